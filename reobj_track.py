@@ -1,0 +1,6119 @@
+#!/usr/bin/env python3
+"""reobj_track: objects of a hand-held video: which detections are the same one, and where each is.
+
+    python reobj_track.py run VIDEO -o OUT        # identities, cameras, one 3D ellipsoid per object
+    python reobj_track.py run VIDEO -o OUT --detections det.txt --poses colmap_model/
+    python reobj_track.py --help
+
+    import reobj_track as rt
+    tracker = rt.Tracker()
+    for frame in rt.Video("room.mp4"):
+        tracks = tracker.update(detector(frame.image), frame.image)
+
+How it works (start reading at `run()`, then `Tracker.update()`):
+  1. detect    boxes, scores, classes and masks of every frame: an ONNX model, a file, or a callable
+  2. embed     one feature map a frame, pooled under each object and around it
+  3. predict   constant-velocity Kalman filter, moved along with the camera's own motion
+  4. associate gate by motion, then one cost from overlap and appearance; high scores first; objects
+               that come back are recognised from a gallery that never expires
+  5. poses     keyframes -> pycolmap -> PnP for the frames between; or poses supplied by the user
+  6. link      tracklets that explain the same place in 3D become one object, or are split again
+  7. fit       one solid and its ellipsoid per object from its boxes and a size prior (quadrics.py)
+
+Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
+[0, 1] and has its centre at (0.5, 0.5) as in COLMAP; `b_from_a` maps coordinates in a to b;
+cameras are `cam_from_world`, x right, y down, z forward; quaternions carry their order in the name.
+
+References: re-OBJ (Bansal et al., ICIAP 2019), PSfMO (Gay et al., ICCV 2017), LfD (Rubino et al.,
+PAMI 2018), SORT (Bewley et al., ICIP 2016), DeepSORT (Wojke et al., ICIP 2017), ByteTrack (Zhang et
+al., ECCV 2022), BoT-SORT (Aharon et al., 2022), COLMAP (Schoenberger and Frahm, CVPR 2016).
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import contextlib
+import csv
+import dataclasses
+import glob
+import hashlib
+import http.client
+import itertools
+import json
+import logging
+import math
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation, Slerp
+
+import quadrics
+
+__version__ = "0.1.0"
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+Image = npt.NDArray[np.uint8]
+
+log = logging.getLogger("reobj_track")
+
+
+class ReobjError(ValueError):
+    """A mistake in the input: says what, where, what was expected and what to do (exit code 2)."""
+
+
+# ---- Constants ---------------------------------------------------------------------------------
+
+COCO_CLASSES = (
+    "person bicycle car motorcycle airplane bus train truck boat traffic_light fire_hydrant "
+    "stop_sign parking_meter bench bird cat dog horse sheep cow elephant bear zebra giraffe "
+    "backpack umbrella handbag tie suitcase frisbee skis snowboard sports_ball kite "
+    "baseball_bat baseball_glove skateboard surfboard tennis_racket bottle wine_glass cup fork "
+    "knife spoon bowl banana apple sandwich orange broccoli carrot hot_dog pizza donut cake "
+    "chair couch potted_plant bed dining_table toilet tv laptop mouse remote keyboard "
+    "cell_phone microwave oven toaster sink refrigerator book clock vase scissors teddy_bear "
+    "hair_drier toothbrush"
+)
+COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in COCO_CLASSES.split())
+
+# ---- Configuration: the only home of numbers ---------------------------------------------------
+
+
+def _opt(default: Any, text: str, flag: str = "") -> Any:
+    """Declare a config field: its default, its help text and, for the few that users need, its
+    flag.
+    """
+    return field(default=default, metadata={"help": text, "flag": flag})
+
+
+@dataclass(frozen=True, slots=True)
+class InputConfig:
+    """Which frames are read. Frame numbers are those of the source, whatever `every` is."""
+
+    every: int = _opt(1, "use every N-th frame", "--every")
+    start: int = _opt(0, "first frame (0-based)", "--start")
+    stop: int = _opt(0, "frame to stop before (0: the end)", "--stop")
+    max_size: int = _opt(0, "shrink frames to this longer side, px (0: native)", "--max-size")
+
+
+@dataclass(frozen=True, slots=True)
+class DetectConfig:
+    """Object detection."""
+
+    model: str = _opt(
+        "deimv2-femto", "detector: a name of `models`, or an .onnx file", "--detector"
+    )
+    min_score: float = _opt(0.1, "detections below this score are never used (ByteTrack: .1)")
+    nms_iou: float = _opt(0.6, "class-wise NMS overlap for models that need NMS (NanoDet: .6)")
+    classes: str = _opt("", "comma-separated class names to keep (default: all)", "--classes")
+    class_names: str = _opt(
+        "", "text file with one class name a line, for models and files that are not COCO"
+    )
+    max_detections: int = _opt(100, "detections kept a frame, best scores first")
+
+
+@dataclass(frozen=True, slots=True)
+class PosesConfig:
+    """Camera poses: keyframes, reconstruction, PnP. Numbers measured in pycolmap.md of the design
+    notes.
+    """
+
+    mode: str = _opt(
+        "auto",
+        "auto: reconstruct with pycolmap; none: 2D only; or a file or folder of poses",
+        "--poses",
+    )
+    fmt: str = _opt(
+        "auto", "format of supplied poses: auto, colmap, tum, transforms", "--pose-format"
+    )
+    camera: str = _opt(
+        "",
+        "intrinsics: fx,fy,cx,cy[,k1,k2,p1,p2] in native pixels (COLMAP: centre + .5)",
+        "--camera",
+    )
+    size_px: int = _opt(640, "longer side of the working images")
+    max_flow: float = _opt(
+        0.12, "new keyframe when the median flow since the last passes this share of the width"
+    )
+    min_ratio: float = _opt(0.55, "new keyframe when fewer of the corners than this survive")
+    max_keyframes: int = _opt(150, "upper bound on keyframes; max_flow grows until it fits")
+    overlap: int = _opt(12, "sequential matching: neighbours at offsets 1, 2, 4 ... 2^(overlap-1)")
+    exhaustive_below: int = _opt(30, "match all pairs when there are no more keyframes than this")
+    min_registered: float = _opt(0.5, "refuse a model with fewer of the keyframes than this")
+    min_points: int = _opt(100, "refuse a model with fewer 3D points")
+    min_tri_angle_deg: float = _opt(
+        1.5, "refuse a model whose median triangulation angle is smaller"
+    )
+    pnp_points: int = _opt(200, "3D points tracked from each keyframe into the frames between")
+    pnp_min_inliers: int = _opt(15, "accept a PnP pose with at least this many inliers")
+    pnp_min_ratio: float = _opt(0.5, "and at least this share of inliers")
+    max_gap: int = _opt(15, "interpolate over at most this many frames (marked `interpolated`)")
+    seed: int = _opt(0, "random seed of the reconstruction")
+    corners: int = _opt(300, "corners followed to choose keyframes")
+    min_corners: int = _opt(20, "with fewer corners a frame counts as textureless")
+    min_keyframes: int = _opt(25, "with fewer keyframes max_flow is halved, down to min_flow")
+    max_interval: int = _opt(60, "new keyframe after this many frames if the camera moved at all (min_flow)")
+    min_flow: float = _opt(0.015, "share of the width that counts as motion")
+    sharp_window: float = _opt(0.7, "the sharpest frame is taken once the flow passed this share of max_flow")
+    klt_window_px: int = _opt(15, "Lucas-Kanade window on the working image")
+    klt_error_px: float = _opt(1.0, "forward-backward error of a followed point")
+    cache_mb: int = _opt(1000, "gray working images kept in memory; beyond it the video is read twice")
+    sift_features: int = _opt(4096, "SIFT features a keyframe")
+    sift_contrast: float = _opt(0.02, "SIFT contrast threshold")
+    sift_contrast_low: float = _opt(0.007, "SIFT contrast threshold where less than sift_few features are found")
+    sift_few: int = _opt(500, "see sift_contrast_low")
+    loop_pairs: int = _opt(6, "look-alike keyframes matched with each keyframe, to close loops")
+    loop_words: int = _opt(64, "visual words that describe the look of a keyframe")
+    loop_sample: int = _opt(20000, "descriptors clustered into words")
+    focal_guess: float = _opt(0.8, "first focal length over the longer side (phones .72-.85)")
+    good_registered: float = _opt(0.9, "take the first healthy model with this share of the keyframes")
+    min_points_per_image: int = _opt(30, "refuse a model with fewer 3D points seen in the median image")
+    strong_tri_angle_deg: float = _opt(5.0, "trust a self-calibrated focal length from this triangulation angle on")
+    strong_spread: float = _opt(0.1, "and from this spread of the cameras over the scene's depth on")
+    focal_range: tuple[float, float] = _opt((0.4, 2.0), "and only when focal / longer side lies in here")
+    tri_sample: int = _opt(2000, "points used for the median triangulation angle")
+    pnp_error_px: float = _opt(4.0, "PnP inlier threshold on the working image")
+    max_run: int = _opt(1000, "frames held at once between two keyframes")
+    pose_tolerance: float = _opt(5e-3, "how far supplied rotations may be from exact (7-Scenes: 1e-3)")
+    max_focal_spread: float = _opt(0.02, "supplied cameras of one video may differ in focal length by this share")
+    lone_frame_s: float = _opt(1 / 60, "half a frame interval when there is only one frame")
+    check_tracks: int = _opt(3, "direction check: tracks needed")
+    check_views: int = _opt(5, "direction check: frames of a track needed")
+    check_most_tracks: int = _opt(200, "direction check: tracks used at most")
+    check_most_views: int = _opt(40, "direction check: frames of a track used at most")
+    check_angle_deg: float = _opt(1.0, "direction check: never complain when the tracks meet within this angle")
+    check_ratio: float = _opt(0.3, "direction check: another reading must be better by this factor")
+    max_step_ratio: float = _opt(5.0, "refuse a PnP pose further from its neighbours than this times the median step")
+
+# ---- Poses -------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class EmbedConfig:
+    """Appearance."""
+
+    model: str = _opt(
+        "colour",
+        "appearance: colour (training-free), none, or a backbone name / .onnx file",
+        "--embed",
+    )
+    size_px: int = _opt(480, "longer side of the backbone's input")
+    context: float = _opt(0.5, "background: the box grown by this share of its size on every side")
+    samples: int = _opt(16, "samples a side over the grown box")
+    object_score: float = _opt(0.3, "detections from this score on are no background for the others")
+    foreground_cells: int = _opt(2, "cells a side that the foreground is divided into")
+    background_cells: int = _opt(
+        4, "cells a side that the grown box is divided into for the background"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerConfig:
+    """Tracking and re-identification."""
+
+    high_score: float = _opt(
+        0.4, "first association round: detections of at least this score", "--high-score"
+    )
+    low_score: float = _opt(0.1, "second round: of at least this score (ByteTrack)")
+    new_score: float = _opt(0.5, "a new track needs this score")
+    n_init: int = _opt(3, "detections before a track is confirmed (DeepSORT)")
+    coast_frames: int = _opt(30, "frames a track is predicted without a detection", "--coast")
+    remember: bool = _opt(True, "recognise objects that return, however long they were away")
+    std_position: float = _opt(
+        0.05, "process noise of a position over the box size (DeepSORT: 1/20)"
+    )
+    std_velocity: float = _opt(
+        1 / 160, "process noise of a velocity over the box size (DeepSORT: 1/160)"
+    )
+    std_measure: float = _opt(0.05, "measurement noise over the box size (DeepSORT: 1/20)")
+    gate_chi2: float = _opt(
+        9.2103, "gate on the centre's squared Mahalanobis distance (chi2 .99, 2 dof)"
+    )
+    gate_iou: float = _opt(0.5, "overlap that passes the gate by itself")
+    low_iou: float = _opt(0.3, "overlap needed for low scores and for a change of class")
+    max_cost: float = _opt(0.9, "most that an accepted match may cost (0: perfect, 1: at the gate)")
+    class_cost: float = _opt(0.2, "added to the cost when the class differs")
+    appearance_weight: float = _opt(0.5, "share of appearance in the cost of contested matches")
+    foreground_weight: float = _opt(0.5, "share of the foreground in the appearance")
+    rival_cost: float = _opt(0.3, "appearance decides where a rival costs less than this more")
+    embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
+    look_momentum: float = _opt(
+        0.8, "memory of a track's running mean appearance (StrongSORT: .9 every frame)"
+    )
+    views: int = _opt(12, "views kept of every identity")
+    novelty: float = _opt(
+        0.95, "a view less similar than this to all kept ones is a new view (cosine)"
+    )
+    return_similarity: float = _opt(
+        0.5, "recognise a return above this similarity (0: as different objects, 1: as same)"
+    )
+    return_margin: float = _opt(0.15, "and only if no other identity comes closer than this")
+    prior_different: float = _opt(
+        0.55, "cosine of different objects of a class before the video has shown any"
+    )
+    prior_same: float = _opt(
+        0.85, "cosine of two views of one object before the video has shown any"
+    )
+    prior_std: float = _opt(0.1, "spread of both")
+    prior_weight: float = _opt(20.0, "number of observed pairs that these priors are worth")
+    camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
+    flow_size_px: int = _opt(320, "longer side of the image for optical flow")
+    flow_corners: int = _opt(200, "corners followed")
+    flow_min_corners: int = _opt(8, "with fewer, the camera is taken to stand still")
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectsConfig:
+    """From tracks and cameras to one solid and ellipsoid per object."""
+
+    priors: str = _opt(
+        "", "size priors by category, JSON (default: the priors.json beside this file)", "--priors"
+    )
+    known_size: str = _opt(
+        "", "metric scale from known heights: 'chair=0.82m,door=2.0m'", "--known-size"
+    )
+    support: str = _opt("auto", "shape of the solids: auto, box, cylinder, ellipsoid", "--support")
+    up: str = _opt(
+        "", "world direction against gravity: x,y,z (default: from the poses or the objects)"
+    )
+    link: bool = _opt(True, "join and split tracklets by 3D evidence")
+    link_look: float = _opt(
+        0.0, "never join objects that look less alike than this (0: as different ones)"
+    )
+    link_place: float = _opt(
+        0.25, "candidates for a join overlap at least this much when cross-projected (IoU)"
+    )
+    keep_iou: float = _opt(
+        0.4, "a join is kept if the joint solid overlaps the boxes at least this much (IoU)"
+    )
+    keep_share: float = _opt(
+        0.6, "in at least this share of the frames of either part (OA-SLAM: half)"
+    )
+    cut_gap: int = _opt(5, "tracklets may be split where this many frames pass without a detection")
+    split_drop: float = _opt(0.7, "a return is doubted if its joint solid overlaps its boxes less than this share")
+    split_place: float = _opt(
+        0.1, "a return is undone when the two places overlap less than this (IoU)"
+    )
+    min_views: int = _opt(3, "objects with fewer detections in frames with poses get no ellipsoid")
+    min_score: float = _opt(0.3, "boxes below this score do not shape the ellipsoid")
+    moving: str = _opt(
+        "person,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe",
+        "classes that move: tracked, but without ellipsoid",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OutputConfig:
+    """Files written."""
+
+    overlay: bool = _opt(True, "write overlay.mp4")
+    overlay_size_px: int = _opt(1280, "longer side of the overlay")
+    ply_detail: int = _opt(2, "subdivisions of the ellipsoids in objects.ply")
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All options; sections are set by `--set section.field=value` on the command line."""
+
+    input: InputConfig = field(default_factory=InputConfig)
+    detect: DetectConfig = field(default_factory=DetectConfig)
+    embed: EmbedConfig = field(default_factory=EmbedConfig)
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    poses: PosesConfig = field(default_factory=PosesConfig)
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    output: OutputConfig = field(default_factory=OutputConfig)
+    threads: int = _opt(0, "threads of onnxruntime, OpenCV and numpy (0: all cores)", "--threads")
+    offline: bool = _opt(False, "never download weights", "--offline")
+
+
+# ---- Data types --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """Detections of one frame as a struct of arrays.
+
+    Attributes:
+        xyxy: (D, 4) boxes x1, y1, x2, y2, pixels, corner convention.
+        score: (D,) in [0, 1].
+        class_id: (D,) index into the class names.
+        masks: (D, H, W) bool at the frame's size, or None. A mask without any pixel means "no
+            mask".
+    """
+
+    xyxy: Array
+    score: Array
+    class_id: IntArray
+    masks: BoolArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.xyxy)
+
+    def __getitem__(self, keep: Any) -> Detections:
+        """Select by index array, boolean mask or slice."""
+        masks = None if self.masks is None else self.masks[keep]
+        return Detections(self.xyxy[keep], self.score[keep], self.class_id[keep], masks)
+
+    @staticmethod
+    def empty() -> Detections:
+        return Detections(np.empty((0, 4)), np.empty(0), np.empty(0, np.int64))
+
+    @staticmethod
+    def from_array(rows: npt.ArrayLike) -> Detections:
+        """Make from (N, 6) rows x1, y1, x2, y2, confidence, class.
+
+        >>> Detections.from_array([[0, 0, 10, 20, 0.9, 56]]).class_id
+        array([56])
+        """
+        rows = np.asarray(rows, np.float64).reshape(-1, 6) if np.size(rows) else np.empty((0, 6))
+        return Detections(rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One video frame: source frame number (0-based), time in seconds, BGR image (H, W, 3) uint8.
+    """
+
+    index: int
+    time_s: float
+    image: Image
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A COLMAP camera: model name, size in pixels, parameters in COLMAP's order (centre of pixel 0
+    at .5).
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def K(self) -> Array:
+        """(3, 3) pinhole part of the intrinsics."""
+        one_focal = self.model in (
+            "SIMPLE_PINHOLE",
+            "SIMPLE_RADIAL",
+            "RADIAL",
+            "SIMPLE_RADIAL_FISHEYE",
+            "RADIAL_FISHEYE",
+        )
+        fx, fy, cx, cy = (self.params[0], *self.params[:3]) if one_focal else self.params[:4]
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    def undistort(self, xy: Array) -> Array:
+        """Map (..., 2) image pixels to the pixels of an ideal pinhole camera with the same K; NaN
+        stays.
+        """
+        import pycolmap
+
+        camera = pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
+        flat = np.asarray(xy, np.float64).reshape(-1, 2)
+        ideal = np.full_like(flat, np.nan)
+        good = np.isfinite(flat).all(1)
+        if good.any():
+            ideal[good] = (
+                np.asarray(camera.cam_from_img(flat[good]), np.float64) @ self.K[:2, :2].T
+                + self.K[:2, 2]
+            )
+        return ideal.reshape(np.shape(xy))
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Cameras of a video.
+
+    Attributes:
+        camera: intrinsics at the frames' native size.
+        frame: (F,) source frame numbers, ascending, one for every frame that was read.
+        time_s: (F,) seconds.
+        cam_from_world: (F, 3, 4), NaN where there is no pose.
+        status: (F,) "keyframe", "pnp", "interpolated", "supplied" or "none".
+        source: "pycolmap", "user" or "none".
+        metric: True when world units are metres.
+        up_in_world: (3,) unit vector against gravity, or None if unknown.
+        points: (N, 3) sparse points in world; colors (N, 3) uint8 RGB.
+        messages: what the user should know (spans without poses and what helps).
+    """
+
+    camera: Camera
+    frame: IntArray
+    time_s: Array
+    cam_from_world: Array
+    status: npt.NDArray[np.str_]
+    source: str
+    metric: bool = False
+    up_in_world: Array | None = None
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    messages: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> BoolArray:
+        """(F,) True where the frame has a pose."""
+        return np.isfinite(self.cam_from_world).all((1, 2))
+
+
+class Progress:
+    """One progress line a stage on stderr with rate and time left; silent when stderr is no
+    terminal.
+    """
+
+    def __init__(self, stage: str, total: int = 0) -> None:
+        self.stage, self.total, self.done, self.started, self.shown = (
+            stage,
+            total,
+            0,
+            time.monotonic(),
+            0.0,
+        )
+        self.enabled = sys.stderr.isatty()
+
+    def step(self, n: int = 1) -> None:
+        self.done += n
+        now = time.monotonic()
+        if self.enabled and now - self.shown > 0.1:
+            self.shown = now
+            rate = self.done / max(now - self.started, 1e-6)
+            share = f"/{self.total} {100 * self.done / self.total:3.0f}%" if self.total else ""
+            left = f", {max(self.total - self.done, 0) / rate:.0f} s left" if self.total else ""
+            sys.stderr.write(f"\r{self.stage:<8}{self.done}{share} {rate:.1f}/s{left}   ")
+
+    def close(self) -> float:
+        """Finish the line and return the seconds since the start."""
+        if self.enabled and self.done:
+            sys.stderr.write("\n")
+        return time.monotonic() - self.started
+
+
+# ---- Weights -----------------------------------------------------------------------------------
+
+DOWNLOAD_CHUNK = 1 << 16  # bytes read at a time
+DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """A file of pre-trained weights; without `url` it is used if it lies in REOBJ_MODELS."""
+
+    name: str
+    role: str  # detector, backbone or reid (appearance of persons)
+    file: str
+    url: str  # pinned at a commit
+    sha256: str
+    size: int
+    licence: str
+    note: str = ""  # AP: 164 images of COCO val2017; ms: one thread
+
+
+_GITHUB = "https://github.com/"
+_DEIM = _GITHUB + "Kazuhito00/DEIMv2-ONNX-Sample/raw/f88d4382abca74edb26ed4c7f46190ac40da0ea5/"
+_YOLOX = (_GITHUB + "Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
+          "3d4f1119d0694200671c08069ecb847aa0d8495a/")  # fmt: skip
+_PICODET = _GITHUB + "hpc203/picodet-onnxruntime/raw/dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/"
+_OSNET = (_GITHUB + "akshaydhame2001/YOLOv8_Tracking_TensorRT/raw/"
+          "cb948b3224a53986e8ccc0ca940fb8fe842e145b/")  # fmt: skip
+_OMZ = (_GITHUB + "Kazuhito00/MOT-Tracking-by-Detection-Pipeline/raw/"
+        "e50a76b8b430b778276e7fd04fd4cafd5d45eab2/Tracker/person_reid/model/")  # fmt: skip
+
+WEIGHTS: tuple[Weights, ...] = (
+    Weights("deimv2-femto", "detector", "deimv2_hgnetv2_femto_coco.onnx",
+            _DEIM + "model/deimv2_hgnetv2_femto_coco.onnx",
+            "c6ad358f750132b891165e034c2ba507abefc5ebe1c1d2732a0acbcacc47e52c", 4116144,
+            "Apache-2.0", "default; COCO, AP 33.2, 39 ms"),
+    Weights("deimv2-atto", "detector", "deimv2_hgnetv2_atto_coco.onnx",
+            _DEIM + "model/deimv2_hgnetv2_atto_coco.onnx",
+            "b114aa6610ac7c2bd9b3186ffb001afa872430db957407ef2473f7148d00646e", 2248408,
+            "Apache-2.0", "smallest; COCO, AP 25.5, 21 ms"),
+    Weights("yolox-nano", "detector", "yolox_nano_416.onnx", _YOLOX + "model/yolox_nano.onnx",
+            "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14", 3660092,
+            "Apache-2.0", "COCO, AP 28.6, 27 ms"),
+    Weights("picodet-s-416", "detector", "picodet_s_416_coco.onnx",
+            _PICODET + "picodet_s_416_coco.onnx",
+            "cdab77bdde16e4f76bec734c4e5791801d1739e4c7ec1995e0e110e04300d0c2", 4040573,
+            "Apache-2.0", "COCO, AP 33.5, 46 ms"),
+    Weights("picodet-s-640", "detector", "picodet_s_640_coco.onnx", "",
+            "708f33b6bc54cd7a0a31f4111a9a60672e5d9401a51d4442f7800f6aa24b0d18", 4014103,
+            "Apache-2.0", "COCO, AP 34.3, 100 ms; picodet-s-416 with a larger input"),
+    Weights("nanodet-plus-m-512", "detector", "nanodet-plus-m_512.onnx", "",
+            "5fc8c64d50783f7b17e62b27f42576b59a5627a51e179b9feba06a6fb36f4a3c", 4793247,
+            "Apache-2.0", "COCO, AP 33.6, 53 ms; converted from ncnn"),
+    Weights("yolo11n-seg", "detector", "yolo11n-seg_dyn.onnx", "",
+            "f75628d5ebbbb652f34adc33fcb163fe3a123e5a8bddc70125cb76b6f3c79005", 11560385,
+            "AGPL-3.0", "COCO with masks, AP 39.5, 154 ms; strong copyleft"),
+    Weights("mobilenetv2", "backbone", "mobilenetv2_feat.onnx", "",
+            "2e2d63ad6239eb67ad4e132a0858da4ecbaf3022560007a659d05a1afd8fbc7f", 8849494,
+            "Apache-2.0", "ImageNet, convolution layers only"),
+    Weights("squeezenet1.1", "backbone", "squeezenet1.1.onnx", "",
+            "06e303cf8798e53991befff5189cca2f00c97835d9aad8922d854b7c6aca9dc0", 4952376,
+            "Apache-2.0", "ImageNet"),
+    Weights("resnet50v2-s3", "backbone", "resnet50v2_gluon_s3.onnx", "",
+            "b70356f9326e334ba092ee786cb7935c454f29da5888ba09815b2a11541bf086", 36281640,
+            "Apache-2.0", "ImageNet, stages 1-3"),
+    Weights("osnet-x0.25-msmt17", "reid", "osnet_x0_25_msmt17.onnx",
+            _OSNET + "osnet_x0_25_msmt17.onnx",
+            "61b2604171ef9d58d21758626f83b35a253c3d7123976523a6e03068c3c95d7b", 921616,
+            "MIT", "persons; for the comparison with DeepSORT"),
+    Weights("person-reid-0287", "reid", "person-reidentification-retail-0287.onnx",
+            _OMZ + "person-reidentification-retail-0287.onnx",
+            "f35a22885b93aa0c249d665b4cf5510d08ded92f814694c3c2fec0112b0d3a56", 2454677,
+            "Apache-2.0", "persons; for the comparison with DeepSORT"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ModelRow:
+    """A known file: "verified", "wrong sha256", "missing" or "not offered" (no download)."""
+
+    weights: Weights
+    state: str
+    path: Path | None
+
+
+def _cache_folder() -> Path:
+    """Return the platform's cache folder for this tool."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = str(Path.home() / "Library" / "Caches")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "reobj_track"
+
+
+def _model_folders() -> list[Path]:
+    """Return the folders searched for weights: REOBJ_MODELS, if set, then the cache."""
+    own = os.environ.get("REOBJ_MODELS")
+    return [Path(own).expanduser(), _cache_folder()] if own else [_cache_folder()]
+
+
+def _find_model(*files: str) -> Path | None:
+    paths = (folder / file for folder in _model_folders() for file in files)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def list_models() -> list[ModelRow]:
+    """Return every known file of weights with its state on this machine."""
+    rows = []
+    for weights in WEIGHTS:
+        path = _find_model(weights.file)
+        state = "missing" if weights.url else "not offered"
+        if path is not None:
+            state = "verified" if _sha256(path) == weights.sha256 else "wrong sha256"
+        rows.append(ModelRow(weights, state, path))
+    return rows
+
+
+def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
+    """Return a model's path: an existing file as it is, a known name verified or downloaded."""
+    path, name = Path(name_or_path).expanduser(), str(name_or_path)
+    if path.is_file():
+        return path
+    weights = next((w for w in WEIGHTS if name in (w.name, w.file)), None)
+    found = _find_model(*([weights.file] if weights else [name, name + ".onnx"]))
+    if weights is None and found is None:
+        known = ", ".join(w.name for w in WEIGHTS)
+        raise ReobjError(f"model {name}: no such file, nor one of the known names ({known})")
+    if weights is not None and found is None:
+        return _fetch(weights, offline)
+    assert found is not None
+    if weights is not None and (digest := _sha256(found)) != weights.sha256:
+        raise ReobjError(
+            f"{found}: sha256 is {digest}, expected {weights.sha256}: delete the file to fetch it "
+            "again, or give its path instead of its name to use it as it is"
+        )
+    return found
+
+
+def _fetch(weights: Weights, offline: bool) -> Path:
+    """Download weights into the first writable folder and return the verified file."""
+    by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
+    if not weights.url:
+        raise ReobjError(f"model {weights.name} is not offered for download: {by_hand}")
+    if offline:
+        raise ReobjError(
+            f"model {weights.name} is not here and --offline forbids the download: fetch "
+            f"{weights.url} elsewhere and {by_hand}"
+        )
+    log.warning(
+        "fetching %s: %.1f MB, licence %s, from %s, sha256 %s",
+        weights.name, weights.size / 1e6, weights.licence, weights.url, weights.sha256,
+    )  # fmt: skip
+    part = _part_file(weights.file)
+    try:
+        _download(weights, part)
+    except urllib.error.HTTPError as error:
+        raise ReobjError(
+            f"{weights.url}: the server says {error.code} {error.reason}; the file may have moved: "
+            f"find one with sha256 {weights.sha256} and {by_hand}"
+        ) from error
+    except (OSError, http.client.HTTPException) as error:
+        reason = getattr(error, "reason", error)
+        raise ReobjError(
+            f"no connection ({reason}): fetch {weights.url} on another machine and {by_hand}"
+        ) from error
+    _check_download(weights, part)
+    os.replace(part, part.with_suffix(""))
+    return part.with_suffix("")
+
+
+def _part_file(name: str) -> Path:
+    """Return where an unfinished download lies: in the first folder that can be written."""
+    folders = _model_folders()
+    for folder in folders:
+        part = folder / (name + ".part")
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            part.open("ab").close()
+            if not part.stat().st_size:
+                part.unlink()
+            return part
+    tried = " nor ".join(map(str, folders))
+    raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
+
+
+def _download(weights: Weights, part: Path) -> None:
+    """Append what is missing to the unfinished file, or start over if the server cannot resume."""
+    start = part.stat().st_size if part.exists() else 0
+    if start == weights.size:
+        return
+    start = start if start < weights.size else 0  # longer: not ours
+    headers = {"User-Agent": "reobj_track"} | ({"Range": f"bytes={start}-"} if start else {})
+    request = urllib.request.Request(weights.url, headers=headers)
+    with urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response:
+        resumed = start > 0 and response.status == 206
+        progress = Progress("fetch kB", weights.size // 1000)
+        progress.step(start // 1000 if resumed else 0)
+        with part.open("ab" if resumed else "wb") as file:
+            for chunk in _chunks(response, weights.size - (start if resumed else 0)):
+                _write_chunk(file, chunk, part)
+                progress.step(len(chunk) // 1000)
+        progress.close()
+
+
+def _chunks(response: Any, size: int) -> Iterator[bytes]:
+    """Yield what arrives until the size is reached or the connection is cut."""
+    with contextlib.suppress(OSError, http.client.HTTPException):
+        while size > 0 and (chunk := response.read(DOWNLOAD_CHUNK)):
+            yield chunk
+            size -= len(chunk)
+
+
+def _write_chunk(file: Any, chunk: bytes, part: Path) -> None:
+    try:
+        file.write(chunk)
+    except OSError as error:
+        raise ReobjError(f"{part}: cannot write ({error.strerror}): free some space") from error
+
+
+def _check_download(weights: Weights, part: Path) -> None:
+    """Refuse a download that is short (it stays, to be resumed) or wrong (it goes)."""
+    size = part.stat().st_size
+    if size < weights.size:
+        raise ReobjError(f"{weights.url}: connection cut after {size} of {weights.size} bytes: "
+                         "run again to go on from there")  # fmt: skip
+    if (digest := _sha256(part)) != weights.sha256:
+        part.unlink()
+        raise ReobjError(
+            f"{weights.url}: sha256 is {digest}, expected {weights.sha256}: file deleted; "
+            "run again; if it happens again the source has changed: do not use it"
+        )
+
+
+# ---- Video -------------------------------------------------------------------------------------
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+IMAGE_FPS = 30.0  # times of image folders whose names are no timestamps
+SHORT_SHARE = 0.02  # of the announced frames may be missing at the end before it is worth a warning
+MAX_BAD_RUN = 64  # unreadable frames in a row after which a video has ended
+LIVE_SCHEMES = ("rtsp://", "rtsps://", "rtmp://", "udp://")
+
+
+class Video:
+    """Frames of a video file, an image folder, a glob, a camera index or a URL.
+
+    Iterating yields `Frame`s, as often as wanted (once for cameras). Frame numbers are those of the
+    source: rows of the sorted images, or frames of the file in order, unreadable ones counted.
+
+    Attributes:
+        source: as given. is_live: a camera or stream, which cannot be read twice.
+        size, working_size: (w, h) of the source after rotation, and of the frames.
+        names: file names of the images by frame number, empty for videos.
+        scale: working / native. fps: mean frame rate. frame_count: of the source (0 if unknown).
+        skipped: frames of the last iteration that could not be read or had another size.
+        messages: warnings, each once.
+    """
+
+    def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
+        self.source, self.config = str(source), config or InputConfig()
+        if self.config.every < 1 or self.config.start < 0 or self.config.max_size < 0:
+            raise ReobjError("--every must be at least 1, --start and --max-size at least 0")
+        self.skipped: list[int] = []
+        self.messages: list[str] = []
+        self._files = _image_files(self.source)
+        self.names = [path.name for path in self._files or []]
+        camera = self.source.isdigit() and not Path(self.source).exists()
+        self.is_live = camera or self.source.startswith(LIVE_SCHEMES)
+        self._capture: Any = None if self._files is not None else self._open()
+        self.size, self.fps, self.frame_count = self._probe()
+        if 0 < self.frame_count <= self.config.start:
+            raise ReobjError(f"{self.source}: --start {self.config.start}, but it has only "
+                             f"{self.frame_count} frames")  # fmt: skip
+        ratio = min(1.0, self.config.max_size / max(self.size)) if self.config.max_size else 1.0
+        width, height = (max(round(side * ratio), 1) for side in self.size)
+        self.working_size = (width, height)
+        self.scale = width / self.size[0]
+
+    def name(self, index: int) -> str:
+        """Return the file name of a frame, "" for videos."""
+        return self.names[index] if self.names else ""
+
+    @property
+    def expected(self) -> int:
+        """Number of frames that an iteration yields at most (0 if unknown)."""
+        stop = min(self.config.stop or self.frame_count, self.frame_count or self.config.stop)
+        return max(math.ceil((stop - self.config.start) / self.config.every), 0)
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.skipped.clear()
+        for index, time_s, image in self._decoded():
+            if image is None or (image.shape[1], image.shape[0]) != self.size:
+                self.skipped.append(index)
+                continue
+            if self.working_size != self.size:
+                small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
+                image = np.asarray(small, np.uint8)
+            yield Frame(index, time_s, image)
+        if self.skipped:
+            some = _shortened(self.skipped)
+            count = len(self.skipped)
+            self._warn(f"{count} frames skipped (unreadable or of another size): {some}")
+
+    def _warn(self, text: str) -> None:
+        text = f"{self.source}: {text}"
+        if text not in self.messages:
+            self.messages.append(text)
+
+    def _decoded(self) -> Iterator[tuple[int, float, Image | None]]:
+        """Yield number, time and image of every wanted frame, None if it cannot be read."""
+        if self._files is None:
+            yield from self._from_capture()
+            return
+        times_s = _image_times(self._files)
+        stop = min(self.config.stop or len(times_s), len(times_s))
+        for index in range(self.config.start, stop, self.config.every):
+            yield index, times_s[index], _read_image(self._files[index])
+
+    def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
+        capture, start, every = self._capture or self._open(), self.config.start, self.config.every
+        began, previous_s, bad, index = time.monotonic(), -1.0, 0, -1
+        pending: list[tuple[int, float, Image | None]] = []  # unreadable, or beyond the end
+        for index in range(self.config.stop or sys.maxsize):
+            wanted = index >= start and (index - start) % every == 0
+            grabbed = capture.grab()
+            # Right after the grab this is the frame's true time, also at a variable rate.
+            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            if self.is_live:
+                time_s = time.monotonic() - began
+            elif time_s <= previous_s:  # some containers have no times
+                time_s = previous_s + 1 / self.fps
+            ok, image = capture.retrieve() if grabbed and wanted else (grabbed, None)
+            if not ok:
+                bad += 1
+                pending += [(index, time_s, None)] if wanted else []
+                if bad >= MAX_BAD_RUN:
+                    break
+                continue
+            yield from pending
+            pending, bad, previous_s = [], 0, time_s
+            if wanted:
+                yield index, time_s, image
+        capture.release()
+        self._capture = None
+        read, stop = index + 1 - bad, self.config.stop or self.frame_count
+        if min(stop, self.frame_count) - read > max(1.0, SHORT_SHARE * self.frame_count):
+            self._warn(f"the file ends early: {read} of {self.frame_count} frames can be read")
+
+    def _open(self) -> Any:
+        """Open the source with OpenCV, which turns the frames upright by the file's rotation."""
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
+        is_url = "://" in self.source
+        is_file = not self.is_live and not is_url
+        if is_file and not Path(self.source).is_file():
+            raise ReobjError(f"{self.source}: no such file or folder")
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        capture = cv2.VideoCapture(self.source if is_file or is_url else int(self.source))
+        cv2.utils.logging.setLogLevel(level)
+        if not capture.isOpened():
+            what = "camera (is it connected?)" if self.is_live else "video (damaged, or no video)"
+            raise ReobjError(f"{self.source}: cannot be opened as a {what}")
+        return capture
+
+    def _probe(self) -> tuple[tuple[int, int], float, int]:
+        """Return size, frame rate and number of frames, from the first readable frame."""
+        if self._files is not None:
+            images: Iterator[Image | None] = map(_read_image, self._files)
+            fps, count = _image_rate(self._files), len(self._files)
+        else:
+            images = (self._capture.read()[1] for _ in range(MAX_BAD_RUN))
+            fps = float(self._capture.get(cv2.CAP_PROP_FPS))
+            count = max(int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        image = next((image for image in images if image is not None), None)
+        if image is None:
+            raise ReobjError(f"{self.source}: not one frame can be decoded")
+        if self._files is None and not self.is_live:
+            self._capture.release()
+            self._capture = None
+        size = (image.shape[1], image.shape[0])
+        return size, fps if 0 < fps < math.inf else IMAGE_FPS, 0 if self.is_live else count
+
+
+def _shortened(items: Sequence[Any]) -> str:
+    """Return the first five of a list, for messages."""
+    return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
+
+
+def _natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key that puts image2 before image10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in parts]
+
+
+def _image_files(source: str) -> list[Path] | None:
+    """Return the images of a folder, glob or single file, sorted; None for anything else."""
+    path = Path(source)
+    if path.is_file():
+        return [path] if path.suffix.lower() in IMAGE_SUFFIXES else None
+    if path.is_dir():
+        found = [other for other in path.iterdir() if not other.name.startswith(".")]
+    elif re.search(r"[*?\[]", source) and "://" not in source:
+        found = [Path(name) for name in glob.glob(source)]
+    else:
+        return None
+    files = [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not files:
+        raise ReobjError(f"{source}: no images there (looked for {' '.join(IMAGE_SUFFIXES)})")
+    return sorted(files, key=_natural_key)
+
+
+def _image_times(files: Sequence[Path]) -> list[float]:
+    """Return seconds by frame: the names if all are timestamps (12.345.png), else 30 a second."""
+    if all(re.fullmatch(r"\d+\.\d+", path.stem) for path in files):
+        return [float(path.stem) for path in files]
+    return [index / IMAGE_FPS for index in range(len(files))]
+
+
+def _image_rate(files: Sequence[Path]) -> float:
+    times_s = _image_times(files)
+    span_s = times_s[-1] - times_s[0]
+    return (len(times_s) - 1) / span_s if span_s > 0 else IMAGE_FPS
+
+
+def _read_image(path: Path) -> Image | None:
+    """Read an image as BGR, upright by its EXIF tag; None if it is none."""
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    except (OSError, cv2.error):
+        return None
+    return None if image is None else np.asarray(image, np.uint8)
+
+
+# ---- Detections: files -------------------------------------------------------------------------
+
+MOSTLY = 0.5  # above this share of bad boxes it is the format that is wrong, not the boxes
+BEYOND = 0.1  # boxes that reach this share of the image beyond it were made on another image size
+NORMALISED_MAX = 1.5  # coordinates up to here are shares of the image
+CACHE_FRAMES = 64  # frames in one file of the detection cache
+POLYGON_BITS = 4  # sub-pixel bits of polygon corners (cv2.fillPoly)
+COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # category ids of COCO that no image uses
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(?i:nan|inf(inity)?)"
+NO_COMMENT = r"\A\s*[^#\s]|,"  # a line with content; a header may start with #
+NPZ_KEYS = ("frame", "xyxy", "score", "class_id", "class_names", "image_size")
+CSV_COLUMNS = {  # what a column holds: the names it has in the wild
+    "frame": "frame frame_id frame_index frame_number",
+    "image": "image image_name file file_name filename timestamp",
+    "x1": "x1 x_min xmin left x bb_left xtl", "y1": "y1 y_min ymin top y bb_top ytl",
+    "x2": "x2 x_max xmax right xbr", "y2": "y2 y_max ymax bottom ybr",
+    "w": "w width bb_width", "h": "h height bb_height",
+    "score": "score confidence conf prob",
+    "class": "class_name name label category class class_id cls category_id coco80_class",
+}  # fmt: skip
+Counts = npt.NDArray[np.uint32]
+
+
+def rle_encode(masks: BoolArray) -> tuple[Counts, IntArray]:
+    """Encode masks as run lengths down the columns, zeros first; an empty mask has no runs.
+
+    Args:
+        masks: (D, H, W) bool.
+    Returns:
+        counts: (M,) run lengths of all masks. offsets: (D + 1,): mask d has the counts from
+        offsets[d] to offsets[d + 1].
+    """
+    height, width = masks.shape[1:]
+    runs = [np.empty(0, np.uint32)]
+    for mask in masks:
+        columns = np.flatnonzero(mask.any(0))
+        if not len(columns):
+            runs.append(runs[0])
+            continue
+        first, last = int(columns[0]), int(columns[-1])
+        inner = mask[:, first : last + 1].T.ravel()  # down the columns that have pixels
+        edges = np.flatnonzero(np.diff(inner, prepend=False, append=False)) + first * height
+        counts = np.diff(edges, prepend=0, append=height * width)
+        runs.append(counts[: len(counts) - (counts[-1] == 0)].astype(np.uint32))
+    return np.concatenate(runs), np.cumsum([len(run) for run in runs]).astype(np.int64)
+
+
+def rle_decode(counts: Counts, offsets: IntArray, size: tuple[int, int]) -> BoolArray:
+    """Decode run lengths into (D, H, W) masks of a (w, h) image; the inverse of `rle_encode`."""
+    width, height = size
+    runs = np.diff(offsets)  # (D,)
+    filled = np.flatnonzero(runs)
+    flat = np.zeros((len(runs), width * height), bool)
+    if len(filled):
+        total = np.add.reduceat(counts.astype(np.int64), offsets[:-1][filled])
+        if (total != width * height).any():
+            raise ReobjError(f"a mask has {total.max()} pixels, the image {width} x {height}")
+        odd = (np.arange(len(counts)) - np.repeat(offsets[:-1], runs)) % 2 == 1  # runs of ones
+        flat[filled] = np.repeat(odd, counts).reshape(len(filled), -1)
+    return flat.reshape(len(runs), width, height).transpose(0, 2, 1)
+
+
+def coco_runs(text: str) -> Counts:
+    """Decode COCO's compressed run lengths: 5 bits a character, differences to the last but one."""
+    raw = np.frombuffer(text.encode(), np.uint8).astype(np.int64) - 48
+    last = np.flatnonzero(~raw & 0x20)  # last character of each number
+    first = np.concatenate([[0], last[:-1] + 1])
+    place = np.arange(len(raw)) - np.repeat(first, last - first + 1)
+    values = np.add.reduceat((raw & 0x1F) << (5 * place), first)
+    values -= (raw[last] >> 4 & 1) << (5 * (place[last] + 1))  # sign
+    values[1::2] = np.cumsum(values[1::2])
+    values[2::2] = np.cumsum(values[2::2])
+    return values.astype(np.uint32)
+
+
+def _pick_runs(counts: Counts, offsets: IntArray, rows: IntArray) -> tuple[Counts, IntArray]:
+    """Return the run lengths of some rows as (counts, offsets)."""
+    parts = [counts[offsets[row] : offsets[row + 1]] for row in rows]
+    ends = np.cumsum([0, *map(len, parts)])
+    return np.concatenate([np.empty(0, np.uint32), *parts]), ends.astype(np.int64)
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Detections as a reader found them, unchecked: `frame` 0-based (-1: none), boxes xyxy."""
+
+    frame: IntArray
+    xyxy: Array
+    score: Array
+    class_id: IntArray
+    class_names: list[str]
+    line: IntArray  # (N,) where each one stands, for messages
+    unit: str = "line"
+    counts: Counts | None = None  # run lengths of the masks
+    offsets: IntArray | None = None
+    messages: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedDetections:
+    """Detections read from a file and checked.
+
+    Attributes:
+        frame: (N,) ascending source frame numbers. xyxy: (N, 4) in native pixels.
+        row: (N,) row in the file, the index of its mask. counts, offsets: run lengths of all masks.
+        size, working_size: (w, h). messages: what was dropped or assumed.
+    """
+
+    frame: IntArray
+    xyxy: Array
+    score: Array
+    class_id: IntArray
+    row: IntArray
+    class_names: tuple[str, ...]
+    size: tuple[int, int]
+    working_size: tuple[int, int]
+    counts: Counts | None = None
+    offsets: IntArray | None = None
+    messages: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def frames(self) -> IntArray:
+        """Frame numbers that have detections, ascending."""
+        return np.unique(self.frame)
+
+    def at(self, frame_index: int) -> Detections:
+        """Return the detections of a frame at the working size, best first; decodes its masks."""
+        low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
+        of = slice(low, high)
+        ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
+        masks = self._masks(self.row[of])
+        return Detections(self.xyxy[of] * ratio, self.score[of], self.class_id[of], masks)
+
+    def _masks(self, rows: IntArray) -> BoolArray | None:
+        if self.counts is None or self.offsets is None:
+            return None
+        counts, offsets = _pick_runs(self.counts, self.offsets, rows)
+        if not len(counts):
+            return None
+        masks = rle_decode(counts, offsets, self.size)
+        if self.working_size == self.size:
+            return masks
+        shares = masks.astype(np.float32)
+        small = [cv2.resize(m, self.working_size, interpolation=cv2.INTER_AREA) for m in shares]
+        return np.stack(small) >= 0.5
+
+
+def load_class_names(path: str | Path) -> tuple[str, ...]:
+    """Read one class name a line."""
+    return tuple(line.strip() for line in _read_text(Path(path)).splitlines() if line.strip())
+
+
+def read_detections(
+    path: str | Path, video: Video, config: DetectConfig | None = None
+) -> RecordedDetections:
+    """Read recorded detections: MOT txt, CSV with a header, COCO results JSON or our npz."""
+    path, config = Path(path), config or DetectConfig()
+    if not path.is_file():
+        raise ReobjError(f"{path}: no such file of detections")
+    names = list(load_class_names(config.class_names)) if config.class_names else []
+    try:
+        rows = _reader_for(path)(path, names, video)
+    except ReobjError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:  # JSON of another make
+        raise ReobjError(f"{path}: an entry is not as expected: {error!r}") from error
+    return _checked(rows, path, video, config)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReobjError(f"{path}: cannot be read as text ({error})") from error
+
+
+def _reader_for(path: Path) -> Callable[[Path, list[str], Video], _Rows]:
+    """Choose the reader by the suffix, for text by the first line that is no comment."""
+    if path.suffix.lower() in (".npz", ".json"):
+        return _read_npz if path.suffix.lower() == ".npz" else _read_coco
+    lines = _read_text(path).splitlines()
+    first = next((line for line in lines if re.search(NO_COMMENT, line)), "")
+    start = re.split(r"[,\s]", first.strip() or "0")[0]  # nothing: MOT without rows
+    return _read_mot if re.fullmatch(NUMBER, start) else _read_csv
+
+
+def _number(cell: str, path: Path, line: int) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        raise ReobjError(f"{path}, line {line}: {cell!r} is not a number") from None
+
+
+def _refuse_nan(values: Array, path: Path, line: IntArray, unit: str = "line") -> None:
+    bad = np.flatnonzero(~np.isfinite(values).all(-1))
+    if len(bad):
+        where = f"{path}, {unit} {line[bad[0]]}"
+        raise ReobjError(f"{where}: NaN or infinite value ({len(bad)} such {unit}(s) in all)")
+
+
+def _read_mot(path: Path, names: list[str], video: Video) -> _Rows:
+    """Read MOTChallenge: frame from 1, id, left, top, w, h[, score[, class or x, y, z]]."""
+    table, line = _mot_table(path)
+    _refuse_nan(table, path, line)
+    if (table[:, 1] % 1 != 0).any():
+        raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
+                         "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
+    score = table[:, 6] if table.shape[1] > 6 else np.ones(len(table))
+    class_id, class_names = _mot_classes(table, names)
+    xyxy = np.hstack([table[:, 2:4], table[:, 2:4] + table[:, 4:6]])
+    rows = _Rows(table[:, 0].astype(np.int64) - 1, xyxy, score, class_id, class_names, line)
+    if len(table) and rows.frame.min() == -1:
+        rows.frame += 1
+        rows.messages.append("MOT frames start at 1, this file has a frame 0: taken as 0-based")
+    return rows
+
+
+def _mot_table(path: Path) -> tuple[Array, IntArray]:
+    """Return (N, 6..10) numbers and their lines."""
+    lines: list[int] = []
+    rows: list[list[float]] = []
+    for line, text in enumerate(_read_text(path).splitlines(), 1):
+        cells = text.replace(",", " ").split()
+        if not cells or cells[0].startswith("#"):
+            continue
+        if len(cells) != (len(rows[0]) if rows else len(cells)) or not 6 <= len(cells) <= 10:
+            wanted = len(rows[0]) if rows else "6 to 10 (frame, id, left, top, w, h, score)"
+            raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {wanted}")
+        lines.append(line)
+        rows.append([_number(cell, path, line) for cell in cells])
+    return np.array(rows) if rows else np.empty((0, 7)), np.array(lines, np.int64)
+
+
+def _mot_classes(table: Array, names: list[str]) -> tuple[IntArray, list[str]]:
+    """Return class ids and names: column 8 if it holds classes (from 1), else all are "object"."""
+    column = table[:, 7] if table.shape[1] > 7 else np.zeros(len(table))
+    if not len(column) or (column < 1).any() or (column % 1 != 0).any():
+        return np.zeros(len(table), np.int64), ["object"]
+    new = [f"class {i + 1}" for i in range(len(names), int(column.max()))]
+    return column.astype(np.int64) - 1, names + new
+
+
+def _csv_header(text: str, path: Path) -> tuple[dict[str, int], int]:
+    """Return role -> column, and the number of the first frame (1 if the header says 1-based)."""
+    role_of = {name: role for role, names in CSV_COLUMNS.items() for name in names.split()}
+    cells = [cell.strip().lstrip("#").strip().lower() for cell in text.split(";")[0].split(",")]
+    plain = [re.sub(r"[ -]", "_", re.sub(r"\(.*?\)", "", cell).strip()) for cell in cells]
+    columns: dict[str, int] = {}
+    for column, name in enumerate(plain):
+        columns.setdefault(role_of.get(name, ""), column)
+    has_end = {"x2", "y2"} <= columns.keys() or {"w", "h"} <= columns.keys()
+    missing = [role for role in ("x1", "y1") if role not in columns]
+    missing += [] if {"frame", "image"} & columns.keys() else ["frame"]
+    missing += [] if has_end else ["x2,y2 or w,h"]
+    if missing:
+        header = ",".join(plain)
+        raise ReobjError(f"{path}, line 1: no column {', '.join(missing)} in the header {header}")
+    return columns, int("frame" in columns and "1-based" in cells[columns["frame"]])
+
+
+def _read_csv(path: Path, names: list[str], video: Video) -> _Rows:
+    """Read a CSV file whose header names its columns (frames 0-based unless it says 1-based)."""
+    lines = enumerate(_read_text(path).splitlines(), 1)
+    texts = [(i, text) for i, text in lines if re.search(NO_COMMENT, text)]
+    header = texts.pop(0)[1].split(";")[0]
+    columns, first = _csv_header(header, path)
+    cells = list(csv.reader(text for _, text in texts))
+    line = np.array([i for i, _ in texts], np.int64)
+    width = header.count(",") + 1
+    for at, row in zip(line, cells, strict=True):
+        if len(row) != width:
+            raise ReobjError(f"{path}, line {at}: {len(row)} columns, expected {width}")
+
+    def column(role: str, default: float = math.nan) -> Array:
+        if role not in columns:
+            return np.full(len(cells), default)
+        texts = [row[columns[role]] for row in cells]
+        return np.array([_number(text, path, at) for at, text in zip(line, texts, strict=True)])
+
+    low = np.stack([column("x1"), column("y1")], 1)  # (N, 2)
+    size = np.stack([column("w"), column("h")], 1)
+    high = np.stack([column("x2"), column("y2")], 1) if "x2" in columns else low + size
+    if "frame" in columns:
+        number = column("frame")
+        _refuse_nan(number[:, None], path, line)
+        frame = number.astype(np.int64) - first
+    else:
+        lookup = _frames_by_name(video)
+        frame = np.array([lookup.get(row[columns["image"]].strip(), -1) for row in cells], np.int64)
+    no_class = np.zeros(len(cells), np.int64)
+    rows = _Rows(frame, np.hstack([low, high]), column("score", 1.0), no_class, names, line)
+    classes = [row[columns["class"]].strip() for row in cells] if "class" in columns else None
+    _csv_classes(rows, classes, path)
+    return rows
+
+
+def _csv_classes(rows: _Rows, cells: list[str] | None, path: Path) -> None:
+    """Fill in the classes: numbers count in the class names (default: COCO's), names are names."""
+    if cells is None:
+        rows.class_names = ["object"]
+        return
+    names = rows.class_names = rows.class_names or list(COCO_NAMES)
+    if not all(re.fullmatch(r"\d+(\.0*)?", cell) for cell in cells):
+        known = {name: i for i, name in enumerate(names)}
+        rows.class_id = np.array([known.setdefault(cell, len(known)) for cell in cells], np.int64)
+        _add_classes(rows, list(known)[len(names) :])
+        return
+    rows.class_id = np.array([int(float(cell)) for cell in cells], np.int64)
+    bad = np.flatnonzero(rows.class_id >= len(names))
+    if len(bad):
+        where = f"{path}, line {rows.line[bad[0]]}"
+        raise ReobjError(f"{where}: {_unnamed_class(rows.class_id[bad[0]], len(names))}")
+
+
+def _unnamed_class(class_id: int, count: int) -> str:
+    return (f"class {class_id}, but there are only {count} class names: give a file of names with "
+            "--set detect.class_names=FILE")  # fmt: skip
+
+
+def _add_classes(rows: _Rows, new: list[str]) -> None:
+    rows.class_names = rows.class_names + new
+    if new:
+        rows.messages.append(f"{len(new)} class names that are not in the list are kept as new "
+                             f"classes: {_shortened(new)}")  # fmt: skip
+
+
+def _frames_by_name(video: Video) -> dict[str, int]:
+    """Return frame numbers by image name, with and without the suffix."""
+    names = list(enumerate(video.names))
+    return {Path(name).stem: i for i, name in names} | {name: i for i, name in names}
+
+
+def _load_json(path: Path) -> Any:
+    try:
+        return json.loads(_read_text(path))
+    except json.JSONDecodeError as error:
+        raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
+
+
+def _dataset_beside(path: Path) -> dict[str, Any] | None:
+    """Find the COCO dataset JSON (with `images`) in the folder of a results JSON."""
+    for other in sorted(path.parent.glob("*.json")):
+        with contextlib.suppress(ReobjError):
+            data = _load_json(other)
+            if isinstance(data, dict) and "images" in data and "categories" in data:
+                return data
+    return None
+
+
+def _coco_frames(dataset: dict[str, Any], video: Video) -> dict[Any, int]:
+    """Return frame number by image id: by file name, else `frame_id`, else the order of the ids."""
+    by_name, images = _frames_by_name(video), dataset["images"]
+    names = {image["id"]: Path(str(image.get("file_name", ""))).name for image in images}
+    if any(name in by_name for name in names.values()):
+        return {key: by_name[name] for key, name in names.items() if name in by_name}
+    if all("frame_id" in image for image in images):
+        return {image["id"]: int(image["frame_id"]) for image in images}
+    return {key: index for index, key in enumerate(sorted(names))}
+
+
+def _coco_91_names() -> list[str]:
+    """Return class names by COCO category id - 1; ids that no image uses have placeholders."""
+    names = iter(COCO_NAMES)
+    last = len(COCO_NAMES) + len(COCO_GAPS)
+    return [f"unused {i}" if i in COCO_GAPS else next(names) for i in range(1, last + 1)]
+
+
+def _read_coco(path: Path, names: list[str], video: Video) -> _Rows:
+    """Read COCO results (a list), or a COCO dataset with annotations; masks as RLE or polygons."""
+    data = _load_json(path)
+    dataset = data if isinstance(data, dict) else _dataset_beside(path)
+    entries = data.get("annotations") if isinstance(data, dict) else data
+    if not isinstance(entries, list):
+        raise ReobjError(f"{path}: expected COCO results: [{{image_id, category_id, bbox, score}}]")
+    for at, entry in enumerate(entries):
+        lacks = [key for key in ("image_id", "category_id", "bbox") if key not in entry]
+        if lacks or len(entry["bbox"]) != 4:
+            wrong = f"bbox is {entry.get('bbox')}, expected 4 numbers"
+            wrong = f"no {', '.join(lacks)}" if lacks else wrong
+            raise ReobjError(f"{path}, entry {at}: {wrong}")
+    count = len(entries)
+    xywh = np.array([entry["bbox"] for entry in entries], np.float64).reshape(count, 4)
+    score = np.array([entry.get("score", 1.0) for entry in entries], np.float64)
+    none = np.zeros(count, np.int64)
+    rows = _Rows(none, np.hstack([xywh[:, :2], xywh[:, :2] + xywh[:, 2:]]), score, none, names,
+                 np.arange(count), "entry")  # fmt: skip
+    _coco_ids(rows, entries, dataset, video, path)
+    runs = [_coco_mask(entry.get("segmentation"), video.size, f"{path}, entry {at}")
+            for at, entry in enumerate(entries)]  # fmt: skip
+    if any(map(len, runs)):
+        rows.counts, rows.offsets = np.concatenate(runs), np.cumsum([0, *map(len, runs)])
+    return rows
+
+
+def _coco_ids(
+    rows: _Rows, entries: list[Any], dataset: dict[str, Any] | None, video: Video, path: Path
+) -> None:
+    """Fill in frames and classes of COCO entries."""
+    keys, images = ([entry[key] for entry in entries] for key in ("category_id", "image_id"))
+    if dataset is not None:
+        frames = _coco_frames(dataset, video)
+        rows.frame = np.array([frames.get(key, -1) for key in images], np.int64)
+        rows.class_names = [str(category["name"]) for category in dataset["categories"]]
+        known = {category["id"]: i for i, category in enumerate(dataset["categories"])}
+        rows.class_id = np.array([known.setdefault(key, len(known)) for key in keys], np.int64)
+        _add_classes(rows, [f"category {key}" for key in list(known)[len(rows.class_names) :]])
+        return
+    rows.messages.append("no COCO dataset JSON beside the results: image_id is taken as the "
+                         "0-based frame number")  # fmt: skip
+    rows.frame = np.array(images, np.int64)
+    rows.class_id = np.array(keys, np.int64) - (0 if rows.class_names else 1)
+    rows.class_names = rows.class_names or _coco_91_names()
+    bad = np.flatnonzero((rows.class_id < 0) | (rows.class_id >= len(rows.class_names)))
+    if len(bad):
+        raise ReobjError(f"{path}, entry {bad[0]}: category_id {keys[bad[0]]} is none of COCO: put "
+                         "the dataset JSON with `categories` beside the results")  # fmt: skip
+
+
+def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
+    """Return the run lengths of a COCO segmentation: RLE (compressed or not), polygons or none."""
+    if not mask:
+        return np.empty(0, np.uint32)
+    if isinstance(mask, dict):
+        counts = mask["counts"]
+        runs = coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
+        if tuple(mask["size"]) != size[::-1] or runs.sum() != size[0] * size[1]:
+            found = f"mask of height, width {mask['size']}"
+            raise ReobjError(f"{where}: {found} in a video of {size[::-1]}")
+        return runs if len(runs) > 1 else np.empty(0, np.uint32)
+    canvas = np.zeros(size[::-1], np.uint8)
+    for ring in mask:  # corner convention -> OpenCV's, where the first pixel's centre is (0, 0)
+        corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)
+        cv2.fillPoly(canvas, [corners], 1, shift=POLYGON_BITS)
+    return rle_encode(canvas[None] > 0)[0]
+
+
+def _read_npz(path: Path, names: list[str], video: Video) -> _Rows:
+    """Read our own format, as `write_detections_npz` makes it."""
+    data = _load_npz(path)
+    missing = [key for key in NPZ_KEYS if key not in data]
+    if missing:
+        raise ReobjError(f"{path}: no array {', '.join(missing)} among {', '.join(data) or 'none'}")
+    count = len(data["frame"])
+    for key, shape in {"xyxy": (count, 4), "score": (count,), "class_id": (count,)}.items():
+        if data[key].shape != shape:
+            raise ReobjError(f"{path}: {key} is {data[key].shape}, expected {shape}")
+    size = tuple(data["image_size"].tolist())
+    if size != video.size:
+        raise ReobjError(f"{path}: made for images of {size} px, but the video is {video.size} px")
+    rows = _Rows(
+        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
+        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
+        data["class_names"].tolist(), np.arange(count), "row",
+        data.get("mask_counts"), data.get("mask_offsets"),
+    )  # fmt: skip
+    if count and not 0 <= rows.class_id.min() <= rows.class_id.max() < len(rows.class_names):
+        raise ReobjError(f"{path}: class_id beyond the {len(rows.class_names)} class_names")
+    if rows.offsets is not None:
+        ends = (len(rows.offsets), rows.offsets[-1], rows.counts is not None)
+        if rows.counts is None or ends != (count + 1, len(rows.counts), True):
+            raise ReobjError(f"{path}: mask_offsets do not fit mask_counts")
+    return rows
+
+
+def _load_npz(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except Exception as error:  # zip, zlib and numpy each have their own for damaged files
+        raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
+
+
+def _checked(rows: _Rows, path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
+    """Check what was read: errors for what cannot be meant, counted messages for single rows."""
+    _refuse_nan(np.column_stack([rows.xyxy, rows.score]), path, rows.line, rows.unit)
+    keep = _real_boxes(rows, path, video.size) & _real_frames(rows, path, video)
+    rows.score = _unit_scores(rows)
+    keep &= rows.score >= config.min_score
+    if config.classes:
+        keep &= np.isin(rows.class_id, _class_filter(config.classes, rows.class_names))
+    if not len(rows.frame):
+        rows.messages.append("no detections in this file")
+    index = np.flatnonzero(keep)
+    index = index[np.lexsort((index, -rows.score[index], rows.frame[index]))]  # best first
+    frame = rows.frame[index]
+    rank = np.arange(len(index)) - np.searchsorted(frame, frame)  # within its frame
+    index = index[rank < config.max_detections]
+    messages = tuple(f"{path.name}: {text}" for text in rows.messages)
+    return RecordedDetections(
+        rows.frame[index], rows.xyxy[index], rows.score[index], rows.class_id[index], index,
+        tuple(rows.class_names), video.size, video.working_size, rows.counts, rows.offsets,
+        messages,
+    )  # fmt: skip
+
+
+def _real_boxes(rows: _Rows, path: Path, size: tuple[int, int]) -> BoolArray:
+    """Return which boxes have an area and touch the image; refuse a file where most have not."""
+    limit, image = np.array(size, np.float64), f"{size[0]} x {size[1]} image"
+    count = len(rows.frame)
+    low, high = rows.xyxy[:, :2], rows.xyxy[:, 2:]
+    empty = (high <= low).any(1)  # (N,)
+    outside = ~empty & ((high <= 0) | (low >= limit)).any(1)
+    beyond = ((low < -BEYOND * limit) | (high > (1 + BEYOND) * limit)).any(1)
+    if count and rows.xyxy.max() <= NORMALISED_MAX:
+        raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
+                         "Multiply them by the image size")  # fmt: skip
+    if (empty | outside).sum() > MOSTLY * count:
+        raise ReobjError(
+            f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
+            f"the {image}: x, y, w, h where x1, y1, x2, y2 is expected, or another video?"
+        )
+    if beyond.sum() > MOSTLY * count:
+        rows.messages.append(f"{beyond.sum()} of {count} boxes reach far beyond the {image}: made "
+                             "at another size, or x, y, w, h read as x1, y1, x2, y2?")  # fmt: skip
+    for bad, what in ((empty, "without area"), (outside, "wholly outside the image")):
+        if bad.any():
+            first = f"{rows.unit} {rows.line[bad][0]}"
+            rows.messages.append(f"{bad.sum()} boxes {what} dropped, the first at {first}")
+    return np.logical_not(empty | outside)
+
+
+def _real_frames(rows: _Rows, path: Path, video: Video) -> BoolArray:
+    """Return which detections belong to a frame of the video; refuse a file where none does."""
+    count = video.frame_count or sys.maxsize  # unknown: all may exist
+    real = np.logical_and(rows.frame >= 0, rows.frame < count)
+    if real.all():
+        return real
+    numbers = np.unique(rows.frame[~real])
+    text = (f"{(~real).sum()} detections of {len(numbers)} frames that the video has not (0-based: "
+            f"{_shortened(numbers.tolist())}; it has {video.frame_count or 'some'})")  # fmt: skip
+    if not real.any():
+        raise ReobjError(f"{path}: {text}: detections of another video?")
+    rows.messages.append(text + " ignored")
+    return real
+
+
+def _unit_scores(rows: _Rows) -> Array:
+    """Return scores in [0, 1]: all -1: none given; percentages are divided; the rest is clipped."""
+    score = rows.score
+    bad = (score < 0) | (score > 1)
+    if not bad.any():
+        return score
+    if (score == -1).all():
+        rows.messages.append("scores are all -1: taken as 1")
+        return np.ones_like(score)
+    if score.min() >= 0 and np.median(score) > NORMALISED_MAX and score.max() <= 100:
+        rows.messages.append(f"scores up to {score.max():g}: taken as percentages")
+        return score / 100
+    rows.messages.append(f"{bad.sum()} scores outside [0, 1] clipped, such as {score[bad][0]:g}")
+    return np.clip(score, 0, 1)
+
+
+def _class_filter(wanted: str, names: Sequence[str]) -> IntArray:
+    """Return the ids of comma-separated class names."""
+    known = {name.lower(): i for i, name in enumerate(names)}
+    chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
+    unknown = [name for name in chosen if name not in known]
+    if unknown:
+        raise ReobjError(f"--classes: no class {', '.join(unknown)} among {', '.join(names)}")
+    return np.array([known[name] for name in chosen], np.int64)
+
+
+def _pack(
+    frames: Sequence[tuple[int, Detections]], names: Sequence[str], size: tuple[int, int]
+) -> dict[str, Any]:
+    """Return the arrays of our npz format."""
+    runs, lengths = [np.empty(0, np.uint32)], [np.zeros(1, np.int64)]
+    for _, found in frames:
+        counts, offsets = np.empty(0, np.uint32), np.zeros(len(found) + 1, np.int64)
+        if found.masks is not None:
+            expected = (len(found), size[1], size[0])
+            if found.masks.shape != expected:
+                raise ReobjError(f"masks are {found.masks.shape}, expected (D, H, W) = {expected}")
+            counts, offsets = rle_encode(found.masks)
+        runs.append(counts)
+        lengths.append(np.diff(offsets))
+    parts = [Detections.empty(), *(found for _, found in frames)]
+    return {
+        "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
+        "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
+        "score": np.concatenate([d.score for d in parts]).astype(np.float64),
+        "class_id": np.concatenate([d.class_id for d in parts]).astype(np.int64),
+        "class_names": np.array(list(names), np.str_),
+        "image_size": np.array(size, np.int64),
+        "mask_counts": np.concatenate(runs),
+        "mask_offsets": np.cumsum(np.concatenate(lengths)),
+    }
+
+
+def _save_npz(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an npz file so that it is there whole or not at all."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise ReobjError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def write_detections_npz(
+    path: str | Path,
+    frames: Iterable[tuple[int, Detections]],
+    class_names: Sequence[str],
+    image_size: tuple[int, int],
+) -> None:
+    """Write (frame number, Detections) pairs, masks as run lengths, for `read_detections`."""
+    _save_npz(Path(path), _pack(list(frames), class_names, image_size))
+
+
+class DetectionCache:
+    """Detections of a detector on disk, so that a killed run goes on where it stopped.
+
+    A folder of npz files with `CACHE_FRAMES` frames each, written whole or not at all: a kill loses
+    the frames since the last `flush`, never half of one. Masks have the `image_size` of the frames.
+    """
+
+    def __init__(self, folder: str | Path, image_size: tuple[int, int]) -> None:
+        self.folder, self.image_size = Path(folder), image_size
+        self._stored: dict[int, tuple[dict[str, Any], slice]] = {}
+        self._fresh: dict[int, Detections] = {}
+        chunks = sorted(self.folder.glob("chunk_*.npz"))
+        self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
+        for path in chunks:
+            self._load(path)
+
+    def __len__(self) -> int:
+        return len(self._stored.keys() | self._fresh.keys())
+
+    def _load(self, path: Path) -> None:
+        try:
+            chunk = _load_npz(path)
+            if tuple(chunk["image_size"]) != self.image_size:
+                raise ReobjError(f"{path}: made for frames of another size")
+            ends = np.cumsum([0, *chunk["done_count"]])
+        except (ReobjError, KeyError) as error:
+            log.warning("%s; its frames are detected again", error)
+            return
+        for index, low, high in zip(chunk["done"].tolist(), ends[:-1], ends[1:], strict=True):
+            self._stored[index] = (chunk, slice(low, high))
+
+    def get(self, index: int) -> Detections | None:
+        """Return the stored detections of a frame, None if it was not detected yet."""
+        if index in self._fresh or index not in self._stored:
+            return self._fresh.get(index)
+        chunk, of = self._stored[index]
+        rows = np.arange(of.start, of.stop)
+        counts, offsets = _pick_runs(chunk["mask_counts"], chunk["mask_offsets"], rows)
+        masks = rle_decode(counts, offsets, self.image_size) if len(counts) else None
+        return Detections(chunk["xyxy"][of], chunk["score"][of], chunk["class_id"][of], masks)
+
+    def put(self, index: int, detections: Detections) -> None:
+        """Store the detections of a frame, also when there are none."""
+        self._fresh[index] = detections
+        if len(self._fresh) >= CACHE_FRAMES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is not on disk yet."""
+        if not self._fresh:
+            return
+        frames = sorted(self._fresh.items())
+        done = {"done": np.array([i for i, _ in frames]),
+                "done_count": np.array([len(found) for _, found in frames])}  # fmt: skip
+        path = self.folder / f"chunk_{self._next:06d}.npz"
+        _save_npz(path, _pack(frames, [], self.image_size) | done)
+        self._next += 1
+        self._fresh.clear()
+        self._load(path)
+
+
+# ---- Detections: ONNX --------------------------------------------------------------------------
+
+PAD_VALUE = 114  # grey of letterbox borders (YOLOX, Ultralytics)
+DYNAMIC_SIDE = 640  # longer side for models that take any size (YOLO11 was trained so)
+SIZE_MULTIPLE = 32  # such models want multiples of their largest stride
+PRE_NMS = 1000  # best candidates that enter NMS
+GFL_BINS = 8  # distance bins of NanoDet-Plus and PicoDet (reg_max 7)
+YOLO_STRIDES, GFL_STRIDES = (8, 16, 32), (8, 16, 32, 64)
+RAW_YOLOX_MAX = 8.0  # median |x, y| of raw YOLOX is below 2, of decoded boxes half the image
+ZOO_MASK = (28, 28)  # masks of Mask R-CNN that cover their box
+IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # RGB
+NANODET_STD = (57.375, 57.12, 58.395)  # BGR
+CAFFE_MEAN = (102.9801, 115.9465, 122.7717)  # BGR
+
+
+@dataclass(frozen=True, slots=True)
+class _Geometry:
+    """Where the image lies in the network's input: input = image * scale + pad, all (x, y)."""
+
+    image_size: tuple[int, int]
+    input_size: tuple[int, int]
+    scale: tuple[float, float]
+    pad: tuple[int, int]
+
+    def to_image(self, xyxy: Array) -> Array:
+        """Map (N, 4) boxes from the input to the image."""
+        return np.asarray((xyxy - np.tile(self.pad, 2)) / np.tile(self.scale, 2), np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidates:
+    """What a decoder finds: boxes in the image, and what makes the masks of chosen rows."""
+
+    xyxy: Array
+    score: Array
+    class_id: IntArray
+    masks: Callable[[IntArray], BoolArray] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Signature:
+    """Inputs (name, shape, type) and outputs (name, shape, kind) of a model, from a trial run."""
+
+    inputs: list[tuple[str, list[Any], str]]
+    outputs: list[tuple[str, tuple[int, ...], str]]
+    input_size: tuple[int, int]
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        return [shape for _, shape, _ in self.outputs]
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """(rows, columns) of the only output (1, rows, columns), else (0, 0)."""
+        shape = [shape for shape in self.shapes if len(shape) == 3]
+        others = any(len(shape) != 4 for shape in self.shapes if len(shape) != 3)
+        return (shape[0][1], shape[0][2]) if len(shape) == 1 and not others else (0, 0)
+
+    def anchors(self, strides: Sequence[int]) -> int:
+        width, height = self.input_size
+        return sum(math.ceil(width / s) * math.ceil(height / s) for s in strides)
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """One family of detectors: how to know it, what it is fed, how its outputs are read.
+
+    Attributes:
+        fit: "stretch" to the input, or keep the aspect with the image in the "corner" or "centre".
+        mean, std: of 0..255 values, in the order that the network wants. nms: its boxes need NMS.
+        first: label of the first class. coco91: labels are COCO's category ids.
+        classes: number of classes (0: the model does not tell).
+    """
+
+    name: str
+    accepts: Callable[[_Signature], bool]
+    decode: Callable[[list[Any], _Geometry], _Candidates]
+    fit: str = "stretch"
+    rgb: bool = True
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    std: tuple[float, ...] = (255.0, 255.0, 255.0)
+    nms: bool = False
+    first: int = 0
+    coco91: bool = False
+    classes: Callable[[_Signature], int] = lambda signature: 0
+
+
+def _fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, _Geometry]:
+    """Resize an image into a network's input of (w, h)."""
+    height, width = image.shape[:2]
+    w, h = size
+    if fit != "stretch":
+        ratio = min(size[0] / width, size[1] / height)
+        w, h = max(round(width * ratio), 1), max(round(height * ratio), 1)
+    left, top = ((size[0] - w) // 2, (size[1] - h) // 2) if fit == "centre" else (0, 0)
+    canvas = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
+    canvas[top : top + h, left : left + w] = cv2.resize(image, (w, h))
+    return canvas, _Geometry((width, height), size, (w / width, h / height), (left, top))
+
+
+def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[Array, Array]:
+    """Return (A, 2) cells x, y and their (A, 1) strides, row by row, level by level."""
+    cells, stride = [], []
+    for s in strides:
+        y, x = np.mgrid[: math.ceil(size[1] / s), : math.ceil(size[0] / s)]
+        cells.append(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
+        stride.append(np.full((x.size, 1), float(s)))
+    return np.concatenate(cells), np.concatenate(stride)
+
+
+def _corners(centers: Array) -> Array:
+    """Convert (N, 4+) centre x, y, width, height to (N, 4) corners."""
+    half = centers[:, 2:4] / 2
+    return np.hstack([centers[:, :2] - half, centers[:, :2] + half])
+
+
+def _best_class(scores: Array) -> tuple[Array, IntArray]:
+    """Return the best score of each row of (N, C), and its class."""
+    best = scores.argmax(1).astype(np.int64)
+    return scores[np.arange(len(scores)), best].astype(np.float64), best
+
+
+def _decode_detr(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Labels, boxes, scores; boxes in pixels of the image, whose size was an input."""
+    boxes = next(o for o in outs if o.ndim == 3)[0]
+    labels = next(o for o in outs if o.ndim == 2 and o.dtype.kind == "i")[0]
+    scores = next(o for o in outs if o.ndim == 2 and o.dtype.kind == "f")[0]
+    return _Candidates(boxes.astype(np.float64), scores.astype(np.float64), labels.astype(np.int64))
+
+
+def _decode_yolox(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Centre, log size, objectness and classes of each cell, or the same already decoded."""
+    rows = outs[0][0].astype(np.float64)  # (A, 5 + C)
+    if np.median(np.abs(rows[:, :2])) < RAW_YOLOX_MAX:
+        cells, stride = _grid(geometry.input_size, YOLO_STRIDES)
+        rows[:, :2] = (rows[:, :2] + cells) * stride
+        rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
+    score, label = _best_class(rows[:, 5:])
+    return _Candidates(geometry.to_image(_corners(rows)), score * rows[:, 4], label)
+
+
+def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Columns of centre, size, class scores[, mask coefficients]; mask prototypes (YOLOv8, 11)."""
+    rows = next(o for o in outs if o.ndim == 3)[0].T  # (A, 4 + C [+ 32])
+    proto = next((o[0] for o in outs if o.ndim == 4), None)  # (32, h, w)
+    end = rows.shape[1] - (0 if proto is None else len(proto))
+    score, label = _best_class(rows[:, 4:end])
+    boxes = geometry.to_image(_corners(rows))
+    if proto is None:
+        return _Candidates(boxes, score, label)
+    ratio = np.divide(proto.shape[:0:-1], geometry.input_size)  # (2,) map / input
+
+    def masks(chosen: IntArray) -> BoolArray:
+        maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
+        scale, pad = ratio * geometry.scale, ratio * geometry.pad
+        return _paste(maps, boxes[chosen], geometry.image_size, scale, pad, 0.0)
+
+    return _Candidates(boxes, score, label, masks)
+
+
+def _decode_end_to_end(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Rows of corners in the input, score, class (YOLOv10, and YOLO exported with NMS)."""
+    rows = outs[0][0].astype(np.float64)  # (N, 6)
+    return _Candidates(geometry.to_image(rows[:, :4]), rows[:, 4], rows[:, 5].astype(np.int64))
+
+
+def _decode_gfl(scores: Array, bins: Array, geometry: _Geometry, strides: Sequence[int],
+                center: float) -> _Candidates:  # fmt: skip
+    """Class scores and distance bins of each cell (Generalized Focal Loss, Li et al. 2020)."""
+    score, label = _best_class(scores)
+    keep = np.argsort(-score, kind="stable")[:PRE_NMS]  # bins of the rest are not worth it
+    cells, stride = (values[keep] for values in _grid(geometry.input_size, strides))
+    logits = bins[keep].reshape(-1, 4, GFL_BINS).astype(np.float64)
+    weight = np.exp(logits - logits.max(2, keepdims=True))
+    distance = weight @ np.arange(GFL_BINS) / weight.sum(2) * stride  # (K, 4) to the sides
+    xy = (cells + center) * stride
+    boxes = np.hstack([xy - distance[:, :2], xy + distance[:, 2:]])
+    return _Candidates(geometry.to_image(boxes), score[keep], label[keep])
+
+
+def _decode_nanodet(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Rows of class scores and bins; distances start at the cell's corner (NanoDet-Plus)."""
+    scores, bins = np.split(outs[0][0], [-4 * GFL_BINS], 1)
+    return _decode_gfl(scores, bins, geometry, GFL_STRIDES, 0.0)
+
+
+def _decode_picodet(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Class scores by level, then bins by level; distances start at the cell's centre (PicoDet)."""
+    half = len(outs) // 2
+    scores, bins = (np.concatenate([o[0] for o in part]) for part in (outs[:half], outs[half:]))
+    return _decode_gfl(scores, bins, geometry, GFL_STRIDES[:half], 0.5)
+
+
+def _decode_with_nms(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Boxes, labels, scores[, masks] after the model's own NMS (Mask R-CNN, SSD, torchvision)."""
+    boxes = next(o for o in outs if o.shape[-1] == 4 and o.ndim in (2, 3)).reshape(-1, 4)
+    labels = next(o for o in outs if o.dtype.kind == "i").reshape(-1).astype(np.int64)
+    floats = (o for o in outs if o.dtype.kind == "f" and o.ndim < 3 and o.shape[-1] != 4)
+    scores = next(o for o in floats if o.size == len(labels)).reshape(-1).astype(np.float64)
+    if len(boxes) and boxes.max() <= NORMALISED_MAX:
+        boxes = boxes * np.tile(geometry.input_size, 2)
+    in_image = geometry.to_image(boxes)
+    maps = next((o[:, 0] for o in outs if o.ndim == 4), None)  # (N, h, w) probabilities
+    if maps is None:
+        return _Candidates(in_image, scores, labels)
+
+    def masks(chosen: IntArray) -> BoolArray:
+        return _rcnn_masks(maps[chosen], in_image[chosen], geometry)
+
+    return _Candidates(in_image, scores, labels, masks)
+
+
+def _rcnn_masks(maps: Any, boxes: Array, geometry: _Geometry) -> BoolArray:
+    """Paste masks that cover their box, or the whole input."""
+    if maps.shape[1:] != ZOO_MASK:
+        scale, pad = np.array(geometry.scale), np.array(geometry.pad)
+        return _paste(maps, boxes, geometry.image_size, scale, pad, 0.5)
+    ratio = np.array(ZOO_MASK) / np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6)  # (K, 2)
+    return _paste(maps, boxes, geometry.image_size, ratio, -boxes[:, :2] * ratio, 0.5)
+
+
+def _decode_tensorflow(outs: list[Any], geometry: _Geometry) -> _Candidates:
+    """Boxes y1, x1, y2, x2 normalised, classes, scores, in this order (TensorFlow)."""
+    boxes, classes, scores = (o[0].astype(np.float64) for o in outs[:3])
+    pixels = boxes[:, [1, 0, 3, 2]] * np.tile(geometry.input_size, 2)
+    return _Candidates(geometry.to_image(pixels), scores, classes.astype(np.int64))
+
+
+def _paste(maps: Any, boxes: Array, size: tuple[int, int], ratio: Array, offset: Array,
+           threshold: float) -> BoolArray:  # fmt: skip
+    """Sample (K, h, w) maps inside their boxes: map = image * ratio + offset, (2,) or (K, 2)."""
+    masks = np.zeros((len(maps), size[1], size[0]), bool)  # (K, H, W)
+    ratio, offset = (np.broadcast_to(v, (len(maps), 2)) for v in (ratio, offset))
+    low = np.clip(np.floor(boxes[:, :2]), 0, size).astype(int)
+    high = np.clip(np.ceil(boxes[:, 2:]), 0, size).astype(int)
+    for k in np.flatnonzero((high > low).all(1)):
+        (x1, y1), (x2, y2) = low[k].tolist(), high[k].tolist()
+        shift = ratio[k] * (low[k] + 0.5) + offset[k] - 0.5  # pixel centres on pixel centres
+        affine = np.column_stack([np.diag(ratio[k]), shift])  # (2, 3)
+        values = cv2.warpAffine(
+            np.ascontiguousarray(maps[k], np.float32), affine, (x2 - x1, y2 - y1),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        masks[k, y1:y2, x1:x2] = values > threshold
+    return masks
+
+
+def _is_detr(s: _Signature) -> bool:
+    kinds = sorted((len(shape), kind) for _, shape, kind in s.outputs)
+    return len(s.inputs) == 2 and kinds == [(2, "f"), (2, "i"), (3, "f")]
+
+
+def _is_picodet(s: _Signature) -> bool:
+    half = len(s.shapes) // 2
+    if half not in (3, 4) or len(s.shapes) != 2 * half or any(len(x) != 3 for x in s.shapes):
+        return False
+    anchors = sum(shape[1] for shape in s.shapes[:half])
+    bins = {shape[2] for shape in s.shapes[half:]}
+    return bins == {4 * GFL_BINS} and anchors == s.anchors(GFL_STRIDES[:half])
+
+
+def _has_nms(s: _Signature) -> bool:
+    """Say whether there are boxes (.., N, 4), integer labels and float scores of the same N."""
+    flat = [(shape, kind) for _, shape, kind in s.outputs if len(shape) in (1, 2)]
+    boxes = [shape for shape in s.shapes if len(shape) in (2, 3) and shape[-1] == 4]
+    labels = [shape for shape, kind in flat if kind == "i"]
+    scores = [shape for shape, kind in flat if kind == "f" and shape in labels]
+    return len(s.inputs) == 1 and bool(boxes and scores) and boxes[0][-2] == labels[0][-1]
+
+
+def _is_zoo_rcnn(s: _Signature) -> bool:
+    masks = [shape[2:] for shape in s.shapes if len(shape) == 4]
+    return _has_nms(s) and len(s.inputs[0][1]) == 3 and masks == [ZOO_MASK]
+
+
+def _is_gfl(s: _Signature) -> bool:
+    return s.rows[0] == s.anchors(GFL_STRIDES) and s.rows[1] > 4 * GFL_BINS
+
+
+def _yolo_classes(s: _Signature) -> int:
+    """Return the columns of YOLOv8 rows that are neither box nor mask coefficients."""
+    return s.rows[0] - 4 - sum(shape[1] for shape in s.shapes if len(shape) == 4)
+
+
+LAYOUTS: tuple[_Layout, ...] = (  # the first that accepts a model reads it
+    _Layout("DEIM, D-FINE, RT-DETR (labels, boxes, scores)", _is_detr, _decode_detr),
+    _Layout("PicoDet", _is_picodet, _decode_picodet, mean=IMAGENET_MEAN, std=IMAGENET_STD, nms=True,
+            classes=lambda s: s.shapes[0][2]),
+    _Layout("NanoDet-Plus", _is_gfl, _decode_nanodet, rgb=False, mean=IMAGENET_MEAN[::-1],
+            std=NANODET_STD, nms=True, classes=lambda s: s.rows[1] - 4 * GFL_BINS),
+    _Layout("YOLOX", lambda s: s.rows[0] == s.anchors(YOLO_STRIDES) and s.rows[1] > 5,
+            _decode_yolox, "corner", rgb=False, std=(1.0, 1.0, 1.0), nms=True,
+            classes=lambda s: s.rows[1] - 5),
+    _Layout("YOLOv8, YOLO11 (and -seg)",
+            lambda s: s.rows[1] == s.anchors(YOLO_STRIDES) and s.rows[0] > 4,
+            _decode_yolo, "centre", nms=True, classes=_yolo_classes),
+    _Layout("YOLOv10, YOLO with NMS", lambda s: s.rows[1] == 6 and len(s.shapes) == 1,
+            _decode_end_to_end, "centre"),
+    _Layout("Mask R-CNN of the ONNX zoo", _is_zoo_rcnn, _decode_with_nms, "corner", rgb=False,
+            mean=CAFFE_MEAN, std=(1.0, 1.0, 1.0), first=1),
+    _Layout("torchvision detection", lambda s: _has_nms(s) and len(s.inputs[0][1]) == 3,
+            _decode_with_nms, "corner", first=1, coco91=True),
+    _Layout("SSD with built-in NMS", _has_nms, _decode_with_nms, mean=IMAGENET_MEAN,
+            std=IMAGENET_STD, first=1),
+    _Layout("TensorFlow detection API", lambda s: "detection_boxes" in s.outputs[0][0],
+            _decode_tensorflow, first=1, coco91=True),
+)  # fmt: skip
+
+
+def onnx_session(path: Path, threads: int = 0) -> Any:
+    """Make an onnxruntime session on the CPU; `threads` 0 means all cores."""
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ReobjError("ONNX models need onnxruntime: pip install onnxruntime") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3  # errors only: its warnings are about how the model was exported
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # spare the cores
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        reason = str(error).splitlines()[0]
+        raise ReobjError(f"{path}: onnxruntime cannot load it: {reason}") from error
+
+
+class OnnxDetector:
+    """A detector from an ONNX file; its layout is read from its inputs and outputs.
+
+        detector = OnnxDetector("deimv2-femto")
+        detections = detector(image)  # BGR; boxes in its pixels
+
+    Attributes:
+        class_names: names by class id. layout: name of the layout found. path: the file.
+    """
+
+    def __init__(
+        self,
+        path_or_name: str | Path = "",
+        config: DetectConfig | None = None,
+        threads: int = 0,
+        offline: bool = False,
+    ) -> None:
+        self.config = config or DetectConfig()
+        self.path = model_path(path_or_name or self.config.model, offline)
+        self._session = onnx_session(self.path, threads)
+        self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
+        self._planar = self._check_input()
+        signature = self._try_out()
+        self._layout = self._find_layout(signature)
+        self.layout = self._layout.name
+        self.class_names = self._names(self._layout.classes(signature))
+        wanted = self.config.classes
+        self._allowed = _class_filter(wanted, self.class_names) if wanted else None
+
+    def __call__(self, image: Image) -> Detections:
+        """Detect the objects in one BGR image (H, W, 3), best first."""
+        size = self._input_size(image.shape[1], image.shape[0])
+        canvas, geometry = _fit_image(image, size, self._layout.fit)
+        outputs = self._session.run(None, self._feeds(canvas, geometry.image_size, self._layout))
+        found = self._layout.decode(outputs, geometry)
+        boxes = np.clip(found.xyxy, 0, np.tile(geometry.image_size, 2))
+        label = found.class_id - self._layout.first
+        keep = self._select(boxes, found.score, label)
+        if len(keep) and label[keep].max() >= len(self.class_names):
+            text = _unnamed_class(label[keep].max(), len(self.class_names))
+            raise ReobjError(f"{self.path}: {text}")
+        masks = found.masks(keep) if found.masks is not None else None
+        return Detections(boxes[keep], found.score[keep], label[keep], masks)
+
+    def _select(self, boxes: Array, score: Array, label: IntArray) -> IntArray:
+        """Return the rows to keep, best first: by score, class, area and NMS."""
+        has_area = (boxes[:, 2:] > boxes[:, :2]).all(1)
+        good = (score >= self.config.min_score) & has_area & (label >= 0)
+        if self._allowed is not None:
+            good &= np.isin(label, self._allowed)
+        rows = np.flatnonzero(good)
+        rows = rows[np.argsort(-score[rows], kind="stable")][:PRE_NMS]
+        if self._layout.nms:
+            limit = self.config.max_detections
+            rows = rows[nms(boxes[rows], label[rows], self.config.nms_iou, limit)]
+        return rows[: self.config.max_detections]
+
+    def _check_input(self) -> bool:
+        """Return True for a (.., 3, H, W) input, False for (1, H, W, 3); refuse anything else."""
+        name, shape, kind = self._inputs[0]
+        planar = len(shape) in (3, 4) and shape[-3] == 3
+        known = kind in ("tensor(float)", "tensor(float16)", "tensor(uint8)")
+        if not known or not (planar or (len(shape) == 4 and shape[3] == 3)):
+            found = f"input {name} is {kind} {shape}, expected an image (1, 3, H, W)"
+            raise ReobjError(f"{self.path}: no known object detector: {found}")
+        return planar
+
+    def _input_size(self, width: int, height: int) -> tuple[int, int]:
+        """Return the (w, h) that the model is fed: its own, or the image's at DYNAMIC_SIDE."""
+        dims = self._inputs[0][1][-3:]
+        own = (dims[2], dims[1]) if self._planar else (dims[1], dims[0])
+        ratio = DYNAMIC_SIDE / max(width, height) / SIZE_MULTIPLE
+        free = [max(math.ceil(round(v * ratio, 3)), 1) * SIZE_MULTIPLE for v in (width, height)]
+        w, h = (a if isinstance(a, int) else b for a, b in zip(own, free, strict=True))
+        return w, h
+
+    def _feeds(
+        self, canvas: Image, image_size: tuple[int, int], layout: _Layout
+    ) -> dict[str, Any]:
+        """Return the model's inputs for a fitted BGR image."""
+        name, shape, kind = self._inputs[0]
+        blob: Any = canvas[..., ::-1] if layout.rgb else canvas
+        if kind != "tensor(uint8)":
+            mean, std = np.array([layout.mean, layout.std], np.float32)
+            blob = (blob.astype(np.float32) - mean) / std
+            blob = blob.astype(np.float16) if kind == "tensor(float16)" else blob
+        blob = blob.transpose(2, 0, 1) if self._planar else blob
+        feeds = {name: np.ascontiguousarray(blob[None] if len(shape) == 4 else blob)}
+        return feeds | {other: np.array([image_size]) for other, _, _ in self._inputs[1:]}
+
+    def _try_out(self) -> _Signature:
+        """Run the model on a grey image to learn the shapes of its outputs."""
+        size = self._input_size(DYNAMIC_SIDE, DYNAMIC_SIDE)
+        grey = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
+        try:
+            outputs = self._session.run(None, self._feeds(grey, size, LAYOUTS[0]))
+        except Exception as error:
+            reason = f"a trial run with {self._inputs} failed: {str(error).splitlines()[0]}"
+            raise ReobjError(f"{self.path}: no known object detector: {reason}") from error
+        names = [output.name for output in self._session.get_outputs()]
+        arrays = [np.asarray(output) for output in outputs]
+        found = [(n, a.shape, str(a.dtype.kind)) for n, a in zip(names, arrays, strict=True)]
+        return _Signature(self._inputs, found, size)
+
+    def _find_layout(self, signature: _Signature) -> _Layout:
+        layout = next((layout for layout in LAYOUTS if layout.accepts(signature)), None)
+        if layout is None:
+            outputs = ", ".join(f"{name} {shape}" for name, shape, _ in signature.outputs)
+            known = "; ".join(layout.name for layout in LAYOUTS)
+            text = f"outputs {outputs}; known layouts: {known}"
+            raise ReobjError(f"{self.path}: no known object detector: {text}")
+        return layout
+
+    def _names(self, count: int) -> tuple[str, ...]:
+        """Return the class names: the user's, the model's own, COCO's, or numbers."""
+        if self.config.class_names:
+            return load_class_names(self.config.class_names)
+        own = self._session.get_modelmeta().custom_metadata_map.get("names", "")
+        if own.startswith("{"):
+            return tuple(str(name) for _, name in sorted(ast.literal_eval(own).items()))
+        if self._layout.coco91:
+            return tuple(_coco_91_names())
+        if count in (0, len(COCO_NAMES)):
+            return COCO_NAMES
+        log.warning("%s: %d classes without names: give a file of names with --set "
+                    "detect.class_names=FILE", self.path, count)  # fmt: skip
+        return tuple(f"class {i}" for i in range(count))
+
+
+def nms(xyxy: Array, class_id: IntArray, max_iou: float, limit: int = sys.maxsize) -> IntArray:
+    """Return the first `limit` rows that survive greedy NMS by class; rows come best first."""
+    area = (xyxy[:, 2:] - xyxy[:, :2]).prod(1)
+    kept: list[int] = []
+    rest = np.arange(len(xyxy))
+    while len(rest) and len(kept) < limit:
+        best, rest = int(rest[0]), rest[1:]
+        kept.append(best)
+        low = np.maximum(xyxy[best, :2], xyxy[rest, :2])
+        high = np.minimum(xyxy[best, 2:], xyxy[rest, 2:])
+        inter = np.clip(high - low, 0, None).prod(1)
+        near = inter > max_iou * (area[best] + area[rest] - inter)
+        rest = rest[~(near & (class_id[rest] == class_id[best]))]
+    return np.array(kept, np.int64)
+
+
+def as_detections(found: Any) -> Detections:
+    """Take detections as they come: ours, (N, 6) rows, or an object like supervision's."""
+    made: Detections = found
+    if not isinstance(found, Detections) and hasattr(found, "xyxy"):
+        xyxy = np.asarray(found.xyxy, np.float64).reshape(-1, 4)
+        values = [getattr(found, key, None) for key in ("confidence", "class_id", "mask")]
+        made = Detections(
+            xyxy,
+            np.ones(len(xyxy)) if values[0] is None else np.asarray(values[0], np.float64),
+            np.zeros(len(xyxy), np.int64) if values[1] is None else np.asarray(values[1], np.int64),
+            None if values[2] is None else np.asarray(values[2], bool),
+        )
+    elif not isinstance(found, Detections):
+        made = Detections.from_array(found)
+    masks = made.xyxy if made.masks is None else made.masks
+    lengths = [len(values) for values in (made.xyxy, made.score, made.class_id, masks)]
+    if len(set(lengths)) > 1 or not np.isfinite(made.xyxy).all():
+        raise ReobjError(f"{lengths} boxes, scores, classes, masks do not fit, or hold NaN")
+    return made
+
+
+class CallableDetector:
+    """Any function image -> detections as a detector; `as_detections` says what it may return."""
+
+    def __init__(
+        self, function: Callable[[Image], Any], class_names: Sequence[str] = COCO_NAMES
+    ) -> None:
+        self.function, self.class_names = function, tuple(class_names)
+
+    def __call__(self, image: Image) -> Detections:
+        """Detect the objects in one BGR image (H, W, 3)."""
+        return as_detections(self.function(image))
+
+
+# ---- Boxes -------------------------------------------------------------------------------------
+
+
+def box_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
+    """Intersection over union of every box in a (A, 4) with every box in b (B, 4): (A, B)."""
+    a, b = a_xyxy[:, None], b_xyxy[None]  # (A, 1, 4), (1, B, 4)
+    overlap = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])  # (A, B, 2)
+    inter = overlap.clip(0).prod(-1)  # (A, B)
+    area_a, area_b = (a[..., 2:] - a[..., :2]).prod(-1), (b[..., 2:] - b[..., :2]).prod(-1)
+    return np.asarray(inter / np.maximum(area_a + area_b - inter, 1e-9), np.float64)
+
+
+def _cxcywh_from_xyxy(xyxy: Array) -> Array:
+    """Centre and size of boxes (N, 4)."""
+    return np.concatenate([(xyxy[:, :2] + xyxy[:, 2:]) / 2, xyxy[:, 2:] - xyxy[:, :2]], 1)
+
+
+def _xyxy_from_cxcywh(box: Array) -> Array:
+    """Corners of boxes given by centre and size (N, 4)."""
+    return np.concatenate([box[:, :2] - box[:, 2:] / 2, box[:, :2] + box[:, 2:] / 2], 1)
+
+
+# ---- Motion: Kalman filter and camera motion ---------------------------------------------------
+
+
+def kalman_predict(mean: Array, cov: Array, config: TrackerConfig) -> tuple[Array, Array]:
+    """Predict all tracks by one frame with a constant-velocity model.
+
+    The state is (cx, cy, w, h) and its velocity. F, H, Q and R do not couple the four coordinates,
+    so the 8x8 covariance falls into four symmetric 2x2 blocks: equal to filterpy's filter, at a
+    fraction of the cost.
+
+    Args:
+        mean: (T, 4, 2) position and velocity, px and px/frame.
+        cov: (T, 4, 3) variances p00 (position), p01, p11 (velocity).
+    Returns:
+        mean, cov after x = F x, P = F P F' + Q.
+    Ref: noise relative to the box size as in DeepSORT (Wojke et al., ICIP 2017).
+    """
+    scale = _noise_scale(mean)  # (T, 4)
+    p00, p01, p11 = np.moveaxis(cov, -1, 0)  # (T, 4) each
+    q0, q1 = (config.std_position * scale) ** 2, (config.std_velocity * scale) ** 2
+    new_cov = np.stack([p00 + 2 * p01 + p11 + q0, p01 + p11, p11 + q1], -1)  # (T, 4, 3)
+    new_mean = np.stack([mean[..., 0] + mean[..., 1], mean[..., 1]], -1)  # (T, 4, 2)
+    return new_mean, new_cov
+
+
+def kalman_update(mean: Array, cov: Array, box: Array, noise: Array) -> tuple[Array, Array]:
+    """Correct tracks with measured boxes.
+
+    Args:
+        mean, cov: as in `kalman_predict`.
+        box: (T, 4) measured cx, cy, w, h.
+        noise: (T, 4) standard deviation of the measurement, px.
+    Returns:
+        mean, cov after K = P H' / S, x = x + K y, P = (I - K H) P.
+    """
+    p00, p01, p11 = np.moveaxis(cov, -1, 0)
+    innovation_var = p00 + noise**2  # S (T, 4)
+    k0, k1 = p00 / innovation_var, p01 / innovation_var  # K (T, 4)
+    residual = box - mean[..., 0]  # y (T, 4)
+    new_mean = np.stack([mean[..., 0] + k0 * residual, mean[..., 1] + k1 * residual], -1)
+    new_cov = np.stack([(1 - k0) * p00, (1 - k0) * p01, p11 - k1 * p01], -1)
+    return new_mean, new_cov
+
+
+def _noise_scale(mean: Array) -> Array:
+    """Length that noise is relative to, (T, 4): the box's mean side for x, y and its own side for
+    w, h.
+    """
+    size = mean[:, 2:, 0].clip(1.0)  # (T, 2)
+    side = np.sqrt(size.prod(1, keepdims=True))  # (T, 1)
+    return np.concatenate([side, side, size], 1)
+
+
+class CameraMotion:
+    """Global image motion between consecutive frames from sparse optical flow, as a 3x3 matrix.
+
+    A similarity transform is fitted by RANSAC to corner tracks (as BoT-SORT does); with too few
+    corners the identity is returned, so a textureless frame never stops the tracker.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self.config = config
+        self._gray: Image | None = None
+        self._corners: npt.NDArray[np.float32] | None = None
+
+    def __call__(self, image: Image) -> Array:
+        """Return new_from_old (3, 3) in pixels of `image`."""
+        shrink = min(1.0, self.config.flow_size_px / max(image.shape[:2]))
+        small = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
+        new_from_old = np.eye(3)
+        if self._gray is not None and self._corners is not None and self._gray.shape == gray.shape:
+            new_from_old = self._flow(gray)
+        self._gray = gray
+        self._corners = cv2.goodFeaturesToTrack(gray, self.config.flow_corners, 0.01, 7)
+        to_small = np.diag([shrink, shrink, 1.0])
+        return np.asarray(np.linalg.inv(to_small) @ new_from_old @ to_small)
+
+    def _flow(self, gray: Image) -> Array:
+        """Fit the similarity small_new_from_small_old (3, 3)."""
+        assert self._gray is not None and self._corners is not None
+        moved, ok, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, self._corners, None)
+        good = ok.ravel() == 1
+        result = np.eye(3)
+        if good.sum() >= self.config.flow_min_corners:
+            cv2.setRNGSeed(0)
+            affine, inliers = cv2.estimateAffinePartial2D(
+                self._corners[good], moved[good], ransacReprojThreshold=2.0
+            )
+            if affine is not None and inliers.mean() > 0.3:
+                result[:2] = affine
+        return result
+
+
+def _warp_state(mean: Array, cov: Array, new_from_old: Array) -> tuple[Array, Array]:
+    """Move tracks along with the camera: positions by the homography, sizes and velocities by its
+    scale.
+    """
+    x, y = mean[:, 0, 0], mean[:, 1, 0]  # (T,)
+    points = np.stack([x, y, np.ones_like(x)], 1) @ new_from_old.T  # (T, 3)
+    depth = np.where(np.abs(points[:, 2]) < 1e-6, 1e-6, points[:, 2])  # (T,)
+    det = np.linalg.det(new_from_old)
+    scale = np.sqrt(np.abs(det / depth**3)).clip(
+        0.5, 2.0
+    )  # (T,) of the local Jacobian of the homography
+    warped = mean * scale[:, None, None]  # (T, 4, 2)
+    warped[:, :2, 0] = points[:, :2] / depth[:, None]
+    return warped, cov * scale[:, None, None] ** 2
+
+
+# ---- Appearance: foreground and background embeddings ------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Embeddings:
+    """Two-part appearance of detections: rows of unit length for the object and for what surrounds
+    it.
+
+    Attributes:
+        foreground: (D, E1); background: (D, E2), E2 may be 0.
+    """
+
+    foreground: Array
+    background: Array
+
+
+class Embedder:
+    """Foreground and background embeddings from one feature map a frame, pooled under masks.
+
+    The thesis (re-OBJ) sends two masked crops of each object through a ResNet; here one pass over
+    the frame serves all objects. The expanded box is sampled on a grid; samples under the object's
+    mask (or the ellipse inscribed in its box) make the foreground, samples under no mask at all the
+    background; both keep a coarse spatial layout (cells).
+
+    Args:
+        model: "colour" for the training-free descriptor (soft colour histogram and gradient
+            orientations), or a backbone: a name listed by `reobj_track.py models` or a path to an
+            ONNX file with an image input and a spatial output.
+    """
+
+    def __init__(
+        self,
+        model: str = "colour",
+        config: EmbedConfig | None = None,
+        threads: int = 0,
+        offline: bool = False,
+    ) -> None:
+        self.config = config or EmbedConfig()
+        self.model = model
+        self._features: Callable[[Image], npt.NDArray[np.float32]] = (
+            _colour_features
+            if model == "colour"
+            else _Backbone(model, self.config, threads, offline)
+        )
+        self._last: tuple[Image, npt.NDArray[np.float32]] | None = None
+
+    def __call__(
+        self, frame: Image, detections: Detections, rows: IntArray | None = None
+    ) -> Embeddings:
+        """Embed the detections of one frame.
+
+        Args:
+            frame: (H, W, 3) BGR.
+            detections: all detections of the frame (their masks also say what is no background).
+            rows: (N,) the detections to embed; default all.
+        """
+        rows = np.arange(len(detections)) if rows is None else rows
+        if self._last is None or self._last[0] is not frame:
+            self._last = (frame, self._features(frame))
+        return self._pool(self._last[1], frame.shape[:2], detections, rows)
+
+    def _pool(
+        self,
+        features: npt.NDArray[np.float32],
+        size_hw: tuple[int, ...],
+        detections: Detections,
+        rows: IntArray,
+    ) -> Embeddings:
+        """Pool a (h, w, C) feature map under foreground and background of the chosen rows."""
+        height, width = size_hw
+        box = _cxcywh_from_xyxy(detections.xyxy)  # (D, 4)
+        side = self.config.samples
+        unit = (np.arange(side) + 0.5) / side * 2 - 1  # (S,) in [-1, 1] over the expanded box
+        half = box[rows, 2:] / 2 * (1 + 2 * self.config.context)  # (N, 2)
+        x = (box[rows, 0, None] + half[:, :1] * unit)[:, None, :].repeat(side, 1)  # (N, S, S)
+        y = (box[rows, 1, None] + half[:, 1:] * unit)[:, :, None].repeat(side, 2)
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        rows_f = (y / height * features.shape[0]).astype(int).clip(0, features.shape[0] - 1)
+        cols_f = (x / width * features.shape[1]).astype(int).clip(0, features.shape[1] - 1)
+        sampled = features[rows_f, cols_f]  # (N, S, S, C)
+        owner = _on_object(detections, rows, x, y) & inside  # (N, S, S)
+        sure = detections[detections.score >= self.config.object_score]
+        free = ~_object_map(sure, size_hw, features.shape[:2])[rows_f, cols_f] & inside & ~owner
+        inner = np.abs(unit) <= 1 / (
+            1 + 2 * self.config.context
+        )  # (S,) samples within the box itself
+        within = sampled[:, inner][:, :, inner]  # (N, s, s, C)
+        foreground = _pool_cells(within, owner[:, inner][:, :, inner], self.config.foreground_cells)
+        background = _pool_cells(sampled, free, self.config.background_cells)
+        return Embeddings(foreground, background)
+
+
+def _on_object(detections: Detections, rows: IntArray, x: Array, y: Array) -> BoolArray:
+    """For samples (N, S, S): is it on the row's own object (its mask, else the inscribed ellipse)?
+    """
+    box = _cxcywh_from_xyxy(detections.xyxy[rows])[:, :, None, None]  # (N, 4, 1, 1)
+    half = np.maximum(box[:, 2:] / 2, 0.5)
+    on = ((x - box[:, 0]) / half[:, 0]) ** 2 + ((y - box[:, 1]) / half[:, 1]) ** 2 <= 1
+    if detections.masks is not None:
+        height, width = detections.masks.shape[1:]
+        row, column = y.astype(int).clip(0, height - 1), x.astype(int).clip(0, width - 1)
+        under = detections.masks[rows[:, None, None], row, column]  # (N, S, S)
+        on = np.where(detections.masks[rows].any((1, 2))[:, None, None], under, on)
+    return np.asarray(on, bool)
+
+
+def _object_map(detections: Detections, size_hw: tuple[int, ...], shape: tuple[int, int]) -> BoolArray:
+    """Which cells of a feature map (h, w) show any object of the frame? size_hw: of the frame."""
+    canvas = np.zeros(shape, np.uint8)
+    masked = np.zeros(len(detections), bool)
+    if detections.masks is not None and len(detections):
+        masked = detections.masks.any((1, 2))
+        union = detections.masks.any(0).astype(np.uint8)
+        canvas = np.asarray(cv2.resize(union, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+    scale = np.array([shape[1] / size_hw[1], shape[0] / size_hw[0]] * 2)
+    for x, y, w, h in (_cxcywh_from_xyxy(detections.xyxy[~masked]) * scale).round().clip(-9999, 9999):
+        axes = (max(int(w / 2), 1), max(int(h / 2), 1))
+        cv2.ellipse(canvas, (int(x), int(y)), axes, 0, 0, 360, (1,), -1)
+    return np.asarray(canvas, bool)
+
+
+def _pool_cells(sampled: npt.NDArray[np.float32], weight: BoolArray, cells: int) -> Array:
+    """Mean feature of each of cells x cells parts, concatenated to unit rows (N, cells * cells *
+    C).
+
+    The signed square root makes a cosine of histograms a Hellinger kernel and tames strong
+    channels.
+    """
+    n, side = sampled.shape[:2]
+    edges = np.linspace(0, side, cells + 1).astype(int)[:-1]
+    total = np.where(weight[..., None], sampled, 0)
+    total = np.add.reduceat(np.add.reduceat(total, edges, 1), edges, 2)  # (N, cells, cells, C)
+    count = np.add.reduceat(
+        np.add.reduceat(weight.astype(np.float32), edges, 1), edges, 2
+    )  # (N, cells, cells)
+    mean = total / np.maximum(count, 1)[..., None]
+    share = np.sqrt(
+        count / np.maximum(count.max((1, 2), keepdims=True), 1)
+    )  # part-empty cells count less
+    rows = (
+        (np.sign(mean) * np.sqrt(np.abs(mean)) * share[..., None]).reshape(n, -1).astype(np.float64)
+    )
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
+
+
+def _colour_features(frame: Image) -> npt.NDArray[np.float32]:
+    """Training-free feature map (h, w, 17): soft histograms of Lab colour and of gradient
+    orientation.
+    """
+    shrink = min(1.0, 320 / max(frame.shape[:2]))
+    small = cv2.resize(frame, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    lab = cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_BGR2Lab)
+    lightness = lab[..., :1] / 100  # (h, w, 1)
+    levels = (1 - np.abs(lightness * 4 - np.arange(5, dtype=np.float32))).clip(0) * 0.5  # (h, w, 5)
+    gray = cv2.GaussianBlur(lab[..., 0] / 100, (0, 0), 1)
+    gradient = cv2.merge(
+        [cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)]
+    )  # (h, w, 2)
+    stacked = np.concatenate(
+        [_direction_bins(lab[..., 1:] / 40), levels, _direction_bins(gradient)], -1
+    )
+    return np.asarray(cv2.blur(stacked, (5, 5)), np.float32)
+
+
+def _direction_bins(vector: npt.NDArray[np.float32], bins: int = 6) -> npt.NDArray[np.float32]:
+    """Soft histogram (h, w, bins) of the direction of vectors (h, w, 2), weighted by their length
+    up to 1.
+    """
+    length = cv2.magnitude(vector[..., 0], vector[..., 1])[..., None] + 1e-6  # (h, w, 1)
+    turn = np.arange(bins) * 2 * np.pi / bins
+    aligned = (vector / length) @ np.stack([np.cos(turn), np.sin(turn)]).astype(
+        np.float32
+    )  # cosines (h, w, bins)
+    aligned = aligned.clip(0)
+    aligned *= aligned
+    return np.asarray(aligned * aligned * np.minimum(length, 1), np.float32)
+
+
+class _Backbone:
+    """Feature map of a frame from an ONNX backbone with an image input and a spatial output."""
+
+    def __init__(self, model: str, config: EmbedConfig, threads: int, offline: bool) -> None:
+        self.config = config
+        self.session = onnx_session(model_path(model, offline=offline), threads)
+        spatial = [o.name for o in self.session.get_outputs() if len(o.shape) == 4]
+        if not spatial or len(self.session.get_inputs()[0].shape) != 4:
+            raise ReobjError(
+                f"{model}: expected a backbone with one image input and a spatial output "
+                f"(N, C, h, w), found outputs {[o.name for o in self.session.get_outputs()]}; "
+                "give another --embed model, or --embed colour"
+            )
+        self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
+
+    def __call__(self, frame: Image) -> npt.NDArray[np.float32]:
+        """Return (h, w, C) features; ImageNet mean and deviation, RGB, size a multiple of 32."""
+        shrink = min(1.0, self.config.size_px / max(frame.shape[:2]))
+        size = [max(32, round(side * shrink / 32) * 32) for side in frame.shape[1::-1]]
+        rgb = (
+            cv2.resize(frame, size, interpolation=cv2.INTER_AREA)[..., ::-1].astype(np.float32)
+            / 255
+        )
+        rgb = (rgb - np.float32([0.485, 0.456, 0.406])) / np.float32([0.229, 0.224, 0.225])
+        (maps,) = self.session.run(
+            [self.output], {self.input: rgb.transpose(2, 0, 1)[None].astype(np.float32)}
+        )
+        return np.ascontiguousarray(maps[0].transpose(1, 2, 0))
+
+
+class _LazyEmbeddings:
+    """Fused embeddings of one frame's detections, computed only for the rows that are asked for."""
+
+    def __init__(
+        self,
+        given: Embeddings | None,
+        embedder: Embedder | None,
+        frame: Image | None,
+        detections: Detections,
+        weight: float,
+    ) -> None:
+        self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
+        self.weight = weight
+        self.rows: npt.NDArray[np.float32] | None = None  # (D, E)
+        self.done = np.zeros(len(detections), bool)
+
+    @property
+    def available(self) -> bool:
+        return self.given is not None or (self.embedder is not None and self.frame is not None)
+
+    def get(self, rows: IntArray) -> npt.NDArray[np.float32]:
+        """Return unit rows (N, E): foreground and background side by side, weighted."""
+        todo = rows[~self.done[rows]]
+        if len(todo):
+            fused = self._fuse(todo)  # (n, E)
+            if self.rows is None:
+                self.rows = np.zeros((len(self.detections), fused.shape[1]), np.float32)
+            self.rows[todo], self.done[todo] = fused, True
+        return np.empty((0, 0), np.float32) if self.rows is None else self.rows[rows]
+
+    def _fuse(self, rows: IntArray) -> npt.NDArray[np.float32]:
+        """cos(fused) = w cos(foreground) + (1 - w) cos(background)."""
+        if self.given is not None:
+            parts = (self.given.foreground[rows], self.given.background[rows])
+        else:
+            assert self.embedder is not None and self.frame is not None
+            embeddings = self.embedder(self.frame, self.detections, rows)
+            parts = (embeddings.foreground, embeddings.background)
+        weight = self.weight if parts[1].shape[1] else 1.0
+        fused = np.concatenate(
+            [
+                math.sqrt(weight) * _unit_rows(parts[0]),
+                math.sqrt(1 - weight) * _unit_rows(parts[1]),
+            ],
+            1,
+        )
+        return _unit_rows(fused).astype(np.float32)
+
+
+def _unit_rows(rows: npt.NDArray[Any]) -> Array:
+    """Scale rows (N, E) to unit length; zero rows stay zero."""
+    rows = np.asarray(rows, np.float64)
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
+
+
+class Gallery:
+    """What every identity of the video looked like: a few diverse views each, never forgotten.
+
+    Arrays grow with the number of identities, not with time: `views` per identity at most.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self.config = config
+        self.rows = np.zeros((0, config.views, 0), np.float32)  # (I, K, E)
+        self.count = np.zeros(0, np.int64)  # (I,) views held
+
+    def add(self, identity: IntArray, rows: npt.NDArray[np.float32]) -> None:
+        """Store one new view (E,) for each of N different identities: a new one if it is novel,
+        else blended.
+        """
+        self._grow(int(identity.max(initial=-1)) + 1, rows.shape[1])
+        own = self.rows[identity]  # (N, K, E)
+        slot = np.arange(own.shape[1])
+        similarity = np.einsum("nke,ne->nk", own, rows)  # (N, K)
+        similarity[slot >= self.count[identity][:, None]] = -2.0
+        nearest = similarity.argmax(1)  # (N,)
+        novel = similarity.max(1) < self.config.novelty  # (N,)
+        room = self.count[identity] < self.config.views
+        crowded = self._most_redundant(own[novel & ~room])
+        target = np.where(novel & room, self.count[identity], nearest)  # (N,)
+        target[novel & ~room] = crowded
+        blend = np.where(novel, 0.0, 0.9)[:, None]
+        picked = own[np.arange(len(identity)), target]  # (N, E)
+        self.rows[identity, target] = _unit_rows(blend * picked + (1 - blend) * rows)
+        self.count[identity] += novel & room
+
+    @staticmethod
+    def _most_redundant(full: npt.NDArray[np.float32]) -> IntArray:
+        """For full sets of views (N, K, E): the view that is most like another one, (N,)."""
+        pairs = np.einsum("nke,nle->nkl", full, full)
+        pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -2.0
+        return np.asarray(pairs.max(2).argmax(1), np.int64)
+
+    def similarity(self, rows: npt.NDArray[np.float32], identity: IntArray) -> Array:
+        """Best cosine between each row (N, E) and any view of each identity (I,): (N, I)."""
+        if not len(rows) or not len(identity) or self.rows.shape[2] != rows.shape[1]:
+            return np.full((len(rows), len(identity)), -2.0)
+        views = self.rows[identity]  # (I, K, E)
+        cosine = (rows @ views.reshape(-1, views.shape[2]).T).reshape(
+            len(rows), len(identity), -1
+        )  # (N, I, K)
+        empty = np.arange(views.shape[1]) >= self.count[identity][:, None]  # (I, K)
+        return np.asarray(np.where(empty, -2.0, cosine).max(2), np.float64)
+
+    def _grow(self, identities: int, width: int) -> None:
+        if self.rows.shape[2] == 0:
+            self.rows = np.zeros((len(self.count), self.config.views, width), np.float32)
+        if identities > len(self.count):
+            extra = max(
+                identities - len(self.count), len(self.count), 16
+            )  # doubling: amortised O(1)
+            self.rows = np.concatenate(
+                [self.rows, np.zeros((extra, *self.rows.shape[1:]), np.float32)]
+            )
+            self.count = np.concatenate([self.count, np.zeros(extra, np.int64)])
+
+
+class SimilarityStats:
+    """Distribution of the cosine between different objects and between views of one object, from
+    the video itself.
+
+    Two detections in one frame are different objects; a track's new view and its last one are the
+    same. Both are seen in every frame, so the decision adapts to any embedding without training
+    labels.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self.sums = {
+            False: np.array(
+                [1.0, config.prior_different, config.prior_different**2 + config.prior_std**2]
+            ),
+            True: np.array([1.0, config.prior_same, config.prior_same**2 + config.prior_std**2]),
+        }
+        for same in self.sums:
+            self.sums[same] *= config.prior_weight
+
+    def add(self, cosine: Array, same: bool) -> None:
+        """Add observed cosines (N,)."""
+        cosine = cosine[cosine > -1.5]
+        self.sums[same] += [len(cosine), cosine.sum(), (cosine**2).sum()]
+
+    def mean_std(self, same: bool) -> tuple[float, float]:
+        """Mean and standard deviation of the cosine of pairs of the same / of different objects."""
+        count, total, squares = self.sums[same]
+        mean = total / count
+        return mean, math.sqrt(max(squares / count - mean**2, 1e-6))
+
+    def normalised(self, cosine: Array) -> Array:
+        """Map cosines so that 0 is the mean of different and 1 the mean of same objects."""
+        different, same = self.mean_std(False)[0], self.mean_std(True)[0]
+        return (cosine - different) / max(same - different, 0.05)
+
+
+# ---- Tracker -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """The detections of one frame that belong to a track, as a struct of arrays of length M.
+
+    Attributes:
+        track_id: identity, from 1; 0 while a track is still tentative.
+        xyxy, score, class_id: of the detection.
+        detection_index: row of the detection in what was handed to the tracker.
+        tracklet_id: uninterrupted piece of track, from 1; an identity that returns has several.
+    """
+
+    track_id: IntArray
+    xyxy: Array
+    score: Array
+    class_id: IntArray
+    detection_index: IntArray
+    tracklet_id: IntArray
+
+    def __len__(self) -> int:
+        return len(self.track_id)
+
+    def __getitem__(self, keep: Any) -> Tracks:
+        return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+
+    def to_array(self) -> Array:
+        """(M, 8) rows x1, y1, x2, y2, id, score, class, detection index."""
+        columns = (self.xyxy, self.track_id, self.score, self.class_id, self.detection_index)
+        return np.column_stack(columns).astype(np.float64).reshape(-1, 8)
+
+
+@dataclass(slots=True)
+class _Live:
+    """State of the live tracks, one row a track (T rows)."""
+
+    mean: Array  # (T, 4, 2) cx, cy, w, h and velocities
+    cov: Array  # (T, 4, 3)
+    tracklet: IntArray  # (T,)
+    identity: IntArray  # (T,) index of the identity, -1 while tentative
+    hits: IntArray  # (T,) frames with a detection
+    missed: IntArray  # (T,) frames since the last one
+    first: IntArray  # (T,) frame of birth
+    embedded: IntArray  # (T,) frame of the last embedding
+    votes: Array  # (T, C) score sums of the classes
+    look: npt.NDArray[np.float32]  # (T, E) running mean of the embeddings
+
+    def select(self, keep: npt.NDArray[Any]) -> _Live:
+        return _Live(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+
+    def append(self, other: _Live) -> _Live:
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
+        return _Live(*(np.concatenate([_widen(a, b), _widen(b, a)]) for a, b in pairs))
+
+    @staticmethod
+    def born(box: Array, tracklet: IntArray, frame: int, config: TrackerConfig) -> _Live:
+        """New tentative tracks from boxes cx, cy, w, h (N, 4); initial spread as in DeepSORT (2 x
+        and 10 x).
+        """
+        n = len(box)
+        mean = np.stack([box, np.zeros_like(box)], -1)
+        scale = _noise_scale(mean)
+        cov = np.stack(
+            [
+                (2 * config.std_position * scale) ** 2,
+                0 * scale,
+                (10 * config.std_velocity * scale) ** 2,
+            ],
+            -1,
+        )
+        zero, one = np.zeros(n, np.int64), np.ones(n, np.int64)
+        return _Live(
+            mean,
+            cov,
+            tracklet,
+            zero - 1,
+            one - 1,
+            zero,
+            zero + frame,
+            zero - 1,
+            np.zeros((n, 1)),
+            np.zeros((n, 0), np.float32),
+        )
+
+
+def _widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Pad the second axis of a with zeros to the width of b (classes or embeddings seen for the
+    first time).
+    """
+    if a.ndim != 2 or a.shape[1] >= b.shape[1]:
+        return a
+    return np.concatenate([a, np.zeros((len(a), b.shape[1] - a.shape[1]), a.dtype)], 1)
+
+
+class Tracker:
+    """Give every detection of a video the identity of its physical object.
+
+    Call `update` once a frame, also with no detections. Identities start at 1, belong to this
+    tracker alone and are never given to another object. An object that was away is recognised by
+    appearance, whatever its place in the image, unless two identities fit about equally well: then
+    it gets a new identity (the linker of `run` decides later, with 3D evidence).
+
+    Args:
+        config: thresholds; the defaults serve video of static scenes from 5 to 60 frames a second.
+        embedder: computes embeddings where they matter; without one, pass `embeddings=` or track by
+            motion.
+
+    >>> tracker = Tracker(TrackerConfig(n_init=1))
+    >>> tracker.update(Detections.from_array([[10, 10, 50, 90, 0.9, 56]])).track_id
+    array([1])
+    """
+
+    def __init__(
+        self, config: TrackerConfig | None = None, embedder: Embedder | None = None
+    ) -> None:
+        self.config = config or TrackerConfig()
+        self.embedder = embedder
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next video starts with identity 1."""
+        self.frame_number = -1
+        self.gallery = Gallery(self.config)
+        self.stats = SimilarityStats(self.config)
+        self.last_seen = np.zeros(0, np.int64)  # (I,) frame of each identity's last detection
+        self.identity_class = np.zeros(0, np.int64)  # (I,)
+        self._tracklets = itertools.count(1)
+        self._camera_motion = CameraMotion(self.config)
+        self._last_pose: Array | None = None
+        self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
+
+    def update(
+        self,
+        detections: Any,
+        frame: Image | None = None,
+        *,
+        embeddings: Embeddings | npt.ArrayLike | None = None,
+        cam_from_world: Array | None = None,
+        camera: Camera | None = None,
+    ) -> Tracks:
+        """Track the detections of the next frame.
+
+        Args:
+            detections: `Detections`, an (N, 6) array x1, y1, x2, y2, confidence, class, or an
+                object with xyxy, confidence, class_id and mask (supervision).
+            frame: (H, W, 3) BGR image: camera motion, and the input of the embedder.
+            embeddings: of all detections: an (D, E) array or `Embeddings`.
+            cam_from_world: (3, 4) pose of this frame, with `camera`: replaces the image's own
+                motion estimate.
+        Returns:
+            The detections that belong to a confirmed track; decided once.
+        """
+        tracks = self.step(
+            detections, frame, embeddings=embeddings, cam_from_world=cam_from_world, camera=camera
+        )
+        return tracks[tracks.track_id > 0]
+
+    def step(
+        self,
+        detections: Any,
+        frame: Image | None = None,
+        *,
+        embeddings: Embeddings | npt.ArrayLike | None = None,
+        cam_from_world: Array | None = None,
+        camera: Camera | None = None,
+    ) -> Tracks:
+        """As `update`, with the tentative tracks too (track_id 0): for those who look back later.
+        """
+        self.frame_number += 1
+        detections = as_detections(detections)
+        lazy = _LazyEmbeddings(
+            _as_embeddings(embeddings, len(detections)),
+            self.embedder,
+            frame,
+            detections,
+            self.config.foreground_weight,
+        )
+        self._predict(frame, cam_from_world, camera)
+        track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
+        self._correct(detections, track_of)
+        track_of = self._begin(detections, track_of)
+        self._look(detections, track_of, lazy)
+        track_of = self._confirm(track_of)
+        result = self._report(detections, track_of)
+        self._retire()
+        return result
+
+    def _predict(
+        self, frame: Image | None, cam_from_world: Array | None, camera: Camera | None
+    ) -> None:
+        """Kalman prediction, then the camera's own motion."""
+        live = self._live
+        live.mean, live.cov = kalman_predict(live.mean, live.cov, self.config)
+        live.mean[:, 2:, 0] = live.mean[:, 2:, 0].clip(1.0)  # a size stays positive
+        live.missed += 1
+        new_from_old = np.eye(3)
+        if cam_from_world is not None and camera is not None:
+            if self._last_pose is not None and np.isfinite(cam_from_world).all():
+                rotation = cam_from_world[:, :3] @ self._last_pose[:, :3].T
+                new_from_old = (
+                    camera.K @ rotation @ np.linalg.inv(camera.K)
+                )  # exact for any depth if t = 0
+            if np.isfinite(cam_from_world).all():
+                self._last_pose = np.asarray(cam_from_world, np.float64)
+        elif frame is not None and self.config.camera_motion:
+            new_from_old = self._camera_motion(frame)
+        if len(live.mean):
+            live.mean, live.cov = _warp_state(live.mean, live.cov, new_from_old)
+
+    def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
+        """Match detections to live tracks: high scores with motion and appearance, then low scores
+        by overlap.
+        """
+        config = self.config
+        track_of = np.full(len(detections), -1, np.int64)
+        box = _cxcywh_from_xyxy(detections.xyxy)
+        cost, feasible, iou = self._motion_cost(detections, box)  # (T, D)
+        high = detections.score >= config.high_score
+        gate = feasible & high
+        if lazy.available and self._live.look.shape[1]:
+            cost = self._add_appearance(cost, gate, lazy)
+        _assign(np.where(gate, cost, np.inf), config.max_cost, track_of)
+        free = ~np.isin(np.arange(len(iou)), track_of)
+        low = (track_of < 0) & (detections.score >= config.low_score)
+        second = feasible & (iou >= config.low_iou) & low & free[:, None]
+        _assign(np.where(second, 1 - iou, np.inf), 1.0, track_of)
+        return track_of
+
+    def _motion_cost(self, detections: Detections, box: Array) -> tuple[Array, BoolArray, Array]:
+        """Cost in [0, 1] from overlap and gated distance, feasibility and IoU, (T, D) each."""
+        live, config = self._live, self.config
+        iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), detections.xyxy)
+        var = (
+            live.cov[:, :2, 0] + (config.std_measure * _noise_scale(live.mean)[:, :2]) ** 2
+        )  # (T, 2) S
+        offset = live.mean[:, None, :2, 0] - box[None, :, :2]  # (T, D, 2)
+        distance = (offset**2 / var[:, None]).sum(-1)  # (T, D) squared Mahalanobis, 2 dof
+        distance = distance / config.gate_chi2
+        same_class = _same_class(live.votes, detections.class_id)
+        feasible = (distance < 1) | (iou > config.gate_iou)
+        cost = 0.5 * (1 - iou) + 0.5 * distance.clip(0, 1) + config.class_cost * ~same_class
+        return cost, feasible & (same_class | (iou > config.low_iou)), iou
+
+    def _add_appearance(self, cost: Array, gate: BoolArray, lazy: _LazyEmbeddings) -> Array:
+        """Blend in appearance for detections and tracks whose best candidate has a close rival."""
+        open_cost = np.where(gate, cost, np.inf)
+        close = open_cost <= self.config.rival_cost + np.minimum(
+            open_cost.min(0, initial=np.inf)[None, :], open_cost.min(1, initial=np.inf)[:, None]
+        )
+        close &= gate
+        contested = close & ((close.sum(0) > 1)[None, :] | (close.sum(1) > 1)[:, None])
+        rows = np.flatnonzero(contested.any(0))
+        if not len(rows):
+            return cost
+        cosine = self._live.look @ lazy.get(rows).T  # (T, n)
+        alike = self.stats.normalised(cosine.astype(np.float64)).clip(0, 1)
+        known = (self._live.embedded >= 0)[:, None]
+        weight = self.config.appearance_weight * known
+        cost = cost.copy()
+        cost[:, rows] = (1 - weight) * cost[:, rows] + weight * (1 - alike)
+        return cost
+
+    def _correct(self, detections: Detections, track_of: IntArray) -> None:
+        """Kalman update of the matched tracks."""
+        rows = np.flatnonzero(track_of >= 0)
+        t, live = track_of[rows], self._live
+        box = _cxcywh_from_xyxy(detections.xyxy[rows])
+        noise = self.config.std_measure * _noise_scale(live.mean[t])
+        live.mean[t], live.cov[t] = kalman_update(live.mean[t], live.cov[t], box, noise)
+        self._count(detections, rows, t)
+
+    def _count(self, detections: Detections, rows: IntArray, t: IntArray) -> None:
+        """Book a detection for each of the tracks t."""
+        live = self._live
+        live.hits[t] += 1
+        live.missed[t] = 0
+        classes = detections.class_id[rows].clip(0)
+        live.votes = _widen(live.votes, np.empty((0, int(classes.max(initial=0)) + 1)))
+        live.votes[t, classes] += detections.score[rows]
+
+    def _begin(self, detections: Detections, track_of: IntArray) -> IntArray:
+        """Start a tentative track at every unmatched detection of sufficient score."""
+        rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
+        ids = np.fromiter(self._tracklets, np.int64, len(rows))
+        born = _Live.born(
+            _cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self.config
+        )
+        track_of[rows] = len(self._live.mean) + np.arange(len(rows))
+        self._live = self._live.append(born)
+        self._count(detections, rows, track_of[rows])
+        return track_of
+
+    def _look(self, detections: Detections, track_of: IntArray, lazy: _LazyEmbeddings) -> None:
+        """Embed tentative tracks, tracks that were not embedded lately, and learn the similarity
+        statistics.
+        """
+        if not lazy.available:
+            return
+        live = self._live
+        rows = np.flatnonzero(track_of >= 0)
+        t = track_of[rows]
+        soon = (live.identity[t] < 0) & (live.hits[t] >= self.config.n_init - 1)
+        due = soon | (self.frame_number % self.config.embed_every == 0)  # all in one pass
+        rows = rows[due | lazy.done[rows]]
+        t = track_of[rows]
+        if not len(rows):
+            return
+        look = lazy.get(rows)  # (n, E)
+        live.look = _widen(live.look, look)
+        known = live.embedded[t] >= 0
+        keep = np.where(known, self.config.look_momentum, 0.0)[:, None]
+        live.look[t] = _unit_rows(keep * live.look[t] + (1 - keep) * look)
+        live.embedded[t] = self.frame_number
+        self._learn(look, live.identity[t], detections.class_id[rows])
+
+    def _learn(self, look: npt.NDArray[np.float32], identity: IntArray, class_id: IntArray) -> None:
+        """Feed the similarity statistics and the gallery with embeddings (n, E) of one frame."""
+        cosine = (look @ look.T).astype(np.float64)  # (n, n)
+        pair = np.triu(class_id[:, None] == class_id[None], 1)
+        self.stats.add(cosine[pair], same=False)
+        old = identity >= 0
+        views = (
+            self.gallery.rows[identity[old]]
+            if len(self.gallery.rows)
+            else np.zeros((0, 0, 0), np.float32)
+        )
+        if views.size:
+            oldest = np.einsum("ne,ne->n", views[:, 0], look[old])
+            self.stats.add(
+                oldest[self.gallery.count[identity[old]] > 1].astype(np.float64), same=True
+            )
+        if old.any():
+            self.gallery.add(identity[old], look[old])
+
+    def _confirm(self, track_of: IntArray) -> IntArray:
+        """Give tracks that were seen often enough an identity: a known one that returns, or a new
+        one.
+        """
+        live = self._live
+        ready = np.flatnonzero(
+            (live.identity < 0) & (live.hits >= self.config.n_init) & (live.missed == 0)
+        )
+        self.last_seen[live.identity[(live.identity >= 0) & (live.missed == 0)]] = self.frame_number
+        returning = self._returns(ready)  # (n,) identity or -1
+        fresh = ready[returning < 0]
+        ids = len(self.last_seen) + np.arange(len(fresh))
+        self.last_seen = np.append(self.last_seen, np.zeros(len(fresh), np.int64))
+        self.identity_class = np.append(
+            self.identity_class, live.votes[fresh].argmax(1) if len(fresh) else []
+        )
+        self.identity_class = self.identity_class.astype(np.int64)
+        stale = np.isin(
+            live.identity, returning[returning >= 0]
+        )  # coasting tracks of those who came back
+        live.identity[ready[returning >= 0]], live.identity[fresh] = returning[returning >= 0], ids
+        self.last_seen[live.identity[ready]] = self.frame_number
+        seen = ready[live.embedded[ready] >= 0]
+        if len(seen):
+            self.gallery.add(live.identity[seen], live.look[seen])
+        return self._drop(stale, track_of)
+
+    def _returns(self, ready: IntArray) -> IntArray:
+        """Recognise known identities in newly confirmed tracks: appearance, with a margin against
+        every other.
+
+        Never gated by overlap, aspect ratio or pixel distance: the camera may return from anywhere.
+        An identity that was seen while the newcomer was already in view is another object.
+        """
+        live, config = self._live, self.config
+        result = np.full(len(ready), -1, np.int64)
+        if not len(ready) or not live.look.shape[1] or not self.config.remember:
+            return result
+        identity = np.flatnonzero(self.last_seen < live.first[ready].max(initial=0))  # (I,)
+        alike = self.stats.normalised(self.gallery.similarity(live.look[ready], identity))  # (n, I)
+        possible = self.last_seen[identity][None] < live.first[ready][:, None]
+        possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
+        alike = np.where(possible & (live.embedded[ready] >= 0)[:, None], alike, -1.0)
+        claimed = np.full(len(identity), -1, np.int64)
+        _assign(
+            np.where(alike >= config.return_similarity, 2 - alike, np.inf).clip(0), np.inf, claimed
+        )
+        for column in np.flatnonzero(claimed >= 0):
+            row = claimed[column]
+            rivals = np.concatenate(
+                [np.delete(alike[row], column), np.delete(alike[:, column], row), [-1.0]]
+            )
+            if alike[row, column] - rivals.max() >= config.return_margin:
+                result[row] = identity[column]
+        return result
+
+    def _drop(self, rows: BoolArray, track_of: IntArray) -> IntArray:
+        """Remove live tracks; returns the detections' rows renumbered."""
+        renumber = np.append(np.where(rows, -1, np.cumsum(~rows) - 1), -1)
+        self._live = self._live.select(~rows)
+        return np.asarray(renumber[track_of], np.int64)
+
+    def _report(self, detections: Detections, track_of: IntArray) -> Tracks:
+        rows = np.flatnonzero(track_of >= 0)
+        t = track_of[rows]
+        return Tracks(
+            self._live.identity[t] + 1,
+            detections.xyxy[rows],
+            detections.score[rows],
+            detections.class_id[rows],
+            rows,
+            self._live.tracklet[t],
+        )
+
+    def _retire(self) -> None:
+        """Drop tracks that coasted too long; their identities stay in the gallery."""
+        live = self._live
+        patience = np.where(
+            live.identity < 0, np.minimum(live.hits, self.config.n_init), self.config.coast_frames
+        )
+        self._live = live.select(live.missed <= patience)
+
+
+def _same_class(votes: Array, class_id: IntArray) -> BoolArray:
+    """(T, D): is the detection's class the one the track was mostly seen as?"""
+    own = votes.argmax(1) if votes.size else np.zeros(len(votes), np.int64)
+    return np.asarray(own[:, None] == class_id[None], bool)
+
+
+def _assign(cost: Array, limit: float, row_of_column: IntArray) -> None:
+    """Minimum-cost assignment of rows to columns where cost < limit; fills row_of_column (C,) in
+    place.
+    """
+    finite = np.isfinite(cost) & (cost < limit)
+    if not finite.any():
+        return
+    worst = (
+        1e3  # dearer than any feasible sum: as many feasible pairs as possible, then the cheapest
+    )
+    rows, columns = linear_sum_assignment(np.where(finite, cost, worst))
+    good = finite[rows, columns]
+    row_of_column[columns[good]] = rows[good]
+
+
+def _as_embeddings(embeddings: Embeddings | npt.ArrayLike | None, count: int) -> Embeddings | None:
+    """Accept one (D, E) array as foreground-only embeddings; check the number of rows."""
+    if embeddings is None:
+        return None
+    if not isinstance(embeddings, Embeddings):
+        rows = np.asarray(embeddings, np.float64).reshape(count, -1) if count else np.empty((0, 0))
+        embeddings = Embeddings(rows, np.empty((count, 0)))
+    if len(embeddings.foreground) != count:
+        raise ReobjError(
+            f"{len(embeddings.foreground)} embeddings for {count} detections: "
+            "give one row a detection"
+        )
+    return embeddings
+
+
+def invert_rigid(b_from_a: Array) -> Array:
+    """Return a_from_b (..., 3, 4) of a rigid b_from_a (..., 3, 4)."""
+    rotation = np.swapaxes(b_from_a[..., :3], -1, -2)
+    return np.concatenate([rotation, -rotation @ b_from_a[..., 3:]], -1)
+
+
+def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
+    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; None for an
+    empty text.
+
+    >>> parse_camera("500,500,320,240", (640, 480)).model
+    'PINHOLE'
+    """
+    if not text.strip():
+        return None
+    with contextlib.suppress(ValueError):
+        numbers = [float(part) for part in text.split(",")]
+        if 4 <= len(numbers) <= 8 and np.isfinite(numbers).all() and min(numbers[:2]) > 0:
+            numbers += [0.0] * (8 - len(numbers) if len(numbers) > 4 else 0)
+            camera = Camera("OPENCV" if len(numbers) == 8 else "PINHOLE", *size, tuple(numbers))
+            return _checked_camera(camera, f"--camera {text}")
+    raise ReobjError(f"--camera {text!r}: expected fx,fy,cx,cy[,k1,k2,p1,p2], pixels of the {size[0]}x{size[1]} frames")
+
+
+def _checked_camera(camera: Camera, where: str) -> Camera:
+    """Refuse intrinsics that belong to another image size."""
+    size, centre, focal = np.array([camera.width, camera.height]), camera.K[:2, 2], camera.K[0, 0]
+    if (np.abs(centre - size / 2) > 0.2 * size).any() or not 0.1 < focal / size.max() < 10:
+        raise ReobjError(
+            f"{where}: focal length {focal:.0f} px and centre ({centre[0]:.0f}, {centre[1]:.0f}) do not fit images of "
+            f"{size[0]}x{size[1]}; give the intrinsics of the frames as they are read (rotated? resized?)"
+        )
+    return camera
+
+
+def estimate_poses(
+    video: Any,
+    config: PosesConfig,
+    work_dir: Path,
+    progress: Callable[[str, int], Progress] = Progress,
+    boxes_to_mask: Callable[[int], Array] | None = None,
+) -> Poses:
+    """Reconstruct the cameras of a video of a static scene.
+
+    Args:
+        video: a `Video`, iterated up to twice.
+        work_dir: receives `sparse/` (COLMAP model of the keyframes, native pixels) and
+            `pycolmap.log`.
+        progress: makes the progress line of a stage from its name and total.
+        boxes_to_mask: frame number -> (N, 4) xyxy boxes of moving things in native pixels, left out
+            of the features.
+    Returns:
+        a pose for every frame that could be located, in the reconstruction's own world and scale. A
+        failed reconstruction is no exception: all poses are NaN and `messages` say why and what
+        helps.
+    """
+    if getattr(video, "is_live", False):
+        raise ReobjError("poses of a live camera cannot be reconstructed: record a video first, or --poses none")
+    size = (int(video.size[0]), int(video.size[1]))
+    camera, work = parse_camera(config.camera, size), _WorkVideo(video, config)
+    keys = pick_keyframes(work.first_pass(progress("keyframes", video.expected)), config)
+    finer = config
+    while len(keys) < min(config.min_keyframes, len(work.frames)) and finer.max_flow > 2 * config.min_flow:
+        finer = dataclasses.replace(finer, max_flow=finer.max_flow / 2)
+        keys = pick_keyframes(work, finer)
+    if not keys:
+        raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
+    boxes = [np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4)) for k in keys]
+    names = [str(video.names[k.frame]) if video.names else f"frame_{k.frame:06d}.jpg" for k in keys]
+    messages = _run_sfm(keys, names, boxes, camera, size, config, work_dir, progress)
+    frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
+    if not (work_dir / "sparse").exists():
+        guess = (config.focal_guess * max(size), size[0] / 2, size[1] / 2)
+        camera = camera or Camera("SIMPLE_PINHOLE", *size, guess)
+        nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
+        return Poses(camera, frame, time_s, nothing, none, "none", messages=tuple(messages))
+    model = _read_model(work_dir / "sparse")
+    places = np.array([keys[i - 1].place for i in model.image_id])
+    located = _locate_between(model, places, work, config, progress("pnp", len(frame)))
+    cam_from_world, status = fill_gaps(frame, *located, config.max_gap)
+    messages += _lost_frames(frame, np.isfinite(cam_from_world).all((1, 2)))
+    found = (model.cameras[0], frame, time_s, cam_from_world, status, "pycolmap")
+    return Poses(*found, points=model.points, colors=model.colors, messages=tuple(messages))
+
+
+def _spans(numbers: Iterable[int], step: int = 1) -> str:
+    """Write ascending numbers as spans.
+
+    >>> _spans([3, 4, 5, 9])
+    '3-5, 9'
+    """
+    spans: list[list[int]] = []
+    for n in numbers:
+        if spans and n - spans[-1][1] <= step:
+            spans[-1][1] = n
+        else:
+            spans.append([n, n])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in spans)
+
+
+def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
+    """Say which frames have no pose and what helps."""
+    step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
+    text = (
+        f"{(~known).sum()} of {len(frame)} frames have no pose (frames {_spans(frame[~known].tolist(), step)}): these "
+        "parts do not connect to the rest; slower turns, fewer blurred frames and more texture help, or give --poses"
+    )
+    return [] if known.all() else [text]
+
+
+# Keyframes: optical flow
+
+
+@dataclass(frozen=True, slots=True)
+class _WorkImage:
+    """One frame at working size: its place in the video, source frame number, time, BGR and gray
+    image.
+    """
+
+    place: int
+    frame: int
+    time_s: float
+    bgr: Image
+    gray: Image
+
+
+class _WorkVideo:
+    """A video at working size; gray images are kept in memory up to `cache_mb`, beyond it the video
+    is read again.
+    """
+
+    def __init__(self, video: Any, config: PosesConfig) -> None:
+        self.video, self.config, self.used_mb = video, config, 0.0
+        self.frames: list[int] = []
+        self.times: list[float] = []
+        self.cache: list[Image] = []
+
+    def __iter__(self) -> Iterator[_WorkImage]:
+        for place, frame in enumerate(self.video):
+            height, width = frame.image.shape[:2]
+            scale = min(1.0, self.config.size_px / max(height, width))
+            size = (max(1, round(width * scale)), max(1, round(height * scale)))
+            bgr = frame.image if scale == 1 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+            yield _WorkImage(place, frame.index, frame.time_s, bgr, cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY))
+
+    def first_pass(self, line: Progress) -> Iterator[_WorkImage]:
+        for work in self:
+            self.frames.append(work.frame)
+            self.times.append(work.time_s)
+            self.used_mb += work.gray.nbytes / 1e6
+            self.cache = [] if self.used_mb > self.config.cache_mb else self.cache
+            self.cache.append(work.gray)
+            line.step()
+            yield work
+        line.close()
+
+    def grays(self) -> Iterator[Image]:
+        return (work.gray for work in self) if self.used_mb > self.config.cache_mb else iter(self.cache)
+
+
+def _klt(old: Image, new: Image, xy: Array, config: PosesConfig) -> tuple[Array, BoolArray]:
+    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back to where
+    they began.
+    """
+    if not len(xy):
+        return xy, np.zeros(0, bool)
+    start = xy.astype(np.float32).reshape(-1, 1, 2)
+    window = (config.klt_window_px, config.klt_window_px)
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(old, new, start, np.empty_like(start), winSize=window)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(new, old, ahead, np.empty_like(start), winSize=window)
+    error = np.linalg.norm(back - start, axis=2)[:, 0]  # (N,)
+    kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < config.klt_error_px)
+    return ahead[:, 0].astype(np.float64), kept
+
+
+class _FlowSinceKeyframe:
+    """Corners of a keyframe followed from frame to frame."""
+
+    def __init__(self, key: _WorkImage, config: PosesConfig) -> None:
+        self.place, self.config, self.gray = key.place, config, key.gray
+        self.start = self.at = self.corners(key.gray)
+        self.count = len(self.start)
+
+    def corners(self, gray: Image) -> Array:
+        found = cv2.goodFeaturesToTrack(gray, self.config.corners, 0.01, max(gray.shape) / 80)
+        return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
+
+    def step(self, gray: Image) -> tuple[float, float]:
+        """Follow into the next frame: median flow since the keyframe over the width, share of
+        corners left.
+        """
+        if self.count < self.config.min_corners:  # textureless so far: a keyframe as soon as there is something
+            return 0.0, float(len(self.corners(gray)) < self.config.min_corners)
+        ahead, kept = _klt(self.gray, gray, self.at, self.config)
+        self.start, self.at, self.gray = self.start[kept], ahead[kept], gray
+        flow = np.linalg.norm(self.at - self.start, axis=1)
+        return float(np.median(flow)) / gray.shape[1] if kept.any() else 0.0, len(flow) / self.count
+
+
+def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_WorkImage]:
+    """Choose keyframes by optical flow, the sharpest near the threshold; the first and the last
+    frame are among them.
+
+    When there are more than `max_keyframes`, every second one is dropped and the spacing doubles:
+    one pass, bounded memory, the same choice every time.
+    """
+    keys: list[_WorkImage] = []
+    again: deque[_WorkImage] = deque()  # frames behind a chosen one, to be looked at again
+    window: list[_WorkImage] = []
+    stream, work, track, wider, flow = iter(works), None, None, 1, 0.0
+    while (following := again.popleft() if again else next(stream, None)) is not None:
+        work = following
+        if track is None:
+            keys, track = [work], _FlowSinceKeyframe(work, config)
+            continue
+        flow, left = track.step(work.gray)
+        if flow >= config.sharp_window * wider * config.max_flow:
+            window.append(work)
+        due = flow > wider * config.max_flow or left < config.min_ratio**wider
+        if due or (work.place - track.place >= wider * config.max_interval and flow > config.min_flow):
+            best = max(window or [work], key=lambda w: float(cv2.Laplacian(w.gray, cv2.CV_32F).var()))
+            again.extendleft(w for w in reversed(window) if w.place > best.place)
+            keys.append(best)
+            if len(keys) > config.max_keyframes:
+                keys, wider = keys[::2], 2 * wider
+            window, track = [], _FlowSinceKeyframe(best, config)
+    if work is not None and work.place > keys[-1].place and (flow > config.min_flow or len(keys) == 1):
+        keys.append(work)
+    return keys
+
+
+# Frames between the keyframes: points followed from both sides, PnP
+
+
+def _locate_between(
+    model: _SparseModel, places: IntArray, video: _WorkVideo, config: PosesConfig, line: Progress
+) -> tuple[Array, npt.NDArray[np.str_]]:
+    """Locate every frame by PnP from points followed from the registered keyframes before and after
+    it.
+
+    Args:
+        places: (R,) place in the video of each registered keyframe, ascending.
+    Returns:
+        cam_from_world (F, 3, 4), NaN where PnP was refused, and status (F,).
+    """
+    count = len(video.frames)
+    cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
+    cam_from_world[places], status[places] = model.cam_from_world, "keyframe"
+    for before, after, run in _segments(places, video.grays(), config.max_run):
+        images = [gray for _, gray in run]
+        ahead = _follow(model, before, images, config)
+        back = _follow(model, after, images[::-1], config)[::-1]
+        for (place, gray), (rows_a, xy_a), (rows_b, xy_b) in zip(run, ahead, back, strict=True):
+            if status[place] == "none":
+                points, xy = model.points[np.r_[rows_a, rows_b]], np.r_[xy_a, xy_b]
+                pose = _absolute_pose(xy, points, model.cameras[0], gray.shape[1], config)
+                if pose is not None:
+                    cam_from_world[place], status[place] = pose, "pnp"
+        line.step(len(run) - 1)
+    line.close()
+    jump = _jumps(cam_from_world, config.max_step_ratio) & (status == "pnp")
+    cam_from_world[jump], status[jump] = np.nan, "none"
+    return cam_from_world, status
+
+
+def _segments(
+    places: IntArray, grays: Iterator[Image], longest: int
+) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
+    """Cut the video at the registered keyframes.
+
+    Yields rows of the keyframes before and after (-1: none), and (place, image) of both and of all
+    between. Of stretches without a keyframe that are longer than `longest`, the middle is left out.
+    """
+    row_of = {int(place): row for row, place in enumerate(places)}
+    before, run = -1, deque[tuple[int, Image]](maxlen=longest)
+    for place, gray in enumerate(grays):
+        run.append((place, gray))
+        row = row_of.get(place, -1)
+        if row >= 0 or (before >= 0 and len(run) == longest):
+            yield before, row, list(run)
+            before, run = row, deque([(place, gray)], maxlen=longest)
+    if before >= 0:
+        yield before, -1, list(run)
+
+
+def _follow(model: _SparseModel, row: int, images: list[Image], config: PosesConfig) -> list[tuple[IntArray, Array]]:
+    """Follow the longest-seen 3D points of a keyframe (row; -1: none) from the first image through
+    the others.
+
+    Returns:
+        per image: rows of `model.points` (n,) and their native pixels (n, 2), COLMAP convention.
+    """
+    seen = np.flatnonzero(model.obs_image == row)
+    seen = seen[np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")[: config.pnp_points]]
+    scale = np.array(images[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
+    rows, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5  # OpenCV: pixel centres at whole numbers
+    followed = [(rows, model.obs_xy[seen])]
+    for old, new in itertools.pairwise(images):
+        ahead, kept = _klt(old, new, xy, config)
+        rows, xy = rows[kept], ahead[kept]
+        followed.append((rows, (xy + 0.5) / scale))
+    return followed
+
+
+def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
+    """Mark frames whose centre is a detour: much further from both neighbours than these are from
+    each other.
+    """
+    known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
+    jump = np.zeros(len(cam_from_world), bool)
+    if len(known) > 2:
+        centre = invert_rigid(cam_from_world[known])[:, :, 3]  # (N, 3)
+        step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
+        direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
+        jump[known[1:-1]] = step[1:] + step[:-1] - direct > ratio * np.maximum(direct, np.median(step))
+    return jump
+
+
+def fill_gaps(
+    frame: IntArray, cam_from_world: Array, status: npt.NDArray[np.str_], max_gap: int
+) -> tuple[Array, npt.NDArray[np.str_]]:
+    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line;
+    never beyond.
+
+    (Interpolating t of cam_from_world instead would bend the path.)
+    """
+    filled, status = cam_from_world.copy(), status.copy()
+    known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
+    for a, b in itertools.pairwise(known):
+        if b - a > 1 and frame[b] - frame[a] - 1 <= max_gap:
+            share = (frame[a + 1 : b] - frame[a]) / (frame[b] - frame[a])  # (n,)
+            ends = invert_rigid(cam_from_world[[a, b]])  # (2, 3, 4) world_from_cam
+            turn = Slerp([0, 1], Rotation.from_matrix(ends[:, :, :3]))(share).as_matrix()  # (n, 3, 3)
+            centre = ends[0, :, 3] + share[:, None] * (ends[1, :, 3] - ends[0, :, 3])  # (n, 3)
+            filled[a + 1 : b] = invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
+            status[a + 1 : b] = "interpolated"
+    return filled, status
+
+
+# Reconstruction of the keyframes in a child process
+
+_ADVICE = (
+    "move the camera sideways around the objects (turning on the spot gives no depth), keep things with texture in "
+    "view, avoid blurred frames, or give --poses; identities in 2D do not need poses"
+)
+_CHILD_CODE = """
+import importlib.util, sys
+name, path, home, folder = sys.argv[1:]
+sys.path.append(home)
+spec = importlib.util.spec_from_file_location(name, path)
+sys.modules[name] = module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+module._sfm_child(folder)
+"""
+
+
+def _run_sfm(
+    keys: list[_WorkImage],
+    names: list[str],
+    boxes: list[Array],
+    camera: Camera | None,
+    size: tuple[int, int],
+    config: PosesConfig,
+    work_dir: Path,
+    progress: Callable[[str, int], Progress],
+) -> list[str]:
+    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why and
+    what helps.
+    """
+    folder = work_dir / "mapping"
+    for old in (work_dir / "sparse", folder):
+        shutil.rmtree(old, ignore_errors=True)
+    if len(keys) < 3:
+        return [f"no camera poses: only {len(keys)} different views; {_ADVICE}"]
+    folder.mkdir(parents=True)
+    np.save(folder / "keyframes.npy", np.stack([key.bgr for key in keys]))
+    scale = np.tile(np.array(keys[0].gray.shape[::-1]) / size, 2)
+    job = {
+        "names": names,
+        "frames": [key.frame for key in keys],
+        "boxes": [(xyxy * scale).tolist() for xyxy in boxes],
+        "camera": None if camera is None else [camera.model, list(camera.params)],
+        "size": size,
+        "config": dataclasses.asdict(config),
+    }
+    (folder / "job.json").write_text(json.dumps(job))
+    messages = _run_child(folder, work_dir / "pycolmap.log", progress)
+    if (folder / "sparse").exists():
+        (folder / "sparse").replace(work_dir / "sparse")
+    shutil.rmtree(folder)
+    return messages
+
+
+def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Progress]) -> list[str]:
+    """Run `_sfm_child` in a fresh interpreter, so that neither an abort nor chatter of COLMAP
+    reaches the user.
+    """
+    here = Path(__file__).resolve()
+    command = [sys.executable, "-c", _CHILD_CODE, here.stem, str(here), str(here.parent), str(folder)]
+    lines: list[Progress] = []
+    with open(log_path, "wb") as errors, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors) as child:
+        try:
+            for text in child.stdout or ():
+                words = text.decode(errors="replace").split()
+                if len(words) != 4 or words[0] != "reobj:":
+                    continue
+                if not lines or lines[-1].stage != words[1]:
+                    for line in lines[-1:]:
+                        line.close()
+                    lines.append(progress(words[1], int(words[3])))
+                lines[-1].step(int(words[2]) - lines[-1].done)
+        except BaseException:
+            child.kill()
+            raise
+    for line in lines[-1:]:
+        line.close()
+    if (folder / "messages.json").exists():
+        return list(json.loads((folder / "messages.json").read_text()))
+    why = f"signal {-child.returncode}" if child.returncode < 0 else f"exit code {child.returncode}"
+    return [f"no camera poses: the reconstruction stopped ({why}), see {log_path}; give --poses"]
+
+
+def _sfm_child(folder_name: str) -> None:
+    """Child process: reconstruct the keyframes of a job folder; writes messages.json and, if it
+    went well, sparse/.
+    """
+    pc = _pycolmap()
+    pc.logging.minloglevel = 0  # stderr is the log file here
+    folder = Path(folder_name)
+    job = json.loads((folder / "job.json").read_text())
+    config, database = PosesConfig(**job["config"]), folder / "database.db"
+    images = np.load(folder / "keyframes.npy", mmap_mode="r")  # (K, h, w, 3) BGR
+    _sfm_match(database, _sfm_features(database, images, job, config), config)
+    model, messages = _sfm_ladder(database, job["frames"], job["camera"] is not None, config)
+    if model is not None:
+        _sfm_write(model, images, folder / "sparse", job["names"], tuple(job["size"]))
+    (folder / "messages.json").write_text(json.dumps(messages))
+
+
+def _tell(stage: str, done: int, total: int) -> None:
+    """Send progress to the parent."""
+    sys.stdout.write(f"reobj: {stage} {done} {total}\n")
+    sys.stdout.flush()
+
+
+# All calls of pycolmap
+
+
+def _pycolmap() -> Any:
+    """Import pycolmap without its log on stderr and without its handler of SIGTERM."""
+    if "pycolmap" in sys.modules:
+        return sys.modules["pycolmap"]
+    handler = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGTERM, handler or signal.SIG_DFL)
+    pycolmap.logging.minloglevel = 3
+    return pycolmap
+
+
+def _pycolmap_camera(camera: Camera, size: tuple[int, int]) -> Any:
+    """Make pycolmap's camera, for images of another size."""
+    made = _pycolmap().Camera(
+        camera_id=1, model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    made.rescale(*size)
+    return made
+
+
+@dataclass(frozen=True, slots=True)
+class _SparseModel:
+    """A COLMAP model as arrays; images by ascending id."""
+
+    image_id: list[int]
+    names: tuple[str, ...]
+    cameras: list[Camera]  # (R,) of each image
+    cam_from_world: Array  # (R, 3, 4)
+    points: Array  # (N, 3)
+    colors: npt.NDArray[np.uint8]  # (N, 3) RGB
+    track_length: IntArray  # (N,)
+    obs_image: IntArray  # (M,) row of the image
+    obs_point: IntArray  # (M,) row of the point
+    obs_xy: Array  # (M, 2) COLMAP pixels
+
+
+def _read_model(folder: Path) -> _SparseModel:
+    model = _pycolmap().Reconstruction(str(folder))
+    images = [model.image(i) for i in sorted(model.reg_image_ids())]
+    points = sorted(model.points3D.items())
+    row = {point_id: r for r, (point_id, _) in enumerate(points)}
+    seen = [(r, row[p.point3D_id], *p.xy) for r, image in enumerate(images) for p in image.get_observation_points2D()]
+    table = np.array(seen).reshape(-1, 4)
+    cameras = {i: Camera(c.model.name, c.width, c.height, tuple(c.params.tolist())) for i, c in model.cameras.items()}
+    return _SparseModel(
+        image_id=[image.image_id for image in images],
+        names=tuple(image.name for image in images),
+        cameras=[cameras[image.camera_id] for image in images],
+        cam_from_world=np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
+        points=np.array([point.xyz for _, point in points]).reshape(-1, 3),
+        colors=np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
+        track_length=np.array([point.track.length() for _, point in points], np.int64),
+        obs_image=table[:, 0].astype(np.int64),
+        obs_point=table[:, 1].astype(np.int64),
+        obs_xy=table[:, 2:],
+    )
+
+
+def _absolute_pose(xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig) -> Array | None:
+    """PnP: cam_from_world (3, 4) from native pixels (n, 2) of world points (n, 3); None if it is
+    not to be trusted.
+    """
+    if len(xy) < config.pnp_min_inliers:
+        return None
+    error_px = config.pnp_error_px * camera.width / work_width
+    ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": config.seed}
+    made = _pycolmap_camera(camera, (camera.width, camera.height))
+    options = {"estimation_options": {"ransac": ransac}}
+    found = _pycolmap().estimate_and_refine_absolute_pose(xy, points, made, **options)
+    if found is None or found["num_inliers"] < max(config.pnp_min_inliers, config.pnp_min_ratio * len(xy)):
+        return None
+    pose: Array = found["cam_from_world"].matrix()
+    in_front = points[found["inlier_mask"]] @ pose[2, :3] + pose[2, 3] > 0
+    return pose if in_front.all() and np.isfinite(pose).all() else None
+
+
+def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: PosesConfig) -> list[Image]:
+    """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database;
+    returns descriptors.
+    """
+    kept = []
+    pc, size = _pycolmap(), (images.shape[2], images.shape[1])
+    if job["camera"] is not None:
+        camera = _pycolmap_camera(Camera(job["camera"][0], *job["size"], tuple(job["camera"][1])), size)
+    else:
+        camera = pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", config.focal_guess * max(size), *size)
+    camera.has_prior_focal_length = job["camera"] is not None
+    cv2.setNumThreads(1)
+    with contextlib.closing(pc.Database.open(str(database))) as db, ThreadPoolExecutor(2) as pool:
+        db.write_camera(camera, use_camera_id=True)
+        rig = pc.Rig(rig_id=1)
+        rig.add_ref_sensor(camera.sensor_id)
+        db.write_rig(rig, use_rig_id=True)
+        features = pool.map(lambda k: _sift(images[k], np.array(job["boxes"][k]), config), range(len(images)))
+        for number, (xy, descriptors) in enumerate(features, 1):
+            image = pc.Image(name=f"{number:06d}", camera_id=1, image_id=number)
+            db.write_image(image, use_image_id=True)
+            frame = pc.Frame(frame_id=number, rig_id=1)
+            frame.add_data_id(image.data_id)
+            db.write_frame(frame, use_frame_id=True)
+            db.write_keypoints(number, xy)
+            db.write_descriptors(number, pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors))
+            kept.append(descriptors)
+            _tell("features", number, len(images))
+    return kept
+
+
+def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np.float32], Image]:
+    """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2) and descriptors (N, 128)
+    uint8.
+    """
+    gray = cv2.cvtColor(np.ascontiguousarray(bgr), cv2.COLOR_BGR2GRAY)
+    mask = np.full(gray.shape, 255, np.uint8)
+    for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
+        mask[math.floor(y1) : math.ceil(y2), math.floor(x1) : math.ceil(x2)] = 0
+    for contrast in (config.sift_contrast, config.sift_contrast_low):
+        sift: Any = cv2.SIFT.create(nfeatures=config.sift_features, contrastThreshold=contrast)
+        keypoints, found = sift.detectAndCompute(gray, mask)
+        if len(keypoints) >= config.sift_few:
+            break
+    if found is None or not len(keypoints):
+        return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
+    xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(0.5)  # COLMAP: centre of pixel 0 at .5
+    root = np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-9)) * 512
+    return xy, np.minimum(root, 255).astype(np.uint8)
+
+
+def _sfm_match(database: Path, descriptors: list[Image], config: PosesConfig) -> None:
+    """Match all pairs of a few keyframes, else each with those at offsets 1, 2, 4, 8 ... and with
+    its look-alikes.
+    """
+    pc, count = _pycolmap(), len(descriptors)
+    verify = {"ransac": {"random_seed": config.seed}}  # without the seed two runs differ
+    options: dict[str, Any] = {"verification_options": verify, "device": pc.Device.cpu}
+    _tell("match", 0, 1)
+    if count <= config.exhaustive_below:
+        pc.match_exhaustive(str(database), **options)
+    else:
+        ordered = {"overlap": config.overlap, "quadratic_overlap": True}
+        pc.match_sequential(str(database), pairing_options=ordered, **options)
+        pairs = database.parent / "pairs.txt"
+        pairs.write_text("".join(f"{i + 1:06d} {j + 1:06d}\n" for i, j in _look_alikes(descriptors, config)))
+        pc.match_image_pairs(str(database), pairing_options={"match_list_path": str(pairs)}, **options)
+    _tell("match", 1, 1)
+
+
+def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[int, int]]:
+    """Find the pairs of keyframes that look most alike, for loops. Ref: VLAD, Jegou et al., CVPR
+    2010.
+    """
+    features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
+    sample = features[:: max(1, len(features) // config.loop_sample)]
+    if len(sample) < config.loop_words:
+        return []
+    cv2.setRNGSeed(config.seed)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
+    _, _, words = cv2.kmeans(sample, config.loop_words, np.empty(0), stop, 1, cv2.KMEANS_PP_CENTERS)  # (W, 128)
+    looks = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sum of the residuals of each word
+    for look, found in zip(looks, descriptors, strict=True):
+        nearest = (found @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
+        np.add.at(look, nearest, found - words[nearest])
+    looks /= np.maximum(np.linalg.norm(looks, axis=2, keepdims=True), 1e-9)
+    flat = looks.reshape(len(looks), -1)
+    alike = flat @ flat.T  # (K, K)
+    alike[np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike)))) <= 2] = -np.inf  # matched already
+    best = np.argsort(-alike, axis=1, kind="stable")[:, : config.loop_pairs]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
+
+
+_RELAXED = {
+    "mapper": {"init_min_tri_angle": 4, "init_min_num_inliers": 40, "abs_pose_min_num_inliers": 15,
+               "abs_pose_min_inlier_ratio": 0.15, "filter_min_tri_angle": 0.5},
+    "triangulation": {"min_angle": 0.5, "ignore_two_view_tracks": False},
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """One mapper's largest model, its other models, and what tells a sound model from a wrong one.
+
+    (The reprojection error does not: wrong models had the smallest.)
+    """
+
+    model: Any = None
+    others: tuple[Any, ...] = ()
+    registered: float = 0.0  # share of the keyframes
+    tri_angle_deg: float = 0.0  # median over points of the widest angle between two rays
+    spread: float = 0.0  # rms distance of the cameras from their mean over the median depth
+    focal: float = 0.0  # over the longer side
+    problem: str = "no two keyframes show the same points from clearly different places"
+
+    def trusted(self, config: PosesConfig) -> bool:
+        """True if the geometry is strong enough to calibrate the focal length."""
+        strong = self.tri_angle_deg >= config.strong_tri_angle_deg and self.spread >= config.strong_spread
+        return strong and config.focal_range[0] <= self.focal <= config.focal_range[1]
+
+
+def _sfm_ladder(database: Path, frames: list[int], known_focal: bool, config: PosesConfig) -> tuple[Any, list[str]]:
+    """Try mappers from strict to permissive; return the best sound model (or None) and messages.
+
+    Args:
+        frames: frame number of each keyframe.
+    """
+    tried: list[_Attempt] = []
+    for rung in ("strict", "relaxed", "global"):
+        sound = [a for a in tried if not a.problem]
+        if any(a.registered >= config.good_registered for a in sound) or (sound and rung == "global"):
+            break
+        tried.append(_sfm_attempt(database, rung, known_focal, len(frames), config))
+    best = max(tried, key=lambda a: (not a.problem, a.registered))
+    messages = []
+    if not best.problem and not known_focal and not best.trusted(config):
+        weak = f"little parallax (rays meet at {best.tri_angle_deg:.1f} deg): the focal length cannot be calibrated"
+        best = _sfm_fixed_focal(database, len(frames), config)
+        messages = [
+            f"{weak} and is taken as {config.focal_guess} x the longer side; sizes and depths are rough: give "
+            "--camera fx,fy,cx,cy, or move the camera sideways around the objects"
+        ]
+    if best.problem:
+        return None, [f"no camera poses: {best.problem}; {_ADVICE}"]
+    kept = set(best.model.reg_image_ids())
+    for other in best.others:
+        part = sorted(frames[i - 1] for i in other.reg_image_ids() if i not in kept)
+        if len(part) >= 3:
+            messages.append(f"frames {part[0]}-{part[-1]}: a reconstruction of its own, left out as it does not connect")
+    return best.model, messages
+
+
+def _sfm_fixed_focal(database: Path, count: int, config: PosesConfig) -> _Attempt:
+    """Map with the focal length held at the guess."""
+    with contextlib.closing(_pycolmap().Database.open(str(database))) as db:
+        camera = db.read_all_cameras()[0]
+        camera.params = [config.focal_guess * max(camera.width, camera.height), *camera.params[1:3], 0.0]
+        camera.has_prior_focal_length = True
+        db.update_camera(camera)
+    return _sfm_attempt(database, "relaxed", True, count, config)
+
+
+def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> _Attempt:
+    """Run a mapper on `count` keyframes, measure its largest model and name its first problem ("":
+    it is sound).
+    """
+    models = _sfm_map(database, rung, fixed, count, config)
+    if not models:
+        return _Attempt()
+    model = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))  # the first is often a stub
+    camera = next(iter(model.cameras.values()))
+    centre = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
+    registered, focal = len(centre) / count, camera.mean_focal_length() / max(camera.width, camera.height)
+    seen = [model.image(i).num_points3D for i in centre]
+    angle, depth = _sfm_angle_and_depth(model, centre, config.tri_sample)
+    spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
+    tests = (
+        (registered < config.min_registered, f"only {len(centre)} of {count} keyframes connect"),
+        (model.num_points3D() < config.min_points, f"only {model.num_points3D()} points could be triangulated"),
+        (np.median(seen) < config.min_points_per_image, "the images share too few points"),
+        (angle < config.min_tri_angle_deg, f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
+        (camera.has_bogus_params(*config.focal_range, 1.0), f"the focal length came out as {focal:.2f} x the width"),
+    )
+    problem = next((text for bad, text in tests if bad), "")
+    return _Attempt(model, tuple(m for m in models if m is not model), registered, angle, spread, focal, problem)
+
+
+def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
+    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics.
+    """
+    pc, out = _pycolmap(), database.parent / rung
+    out.mkdir(exist_ok=True)
+    paths = (str(database), str(out), str(out))
+    options: dict[str, Any] = {"num_threads": 1, "random_seed": config.seed}  # one thread: the same result every time
+    if rung == "global":
+        if fixed:
+            options["mapper"] = {"bundle_adjustment": {"refine_focal_length": False, "refine_extra_params": False}}
+        else:  # with a wrong focal length global mapping is wrong and looks right
+            pc.calibrate_view_graph(str(database))
+        return list(pc.global_mapping(*paths, options=options).values())
+    options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
+    options |= {"ba_global_frames_ratio": 1.4, "ba_global_points_ratio": 1.4, "ba_global_function_tolerance": 1e-5}
+    options |= {"ba_refine_focal_length": not fixed, "ba_refine_extra_params": not fixed}
+    options |= _RELAXED if rung == "relaxed" else {}
+    done = itertools.count(2)
+    tick = {"next_image_callback": lambda: _tell("mapping", min(next(done), count), count)}
+    return list(pc.incremental_mapping(*paths, options=options, **tick).values())
+
+
+def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> tuple[float, float]:
+    """Median over points of the widest triangulation angle (degrees), and median distance from the
+    cameras.
+    """
+    ids = sorted(model.point3D_ids())
+    angles, depths = [0.0][: not ids], [0.0][: not ids]
+    for point_id in ids[:: max(1, len(ids) // sample)]:
+        point = model.point3D(point_id)
+        rays = point.xyz - np.array([centre[e.image_id] for e in point.track.elements])  # (L, 3)
+        length = np.linalg.norm(rays, axis=1)
+        unit = rays / length[:, None]
+        angles.append(math.degrees(math.acos(float(np.clip((unit @ unit.T).min(), -1, 1)))))
+        depths.append(float(np.median(length)))
+    return float(np.median(angles)), float(np.median(depths))
+
+
+def _sfm_write(model: Any, images: Any, folder: Path, names: list[str], native: tuple[int, int]) -> None:
+    """Write a COLMAP model in native pixels with the real names; points get the colour of their
+    first observation.
+    """
+    height, width = images.shape[1:3]
+    for point_id in model.point3D_ids():
+        point = model.point3D(point_id)
+        seen = point.track.elements[0]
+        x, y = model.image(seen.image_id).point2D(seen.point2D_idx).xy.astype(int)
+        point.color = images[seen.image_id - 1, np.clip(y, 0, height - 1), np.clip(x, 0, width - 1), ::-1]
+    scale = np.array(native) / (width, height)
+    for image_id, image in model.images.items():
+        image.name = names[image_id - 1]
+        for p in image.points2D:
+            p.xy = p.xy * scale
+    model.camera(1).rescale(*native)
+    folder.mkdir()
+    model.write(str(folder))
+
+
+# Poses supplied by the user
+
+
+@dataclass(frozen=True, slots=True)
+class _GivenPoses:
+    """Poses of a file in its own order; frames are found by name, by time stamp, or by row."""
+
+    cam_from_world: Array  # (N, 3, 4), NaN: no pose
+    camera: Camera | None = None
+    names: tuple[str, ...] = ()
+    stamps_s: Array | None = None
+    metric: bool = False
+    up_in_world: Array | None = None
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+
+
+def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
+    """Read poses made elsewhere, in the format `config.fmt` (auto: recognised).
+
+    Args:
+        path: file or folder; video: the frames they belong to; config: its `camera` overrides the
+            file's intrinsics.
+    Returns:
+        poses of the frames that the file knows, NaN for the others (counted in `messages`).
+    """
+    path, size = Path(path), (int(video.size[0]), int(video.size[1]))
+    if not path.exists():
+        raise ReobjError(f"{path}: no such file or folder; --poses takes auto, none, or poses in a known format")
+    reader = _POSE_READERS.get(_pose_format(path) if config.fmt == "auto" else config.fmt)
+    if reader is None:
+        raise ReobjError(f"--pose-format {config.fmt}: unknown; known are auto, {', '.join(_POSE_READERS)}")
+    given = reader(path, size)
+    camera = parse_camera(config.camera, size) or given.camera
+    if camera is None:
+        raise ReobjError(f"{path}: this format has no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2] (pixels)")
+    camera = _checked_camera(_resized_camera(camera, size, path), str(path))
+    numbers = [(frame.index, frame.time_s) for frame in video]
+    frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
+    row, messages = _rows_of_frames(given, path, frame, time_s, [video.names[n] for n in frame if video.names])
+    poses = np.full((len(frame), 3, 4), np.nan)
+    poses[row >= 0] = given.cam_from_world[row[row >= 0]]
+    known = np.isfinite(poses).all((1, 2))
+    if not known.all():
+        lost = _spans(frame[~known].tolist())
+        messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
+    status, extra = np.where(known, "supplied", "none"), (given.points, given.colors, tuple(messages))
+    return Poses(camera, frame, time_s, poses, status, "user", given.metric, given.up_in_world, *extra)
+
+
+def _pose_format(path: Path) -> str:
+    """Recognise a format from the names in a folder, or from a file's name and its first row."""
+    if path.is_dir():
+        if (path / "transforms.json").exists():
+            return "transforms"
+        return "scannet" if (path / "pose").is_dir() or any(path.glob("*.pose.txt")) else "colmap"
+    if path.name.startswith("images."):
+        return "colmap"
+    if path.suffix == ".json" or path.name == "metadata":
+        return "record3d" if "poses" in _json_object(path) else "transforms"
+    counts = {7: "arkitscenes", 8: "tum", 12: "kitti", 16: "kitti"}
+    rows, _ = _number_rows(path, tuple(counts), "a pose a line (TUM: 8 numbers, KITTI: 12 or 16)")
+    return counts[rows.shape[1]]
+
+
+def _number_rows(path: Path, columns: tuple[int, ...], expected: str) -> tuple[Array, list[str]]:
+    """Read a table of finite numbers (N, C), C in `columns`, and where each row is (for messages).
+    """
+    rows: list[list[float]] = []
+    where = []
+    for number, text in enumerate(_lines(path), 1):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        at = f"{path}, line {number}"
+        try:
+            row = [float(word) for word in text.replace(",", " ").split()]
+        except ValueError:
+            raise ReobjError(f"{at}: {text.strip()[:60]!r} is not a row of numbers; expected {expected}") from None
+        if len(row) not in columns or (rows and len(row) != len(rows[0])):
+            raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
+        if not np.isfinite(row).all():
+            raise ReobjError(f"{at}: a number is not finite; leave out the rows of frames without a pose")
+        rows.append(row)
+        where.append(at)
+    if not rows:
+        raise ReobjError(f"{path}: no poses in it; expected {expected}")
+    return np.array(rows), where
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ReobjError(f"{path}: cannot be read as text ({error}); expected a file of poses") from None
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads("\n".join(_lines(path)))
+    except json.JSONDecodeError as error:
+        raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from None
+    if not isinstance(content, dict):
+        raise ReobjError(f"{path}: expected an object with `frames` (nerfstudio, instant-ngp) or `poses` (Record3D)")
+    return content
+
+
+def _rigid(matrix: Array, where: Sequence[str]) -> Array:
+    """Check rigid transforms (N, 3 or 4, 4) and return (N, 3, 4) with exact rotations; rows of NaN
+    or inf: NaN.
+    """
+    lost = ~np.isfinite(matrix).all((1, 2))
+    matrix = np.where(lost[:, None, None], np.eye(4)[: matrix.shape[1]], matrix)
+    rotation = matrix[:, :3, :3]
+    tolerance = PosesConfig().pose_tolerance
+    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))  # (N,)
+    if matrix.shape[1] == 4:
+        transposed = np.abs(matrix[:, 3] - [0, 0, 0, 1]).max(1) > tolerance
+        _refuse(transposed, where, "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)")
+    what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular); expected a row-major rigid pose"
+    _refuse(off > tolerance, where, f"{what} without scale")
+    _refuse(np.linalg.det(rotation) < 0, where, "the rotation is mirrored (determinant -1); turn two axes, not one")
+    u, _, vt = np.linalg.svd(rotation)
+    exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
+    return np.where(lost[:, None, None], np.nan, exact)
+
+
+def _refuse(bad: BoolArray, where: Sequence[str], problem: str) -> None:
+    if bad.any():
+        raise ReobjError(f"{where[int(np.argmax(bad))]}: {problem}")
+
+
+def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
+    """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations
+    (N, 3).
+    """
+    norm = np.linalg.norm(xyzw, axis=1)
+    what = "the quaternion is not of length 1; expected the columns of the format in its order"
+    _refuse(np.abs(norm - 1) > PosesConfig().pose_tolerance, where, what)
+    return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
+
+
+def _given_tum(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam, xyzw; metres unless our own header
+    says otherwise.
+    """
+    rows, where = _number_rows(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
+    world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
+    metric = not any(line.startswith("#") and _NO_SCALE in line for line in _lines(path))
+    return _GivenPoses(invert_rigid(world_from_cam), stamps_s=rows[:, 0], metric=metric)
+
+
+_NO_SCALE = "units: arbitrary"
+
+
+def _given_kitti(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """KITTI: a row-major 3x4 (or 4x4) world_from_cam a line, one line for each frame of the source;
+    metres.
+    """
+    rows, where = _number_rows(path, (12, 16), "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam")
+    return _GivenPoses(invert_rigid(_rigid(rows.reshape(len(rows), -1, 4), where)), metric=True)
+
+
+def _given_arkitscenes(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """ARKitScenes .traj: `t rx ry rz tx ty tz`, axis-angle, cam_from_world, metres."""
+    rows, _ = _number_rows(path, (7,), "ARKitScenes rows: t rx ry rz tx ty tz")
+    rotation = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
+    return _GivenPoses(np.concatenate([rotation, rows[:, 4:, None]], 2), stamps_s=rows[:, 0], metric=True)
+
+
+_CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
+
+
+def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """Record3D metadata: `poses` [qx qy qz qw tx ty tz] world_from_cam in OpenGL axes, `K`
+    column-major; y up.
+    """
+    data = _json_object(path)
+    try:
+        rows = np.array(data["poses"], np.float64).reshape(-1, 7)
+        fx, fy, cx, cy = (float(data["K"][i]) for i in (0, 4, 6, 7))
+        camera = Camera("PINHOLE", int(data["w"]), int(data["h"]), (fx, fy, cx, cy))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ReobjError(f"{path}: no Record3D metadata ({error!r}); expected poses (N x 7), K (9), w and h") from None
+    where = [f"{path}, poses[{i}]" for i in range(len(rows))]
+    world_from_gl = _from_quaternions(rows[:, :4], rows[:, 4:], where)
+    poses = _CV_FROM_GL @ invert_rigid(world_from_gl)
+    return _GivenPoses(poses, camera, metric=True, up_in_world=np.array([0, 1.0, 0]))
+
+
+def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """ScanNet `pose/<frame>.txt` (also 7-Scenes `*.pose.txt`): 4x4 world_from_cam, metres; inf:
+    lost frame; z up.
+    """
+    folder = path / "pose" if (path / "pose").is_dir() else path
+    files = sorted(file for file in folder.glob("*.txt") if file.stem[-1:].isdigit() or file.stem.endswith(".pose"))
+    if not files:
+        raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
+    tables = [np.array([line.split() for line in _lines(file) if line.strip()], object) for file in files]
+    _refuse(np.array([t.shape != (4, 4) for t in tables]), [str(f) for f in files], "expected 4 rows of 4 numbers")
+    world_from_cam = _rigid(np.array(tables, np.float64), [str(file) for file in files])
+    intrinsic = path / "intrinsic" / "intrinsic_color.txt"
+    camera = None
+    if intrinsic.exists():
+        K, _ = _number_rows(intrinsic, (3, 4), "a 3x3 or 4x4 matrix")
+        camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
+    up = np.array([0, 0, 1.0]) if folder.name == "pose" else None
+    names = tuple(file.stem for file in files)
+    return _GivenPoses(invert_rigid(world_from_cam), camera, names, metric=True, up_in_world=up)
+
+
+def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """transforms.json of nerfstudio or instant-ngp: world_from_cam in OpenGL axes; scale unknown.
+
+    nerfstudio turned the world by `applied_transform`; this is undone: T_cv = inv(A) T diag(1, -1,
+    -1, 1).
+    """
+    path = path / "transforms.json" if path.is_dir() else path
+    data = _json_object(path)
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise ReobjError(f"{path}: no `frames` in it; expected the transforms.json of nerfstudio or instant-ngp")
+    where = [f"{path}, frames[{i}]" for i in range(len(frames))]
+    try:
+        matrix = np.array([f["transform_matrix"] for f in frames], np.float64).reshape(-1, 4, 4)
+        names = tuple(str(f["file_path"]) for f in frames)
+        cameras = [_transforms_camera({**data, **f}, size) for f in frames]
+        applied = np.eye(4)
+        applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ReobjError(f"{path}: a frame without a 4x4 transform_matrix and file_path ({error!r})") from None
+    gl_from_world = invert_rigid(_rigid(matrix, where)) @ applied  # (N, 3, 4)
+    return _GivenPoses(_CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
+
+
+def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | None:
+    """Make the camera of a transforms.json frame, None without a focal length."""
+    width, height = int(data.get("w", size[0])), int(data.get("h", size[1]))
+    focal = data.get("fl_x")
+    if focal is None and "camera_angle_x" in data:
+        focal = 0.5 * width / math.tan(0.5 * float(data["camera_angle_x"]))
+    if focal is None:
+        return None
+    fisheye = data.get("is_fisheye") or "FISHEYE" in str(data.get("camera_model", "")).upper()
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+    pinhole = (focal, data.get("fl_y", focal), data.get("cx", width / 2), data.get("cy", height / 2))
+    params = tuple(float(v) for v in (*pinhole, *(data.get(key, 0) for key in keys)))
+    if not fisheye and not any(params[4:]):
+        return Camera("PINHOLE", width, height, params[:4])
+    return Camera("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, params)
+
+
+def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
+    """The one camera of all images; slightly different ones (autofocus) are replaced by the median
+    one.
+    """
+    found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
+    if not found:
+        return None
+    middle = found[len(found) // 2]
+    same = all((c.model, c.width, c.height) == (middle.model, middle.width, middle.height) for c in found)
+    if not same or found[-1].params[0] > (1 + PosesConfig().max_focal_spread) * found[0].params[0]:
+        raise ReobjError(f"{path}: several different cameras; expected one camera for the whole video (single_camera)")
+    return middle
+
+
+_COLMAP_PARAMS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
+}  # fmt: skip
+
+
+def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """COLMAP model, text or binary (preferred), with or without rigs: cam_from_world; scale
+    unknown.
+    """
+    start = path if path.is_dir() else path.parent
+    folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
+    for suffix, read in ((".bin", _colmap_binary), (".txt", _colmap_text)):
+        for folder in folders:
+            if (folder / f"images{suffix}").exists():
+                return read(folder)
+    raise ReobjError(f"{path}: no images.bin or images.txt in it; expected a COLMAP model, or see --pose-format")
+
+
+def _colmap_binary(folder: Path) -> _GivenPoses:
+    try:
+        model = _read_model(folder)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise ReobjError(f"{folder}: not a COLMAP model ({str(error).splitlines()[0]}); write it again") from None
+    if not model.names:
+        raise ReobjError(f"{folder}: the COLMAP model has no registered image")
+    camera = _one_camera(model.cameras, folder)
+    return _GivenPoses(model.cam_from_world, camera, model.names, points=model.points, colors=model.colors)
+
+
+def _colmap_text(folder: Path) -> _GivenPoses:
+    cameras = {}
+    for at, words in _word_rows(folder / "cameras.txt"):
+        count = _COLMAP_PARAMS.get(words[1] if len(words) > 3 else "")
+        if count is None or len(words) != 4 + count:
+            raise ReobjError(f"{at}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] with a known model, all parameters")
+        cameras[words[0]] = Camera(words[1], int(words[2]), int(words[3]), tuple(float(w) for w in words[4:]))
+    rows, where, names, used, points_next = [], [], [], [], False
+    for at, words in _word_rows(folder / "images.txt", blank=True):
+        points_line = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
+        if points_line and (points_next or not words):  # models of poses only may lack this line
+            points_next = False
+            continue
+        try:
+            rows.append([float(w) for w in words[1:8]])
+            used.append(cameras[words[8]])
+            names.append(" ".join([words[9], *words[10:]]))
+        except (ValueError, IndexError, KeyError):
+            raise ReobjError(f"{at}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
+        where.append(at)
+        points_next = True
+    if not rows:
+        raise ReobjError(f"{folder / 'images.txt'}: no images in it")
+    table = np.array(rows)
+    poses = _from_quaternions(table[:, [1, 2, 3, 0]], table[:, 4:], where)
+    file = folder / "points3D.txt"
+    points = np.array([w[1:7] for _, w in _word_rows(file)] if file.exists() else [], np.float64).reshape(-1, 6)
+    camera = _one_camera(used, folder)
+    return _GivenPoses(poses, camera, tuple(names), points=points[:, :3], colors=points[:, 3:].astype(np.uint8))
+
+
+def _word_rows(path: Path, blank: bool = False) -> Iterator[tuple[str, list[str]]]:
+    """Yield where and the words of each line that is no comment, blank lines on request."""
+    for number, text in enumerate(_lines(path), 1):
+        words = text.split()
+        if (words or blank) and not text.lstrip().startswith("#"):
+            yield f"{path}, line {number}", words
+
+
+_POSE_READERS: dict[str, Callable[[Path, tuple[int, int]], _GivenPoses]] = {
+    "colmap": _given_colmap,
+    "tum": _given_tum,
+    "kitti": _given_kitti,
+    "transforms": _given_transforms,
+    "scannet": _given_scannet,
+    "record3d": _given_record3d,
+    "arkitscenes": _given_arkitscenes,
+}
+
+
+def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera:
+    """Bring intrinsics to the frames' size; another shape of image is refused."""
+    if (camera.width, camera.height) == size:
+        return camera
+    if abs(camera.width * size[1] - camera.height * size[0]) > max(camera.width, camera.height, *size):
+        raise ReobjError(
+            f"{path}: the poses are of {camera.width}x{camera.height} images, the frames are {size[0]}x{size[1]}; "
+            "expected the same shape (rotated or cropped video?)"
+        )
+    return Camera(camera.model, *size, tuple(_pycolmap_camera(camera, size).params.tolist()))
+
+
+def _rows_of_frames(
+    given: _GivenPoses, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
+) -> tuple[IntArray, list[str]]:
+    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order.
+    """
+    count = len(given.cam_from_world)
+    messages: list[str] = []
+    if given.names:
+        row = _rows_by_name(given.names, frame, names)
+        what = f"images {given.names[0]!r} ..., frames {names[0] if len(names) else frame[0]!r} ..."
+    elif given.stamps_s is not None:
+        row, messages = _rows_by_time(given.stamps_s, frame, time_s)
+        what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
+    else:
+        row = np.arange(count) if count == len(frame) else frame.copy()
+        what = f"{count} rows, frame numbers up to {frame.max()}; expected one row a frame"
+        row[row >= count] = -1
+        if frame.max() >= count != len(frame):
+            raise ReobjError(f"{path}: {what}")
+    if (row < 0).all():
+        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({what})")
+    return row, messages
+
+
+def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
+    """Match by path, file name or stem; otherwise by the last number in the name (from 0, or from 1
+    without a 0).
+    """
+    keys: list[Callable[[str], str]] = [str, lambda n: Path(n).name, lambda n: Path(n).stem]
+    for key in keys:
+        rows = {key(name): r for r, name in enumerate(given)}
+        found = np.array([rows.get(key(name), -1) for name in names], np.int64)
+        if (found >= 0).any():
+            return found
+    digits = [re.findall(r"\d+", Path(name).stem) for name in given]
+    numbers = np.array([int(d[-1]) if d else -1 for d in digits])  # (N,)
+    from_one = 0 not in numbers and 1 in numbers and numbers.max() > frame.max()
+    row_of = dict(zip((numbers - from_one).tolist(), range(len(given)), strict=True))
+    return np.array([row_of.get(n, -1) for n in frame.tolist()], np.int64)
+
+
+def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
+    """Match the nearest stamp within half a frame; stamps of another clock only if there is one for
+    each frame.
+    """
+    if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
+        return np.arange(len(frame)), ["time stamps are of another clock than the frames: matched in order"]
+    steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
+    half = 0.5 * float(np.median(steps)) if len(steps) else PosesConfig().lone_frame_s
+    nearest = np.abs(stamps_s[None] - time_s[:, None]).argmin(1)  # (F,)
+    return np.where(np.abs(stamps_s[nearest] - time_s) <= half * (1 + 1e-6), nearest, -1), []
+
+
+# Check of direction and axes
+
+
+def check_poses(
+    poses: Poses, tracks: Sequence[tuple[IntArray, Array]], config: PosesConfig | None = None
+) -> str | None:
+    """Find out whether poses are given in the wrong direction or with the wrong axes.
+
+    Triangulates the box centres of tracks with the poses as they are, inverted, and with OpenGL
+    axes; the residual is the angle between a ray and the direction to the point (180 deg when it is
+    behind the camera).
+
+    Args:
+        tracks: per track frame numbers (n,) and centres (n, 2), native pixels.
+    Returns:
+        a message that names the likely mistake if another reading explains the tracks clearly
+        better, else None.
+    """
+    config = config or PosesConfig()
+    usual = poses.cam_from_world
+    readings = {
+        "as they are": usual,
+        "world_from_cam given as cam_from_world, or the other way round": invert_rigid(usual),
+        "OpenGL axes (y up, z backward) given as OpenCV axes (y down, z forward), or the other way round":
+            _CV_FROM_GL @ usual,
+        "inverted and with OpenGL axes": _CV_FROM_GL @ invert_rigid(usual),
+    }  # fmt: skip
+    views = [view for track in tracks if (view := _track_views(poses, *track, config)) is not None]
+    views = sorted(views, key=lambda v: -len(v[0]))[: config.check_most_tracks]
+    if len(views) < config.check_tracks:
+        return None
+    angle = {
+        text: float(np.median([_ray_error_deg(reading[at], rays) for at, rays in views]))
+        for text, reading in readings.items()
+    }
+    asis = angle.pop("as they are")
+    best = min(angle.values())
+    if asis < config.check_angle_deg or best > config.check_ratio * asis:
+        return None
+    likely = " or ".join(text for text, value in angle.items() if value <= 1.5 * best)
+    return (
+        f"the poses look like {likely}: {len(views)} tracks meet in 3D within {best:.1f} deg when read that way, "
+        f"{asis:.1f} deg as they are; check --pose-format and the file's convention"
+    )
+
+
+def _track_views(poses: Poses, frame: IntArray, xy: Array, config: PosesConfig) -> tuple[IntArray, Array] | None:
+    """Rows of the frames of a track that have a pose, thinned, and unit rays (n, 3) in the camera;
+    None if too few.
+    """
+    place = np.clip(np.searchsorted(poses.frame, frame), 0, len(poses.frame) - 1)
+    use = np.flatnonzero((poses.frame[place] == frame) & poses.known[place] & np.isfinite(xy).all(1))
+    if len(use) < config.check_views:
+        return None
+    use = use[np.unique(np.linspace(0, len(use) - 1, min(len(use), config.check_most_views)).round().astype(int))]
+    ideal = poses.camera.undistort(xy[use])
+    rays = np.column_stack([ideal, np.ones(len(use))]) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
+    return place[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
+    """Meet rays (n, 3) of n cameras (n, 3, 4) in the nearest point or, if better, at infinity;
+    median angle to it.
+    """
+    world_from_cam = invert_rigid(cam_from_world)
+    ray, centre = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam), world_from_cam[:, :, 3]
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3) sum_i (I - d d') (X - c) = 0
+    point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centre), rcond=1e-9)[0]
+    toward = np.stack([point - centre, np.broadcast_to(ray.mean(0), ray.shape)])  # (2, n, 3)
+    cosine = (ray * toward).sum(2) / np.maximum(np.linalg.norm(toward, axis=2), 1e-12)
+    return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)), axis=1).min()))
+
+
+# Writers
+
+
+def write_tum(path: Path, poses: Poses) -> None:
+    """Write the known poses as TUM rows: world_from_cam, seconds, quaternion xyzw."""
+    world_from_cam = invert_rigid(poses.cam_from_world[poses.known])
+    xyzw = Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat() if len(world_from_cam) else np.empty((0, 4))
+    table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
+    units = "units: metres" if poses.metric else _NO_SCALE
+    rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
+    path.write_text("\n".join([f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})", *rows]) + "\n")
+
+
+def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
+    """Write a COLMAP text model of all known poses and points; pycolmap's own binary model is kept
+    if there is one.
+
+    Args:
+        image_names: (F,) name of every frame of `poses`.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    if poses.source == "pycolmap" and (path / "images.bin").exists():
+        return
+    for old in path.glob("*.bin"):
+        old.unlink()
+    camera = poses.camera
+    numbers = " ".join(repr(float(p)) for p in camera.params)
+    (path / "cameras.txt").write_text(f"1 {camera.model} {camera.width} {camera.height} {numbers}\n")
+    lines = []
+    for i in np.flatnonzero(poses.known).tolist():
+        xyzw = Rotation.from_matrix(poses.cam_from_world[i, :, :3]).as_quat()
+        values = (*xyzw[[3, 0, 1, 2]], *poses.cam_from_world[i, :, 3])
+        lines.append(f"{i + 1} {' '.join(repr(float(v)) for v in values)} 1 {image_names[i]}\n\n")
+    (path / "images.txt").write_text("".join(lines))
+    points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
+    rows = [f"{i} {x!r} {y!r} {z!r} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(points, 1)]
+    (path / "points3D.txt").write_text("".join(rows))
+
+
+# ---- Objects: tracklets -> one identity and one solid each -------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class TrackTable:
+    """All tracked detections of a video, one row each (N rows), ordered by frame.
+
+    Attributes:
+        frame: source frame numbers; object_id: identity from 1; tracklet_id: uninterrupted piece of
+            track.
+        xyxy: (N, 4) in the video's native pixels; score; class_id; detection_index: row among the
+            frame's detections.
+    """
+
+    frame: IntArray
+    object_id: IntArray
+    tracklet_id: IntArray
+    xyxy: Array
+    score: Array
+    class_id: IntArray
+    detection_index: IntArray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, keep: Any) -> TrackTable:
+        return TrackTable(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+
+    def with_objects(self, object_id: IntArray) -> TrackTable:
+        """The same rows with other identities, renumbered 1, 2, ... by first appearance."""
+        _, first, inverse = np.unique(object_id, return_index=True, return_inverse=True)
+        rank = np.empty(len(first), np.int64)
+        rank[np.argsort(first)] = np.arange(1, len(first) + 1)
+        return dataclasses.replace(self, object_id=rank[inverse.ravel()])
+
+    @staticmethod
+    def from_steps(frames: Sequence[int], steps: Sequence[Tracks], scale: float) -> TrackTable:
+        """Collect the results of `Tracker.step`; tentative rows get the identity that was confirmed
+        later.
+        """
+        frame = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
+        joined = {
+            f.name: np.concatenate([getattr(s, f.name) for s in steps]) if steps else np.empty(0)
+            for f in dataclasses.fields(Tracks)
+        }
+        tracklets, inverse = np.unique(joined["tracklet_id"].astype(np.int64), return_inverse=True)
+        identity = np.zeros(len(tracklets), np.int64)
+        np.maximum.at(identity, inverse, joined["track_id"].astype(np.int64))
+        table = TrackTable(
+            frame,
+            identity[inverse],
+            tracklets[inverse],
+            joined["xyxy"].reshape(-1, 4) / scale,
+            joined["score"],
+            joined["class_id"].astype(np.int64),
+            joined["detection_index"].astype(np.int64),
+        )
+        return table[table.object_id > 0]
+
+
+def object_classes(table: TrackTable) -> dict[int, int]:
+    """Class of each object: the one with the largest sum of scores."""
+    votes: dict[int, dict[int, float]] = {}
+    for obj, cls, score in zip(
+        table.object_id.tolist(), table.class_id.tolist(), table.score.tolist(), strict=True
+    ):
+        counts = votes.setdefault(obj, {})
+        counts[cls] = counts.get(cls, 0.0) + score
+    return {
+        obj: max(counts, key=lambda c: (counts[c], -c)) for obj, counts in sorted(votes.items())
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """Boxes of G groups of track rows in the V frames that have a pose: the input of
+    `quadrics.fit_objects`.
+
+    Attributes:
+        frame: (V,) source frames; boxes: (V, G, 4) undistorted pixels, NaN where unseen; score: (V,
+            G).
+        img_from_world: (V, 3, 4).
+    """
+
+    frame: IntArray
+    boxes: Array
+    score: Array
+    img_from_world: Array
+    image_size: tuple[int, int]
+
+
+def gather_views(
+    table: TrackTable, poses: Poses, groups: IntArray, count: int, min_score: float
+) -> Views:
+    """Spread the track rows over frames and groups.
+
+    Args:
+        groups: (N,) group of each row of the table, 0 .. count - 1.
+        min_score: rows below it are left out.
+    """
+    row_of_frame = {int(f): i for i, f in enumerate(poses.frame[poses.known])}
+    view = np.array([row_of_frame.get(int(f), -1) for f in table.frame], np.int64)  # (N,)
+    use = (view >= 0) & (table.score >= min_score)
+    boxes = np.full((len(row_of_frame), count, 4), np.nan)
+    score = np.zeros((len(row_of_frame), count))
+    boxes[view[use], groups[use]] = _undistort_boxes(table.xyxy[use], poses.camera)
+    score[view[use], groups[use]] = table.score[use]
+    img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (V, 3, 4)
+    size = (poses.camera.width, poses.camera.height)
+    return Views(poses.frame[poses.known], boxes, score, img_from_world, size)
+
+
+def _undistort_boxes(xyxy: Array, camera: Camera) -> Array:
+    """Boxes in the ideal pinhole image: each edge through the undistorted middle of the edge;
+    border edges stay.
+    """
+    if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return xyxy
+    x1, y1, x2, y2 = xyxy.T
+    middle_x, middle_y = (x1 + x2) / 2, (y1 + y2) / 2
+    edges = np.stack(
+        [
+            np.stack([x1, middle_y], 1),
+            np.stack([middle_x, y1], 1),
+            np.stack([x2, middle_y], 1),
+            np.stack([middle_x, y2], 1),
+        ],
+        1,
+    )  # (N, 4, 2)
+    ideal = camera.undistort(edges)
+    undistorted = np.stack(
+        [ideal[:, 0, 0], ideal[:, 1, 1], ideal[:, 2, 0], ideal[:, 3, 1]], 1
+    )  # (N, 4)
+    limit = np.array([camera.width, camera.height] * 2)
+    at_border = (xyxy <= 1) | (xyxy >= limit - 1)
+    return np.where(at_border, xyxy, undistorted)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkEvent:
+    """A join or a split of tracklets and its evidence (IoU of cross-projection, similarity of
+    looks).
+    """
+
+    kind: str
+    tracklets: tuple[int, ...]
+    place_iou: float
+    look: float
+    kept: bool
+
+
+class Linker:
+    """Decide over the whole video which tracklets are one object.
+
+    Atoms are the tracklets, cut at gaps (where a tracker slips to a twin); those that the tracker
+    recognised as one identity start together. A start is undone where two well-measured places
+    differ; groups that explain each other's boxes are joined, refitted and kept only if the joint
+    solid overlaps the boxes of both in most frames (merge, re-project, undo: the idea of OA-SLAM).
+    Two tracklets seen in one frame are never the same object.
+
+    Args:
+        table: track rows with the tracker's identities.
+        similarity: (I, I) normalised similarity of the tracker's identities (0: as different, 1: as
+            same objects).
+    """
+
+    def __init__(
+        self,
+        table: TrackTable,
+        similarity: Array,
+        poses: Poses,
+        fit: Callable[[Views, list[int]], Any],
+        config: ObjectsConfig,
+    ) -> None:
+        self.table, self.poses, self.fit, self.config = table, poses, fit, config
+        self.atom, first = _segments_of(table, config.cut_gap)  # (N,), (L,)
+        self.tracklets = table.tracklet_id[first]  # (L,)
+        self.identity = table.object_id[first] - 1  # (L,)
+        self.similarity = similarity
+        self.group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
+        self.classes = _majority(table.class_id, table.score, self.atom, len(self.tracklets))
+        self.together = self._seen_together()
+        self.events: list[LinkEvent] = []
+
+    def run(self) -> IntArray:
+        """Return the object of every row of the table, (N,), any numbering."""
+        self._split()
+        rejected: set[tuple[int, ...]] = set()
+        while self._join_round(rejected):
+            pass
+        return np.asarray(self.group[self.atom], np.int64)
+
+    def _seen_together(self) -> BoolArray:
+        """(L, L): tracklets with a detection in the same frame."""
+        frames, row = np.unique(self.table.frame, return_inverse=True)
+        seen = np.zeros((len(self.tracklets), len(frames)), np.float32)
+        seen[self.atom, row] = 1
+        return np.asarray(seen @ seen.T > 0)
+
+    def _cross_iou(self, labels: IntArray, count: int) -> tuple[Array, Array]:
+        """Fit all groups of atoms; how well does each solid explain the boxes of each other group?
+
+        Returns:
+            place: (G, G) median IoU of solid g in the frames of group h.
+            own: (V, G) IoU of each solid with its own boxes.
+        """
+        rows = labels[self.atom]  # (N,)
+        views = gather_views(self.table, self.poses, rows, count, self.config.min_score)
+        classes = _majority(self.table.class_id, self.table.score, rows, count)
+        fits = self.fit(views, classes.tolist())
+        solids = quadrics.solid_boxes(
+            fits.ellipsoids, list(fits.support), views.img_from_world
+        )  # (V, G, 4)
+        solids = quadrics.clip_boxes(solids, views.image_size)
+        place = np.zeros((count, count))
+        for h in range(count):  # over groups: each is one vectorised comparison
+            seen = np.flatnonzero(np.isfinite(views.boxes[:, h, 0]))
+            if len(seen):
+                iou = _paired_iou(solids[seen], views.boxes[seen, h][:, None])  # (n, G)
+                place[:, h] = np.median(iou, 0)
+        return place, _paired_iou(solids, views.boxes)
+
+    def _split(self) -> None:
+        """Undo returns whose places differ: tracklets that the joint solid of their identity does
+        not explain.
+
+        Nothing is split on a poor fit alone: the tracklet's own solid must explain its boxes much
+        better, and its place must not overlap those that the joint solid does explain.
+        """
+        count, groups = len(self.tracklets), int(self.group.max()) + 1
+        if groups == count:
+            return
+        place, own = self._cross_iou(np.arange(count), count)
+        _, joint = self._cross_iou(self.group, groups)
+        atoms = range(count)
+        alone = np.array([self._median_iou(own[:, a], self.atom == a) for a in atoms])  # (L,)
+        together = np.array([self._median_iou(joint[:, self.group[a]], self.atom == a) for a in atoms])
+        worse = together < self.config.split_drop * alone
+        length = np.bincount(self.atom, minlength=count)
+        for g in np.flatnonzero(np.bincount(self.group) > 1):
+            members = np.flatnonzero(self.group == g)
+            anchors = members[~worse[members]]
+            anchors = anchors if len(anchors) else members[[np.argmax(length[members])]]
+            for atom in np.setdiff1d(members, anchors):
+                iou = float(max(place[anchors, atom].max(), place[atom, anchors].max()))
+                if iou < self.config.split_place:
+                    self.group[atom] = self.group.max() + 1
+                    ids = (int(self.tracklets[anchors[0]]), int(self.tracklets[atom]))
+                    self.events.append(LinkEvent("split", ids, iou, 1.0, True))
+
+    def _join_round(self, rejected: set[tuple[int, ...]]) -> bool:
+        """Join the best disjoint pairs of groups; returns whether another round could find more."""
+        labels, self.group = np.unique(self.group, return_inverse=True)
+        count = len(labels)
+        place, _ = self._cross_iou(self.group, count)
+        pairs = self._candidates(place, count, rejected)
+        if not pairs:
+            return False
+        proposal = np.arange(count)
+        for a, b, _, _ in pairs:
+            proposal[b] = a
+        _, own = self._cross_iou(
+            np.unique(proposal[self.group], return_inverse=True)[1], len(np.unique(proposal))
+        )
+        column = np.unique(proposal, return_inverse=True)[1]
+        for a, b, iou, look in pairs:
+            kept = self._verify(own[:, column[a]], a, b)
+            ids = tuple(sorted(self.tracklets[(self.group == a) | (self.group == b)].tolist()))
+            self.events.append(LinkEvent("join", ids, iou, look, kept))
+            rejected.add(ids)
+            if kept:
+                self.group[self.group == b] = a
+        return True
+
+    def _candidates(
+        self, place: Array, count: int, rejected: set[tuple[int, ...]]
+    ) -> list[tuple[int, int, float, float]]:
+        """Disjoint pairs of groups worth a joint fit: (a, b, cross IoU, look), best first."""
+        member = np.zeros((count, len(self.group)), np.float32)
+        member[self.group, np.arange(len(self.group))] = 1
+        apart = member @ self.together.astype(np.float32) @ member.T > 0  # (G, G) cannot be one
+        classes = _majority(self.table.class_id, self.table.score, self.group[self.atom], count)
+        look = self._look(count)
+        score = np.maximum(place, place.T)
+        good = ~apart & (classes[:, None] == classes[None]) & (score >= self.config.link_place)
+        good &= look >= self.config.link_look
+        a, b = np.nonzero(np.triu(good, 1))
+        pairs: list[tuple[int, int, float, float]] = []
+        used: set[int] = set()
+        for i in np.argsort(-(score[a, b] + 0.5 * look[a, b]), kind="stable"):
+            pair = (int(a[i]), int(b[i]))
+            ids = tuple(sorted(self.tracklets[np.isin(self.group, pair)].tolist()))
+            if ids not in rejected and not used & set(pair):
+                used |= set(pair)
+                pairs.append((*pair, float(score[pair]), float(look[pair])))
+        return pairs
+
+    def _look(self, count: int) -> Array:
+        """(G, G) best similarity of looks between the identities that two groups hold."""
+        best = np.full((count, len(self.similarity)), -1.0)
+        np.maximum.at(best, self.group, self.similarity[self.identity])  # (G, I)
+        result = np.full((count, count), -1.0)
+        np.maximum.at(result.T, self.group, best.T[self.identity])
+        return result
+
+    def _verify(self, own_iou: Array, a: int, b: int) -> bool:
+        """Does the joint solid explain the boxes of both parts?"""
+        part = self.group[self.atom]
+        return self._explains(own_iou, part == a) and self._explains(own_iou, part == b)
+
+    def _explains(self, own_iou: Array, rows: BoolArray) -> bool:
+        """Does a solid overlap the boxes of these rows in most of their frames? own_iou: (V,)."""
+        iou = own_iou[self._views_of(rows)]
+        return bool(len(iou) and np.mean(iou >= self.config.keep_iou) >= self.config.keep_share)
+
+    def _median_iou(self, own_iou: Array, rows: BoolArray) -> float:
+        """Median overlap of a solid with the boxes of these rows; 0 if none has a pose."""
+        iou = own_iou[self._views_of(rows)]
+        return float(np.median(iou)) if len(iou) else 0.0
+
+    def _views_of(self, rows: BoolArray) -> BoolArray:
+        """(V,) frames with a pose in which one of the rows is seen."""
+        seen = self.table.frame[rows & (self.table.score >= self.config.min_score)]
+        return np.isin(self.poses.frame[self.poses.known], seen)
+
+
+def _segments_of(table: TrackTable, cut_gap: int) -> tuple[IntArray, IntArray]:
+    """Cut tracklets where more than cut_gap frames pass without a detection.
+
+    Returns:
+        segment of each row (N,), numbered from 0, and the first row of each segment (L,).
+    """
+    order = np.lexsort((table.frame, table.tracklet_id))
+    tracklet, frame = table.tracklet_id[order], table.frame[order]
+    begins = np.append(True, (np.diff(tracklet) != 0) | (np.diff(frame) > cut_gap))[: len(order)]
+    segment = np.empty(len(order), np.int64)
+    segment[order] = np.cumsum(begins) - 1
+    return segment, order[begins]
+
+
+def _paired_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
+    """IoU of boxes paired by broadcasting (..., 4); 0 where one is NaN."""
+    overlap = np.minimum(a_xyxy[..., 2:], b_xyxy[..., 2:]) - np.maximum(
+        a_xyxy[..., :2], b_xyxy[..., :2]
+    )
+    inter = overlap.clip(0).prod(-1)
+    union = (
+        (a_xyxy[..., 2:] - a_xyxy[..., :2]).prod(-1)
+        + (b_xyxy[..., 2:] - b_xyxy[..., :2]).prod(-1)
+        - inter
+    )
+    return np.nan_to_num(np.asarray(inter / np.maximum(union, 1e-9), np.float64))
+
+
+def _majority(class_id: IntArray, score: Array, group: IntArray, count: int) -> IntArray:
+    """Class with the largest sum of scores in each group, (count,)."""
+    votes = np.zeros((count, int(class_id.max(initial=0)) + 1))
+    np.add.at(votes, (group, class_id.clip(0)), score)
+    return np.asarray(votes.argmax(1), np.int64)
+
+
+# ---- Writers -----------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Write a file under a temporary name beside it and move it into place only when it is
+    complete.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".part-{path.name}")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_mot(path: Path, table: TrackTable) -> None:
+    """Write tracks as MOTChallenge results: frame (1-based), id, left, top, width, height, score,
+    -1, -1, -1.
+    """
+    with atomic(path) as part, part.open("w") as file:
+        for frame, obj, box, score in zip(
+            table.frame, table.object_id, table.xyxy, table.score, strict=True
+        ):
+            left, top, right, bottom = box
+            file.write(
+                f"{frame + 1},{obj},{left:.2f},{top:.2f},{right - left:.2f},{bottom - top:.2f},"
+                f"{score:.4f},-1,-1,-1\n"
+            )
+
+
+def write_ply(
+    path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int], detail: int
+) -> None:
+    """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world
+    coordinates.
+    """
+    sphere, faces = _icosphere(detail)  # (P, 3), (T, 3)
+    half = ellipsoids.half_axes[:, None] * sphere  # (O, P, 3)
+    points = (
+        np.einsum("oij,opj->opi", ellipsoids.world_from_obj, half)
+        + ellipsoids.center_in_world[:, None]
+    )
+    colors = np.array([object_color(i)[::-1] for i in object_id], np.uint8).reshape(-1, 3)  # RGB
+    vertex = np.zeros(points.shape[:2], [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertex["xyz"], vertex["rgb"] = points, colors[:, None]
+    face = np.zeros((len(points), len(faces)), [("n", "u1"), ("i", "<i4", 3)])
+    face["n"], face["i"] = 3, faces + (np.arange(len(points)) * len(sphere))[:, None, None]
+    names = "".join(
+        f"property {t} {n}\n"
+        for t, n in [
+            ("float", "x"),
+            ("float", "y"),
+            ("float", "z"),
+            ("uchar", "red"),
+            ("uchar", "green"),
+            ("uchar", "blue"),
+        ]
+    )
+    header = (
+        "ply\nformat binary_little_endian 1.0\ncomment reobj_track ellipsoids\n"
+        f"element vertex {vertex.size}\n"
+        f"{names}element face {face.size}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    with atomic(path) as part:
+        part.write_bytes(header.encode() + vertex.tobytes() + face.tobytes())
+
+
+def _icosphere(detail: int) -> tuple[Array, IntArray]:
+    """Unit sphere as triangles: points (P, 3) and faces (T, 3); `detail` subdivisions of an
+    octahedron.
+    """
+    points = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+    vertices = [np.array(p, np.float64) for p in points]
+    faces = [(a, b, c) for a, b in ((0, 2), (2, 1), (1, 3), (3, 0)) for c in (4, 5)]
+    faces = [(a, b, c) if c == 4 else (b, a, c) for a, b, c in faces]
+    for _ in range(detail + 1):
+        middle: dict[tuple[int, int], int] = {}
+
+        def between(a: int, b: int, middle: dict[tuple[int, int], int] = middle) -> int:
+            key = (min(a, b), max(a, b))
+            if key not in middle:
+                point = vertices[a] + vertices[b]
+                vertices.append(point / np.linalg.norm(point))
+                middle[key] = len(vertices) - 1
+            return middle[key]
+
+        split = [(a, b, c, between(a, b), between(b, c), between(c, a)) for a, b, c in faces]
+        faces = [
+            t
+            for a, b, c, ab, bc, ca in split
+            for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        ]
+    return np.array(vertices), np.array(faces, np.int64)
+
+
+OBJECT_FIELDS: dict[str, tuple[type, ...]] = {  # of objects.json: name -> types of its value
+    "id": (int,),
+    "class": (str,),
+    "score": (float, int),
+    "status": (str,),
+    "reason": (str,),
+    "support": (str, type(None)),
+    "center": (list, type(None)),
+    "half_axes": (list, type(None)),
+    "quat_wxyz": (list, type(None)),
+    "size": (list, type(None)),
+    "size_m": (list, type(None)),
+    "size_rel_sigma": (list, type(None)),
+    "cov": (list, type(None)),
+    "views": (int,),
+    "frames_seen": (int,),
+    "parallax_deg": (float, int, type(None)),
+    "dropped_boxes": (int,),
+    "reprojection_iou_median": (float, int, type(None)),
+    "tracks": (list,),
+    "frames": (list,),
+}
+STATUSES = ("ok", "prior_dominated", "rejected")
+
+
+def validate_objects(path: Path) -> list[str]:
+    """Check an objects.json against the format; returns one line for each fault, none if it is
+    valid.
+    """
+    try:
+        data = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ReobjError(f"{path}: cannot be read as JSON ({error})") from error
+    if not isinstance(data, dict) or data.get("format") != "reobj-objects":
+        return [f'{path}: expected a JSON object with "format": "reobj-objects"']
+    faults = [
+        f"{path}: missing key {key!r}"
+        for key in ("version", "video", "world", "conventions", "objects")
+        if key not in data
+    ]
+    seen: set[int] = set()
+    for i, obj in enumerate(data.get("objects", [])):
+        where = f"{path}: objects[{i}]"
+        faults += [f"{where}: {fault}" for fault in _object_faults(obj)]
+        if obj.get("id") in seen:
+            faults.append(f"{where}: id {obj.get('id')} occurs twice")
+        seen.add(obj.get("id"))
+    return faults
+
+
+def _object_faults(obj: dict[str, Any]) -> list[str]:
+    """Faults of one entry of objects.json."""
+    faults = [f"missing key {key!r}" for key in OBJECT_FIELDS if key not in obj]
+    faults += [
+        f"{key}: expected {' or '.join(t.__name__ for t in types)}, found {type(obj[key]).__name__}"
+        for key, types in OBJECT_FIELDS.items()
+        if key in obj and not isinstance(obj[key], types)
+    ]
+    if obj.get("status") not in STATUSES:
+        faults.append(f"status: expected one of {', '.join(STATUSES)}, found {obj.get('status')!r}")
+    for key, length in (("center", 3), ("half_axes", 3), ("size", 3), ("quat_wxyz", 4), ("cov", 9)):
+        value = obj.get(key)
+        if isinstance(value, list) and len(value) != length:
+            faults.append(f"{key}: expected {length} entries, found {len(value)}")
+    if obj.get("status") != "rejected" and obj.get("center") is None:
+        faults.append("center: missing although the object is not rejected")
+    return faults
+
+
+def quat_wxyz_from_matrix(rotation: Array) -> Array:
+    """Unit quaternions (N, 4), w first and >= 0, of rotation matrices (N, 3, 3)."""
+    if not len(rotation):
+        return np.empty((0, 4))
+    xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return np.asarray(xyzw[:, [3, 0, 1, 2]], np.float64)
+
+
+# ---- Overlay -----------------------------------------------------------------------------------
+
+
+def object_color(object_id: int) -> tuple[int, int, int]:
+    """A BGR colour for an identity, well apart from its neighbours (golden-angle hues)."""
+    hue = object_id * 0.381966 % 1.0
+    hsv = np.uint8(
+        [[[round(hue * 179), 200 - 60 * (object_id % 2), 255 - 45 * (object_id // 2 % 2)]]]
+    )
+    blue, green, red = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].tolist()
+    return blue, green, red
+
+
+def draw_tracks(image: Image, table: TrackTable, labels: dict[int, str], scale: float) -> None:
+    """Draw the boxes and identities of one frame's rows, in place.
+
+    Args:
+        labels: text of each identity; scale: image pixels per pixel of the table.
+    """
+    for obj, box in zip(table.object_id.tolist(), table.xyxy * scale, strict=True):
+        x1, y1, x2, y2 = box.round().astype(int).tolist()
+        color = object_color(obj)
+        cv2.rectangle(image, (x1, y1), (x2, y2), color, 2, cv2.LINE_AA)
+        _draw_label(image, labels.get(obj, str(obj)), x1, y1, color)
+
+
+def _draw_label(image: Image, text: str, x: int, y: int, color: tuple[int, int, int]) -> None:
+    """Text on a filled tag above (x, y), kept inside the image."""
+    (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+    x = max(0, min(x, image.shape[1] - width - 4))
+    y = max(height + base + 2, y)
+    cv2.rectangle(image, (x, y - height - base - 2), (x + width + 4, y), color, -1)
+    dark = sum(color) > 380
+    cv2.putText(
+        image,
+        text,
+        (x + 2, y - base),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.45,
+        (0,) * 3 if dark else (255,) * 3,
+        1,
+        cv2.LINE_AA,
+    )
+
+
+def draw_ellipses(
+    image: Image, dual_c: Array, visible: BoolArray, object_id: Sequence[int], seen: set[int]
+) -> None:
+    """Draw projected ellipsoids: the back-projection of the fit, thin where the object is not
+    detected now.
+
+    Args:
+        dual_c: (O, 3, 3) dual conics in pixels of `image`; visible: (O,).
+    """
+    for conic, ok, obj in zip(dual_c, visible, object_id, strict=True):
+        shape = _ellipse_of_dual_conic(conic) if ok else None
+        if shape is not None and max(shape[1]) < 4 * max(image.shape):
+            box = (shape[0], shape[1], shape[2])
+            cv2.ellipse(image, box, object_color(obj), 2 if obj in seen else 1, cv2.LINE_AA)
+
+
+def _ellipse_of_dual_conic(
+    dual_c: Array,
+) -> tuple[tuple[float, float], tuple[float, float], float] | None:
+    """Centre, full axes and angle in degrees of an ellipse, or None if it is none: C* = [S - mm',
+    -m; -m', -1].
+    """
+    conic = dual_c / -dual_c[2, 2]
+    center = -conic[:2, 2]
+    values, vectors = np.linalg.eigh(conic[:2, :2] + np.outer(center, center))
+    if not (np.isfinite(values).all() and values.min() > 0):
+        return None
+    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+    minor, major = 2 * np.sqrt(values)
+    x, y = (center - 0.5).tolist()  # OpenCV draws with the pixel's centre at 0
+    return (x, y), (float(major), float(minor)), angle
+
+
+class VideoWriter:
+    """MP4 writer that appears under its name only when it is complete."""
+
+    def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
+        self.path, self.part = path, path.with_name(f".part-{path.name}")
+        fourcc = cv2.VideoWriter.fourcc(
+            *"mp4v"
+        )  # MPEG-4 part 2: the one H.264-free codec that ships in the wheel
+        self.writer = cv2.VideoWriter(str(self.part), fourcc, fps, size)
+        if not self.writer.isOpened():
+            raise OSError(f"{path}: OpenCV cannot write this video")
+        self.size, self.count = size, 0
+
+    def write(self, image: Image) -> None:
+        self.writer.write(image)
+        self.count += 1
+
+    def close(self, complete: bool) -> None:
+        """Finish the file; keep it only if it is complete (OpenCV does not tell when the disk is
+        full).
+        """
+        self.writer.release()
+        try:
+            if complete and self._frames_on_disk() != self.count:
+                raise OSError(f"{self.path}: not all frames could be written; is the disk full?")
+            if complete:
+                self.part.replace(self.path)
+        finally:
+            self.part.unlink(missing_ok=True)
+
+    def _frames_on_disk(self) -> int:
+        capture = cv2.VideoCapture(str(self.part))
+        try:
+            return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+        finally:
+            capture.release()
+
+
+def write_overlay(
+    path: Path,
+    video: Video,
+    table: TrackTable,
+    labels: dict[int, str],
+    poses: Poses | None,
+    ellipsoids: quadrics.Ellipsoids | None,
+    object_id: Sequence[int],
+    config: OutputConfig,
+) -> None:
+    """Write a video with boxes, identities and the back-projected ellipsoids of every frame."""
+    width, height = video.size
+    shrink = min(1.0, config.overlay_size_px / max(width, height))
+    size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
+    projected = _project_all(poses, ellipsoids, size[0] / width)
+    start, stop = np.searchsorted(table.frame, [0, 0])
+    writer = VideoWriter(path, max(1.0, (video.fps or 30.0) / video.config.every), size)
+    progress, complete = Progress("overlay", video.expected), False
+    try:
+        for frame in video:
+            start, stop = np.searchsorted(table.frame, [frame.index, frame.index + 1])
+            image = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+            rows = table[slice(start, stop)]
+            if frame.index in projected:
+                draw_ellipses(
+                    image, *projected[frame.index], object_id, set(rows.object_id.tolist())
+                )
+            draw_tracks(image, rows, labels, size[0] / width)
+            writer.write(image)
+            progress.step()
+        complete = True
+    finally:
+        writer.close(complete)
+        progress.close()
+
+
+def _project_all(
+    poses: Poses | None, ellipsoids: quadrics.Ellipsoids | None, scale: float
+) -> dict[int, tuple[Array, BoolArray]]:
+    """Dual conics (O, 3, 3) and visibility (O,) of all ellipsoids for every frame with a pose, in
+    scaled pixels.
+    """
+    if (
+        poses is None
+        or ellipsoids is None
+        or not len(ellipsoids.half_axes)
+        or not poses.known.any()
+    ):
+        return {}
+    img_from_world = (
+        np.diag([scale, scale, 1.0]) @ poses.camera.K @ poses.cam_from_world[poses.known]
+    )
+    dual_c, visible = quadrics.project(ellipsoids.dual_quadrics(), img_from_world)
+    return {int(f): (dual_c[i], visible[i]) for i, f in enumerate(poses.frame[poses.known])}
+
+
+# ---- Run: the whole chain ----------------------------------------------------------------------
+
+
+@dataclass
+class RunResult:
+    """What `run` found; the same is in the files of `out`.
+
+    Attributes:
+        table: all track rows; objects: entries of objects.json; poses; fits: quadrics.ObjectFits or
+            None.
+        seconds: wall time by stage; warnings: what the user should know.
+    """
+
+    out: Path
+    table: TrackTable
+    class_names: tuple[str, ...]
+    objects: list[dict[str, Any]]
+    poses: Poses | None
+    fits: Any
+    seconds: dict[str, float]
+    warnings: list[str]
+    world: dict[str, Any] = field(default_factory=dict)
+
+
+class Workspace:
+    """The output folder: what belongs to which inputs and options.
+
+    Every stage keeps its result in OUT/cache under a hash of its inputs and options: a killed run
+    resumes, a changed option recomputes what depends on it.
+    """
+
+    def __init__(self, out: Path, overwrite: bool = False) -> None:
+        self.out, self.cache = out, out / "cache"
+        foreign = out.is_dir() and any(out.iterdir()) and not self.cache.is_dir()
+        if out.exists() and not out.is_dir():
+            raise ReobjError(f"{out}: is a file; -o wants a folder")
+        if foreign and not overwrite:
+            raise ReobjError(
+                f"{out}: is not empty and not made by reobj_track; choose another -o, "
+                "or say --overwrite"
+            )
+        self.cache.mkdir(parents=True, exist_ok=True)
+
+    def claim(self, video: Video, overwrite: bool) -> None:
+        """Bind the folder to one video, so that results of two videos never mix."""
+        path = self.cache / "source.json"
+        path_of = Path(str(video.source))
+        fingerprint = {
+            "source": str(path_of.absolute()) if path_of.exists() else str(video.source),
+            "content": source_fingerprint(video.source),
+            "input": dataclasses.asdict(video.config),
+        }
+        if path.exists() and not overwrite:
+            old = json.loads(path.read_text())
+            if old["content"] != fingerprint["content"]:
+                raise ReobjError(
+                    f"{self.out}: holds the results of {old['source']}, not of {video.source}; "
+                    "choose another -o, or say --overwrite"
+                )
+        with atomic(path) as part:
+            part.write_text(json.dumps(fingerprint))
+
+    def path(self, stage: str, *key: Any) -> Path:
+        """File of a stage's result for this key (configs and strings)."""
+        text = json.dumps(
+            [dataclasses.asdict(k) if dataclasses.is_dataclass(k) else k for k in key],
+            sort_keys=True,
+        )
+        return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
+
+    def remember(self, track: TrackResult, poses: Poses | None) -> None:
+        """Keep the latest tracks and poses for `objects OUT`."""
+        track.save(self.cache / "last-tracks.npz")
+        if poses is None:
+            (self.cache / "last-poses.npz").unlink(missing_ok=True)
+        else:
+            save_poses(self.cache / "last-poses.npz", poses)
+
+    def recall(self) -> tuple[TrackResult, Poses | None]:
+        """The latest tracks and poses."""
+        path = self.cache / "last-tracks.npz"
+        if not path.exists():
+            raise ReobjError(f"{self.out}: no tracks here; make them first with `run` or `track`")
+        poses = self.cache / "last-poses.npz"
+        return TrackResult.load(path), load_poses(poses) if poses.exists() else None
+
+
+def source_fingerprint(source: Any) -> str:
+    """Hash of names, sizes and modification times of a file or of a folder's files; the name itself
+    for streams.
+    """
+    path = Path(str(source))
+    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    if not path.exists():
+        return str(source)
+    facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
+
+
+def run(
+    source: str | Path | int,
+    out: str | Path,
+    config: Config | None = None,
+    *,
+    detections: str | Path | Callable[[Image], Any] | None = None,
+    stages: Sequence[str] = ("poses", "objects"),
+    overwrite: bool = False,
+) -> RunResult:
+    """Run the chain on a video: detect, track, poses, objects; write the files of the output
+    folder.
+
+    Args:
+        source: video file, folder of images, glob, or camera index.
+        out: output folder; results of earlier stages found there are used again.
+        detections: file with recorded detections, or a callable image -> Detections; default:
+            config.detect.model.
+        stages: what comes after tracking: () for identities only, ("poses",), ("poses", "objects").
+    Returns:
+        RunResult, also when the reconstruction fails: then without cameras and ellipsoids, and with
+        a warning.
+    Raises:
+        ReobjError: for input that cannot be used, with what to do.
+    """
+    config = config or Config()
+    _set_threads(config.threads)
+    video = Video(source, config.input)
+    space = Workspace(Path(out), overwrite)
+    space.claim(video, overwrite)
+    seconds: dict[str, float] = {}
+    poses = _supplied_poses(video, config) if "poses" in stages else None
+    track = track_video(video, space, config, detections, poses, seconds)
+    if "poses" in stages and poses is None and config.poses.mode != "none":
+        poses = _reconstruct(video, space, config, seconds)
+    if poses is not None:
+        _check_supplied(poses, track.table)
+    space.remember(track, poses if "objects" in stages else None)
+    return _finish_objects(
+        video, space, track, poses if "objects" in stages else None, config, seconds
+    )
+
+
+def refit(out: str | Path, config: Config | None = None) -> RunResult:
+    """Link and fit again from what an output folder holds, with other options of the objects
+    section.
+    """
+    space = Workspace(Path(out))
+    track, poses = space.recall()
+    source = json.loads((space.cache / "source.json").read_text())
+    config = dataclasses.replace(config or Config(), input=InputConfig(**source["input"]))
+    return _finish_objects(Video(source["source"], config.input), space, track, poses, config, {})
+
+
+def _finish_objects(
+    video: Video,
+    space: Workspace,
+    track: TrackResult,
+    poses: Poses | None,
+    config: Config,
+    seconds: dict[str, float],
+) -> RunResult:
+    """Objects from tracks and poses, and all files of the output folder."""
+    result = make_objects(track, poses, config, space.out, seconds)
+    result.warnings += [*track.messages, *(poses.messages if poses is not None else ())]
+    for warning in result.warnings:
+        log.warning(warning)
+    result.poses = poses
+    write_results(result, video, config)
+    return result
+
+
+def _set_threads(threads: int) -> None:
+    """Limit OpenCV (numpy's BLAS reads OMP_NUM_THREADS when it is imported)."""
+    if threads:
+        cv2.setNumThreads(threads)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackResult:
+    """Identities of a video from the tracker: rows, similarity of the identities, class names,
+    messages.
+    """
+
+    table: TrackTable
+    similarity: Array
+    class_names: tuple[str, ...]
+    messages: tuple[str, ...]
+
+    def save(self, path: Path) -> None:
+        """Write as npz, atomically."""
+        columns = {f.name: getattr(self.table, f.name) for f in dataclasses.fields(TrackTable)}
+        names, messages = np.array(self.class_names, str), np.array(self.messages, str)
+        with atomic(path) as part, part.open("wb") as file:
+            np.savez_compressed(
+                file, **columns, similarity=self.similarity, class_names=names, messages=messages
+            )
+
+    @staticmethod
+    def load(path: Path) -> TrackResult:
+        """Read what `save` wrote."""
+        with np.load(path, allow_pickle=False) as data:
+            table = TrackTable(*(data[f.name] for f in dataclasses.fields(TrackTable)))
+            names, messages = data["class_names"].tolist(), data["messages"].tolist()
+            return TrackResult(table, data["similarity"], tuple(names), tuple(messages))
+
+
+def save_poses(path: Path, poses: Poses) -> None:
+    """Write poses as npz, atomically."""
+    facts = {
+        "camera": dataclasses.asdict(poses.camera),
+        "source": poses.source,
+        "metric": poses.metric,
+        "up": None if poses.up_in_world is None else poses.up_in_world.tolist(),
+        "messages": poses.messages,
+    }
+    arrays = {k: getattr(poses, k) for k in _POSE_ARRAYS}
+    with atomic(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, facts=np.array(json.dumps(facts)), **arrays)
+
+
+_POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors")
+
+
+def load_poses(path: Path) -> Poses:
+    """Read what `save_poses` wrote."""
+    with np.load(path, allow_pickle=False) as data:
+        facts, arrays = json.loads(str(data["facts"])), {k: data[k] for k in _POSE_ARRAYS}
+    camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
+    up = None if facts["up"] is None else np.array(facts["up"])
+    return Poses(
+        camera=camera,
+        source=facts["source"],
+        metric=facts["metric"],
+        up_in_world=up,
+        messages=tuple(facts["messages"]),
+        **arrays,
+    )
+
+
+def track_video(
+    video: Video,
+    space: Workspace,
+    config: Config,
+    detections: Any,
+    poses: Poses | None,
+    seconds: dict[str, float],
+) -> TrackResult:
+    """Detect and track all frames, or take both from the cache."""
+    source = _detection_source(video, config, detections)
+    key = (source_fingerprint(video.source), config.input, source.key)
+    supplied = "" if poses is None else source_fingerprint(config.poses.mode)
+    path = space.path("tracks", *key, config.embed, config.tracker, supplied)
+    if path.exists() and source.key:
+        return TrackResult.load(path)
+    started = time.monotonic()
+    cache_path = space.path("detections", *key).with_suffix("") if source.key else None
+    result = _track_frames(video, source, cache_path, config, poses)
+    seconds["track"] = time.monotonic() - started
+    result.save(path)
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Where detections come from: a key for the cache ("" if not to be cached) and frame ->
+    Detections.
+    """
+
+    key: str
+    class_names: tuple[str, ...]
+    detect: Callable[[Frame], Detections]
+    slow: bool
+    messages: Sequence[str] = ()
+
+
+def _detection_source(video: Video, config: Config, detections: Any) -> _Source:
+    """A file of recorded detections, a callable, or the ONNX detector."""
+    if callable(detections):
+        call = CallableDetector(detections)
+        return _Source("", call.class_names, lambda frame: call(frame.image), False)
+    if detections:
+        recorded = read_detections(detections, video, config.detect)
+        key = source_fingerprint(detections)
+        at = recorded.at
+        return _Source(key, recorded.class_names, lambda frame: at(frame.index), False, recorded.messages)
+    path = model_path(config.detect.model, offline=config.offline)
+    detector = OnnxDetector(path, config.detect, config.threads)
+    key = json.dumps([path.name, path.stat().st_size, dataclasses.asdict(config.detect)])
+    return _Source(key, detector.class_names, lambda frame: detector(frame.image), True)
+
+
+def _track_frames(
+    video: Video, source: _Source, cache_path: Path | None, config: Config, poses: Poses | None
+) -> TrackResult:
+    """One pass over the video: detections (cached if they are dear), tracker, progress."""
+    cache = DetectionCache(cache_path, video.working_size) if cache_path and source.slow else None
+    tracker = Tracker(config.tracker, _embedder(config))
+    pose_of = (
+        {} if poses is None else dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
+    )
+    camera = None if poses is None else _scaled_camera(poses.camera, video.scale)
+    frames: list[int] = []
+    steps: list[Tracks] = []
+    progress = Progress("track", video.expected)
+    try:
+        for frame in video:
+            detections = _detect_cached(frame, source, cache)
+            steps.append(
+                tracker.step(
+                    detections, frame.image, cam_from_world=pose_of.get(frame.index), camera=camera
+                )
+            )
+            frames.append(frame.index)
+            progress.step()
+    except KeyboardInterrupt:
+        if not video.is_live:
+            raise
+    finally:
+        progress.close()
+        if cache is not None:
+            cache.flush()
+    if not frames:
+        raise ReobjError(
+            f"{video.source}: no frame could be read (--start/--stop/--every leave none, "
+            "or the file is damaged)"
+        )
+    table = TrackTable.from_steps(frames, steps, video.scale)
+    messages = [*source.messages, *_video_messages(video, table)]
+    return TrackResult(table, _identity_similarity(tracker), source.class_names, tuple(messages))
+
+
+def _detect_cached(frame: Frame, source: _Source, cache: DetectionCache | None) -> Detections:
+    """Detections of a frame, from the cache if they were computed before."""
+    found = cache.get(frame.index) if cache is not None else None
+    if found is None:
+        found = source.detect(frame)
+        if cache is not None:
+            cache.put(frame.index, found)
+    return found
+
+
+def _embedder(config: Config) -> Embedder | None:
+    if config.embed.model == "none":
+        return None
+    return Embedder(config.embed.model, config.embed, config.threads, config.offline)
+
+
+def _scaled_camera(camera: Camera, scale: float) -> Camera:
+    """The pinhole part of a camera for images resized by `scale`."""
+    K = camera.K
+    params = (K[0, 0] * scale, K[1, 1] * scale, K[0, 2] * scale, K[1, 2] * scale)
+    return Camera("PINHOLE", round(camera.width * scale), round(camera.height * scale), params)
+
+
+def _identity_similarity(tracker: Tracker) -> Array:
+    """(I, I) normalised similarity of the tracker's identities: the most alike pair of views
+    counts.
+    """
+    count = len(tracker.last_seen)
+    views = tracker.gallery.rows[:count]  # (I, K, E)
+    if not views.size:
+        return np.zeros((count, count))
+    return (
+        np.stack(
+            [
+                tracker.stats.normalised(
+                    tracker.gallery.similarity(
+                        views[i, : max(1, tracker.gallery.count[i])], np.arange(count)
+                    ).max(0)
+                )
+                for i in range(count)
+            ]
+        )
+        if count
+        else np.zeros((0, 0))
+    )
+
+
+def _video_messages(video: Video, table: TrackTable) -> list[str]:
+    """What the user should know about the input."""
+    messages = list(video.messages)
+    if not len(table):
+        messages.append(
+            "no object was tracked: no detections, or all below the scores of "
+            "--set tracker.new_score / tracker.high_score"
+        )
+    return messages
+
+
+def _supplied_poses(video: Video, config: Config) -> Poses | None:
+    """Poses given by the user, or None if they are to be reconstructed."""
+    if config.poses.mode in ("auto", "none"):
+        return None
+    return read_poses(config.poses.mode, video, config.poses)
+
+
+def _check_supplied(poses: Poses, table: TrackTable) -> None:
+    """Refuse supplied poses whose direction or axes contradict the tracks."""
+    if poses.source != "user":
+        return
+    centers = (table.xyxy[:, :2] + table.xyxy[:, 2:]) / 2
+    tracks = [(table.frame[rows], centers[rows]) for rows in _rows_by(table.tracklet_id)]
+    fault = check_poses(poses, tracks)
+    if fault:
+        raise ReobjError(fault)
+
+
+def _rows_by(group: IntArray) -> list[IntArray]:
+    """Row numbers of each distinct value, in the order of the values."""
+    order = np.argsort(group, kind="stable")
+    _, starts = np.unique(group[order], return_index=True)
+    return (
+        [np.asarray(rows, np.int64) for rows in np.split(order, starts[1:])] if len(group) else []
+    )
+
+
+def _reconstruct(
+    video: Video, space: Workspace, config: Config, seconds: dict[str, float]
+) -> Poses:
+    """Poses from pycolmap, cached."""
+    path = space.path("poses", source_fingerprint(video.source), config.input, config.poses)
+    if path.exists():
+        return load_poses(path)
+    started = time.monotonic()
+    work = space.cache / "sfm"
+    poses = estimate_poses(video, config.poses, work)
+    if (work / "sparse").is_dir():
+        shutil.rmtree(space.out / "sparse", ignore_errors=True)
+        (work / "sparse").replace(space.out / "sparse")
+    if poses.known.any():
+        save_poses(path, poses)
+    seconds["poses"] = time.monotonic() - started
+    return poses
+
+
+def make_objects(
+    track: TrackResult, poses: Poses | None, config: Config, out: Path, seconds: dict[str, float]
+) -> RunResult:
+    """Link tracklets and fit one solid per object; without poses the tracker's identities are the
+    objects.
+    """
+    started = time.monotonic()
+    table, events, fits, views = track.table, [], None, None
+    if poses is not None and poses.known.sum() >= config.objects.min_views and len(table):
+        fit = _fitter(config.objects, poses, track.class_names)
+        if config.objects.link:
+            linker = Linker(table, track.similarity, poses, fit, config.objects)
+            table, events = table.with_objects(linker.run()), linker.events
+        else:
+            table = table.with_objects(table.object_id)
+        classes = object_classes(table)
+        views = gather_views(
+            table, poses, table.object_id - 1, len(classes), config.objects.min_score
+        )
+        fits = fit(views, list(classes.values()))
+    else:
+        table = table.with_objects(table.object_id) if len(table) else table
+    objects = _object_entries(table, track.class_names, fits, views, config.objects)
+    seconds["objects"] = time.monotonic() - started
+    result = RunResult(out, table, track.class_names, objects, poses, fits, seconds, [])
+    result.world = _world_entry(poses, fits, events)
+    return result
+
+
+def _fitter(
+    config: ObjectsConfig, poses: Poses, class_names: Sequence[str]
+) -> Callable[[Views, list[int]], Any]:
+    """Bind priors, scale and gravity to `quadrics.fit_objects`."""
+    priors = quadrics.load_priors(config.priors or None)
+    known = parse_known_size(config.known_size)
+    up = np.array([float(x) for x in config.up.split(",")]) if config.up else poses.up_in_world
+    support = None if config.support == "auto" else config.support
+
+    def fit(views: Views, classes: list[int]) -> Any:
+        categories = [class_names[c] if c < len(class_names) else "" for c in classes]
+        return quadrics.fit_objects(
+            views.boxes,
+            views.img_from_world,
+            views.image_size,
+            categories,
+            priors,
+            up=up,
+            support=support,
+            score=views.score,
+            metric=poses.metric,
+            known_size=known,
+        )
+
+    return fit
+
+
+def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
+    """Parse 'chair=0.82m,door=2.0m' into heights in metres by category.
+
+    >>> parse_known_size("door=2.0m, chair=82cm")
+    {'door': ('h', 2.0), 'chair': ('h', 0.82)}
+    """
+    per_metre = {"m": 1, "cm": 100, "mm": 1000}
+    sizes: dict[str | int, tuple[str | int, float]] = {}
+    for item in filter(None, (part.strip() for part in text.split(","))):
+        found = re.fullmatch(r"(.+?)\s*=\s*([0-9.]+)\s*(m|cm|mm)", item)
+        if found is None:
+            raise ReobjError(
+                f"--known-size {item!r}: expected CATEGORY=HEIGHT in m, cm or mm, such as door=2.0m"
+            )
+        sizes[found[1]] = ("h", float(found[2]) / per_metre[found[3]])
+    return sizes
+
+
+# ---- Results -----------------------------------------------------------------------------------
+
+
+def _object_entries(
+    table: TrackTable,
+    class_names: Sequence[str],
+    fits: Any,
+    views: Views | None,
+    config: ObjectsConfig,
+) -> list[dict[str, Any]]:
+    """Entries of objects.json, one an object."""
+    entries = []
+    moving = set(config.moving.split(","))
+    iou = (
+        quadrics.reprojection_iou(fits, views.boxes, views.img_from_world, views.image_size)
+        if views
+        else None
+    )
+    for i, (obj, cls) in enumerate(object_classes(table).items()):
+        rows = table[table.object_id == obj]
+        entry: dict[str, Any] = dict.fromkeys(OBJECT_FIELDS)
+        name = class_names[cls] if 0 <= cls < len(class_names) else "object"
+        entry |= {
+            "id": obj,
+            "class": name,
+            "score": round(float(rows.score.mean()), 4),
+            "status": "rejected",
+            "reason": "no camera poses",
+            "views": 0,
+            "frames_seen": len(np.unique(rows.frame)),
+            "dropped_boxes": 0,
+            "tracks": np.unique(rows.tracklet_id).tolist(),
+            "frames": _spans_of(rows),
+        }
+        if fits is not None and views is not None:
+            _add_fit(entry, fits, i, views, iou[:, i] if iou is not None else None)
+            if name in moving:
+                _reject(entry, "objects of this class move")
+            elif entry["views"] < config.min_views:
+                _reject(
+                    entry,
+                    f"seen in {entry['views']} frames with a camera pose; "
+                    f"{config.min_views} are needed",
+                )
+        entries.append(entry)
+    return entries
+
+
+def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array | None) -> None:
+    """Add the solid, its uncertainty and its evidence to an entry."""
+    solid, scale = fits.ellipsoids, fits.scale
+    seen = np.isfinite(views.boxes[:, i, 0])
+    entry |= {
+        "status": str(fits.status[i]),
+        "reason": str(fits.reason[i]),
+        "support": str(fits.support[i]),
+        "views": int(seen.sum()),
+        "dropped_boxes": int((seen & ~fits.inlier[:, i]).sum()),
+        "parallax_deg": _rounded(fits.parallax_deg[i], 2),
+        "reprojection_iou_median": _rounded(np.median(iou[seen]), 3)
+        if iou is not None and seen.any()
+        else None,
+    }
+    if entry["status"] != "rejected":
+        size = fits.size[i]
+        entry |= {
+            "center": _numbers(solid.center_in_world[i]),
+            "half_axes": _numbers(solid.half_axes[i]),
+            "quat_wxyz": _numbers(quat_wxyz_from_matrix(solid.world_from_obj[i : i + 1])[0]),
+            "size": _numbers(size),
+            "cov": [_numbers(row) for row in fits.cov[i]],
+            "size_m": _numbers(size * scale.value) if scale.source != "none" else None,
+            "size_rel_sigma": _numbers(np.sqrt(np.diag(fits.cov[i])[3:6] + scale.rel_sigma**2)),
+        }
+
+
+def _reject(entry: dict[str, Any], reason: str) -> None:
+    entry |= dict.fromkeys(
+        ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov", "support")
+    )
+    entry |= {"status": "rejected", "reason": reason}
+
+
+def _rounded(value: float, digits: int) -> float | None:
+    return round(float(value), digits) if math.isfinite(value) else None
+
+
+def _numbers(values: Array) -> list[float]:
+    """Six significant digits: far below any accuracy, and stable text."""
+    return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
+
+
+def _spans_of(rows: TrackTable) -> list[list[int]]:
+    """First and last frame of every tracklet, by time."""
+    spans = [
+        [int(rows.frame[r].min()), int(rows.frame[r].max())] for r in _rows_by(rows.tracklet_id)
+    ]
+    return sorted(spans)
+
+
+def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
+    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits.
+    """
+    if poses is None:
+        return {"units": None, "source": "none", "registered_frames": 0, "links": []}
+    scale = fits.scale if fits is not None else None
+    return {
+        "units": "m" if poses.metric else "arbitrary",
+        "source": poses.source,
+        "registered_frames": int(poses.known.sum()),
+        "frames": len(poses.frame),
+        "up_in_world": None if poses.up_in_world is None else _numbers(poses.up_in_world),
+        "scale": None
+        if scale is None
+        else {
+            "metres_per_unit": _rounded(scale.value, 6),
+            "rel_sigma": _rounded(scale.rel_sigma, 4),
+            "source": scale.source,
+        },
+        "links": [dataclasses.asdict(e) for e in events],
+    }
+
+
+CONVENTIONS = {
+    "pose": "cam_from_world",
+    "camera_axes": "x right, y down, z forward",
+    "quaternion": "wxyz, world_from_obj",
+    "pixels": "centre of the top-left pixel at (0.5, 0.5) (COLMAP)",
+    "frames": "0-based",
+    "size": "full extents of the solid along its own axes",
+    "ellipsoid": "inscribed in a box or cylinder",
+    "cov": "9x9: center, log half axes, rotation vector in object axes",
+}
+
+
+def write_results(result: RunResult, video: Video, config: Config) -> None:
+    """Write the files of the output folder; each appears only when it is complete."""
+    out, started = result.out, time.monotonic()
+    write_mot(out / "tracks.txt", result.table)
+    _write_objects_json(result, video)
+    poses = result.poses
+    if poses is not None and poses.known.any():
+        write_tum(out / "poses.txt", poses)
+        if poses.source == "user":
+            write_colmap(
+                out / "sparse", poses, [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
+            )
+    kept = [i for i, o in enumerate(result.objects) if o["status"] != "rejected"]
+    ellipsoids = None if result.fits is None else _take(result.fits.ellipsoids, kept)
+    ids = [result.objects[i]["id"] for i in kept]
+    if ellipsoids is not None:
+        write_ply(out / "objects.ply", ellipsoids, ids, config.output.ply_detail)
+    if config.output.overlay and not video.is_live:
+        labels = {o["id"]: f"{o['id']} {o['class']}" for o in result.objects}
+        write_overlay(
+            out / "overlay.mp4", video, result.table, labels, poses, ellipsoids, ids, config.output
+        )
+    result.seconds["write"] = time.monotonic() - started
+
+
+def _take(solid: quadrics.Ellipsoids, rows: list[int]) -> quadrics.Ellipsoids:
+    return quadrics.Ellipsoids(
+        solid.center_in_world[rows], solid.half_axes[rows], solid.world_from_obj[rows]
+    )
+
+
+def _write_objects_json(result: RunResult, video: Video) -> None:
+    from importlib.metadata import version
+
+    packages = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "onnxruntime")
+    versions = {}
+    for name in packages:
+        with contextlib.suppress(
+            Exception
+        ):  # a package installed under another name has no version to tell
+            versions[name] = version(name)
+    width, height = video.size
+    data = {
+        "format": "reobj-objects",
+        "version": 1,
+        "command": " ".join(sys.argv),
+        "reobj_track": __version__,
+        "versions": versions,
+        "conventions": CONVENTIONS,
+        "video": {
+            "path": str(video.source),
+            "width": width,
+            "height": height,
+            "fps": video.fps,
+            "tracked_frames": len(np.unique(result.table.frame)),
+        },
+        "world": result.world,
+        "objects": result.objects,
+        "warnings": result.warnings,
+    }
+    with atomic(result.out / "objects.json") as part:
+        part.write_text(json.dumps(data, indent=1) + "\n")
+
+
+def summary(result: RunResult) -> str:
+    """The table that `run` prints: object, class, frames seen, size with sigma, status."""
+    scaled = any(o["size_m"] for o in result.objects)
+    lines = [
+        f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  "
+        f"{'width x depth x height, ' + ('m' if scaled else 'units'):<26} {'sigma':>6}  status"
+    ]
+    for o in result.objects:
+        size = o["size_m"] or o["size"]
+        text = " x ".join(f"{s:.2f}" for s in size) if size else "-"
+        sigma = f"{100 * max(o['size_rel_sigma']):.0f} %" if o["size_rel_sigma"] else "-"
+        reason = f" ({o['reason']})" if o["reason"] else ""
+        lines.append(
+            f"{o['id']:>6}  {o['class']:<14} {o['frames_seen']:>6} {len(o['frames']):>6}  "
+            f"{text:<26} {sigma:>6}  "
+            f"{o['status']}{reason}"
+        )
+    counts: dict[str, int] = {}
+    for o in result.objects:
+        counts[o["class"]] = counts.get(o["class"], 0) + 1
+    lines.append(
+        "distinct objects: " + (", ".join(f"{n} {c}" for c, n in sorted(counts.items())) or "none")
+    )
+    return "\n".join(lines + _summary_world(result))
+
+
+def _summary_world(result: RunResult) -> list[str]:
+    """Lines on cameras, scale, time and where to look."""
+    lines = []
+    world = result.world
+    if result.poses is not None:
+        lines.append(
+            f"cameras: {world['registered_frames']} of {len(result.poses.frame)} frames "
+            f"({result.poses.source})"
+        )
+        if world.get("scale"):
+            scale = world["scale"]
+            lines.append(
+                f"scale: {scale['metres_per_unit']} m per unit, "
+                f"sigma {100 * (scale['rel_sigma'] or 0):.0f} % "
+                f"(from {scale['source']})"
+            )
+    lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()))
+    lines.append(
+        "look at: " + ", ".join(str(result.out / f) for f in ("overlay.mp4", "objects.json"))
+    )
+    return lines
+
+
+# ---- Command line ------------------------------------------------------------------------------
+
+
+def _options(parser: argparse.ArgumentParser, *sections: str) -> None:
+    """Add the flags that the config dataclasses declare for these sections ("" for the top level).
+    """
+    for section in sections:
+        cls: Any = Config if not section else Config.__dataclass_fields__[section].default_factory
+        for f in dataclasses.fields(cls):
+            flag = f.metadata.get("flag", "")
+            if not flag:
+                continue
+            dest = f"{section}.{f.name}" if section else f.name
+            if isinstance(f.default, bool):
+                parser.add_argument(
+                    flag, dest=dest, action="store_true", default=None, help=f.metadata["help"]
+                )
+            else:
+                text = (
+                    f"{f.metadata['help']} (default: {f.default})"
+                    if f.default not in ("", 0)
+                    else f.metadata["help"]
+                )
+                parser.add_argument(
+                    flag,
+                    dest=dest,
+                    type=type(f.default),
+                    default=None,
+                    help=text.replace("%", "%%"),
+                    metavar=type(f.default).__name__.upper(),
+                )
+
+
+def config_from_args(args: argparse.Namespace) -> Config:
+    """Build the config from flags and from --set section.field=value."""
+    config = Config()
+    for dest, value in vars(args).items():
+        section, _, name = dest.rpartition(".")
+        if value is not None and (section or dest in ("threads", "offline")):
+            config = _replaced(config, section, name or dest, value)
+    for item in args.set or []:
+        target, equals, text = item.partition("=")
+        section, _, name = target.rpartition(".")
+        config = _replaced(
+            config, section, name, _parse_value(config, section, name, text, item if equals else "")
+        )
+    return config
+
+
+def _replaced(config: Config, section: str, name: str, value: Any) -> Config:
+    if not section:
+        return dataclasses.replace(config, **{name: value})
+    changed = dataclasses.replace(getattr(config, section), **{name: value})
+    return dataclasses.replace(config, **{section: changed})
+
+
+def _parse_value(config: Config, section: str, name: str, text: str, item: str) -> Any:
+    """Convert the text of --set to the type of the field."""
+    owner = getattr(config, section, None) if section else config
+    names = [
+        f"{s.name}.{f.name}"
+        for s in dataclasses.fields(Config)
+        if dataclasses.is_dataclass(getattr(config, s.name))
+        for f in dataclasses.fields(getattr(config, s.name))
+    ]
+    if (
+        owner is None
+        or not dataclasses.is_dataclass(owner)
+        or name not in {f.name for f in dataclasses.fields(owner)}
+    ):
+        import difflib
+
+        close = difflib.get_close_matches(f"{section}.{name}", names, 1) or ["tracker.coast_frames"]
+        raise ReobjError(f"--set {section}.{name}: no such option; did you mean {close[0]}?")
+    kind = type(getattr(owner, name))
+    try:
+        if not item:
+            raise ValueError
+        return text.lower() in ("1", "true", "yes", "on") if kind is bool else kind(text)
+    except ValueError:
+        raise ReobjError(
+            f"--set {section}.{name}: expected ={kind.__name__.upper()}, found {text!r}"
+        ) from None
+
+
+class _ListOptions(argparse.Action):
+    """--options: print every field of the config with its default and meaning, then stop."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *args: Any) -> None:
+        for section in dataclasses.fields(Config):
+            owner = getattr(Config(), section.name)
+            for f in dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ():
+                print(f"{section.name}.{f.name}={f.default}\n        {f.metadata['help']}")
+        parser.exit()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="reobj_track",
+        description="Objects of a hand-held video of a static scene: which detections are the same "
+        "physical object, and where each one is in 3D.",
+        epilog="Example: reobj_track.py run room.mp4 -o out; then open out/overlay.mp4.",
+    )
+    parser.add_argument("--version", action="version", version=f"reobj_track {__version__}")
+    parser.add_argument(
+        "--options", action=_ListOptions, nargs=0, help="list what --set section.field=value can set"
+    )
+    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(
+        sub, "run", "video -> identities -> cameras -> ellipsoids -> files to look at", _cmd_run
+    )
+    _add_run(sub, "track", "identities only (2D)", _cmd_track)
+    _add_run(sub, "poses", "cameras only (pycolmap)", _cmd_poses)
+    _add_objects(sub)
+    _add_eval(sub)
+    _add_models(sub)
+    return parser
+
+
+def _common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--set",
+        action="append",
+        metavar="SECTION.FIELD=VALUE",
+        help="any other option, e.g. tracker.coast_frames=60; `reobj_track.py --options` lists them",
+    )
+    parser.add_argument("-v", "--verbose", action="store_true", help="say what is being done")
+    parser.add_argument("--debug", action="store_true", help="say more, and show tracebacks")
+
+
+def _add_run(sub: Any, name: str, text: str, func: Callable[[argparse.Namespace], int]) -> None:
+    parser = sub.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+    parser.add_argument(
+        "video", help="video file, folder of images, glob in quotes, camera index or stream URL"
+    )
+    parser.add_argument("-o", "--out", required=True, help="output folder")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="write into a folder that holds something else"
+    )
+    sections = {
+        "run": ("input", "detect", "embed", "tracker", "poses", "objects"),
+        "track": ("input", "detect", "embed", "tracker"),
+        "poses": ("input", "poses"),
+    }[name]
+    if name != "poses":
+        parser.add_argument(
+            "--detections",
+            help="recorded detections instead of a detector: MOT txt, CSV, COCO JSON, npz",
+        )
+    _options(parser, *sections, "")
+    _common(parser)
+    parser.set_defaults(func=func)
+
+
+def _cmd_run(args: argparse.Namespace) -> int:
+    return _finish(
+        run(
+            args.video,
+            args.out,
+            config_from_args(args),
+            detections=args.detections,
+            overwrite=args.overwrite,
+        )
+    )
+
+
+def _cmd_track(args: argparse.Namespace) -> int:
+    return _finish(
+        run(
+            args.video,
+            args.out,
+            config_from_args(args),
+            detections=args.detections,
+            stages=(),
+            overwrite=args.overwrite,
+        )
+    )
+
+
+def _finish(result: RunResult) -> int:
+    """Print the summary on stdout."""
+    print(summary(result))
+    return 0
+
+
+def _cmd_poses(args: argparse.Namespace) -> int:
+    config = config_from_args(args)
+    video = Video(args.video, config.input)
+    space = Workspace(Path(args.out), args.overwrite)
+    space.claim(video, args.overwrite)
+    seconds: dict[str, float] = {}
+    poses = _supplied_poses(video, config) or _reconstruct(video, space, config, seconds)
+    if poses.known.any():
+        write_tum(space.out / "poses.txt", poses)
+    print(
+        f"cameras: {poses.known.sum()} of {len(poses.frame)} frames, {len(poses.points)} points; "
+        f"look at: {space.out / 'poses.txt'}, {space.out / 'sparse'}"
+    )
+    for message in poses.messages:
+        log.warning(message)
+    return 0
+
+
+def _add_objects(sub: Any) -> None:
+    text = "(re)fit the ellipsoids from what an output folder already holds"
+    parser = sub.add_parser("objects", help=text, description=text[0].upper() + text[1:] + ".")
+    parser.add_argument("out", help="output folder of an earlier `run`")
+    parser.add_argument(
+        "--validate", action="store_true", help="only check objects.json against its format"
+    )
+    _options(parser, "objects")
+    _common(parser)
+    parser.set_defaults(func=_cmd_objects)
+
+
+def _cmd_objects(args: argparse.Namespace) -> int:
+    out = Path(args.out)
+    if args.validate:
+        faults = validate_objects(out / "objects.json" if out.is_dir() else out)
+        print("\n".join(faults) or "valid")
+        return 2 if faults else 0
+    return _finish(refit(out, config_from_args(args)))
+
+
+def _add_eval(sub: Any) -> None:
+    parser = sub.add_parser("eval", help="compare with ground truth (needs the `eval` extra)")
+    parser.add_argument("out", help="output folder of an earlier `run`")
+    parser.add_argument("--gt", required=True, help="ground truth in MOTChallenge format")
+    _common(parser)
+    parser.set_defaults(func=_cmd_eval)
+
+
+def _cmd_eval(args: argparse.Namespace) -> int:
+    raise ReobjError(
+        "eval: not there yet in this version; tracks.txt is in MOTChallenge format: TrackEval "
+        "(pip install 'reobj-track[eval]', in an environment of its own) scores it"
+    )
+
+
+def _add_models(sub: Any) -> None:
+    text = "list, download and verify weights"
+    parser = sub.add_parser("models", help=text, description=text[0].upper() + text[1:] + ".")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="weights to download or verify; none: list all"
+    )
+    _options(parser, "")
+    _common(parser)
+    parser.set_defaults(func=_cmd_models)
+
+
+def _cmd_models(args: argparse.Namespace) -> int:
+    for name in args.names:
+        print(model_path(name, offline=bool(args.offline)))
+    if not args.names:
+        for row in list_models():
+            w = row.weights
+            print(
+                f"{w.name:<20} {w.role:<9} {w.size / 1e6:5.1f} MB  {w.licence:<11} "
+                f"{row.state:<13} {w.note}"
+            )
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns 0, 2 for bad input, 130 after Ctrl-C, 1 for a fault of ours."""
+    args = _parser().parse_args(argv)
+    level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
+    logging.addLevelName(logging.WARNING, "warning")
+    form = "%(levelname)s: %(message)s"
+    logging.basicConfig(level=level, format=form, stream=sys.stderr, force=True)
+    try:
+        return int(args.func(args))
+    except KeyboardInterrupt:
+        print(
+            "\ninterrupted: what was computed is kept in the output folder's cache; "
+            "run the same command again to go on from there",
+            file=sys.stderr,
+        )
+        return 130
+    except (ReobjError, quadrics.QuadricsError, OSError) as error:
+        if args.debug:
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

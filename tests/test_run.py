@@ -1,0 +1,389 @@
+"""The command line as a user meets it: whole runs, resuming, and every way the input can be wrong."""
+
+from __future__ import annotations
+
+import errno
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import quadrics
+import reobj_track as rt
+
+ROOT = Path(__file__).resolve().parent.parent
+FRAMES = 12
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (240, 400, 3), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 2)
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    """A folder of frames that pan over a texture."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    image = texture()
+    for i in range(FRAMES):
+        cv2.imwrite(str(folder / f"{i:03d}.png"), image[:, 4 * i : 4 * i + 320])
+    return folder
+
+
+def mot_rows(frames: int = FRAMES) -> str:
+    """Two objects that stay on the texture while the camera pans."""
+    lines = [f"{i + 1},-1,{100 - 4 * i},60,40,50,0.9,-1,-1,-1\n{i + 1},-1,{220 - 4 * i},80,50,60,0.9,-1,-1,-1"
+             for i in range(frames)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture
+def detections(tmp_path: Path) -> Path:
+    path = tmp_path / "det.txt"
+    path.write_text(mot_rows())
+    return path
+
+
+def cli(*args: object) -> int:
+    return rt.main([str(a) for a in args])
+
+
+# ---- What must work ----
+
+
+def test_track_writes_identities(clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 0
+    mot = np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")
+    assert sorted(set(mot[:, 1])) == [1, 2] and len(mot) == 2 * FRAMES  # tentative frames are back-filled
+    assert rt.validate_objects(tmp_path / "out/objects.json") == []
+    out = capsys.readouterr().out
+    assert "distinct objects: 2" in out and "overlay.mp4" in out
+
+
+def test_run_without_parallax_keeps_the_2d_results(clip: Path, detections: Path, tmp_path: Path,
+                                                   capsys: pytest.CaptureFixture[str]) -> None:
+    """A camera that stands still: no crash, the reason and the remedy are said."""
+    for image in sorted(clip.iterdir())[1:]:
+        image.write_bytes((clip / "000.png").read_bytes())
+    lines = [line for line in detections.read_text().splitlines() if line.startswith("1,")]
+    detections.write_text("".join(line.replace("1,", f"{i + 1},", 1) + "\n" for i in range(FRAMES) for line in lines))
+    assert cli("run", clip, "-o", tmp_path / "out", "--detections", detections) == 0
+    captured = capsys.readouterr()
+    assert "warning: no camera poses" in captured.err and "--poses" in captured.err
+    assert "distinct objects: 2" in captured.out
+    assert not (tmp_path / "out/poses.txt").exists()
+
+
+def test_poses_none_stays_in_2d(clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli("run", clip, "-o", tmp_path / "out", "--detections", detections, "--poses", "none") == 0
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_same_input_same_bytes(clip: Path, detections: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        assert cli("track", clip, "-o", tmp_path / name, "--detections", detections) == 0
+    read = [(tmp_path / n / "tracks.txt").read_bytes() for n in ("a", "b")]
+    objects = [json.loads((tmp_path / n / "objects.json").read_text())["objects"] for n in ("a", "b")]
+    assert read[0] == read[1] and objects[0] == objects[1]
+
+
+def test_every_keeps_source_frame_numbers(clip: Path, detections: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert cli("track", clip, "-o", out, "--detections", detections, "--every", 2, "--start", 2) == 0
+    assert sorted(set(np.loadtxt(out / "tracks.txt", delimiter=",")[:, 0])) == [3, 5, 7, 9, 11]
+
+
+def test_max_size_keeps_native_pixels_in_the_files(clip: Path, detections: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert cli("track", clip, "-o", out, "--detections", detections, "--max-size", 160) == 0
+    mot = np.loadtxt(out / "tracks.txt", delimiter=",")
+    np.testing.assert_allclose(mot[0, 2:6], [100, 60, 40, 50], atol=0.1)
+
+
+def test_one_frame(clip: Path, detections: Path, tmp_path: Path) -> None:
+    assert cli("run", clip, "-o", tmp_path / "out", "--detections", detections, "--stop", 1,
+               "--set", "tracker.n_init=1") == 0
+    assert len(np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")) == 2
+
+
+def test_zero_detections(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "none.txt").write_text("")
+    code = cli("track", clip, "-o", tmp_path / "out", "--detections", tmp_path / "none.txt")
+    captured = capsys.readouterr()
+    assert code == 0
+    assert "no object was tracked" in captured.err and "distinct objects: none" in captured.out
+    assert (tmp_path / "out/tracks.txt").read_text() == ""
+
+
+def test_corrupt_frame_in_the_middle_is_skipped_and_counted(clip: Path, detections: Path, tmp_path: Path,
+                                                            capsys: pytest.CaptureFixture[str]) -> None:
+    (clip / "005.png").write_bytes(b"not an image")
+    assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 0
+    assert "1 frames skipped" in capsys.readouterr().err
+    frames = set(np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")[:, 0])
+    assert 6 not in frames and {5, 7} <= frames
+
+
+def test_python_callable_as_detector(clip: Path, tmp_path: Path) -> None:
+    calls = []
+
+    def detector(image: np.ndarray) -> list[list[float]]:
+        calls.append(image.shape)
+        x = 100 - 4 * (len(calls) - 1)
+        return [[x, 60, x + 40, 110, 0.9, 56]]
+
+    result = rt.run(clip, tmp_path / "out", detections=detector, stages=())
+    assert calls == [(240, 320, 3)] * FRAMES
+    assert [o["class"] for o in result.objects] == ["chair"]
+
+
+# ---- Resume and output folder ----
+
+
+class CountingDetector:
+    """Stands in for OnnxDetector; counts frames and can be interrupted."""
+
+    calls = 0
+    stop_at = -1
+    class_names = rt.COCO_NAMES
+
+    def __init__(self, *args: object) -> None: ...
+
+    def __call__(self, image: np.ndarray) -> rt.Detections:
+        cls = type(self)
+        if cls.calls == cls.stop_at:
+            cls.stop_at = -1
+            raise KeyboardInterrupt
+        cls.calls += 1
+        return rt.Detections.from_array([[100, 60, 140, 110, 0.9, 56]])
+
+
+@pytest.fixture
+def counting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> type[CountingDetector]:
+    weights = tmp_path / "fake.onnx"
+    weights.write_bytes(b"weights")
+    monkeypatch.setattr(rt, "OnnxDetector", CountingDetector)
+    CountingDetector.calls, CountingDetector.stop_at = 0, -1
+    return CountingDetector
+
+
+def test_ctrl_c_keeps_what_was_computed(clip: Path, tmp_path: Path, counting: type[CountingDetector],
+                                        capsys: pytest.CaptureFixture[str]) -> None:
+    counting.stop_at = 7
+    args = ("track", clip, "-o", tmp_path / "out", "--detector", tmp_path / "fake.onnx")
+    assert cli(*args) == 130
+    assert "run the same command again" in capsys.readouterr().err
+    assert counting.calls == 7
+    assert cli(*args) == 0
+    assert counting.calls == FRAMES  # the first 7 were not detected again
+    assert len(np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")) == FRAMES
+
+
+def test_a_changed_option_recomputes_only_what_depends_on_it(clip: Path, tmp_path: Path,
+                                                             counting: type[CountingDetector]) -> None:
+    args = ("track", clip, "-o", tmp_path / "out", "--detector", tmp_path / "fake.onnx")
+    assert cli(*args) == 0 and counting.calls == FRAMES
+    assert cli(*args, "--set", "tracker.n_init=2") == 0 and counting.calls == FRAMES  # detections kept
+    assert cli(*args, "--set", "detect.min_score=0.3") == 0 and counting.calls == 2 * FRAMES
+
+
+def test_objects_refits_without_video_or_detector(clip: Path, detections: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert cli("track", clip, "-o", out, "--detections", detections) == 0
+    before = (out / "tracks.txt").read_bytes()
+    (out / "tracks.txt").unlink()
+    assert cli("objects", out) == 0
+    assert (out / "tracks.txt").read_bytes() == before
+    assert cli("objects", out, "--validate") == 0
+
+
+def test_foreign_folder_is_not_written_into(clip: Path, detections: Path, tmp_path: Path,
+                                            capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/thesis.tex").write_text("precious")
+    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections)
+    assert cli(*args) == 2
+    assert "not made by reobj_track" in capsys.readouterr().err
+    assert cli(*args, "--overwrite") == 0
+    assert (tmp_path / "out/thesis.tex").read_text() == "precious"
+
+
+def test_results_of_two_videos_never_mix(clip: Path, detections: Path, tmp_path: Path,
+                                         capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert cli("track", clip, "-o", out, "--detections", detections) == 0
+    other = tmp_path / "other"
+    other.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(other / f"{i}.png"), texture(1))
+    assert cli("track", other, "-o", out, "--detections", detections) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+# ---- What goes wrong ----
+
+
+def bad(name: str, content: str) -> tuple[str, str]:
+    return name, content
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("1,-1,10,10\n", r"det\.txt.*line 1"),  # wrong column count
+        ("1,-1,10,10,20,20,0.9\n1,-1,nan,10,20,20,0.9\n", r"det\.txt.*line 2"),  # NaN
+        ("1,-1,10,ten,20,20,0.9\n", r"det\.txt.*line 1"),  # no number
+        ("901,-1,10,10,20,20,0.9\n", r"det\.txt.*901|frame"),  # only frames that do not exist
+    ],
+)
+def test_bad_detections(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str,
+                        message: str) -> None:
+    (tmp_path / "det.txt").write_text(content)
+    assert cli("track", clip, "-o", tmp_path / "out", "--detections", tmp_path / "det.txt") == 2
+    assert_one_clear_line(capsys, message)
+    assert not (tmp_path / "out/tracks.txt").exists()
+
+
+def assert_one_clear_line(capsys: pytest.CaptureFixture[str], message: str) -> None:
+    err = capsys.readouterr().err
+    assert re.search(message, err), err
+    assert err.startswith("error: ") and err.count("\n") == 1, err
+
+
+def test_some_frames_that_do_not_exist_are_said(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "det.txt").write_text(mot_rows() + "900,-1,10,10,20,20,0.9,-1,-1,-1\n")
+    assert cli("track", clip, "-o", tmp_path / "out", "--detections", tmp_path / "det.txt") == 0
+    assert "899" in capsys.readouterr().err  # 0-based inside, as documented
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("missing.mp4",), "missing.mp4"),  # no such video
+        (("empty",), "empty"),  # folder without images
+        (("broken.mp4",), "broken.mp4"),  # not a video
+        (("frames", "--detections", "missing.txt"), "missing.txt"),
+        (("frames", "--detections", "det.txt", "--poses", "missing"), "missing"),
+        (("frames", "--detections", "det.txt", "--set", "tracker.coast_frame=3"), "did you mean tracker.coast_frames"),
+        (("frames", "--detections", "det.txt", "--set", "tracker.n_init=many"), "expected =INT"),
+        (("frames", "--detections", "det.txt", "--start", "99"), "--start"),
+        (("frames", "--detector", "text.onnx"), "text.onnx"),  # no ONNX file at all
+        (("frames", "--detector", "no-such-model", "--offline"), "no-such-model"),
+        (("frames", "--detections", "det.txt", "--embed", "text.onnx"), "text.onnx"),
+    ],
+)
+def test_bad_input(clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                   monkeypatch: pytest.MonkeyPatch, args: tuple[str, ...], message: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken.mp4").write_bytes(b"\0" * 1000)
+    (tmp_path / "text.onnx").write_text("hello")
+    command = "run" if "--poses" in args else "track"
+    assert cli(command, *args, "-o", "out") == 2
+    assert_one_clear_line(capsys, message)
+
+
+PLACES = np.array([[-1.2, 0, 3.0], [-0.5, 0.5, 3.2], [0, -0.4, 3.5], [0.6, 0.2, 3.8], [1.2, -0.2, 4.0]])
+
+
+def rendered_tracks(folder: Path, poses: str) -> tuple[Path, Path, Path]:
+    """Frames, detections and TUM poses of a sideways walk past five balls; `poses`: right or inverse."""
+    solids = quadrics.Ellipsoids(PLACES, np.full((5, 3), 0.25), np.tile(np.eye(3), (5, 1, 1)))
+    frames = folder / "frames"
+    frames.mkdir()
+    lines, tum = [], []
+    K = np.array([[300, 0, 160], [0, 300, 120], [0, 0, 1.0]])
+    for i in range(30):
+        turn = np.radians(-15 + i)
+        rotation = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+        center = np.array([-1.0 + i / 15, 0.02 * np.sin(i), 0.3 * np.sin(i / 5)])
+        cam_from_world = np.c_[rotation, -rotation @ center]
+        boxes = quadrics.solid_boxes(solids, "ellipsoid", (K @ cam_from_world)[None])[0]
+        lines += [f"{i + 1},-1,{x1},{y1},{x2 - x1},{y2 - y1},0.9" for x1, y1, x2, y2 in boxes]
+        world_from_cam = np.vstack([cam_from_world, [0, 0, 0, 1]])
+        world_from_cam = np.linalg.inv(world_from_cam) if poses == "right" else world_from_cam
+        w, x, y, z = rt.quat_wxyz_from_matrix(world_from_cam[None, :3, :3])[0]
+        tum.append(f"{i / 30:.6f} {' '.join(map(str, world_from_cam[:3, 3]))} {x} {y} {z} {w}")
+        cv2.imwrite(str(frames / f"{i:03d}.png"), np.full((240, 320, 3), 127, np.uint8))
+    (folder / "det.txt").write_text("\n".join(lines))
+    (folder / "poses.txt").write_text("\n".join(tum))
+    return frames, folder / "det.txt", folder / "poses.txt"
+
+
+def test_supplied_poses_give_ellipsoids_in_metres(tmp_path: Path) -> None:
+    frames, det, poses = rendered_tracks(tmp_path, "right")
+    args = ("run", frames, "-o", tmp_path / "out", "--detections", det, "--poses", poses, "--camera", "300,300,160,120")
+    assert cli(*args, "--support", "ellipsoid") == 0
+    data = json.loads((tmp_path / "out/objects.json").read_text())
+    assert data["world"]["units"] == "m" and data["world"]["registered_frames"] == 30
+    centers = np.array([o["center"] for o in data["objects"]])
+    np.testing.assert_allclose(centers[np.argsort(centers[:, 2])], PLACES, atol=0.05)
+
+
+def test_poses_in_the_wrong_direction_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames, det, poses = rendered_tracks(tmp_path, "inverse")
+    args = ("run", frames, "-o", tmp_path / "out", "--detections", det, "--poses", poses, "--camera", "300,300,160,120")
+    assert cli(*args) == 2
+    assert_one_clear_line(capsys, "cam_from_world")
+    assert not (tmp_path / "out/objects.json").exists()
+
+
+def test_disk_full_leaves_nothing_half_written(clip: Path, detections: Path, tmp_path: Path,
+                                               capsys: pytest.CaptureFixture[str],
+                                               monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(rt.np, "savez_compressed", full)
+    assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 2
+    assert_one_clear_line(capsys, "No space left")
+    assert not [p for p in (tmp_path / "out").rglob("*") if ".part-" in p.name or p.suffix == ".npz"]
+
+
+def test_overlay_cut_by_a_full_disk_is_not_kept(clip: Path, detections: Path, tmp_path: Path) -> None:
+    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk: OpenCV itself does not report it."""
+    code = ("import resource, sys, reobj_track as rt; resource.setrlimit(resource.RLIMIT_FSIZE, (16000, 16000)); "
+            "sys.exit(rt.main(sys.argv[1:]))")
+    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections)
+    done = subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, cwd=Path(rt.__file__).parent)
+    assert done.returncode == 2, done.stderr
+    assert "overlay.mp4" in done.stderr
+    assert not list((tmp_path / "out").glob("*overlay.mp4"))
+
+
+# ---- Promises of the module ----
+
+
+def test_import_loads_no_heavy_package() -> None:
+    code = ("import sys, reobj_track, quadrics; bad = {'pycolmap', 'onnxruntime', 'matplotlib', 'torch', 'trimesh', "
+            "'filterpy'} & set(sys.modules); sys.exit(','.join(sorted(bad)) or 0)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(rt.__file__).parent)
+    assert done.returncode == 0, done.stderr
+
+
+def test_doctests() -> None:
+    import doctest
+
+    for module in (rt, quadrics):
+        failed, tried = doctest.testmod(module)
+        assert failed == 0
+    assert tried is not None
+
+
+@pytest.mark.parametrize("command", ["", "run", "track", "poses", "objects", "eval", "models"])
+def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli(*([command] if command else []), "--help")
+    assert stop.value.code == 0
+    assert "usage:" in capsys.readouterr().out
+
+
+def test_eval_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli("eval", tmp_path, "--gt", tmp_path / "gt.txt") == 2
+    assert_one_clear_line(capsys, "TrackEval")

@@ -1,0 +1,366 @@
+"""Motion, appearance, association and identities of the tracker."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+import reobj_track as rt
+
+CHAIR, CUP = 56, 41
+
+
+def rows(*boxes: tuple[float, ...], score: float = 0.9, class_id: int = CHAIR) -> rt.Detections:
+    """Detections from x1, y1, x2, y2 (and optionally score, class) tuples."""
+    table = [(*b[:4], b[4] if len(b) > 4 else score, b[5] if len(b) > 5 else class_id) for b in boxes]
+    return rt.Detections.from_array(table)
+
+
+def unit(rng: np.random.Generator, n: int, dim: int = 64) -> np.ndarray:
+    vectors = rng.normal(size=(n, dim))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+# ---- Boxes ----
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        ((0, 0, 10, 10), (0, 0, 10, 10), 1.0),  # equal
+        ((0, 0, 10, 10), (10, 0, 20, 10), 0.0),  # touching edges
+        ((0, 0, 10, 10), (10, 10, 20, 20), 0.0),  # touching corners
+        ((0, 0, 10, 10), (5, 0, 15, 10), 1 / 3),  # half over half
+        ((0, 0, 10, 10), (2, 2, 4, 4), 0.04),  # one inside the other
+        ((0, 0, 0, 0), (0, 0, 0, 0), 0.0),  # zero area
+    ],
+)
+def test_box_iou(a: tuple[float, ...], b: tuple[float, ...], expected: float) -> None:
+    iou = rt.box_iou(np.array([a], float), np.array([b], float))
+    assert iou[0, 0] == pytest.approx(expected)
+
+
+def test_box_iou_keeps_rank_when_empty() -> None:
+    assert rt.box_iou(np.empty((0, 4)), np.ones((3, 4))).shape == (0, 3)
+
+
+# ---- Motion ----
+
+
+def filterpy_of(box: np.ndarray, config: rt.TrackerConfig) -> KalmanFilter:
+    """The same model as 8-state filterpy filter: cx, cy, w, h, then their velocities."""
+    kf = KalmanFilter(dim_x=8, dim_z=4)
+    kf.F = np.eye(8) + np.eye(8, k=4)
+    kf.H = np.eye(4, 8)
+    live = rt._Live.born(box[None], np.array([1]), 0, config)
+    kf.x[:4, 0] = box
+    kf.P = np.diag(np.concatenate([live.cov[0, :, 0], live.cov[0, :, 2]]))
+    return kf
+
+
+def test_kalman_equals_filterpy() -> None:
+    config = rt.TrackerConfig()
+    rng = np.random.default_rng(0)
+    box = rng.uniform(50, 200, (5, 4))
+    filters = [filterpy_of(b, config) for b in box]
+    live = rt._Live.born(box, np.arange(5), 0, config)
+    mean, cov = live.mean, live.cov
+    for _ in range(30):
+        scale = rt._noise_scale(mean)
+        mean, cov = rt.kalman_predict(mean, cov, config)
+        for i, kf in enumerate(filters):
+            q = np.concatenate([config.std_position * scale[i], config.std_velocity * scale[i]]) ** 2
+            kf.predict(Q=np.diag(q))
+        measured = mean[..., 0] + rng.normal(0, 4, (5, 4))
+        noise = config.std_measure * rt._noise_scale(mean)
+        mean, cov = rt.kalman_update(mean, cov, measured, noise)
+        for i, kf in enumerate(filters):
+            kf.update(measured[i], R=np.diag(noise[i] ** 2))
+    for i, kf in enumerate(filters):
+        np.testing.assert_allclose(mean[i].T.ravel(), kf.x[:, 0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(cov[i, :, 0], np.diag(kf.P)[:4], atol=1e-9)
+        np.testing.assert_allclose(cov[i, :, 1], np.diag(kf.P[:4, 4:]), atol=1e-9)
+        np.testing.assert_allclose(cov[i, :, 2], np.diag(kf.P)[4:], atol=1e-9)
+
+
+def textured(rng: np.random.Generator) -> np.ndarray:
+    return cv2.GaussianBlur(rng.integers(0, 256, (480, 640, 3), dtype=np.uint8), (0, 0), 3)
+
+
+def test_camera_motion_recovers_a_known_shift() -> None:
+    image = textured(np.random.default_rng(1))
+    motion = rt.CameraMotion(rt.TrackerConfig())
+    motion(image)
+    shift = np.float64([[1, 0, 9], [0, 1, -6]])
+    new_from_old = motion(cv2.warpAffine(image, shift, (640, 480), borderMode=cv2.BORDER_REFLECT))
+    np.testing.assert_allclose(new_from_old[:2, 2], [9, -6], atol=0.5)
+    np.testing.assert_allclose(new_from_old[:2, :2], np.eye(2), atol=0.01)
+
+
+def test_camera_motion_survives_a_textureless_frame() -> None:
+    motion = rt.CameraMotion(rt.TrackerConfig())
+    blank = np.full((100, 100, 3), 128, np.uint8)
+    motion(blank)
+    np.testing.assert_array_equal(motion(blank), np.eye(3))
+
+
+def test_identity_survives_a_jerk_of_the_camera() -> None:
+    """The view jumps by 100 px: without motion compensation the gate loses the object."""
+    image = textured(np.random.default_rng(2))
+    jerk = np.float64([[1, 0, -60], [0, 1, 0]])
+    moved = cv2.warpAffine(image, jerk, (640, 480), borderMode=cv2.BORDER_REFLECT)
+    found = {}
+    for on in (True, False):
+        tracker = rt.Tracker(rt.TrackerConfig(camera_motion=on))
+        for _ in range(10):
+            tracker.update(rows((200, 200, 230, 230)), image)
+        for _ in range(4):
+            found[on] = tracker.update(rows((140, 200, 170, 230)), moved).track_id.tolist()
+    assert found[True] == [1]
+    assert found[False] != [1]
+
+
+def test_known_pose_replaces_the_image_motion() -> None:
+    """A pan by a known rotation moves the box exactly as the homography K R K^-1 says."""
+    camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+    for step in range(8):
+        angle = np.radians(3.0 * step)
+        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+        pose = np.c_[turn, np.zeros(3)]
+        center = camera.K @ turn @ np.array([0.2, 0, 1.0])
+        x, y = center[:2] / center[2]
+        tracks = tracker.update(rows((x - 15, y - 15, x + 15, y + 15)), cam_from_world=pose, camera=camera)
+        assert tracks.track_id.tolist() == [1]
+
+
+# ---- Identities ----
+
+
+def test_identities_start_at_one_and_belong_to_the_tracker() -> None:
+    for _ in range(2):
+        tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+        assert tracker.update(rows((0, 0, 50, 50), (100, 0, 150, 50))).track_id.tolist() == [1, 2]
+    tracker.reset()
+    assert tracker.update(rows((0, 0, 50, 50))).track_id.tolist() == [1]
+
+
+def test_a_track_is_tentative_until_seen_n_init_times() -> None:
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=3))
+    lengths = [len(tracker.update(rows((0, 0, 50, 50)))) for _ in range(4)]
+    assert lengths == [0, 0, 1, 1]
+
+
+def test_step_tells_tentative_tracks_and_their_tracklet() -> None:
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=2))
+    first, second = tracker.step(rows((0, 0, 50, 50))), tracker.step(rows((0, 0, 50, 50)))
+    assert first.track_id.tolist() == [0] and second.track_id.tolist() == [1]
+    assert first.tracklet_id.tolist() == second.tracklet_id.tolist()
+
+
+def test_every_row_names_its_detection() -> None:
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+    detections = rows((300, 0, 350, 50, 0.05), (0, 0, 50, 50), (100, 0, 150, 50))  # the first is too weak
+    tracks = tracker.update(detections)
+    assert tracks.detection_index.tolist() == [1, 2]
+    np.testing.assert_array_equal(tracks.xyxy, detections.xyxy[1:])
+
+
+def test_empty_frames_and_empty_first_frame() -> None:
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+    assert len(tracker.update(rt.Detections.empty())) == 0
+    tracker.update(rows((0, 0, 50, 50)))
+    assert tracker.update(rt.Detections.empty()).xyxy.shape == (0, 4)
+    assert tracker.update(rows((0, 0, 50, 50))).track_id.tolist() == [1]
+
+
+def test_low_scores_continue_tracks_but_start_none() -> None:
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+    tracker.update(rows((0, 0, 50, 50)))
+    tracks = tracker.update(rows((0, 0, 50, 50, 0.2), (200, 200, 260, 260, 0.2)))
+    assert tracks.track_id.tolist() == [1]
+
+
+def test_crossing_objects_keep_their_identity_by_appearance() -> None:
+    """Two objects swap places between frames: motion says stay, the embeddings say swapped."""
+    looks = unit(np.random.default_rng(3), 2)
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1, appearance_weight=0.8))
+    for _ in range(5):
+        tracker.update(rows((100, 100, 150, 150), (108, 100, 158, 150)), embeddings=looks)
+    tracks = tracker.update(rows((102, 100, 152, 150), (106, 100, 156, 150)), embeddings=looks[::-1])
+    assert tracks.track_id.tolist() == [2, 1]
+
+
+def away_and_back(tracker: rt.Tracker, looks: np.ndarray, back: np.ndarray, gap: int = 200) -> list[int]:
+    """Show objects on the left, nothing for a while, then objects on the right with other sizes."""
+    left = [(60 * i, 50, 60 * i + 40, 110) for i in range(len(looks))]
+    for _ in range(12):
+        tracker.update(rows(*left), embeddings=looks)
+    for _ in range(gap):
+        tracker.update(rt.Detections.empty())
+    right = [(900 + 90 * i, 400, 960 + 90 * i, 440) for i in range(len(back))]
+    for _ in range(6):
+        tracks = tracker.update(rows(*right), embeddings=back)
+    return tracks.track_id.tolist()
+
+
+def test_objects_that_return_elsewhere_get_their_identity_back() -> None:
+    """After 200 frames, at the other side of the picture, with another shape: never gated by overlap."""
+    rng = np.random.default_rng(4)
+    looks = unit(rng, 4)
+    back = looks[::-1] + 0.05 * unit(rng, 4)
+    assert away_and_back(rt.Tracker(), looks, back) == [4, 3, 2, 1]
+
+
+def test_a_newcomer_does_not_steal_an_identity() -> None:
+    rng = np.random.default_rng(5)
+    assert away_and_back(rt.Tracker(), unit(rng, 3), unit(rng, 3)) == [4, 5, 6]
+
+
+def test_an_ambiguous_return_gets_a_new_identity() -> None:
+    """Twins left; one of them returns and fits both about equally well: left to the linker."""
+    rng = np.random.default_rng(6)
+    base = unit(rng, 1)
+    twins = np.concatenate([base + 0.02 * unit(rng, 1), base + 0.02 * unit(rng, 1)])
+    assert away_and_back(rt.Tracker(), twins, base) == [3]
+
+
+def test_twins_are_told_apart_by_their_background() -> None:
+    """Same foreground, different surroundings."""
+    rng = np.random.default_rng(7)
+    same = np.repeat(unit(rng, 1), 3, 0)
+    around = unit(rng, 3)
+    both = rt.Embeddings(same, around)
+    tracker = rt.Tracker()
+    boxes = [(60 * i, 50, 60 * i + 40, 110) for i in range(3)]
+    for _ in range(12):
+        tracker.update(rows(*boxes), embeddings=both)
+    for _ in range(100):
+        tracker.update(rt.Detections.empty())
+    for _ in range(5):
+        moved = [(500 + 60 * i, 50, 540 + 60 * i, 110) for i in range(3)]
+        tracks = tracker.update(rows(*moved), embeddings=rt.Embeddings(same, around[[2, 0, 1]]))
+    assert tracks.track_id.tolist() == [3, 1, 2]
+
+
+def test_another_class_never_takes_over_an_identity() -> None:
+    look = unit(np.random.default_rng(8), 1)
+    tracker = rt.Tracker()
+    for _ in range(5):
+        tracker.update(rows((0, 0, 50, 50)), embeddings=look)
+    for _ in range(60):
+        tracker.update(rt.Detections.empty())
+    for _ in range(5):
+        tracks = tracker.update(rows((300, 0, 350, 50), class_id=CUP), embeddings=look)
+    assert tracks.track_id.tolist() == [2]
+
+
+def test_gallery_is_bounded_and_keeps_diverse_views() -> None:
+    rng = np.random.default_rng(9)
+    config = rt.TrackerConfig(n_init=1, embed_every=1, views=6)
+    tracker = rt.Tracker(config)
+    first = unit(rng, 1)
+    for look in [first, *(unit(rng, 1) for _ in range(40))]:
+        tracker.update(rows((0, 0, 50, 50)), embeddings=look)
+    assert tracker.gallery.rows.shape[1] == 6
+    assert tracker.gallery.count[0] == 6
+    np.testing.assert_allclose(np.linalg.norm(tracker.gallery.rows[0], axis=1), 1, atol=1e-5)
+
+
+def test_embeddings_stay_with_their_boxes() -> None:
+    """Weak and unmatched detections in between must not shift the rows."""
+    rng = np.random.default_rng(10)
+    looks = unit(rng, 2)
+    noise = unit(rng, 1)
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+    mixed = rt.Embeddings(np.concatenate([noise, looks[:1], noise, looks[1:]]), np.empty((4, 0)))
+    boxes = [(400, 0, 450, 50, 0.05), (0, 0, 50, 50), (400, 200, 450, 250, 0.05), (100, 0, 150, 50)]
+    tracks = tracker.update(rows(*boxes), embeddings=mixed)
+    assert tracks.detection_index.tolist() == [1, 3]
+    np.testing.assert_allclose(tracker._live.look, looks, atol=1e-6)
+
+
+def test_wrong_number_of_embeddings_is_refused() -> None:
+    with pytest.raises(rt.ReobjError, match="one row a detection"):
+        rt.Tracker().update(rows((0, 0, 5, 5)), embeddings=rt.Embeddings(np.ones((2, 4)), np.ones((2, 0))))
+
+
+def test_tracker_is_deterministic() -> None:
+    def once() -> np.ndarray:
+        rng = np.random.default_rng(11)
+        tracker = rt.Tracker()
+        out = []
+        for _ in range(40):
+            boxes = rng.uniform(0, 400, (8, 2))
+            detections = rt.Detections(np.c_[boxes, boxes + 40], rng.uniform(0.2, 1, 8), np.full(8, CHAIR))
+            out.append(tracker.update(detections, embeddings=unit(rng, 8)).to_array())
+        return np.concatenate(out)
+
+    np.testing.assert_array_equal(once(), once())
+
+
+def test_state_does_not_grow_with_time() -> None:
+    """The same five objects for 1,500 frames: as many rows at the end as after 100."""
+    rng = np.random.default_rng(12)
+    looks, tracker = unit(rng, 5), rt.Tracker(rt.TrackerConfig(embed_every=1))
+    boxes = [(80 * i, 0, 80 * i + 50, 50) for i in range(5)]
+    sizes = []
+    for frame in range(1500):
+        tracker.update(rows(*boxes), embeddings=looks + 0.3 * unit(rng, 5))
+        if frame in (100, 1499):
+            sizes.append((tracker.gallery.rows.nbytes, len(tracker._live.mean)))
+    assert sizes[0] == sizes[1]
+
+
+# ---- Embedder ----
+
+
+def scene_with_twins() -> tuple[np.ndarray, rt.Detections]:
+    """Two identical patches on different backgrounds."""
+    rng = np.random.default_rng(13)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (240, 480, 3), dtype=np.uint8), (0, 0), 8)
+    image[:, :240] = (0.5 * image[:, :240] + [100, 20, 20]).clip(0, 255).astype(np.uint8)
+    image[:, 240:] = (0.5 * image[:, 240:] + [20, 20, 100]).clip(0, 255).astype(np.uint8)
+    patch = cv2.GaussianBlur(rng.integers(0, 256, (60, 60, 3), dtype=np.uint8), (0, 0), 3)
+    image[90:150, 90:150] = image[90:150, 330:390] = patch
+    return image, rows((90, 90, 150, 150), (330, 90, 390, 150))
+
+
+def test_embedder_separates_foreground_from_background() -> None:
+    image, detections = scene_with_twins()
+    found = rt.Embedder()(image, detections)
+    assert found.foreground[0] @ found.foreground[1] > 0.98
+    assert found.background[0] @ found.background[1] < 0.9
+
+
+def test_embedder_uses_masks() -> None:
+    """With a mask of the left half only, the right half of the patch no longer counts as foreground."""
+    image, detections = scene_with_twins()
+    masks = np.zeros((2, *image.shape[:2]), bool)
+    masks[0, 90:150, 90:120] = masks[1, 90:150, 330:360] = True
+    masked = rt.Detections(detections.xyxy, detections.score, detections.class_id, masks)
+    before = rt.Embedder()(image, masked).foreground[0]
+    changed = image.copy()
+    changed[95:145, 135:150] = 255  # in the box, outside the mask
+    after = rt.Embedder()(changed, masked).foreground[0]
+    plain = rt.Embedder()(changed, detections).foreground[0]
+    unmasked_before = rt.Embedder()(image, detections).foreground[0]
+    assert before @ after > 0.99
+    assert plain @ unmasked_before < before @ after
+
+
+def test_embedding_some_rows_equals_embedding_all() -> None:
+    image, detections = scene_with_twins()
+    embedder = rt.Embedder()
+    whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
+    np.testing.assert_array_equal(whole.foreground[1:], part.foreground)
+    np.testing.assert_array_equal(whole.background[1:], part.background)
+
+
+@pytest.mark.parametrize("box", [(-50, -50, 20, 20), (470, 230, 600, 400), (10, 10, 10.5, 10.5), (900, 900, 950, 950)])
+def test_embedder_takes_boxes_at_and_over_the_border(box: tuple[float, ...]) -> None:
+    image, _ = scene_with_twins()
+    found = rt.Embedder()(image, rows(box))
+    assert np.isfinite(found.foreground).all() and np.isfinite(found.background).all()
