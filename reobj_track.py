@@ -73,6 +73,7 @@ Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 Image = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float32]
 
 log = logging.getLogger("reobj_track")
 
@@ -204,7 +205,7 @@ class PosesConfig:
     check_ratio: float = _opt(0.3, "direction check: another reading must be better by this factor")
     max_step_ratio: float = _opt(5.0, "refuse a PnP pose further from its neighbours than this times the median step")
 
-# ---- Poses -------------------------------------------------------------------------------------
+# ---- Poses -------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class EmbedConfig:
     """Appearance."""
@@ -217,7 +218,9 @@ class EmbedConfig:
     size_px: int = _opt(480, "longer side of the backbone's input")
     context: float = _opt(0.5, "background: the box grown by this share of its size on every side")
     samples: int = _opt(16, "samples a side over the grown box")
-    object_score: float = _opt(0.3, "detections from this score on are no background for the others")
+    object_score: float = _opt(
+        0.3, "detections from this score on are no background for the others"
+    )
     foreground_cells: int = _opt(2, "cells a side that the foreground is divided into")
     background_cells: int = _opt(
         4, "cells a side that the grown box is divided into for the background"
@@ -307,7 +310,9 @@ class ObjectsConfig:
         0.6, "in at least this share of the frames of either part (OA-SLAM: half)"
     )
     cut_gap: int = _opt(5, "tracklets may be split where this many frames pass without a detection")
-    split_drop: float = _opt(0.7, "a return is doubted if its joint solid overlaps its boxes less than this share")
+    split_drop: float = _opt(
+        0.7, "a return is doubted if its joint solid overlaps its boxes less than this share"
+    )
     split_place: float = _opt(
         0.1, "a return is undone when the two places overlap less than this (IoU)"
     )
@@ -472,7 +477,7 @@ class Poses:
     @property
     def known(self) -> BoolArray:
         """(F,) True where the frame has a pose."""
-        return np.isfinite(self.cam_from_world).all((1, 2))
+        return np.asarray(np.isfinite(self.cam_from_world).all((1, 2)), bool)
 
 
 class Progress:
@@ -507,7 +512,7 @@ class Progress:
         return time.monotonic() - self.started
 
 
-# ---- Weights -----------------------------------------------------------------------------------
+# ---- Weights -------------------------------------------------------------------------------------
 
 DOWNLOAD_CHUNK = 1 << 16  # bytes read at a time
 DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
@@ -746,7 +751,7 @@ def _check_download(weights: Weights, part: Path) -> None:
         )
 
 
-# ---- Video -------------------------------------------------------------------------------------
+# ---- Video ---------------------------------------------------------------------------------------
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 IMAGE_FPS = 30.0  # times of image folders whose names are no timestamps
@@ -945,7 +950,7 @@ def _read_image(path: Path) -> Image | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-# ---- Detections: files -------------------------------------------------------------------------
+# ---- Detections: files ---------------------------------------------------------------------------
 
 MOSTLY = 0.5  # above this share of bad boxes it is the format that is wrong, not the boxes
 BEYOND = 0.1  # boxes that reach this share of the image beyond it were made on another image size
@@ -1621,7 +1626,7 @@ class DetectionCache:
         self._load(path)
 
 
-# ---- Detections: ONNX --------------------------------------------------------------------------
+# ---- Detections: ONNX ----------------------------------------------------------------------------
 
 PAD_VALUE = 114  # grey of letterbox borders (YOLOX, Ultralytics)
 DYNAMIC_SIDE = 640  # longer side for models that take any size (YOLO11 was trained so)
@@ -2211,7 +2216,7 @@ class CameraMotion:
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
         self._gray: Image | None = None
-        self._corners: npt.NDArray[np.float32] | None = None
+        self._corners: Any = None
 
     def __call__(self, image: Image) -> Array:
         """Return new_from_old (3, 3) in pixels of `image`."""
@@ -2229,7 +2234,8 @@ class CameraMotion:
     def _flow(self, gray: Image) -> Array:
         """Fit the similarity small_new_from_small_old (3, 3)."""
         assert self._gray is not None and self._corners is not None
-        moved, ok, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, self._corners, None)
+        guess = np.empty_like(self._corners)
+        moved, ok, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, self._corners, guess)
         good = ok.ravel() == 1
         result = np.eye(3)
         if good.sum() >= self.config.flow_min_corners:
@@ -2297,12 +2303,12 @@ class Embedder:
     ) -> None:
         self.config = config or EmbedConfig()
         self.model = model
-        self._features: Callable[[Image], npt.NDArray[np.float32]] = (
+        self._features: Callable[[Image], Floats] = (
             _colour_features
             if model == "colour"
             else _Backbone(model, self.config, threads, offline)
         )
-        self._last: tuple[Image, npt.NDArray[np.float32]] | None = None
+        self._last: tuple[Image, Floats] | None = None
 
     def __call__(
         self, frame: Image, detections: Detections, rows: IntArray | None = None
@@ -2321,7 +2327,7 @@ class Embedder:
 
     def _pool(
         self,
-        features: npt.NDArray[np.float32],
+        features: Floats,
         size_hw: tuple[int, ...],
         detections: Detections,
         rows: IntArray,
@@ -2360,26 +2366,33 @@ def _on_object(detections: Detections, rows: IntArray, x: Array, y: Array) -> Bo
         height, width = detections.masks.shape[1:]
         row, column = y.astype(int).clip(0, height - 1), x.astype(int).clip(0, width - 1)
         under = detections.masks[rows[:, None, None], row, column]  # (N, S, S)
-        on = np.where(detections.masks[rows].any((1, 2))[:, None, None], under, on)
+        masked = np.asarray(detections.masks[rows].any((1, 2)), bool)
+        on = np.where(masked[:, None, None], under, on)
     return np.asarray(on, bool)
 
 
-def _object_map(detections: Detections, size_hw: tuple[int, ...], shape: tuple[int, int]) -> BoolArray:
+def _object_map(
+    detections: Detections, size_hw: tuple[int, ...], shape: tuple[int, int]
+) -> BoolArray:
     """Which cells of a feature map (h, w) show any object of the frame? size_hw: of the frame."""
     canvas = np.zeros(shape, np.uint8)
     masked = np.zeros(len(detections), bool)
     if detections.masks is not None and len(detections):
-        masked = detections.masks.any((1, 2))
-        union = detections.masks.any(0).astype(np.uint8)
-        canvas = np.asarray(cv2.resize(union, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8)
+        masked = np.asarray(detections.masks.any((1, 2)), bool)
+        union = np.asarray(detections.masks.any(0), np.uint8)
+        canvas = np.asarray(
+            cv2.resize(union, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8
+        )
     scale = np.array([shape[1] / size_hw[1], shape[0] / size_hw[0]] * 2)
-    for x, y, w, h in (_cxcywh_from_xyxy(detections.xyxy[~masked]) * scale).round().clip(-9999, 9999):
+    for x, y, w, h in (
+        (_cxcywh_from_xyxy(detections.xyxy[~masked]) * scale).round().clip(-9999, 9999)
+    ):
         axes = (max(int(w / 2), 1), max(int(h / 2), 1))
         cv2.ellipse(canvas, (int(x), int(y)), axes, 0, 0, 360, (1,), -1)
     return np.asarray(canvas, bool)
 
 
-def _pool_cells(sampled: npt.NDArray[np.float32], weight: BoolArray, cells: int) -> Array:
+def _pool_cells(sampled: Floats, weight: BoolArray, cells: int) -> Array:
     """Mean feature of each of cells x cells parts, concatenated to unit rows (N, cells * cells *
     C).
 
@@ -2403,7 +2416,7 @@ def _pool_cells(sampled: npt.NDArray[np.float32], weight: BoolArray, cells: int)
     return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
 
 
-def _colour_features(frame: Image) -> npt.NDArray[np.float32]:
+def _colour_features(frame: Image) -> Floats:
     """Training-free feature map (h, w, 17): soft histograms of Lab colour and of gradient
     orientation.
     """
@@ -2422,10 +2435,8 @@ def _colour_features(frame: Image) -> npt.NDArray[np.float32]:
     return np.asarray(cv2.blur(stacked, (5, 5)), np.float32)
 
 
-def _direction_bins(vector: npt.NDArray[np.float32], bins: int = 6) -> npt.NDArray[np.float32]:
-    """Soft histogram (h, w, bins) of the direction of vectors (h, w, 2), weighted by their length
-    up to 1.
-    """
+def _direction_bins(vector: Any, bins: int = 6) -> Floats:
+    """Soft histogram (h, w, bins) of the directions of vectors (h, w, 2), weighted by length <= 1."""
     length = cv2.magnitude(vector[..., 0], vector[..., 1])[..., None] + 1e-6  # (h, w, 1)
     turn = np.arange(bins) * 2 * np.pi / bins
     aligned = (vector / length) @ np.stack([np.cos(turn), np.sin(turn)]).astype(
@@ -2451,7 +2462,7 @@ class _Backbone:
             )
         self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
 
-    def __call__(self, frame: Image) -> npt.NDArray[np.float32]:
+    def __call__(self, frame: Image) -> Floats:
         """Return (h, w, C) features; ImageNet mean and deviation, RGB, size a multiple of 32."""
         shrink = min(1.0, self.config.size_px / max(frame.shape[:2]))
         size = [max(32, round(side * shrink / 32) * 32) for side in frame.shape[1::-1]]
@@ -2459,7 +2470,7 @@ class _Backbone:
             cv2.resize(frame, size, interpolation=cv2.INTER_AREA)[..., ::-1].astype(np.float32)
             / 255
         )
-        rgb = (rgb - np.float32([0.485, 0.456, 0.406])) / np.float32([0.229, 0.224, 0.225])
+        rgb = (rgb - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
         (maps,) = self.session.run(
             [self.output], {self.input: rgb.transpose(2, 0, 1)[None].astype(np.float32)}
         )
@@ -2479,14 +2490,14 @@ class _LazyEmbeddings:
     ) -> None:
         self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
         self.weight = weight
-        self.rows: npt.NDArray[np.float32] | None = None  # (D, E)
+        self.rows: Floats | None = None  # (D, E)
         self.done = np.zeros(len(detections), bool)
 
     @property
     def available(self) -> bool:
         return self.given is not None or (self.embedder is not None and self.frame is not None)
 
-    def get(self, rows: IntArray) -> npt.NDArray[np.float32]:
+    def get(self, rows: IntArray) -> Floats:
         """Return unit rows (N, E): foreground and background side by side, weighted."""
         todo = rows[~self.done[rows]]
         if len(todo):
@@ -2496,7 +2507,7 @@ class _LazyEmbeddings:
             self.rows[todo], self.done[todo] = fused, True
         return np.empty((0, 0), np.float32) if self.rows is None else self.rows[rows]
 
-    def _fuse(self, rows: IntArray) -> npt.NDArray[np.float32]:
+    def _fuse(self, rows: IntArray) -> Floats:
         """cos(fused) = w cos(foreground) + (1 - w) cos(background)."""
         if self.given is not None:
             parts = (self.given.foreground[rows], self.given.background[rows])
@@ -2532,7 +2543,7 @@ class Gallery:
         self.rows = np.zeros((0, config.views, 0), np.float32)  # (I, K, E)
         self.count = np.zeros(0, np.int64)  # (I,) views held
 
-    def add(self, identity: IntArray, rows: npt.NDArray[np.float32]) -> None:
+    def add(self, identity: IntArray, rows: Floats) -> None:
         """Store one new view (E,) for each of N different identities: a new one if it is novel,
         else blended.
         """
@@ -2553,13 +2564,13 @@ class Gallery:
         self.count[identity] += novel & room
 
     @staticmethod
-    def _most_redundant(full: npt.NDArray[np.float32]) -> IntArray:
+    def _most_redundant(full: Floats) -> IntArray:
         """For full sets of views (N, K, E): the view that is most like another one, (N,)."""
         pairs = np.einsum("nke,nle->nkl", full, full)
         pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -2.0
         return np.asarray(pairs.max(2).argmax(1), np.int64)
 
-    def similarity(self, rows: npt.NDArray[np.float32], identity: IntArray) -> Array:
+    def similarity(self, rows: Floats, identity: IntArray) -> Array:
         """Best cosine between each row (N, E) and any view of each identity (I,): (N, I)."""
         if not len(rows) or not len(identity) or self.rows.shape[2] != rows.shape[1]:
             return np.full((len(rows), len(identity)), -2.0)
@@ -2665,7 +2676,7 @@ class _Live:
     first: IntArray  # (T,) frame of birth
     embedded: IntArray  # (T,) frame of the last embedding
     votes: Array  # (T, C) score sums of the classes
-    look: npt.NDArray[np.float32]  # (T, E) running mean of the embeddings
+    look: Floats  # (T, E) running mean of the embeddings
 
     def select(self, keep: npt.NDArray[Any]) -> _Live:
         return _Live(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
@@ -2935,7 +2946,7 @@ class Tracker:
         live.embedded[t] = self.frame_number
         self._learn(look, live.identity[t], detections.class_id[rows])
 
-    def _learn(self, look: npt.NDArray[np.float32], identity: IntArray, class_id: IntArray) -> None:
+    def _learn(self, look: Floats, identity: IntArray, class_id: IntArray) -> None:
         """Feed the similarity statistics and the gallery with embeddings (n, E) of one frame."""
         cosine = (look @ look.T).astype(np.float64)  # (n, n)
         pair = np.triu(class_id[:, None] == class_id[None], 1)
@@ -3080,8 +3091,7 @@ def invert_rigid(b_from_a: Array) -> Array:
 
 
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
-    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; None for an
-    empty text.
+    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; None for an empty text.
 
     >>> parse_camera("500,500,320,240", (640, 480)).model
     'PINHOLE'
@@ -3119,15 +3129,12 @@ def estimate_poses(
 
     Args:
         video: a `Video`, iterated up to twice.
-        work_dir: receives `sparse/` (COLMAP model of the keyframes, native pixels) and
-            `pycolmap.log`.
+        work_dir: receives `sparse/` (COLMAP model of the keyframes, native pixels) and `pycolmap.log`.
         progress: makes the progress line of a stage from its name and total.
-        boxes_to_mask: frame number -> (N, 4) xyxy boxes of moving things in native pixels, left out
-            of the features.
+        boxes_to_mask: frame number -> (N, 4) xyxy boxes of moving things in native pixels, left out of the features.
     Returns:
-        a pose for every frame that could be located, in the reconstruction's own world and scale. A
-        failed reconstruction is no exception: all poses are NaN and `messages` say why and what
-        helps.
+        a pose for every frame that could be located, in the reconstruction's own world and scale. A failed
+        reconstruction is no exception: all poses are NaN and `messages` say why and what helps.
     """
     if getattr(video, "is_live", False):
         raise ReobjError("poses of a live camera cannot be reconstructed: record a video first, or --poses none")
@@ -3188,9 +3195,7 @@ def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class _WorkImage:
-    """One frame at working size: its place in the video, source frame number, time, BGR and gray
-    image.
-    """
+    """One frame at working size: its place in the video, source frame number, time, BGR and gray image."""
 
     place: int
     frame: int
@@ -3200,9 +3205,7 @@ class _WorkImage:
 
 
 class _WorkVideo:
-    """A video at working size; gray images are kept in memory up to `cache_mb`, beyond it the video
-    is read again.
-    """
+    """A video at working size; gray images are kept in memory up to `cache_mb`, beyond it the video is read again."""
 
     def __init__(self, video: Any, config: PosesConfig) -> None:
         self.video, self.config, self.used_mb = video, config, 0.0
@@ -3234,9 +3237,7 @@ class _WorkVideo:
 
 
 def _klt(old: Image, new: Image, xy: Array, config: PosesConfig) -> tuple[Array, BoolArray]:
-    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back to where
-    they began.
-    """
+    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back to where they began."""
     if not len(xy):
         return xy, np.zeros(0, bool)
     start = xy.astype(np.float32).reshape(-1, 1, 2)
@@ -3261,9 +3262,7 @@ class _FlowSinceKeyframe:
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
     def step(self, gray: Image) -> tuple[float, float]:
-        """Follow into the next frame: median flow since the keyframe over the width, share of
-        corners left.
-        """
+        """Follow into the next frame: median flow since the keyframe over the width, share of corners left."""
         if self.count < self.config.min_corners:  # textureless so far: a keyframe as soon as there is something
             return 0.0, float(len(self.corners(gray)) < self.config.min_corners)
         ahead, kept = _klt(self.gray, gray, self.at, self.config)
@@ -3273,11 +3272,10 @@ class _FlowSinceKeyframe:
 
 
 def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_WorkImage]:
-    """Choose keyframes by optical flow, the sharpest near the threshold; the first and the last
-    frame are among them.
+    """Choose keyframes by optical flow, the sharpest near the threshold; the first and the last frame are among them.
 
-    When there are more than `max_keyframes`, every second one is dropped and the spacing doubles:
-    one pass, bounded memory, the same choice every time.
+    When there are more than `max_keyframes`, every second one is dropped and the spacing doubles: one pass, bounded
+    memory, the same choice every time.
     """
     keys: list[_WorkImage] = []
     again: deque[_WorkImage] = deque()  # frames behind a chosen one, to be looked at again
@@ -3310,8 +3308,7 @@ def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_Wo
 def _locate_between(
     model: _SparseModel, places: IntArray, video: _WorkVideo, config: PosesConfig, line: Progress
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Locate every frame by PnP from points followed from the registered keyframes before and after
-    it.
+    """Locate every frame by PnP from points followed from the registered keyframes before and after it.
 
     Args:
         places: (R,) place in the video of each registered keyframe, ascending.
@@ -3343,8 +3340,8 @@ def _segments(
 ) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
     """Cut the video at the registered keyframes.
 
-    Yields rows of the keyframes before and after (-1: none), and (place, image) of both and of all
-    between. Of stretches without a keyframe that are longer than `longest`, the middle is left out.
+    Yields rows of the keyframes before and after (-1: none), and (place, image) of both and of all between. Of
+    stretches without a keyframe that are longer than `longest`, the middle is left out.
     """
     row_of = {int(place): row for row, place in enumerate(places)}
     before, run = -1, deque[tuple[int, Image]](maxlen=longest)
@@ -3359,8 +3356,7 @@ def _segments(
 
 
 def _follow(model: _SparseModel, row: int, images: list[Image], config: PosesConfig) -> list[tuple[IntArray, Array]]:
-    """Follow the longest-seen 3D points of a keyframe (row; -1: none) from the first image through
-    the others.
+    """Follow the longest-seen 3D points of a keyframe (row; -1: none) from the first image through the others.
 
     Returns:
         per image: rows of `model.points` (n,) and their native pixels (n, 2), COLMAP convention.
@@ -3378,9 +3374,7 @@ def _follow(model: _SparseModel, row: int, images: list[Image], config: PosesCon
 
 
 def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
-    """Mark frames whose centre is a detour: much further from both neighbours than these are from
-    each other.
-    """
+    """Mark frames whose centre is a detour: much further from both neighbours than these are from each other."""
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     jump = np.zeros(len(cam_from_world), bool)
     if len(known) > 2:
@@ -3394,8 +3388,7 @@ def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
 def fill_gaps(
     frame: IntArray, cam_from_world: Array, status: npt.NDArray[np.str_], max_gap: int
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line;
-    never beyond.
+    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line; never beyond.
 
     (Interpolating t of cam_from_world instead would bend the path.)
     """
@@ -3439,9 +3432,7 @@ def _run_sfm(
     work_dir: Path,
     progress: Callable[[str, int], Progress],
 ) -> list[str]:
-    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why and
-    what helps.
-    """
+    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why and what helps."""
     folder = work_dir / "mapping"
     for old in (work_dir / "sparse", folder):
         shutil.rmtree(old, ignore_errors=True)
@@ -3467,9 +3458,7 @@ def _run_sfm(
 
 
 def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Progress]) -> list[str]:
-    """Run `_sfm_child` in a fresh interpreter, so that neither an abort nor chatter of COLMAP
-    reaches the user.
-    """
+    """Run `_sfm_child` in a fresh interpreter, so that neither an abort nor chatter of COLMAP reaches the user."""
     here = Path(__file__).resolve()
     command = [sys.executable, "-c", _CHILD_CODE, here.stem, str(here), str(here.parent), str(folder)]
     lines: list[Progress] = []
@@ -3496,9 +3485,7 @@ def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Prog
 
 
 def _sfm_child(folder_name: str) -> None:
-    """Child process: reconstruct the keyframes of a job folder; writes messages.json and, if it
-    went well, sparse/.
-    """
+    """Child process: reconstruct the keyframes of a job folder; writes messages.json and, if it went well, sparse/."""
     pc = _pycolmap()
     pc.logging.minloglevel = 0  # stderr is the log file here
     folder = Path(folder_name)
@@ -3582,9 +3569,7 @@ def _read_model(folder: Path) -> _SparseModel:
 
 
 def _absolute_pose(xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig) -> Array | None:
-    """PnP: cam_from_world (3, 4) from native pixels (n, 2) of world points (n, 3); None if it is
-    not to be trusted.
-    """
+    """PnP: cam_from_world (3, 4) from native pixels (n, 2) of world points (n, 3); None if it is not to be trusted."""
     if len(xy) < config.pnp_min_inliers:
         return None
     error_px = config.pnp_error_px * camera.width / work_width
@@ -3600,9 +3585,7 @@ def _absolute_pose(xy: Array, points: Array, camera: Camera, work_width: int, co
 
 
 def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: PosesConfig) -> list[Image]:
-    """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database;
-    returns descriptors.
-    """
+    """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database; returns descriptors."""
     kept = []
     pc, size = _pycolmap(), (images.shape[2], images.shape[1])
     if job["camera"] is not None:
@@ -3631,9 +3614,7 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
 
 
 def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np.float32], Image]:
-    """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2) and descriptors (N, 128)
-    uint8.
-    """
+    """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2) and descriptors (N, 128) uint8."""
     gray = cv2.cvtColor(np.ascontiguousarray(bgr), cv2.COLOR_BGR2GRAY)
     mask = np.full(gray.shape, 255, np.uint8)
     for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
@@ -3651,9 +3632,7 @@ def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np
 
 
 def _sfm_match(database: Path, descriptors: list[Image], config: PosesConfig) -> None:
-    """Match all pairs of a few keyframes, else each with those at offsets 1, 2, 4, 8 ... and with
-    its look-alikes.
-    """
+    """Match all pairs of a few keyframes, else each with those at offsets 1, 2, 4, 8 ... and with its look-alikes."""
     pc, count = _pycolmap(), len(descriptors)
     verify = {"ransac": {"random_seed": config.seed}}  # without the seed two runs differ
     options: dict[str, Any] = {"verification_options": verify, "device": pc.Device.cpu}
@@ -3670,9 +3649,7 @@ def _sfm_match(database: Path, descriptors: list[Image], config: PosesConfig) ->
 
 
 def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[int, int]]:
-    """Find the pairs of keyframes that look most alike, for loops. Ref: VLAD, Jegou et al., CVPR
-    2010.
-    """
+    """Find the pairs of keyframes that look most alike, for loops. Ref: VLAD, Jegou et al., CVPR 2010."""
     features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
     sample = features[:: max(1, len(features) // config.loop_sample)]
     if len(sample) < config.loop_words:
@@ -3762,9 +3739,7 @@ def _sfm_fixed_focal(database: Path, count: int, config: PosesConfig) -> _Attemp
 
 
 def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> _Attempt:
-    """Run a mapper on `count` keyframes, measure its largest model and name its first problem ("":
-    it is sound).
-    """
+    """Run a mapper on `count` keyframes, measure its largest model and name its first problem ("": it is sound)."""
     models = _sfm_map(database, rung, fixed, count, config)
     if not models:
         return _Attempt()
@@ -3787,8 +3762,7 @@ def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: Pos
 
 
 def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
-    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics.
-    """
+    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics."""
     pc, out = _pycolmap(), database.parent / rung
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
@@ -3809,9 +3783,7 @@ def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesCo
 
 
 def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> tuple[float, float]:
-    """Median over points of the widest triangulation angle (degrees), and median distance from the
-    cameras.
-    """
+    """Median over points of the widest triangulation angle (degrees), and median distance from the cameras."""
     ids = sorted(model.point3D_ids())
     angles, depths = [0.0][: not ids], [0.0][: not ids]
     for point_id in ids[:: max(1, len(ids) // sample)]:
@@ -3825,9 +3797,7 @@ def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> t
 
 
 def _sfm_write(model: Any, images: Any, folder: Path, names: list[str], native: tuple[int, int]) -> None:
-    """Write a COLMAP model in native pixels with the real names; points get the colour of their
-    first observation.
-    """
+    """Write a COLMAP model in native pixels with the real names; points get the colour of their first observation."""
     height, width = images.shape[1:3]
     for point_id in model.point3D_ids():
         point = model.point3D(point_id)
@@ -3865,8 +3835,7 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
     """Read poses made elsewhere, in the format `config.fmt` (auto: recognised).
 
     Args:
-        path: file or folder; video: the frames they belong to; config: its `camera` overrides the
-            file's intrinsics.
+        path: file or folder; video: the frames they belong to; config: its `camera` overrides the file's intrinsics.
     Returns:
         poses of the frames that the file knows, NaN for the others (counted in `messages`).
     """
@@ -3910,8 +3879,7 @@ def _pose_format(path: Path) -> str:
 
 
 def _number_rows(path: Path, columns: tuple[int, ...], expected: str) -> tuple[Array, list[str]]:
-    """Read a table of finite numbers (N, C), C in `columns`, and where each row is (for messages).
-    """
+    """Read a table of finite numbers (N, C), C in `columns`, and where each row is (for messages)."""
     rows: list[list[float]] = []
     where = []
     for number, text in enumerate(_lines(path), 1):
@@ -3951,9 +3919,7 @@ def _json_object(path: Path) -> dict[str, Any]:
 
 
 def _rigid(matrix: Array, where: Sequence[str]) -> Array:
-    """Check rigid transforms (N, 3 or 4, 4) and return (N, 3, 4) with exact rotations; rows of NaN
-    or inf: NaN.
-    """
+    """Check rigid transforms (N, 3 or 4, 4) and return (N, 3, 4) with exact rotations; rows of NaN or inf: NaN."""
     lost = ~np.isfinite(matrix).all((1, 2))
     matrix = np.where(lost[:, None, None], np.eye(4)[: matrix.shape[1]], matrix)
     rotation = matrix[:, :3, :3]
@@ -3976,9 +3942,7 @@ def _refuse(bad: BoolArray, where: Sequence[str], problem: str) -> None:
 
 
 def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
-    """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations
-    (N, 3).
-    """
+    """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations (N, 3)."""
     norm = np.linalg.norm(xyzw, axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
     _refuse(np.abs(norm - 1) > PosesConfig().pose_tolerance, where, what)
@@ -3986,9 +3950,7 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
 
 
 def _given_tum(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam, xyzw; metres unless our own header
-    says otherwise.
-    """
+    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam, xyzw; metres unless our own header says otherwise."""
     rows, where = _number_rows(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
     metric = not any(line.startswith("#") and _NO_SCALE in line for line in _lines(path))
@@ -3999,9 +3961,7 @@ _NO_SCALE = "units: arbitrary"
 
 
 def _given_kitti(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """KITTI: a row-major 3x4 (or 4x4) world_from_cam a line, one line for each frame of the source;
-    metres.
-    """
+    """KITTI: a row-major 3x4 (or 4x4) world_from_cam a line, one line for each frame of the source; metres."""
     rows, where = _number_rows(path, (12, 16), "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam")
     return _GivenPoses(invert_rigid(_rigid(rows.reshape(len(rows), -1, 4), where)), metric=True)
 
@@ -4017,9 +3977,7 @@ _CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 
 
 def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """Record3D metadata: `poses` [qx qy qz qw tx ty tz] world_from_cam in OpenGL axes, `K`
-    column-major; y up.
-    """
+    """Record3D metadata: `poses` [qx qy qz qw tx ty tz] world_from_cam in OpenGL axes, `K` column-major; y up."""
     data = _json_object(path)
     try:
         rows = np.array(data["poses"], np.float64).reshape(-1, 7)
@@ -4034,9 +3992,7 @@ def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
 
 
 def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """ScanNet `pose/<frame>.txt` (also 7-Scenes `*.pose.txt`): 4x4 world_from_cam, metres; inf:
-    lost frame; z up.
-    """
+    """ScanNet `pose/<frame>.txt` (also 7-Scenes `*.pose.txt`): 4x4 world_from_cam, metres; inf: lost frame; z up."""
     folder = path / "pose" if (path / "pose").is_dir() else path
     files = sorted(file for file in folder.glob("*.txt") if file.stem[-1:].isdigit() or file.stem.endswith(".pose"))
     if not files:
@@ -4057,8 +4013,7 @@ def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
 def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
     """transforms.json of nerfstudio or instant-ngp: world_from_cam in OpenGL axes; scale unknown.
 
-    nerfstudio turned the world by `applied_transform`; this is undone: T_cv = inv(A) T diag(1, -1,
-    -1, 1).
+    nerfstudio turned the world by `applied_transform`; this is undone: T_cv = inv(A) T diag(1, -1, -1, 1).
     """
     path = path / "transforms.json" if path.is_dir() else path
     data = _json_object(path)
@@ -4096,9 +4051,7 @@ def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | 
 
 
 def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
-    """The one camera of all images; slightly different ones (autofocus) are replaced by the median
-    one.
-    """
+    """The one camera of all images; slightly different ones (autofocus) are replaced by the median one."""
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
     if not found:
         return None
@@ -4116,9 +4069,7 @@ _COLMAP_PARAMS = {
 
 
 def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """COLMAP model, text or binary (preferred), with or without rigs: cam_from_world; scale
-    unknown.
-    """
+    """COLMAP model, text or binary (preferred), with or without rigs: cam_from_world; scale unknown."""
     start = path if path.is_dir() else path.parent
     folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
     for suffix, read in ((".bin", _colmap_binary), (".txt", _colmap_text)):
@@ -4204,8 +4155,7 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
 def _rows_of_frames(
     given: _GivenPoses, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
 ) -> tuple[IntArray, list[str]]:
-    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order.
-    """
+    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order."""
     count = len(given.cam_from_world)
     messages: list[str] = []
     if given.names:
@@ -4226,9 +4176,7 @@ def _rows_of_frames(
 
 
 def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
-    """Match by path, file name or stem; otherwise by the last number in the name (from 0, or from 1
-    without a 0).
-    """
+    """Match by path, file name or stem; otherwise by the last number in the name (from 0, or from 1 without a 0)."""
     keys: list[Callable[[str], str]] = [str, lambda n: Path(n).name, lambda n: Path(n).stem]
     for key in keys:
         rows = {key(name): r for r, name in enumerate(given)}
@@ -4243,9 +4191,7 @@ def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -
 
 
 def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
-    """Match the nearest stamp within half a frame; stamps of another clock only if there is one for
-    each frame.
-    """
+    """Match the nearest stamp within half a frame; stamps of another clock only if there is one for each frame."""
     if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
         return np.arange(len(frame)), ["time stamps are of another clock than the frames: matched in order"]
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
@@ -4262,15 +4208,13 @@ def check_poses(
 ) -> str | None:
     """Find out whether poses are given in the wrong direction or with the wrong axes.
 
-    Triangulates the box centres of tracks with the poses as they are, inverted, and with OpenGL
-    axes; the residual is the angle between a ray and the direction to the point (180 deg when it is
-    behind the camera).
+    Triangulates the box centres of tracks with the poses as they are, inverted, and with OpenGL axes; the residual
+    is the angle between a ray and the direction to the point (180 deg when it is behind the camera).
 
     Args:
         tracks: per track frame numbers (n,) and centres (n, 2), native pixels.
     Returns:
-        a message that names the likely mistake if another reading explains the tracks clearly
-        better, else None.
+        a message that names the likely mistake if another reading explains the tracks clearly better, else None.
     """
     config = config or PosesConfig()
     usual = poses.cam_from_world
@@ -4301,9 +4245,7 @@ def check_poses(
 
 
 def _track_views(poses: Poses, frame: IntArray, xy: Array, config: PosesConfig) -> tuple[IntArray, Array] | None:
-    """Rows of the frames of a track that have a pose, thinned, and unit rays (n, 3) in the camera;
-    None if too few.
-    """
+    """Rows of the frames of a track that have a pose, thinned, and unit rays (n, 3) in the camera; None if too few."""
     place = np.clip(np.searchsorted(poses.frame, frame), 0, len(poses.frame) - 1)
     use = np.flatnonzero((poses.frame[place] == frame) & poses.known[place] & np.isfinite(xy).all(1))
     if len(use) < config.check_views:
@@ -4315,9 +4257,7 @@ def _track_views(poses: Poses, frame: IntArray, xy: Array, config: PosesConfig) 
 
 
 def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
-    """Meet rays (n, 3) of n cameras (n, 3, 4) in the nearest point or, if better, at infinity;
-    median angle to it.
-    """
+    """Meet rays (n, 3) of n cameras (n, 3, 4) in the nearest point or, if better, at infinity; median angle to it."""
     world_from_cam = invert_rigid(cam_from_world)
     ray, centre = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam), world_from_cam[:, :, 3]
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3) sum_i (I - d d') (X - c) = 0
@@ -4341,8 +4281,7 @@ def write_tum(path: Path, poses: Poses) -> None:
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
-    """Write a COLMAP text model of all known poses and points; pycolmap's own binary model is kept
-    if there is one.
+    """Write a COLMAP text model of all known poses and points; pycolmap's own binary model is kept if there is one.
 
     Args:
         image_names: (F,) name of every frame of `poses`.
@@ -4602,7 +4541,9 @@ class Linker:
         _, joint = self._cross_iou(self.group, groups)
         atoms = range(count)
         alone = np.array([self._median_iou(own[:, a], self.atom == a) for a in atoms])  # (L,)
-        together = np.array([self._median_iou(joint[:, self.group[a]], self.atom == a) for a in atoms])
+        together = np.array(
+            [self._median_iou(joint[:, self.group[a]], self.atom == a) for a in atoms]
+        )
         worse = together < self.config.split_drop * alone
         length = np.bincount(self.atom, minlength=count)
         for g in np.flatnonzero(np.bincount(self.group) > 1):
@@ -4907,9 +4848,8 @@ def quat_wxyz_from_matrix(rotation: Array) -> Array:
 def object_color(object_id: int) -> tuple[int, int, int]:
     """A BGR colour for an identity, well apart from its neighbours (golden-angle hues)."""
     hue = object_id * 0.381966 % 1.0
-    hsv = np.uint8(
-        [[[round(hue * 179), 200 - 60 * (object_id % 2), 255 - 45 * (object_id // 2 % 2)]]]
-    )
+    color = (round(hue * 179), 200 - 60 * (object_id % 2), 255 - 45 * (object_id // 2 % 2))
+    hsv = np.array([[color]], np.uint8)
     blue, green, red = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].tolist()
     return blue, green, red
 
@@ -5038,7 +4978,8 @@ def write_overlay(
     try:
         for frame in video:
             start, stop = np.searchsorted(table.frame, [frame.index, frame.index + 1])
-            image = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+            small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+            image = np.asarray(small, np.uint8)
             rows = table[slice(start, stop)]
             if frame.index in projected:
                 draw_ellipses(
@@ -5137,10 +5078,7 @@ class Workspace:
 
     def path(self, stage: str, *key: Any) -> Path:
         """File of a stage's result for this key (configs and strings)."""
-        text = json.dumps(
-            [dataclasses.asdict(k) if dataclasses.is_dataclass(k) else k for k in key],
-            sort_keys=True,
-        )
+        text = json.dumps(key, sort_keys=True, default=dataclasses.asdict)
         return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
     def remember(self, track: TrackResult, poses: Poses | None) -> None:
@@ -5205,7 +5143,8 @@ def run(
     poses = _supplied_poses(video, config) if "poses" in stages else None
     track = track_video(video, space, config, detections, poses, seconds)
     if "poses" in stages and poses is None and config.poses.mode != "none":
-        poses = _reconstruct(video, space, config, seconds)
+        moving = _moving_rows(track, config.objects)
+        poses = _reconstruct(video, space, config, seconds, moving)
     if poses is not None:
         _check_supplied(poses, track.table)
     space.remember(track, poses if "objects" in stages else None)
@@ -5356,7 +5295,9 @@ def _detection_source(video: Video, config: Config, detections: Any) -> _Source:
         recorded = read_detections(detections, video, config.detect)
         key = source_fingerprint(detections)
         at = recorded.at
-        return _Source(key, recorded.class_names, lambda frame: at(frame.index), False, recorded.messages)
+        return _Source(
+            key, recorded.class_names, lambda frame: at(frame.index), False, recorded.messages
+        )
     path = model_path(config.detect.model, offline=config.offline)
     detector = OnnxDetector(path, config.detect, config.threads)
     key = json.dumps([path.name, path.stat().st_size, dataclasses.asdict(config.detect)])
@@ -5489,15 +5430,23 @@ def _rows_by(group: IntArray) -> list[IntArray]:
 
 
 def _reconstruct(
-    video: Video, space: Workspace, config: Config, seconds: dict[str, float]
+    video: Video,
+    space: Workspace,
+    config: Config,
+    seconds: dict[str, float],
+    moving: TrackTable | None = None,
 ) -> Poses:
-    """Poses from pycolmap, cached."""
-    path = space.path("poses", source_fingerprint(video.source), config.input, config.poses)
+    """Poses from pycolmap, cached; features on moving things (people, animals) are left out."""
+    boxes = np.empty((0, 5)) if moving is None else np.column_stack([moving.frame, moving.xyxy])
+    digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
+    content = source_fingerprint(video.source)
+    path = space.path("poses", content, config.input, config.poses, digest)
     if path.exists():
         return load_poses(path)
     started = time.monotonic()
     work = space.cache / "sfm"
-    poses = estimate_poses(video, config.poses, work)
+    mask = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
+    poses = estimate_poses(video, config.poses, work, boxes_to_mask=mask)
     if (work / "sparse").is_dir():
         shutil.rmtree(space.out / "sparse", ignore_errors=True)
         (work / "sparse").replace(space.out / "sparse")
@@ -5505,6 +5454,12 @@ def _reconstruct(
         save_poses(path, poses)
     seconds["poses"] = time.monotonic() - started
     return poses
+
+
+def _moving_rows(track: TrackResult, config: ObjectsConfig) -> TrackTable:
+    """Rows of the classes that move."""
+    moving = [i for i, n in enumerate(track.class_names) if n in config.moving.split(",")]
+    return track.table[np.isin(track.table.class_id, moving)]
 
 
 def make_objects(
@@ -5934,7 +5889,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"reobj_track {__version__}")
     parser.add_argument(
-        "--options", action=_ListOptions, nargs=0, help="list what --set section.field=value can set"
+        "--options",
+        action=_ListOptions,
+        nargs=0,
+        help="list what --set section.field=value can set",
     )
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(
@@ -5953,7 +5911,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
         "--set",
         action="append",
         metavar="SECTION.FIELD=VALUE",
-        help="any other option, e.g. tracker.coast_frames=60; `reobj_track.py --options` lists them",
+        help="any other option, e.g. tracker.coast_frames=60; --options lists them",
     )
     parser.add_argument("-v", "--verbose", action="store_true", help="say what is being done")
     parser.add_argument("--debug", action="store_true", help="say more, and show tracebacks")

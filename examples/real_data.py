@@ -3,10 +3,10 @@
 
     python examples/real_data.py FOLDER... -o OUT [--detector NAME]
 
-A FOLDER holds `images/` (or is a video file) and, optionally, `detections_yolov8s.csv` (used unless --detector
-is given), `gt_mot.txt` (identities, MOTChallenge), `poses_c2w.txt` (4x4 world_from_cam a line) with which the
-reconstructed cameras are compared after a similarity alignment. Nothing is tuned to a recording: all run with
-the defaults.
+A FOLDER holds `images/` (or is a video file) and, optionally, `detections_yolov8s.csv` (used unless
+--detector is given), `gt_mot.txt` (identities, MOTChallenge), `poses_c2w.txt` (4x4 world_from_cam a
+line) with which the reconstructed cameras are compared after a similarity alignment. Nothing is
+tuned to a recording: all run with the defaults.
 """
 
 from __future__ import annotations
@@ -22,21 +22,27 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 
 HEADER = (
-    "| recording | frames | with pose | camera error | tracker ids | objects | with ellipsoid | IDF1 | "
+    "| recording | frames | with pose | camera error | tracker ids | objects | ellipsoids | IDF1 | "
     "track s | poses s | objects s |\n|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
 def main() -> int:
     """Run every recording and print its row."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("-o", "--out", type=Path, required=True)
-    parser.add_argument("--detector", default="", help="ONNX detector instead of recorded detections")
+    parser.add_argument(
+        "--detector", default="", help="ONNX detector instead of recorded detections"
+    )
     args = parser.parse_args()
     print(HEADER)
     for recording in args.recordings:
-        print(row(recording, args.out / (recording.stem + args.detector), args.detector), flush=True)
+        print(
+            row(recording, args.out / (recording.stem + args.detector), args.detector), flush=True
+        )
     return 0
 
 
@@ -91,8 +97,8 @@ def align(points: np.ndarray, target: np.ndarray) -> np.ndarray:
 def identity_score(recording: Path, result: rt.RunResult) -> str:
     """IDF1 against `gt_mot.txt`, over the classes that are annotated there (Ristani et al., 2016).
 
-    Detections of a class are compared with the annotations of that class at IoU .5; objects that the
-    recording does not annotate are left out by keeping the classes chair, dining table and cup.
+    Detections of a class are compared with the annotations of that class at IoU .5; objects that
+    the recording does not annotate are left out by keeping the classes chair, dining table and cup.
     """
     path = recording / "gt_mot.txt"
     if not path.exists():

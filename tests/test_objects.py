@@ -33,27 +33,46 @@ def walk(frames: int = 120, arc_deg: float = 120.0) -> rt.Poses:
     eyes = np.stack([3.5 * np.sin(angles), -3.5 * np.cos(angles), np.full(frames, 1.6)], 1)
     poses = np.stack([looking_at(eye, np.array([0, 0, 0.4])) for eye in eyes])
     status = np.array(["supplied"] * frames)
-    return rt.Poses(CAMERA, np.arange(frames), np.arange(frames) / 30, poses, status, "user", True,
-                    np.array([0, 0, 1.0]))
+    return rt.Poses(
+        CAMERA,
+        np.arange(frames),
+        np.arange(frames) / 30,
+        poses,
+        status,
+        "user",
+        True,
+        np.array([0, 0, 1.0]),
+    )
 
 
 def chair_solids() -> quadrics.Ellipsoids:
     """Three equal chairs in a row and nothing else."""
     centers = np.array([[-1.1, 0, 0.41], [0, 0.1, 0.41], [1.1, 0, 0.41]])
-    turn = np.array([[[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]] for a in (0.2, 1.1, -0.5)])
+    turn = np.array(
+        [
+            [[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]
+            for a in (0.2, 1.1, -0.5)
+        ]
+    )
     return quadrics.Ellipsoids(centers, np.tile([0.28, 0.3, 0.41], (3, 1)), turn)
 
 
 def table_of(poses: rt.Poses, seed: int = 0) -> rt.TrackTable:
     """Noisy boxes of the chairs, one tracklet a chair; rows ordered by frame."""
-    boxes = quadrics.solid_boxes(chair_solids(), "box", poses.camera.K @ poses.cam_from_world)  # (F, 3, 4)
+    boxes = quadrics.solid_boxes(
+        chair_solids(), "box", poses.camera.K @ poses.cam_from_world
+    )  # (F, 3, 4)
     boxes = boxes + np.random.default_rng(seed).normal(0, 1.0, boxes.shape)
     frame, obj = np.divmod(np.arange(boxes.shape[0] * 3), 3)
     n = len(frame)
-    return rt.TrackTable(frame, obj + 1, obj + 1, boxes.reshape(-1, 4), np.full(n, 0.9), np.full(n, CHAIR), obj)
+    return rt.TrackTable(
+        frame, obj + 1, obj + 1, boxes.reshape(-1, 4), np.full(n, 0.9), np.full(n, CHAIR), obj
+    )
 
 
-def linked(table: rt.TrackTable, poses: rt.Poses, similarity: np.ndarray | None = None) -> rt.RunResult:
+def linked(
+    table: rt.TrackTable, poses: rt.Poses, similarity: np.ndarray | None = None
+) -> rt.RunResult:
     count = int(table.object_id.max())
     similarity = np.ones((count, count)) if similarity is None else similarity
     track = rt.TrackResult(table, similarity, NAMES, ())
@@ -64,13 +83,19 @@ def linked(table: rt.TrackTable, poses: rt.Poses, similarity: np.ndarray | None 
 
 
 def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
-    """Each chair's track is cut in two with a gap; the halves are found again, the twins stay apart."""
+    """Each chair's track is cut in two with a gap; the halves are found again, the twins stay
+    apart.
+    """
     poses = walk()
     table = table_of(poses)
     table = table[(table.frame < 40) | (table.frame >= 80)]
     late = table.frame >= 80
-    table = rt.TrackTable(table.frame, table.object_id + 3 * late, table.tracklet_id + 3 * late, *(
-        getattr(table, name) for name in ("xyxy", "score", "class_id", "detection_index")))
+    table = rt.TrackTable(
+        table.frame,
+        table.object_id + 3 * late,
+        table.tracklet_id + 3 * late,
+        *(getattr(table, name) for name in ("xyxy", "score", "class_id", "detection_index")),
+    )
     result = linked(table, poses)
     truth = table.detection_index  # the true chair
     pairs = {(t, o) for t, o in zip(truth.tolist(), result.table.object_id.tolist(), strict=True)}
@@ -79,29 +104,56 @@ def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
 
 
 def test_a_wrong_return_is_split_by_its_place() -> None:
-    """The tracker took the third chair for the first one that came back: two places, two objects."""
+    """The tracker took the third chair for the first one that came back: two places, two objects.
+    """
     poses = walk()
     table = table_of(poses)
-    table = table[((table.detection_index == 0) & (table.frame < 50)) | ((table.detection_index == 2) & (table.frame > 70))]
+    table = table[
+        ((table.detection_index == 0) & (table.frame < 50))
+        | ((table.detection_index == 2) & (table.frame > 70))
+    ]
     one = np.ones(len(table), np.int64)
-    table = rt.TrackTable(table.frame, one, table.tracklet_id, table.xyxy, table.score, table.class_id,
-                          table.detection_index)
+    table = rt.TrackTable(
+        table.frame,
+        one,
+        table.tracklet_id,
+        table.xyxy,
+        table.score,
+        table.class_id,
+        table.detection_index,
+    )
     result = linked(table, poses)
     assert len(result.objects) == 2
     assert [e["kind"] for e in result.world["links"]] == ["split"]
 
 
 def test_objects_seen_together_are_never_joined() -> None:
-    """Two tracks of one chair in the same frames (a double detection) stay two: the evidence says so."""
+    """Two tracks of one chair in the same frames (a double detection) stay two: the evidence says
+    so.
+    """
     poses = walk()
     table = table_of(poses)
     first = table[table.detection_index == 0]
-    double = rt.TrackTable(*(np.concatenate([getattr(first, f), getattr(first, f)]) for f in (
-        "frame", "object_id", "tracklet_id", "xyxy", "score", "class_id", "detection_index")))
+    double = rt.TrackTable(
+        *(
+            np.concatenate([getattr(first, f), getattr(first, f)])
+            for f in (
+                "frame",
+                "object_id",
+                "tracklet_id",
+                "xyxy",
+                "score",
+                "class_id",
+                "detection_index",
+            )
+        )
+    )
     half = len(first)
     ids = np.repeat([1, 2], half)
     order = np.argsort(double.frame, kind="stable")
-    double = rt.TrackTable(double.frame, ids, ids, double.xyxy, double.score, double.class_id, double.detection_index)[order]
+    double = rt.TrackTable(
+        double.frame, ids, ids, double.xyxy, double.score, double.class_id, double.detection_index
+    )[order]
     assert len(linked(double, poses).objects) == 2
 
 
@@ -110,8 +162,15 @@ def test_different_classes_are_never_joined() -> None:
     table = table_of(poses)
     table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
     late = (table.frame > 70).astype(np.int64)
-    table = rt.TrackTable(table.frame, 1 + late, 1 + late, table.xyxy, table.score,
-                          np.where(late == 1, CUP, CHAIR), table.detection_index)
+    table = rt.TrackTable(
+        table.frame,
+        1 + late,
+        1 + late,
+        table.xyxy,
+        table.score,
+        np.where(late == 1, CUP, CHAIR),
+        table.detection_index,
+    )
     assert [o["class"] for o in linked(table, poses).objects] == ["chair", "cup"]
 
 
@@ -132,7 +191,13 @@ def test_objects_come_out_where_they_are() -> None:
 
 def test_without_poses_objects_are_the_tracks() -> None:
     result = linked(table_of(walk()), walk())
-    flat = rt.make_objects(rt.TrackResult(table_of(walk()), np.ones((3, 3)), NAMES, ()), None, rt.Config(), Path("x"), {})
+    flat = rt.make_objects(
+        rt.TrackResult(table_of(walk()), np.ones((3, 3)), NAMES, ()),
+        None,
+        rt.Config(),
+        Path("x"),
+        {},
+    )
     assert [o["id"] for o in flat.objects] == [o["id"] for o in result.objects] == [1, 2, 3]
     assert all(o["center"] is None and o["reason"] == "no camera poses" for o in flat.objects)
 
@@ -148,8 +213,15 @@ def test_frames_without_pose_are_left_out() -> None:
 def test_moving_classes_get_no_ellipsoid() -> None:
     poses = walk()
     table = table_of(poses)
-    table = rt.TrackTable(table.frame, table.object_id, table.tracklet_id, table.xyxy, table.score,
-                          np.zeros(len(table), np.int64), table.detection_index)
+    table = rt.TrackTable(
+        table.frame,
+        table.object_id,
+        table.tracklet_id,
+        table.xyxy,
+        table.score,
+        np.zeros(len(table), np.int64),
+        table.detection_index,
+    )
     assert {o["reason"] for o in linked(table, poses).objects} == {"objects of this class move"}
 
 
@@ -165,7 +237,9 @@ def test_boxes_are_undistorted_but_border_edges_stay() -> None:
     camera = rt.Camera("SIMPLE_RADIAL", 640, 480, (520.0, 320.0, 240.0, 0.2))
     boxes = np.array([[400.0, 300, 600, 450], [0, 100, 200, 480]])
     ideal = rt._undistort_boxes(boxes, camera)
-    assert (ideal[0, 2:] < boxes[0, 2:]).all()  # positive k pushes points outwards: the ideal ones lie inwards
+    assert (
+        ideal[0, 2:] < boxes[0, 2:]
+    ).all()  # positive k pushes points outwards: the ideal ones lie inwards
     assert ideal[1, 0] == 0 and ideal[1, 3] == 480
 
 
@@ -209,7 +283,10 @@ def test_projected_ellipse_lies_in_the_box(tmp_path: Path) -> None:
         (x, y), (major, minor), angle = rt._ellipse_of_dual_conic(conic)  # type: ignore[misc]
         turn, phase = np.radians(angle), np.linspace(0, 2 * np.pi, 100)
         edge = np.stack([major / 2 * np.cos(phase), minor / 2 * np.sin(phase)])
-        outline = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ edge + [[x + 0.5], [y + 0.5]]
+        outline = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ edge + [
+            [x + 0.5],
+            [y + 0.5],
+        ]
         assert (outline[0] >= box[0] - 0.5).all() and (outline[0] <= box[2] + 0.5).all()
         assert (outline[1] >= box[1] - 0.5).all() and (outline[1] <= box[3] + 0.5).all()
     assert visible.all()
@@ -240,8 +317,14 @@ def test_validate_finds_faults(tmp_path: Path, change: dict[str, object], fault:
     poses = walk()
     result = linked(table_of(poses), poses)
     result.objects[0] |= change
-    data = {"format": "reobj-objects", "version": 1, "video": {}, "world": {}, "conventions": {},
-            "objects": result.objects}
+    data = {
+        "format": "reobj-objects",
+        "version": 1,
+        "video": {},
+        "world": {},
+        "conventions": {},
+        "objects": result.objects,
+    }
     (tmp_path / "objects.json").write_text(json.dumps(data))
     faults = rt.validate_objects(tmp_path / "objects.json")
     assert any(fault in line for line in faults), faults

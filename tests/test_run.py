@@ -1,4 +1,5 @@
-"""The command line as a user meets it: whole runs, resuming, and every way the input can be wrong."""
+"""The command line as a user meets it: whole runs, resuming, and every way the input can be wrong.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +39,11 @@ def clip(tmp_path: Path) -> Path:
 
 def mot_rows(frames: int = FRAMES) -> str:
     """Two objects that stay on the texture while the camera pans."""
-    lines = [f"{i + 1},-1,{100 - 4 * i},60,40,50,0.9,-1,-1,-1\n{i + 1},-1,{220 - 4 * i},80,50,60,0.9,-1,-1,-1"
-             for i in range(frames)]
+    lines = [
+        f"{i + 1},-1,{x - 4 * i},{y},40,50,0.9,-1,-1,-1"
+        for i in range(frames)
+        for x, y in ((100, 60), (220, 80))
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -57,22 +61,29 @@ def cli(*args: object) -> int:
 # ---- What must work ----
 
 
-def test_track_writes_identities(clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_track_writes_identities(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 0
     mot = np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")
-    assert sorted(set(mot[:, 1])) == [1, 2] and len(mot) == 2 * FRAMES  # tentative frames are back-filled
+    assert (
+        sorted(set(mot[:, 1])) == [1, 2] and len(mot) == 2 * FRAMES
+    )  # tentative frames are back-filled
     assert rt.validate_objects(tmp_path / "out/objects.json") == []
     out = capsys.readouterr().out
     assert "distinct objects: 2" in out and "overlay.mp4" in out
 
 
-def test_run_without_parallax_keeps_the_2d_results(clip: Path, detections: Path, tmp_path: Path,
-                                                   capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_without_parallax_keeps_the_2d_results(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A camera that stands still: no crash, the reason and the remedy are said."""
     for image in sorted(clip.iterdir())[1:]:
         image.write_bytes((clip / "000.png").read_bytes())
     lines = [line for line in detections.read_text().splitlines() if line.startswith("1,")]
-    detections.write_text("".join(line.replace("1,", f"{i + 1},", 1) + "\n" for i in range(FRAMES) for line in lines))
+    detections.write_text(
+        "".join(line.replace("1,", f"{i + 1},", 1) + "\n" for i in range(FRAMES) for line in lines)
+    )
     assert cli("run", clip, "-o", tmp_path / "out", "--detections", detections) == 0
     captured = capsys.readouterr()
     assert "warning: no camera poses" in captured.err and "--poses" in captured.err
@@ -80,8 +91,12 @@ def test_run_without_parallax_keeps_the_2d_results(clip: Path, detections: Path,
     assert not (tmp_path / "out/poses.txt").exists()
 
 
-def test_poses_none_stays_in_2d(clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli("run", clip, "-o", tmp_path / "out", "--detections", detections, "--poses", "none") == 0
+def test_poses_none_stays_in_2d(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        cli("run", clip, "-o", tmp_path / "out", "--detections", detections, "--poses", "none") == 0
+    )
     assert "warning" not in capsys.readouterr().err
 
 
@@ -89,17 +104,23 @@ def test_same_input_same_bytes(clip: Path, detections: Path, tmp_path: Path) -> 
     for name in ("a", "b"):
         assert cli("track", clip, "-o", tmp_path / name, "--detections", detections) == 0
     read = [(tmp_path / n / "tracks.txt").read_bytes() for n in ("a", "b")]
-    objects = [json.loads((tmp_path / n / "objects.json").read_text())["objects"] for n in ("a", "b")]
+    objects = [
+        json.loads((tmp_path / n / "objects.json").read_text())["objects"] for n in ("a", "b")
+    ]
     assert read[0] == read[1] and objects[0] == objects[1]
 
 
 def test_every_keeps_source_frame_numbers(clip: Path, detections: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert cli("track", clip, "-o", out, "--detections", detections, "--every", 2, "--start", 2) == 0
+    assert (
+        cli("track", clip, "-o", out, "--detections", detections, "--every", 2, "--start", 2) == 0
+    )
     assert sorted(set(np.loadtxt(out / "tracks.txt", delimiter=",")[:, 0])) == [3, 5, 7, 9, 11]
 
 
-def test_max_size_keeps_native_pixels_in_the_files(clip: Path, detections: Path, tmp_path: Path) -> None:
+def test_max_size_keeps_native_pixels_in_the_files(
+    clip: Path, detections: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     assert cli("track", clip, "-o", out, "--detections", detections, "--max-size", 160) == 0
     mot = np.loadtxt(out / "tracks.txt", delimiter=",")
@@ -107,8 +128,21 @@ def test_max_size_keeps_native_pixels_in_the_files(clip: Path, detections: Path,
 
 
 def test_one_frame(clip: Path, detections: Path, tmp_path: Path) -> None:
-    assert cli("run", clip, "-o", tmp_path / "out", "--detections", detections, "--stop", 1,
-               "--set", "tracker.n_init=1") == 0
+    assert (
+        cli(
+            "run",
+            clip,
+            "-o",
+            tmp_path / "out",
+            "--detections",
+            detections,
+            "--stop",
+            1,
+            "--set",
+            "tracker.n_init=1",
+        )
+        == 0
+    )
     assert len(np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")) == 2
 
 
@@ -121,8 +155,9 @@ def test_zero_detections(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (tmp_path / "out/tracks.txt").read_text() == ""
 
 
-def test_corrupt_frame_in_the_middle_is_skipped_and_counted(clip: Path, detections: Path, tmp_path: Path,
-                                                            capsys: pytest.CaptureFixture[str]) -> None:
+def test_corrupt_frame_in_the_middle_is_skipped_and_counted(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (clip / "005.png").write_bytes(b"not an image")
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 0
     assert "1 frames skipped" in capsys.readouterr().err
@@ -173,8 +208,9 @@ def counting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> type[CountingDe
     return CountingDetector
 
 
-def test_ctrl_c_keeps_what_was_computed(clip: Path, tmp_path: Path, counting: type[CountingDetector],
-                                        capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_keeps_what_was_computed(
+    clip: Path, tmp_path: Path, counting: type[CountingDetector], capsys: pytest.CaptureFixture[str]
+) -> None:
     counting.stop_at = 7
     args = ("track", clip, "-o", tmp_path / "out", "--detector", tmp_path / "fake.onnx")
     assert cli(*args) == 130
@@ -185,15 +221,20 @@ def test_ctrl_c_keeps_what_was_computed(clip: Path, tmp_path: Path, counting: ty
     assert len(np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")) == FRAMES
 
 
-def test_a_changed_option_recomputes_only_what_depends_on_it(clip: Path, tmp_path: Path,
-                                                             counting: type[CountingDetector]) -> None:
+def test_a_changed_option_recomputes_only_what_depends_on_it(
+    clip: Path, tmp_path: Path, counting: type[CountingDetector]
+) -> None:
     args = ("track", clip, "-o", tmp_path / "out", "--detector", tmp_path / "fake.onnx")
     assert cli(*args) == 0 and counting.calls == FRAMES
-    assert cli(*args, "--set", "tracker.n_init=2") == 0 and counting.calls == FRAMES  # detections kept
+    assert (
+        cli(*args, "--set", "tracker.n_init=2") == 0 and counting.calls == FRAMES
+    )  # detections kept
     assert cli(*args, "--set", "detect.min_score=0.3") == 0 and counting.calls == 2 * FRAMES
 
 
-def test_objects_refits_without_video_or_detector(clip: Path, detections: Path, tmp_path: Path) -> None:
+def test_objects_refits_without_video_or_detector(
+    clip: Path, detections: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     assert cli("track", clip, "-o", out, "--detections", detections) == 0
     before = (out / "tracks.txt").read_bytes()
@@ -203,8 +244,9 @@ def test_objects_refits_without_video_or_detector(clip: Path, detections: Path, 
     assert cli("objects", out, "--validate") == 0
 
 
-def test_foreign_folder_is_not_written_into(clip: Path, detections: Path, tmp_path: Path,
-                                            capsys: pytest.CaptureFixture[str]) -> None:
+def test_foreign_folder_is_not_written_into(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/thesis.tex").write_text("precious")
     args = ("track", clip, "-o", tmp_path / "out", "--detections", detections)
@@ -214,8 +256,9 @@ def test_foreign_folder_is_not_written_into(clip: Path, detections: Path, tmp_pa
     assert (tmp_path / "out/thesis.tex").read_text() == "precious"
 
 
-def test_results_of_two_videos_never_mix(clip: Path, detections: Path, tmp_path: Path,
-                                         capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_of_two_videos_never_mix(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     assert cli("track", clip, "-o", out, "--detections", detections) == 0
     other = tmp_path / "other"
@@ -242,8 +285,9 @@ def bad(name: str, content: str) -> tuple[str, str]:
         ("901,-1,10,10,20,20,0.9\n", r"det\.txt.*901|frame"),  # only frames that do not exist
     ],
 )
-def test_bad_detections(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str,
-                        message: str) -> None:
+def test_bad_detections(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, message: str
+) -> None:
     (tmp_path / "det.txt").write_text(content)
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", tmp_path / "det.txt") == 2
     assert_one_clear_line(capsys, message)
@@ -256,7 +300,9 @@ def assert_one_clear_line(capsys: pytest.CaptureFixture[str], message: str) -> N
     assert err.startswith("error: ") and err.count("\n") == 1, err
 
 
-def test_some_frames_that_do_not_exist_are_said(clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_some_frames_that_do_not_exist_are_said(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "det.txt").write_text(mot_rows() + "900,-1,10,10,20,20,0.9,-1,-1,-1\n")
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", tmp_path / "det.txt") == 0
     assert "899" in capsys.readouterr().err  # 0-based inside, as documented
@@ -270,7 +316,10 @@ def test_some_frames_that_do_not_exist_are_said(clip: Path, tmp_path: Path, caps
         (("broken.mp4",), "broken.mp4"),  # not a video
         (("frames", "--detections", "missing.txt"), "missing.txt"),
         (("frames", "--detections", "det.txt", "--poses", "missing"), "missing"),
-        (("frames", "--detections", "det.txt", "--set", "tracker.coast_frame=3"), "did you mean tracker.coast_frames"),
+        (
+            ("frames", "--detections", "det.txt", "--set", "tracker.coast_frame=3"),
+            "did you mean tracker.coast_frames",
+        ),
         (("frames", "--detections", "det.txt", "--set", "tracker.n_init=many"), "expected =INT"),
         (("frames", "--detections", "det.txt", "--start", "99"), "--start"),
         (("frames", "--detector", "text.onnx"), "text.onnx"),  # no ONNX file at all
@@ -278,8 +327,15 @@ def test_some_frames_that_do_not_exist_are_said(clip: Path, tmp_path: Path, caps
         (("frames", "--detections", "det.txt", "--embed", "text.onnx"), "text.onnx"),
     ],
 )
-def test_bad_input(clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-                   monkeypatch: pytest.MonkeyPatch, args: tuple[str, ...], message: str) -> None:
+def test_bad_input(
+    clip: Path,
+    detections: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    args: tuple[str, ...],
+    message: str,
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken.mp4").write_bytes(b"\0" * 1000)
@@ -289,11 +345,15 @@ def test_bad_input(clip: Path, detections: Path, tmp_path: Path, capsys: pytest.
     assert_one_clear_line(capsys, message)
 
 
-PLACES = np.array([[-1.2, 0, 3.0], [-0.5, 0.5, 3.2], [0, -0.4, 3.5], [0.6, 0.2, 3.8], [1.2, -0.2, 4.0]])
+PLACES = np.array(
+    [[-1.2, 0, 3.0], [-0.5, 0.5, 3.2], [0, -0.4, 3.5], [0.6, 0.2, 3.8], [1.2, -0.2, 4.0]]
+)
 
 
 def rendered_tracks(folder: Path, poses: str) -> tuple[Path, Path, Path]:
-    """Frames, detections and TUM poses of a sideways walk past five balls; `poses`: right or inverse."""
+    """Frames, detections and TUM poses of a sideways walk past five balls; `poses`: right or
+    inverse.
+    """
     solids = quadrics.Ellipsoids(PLACES, np.full((5, 3), 0.25), np.tile(np.eye(3), (5, 1, 1)))
     frames = folder / "frames"
     frames.mkdir()
@@ -301,7 +361,9 @@ def rendered_tracks(folder: Path, poses: str) -> tuple[Path, Path, Path]:
     K = np.array([[300, 0, 160], [0, 300, 120], [0, 0, 1.0]])
     for i in range(30):
         turn = np.radians(-15 + i)
-        rotation = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+        rotation = np.array(
+            [[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]]
+        )
         center = np.array([-1.0 + i / 15, 0.02 * np.sin(i), 0.3 * np.sin(i / 5)])
         cam_from_world = np.c_[rotation, -rotation @ center]
         boxes = quadrics.solid_boxes(solids, "ellipsoid", (K @ cam_from_world)[None])[0]
@@ -318,7 +380,18 @@ def rendered_tracks(folder: Path, poses: str) -> tuple[Path, Path, Path]:
 
 def test_supplied_poses_give_ellipsoids_in_metres(tmp_path: Path) -> None:
     frames, det, poses = rendered_tracks(tmp_path, "right")
-    args = ("run", frames, "-o", tmp_path / "out", "--detections", det, "--poses", poses, "--camera", "300,300,160,120")
+    args = (
+        "run",
+        frames,
+        "-o",
+        tmp_path / "out",
+        "--detections",
+        det,
+        "--poses",
+        poses,
+        "--camera",
+        "300,300,160,120",
+    )
     assert cli(*args, "--support", "ellipsoid") == 0
     data = json.loads((tmp_path / "out/objects.json").read_text())
     assert data["world"]["units"] == "m" and data["world"]["registered_frames"] == 30
@@ -326,32 +399,63 @@ def test_supplied_poses_give_ellipsoids_in_metres(tmp_path: Path) -> None:
     np.testing.assert_allclose(centers[np.argsort(centers[:, 2])], PLACES, atol=0.05)
 
 
-def test_poses_in_the_wrong_direction_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_poses_in_the_wrong_direction_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     frames, det, poses = rendered_tracks(tmp_path, "inverse")
-    args = ("run", frames, "-o", tmp_path / "out", "--detections", det, "--poses", poses, "--camera", "300,300,160,120")
+    args = (
+        "run",
+        frames,
+        "-o",
+        tmp_path / "out",
+        "--detections",
+        det,
+        "--poses",
+        poses,
+        "--camera",
+        "300,300,160,120",
+    )
     assert cli(*args) == 2
     assert_one_clear_line(capsys, "cam_from_world")
     assert not (tmp_path / "out/objects.json").exists()
 
 
-def test_disk_full_leaves_nothing_half_written(clip: Path, detections: Path, tmp_path: Path,
-                                               capsys: pytest.CaptureFixture[str],
-                                               monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_full_leaves_nothing_half_written(
+    clip: Path,
+    detections: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def full(*args: object, **kwargs: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(rt.np, "savez_compressed", full)
     assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 2
     assert_one_clear_line(capsys, "No space left")
-    assert not [p for p in (tmp_path / "out").rglob("*") if ".part-" in p.name or p.suffix == ".npz"]
+    assert not [
+        p for p in (tmp_path / "out").rglob("*") if ".part-" in p.name or p.suffix == ".npz"
+    ]
 
 
-def test_overlay_cut_by_a_full_disk_is_not_kept(clip: Path, detections: Path, tmp_path: Path) -> None:
-    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk: OpenCV itself does not report it."""
-    code = ("import resource, sys, reobj_track as rt; resource.setrlimit(resource.RLIMIT_FSIZE, (16000, 16000)); "
-            "sys.exit(rt.main(sys.argv[1:]))")
+def test_overlay_cut_by_a_full_disk_is_not_kept(
+    clip: Path, detections: Path, tmp_path: Path
+) -> None:
+    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk: OpenCV itself does not
+    report it.
+    """
+    code = (
+        "import resource, sys, reobj_track as rt; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (16000, 16000)); "
+        "sys.exit(rt.main(sys.argv[1:]))"
+    )
     args = ("track", clip, "-o", tmp_path / "out", "--detections", detections)
-    done = subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, cwd=Path(rt.__file__).parent)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, args)],
+        capture_output=True,
+        text=True,
+        cwd=Path(rt.__file__).parent,
+    )
     assert done.returncode == 2, done.stderr
     assert "overlay.mp4" in done.stderr
     assert not list((tmp_path / "out").glob("*overlay.mp4"))
@@ -361,9 +465,14 @@ def test_overlay_cut_by_a_full_disk_is_not_kept(clip: Path, detections: Path, tm
 
 
 def test_import_loads_no_heavy_package() -> None:
-    code = ("import sys, reobj_track, quadrics; bad = {'pycolmap', 'onnxruntime', 'matplotlib', 'torch', 'trimesh', "
-            "'filterpy'} & set(sys.modules); sys.exit(','.join(sorted(bad)) or 0)")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(rt.__file__).parent)
+    code = (
+        "import sys, reobj_track, quadrics; "
+        "bad = {'pycolmap', 'onnxruntime', 'matplotlib', 'torch', 'trimesh', "
+        "'filterpy'} & set(sys.modules); sys.exit(','.join(sorted(bad)) or 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(rt.__file__).parent
+    )
     assert done.returncode == 0, done.stderr
 
 

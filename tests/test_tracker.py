@@ -14,7 +14,9 @@ CHAIR, CUP = 56, 41
 
 def rows(*boxes: tuple[float, ...], score: float = 0.9, class_id: int = CHAIR) -> rt.Detections:
     """Detections from x1, y1, x2, y2 (and optionally score, class) tuples."""
-    table = [(*b[:4], b[4] if len(b) > 4 else score, b[5] if len(b) > 5 else class_id) for b in boxes]
+    table = [
+        (*b[:4], b[4] if len(b) > 4 else score, b[5] if len(b) > 5 else class_id) for b in boxes
+    ]
     return rt.Detections.from_array(table)
 
 
@@ -71,7 +73,10 @@ def test_kalman_equals_filterpy() -> None:
         scale = rt._noise_scale(mean)
         mean, cov = rt.kalman_predict(mean, cov, config)
         for i, kf in enumerate(filters):
-            q = np.concatenate([config.std_position * scale[i], config.std_velocity * scale[i]]) ** 2
+            q = (
+                np.concatenate([config.std_position * scale[i], config.std_velocity * scale[i]])
+                ** 2
+            )
             kf.predict(Q=np.diag(q))
         measured = mean[..., 0] + rng.normal(0, 4, (5, 4))
         noise = config.std_measure * rt._noise_scale(mean)
@@ -128,11 +133,15 @@ def test_known_pose_replaces_the_image_motion() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
     for step in range(8):
         angle = np.radians(3.0 * step)
-        turn = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
+        turn = np.array(
+            [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+        )
         pose = np.c_[turn, np.zeros(3)]
         center = camera.K @ turn @ np.array([0.2, 0, 1.0])
         x, y = center[:2] / center[2]
-        tracks = tracker.update(rows((x - 15, y - 15, x + 15, y + 15)), cam_from_world=pose, camera=camera)
+        tracks = tracker.update(
+            rows((x - 15, y - 15, x + 15, y + 15)), cam_from_world=pose, camera=camera
+        )
         assert tracks.track_id.tolist() == [1]
 
 
@@ -162,7 +171,9 @@ def test_step_tells_tentative_tracks_and_their_tracklet() -> None:
 
 def test_every_row_names_its_detection() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
-    detections = rows((300, 0, 350, 50, 0.05), (0, 0, 50, 50), (100, 0, 150, 50))  # the first is too weak
+    detections = rows(
+        (300, 0, 350, 50, 0.05), (0, 0, 50, 50), (100, 0, 150, 50)
+    )  # the first is too weak
     tracks = tracker.update(detections)
     assert tracks.detection_index.tolist() == [1, 2]
     np.testing.assert_array_equal(tracks.xyxy, detections.xyxy[1:])
@@ -189,11 +200,15 @@ def test_crossing_objects_keep_their_identity_by_appearance() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1, appearance_weight=0.8))
     for _ in range(5):
         tracker.update(rows((100, 100, 150, 150), (108, 100, 158, 150)), embeddings=looks)
-    tracks = tracker.update(rows((102, 100, 152, 150), (106, 100, 156, 150)), embeddings=looks[::-1])
+    tracks = tracker.update(
+        rows((102, 100, 152, 150), (106, 100, 156, 150)), embeddings=looks[::-1]
+    )
     assert tracks.track_id.tolist() == [2, 1]
 
 
-def away_and_back(tracker: rt.Tracker, looks: np.ndarray, back: np.ndarray, gap: int = 200) -> list[int]:
+def away_and_back(
+    tracker: rt.Tracker, looks: np.ndarray, back: np.ndarray, gap: int = 200
+) -> list[int]:
     """Show objects on the left, nothing for a while, then objects on the right with other sizes."""
     left = [(60 * i, 50, 60 * i + 40, 110) for i in range(len(looks))]
     for _ in range(12):
@@ -207,7 +222,9 @@ def away_and_back(tracker: rt.Tracker, looks: np.ndarray, back: np.ndarray, gap:
 
 
 def test_objects_that_return_elsewhere_get_their_identity_back() -> None:
-    """After 200 frames, at the other side of the picture, with another shape: never gated by overlap."""
+    """After 200 frames, at the other side of the picture, with another shape: never gated by
+    overlap.
+    """
     rng = np.random.default_rng(4)
     looks = unit(rng, 4)
     back = looks[::-1] + 0.05 * unit(rng, 4)
@@ -284,7 +301,9 @@ def test_embeddings_stay_with_their_boxes() -> None:
 
 def test_wrong_number_of_embeddings_is_refused() -> None:
     with pytest.raises(rt.ReobjError, match="one row a detection"):
-        rt.Tracker().update(rows((0, 0, 5, 5)), embeddings=rt.Embeddings(np.ones((2, 4)), np.ones((2, 0))))
+        rt.Tracker().update(
+            rows((0, 0, 5, 5)), embeddings=rt.Embeddings(np.ones((2, 4)), np.ones((2, 0)))
+        )
 
 
 def test_tracker_is_deterministic() -> None:
@@ -294,7 +313,9 @@ def test_tracker_is_deterministic() -> None:
         out = []
         for _ in range(40):
             boxes = rng.uniform(0, 400, (8, 2))
-            detections = rt.Detections(np.c_[boxes, boxes + 40], rng.uniform(0.2, 1, 8), np.full(8, CHAIR))
+            detections = rt.Detections(
+                np.c_[boxes, boxes + 40], rng.uniform(0.2, 1, 8), np.full(8, CHAIR)
+            )
             out.append(tracker.update(detections, embeddings=unit(rng, 8)).to_array())
         return np.concatenate(out)
 
@@ -336,7 +357,9 @@ def test_embedder_separates_foreground_from_background() -> None:
 
 
 def test_embedder_uses_masks() -> None:
-    """With a mask of the left half only, the right half of the patch no longer counts as foreground."""
+    """With a mask of the left half only, the right half of the patch no longer counts as
+    foreground.
+    """
     image, detections = scene_with_twins()
     masks = np.zeros((2, *image.shape[:2]), bool)
     masks[0, 90:150, 90:120] = masks[1, 90:150, 330:360] = True
@@ -359,7 +382,9 @@ def test_embedding_some_rows_equals_embedding_all() -> None:
     np.testing.assert_array_equal(whole.background[1:], part.background)
 
 
-@pytest.mark.parametrize("box", [(-50, -50, 20, 20), (470, 230, 600, 400), (10, 10, 10.5, 10.5), (900, 900, 950, 950)])
+@pytest.mark.parametrize(
+    "box", [(-50, -50, 20, 20), (470, 230, 600, 400), (10, 10, 10.5, 10.5), (900, 900, 950, 950)]
+)
 def test_embedder_takes_boxes_at_and_over_the_border(box: tuple[float, ...]) -> None:
     image, _ = scene_with_twins()
     found = rt.Embedder()(image, rows(box))
