@@ -106,6 +106,7 @@ class FitConfig:
         6.0  # mean squared residual of a view's 4 edges (chi2_4 .9999 is 23.5 / 4)
     )
     edge_outlier: float = 5.0  # sigma, a single edge farther off is dropped (occlusion)
+    max_noise: float = 8.0  # noise factor above which the boxes are not of one static object
     min_inlier_share: float = 0.4  # of the views; below it the object is rejected
     tilt_deg: float = 3.0  # deg, how upright an object stands when gravity is known
     camera_roll_deg: float = 6.0  # deg, spread of a hand-held camera's roll: up from cameras
@@ -633,11 +634,10 @@ def _lfd_system(boxes: Array, cams: Array, origin: Array, unit: Array, seen: Boo
     scale = np.linalg.norm(half, axis=-1)  # (O, V)
     local = cams.copy()  # (O, V, 3, 4) world -> object-centred world in object units
     local[..., 3] += np.einsum("ovij,oj->ovi", cams[..., :3], origin)
-    local[..., :3] *= unit[:, None, None, None]
+    local[..., 3] /= unit[:, None, None]  # depth counts in object units too
     mid = 0.5 * (boxes[..., 2:] + boxes[..., :2])
     local[..., :2, :] -= mid[..., None] * local[..., 2:, :]
     local[..., :2, :] /= scale[..., None, None]
-    local /= np.linalg.norm(local, axis=(-1, -2), keepdims=True)
     r, s = np.array(VECH6).T
     i, j = np.array(VECH10).T
     block = local[..., r[:, None], i] * local[..., s[:, None], j]  # (O, V, 6, 10)
@@ -689,7 +689,8 @@ def fit_lfd(
     unit_rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     origin = _ray_point(cams, unit_rays, seen.astype(np.float64), index)  # (O, 3)
     depth = np.abs(np.einsum("ovj,oj->ov", mats[..., 2, :3], origin) + mats[..., 2, 3])
-    unit = np.sum(seen * depth * extent.mean(-1), 1) / seen.sum(1) * 0.5 + 1e-12  # (O,)
+    # an object measures ~.1 unit, as in the authors' data: the null vector's norm is not scale free
+    unit = 10.0 * np.sum(seen * depth * extent.mean(-1), 1) / seen.sum(1) + 1e-12  # (O,)
     for _ in range(2):
         system = _lfd_system(boxes, mats, origin, unit, seen)
         solution = np.linalg.svd(system, full_matrices=False)[2][:, -1, :10]  # (O, 10)
@@ -2218,6 +2219,8 @@ def _judge(
         wrong = ""
         if not finite[b]:
             wrong = "no finite solution"
+        elif fit.noise[b] > cfg.max_noise:
+            wrong = f"its boxes fit no solid: noise {fit.noise[b]:.1f} times the usual"
         elif far[b] > cfg.absurd_size:
             wrong = f"size is {far[b]:.1f} sigma from its category's"
         elif inside[b] < max(1.0, cfg.min_inlier_share * seen[b]):

@@ -3796,6 +3796,26 @@ def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> t
     return float(np.median(angles)), float(np.median(depths))
 
 
+def _sfm_parallax_px(model: Any) -> float:
+    """Measure what a pure turn cannot explain: upper quartile over image pairs of the median residual of the best turn."""
+    rays: dict[int, dict[int, Array]] = {}
+    for image_id in sorted(model.reg_image_ids()):
+        seen = model.image(image_id).get_observation_points2D()
+        ideal = np.asarray(model.camera(1).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2))).reshape(-1, 2)
+        unit = np.column_stack([ideal, np.ones(len(ideal))])
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        rays[image_id] = dict(zip([p.point3D_id for p in seen], unit, strict=True))
+    residuals = []
+    for a, b in itertools.combinations(rays, 2):
+        if (b - a) & (b - a - 1) == 0:  # 1, 2, 4, 8 ... keyframes apart
+            both = sorted(rays[a].keys() & rays[b].keys())
+            if len(both) >= 15:
+                one, other = (np.array([rays[i][p] for p in both]) for i in (a, b))  # (n, 3)
+                turned = Rotation.align_vectors(other, one)[0].apply(one)
+                residuals.append(np.median(np.linalg.norm(turned - other, axis=1)))
+    return float(np.percentile(residuals, 75)) * model.camera(1).mean_focal_length() if residuals else 0.0
+
+
 def _sfm_write(model: Any, images: Any, folder: Path, names: list[str], native: tuple[int, int]) -> None:
     """Write a COLMAP model in native pixels with the real names; points get the colour of their first observation."""
     height, width = images.shape[1:3]
@@ -4887,19 +4907,17 @@ def _draw_label(image: Image, text: str, x: int, y: int, color: tuple[int, int, 
 
 
 def draw_ellipses(
-    image: Image, dual_c: Array, visible: BoolArray, object_id: Sequence[int], seen: set[int]
+    image: Image, dual_c: Array, drawn: BoolArray, object_id: Sequence[int], seen: set[int]
 ) -> None:
-    """Draw projected ellipsoids: the back-projection of the fit, thin where the object is not
-    detected now.
+    """Draw projected ellipsoids: the back-projection of the fit, thin for objects not in `seen`.
 
     Args:
-        dual_c: (O, 3, 3) dual conics in pixels of `image`; visible: (O,).
+        dual_c: (O, 3, 3) dual conics in pixels of `image`; drawn: (O,) which ones.
     """
-    for conic, ok, obj in zip(dual_c, visible, object_id, strict=True):
-        shape = _ellipse_of_dual_conic(conic) if ok else None
+    for conic, wanted, obj in zip(dual_c, drawn, object_id, strict=True):
+        shape = _ellipse_of_dual_conic(conic) if wanted else None
         if shape is not None and max(shape[1]) < 4 * max(image.shape):
-            box = (shape[0], shape[1], shape[2])
-            cv2.ellipse(image, box, object_color(obj), 2 if obj in seen else 1, cv2.LINE_AA)
+            cv2.ellipse(image, shape, object_color(obj), 2 if obj in seen else 1, cv2.LINE_AA)
 
 
 def _ellipse_of_dual_conic(
@@ -4958,34 +4976,38 @@ class VideoWriter:
 
 
 def write_overlay(
-    path: Path,
-    video: Video,
-    table: TrackTable,
-    labels: dict[int, str],
-    poses: Poses | None,
-    ellipsoids: quadrics.Ellipsoids | None,
-    object_id: Sequence[int],
-    config: OutputConfig,
+    result: RunResult, solids: quadrics.Ellipsoids | None, video: Video, config: OutputConfig
 ) -> None:
-    """Write a video with boxes, identities and the back-projected ellipsoids of every frame."""
+    """Write overlay.mp4: boxes, identities and back-projected ellipsoids of every frame.
+
+    Args:
+        solids: ellipsoids of the objects that are not rejected, in their order. Those that rest on
+            a prior are drawn only while they are detected.
+    """
     width, height = video.size
     shrink = min(1.0, config.overlay_size_px / max(width, height))
     size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
-    projected = _project_all(poses, ellipsoids, size[0] / width)
-    start, stop = np.searchsorted(table.frame, [0, 0])
-    writer = VideoWriter(path, max(1.0, (video.fps or 30.0) / video.config.every), size)
+    scale = size[0] / width
+    projected = _project_all(result.poses, solids, scale)
+    kept = [o for o in result.objects if o["status"] != "rejected"]
+    ids, sure = [o["id"] for o in kept], {o["id"] for o in kept if o["status"] == "ok"}
+    labels = {o["id"]: f"{o['id']} {o['class']}" for o in result.objects}
+    fps = max(1.0, (video.fps or 30.0) / video.config.every)
+    writer = VideoWriter(result.out / "overlay.mp4", fps, size)
     progress, complete = Progress("overlay", video.expected), False
     try:
         for frame in video:
-            start, stop = np.searchsorted(table.frame, [frame.index, frame.index + 1])
-            small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-            image = np.asarray(small, np.uint8)
-            rows = table[slice(start, stop)]
+            low, high = np.searchsorted(result.table.frame, [frame.index, frame.index + 1])
+            rows = result.table[slice(low, high)]
+            image = np.asarray(
+                cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8
+            )
             if frame.index in projected:
-                draw_ellipses(
-                    image, *projected[frame.index], object_id, set(rows.object_id.tolist())
-                )
-            draw_tracks(image, rows, labels, size[0] / width)
+                dual_c, visible = projected[frame.index]
+                seen = set(rows.object_id.tolist())
+                drawn = visible & np.array([i in seen or i in sure for i in ids], bool)
+                draw_ellipses(image, dual_c, drawn, ids, seen)
+            draw_tracks(image, rows, labels, scale)
             writer.write(image)
             progress.step()
         complete = True
@@ -5637,8 +5659,7 @@ def _spans_of(rows: TrackTable) -> list[list[int]]:
 
 
 def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
-    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits.
-    """
+    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits."""
     if poses is None:
         return {"units": None, "source": "none", "registered_frames": 0, "links": []}
     scale = fits.scale if fits is not None else None
@@ -5674,32 +5695,24 @@ CONVENTIONS = {
 def write_results(result: RunResult, video: Video, config: Config) -> None:
     """Write the files of the output folder; each appears only when it is complete."""
     out, started = result.out, time.monotonic()
+    for name in ("poses.txt", "objects.ply", "overlay.mp4"):  # of an earlier run with other options
+        (out / name).unlink(missing_ok=True)
     write_mot(out / "tracks.txt", result.table)
     _write_objects_json(result, video)
     poses = result.poses
     if poses is not None and poses.known.any():
         write_tum(out / "poses.txt", poses)
         if poses.source == "user":
-            write_colmap(
-                out / "sparse", poses, [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
-            )
-    kept = [i for i, o in enumerate(result.objects) if o["status"] != "rejected"]
-    ellipsoids = None if result.fits is None else _take(result.fits.ellipsoids, kept)
-    ids = [result.objects[i]["id"] for i in kept]
-    if ellipsoids is not None:
-        write_ply(out / "objects.ply", ellipsoids, ids, config.output.ply_detail)
+            names = [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
+            write_colmap(out / "sparse", poses, names)
+    kept = np.array([o["status"] != "rejected" for o in result.objects], bool)
+    solids = None if result.fits is None else result.fits.ellipsoids[kept]
+    if solids is not None:
+        ids = [o["id"] for o in result.objects if o["status"] != "rejected"]
+        write_ply(out / "objects.ply", solids, ids, config.output.ply_detail)
     if config.output.overlay and not video.is_live:
-        labels = {o["id"]: f"{o['id']} {o['class']}" for o in result.objects}
-        write_overlay(
-            out / "overlay.mp4", video, result.table, labels, poses, ellipsoids, ids, config.output
-        )
+        write_overlay(result, solids, video, config.output)
     result.seconds["write"] = time.monotonic() - started
-
-
-def _take(solid: quadrics.Ellipsoids, rows: list[int]) -> quadrics.Ellipsoids:
-    return quadrics.Ellipsoids(
-        solid.center_in_world[rows], solid.half_axes[rows], solid.world_from_obj[rows]
-    )
 
 
 def _write_objects_json(result: RunResult, video: Video) -> None:
@@ -5788,8 +5801,7 @@ def _summary_world(result: RunResult) -> list[str]:
 
 
 def _options(parser: argparse.ArgumentParser, *sections: str) -> None:
-    """Add the flags that the config dataclasses declare for these sections ("" for the top level).
-    """
+    """Add the flags that the config dataclasses declare for these sections ("" for the top level)."""
     for section in sections:
         cls: Any = Config if not section else Config.__dataclass_fields__[section].default_factory
         for f in dataclasses.fields(cls):

@@ -1,10 +1,13 @@
-"""Measure quadrics.py on synthetic scenes with known truth: tables and plots of docs/quadrics.md.
+"""Measure quadrics.py on synthetic scenes with known truth: tables and plot of docs/quadrics.md.
 
 Usage:
     python examples/synthetic_quadrics.py [--quick] [--only NAME ...] [-o docs]
 
+Prints each table and, with -o, writes it between its markers in docs/quadrics.md.
+
 All experiments are seeded. Boxes are the exact bounds of the projected solid (ellipsoid: dual
-conic; cuboid: corners; cylinder: rims), each edge moved by Gaussian noise of a share of the box's width or height.
+conic; cuboid: corners; cylinder: rims), each edge moved by Gaussian noise of a share of the box's
+width or height.
 """
 
 from __future__ import annotations
@@ -12,16 +15,20 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
-from quadrics import Array, Ellipsoids, Priors
+from quadrics import Array, BoolArray, Ellipsoids, FitConfig, Priors
 
 IMAGE = (1280, 960)  # px
 FOCAL = 1000.0  # px
+UP = (0.0, 0.0, 1.0)
+CUBOIDS = ((0.59, 0.60, 0.82), (0.60, 0.19, 0.45), (0.22, 0.28, 0.04))  # m, literature 2.4
 
 
 def look_at(center: Array, target: Array, roll: Array) -> Array:
@@ -34,11 +41,15 @@ def look_at(center: Array, target: Array, roll: Array) -> Array:
     c, s = np.cos(roll)[:, None], np.sin(roll)[:, None]
     rot = np.stack([c * right + s * down, c * down - s * right, forward], 1)  # (F, 3, 3)
     calib = np.array([[FOCAL, 0, IMAGE[0] / 2], [0, FOCAL, IMAGE[1] / 2], [0, 0, 1.0]])
-    return calib @ np.concatenate([rot, -rot @ center[:, :, None]], 2)
+    return np.asarray(calib @ np.concatenate([rot, -rot @ center[:, :, None]], 2))
 
 
 def arc_cameras(
-    n: int, arc_deg: float, rng: np.random.Generator, distance: float = 2.5, elevation_deg: float = 25.0
+    n: int,
+    arc_deg: float,
+    rng: np.random.Generator,
+    distance: float = 2.5,
+    elevation_deg: float = 25.0,
 ) -> Array:
     """n cameras on an arc around the origin, with jitter in place, aim and roll."""
     yaw = np.deg2rad(np.linspace(-0.5, 0.5, n) * arc_deg) + rng.uniform(0, 2 * np.pi)
@@ -48,14 +59,17 @@ def arc_cameras(
     return look_at(center, rng.normal(0, 0.1, (n, 3)), rng.normal(0, 0.03, n))
 
 
-def random_yaw(n: int, rng: np.random.Generator) -> Array:
-    """Upright rotations (n, 3, 3)."""
+def random_yaw(n: int, rng: np.random.Generator, tilt_deg: float = 0.0) -> Array:
+    """Upright rotations (n, 3, 3), leaning by a Gaussian tilt about both level axes."""
     angle = rng.uniform(0, 2 * np.pi, n)
-    return quadrics.rotations(angle[:, None] * np.array([0.0, 0.0, 1.0]))
+    lean = np.zeros((n, 3))
+    lean[:, :2] = rng.normal(0, np.deg2rad(tilt_deg), (n, 2))
+    yaw = quadrics.rotations(angle[:, None] * np.array([0.0, 0.0, 1.0]))
+    return np.asarray(yaw @ quadrics.rotations(lean))
 
 
 def noisy(boxes: Array, share: float, rng: np.random.Generator) -> Array:
-    """Move left and right edges by Gaussian noise of `share` of the width, top and bottom of the height."""
+    """Move edges by Gaussian noise of `share` of the width (left, right) or height."""
     side = np.tile(boxes[..., 2:] - boxes[..., :2], 2)
     return boxes + rng.normal(0, share, boxes.shape) * side
 
@@ -73,8 +87,9 @@ def individual_priors(log_size: Array, sigma: float, support: str) -> tuple[Prio
 
 
 def scenes(
-    n_trials: int, n_views: int, arc_deg: float, noise: float, support: str, rng: np.random.Generator,
-    sizes: tuple[float, float, float] | None = None, spread: float = 0.25,
+    n_trials: int, n_views: int, arc_deg: float, noise: float, support: str,
+    rng: np.random.Generator,
+    sizes: tuple[float, float, float] | None = None, spread: float = 0.25, tilt_deg: float = 0.0,
 ) -> tuple[Array, Array, Ellipsoids, Priors, list[str]]:  # fmt: skip
     """Independent one-object scenes: boxes (T, V, 1, 4), cameras (T, V, 3, 4), truth, priors.
 
@@ -86,7 +101,7 @@ def scenes(
     else:
         mean = np.tile(np.log(sizes), (n_trials, 1))
     log_size = mean + rng.normal(0, spread, mean.shape)
-    rot = random_yaw(n_trials, rng)
+    rot = random_yaw(n_trials, rng, tilt_deg)
     truth = Ellipsoids(rng.normal(0, 0.05, (n_trials, 3)), 0.5 * np.exp(log_size), rot)
     cams = np.stack([arc_cameras(n_views, arc_deg, rng) for _ in range(n_trials)])
     boxes = np.stack(
@@ -102,3 +117,604 @@ def as_one(boxes: Array, cams: Array) -> tuple[Array, Array]:
     for k in range(trials):
         joint[k * views : (k + 1) * views, k] = boxes[k, :, 0]
     return joint, cams.reshape(-1, 3, 4)
+
+
+# ---- References and helpers ----------------------------------------------------------------
+
+
+def plain_lfd(boxes: Array, cams: Array) -> Array:
+    """LfD as published, one object at a time: the stand-in for the official code.
+
+    boxes (V, 4), cams (V, 3, 4) -> dual quadric (4, 4). For each view beta C* = P Q* P' with P and
+    C* in the frame where the ellipse is centred and of unit size; null vector by SVD; repeated once
+    with the origin at the first centre. Ref: Rubino et al., PAMI 2018.
+    """
+    i, j = np.triu_indices(4)
+    r, s = np.triu_indices(3)
+    expand = np.zeros((16, 10))  # vec Q = expand @ vech Q
+    for k, (a, b) in enumerate(zip(i, j, strict=True)):
+        expand[4 * a + b, k] = expand[4 * b + a, k] = 1.0
+    origin = np.zeros(3)
+    dual_q = np.zeros((4, 4))
+    for _ in range(2):
+        shift = np.eye(4)
+        shift[:3, 3] = origin
+        rows = np.zeros((6 * len(boxes), 10 + len(boxes)))
+        for v, (x1, y1, x2, y2) in enumerate(boxes):
+            half = 0.5 * np.array([x2 - x1, y2 - y1])
+            scale = np.linalg.norm(half)
+            frame = np.array([[scale, 0, (x1 + x2) / 2], [0, scale, (y1 + y2) / 2], [0, 0, 1]])
+            cam = np.linalg.inv(frame) @ cams[v] @ shift
+            kron = (np.kron(cam, cam) @ expand).reshape(3, 3, 10)
+            rows[6 * v : 6 * v + 6, :10] = kron[r, s]
+            conic = np.diag([*(half / scale) ** 2, -1.0])
+            rows[6 * v : 6 * v + 6, 10 + v] = -conic[r, s]
+        null = np.linalg.svd(rows)[2][-1, :10]
+        local = (expand @ null).reshape(4, 4)
+        local = -local / local[3, 3]
+        dual_q = shift @ local @ shift.T
+        origin = -dual_q[:3, 3]
+    return dual_q
+
+
+def spoil(boxes: Array, kind: str, rng: np.random.Generator) -> tuple[Array, BoolArray]:
+    """Replace one box in five of each scene; boxes (T, V, 1, 4) -> changed boxes, mask (T, V).
+
+    far: anywhere in the image; near: a neighbour half a box to a box away, of another size;
+    hidden: an occluder covers 30 to 60 % from one side.
+    """
+    out, trials, views = boxes.copy(), *boxes.shape[:2]
+    wrong = np.zeros((trials, views), bool)
+    for t in range(trials):
+        for v in rng.choice(views, max(1, views // 5), replace=False):
+            wrong[t, v] = True
+            size = boxes[t, v, 0, 2:] - boxes[t, v, 0, :2]
+            middle = boxes[t, v, 0, :2] + 0.5 * size
+            if kind == "hidden":
+                side = rng.integers(4)
+                sign = 1.0 if side < 2 else -1.0
+                out[t, v, 0, side] += sign * rng.uniform(0.3, 0.6) * size[side % 2]
+                continue
+            turn = rng.uniform(0, 2 * np.pi)
+            near = middle + np.array([np.cos(turn), np.sin(turn)]) * size * rng.uniform(0.5, 1.2)
+            middle = near if kind == "near" else rng.uniform([0, 0], IMAGE)
+            size = size * np.exp(rng.normal(0, 0.3, 2))
+            out[t, v, 0] = [*(middle - 0.5 * size), *(middle + 0.5 * size)]
+    return out, wrong
+
+
+def outline_lines(
+    solids: Ellipsoids, cams: Array, boxes: Array, n: int, noise: float, rng: np.random.Generator
+) -> Array:
+    """Noisy tangent lines (F, O, n, 3) of outlines, as masks would give; NaN if unseen."""
+    dual_c, visible = quadrics.project(solids.dual_quadrics(), cams)
+    lines = conic_lines(dual_c, n)
+    side = np.sqrt(np.prod(boxes[..., 2:] - boxes[..., :2], -1))  # (F, O)
+    lines[..., 2] += rng.normal(0, noise, lines.shape[:-1]) * side[..., None]
+    seen: BoolArray = np.asarray(visible & np.isfinite(boxes[..., 0]))
+    return np.where(seen[..., None, None], lines, np.nan)
+
+
+def conic_lines(dual_c: Array, n: int) -> Array:
+    """Outward tangent lines (..., n, 3) of dual conics in n even directions."""
+    angle = (np.arange(n) + 0.5) * (2 * np.pi / n)
+    normal = np.stack([np.cos(angle), np.sin(angle)], -1)  # (n, 2)
+    center, rows = quadrics._dual_conic_parts(dual_c)
+    quad = np.stack([normal[:, 0] ** 2, 2 * normal[:, 0] * normal[:, 1], normal[:, 1] ** 2], -1)
+    reach = np.sqrt(np.clip(np.einsum("...k,nk->...n", rows, quad), 0, None))
+    offset = -(np.einsum("...k,nk->...n", center, normal) + reach)
+    full = np.broadcast_to(normal, (*offset.shape, 2))
+    return np.concatenate([full, offset[..., None]], -1)
+
+
+def align(found: Ellipsoids, truth: Ellipsoids) -> Ellipsoids:
+    """Similarity (no reflection) of `found` onto `truth` by their centres. Ref: Umeyama 1991."""
+    a = found.center_in_world - found.center_in_world.mean(0)
+    b = truth.center_in_world - truth.center_in_world.mean(0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    rot = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    scale = np.trace(b.T @ a @ rot.T) / (a**2).sum()
+    center = scale * a @ rot.T + truth.center_in_world.mean(0)
+    return Ellipsoids(center, scale * found.half_axes, rot @ found.world_from_obj)
+
+
+def far_scene(
+    n_views: int, n_objects: int, sweep_deg: float, rng: np.random.Generator
+) -> tuple[Ellipsoids, Array]:
+    """Objects within 2 m seen by nearly affine cameras from 60 m (as in the SfMO papers)."""
+    half = np.exp(rng.uniform(np.log(0.1), np.log(0.4), (n_objects, 3)))
+    truth = Ellipsoids(rng.uniform(-1, 1, (n_objects, 3)), half, random_yaw(n_objects, rng))
+    yaw = np.deg2rad(np.linspace(-0.5, 0.5, n_views) * sweep_deg) + rng.uniform(0, 2 * np.pi)
+    lift = np.deg2rad(20 + 0.25 * sweep_deg * np.sin(np.arange(n_views)))
+    center = np.stack([np.cos(yaw) * np.cos(lift), np.sin(yaw) * np.cos(lift), np.sin(lift)], 1)
+    cams = look_at(60.0 * center, np.zeros((n_views, 3)), np.zeros(n_views))
+    zoom = np.array([[20.0, 0, -19 * IMAGE[0] / 2], [0, 20.0, -19 * IMAGE[1] / 2], [0, 0, 1]])
+    return truth, zoom @ cams
+
+
+def furnished_room(
+    rng: np.random.Generator, noise: float = 0.02
+) -> tuple[Array, Array, Ellipsoids, list[str]]:
+    """Known things in a 5 m room, sizes drawn from priors.json, 24 cameras around, cut boxes."""
+    names = (
+        "chair,chair,couch,dining table,refrigerator,toilet,night stand,microwave,bed,bottle,"
+        "cup,laptop,vase,keyboard,potted plant,sports ball"
+    ).split(",")
+    priors = quadrics.load_priors()
+    rows = priors.index(names)
+    draw = np.einsum(
+        "oij,oj->oi", np.linalg.cholesky(priors.log_cov[rows]), rng.normal(0, 1, (len(names), 3))
+    )
+    log_size = priors.log_mean[rows] + draw
+    round_ = priors.yaw_symmetric[rows]
+    log_size[round_, 1] = log_size[round_, 0]
+    half = 0.5 * np.exp(log_size)
+    spot = np.array([(x, y) for x in np.linspace(-2, 2, 4) for y in np.linspace(-2, 2, 4)])
+    lift = np.where(half.max(1) < 0.25, 0.75, 0.0) + half[:, 2]  # small things on tables
+    center = np.concatenate([rng.permutation(spot)[: len(names)], lift[:, None]], 1)
+    truth = Ellipsoids(center, half, random_yaw(len(names), rng, 1.0))
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    eye = np.stack([3.2 * np.cos(turn), 3.2 * np.sin(turn), np.full(24, 1.6)], 1)
+    aim = np.stack([0.8 * np.cos(turn + 2.4), 0.8 * np.sin(turn + 2.4), np.full(24, 0.5)], 1)
+    cams = look_at(eye + rng.normal(0, 0.1, eye.shape), aim, rng.normal(0, 0.03, 24))
+    codes = [quadrics.SUPPORTS[k] for k in priors.support[rows]]
+    boxes = noisy(quadrics.solid_boxes(truth, codes, cams, near=0.1), noise, rng)
+    far_edge = np.array(IMAGE) - 20
+    inside = np.all((boxes[..., 2:] > 20) & (boxes[..., :2] < far_edge), -1, keepdims=True)
+    boxes = np.where(inside, quadrics.clip_boxes(boxes, IMAGE), np.nan)
+    return boxes, cams, truth, names
+
+
+def solve(
+    boxes: Array, cams: Array, priors: Priors, names: Sequence[str],
+    config: FitConfig | None = None, support: str | None = None,
+) -> quadrics.ObjectFits:  # fmt: skip
+    """Fit independent one-object scenes side by side, gravity known."""
+    joint, flat = as_one(boxes, cams)
+    return quadrics.fit_objects(
+        joint, flat, IMAGE, names, priors, up=UP, support=support, config=config
+    )
+
+
+def region_error(fits: quadrics.ObjectFits, truth: Ellipsoids) -> tuple[Array, Array]:
+    """Errors (O, 9) in the covariance's coordinates and their squared Mahalanobis distance (O,).
+
+    A solid turned by 90 degrees with width and depth swapped is the same solid: nearest one counts.
+    """
+    best, errors = np.full(len(truth), np.inf), np.zeros((len(truth), 9))
+    inverse = np.linalg.inv(fits.cov)
+    for k in range(4):
+        turn = quadrics.rotations(np.array([[0, 0, k * np.pi / 2]]))[0]
+        half = truth.half_axes[:, [1, 0, 2]] if k % 2 else truth.half_axes
+        rot = fits.ellipsoids.world_from_obj.transpose(0, 2, 1) @ truth.world_from_obj @ turn
+        center = truth.center_in_world - fits.ellipsoids.center_in_world
+        ratio = np.log(half / fits.ellipsoids.half_axes)
+        error = np.concatenate([center, ratio, quadrics.rotation_vectors(rot)], 1)
+        square = np.einsum("oi,oij,oj->o", error, inverse, error)
+        closer = square < best
+        best[closer], errors[closer] = square[closer], error[closer]
+    return errors, best
+
+
+def coverage(
+    n: int, views: int, arc_deg: float, noise: float, support: str, rng: np.random.Generator,
+    config: FitConfig | None = None,
+) -> dict[str, float]:  # fmt: skip
+    """Share of trials with the truth in the 95 % region: all nine, and each block of three.
+
+    The truth is drawn from the prior, tilt included, so that the region means what it says.
+    """
+    boxes, cams, truth, priors, names = scenes(
+        n, views, arc_deg, noise, support, rng, tilt_deg=FitConfig().tilt_deg
+    )
+    fits = solve(boxes, cams, priors, names, config)
+    errors, square = region_error(fits, truth)
+    out = {"all": float((square < 16.919).mean())}  # chi2 0.95, 9 dof
+    for name, part in (("center", slice(0, 3)), ("size", slice(3, 6)), ("rotation", slice(6, 9))):
+        block = np.linalg.inv(fits.cov[:, part, part])
+        own = np.einsum("oi,oij,oj->o", errors[:, part], block, errors[:, part])
+        out[name] = float((own < 7.815).mean())  # chi2 0.95, 3 dof
+    return out
+
+
+def time_fit(n: int, views: int, support: str) -> float:
+    """Seconds an object: n objects seen by the same cameras."""
+    rng = np.random.default_rng(0)
+    log_size = rng.uniform(np.log(0.2), np.log(0.8), (n, 3))
+    size = log_size + rng.normal(0, 0.25, (n, 3))
+    truth = Ellipsoids(rng.uniform(-0.5, 0.5, (n, 3)), 0.5 * np.exp(size), random_yaw(n, rng))
+    cams = arc_cameras(views, 90, rng, distance=4)
+    boxes = noisy(quadrics.solid_boxes(truth, support, cams), 0.02, rng)
+    priors, names = individual_priors(log_size, 0.25, support)
+    start = time.perf_counter()
+    quadrics.fit_objects(boxes, cams, (9000, 9000), names, priors, up=UP)
+    return (time.perf_counter() - start) / n
+
+
+def ugly_scene(f: int, o: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Boxes (F, O, 4) and cameras (F, 3, 4) with everything that can be wrong in them."""
+    spread = rng.choice([0.0, 1e-6, 0.01, 1.0, 10.0, 1e4, 1e8])
+    center = rng.normal(0, spread, (f, 3))
+    rot = quadrics.rotations(rng.normal(0, rng.choice([0.0, 0.1, 0.3, 3.0]), (f, 3)))
+    calib = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    cams = calib @ np.concatenate([rot, -rot @ center[:, :, None]], 2)
+    with np.errstate(all="ignore"):
+        cams[rng.random(f) < 0.05] *= rng.choice([-1.0, 0.0, 1e-200, 1e200, np.inf, np.nan])
+        middle = rng.uniform(-200, [840, 680], (f, o, 2))
+        if rng.random() < 0.5:  # boxes that one place explains
+            point = rng.normal(0, 1, (o, 3)) + np.array([0, 0, 3])
+            image = np.einsum("fij,oj->foi", cams[:, :, :3], point) + cams[:, None, :, 3]
+            middle = image[..., :2] / image[..., 2:]
+    size = np.exp(rng.normal(4, 1.0, (f, o, 2)) * rng.choice([0.3, 1.0]))
+    boxes = np.concatenate([middle - size / 2, middle + size / 2], -1)
+    fate = rng.random((f, o))
+    boxes[fate < 0.02] = 0.0  # zero area
+    boxes[(fate > 0.02) & (fate < 0.04)] *= 1e12
+    boxes[(fate > 0.04) & (fate < 0.05)] = np.inf
+    boxes[(fate > 0.05) & (fate < 0.07)] = [0, 0, 640, 480]  # fills the image
+    flipped = (fate > 0.07) & (fate < 0.09)
+    boxes[flipped] = boxes[flipped][:, [2, 3, 0, 1]]
+    boxes[rng.random((f, o)) < rng.choice([0.0, 0.3, 0.9])] = np.nan
+    return boxes, cams
+
+
+def is_honest(fits: quadrics.ObjectFits) -> BoolArray:
+    """(O,) True where a result that is not rejected is finite, positive and explained."""
+    live = fits.status != "rejected"
+    numbers = np.isfinite(fits.size).all(1) & (fits.size > 0).all(1) & np.isfinite(fits.rms_px)
+    numbers &= np.isfinite(fits.cov).all((1, 2)) & np.isfinite(fits.ellipsoids.center_in_world).all(
+        1
+    )
+    lowest = np.linalg.eigvalsh(np.where(np.isfinite(fits.cov), fits.cov, 0.0))
+    numbers &= lowest[:, 0] >= -1e-6 * np.maximum(lowest[:, -1], 1e-30)
+    explained = np.array(
+        [s == "ok" or bool(r) for s, r in zip(fits.status, fits.reason, strict=True)]
+    )
+    return np.asarray((numbers | ~live) & (explained if len(explained) else live))
+
+
+def fuzz(n: int, rng: np.random.Generator) -> dict[str, int]:
+    """Fit n random, mostly absurd objects; count the statuses and the dishonest results."""
+    counts = {"objects": 0, "bad": 0, "ok": 0, "prior_dominated": 0, "rejected": 0}
+    priors = quadrics.load_priors()
+    while counts["objects"] < n:
+        f, o = int(rng.choice([1, 2, 3, 5, 8])), int(rng.choice([1, 10, 200]))
+        boxes, cams = ugly_scene(f, o, rng)
+        names = [str(x) for x in rng.choice(priors.names, o)] if rng.random() < 0.7 else None
+        up = (None, UP, (0.0, -1.0, 0.0))[rng.integers(3)]
+        support = (None, "evidence", *quadrics.SUPPORTS)[rng.integers(5)]
+        fits = quadrics.fit_objects(
+            boxes,
+            cams,
+            (640, 480),
+            names,
+            priors,
+            up=up,
+            support=support,
+            metric=bool(rng.integers(2)),
+        )
+        quadrics.fit_lfd(boxes, cams)
+        quadrics.reprojection_iou(fits, boxes, cams, (640, 480))
+        counts["objects"] += o
+        counts["bad"] += int((~is_honest(fits)).sum())
+        for status in ("ok", "prior_dominated", "rejected"):
+            counts[status] += int((fits.status == status).sum())
+    return counts
+
+
+# ---- Tables --------------------------------------------------------------------------------
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join(str(x) for x in row) + " |" for row in rows])
+
+
+def lfd_overlap(boxes: Array, cams: Array, truth: Ellipsoids) -> tuple[float, float]:
+    """Mean O3D of closed-form LfD (0 where it is no ellipsoid at all) and share of ellipsoids."""
+    dual_q, real = quadrics.fit_lfd(*as_one(boxes, cams))
+    found = Ellipsoids.from_dual_quadrics(dual_q)[0]
+    return float(np.nan_to_num(quadrics.volume_overlap(found, truth)).mean()), float(real.mean())
+
+
+def ellipsoids_table(trials: int) -> str:
+    """O3D of true ellipsoids: LfD and fit_objects over arcs, views and noise."""
+    rows = []
+    for views in (3, 10):
+        for arc in (5, 20, 90):
+            row: list[object] = [views, arc]
+            for noise in (0.01, 0.03, 0.10):
+                rng = np.random.default_rng(1)
+                boxes, cams, truth, priors, names = scenes(
+                    trials, views, arc, noise, "ellipsoid", rng
+                )
+                closed, real = lfd_overlap(boxes, cams, truth)
+                fits = solve(boxes, cams, priors, names)
+                ours = quadrics.volume_overlap(fits.ellipsoids, truth).mean()
+                row.append(f"{closed:.2f} ({real:.0%} real) -> **{ours:.2f}**")
+            rows.append(row)
+    return table(["views", "arc deg", "noise 1 %", "3 %", "10 %"], rows)
+
+
+def cuboids_table(trials: int) -> str:
+    """Box IoU of true cuboids when fitted as an ellipsoid, as a box, and by the evidence."""
+    rows = []
+    for size in CUBOIDS:
+        rng = np.random.default_rng(2)
+        boxes, cams, truth, priors, names = scenes(trials, 10, 120, 0.02, "box", rng, size)
+        row: list[object] = [" x ".join(f"{x:.2f}" for x in size)]
+        for support in ("ellipsoid", "box", "evidence"):
+            fits = solve(boxes, cams, priors, names, support=support)
+            iou = quadrics.box_overlap(fits.ellipsoids, truth).mean()
+            share = (fits.support == "box").mean()
+            row.append(f"{iou:.3f}" + (f" ({share:.0%} boxes)" if support == "evidence" else ""))
+        rows.append(row)
+    return table(["size m", "ellipsoid", "box", "evidence"], rows)
+
+
+def wrong_table(trials: int) -> str:
+    """Fall of O3D when one box in five is wrong, and when an oracle removes it."""
+    rows = []
+    for support, measure in (("ellipsoid", quadrics.volume_overlap), ("box", quadrics.box_overlap)):
+        for views, arc in ((5, 20), (5, 40), (5, 90), (10, 90)):
+            rng = np.random.default_rng(3)
+            boxes, cams, truth, priors, names = scenes(trials, views, arc, 0.02, support, rng)
+            clean = measure(solve(boxes, cams, priors, names).ellipsoids, truth).mean()
+            row: list[object] = [support, views, arc, f"{clean:.3f}"]
+            for kind in ("far", "near", "hidden"):
+                bad, wrong = spoil(boxes, kind, np.random.default_rng(4))
+                found = measure(solve(bad, cams, priors, names).ellipsoids, truth).mean()
+                bad[wrong] = np.nan
+                best = measure(solve(bad, cams, priors, names).ellipsoids, truth).mean()
+                row.append(f"{clean - found:+.3f} ({clean - best:+.3f})")
+            rows.append(row)
+    return table(["shape", "views", "arc deg", "clean", "far", "near", "hidden"], rows)
+
+
+def coverage_table(trials: int) -> str:
+    """Share of truths inside the 95 % region."""
+    rows = []
+    config = FitConfig(correlation_deg=0.0)  # the noise of these boxes is independent
+    for support in quadrics.SUPPORTS:
+        for views, arc in ((3, 20), (3, 90), (6, 60), (10, 20), (10, 120)):
+            rng = np.random.default_rng(5)
+            inside = coverage(trials, views, arc, 0.02, support, rng, config)
+            rows.append([support, views, arc, *(f"{100 * x:.1f}" for x in inside.values())])
+    mean = [f"**{np.mean([float(str(r[k])) for r in rows]):.1f}**" for k in range(3, 7)]
+    rows.append(["mean", "", "", *mean])
+    return table(["shape", "views", "arc deg", "all 9", "center", "size", "rotation"], rows)
+
+
+def masks_table(trials: int) -> str:
+    """O3D with four box edges against twelve more tangents of the mask's hull."""
+    rows = []
+    for views, arc in ((3, 10), (3, 30), (3, 90), (8, 30)):
+        rng = np.random.default_rng(6)
+        boxes, cams, truth, priors, names = scenes(trials, views, arc, 0.02, "ellipsoid", rng)
+        joint, flat = as_one(boxes, cams)
+        lines = outline_lines(truth, flat, joint, 12, 0.02, rng)
+        plain = quadrics.fit_objects(joint, flat, IMAGE, names, priors, up=UP)
+        hull = quadrics.fit_objects(joint, flat, IMAGE, names, priors, up=UP, lines=lines)
+        scores = [quadrics.volume_overlap(f.ellipsoids, truth).mean() for f in (plain, hull)]
+        rows.append([views, arc, *(f"{x:.3f}" for x in scores), f"{scores[1] - scores[0]:+.3f}"])
+    return table(["views", "arc deg", "4 box edges", "+ 12 hull tangents", "gain"], rows)
+
+
+def speed_table(trials: int) -> str:
+    """Milliseconds an object, and the ratio to the plain per-object LfD in the same run."""
+    rng = np.random.default_rng(7)
+    boxes, cams, *_ = scenes(min(trials, 100), 8, 90, 0.02, "ellipsoid", rng)
+    start = time.perf_counter()
+    for k in range(len(boxes)):
+        plain_lfd(boxes[k, :, 0], cams[k])
+    plain = (time.perf_counter() - start) / len(boxes)
+    truth = Ellipsoids(
+        rng.uniform(-0.5, 0.5, (1000, 3)), rng.uniform(0.1, 0.4, (1000, 3)), random_yaw(1000, rng)
+    )
+    shared = arc_cameras(8, 90, rng, distance=4)
+    many = noisy(quadrics.solid_boxes(truth, "ellipsoid", shared), 0.02, rng)
+    start = time.perf_counter()
+    quadrics.fit_lfd(many, shared)
+    batched = (time.perf_counter() - start) / 1000
+    rows = [["plain LfD, one object at a time", f"{1e3 * plain:.3f}", "1"]]
+    rows.append(["fit_lfd, 1,000 objects", f"{1e3 * batched:.3f}", f"{batched / plain:.2f}"])
+    for support in quadrics.SUPPORTS:
+        ours = min(time_fit(1000, 8, support) for _ in range(3))
+        rows.append(
+            [f"fit_objects ({support}), 1,000 objects", f"{1e3 * ours:.3f}", f"{ours / plain:.2f}"]
+        )
+    return table(["8 views", "ms an object", "ratio"], rows)
+
+
+def room_table(trials: int) -> str:
+    """Scale and gravity of furnished rooms, nothing given but boxes, categories and cameras."""
+    priors, rows = quadrics.load_priors(), []
+    for given in ("scale and up", "up", "scale", "nothing"):
+        scales, tilts, sizes, inside = [], [], [], []
+        for seed in range(max(4, trials // 15)):
+            boxes, cams, truth, names = furnished_room(np.random.default_rng(seed))
+            unit = 1.0 if "scale" in given else 0.37
+            fits = quadrics.fit_objects(
+                boxes, cams @ np.diag([1 / unit] * 3 + [1.0]), IMAGE, names, priors,
+                up=UP if "up" in given else None, metric="scale" in given,
+            )  # fmt: skip
+            error = np.log(fits.scale.value * unit)
+            scales.append(abs(error))
+            inside.append(abs(error) <= 1.96 * fits.scale.rel_sigma or "scale" in given)
+            tilts.append(np.rad2deg(np.arccos(np.clip(fits.up @ np.array(UP), -1, 1))))
+            ratio = np.log(np.sort(fits.size * fits.scale.value) / np.sort(2 * truth.half_axes))
+            sizes.append(np.nanmedian(np.abs(ratio)))
+        medians = [f"{100 * np.median(scales):.1f} %", f"{np.mean(inside):.0%}"]
+        rows.append([given, *medians, f"{np.median(tilts):.2f}", f"{100 * np.median(sizes):.1f} %"])
+    head = ["given", "scale error", "within its 95 %", "up error deg", "median size error"]
+    return table(head, rows)
+
+
+def fuzz_table(trials: int) -> str:
+    """Random, mostly absurd input: no exception, no warning, no nan without "rejected"."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        counts = fuzz(100_000 if trials > 100 else 5_000, np.random.default_rng(8))
+    return table(list(counts), [list(counts.values())])
+
+
+# ---- Figure 4.2 of the thesis --------------------------------------------------------------
+
+
+def disturb(dual_c: Array, rotation_deg: float, size: float, rng: np.random.Generator) -> Array:
+    """Turn ellipses about their centres and scale their axes by Gaussian errors."""
+    center, rows = quadrics._dual_conic_parts(dual_c)
+    block = np.stack([rows[..., 0], rows[..., 1], rows[..., 1], rows[..., 2]], -1)
+    value, vector = np.linalg.eigh(block.reshape(*rows.shape[:-1], 2, 2))
+    value = value * np.exp(2 * rng.normal(0, size, value.shape))
+    turn = rng.normal(0, np.deg2rad(rotation_deg), rows.shape[:-1])
+    c, s = np.cos(turn), np.sin(turn)
+    rot = np.stack([c, -s, s, c], -1).reshape(*turn.shape, 2, 2) @ vector
+    out = -np.ones((*turn.shape, 3, 3))
+    spread = np.einsum("...ik,...k,...jk->...ij", rot, value, rot)
+    out[..., :2, :2] = spread - center[..., :, None] * center[..., None, :]
+    out[..., :2, 2] = out[..., 2, :2] = -center
+    return out
+
+
+def ratio_priors(mean_log: Array, cov_log: Array) -> Priors:
+    """Priors that know axis ratios only: the common size is free (log sigma 3)."""
+    names = tuple(f"kind {k}" for k in range(len(mean_log)))
+    full = np.zeros((len(names), 3, 3))
+    full[:, :2, :2] = cov_log
+    full += 1e-4 * np.eye(3) + 9.0
+    log_mean = np.concatenate([mean_log, np.zeros((len(names), 1))], 1)
+    flags = np.ones(len(names), bool)
+    code = np.zeros(len(names), np.int64)
+    return Priors(names, {}, log_mean, full, mean_log, cov_log, code, ~flags, flags)
+
+
+def thesis_trial(rotation_deg: float, size: float, seed: int) -> list[float]:
+    """Mean O3D of SfMO, PSfMO, PSfMO with cameras and fit_objects for one disturbed scene."""
+    rng = np.random.default_rng(seed)
+    truth, cams = far_scene(15, 8, 25.0, rng)
+    table_ = quadrics.load_priors()
+    kinds = table_.index(["chair", "couch", "bottle", "monitor", "bed", "laptop", "mug", "bench"])
+    known = ratio_priors(table_.ratio_mean[kinds], table_.ratio_cov[kinds])
+    draw = np.einsum("oij,oj->oi", np.linalg.cholesky(known.ratio_cov), rng.normal(0, 1, (8, 2)))
+    ratio = np.exp(np.concatenate([known.ratio_mean + draw, np.zeros((8, 1))], 1))
+    half = ratio / np.linalg.norm(ratio, axis=1, keepdims=True) * rng.uniform(0.25, 0.45, (8, 1))
+    truth = Ellipsoids(truth.center_in_world, half, truth.world_from_obj)
+    dual_c = disturb(quadrics.project(truth.dual_quadrics(), cams)[0], rotation_deg, size, rng)
+    names = list(known.names)
+    boxes = quadrics.boxes_from_dual_conics(dual_c)
+    affine = quadrics.fit_psfmo(None, known, names, None, dual_c)
+    posed = quadrics.fit_psfmo(None, known, names, cams, dual_c)
+    ours = quadrics.fit_objects(
+        boxes, cams, (10**5, 10**5), names, known, up=UP, lines=conic_lines(dual_c, 12)
+    )
+    assert affine.start is not None and affine.mirrored is not None
+    pairs = ((affine.start.ellipsoids, affine.start.mirrored), (affine.ellipsoids, affine.mirrored))
+    scores = [
+        max(float(quadrics.volume_overlap(align(x, truth), truth).mean()) for x in pair)
+        for pair in pairs
+    ]
+    rest = [quadrics.volume_overlap(x.ellipsoids, truth).mean() for x in (posed, ours)]
+    return scores + [float(np.nan_to_num(x)) for x in rest]
+
+
+def thesis_figure(trials: int, image: Path | None = None) -> str:
+    """O3D (mean and sigma over scenes) against ellipse rotation error and size error."""
+    methods = ["SfMO", "PSfMO", "PSfMO, cameras known", "fit_objects, cameras known"]
+    sweeps = {
+        "ellipse rotation error, deg": [(x, 0.02) for x in (0, 5, 10, 20, 30, 45)],
+        "size error, %": [(2, x / 100) for x in (0, 5, 10, 20, 30, 50)],
+    }
+    rows, curves = [], {}
+    for label, settings in sweeps.items():
+        for rotation, size in settings:
+            seeds = range(max(6, trials // 10))
+            scores = np.array([thesis_trial(rotation, size, seed) for seed in seeds])  # (S, 4)
+            x = rotation if "rotation" in label else 100 * size
+            cells = [
+                f"{m:.2f} ± {s:.2f}" for m, s in zip(scores.mean(0), scores.std(0), strict=True)
+            ]
+            rows.append([label, f"{x:g}", *cells])
+            curves[label, x] = (scores.mean(0), scores.std(0))
+    if image is not None:
+        draw_figure(curves, list(sweeps), methods, image)
+    return table(["disturbance", "value", *methods], rows)
+
+
+def draw_figure(
+    curves: dict[tuple[str, float], tuple[Array, Array]],
+    labels: list[str],
+    methods: list[str],
+    path: Path,
+) -> None:
+    """Two panels as in the thesis's Fig. 4.2."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(10, 4), sharey=True)
+    for panel, label in zip(panels, labels, strict=True):
+        x = np.array([key[1] for key in curves if key[0] == label])
+        mean, sigma = (np.array([curves[label, v][k] for v in x]) for k in (0, 1))
+        for m, name in enumerate(methods):
+            panel.plot(x, mean[:, m], marker="o", label=name)
+            panel.fill_between(x, mean[:, m] - sigma[:, m], mean[:, m] + sigma[:, m], alpha=0.15)
+        panel.set_xlabel(label)
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("O3D (mean and sigma over scenes)")
+    panels[0].set_ylim(0, 1)
+    panels[1].legend(fontsize=8)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+TABLES: dict[str, Callable[[int], str]] = {
+    "ellipsoids": ellipsoids_table,
+    "cuboids": cuboids_table,
+    "wrong": wrong_table,
+    "coverage": coverage_table,
+    "masks": masks_table,
+    "room": room_table,
+    "thesis": thesis_figure,
+    "speed": speed_table,
+    "fuzz": fuzz_table,
+}
+
+
+def write_table(page: Path, name: str, text: str) -> None:
+    """Replace what stands between the markers of a table in a markdown page."""
+    old = page.read_text(encoding="utf-8")
+    begin, end = f"<!-- table {name} -->", f"<!-- end {name} -->"
+    if begin not in old or end not in old:
+        raise SystemExit(f"error: {page} has no markers {begin} ... {end}")
+    head, rest = old.split(begin, 1)
+    page.write_text(f"{head}{begin}\n{text}\n{end}{rest.split(end, 1)[1]}", encoding="utf-8")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="fewer trials: a smoke test")
+    parser.add_argument("--only", nargs="+", choices=list(TABLES), default=list(TABLES))
+    parser.add_argument("-o", type=Path, metavar="DOCS", help="folder with quadrics.md to fill in")
+    args = parser.parse_args(argv)
+    for name in args.only:
+        start = time.perf_counter()
+        trials = 40 if args.quick else 300
+        if name == "thesis" and args.o:
+            text = thesis_figure(trials, args.o / "img" / "synthetic_quadrics.png")
+        else:
+            text = TABLES[name](trials)
+        print(f"## {name} ({time.perf_counter() - start:.0f} s)\n\n{text}\n", flush=True)
+        if args.o:
+            write_table(args.o / "quadrics.md", name, text)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

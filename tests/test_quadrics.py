@@ -19,8 +19,9 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "examples")]
 import build_priors  # noqa: E402
-import quadrics as q  # noqa: E402
 import synthetic_quadrics as syn  # noqa: E402
+
+import quadrics as q  # noqa: E402
 
 DEMO = ROOT.parent / "shared" / "data" / "lfd_aldoma"
 UP = (0.0, 0.0, 1.0)
@@ -41,9 +42,9 @@ def random_solids(n: int, rng: np.random.Generator, upright: bool = False) -> q.
     return q.Ellipsoids(rng.normal(0, 0.4, (n, 3)), half, q.rotations(turn))
 
 
-def surface(solids: q.Ellipsoids, k: int, support: str, n: int = 60) -> np.ndarray:
+def surface(solids: q.Ellipsoids, k: int, support: str, n: int = 90) -> np.ndarray:
     """Dense points on the surface of one solid."""
-    a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 4 * n), np.linspace(-1, 1, n))
+    a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 4 * n), np.sin(np.linspace(-0.5, 0.5, n) * np.pi))
     if support == "ellipsoid":
         r = np.sqrt(1 - b**2)
         unit = np.stack([r * np.cos(a), r * np.sin(a), b], -1).reshape(-1, 3)
@@ -59,9 +60,9 @@ def pixels(points: np.ndarray, cam: np.ndarray) -> np.ndarray:
     return image[:, :2] / image[:, 2:]
 
 
-def fitted(n: int, views: int, arc: float, noise: float, support: str, seed: int = 0, **options):
+def fitted(n: int, views: int, arc: float, noise: float, shape: str, seed: int = 0, **options):
     rng = np.random.default_rng(seed)
-    boxes, cams, truth, priors, names = syn.scenes(n, views, arc, noise, support, rng)
+    boxes, cams, truth, priors, names = syn.scenes(n, views, arc, noise, shape, rng)
     joint, flat = syn.as_one(boxes, cams)
     options = {"up": UP, **options}
     fits = q.fit_objects(joint, flat, syn.IMAGE, names, priors, **options)
@@ -89,7 +90,11 @@ def test_projection_matches_pycolmap() -> None:
     calib = np.array([[700.0, 0, 333.0], [0, 690.0, 251.0], [0, 0, 1]])
     camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 700.0, 640, 480)
     camera.params = [700.0, 690.0, 333.0, 251.0]
-    tiny = q.Ellipsoids(rng.normal(0, 0.5, (6, 3)) + [0, 0, 4], np.full((6, 3), 1e-4), np.tile(np.eye(3), (6, 1, 1)))
+    tiny = q.Ellipsoids(
+        rng.normal(0, 0.5, (6, 3)) + np.array([0, 0, 4]),
+        np.full((6, 3), 1e-4),
+        np.tile(np.eye(3), (6, 1, 1)),
+    )
     rot = q.rotations(rng.normal(0, 0.2, (1, 3)))[0]
     cam_from_world = np.concatenate([rot, rng.normal(0, 0.2, (3, 1))], 1)
     boxes = q.solid_boxes(tiny, "ellipsoid", (calib @ cam_from_world)[None])[0]
@@ -185,7 +190,7 @@ def test_plain_lfd_agrees_with_the_batched_one() -> None:
     plain = np.array([syn.plain_lfd(boxes[:, k], cams) for k in range(6)])
     assert real.all()
     overlap = q.volume_overlap(*(q.Ellipsoids.from_dual_quadrics(x)[0] for x in (ours, plain)))
-    assert overlap.min() > 0.93
+    assert overlap.min() > 0.999
 
 
 @pytest.mark.parametrize("shift", [(3.0, 2.0, 1.0), (-1000.0, 700.0, 20.0)])
@@ -226,12 +231,17 @@ def test_published_lfd_demo(demo) -> None:
     boxes, cams, truth = demo
     dual_q, real = q.fit_lfd(boxes, cams)
     assert real.all()
-    assert q.volume_overlap(q.Ellipsoids.from_dual_quadrics(dual_q)[0], truth).mean() >= 0.70
+    closed = q.volume_overlap(q.Ellipsoids.from_dual_quadrics(dual_q)[0], truth).mean()
+    assert closed == pytest.approx(0.716, abs=0.001)
+    first = q.Ellipsoids.from_dual_quadrics(q.fit_lfd(boxes[:3], cams[:3])[0])[0]
+    assert q.volume_overlap(first, truth).mean() == pytest.approx(0.518, abs=0.003)
     fits = q.fit_objects(boxes, cams, (640, 480), up=UP, support="ellipsoid")
     assert q.volume_overlap(fits.ellipsoids, truth).mean() >= 0.72
     three = [
         q.volume_overlap(
-            q.fit_objects(boxes[k : k + 3], cams[k : k + 3], (640, 480), up=UP, support="ellipsoid").ellipsoids,
+            q.fit_objects(
+                boxes[k : k + 3], cams[k : k + 3], (640, 480), up=UP, support="ellipsoid"
+            ).ellipsoids,
             truth,
         ).mean()
         for k in range(6)
@@ -255,7 +265,9 @@ def test_evidence_tells_cartons_from_bottles(demo) -> None:
 def test_clean_boxes_give_the_truth(support: str) -> None:
     fits, truth, *_ = fitted(40, 8, 100, 1e-4, support)
     assert (fits.status == "ok").all()
-    assert np.linalg.norm(fits.ellipsoids.center_in_world - truth.center_in_world, axis=1).max() < 0.01
+    assert (
+        np.linalg.norm(fits.ellipsoids.center_in_world - truth.center_in_world, axis=1).max() < 0.01
+    )
     overlap = q.box_overlap if support == "box" else q.volume_overlap
     assert np.median(overlap(fits.ellipsoids, truth)) > 0.98
     assert (fits.support == support).all() and fits.inlier.sum() == 40 * 8
@@ -265,7 +277,7 @@ def test_clean_boxes_give_the_truth(support: str) -> None:
     ("arc", "lowest", "lfd_highest"),
     [
         (5, 0.45, 0.30),  # almost no parallax: the prior carries it
-        (20, 0.66, 0.40),
+        (20, 0.66, 0.50),
         (90, 0.84, 0.82),
     ],
 )
@@ -458,11 +470,17 @@ def test_lying_book_keeps_a_vertical_third_axis() -> None:
     ],
 )
 def test_empty_input(shape: tuple[int, int], reason: str | None) -> None:
-    fits = q.fit_objects(np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan), (640, 480))
+    fits = q.fit_objects(
+        np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan), (640, 480)
+    )
     assert len(fits) == shape[1] and (fits.status == "rejected").all()
     assert fits.inlier.shape == shape and fits.cov.shape == (shape[1], 9, 9)
     assert all(reason in r for r in fits.reason if reason)
-    assert q.fit_lfd(np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan))[0].shape == (shape[1], 4, 4)
+    assert q.fit_lfd(np.full((*shape, 4), np.nan), np.full((shape[0], 3, 4), np.nan))[0].shape == (
+        shape[1],
+        4,
+        4,
+    )
 
 
 @pytest.mark.parametrize(
@@ -510,7 +528,9 @@ def test_fast_enough() -> None:
 
 
 def spheres(center: np.ndarray, radius: np.ndarray) -> q.Ellipsoids:
-    return q.Ellipsoids(center, np.repeat(radius[:, None], 3, 1), np.tile(np.eye(3), (len(radius), 1, 1)))
+    return q.Ellipsoids(
+        center, np.repeat(radius[:, None], 3, 1), np.tile(np.eye(3), (len(radius), 1, 1))
+    )
 
 
 def test_volume_overlap_of_spheres_is_the_lens() -> None:
@@ -519,9 +539,13 @@ def test_volume_overlap_of_spheres_is_the_lens() -> None:
     direction = rng.normal(0, 1, (200, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     lens = np.pi * (r1 + r2 - d) ** 2 * (d**2 + 2 * d * (r1 + r2) - 3 * (r1 - r2) ** 2) / (12 * d)
-    lens = np.where(d >= r1 + r2, 0, np.where(d <= abs(r1 - r2), 4 / 3 * np.pi * np.minimum(r1, r2) ** 3, lens))
+    lens = np.where(
+        d >= r1 + r2, 0, np.where(d <= abs(r1 - r2), 4 / 3 * np.pi * np.minimum(r1, r2) ** 3, lens)
+    )
     expected = lens / (4 / 3 * np.pi * (r1**3 + r2**3) - lens)
-    measured = q.volume_overlap(spheres(np.zeros((200, 3)), r1), spheres(direction * d[:, None], r2))
+    measured = q.volume_overlap(
+        spheres(np.zeros((200, 3)), r1), spheres(direction * d[:, None], r2)
+    )
     assert np.abs(measured - expected).max() < 1e-3
 
 
@@ -574,19 +598,21 @@ def test_sfmo_says_when_there_is_too_little(shape: tuple[int, int]) -> None:
     assert not result.ok and "needs" in result.note and len(result.ellipsoids) == shape[1]
 
 
-def test_psfmo_prior_helps_where_sfmo_is_weak() -> None:
+def test_psfmo_prior_helps_where_least_squares_is_weak() -> None:
+    """Narrow views: SfMO's least-squares shapes are elongated in depth, the prior mends them."""
     gains = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        truth, cams = syn.far_scene(15, 10, 12.0, rng)  # narrow: shapes are elongated in depth
+        truth, cams = syn.far_scene(15, 10, 12.0, rng)
         boxes = syn.noisy(q.solid_boxes(truth, "ellipsoid", cams), 0.02, rng)
         priors, names = syn.individual_priors(np.log(2 * truth.half_axes), 0.1, "ellipsoid")
-        plain = q.fit_psfmo(boxes, priors, [None] * 10, cams)
+        parts = q._box_conics(boxes)
+        plain = q._known_camera_start(*parts, np.ones(boxes.shape[:2], bool), cams)[0]
         informed = q.fit_psfmo(boxes, priors, names, cams)
-        before, after = (q.volume_overlap(x.ellipsoids, truth).mean() for x in (plain, informed))
         assert np.isfinite(informed.noise).all() and informed.start is None
-        gains.append(after - before)
-    assert np.mean(gains) > 0.03
+        scores = [q.volume_overlap(x, truth).mean() for x in (plain, informed.ellipsoids)]
+        gains.append(scores[1] - scores[0])
+    assert np.mean(gains) > 0.05
 
 
 def test_psfmo_finds_the_axis_assignment() -> None:
@@ -609,9 +635,10 @@ def test_priors_cover_the_vocabularies() -> None:
         "cabinet,bed,chair,sofa,table,door,window,bookshelf,picture,counter,desk,curtain,"
         "refrigerator,shower curtain,toilet,sink,bathtub,otherfurniture"
     ).split(",")
-    sun = "night_stand,dresser,pillow,lamp,monitor,garbage_bin,box,whiteboard,shelves,mirror,bag".split(",")
+    sun = "night_stand,dresser,pillow,lamp,monitor,garbage_bin,box,whiteboard,shelves,bag"
+    rest = [*scannet, *sun.split(","), "tvmonitor", "television", "Potted_Plant"]
     assert (priors.index(COCO_80) >= 0).all() and set(COCO_80) <= set(priors.names)
-    assert (priors.index(scannet + sun + ["tvmonitor", "television", "Potted_Plant"]) >= 0).all()
+    assert (priors.index(rest) >= 0).all()
     assert priors.index(["unheard of", None, ""]).tolist() == [-1, -1, -1]
     assert priors.index(["sofa"]) == priors.index(["couch"])
     assert (np.linalg.eigvalsh(priors.log_cov) > 0).all() and (priors.log_mean < np.log(60)).all()
@@ -643,7 +670,9 @@ def test_build_priors_from_meshes_and_table(tmp_path: Path) -> None:
     assert build_priors.main([str(tmp_path / "meshes"), "-o", str(out), "--up", "y"]) == 0
     priors = q.load_priors(out)
     assert np.allclose(priors.log_mean[0], np.log(sizes).mean(0), atol=1e-3)
-    assert np.allclose(np.sqrt(np.diagonal(priors.log_cov[0])), np.log(sizes).std(0, ddof=1), rtol=0.02)
+    assert np.allclose(
+        np.sqrt(np.diagonal(priors.log_cov[0])), np.log(sizes).std(0, ddof=1), rtol=0.02
+    )
     table = tmp_path / "sizes.csv"
     table.write_text("category,w,d,h\n" + "".join(f"stool,{w},{d},{h}\n" for w, d, h in sizes))
     assert build_priors.main([str(table), "-o", str(out), "--support", "cylinder"]) == 0
@@ -662,5 +691,7 @@ def test_functions_are_short_and_nothing_optional_is_imported() -> None:
             text = ast.get_docstring(node, clean=False)
             lines = node.end_lineno - node.lineno + 1 - (len(text.split("\n")) if text else 0)
             assert lines <= 50, (node.name, lines)
-    names = {a.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    names = {
+        a.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names
+    }
     assert names <= {"json", "re", "numpy"}
