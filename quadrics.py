@@ -72,9 +72,7 @@ class FitConfig:
     """Every number that `fit_objects` uses, with unit, meaning and origin."""
 
     edge_noise_px: float = 1.0  # px, floor of a box edge's standard deviation (detector rounding)
-    edge_noise_rel: float = (
-        0.02  # of the box's width (height) for its left, right (top, bottom) edge
-    )
+    edge_noise_rel: float = 0.02  # of the box's width (left, right edge) or height (top, bottom)
     noise_prior_dof: float = 12.0  # weight, in residuals, of those two against the residuals seen
     object_noise_dof: float = 20.0  # weight of the pooled noise level in one object's own level
     noise_range: tuple[float, float] = (0.05, 20.0)  # limits of the noise factor
@@ -102,13 +100,11 @@ class FitConfig:
     size_wall: float = 4.0  # sigma, beyond it the size prior turns quartic
     size_wall_rise: float = 4.0  # how steep: extra cost rise * (s^2 - wall^2)^2 / wall^2
     near_depth: float = 1e-3  # of the start depth; nearer than this counts as behind
-    view_outlier: float = (
-        6.0  # mean squared residual of a view's 4 edges (chi2_4 .9999 is 23.5 / 4)
-    )
+    view_outlier: float = 6.0  # mean squared residual of a view (chi2 .9999, 4 dof, is 23.5 / 4)
     edge_outlier: float = 5.0  # sigma, a single edge farther off is dropped (occlusion)
     max_noise: float = 8.0  # noise factor above which the boxes are not of one static object
     min_inlier_share: float = 0.4  # of the views; below it the object is rejected
-    tilt_deg: float = 3.0  # deg, how upright an object stands when gravity is known
+    tilt_deg: float = 1.5  # deg, how upright an object stands when gravity is known
     camera_roll_deg: float = 6.0  # deg, spread of a hand-held camera's roll: up from cameras
     camera_pitch_deg: float = 35.0  # deg, same of its pitch
     camera_up_views: float = 4.0  # views of independent roll that a video is worth
@@ -116,9 +112,10 @@ class FitConfig:
     yaw_sigma_rad: float = 0.9  # rad, std of a uniform angle in +-90 deg: cap of unknown rotation
     round_log_ratio: float = 0.05  # log(w/d) spread of yaw-symmetric categories
     unknown_scale_log: float = 3.0  # log, prior spread of the global scale when poses have none
-    unknown_aspect_log: float = 0.5  # log, spread of axis ratios of an unknown category
-    unknown_size_log: float = 1.0  # log, spread of the common size of an unknown category
-    unknown_size_m: tuple[float, float, float] = (0.4, 0.35, 0.45)  # m, geometric mean, priors.json
+    # unknown category: spread of the 110 indoor categories of priors.json
+    unknown_aspect_log: float = 0.6  # log, standard deviation of each axis about the common size
+    unknown_size_log: float = 0.9  # log, standard deviation of the common size
+    unknown_size_m: tuple[float, float, float] = (0.29, 0.25, 0.25)  # m, geometric mean
     prior_dominated: float = 0.7071  # posterior / prior sigma above which the prior did the work
     loose_log: float = 0.35  # log, an axis less certain than this is not called measured
     odd_size: float = 3.5  # sigma from the prior: said in the reason
@@ -133,7 +130,7 @@ class FitConfig:
     bend_weight: float = 2.0  # of q q'; second moment .75, the 95 % tail needs about 2
     max_bend: float = 30.0  # sigma, limit of the bend of a principal axis
     max_widening: float = 4.0  # limit of that correction, as a factor on sigma
-    smooth_cov: float = 0.05  # same for the covariance: the spread of m, i.e. tilt_deg in rad
+    smooth_cov: float = 0.05  # same for the covariance: the spread of m, near kinks
     smooth: float = 1e-3  # rounds the kink of |m| in the box support
 
 
@@ -259,15 +256,15 @@ def _with_positive_depth(img_from_world: Array) -> Array:
 # ---- Solids: projected boxes, IoU -----------------------------------------------------------
 
 
-def support_codes(support: str | Sequence[str] | None, n: int) -> IntArray:
-    """Turn support names into codes (n,); None or "evidence" gives -1 (undecided)."""
+def support_codes(support: str | Sequence[str | None] | None, n: int) -> IntArray:
+    """Turn support names into codes (n,); None: BY_CATEGORY, "evidence": BY_EVIDENCE."""
     names = [support] * n if support is None or isinstance(support, str) else list(support)
     if len(names) != n:
         raise QuadricsError(
             f"{len(names)} supports given for {n} objects: give one name or one each"
         )
     table: dict[str | None, int] = {name: k for k, name in enumerate(SUPPORTS)}
-    table.update({None: -1, "evidence": -1})
+    table.update({None: BY_CATEGORY, "evidence": BY_EVIDENCE})
     unknown = {str(x) for x in names if x not in table}
     if unknown:
         raise QuadricsError(
@@ -321,6 +318,8 @@ def solid_boxes(
         (F, O, 4) xyxy in pixels, not clipped; NaN where nothing is in front of the camera.
     """
     codes = support_codes(support, len(solids))
+    if (codes < 0).any():
+        raise QuadricsError(f"solids have a shape: name one of {SUPPORTS} for each")
     cams = _with_positive_depth(np.asarray(img_from_world, np.float64))  # (F, 3, 4)
     boxes = np.full((len(cams), len(solids), 4), np.nan)
     for code in np.unique(codes):
@@ -634,7 +633,8 @@ def _lfd_system(boxes: Array, cams: Array, origin: Array, unit: Array, seen: Boo
     scale = np.linalg.norm(half, axis=-1)  # (O, V)
     local = cams.copy()  # (O, V, 3, 4) world -> object-centred world in object units
     local[..., 3] += np.einsum("ovij,oj->ovi", cams[..., :3], origin)
-    local[..., 3] /= unit[:, None, None]  # depth counts in object units too
+    local[..., 3] /= unit[:, None, None]
+    local *= 10.0  # large against beta's entries: from 3 up the solution no longer depends on it
     mid = 0.5 * (boxes[..., 2:] + boxes[..., :2])
     local[..., :2, :] -= mid[..., None] * local[..., 2:, :]
     local[..., :2, :] /= scale[..., None, None]
@@ -1199,8 +1199,7 @@ def _skew(v: Array) -> Array:
 
 class _Residuals(NamedTuple):
     value: Array  # (B, M) in sigma; 0 where unused
-    jacobian: Array | None  # (B, M, 9)
-    behind: BoolArray  # (B, V)
+    jacobian: Array  # (B, M, 9), empty when not asked for
 
 
 def _residuals(
@@ -1232,7 +1231,7 @@ def _residuals(
     value = scale * gap
     value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = cfg.behind
     if not jacobian:
-        return _Residuals(value, None, behind)
+        return _Residuals(value, np.empty(0))
     jac = np.empty((n_prob, flat, 9))
     shrink = np.repeat(inv_depth, n_edge, 1) * value * (scale > 0)  # (B, M)
     rows = np.repeat(edges.depth_row[..., :3], n_edge, 1)  # (B, M, 3)
@@ -1242,7 +1241,7 @@ def _residuals(
     jac[..., 6] = v[..., 1] * m[..., 2] - v[..., 2] * m[..., 1]
     jac[..., 7] = v[..., 2] * m[..., 0] - v[..., 0] * m[..., 2]
     jac[..., 8] = v[..., 0] * m[..., 1] - v[..., 1] * m[..., 0]
-    return _Residuals(value, jac, behind)
+    return _Residuals(value, jac)
 
 
 def _robust(value: Array, cfg: FitConfig, loss: str) -> tuple[Array, Array]:
@@ -1273,7 +1272,6 @@ def _normal_equations(
 ) -> _Normal:
     """Cost, gradient and Gauss-Newton Hessian: edges + size prior + upright prior."""
     res = _residuals(state, edges, prob.groups, cfg, jacobian=True)
-    assert res.jacobian is not None
     rho, weight = _robust(res.value, cfg, loss)
     weighted = (res.jacobian * weight[..., None]).transpose(0, 2, 1)  # (B, 9, M)
     hessian = weighted @ res.jacobian  # (B, 9, 9)
@@ -1509,7 +1507,7 @@ def _start_table(spec: _Spec) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """List the problems: object, support, vertical axis, yaw, each (B,)."""
     n = len(spec.size_mean)
     use = np.ones((n, 3, 3, 4), bool) & spec.allowed[:, :, None, None]  # object, support, axis, yaw
-    use[spec.upright, :, :2] = False
+    use[spec.upright & bool(np.any(spec.up)), :, :2] = False  # up unknown: any axis may stand
     use[:, CYLINDER, 1] = False  # a lying cylinder: axis 0 and 1 vertical are the same
     round_ = spec.round_[:, None] | (np.arange(3) == CYLINDER) & (spec.natural != CYLINDER)[:, None]
     use[:, :, 2, 1:] &= ~round_[:, :, None]
@@ -1624,7 +1622,6 @@ class _Fit:
     hessian: Array  # (B, 9, 9) at unit noise
     good: BoolArray  # (B, V, E) edges in use
     noise: Array  # (B,) factor on the nominal edge sigma
-    mean_square: Array  # (B,) of inlier residuals, nominal sigma
     evidence: Array  # (B,)
     views: BoolArray  # (B, V) inlier views
     spread: Array  # (B, 9, 9) second moment of rival solutions
@@ -1715,7 +1712,7 @@ def _best_starts(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     good: BoolArray = data.edges.used[obj[keep]]
     zero, one = np.zeros(len(keep)), np.ones(len(keep))
     return _Fit(
-        obj[keep], code[keep], axis[keep], state.take(keep), hessian[keep], good, one, one, zero,
+        obj[keep], code[keep], axis[keep], state.take(keep), hessian[keep], good, one, zero,
         np.asarray(good.any(-1)), spread[group],
     )  # fmt: skip
 
@@ -1802,7 +1799,6 @@ def _update_noise(fit: _Fit, value: Array, spec: _Spec, cfg: FitConfig, robust: 
         square = (np.minimum(value**2, (cfg.huber * fit.noise[:, None, None]) ** 2) * fit.good).sum(
             (1, 2)
         )
-    fit.mean_square = square / n
     best = np.full(int(fit.obj.max()) + 1, np.inf)
     np.minimum.at(best, fit.obj, square / dof)  # of the supports tried, the one that fits
     mine = square / dof <= best[fit.obj]
@@ -1954,11 +1950,7 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     value = _all_residuals(fit, data, cfg)
     fit.evidence = _log_evidence(fit, value, spec, data, cfg)
     order = np.lexsort((-fit.evidence, fit.obj))
-    best = fit.take(order[_group_starts(fit.obj[order])])
-    best.mean_square = (_all_residuals(best, data, cfg) ** 2 * best.good).sum((1, 2)) / np.maximum(
-        best.good.sum((1, 2)), 1
-    )
-    return best
+    return fit.take(order[_group_starts(fit.obj[order])])
 
 
 # ---- fit_objects: scale, gravity, report ----------------------------------------------------
@@ -2143,9 +2135,10 @@ def _parallax(fit: _Fit, data: _Data) -> Array:
     return np.asarray(np.rad2deg(np.arccos(np.clip(lowest, -1.0, 1.0))))
 
 
-def _stand_up(fit: _Fit, cov: Array, up: Array) -> tuple[Ellipsoids, Array, IntArray]:
-    """Relabel axes so that the third one points up (not for lying cylinders).
+def _stand_up(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntArray]:
+    """Relabel axes so that the vertical one comes third (not for lying cylinders).
 
+    Every start has its vertical axis pointing up, so the third axis does too.
     Returns solids, covariance (B, 9, 9), and order (B, 3): the prior's axis behind each new one.
     """
     order = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])[np.where(fit.code == CYLINDER, 2, fit.axis)]
@@ -2154,11 +2147,7 @@ def _stand_up(fit: _Fit, cov: Array, up: Array) -> tuple[Ellipsoids, Array, IntA
     rot = np.take_along_axis(fit.state.rot, order[:, None, :], 2)
     full = np.concatenate([np.tile(np.arange(3), (len(order), 1)), 3 + order, 6 + order], 1)
     cov = cov[row[:, :, None], full[:, :, None], full[:, None, :]]
-    down = (rot[:, :, 2] @ up) < 0
-    sign = np.where(down[:, None], [1.0, -1.0, -1.0], 1.0)  # half a turn about the first axis
-    nine = np.concatenate([np.ones((len(sign), 6)), sign], 1)
-    solids = Ellipsoids(fit.state.center, half, rot * sign[:, None, :])
-    return solids, cov * nine[:, :, None] * nine[:, None], order
+    return Ellipsoids(fit.state.center, half, rot), cov, order
 
 
 def _inlier_table(
@@ -2277,7 +2266,7 @@ def fit_objects(
     categories: Sequence[str | None] | None = None,
     priors: Priors | None = None,
     up: Sequence[float] | Array | None = None,
-    support: str | Sequence[str] | None = None,
+    support: str | Sequence[str | None] | None = None,
     *,
     score: npt.ArrayLike | None = None,
     metric: bool = True,
@@ -2305,22 +2294,24 @@ def fit_objects(
     boxes, given = np.asarray(boxes_xyxy, np.float64), np.asarray(img_from_world, np.float64)
     _check_input(boxes, given, image_size, categories)
     codes = support_codes(support, boxes.shape[1])
-    if support is not None:
-        codes = np.where(codes < 0, BY_EVIDENCE, codes)
     cams = _cameras(given)
     usable = _usable_boxes(boxes, cams)
     quality = np.ones(usable.shape)
     if score is not None:
         quality = np.nan_to_num(np.asarray(score, np.float64))
-    world = _first_world(up, metric and not known_size, cams, cfg)
+    inside = (boxes[..., :2] > cfg.border_px) & (
+        boxes[..., 2:] < np.array(image_size) - cfg.border_px
+    )
+    quality = quality + inside.all(-1)  # uncut boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
+    sizes = _known_sizes(known_size, categories, live)
+    world = _first_world(up, metric and not sizes, cams, cfg)
     if not len(live):
         return _report(None, boxes, usable, cams, live, world, image_size, cfg)
     extra = None if lines is None else np.asarray(lines, np.float64)[:, live]
     seen = (boxes[:, live], usable[:, live], quality[:, live])
     data = _gather_data(*seen, cams, image_size, extra, cfg)
     names = [None if categories is None else categories[int(k)] for k in live]
-    sizes = _known_sizes(known_size, categories, live)
     solved, world = _solve_passes(data, names, priors, codes[live], sizes, world, cfg)
     return _report(solved, boxes, usable, cams, live, world, image_size, cfg)
 
@@ -2371,7 +2362,9 @@ def _report(
     if solved is not None:
         fit, spec, data = solved
         wide = _curved_covariance(fit, data, spec, cfg) + fit.spread
-        found, cov[live], order = _stand_up(fit, wide, world.up)
+        # the noise level is itself estimated: Student's 95 % region for three parameters
+        wide *= (1.0 + 3.5 / (cfg.object_noise_dof + _free_dof(fit, spec)))[:, None, None]
+        found, cov[live], order = _stand_up(fit, wide)
         for name in ("center_in_world", "half_axes", "world_from_obj"):
             getattr(solids, name)[live] = getattr(found, name)
         prior = np.sqrt(np.einsum("bii->bi", spec.size_cov))[np.arange(len(live))[:, None], order]

@@ -188,6 +188,7 @@ class PosesConfig:
     focal_guess: float = _opt(0.8, "first focal length over the longer side (phones .72-.85)")
     good_registered: float = _opt(0.9, "take the first healthy model with this share of the keyframes")
     min_points_per_image: int = _opt(30, "refuse a model with fewer 3D points seen in the median image")
+    min_parallax_px: float = _opt(3.0, "refuse a model that pure turns explain to this (turns: < 1.4, walks: > 10)")
     strong_tri_angle_deg: float = _opt(5.0, "trust a self-calibrated focal length from this triangulation angle on")
     strong_spread: float = _opt(0.1, "and from this spread of the cameras over the scene's depth on")
     focal_range: tuple[float, float] = _opt((0.4, 2.0), "and only when focal / longer side lies in here")
@@ -496,18 +497,25 @@ class Progress:
         self.enabled = sys.stderr.isatty()
 
     def step(self, n: int = 1) -> None:
+        """Count n more; redraw at most ten times a second."""
         self.done += n
-        now = time.monotonic()
-        if self.enabled and now - self.shown > 0.1:
-            self.shown = now
-            rate = self.done / max(now - self.started, 1e-6)
-            share = f"/{self.total} {100 * self.done / self.total:3.0f}%" if self.total else ""
-            left = f", {max(self.total - self.done, 0) / rate:.0f} s left" if self.total else ""
-            sys.stderr.write(f"\r{self.stage:<8}{self.done}{share} {rate:.1f}/s{left}   ")
+        if self.enabled and time.monotonic() - self.shown > 0.1:
+            self._draw()
+
+    def _draw(self) -> None:
+        self.shown = time.monotonic()
+        rate = self.done / max(self.shown - self.started, 1e-6)
+        text = f"{self.stage:<10}{self.done}"
+        if self.total:
+            left = max(self.total - self.done, 0) / rate if rate else math.inf
+            text += f"/{self.total} {100 * self.done / self.total:3.0f} %"
+            text += f", {left:.0f} s left" if math.isfinite(left) else ""
+        sys.stderr.write(f"\r{text}, {rate:.1f}/s\x1b[K")  # erase what a longer line left behind
 
     def close(self) -> float:
         """Finish the line and return the seconds since the start."""
         if self.enabled and self.done:
+            self._draw()
             sys.stderr.write("\n")
         return time.monotonic() - self.started
 
@@ -3687,6 +3695,7 @@ class _Attempt:
     others: tuple[Any, ...] = ()
     registered: float = 0.0  # share of the keyframes
     tri_angle_deg: float = 0.0  # median over points of the widest angle between two rays
+    parallax_px: float = 0.0  # what turns of the camera alone cannot explain
     spread: float = 0.0  # rms distance of the cameras from their mean over the median depth
     focal: float = 0.0  # over the longer side
     problem: str = "no two keyframes show the same points from clearly different places"
@@ -3706,7 +3715,8 @@ def _sfm_ladder(database: Path, frames: list[int], known_focal: bool, config: Po
     tried: list[_Attempt] = []
     for rung in ("strict", "relaxed", "global"):
         sound = [a for a in tried if not a.problem]
-        if any(a.registered >= config.good_registered for a in sound) or (sound and rung == "global"):
+        turned = [a for a in tried if a.problem and a.parallax_px < config.min_parallax_px]
+        if any(a.registered >= config.good_registered for a in sound + turned) or (sound and rung == "global"):
             break
         tried.append(_sfm_attempt(database, rung, known_focal, len(frames), config))
     best = max(tried, key=lambda a: (not a.problem, a.registered))
@@ -3724,7 +3734,7 @@ def _sfm_ladder(database: Path, frames: list[int], known_focal: bool, config: Po
     for other in best.others:
         part = sorted(frames[i - 1] for i in other.reg_image_ids() if i not in kept)
         if len(part) >= 3:
-            messages.append(f"frames {part[0]}-{part[-1]}: a reconstruction of its own, left out as it does not connect")
+            messages.append(f"frames {part[0]}-{part[-1]}: a separate reconstruction, left out as it does not connect")
     return best.model, messages
 
 
@@ -3748,17 +3758,20 @@ def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: Pos
     centre = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     registered, focal = len(centre) / count, camera.mean_focal_length() / max(camera.width, camera.height)
     seen = [model.image(i).num_points3D for i in centre]
+    parallax = _sfm_parallax_px(model)
     angle, depth = _sfm_angle_and_depth(model, centre, config.tri_sample)
     spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
     tests = (
         (registered < config.min_registered, f"only {len(centre)} of {count} keyframes connect"),
         (model.num_points3D() < config.min_points, f"only {model.num_points3D()} points could be triangulated"),
         (np.median(seen) < config.min_points_per_image, "the images share too few points"),
+        (parallax < config.min_parallax_px, "a mere turn of the camera explains all images, so there is no depth"),
         (angle < config.min_tri_angle_deg, f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
         (camera.has_bogus_params(*config.focal_range, 1.0), f"the focal length came out as {focal:.2f} x the width"),
     )
     problem = next((text for bad, text in tests if bad), "")
-    return _Attempt(model, tuple(m for m in models if m is not model), registered, angle, spread, focal, problem)
+    others = tuple(m for m in models if m is not model)
+    return _Attempt(model, others, registered, angle, parallax, spread, focal, problem)
 
 
 def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
@@ -3797,12 +3810,15 @@ def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> t
 
 
 def _sfm_parallax_px(model: Any) -> float:
-    """Measure what a pure turn cannot explain: upper quartile over image pairs of the median residual of the best turn."""
+    """Measure what pure turns cannot explain: median residual of the best turn, upper quartile over image pairs.
+
+    A model of a camera that only turned looks sound otherwise: a wrong focal length makes up triangulation angles.
+    """
     rays: dict[int, dict[int, Array]] = {}
     for image_id in sorted(model.reg_image_ids()):
         seen = model.image(image_id).get_observation_points2D()
-        ideal = np.asarray(model.camera(1).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2))).reshape(-1, 2)
-        unit = np.column_stack([ideal, np.ones(len(ideal))])
+        ideal = np.asarray(model.camera(1).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2)))
+        unit = np.column_stack([ideal.reshape(-1, 2), np.ones(len(seen))])  # (n, 3)
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
         rays[image_id] = dict(zip([p.point3D_id for p in seen], unit, strict=True))
     residuals = []

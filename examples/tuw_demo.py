@@ -1,7 +1,7 @@
 """The LfD authors' own demo (TUW: 6 objects, 8 views) with LfD and with fit_objects.
 
 Usage:
-    python examples/tuw_demo.py FOLDER
+    python examples/tuw_demo.py FOLDER [-o docs]
 
 FOLDER holds bounding_boxes.npy (8, 24), camera_poses.npy (32, 3), intrinsics.npy (3, 3) and gt.npy
 (6, 4, 4) of IIT-PAVIS/LfD, Data/Aldoma (MIT; data after Aldoma et al., IROS 2014). The data is not
@@ -21,6 +21,9 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from synthetic_quadrics import table, write_table
+
 import quadrics
 from quadrics import Array, Ellipsoids
 
@@ -45,48 +48,43 @@ def lfd_score(boxes: Array, cams: Array, truth: Ellipsoids) -> tuple[Array, int]
     return np.nan_to_num(quadrics.volume_overlap(found, truth)), int(real.sum())
 
 
-def fit_score(
-    boxes: Array, cams: Array, truth: Ellipsoids, up: Sequence[float] | None
-) -> tuple[Array, int]:
+def fit_score(boxes: Array, cams: Array, truth: Ellipsoids, up: Sequence[float] | None) -> Array:
     """O3D (6,) of fit_objects with support="ellipsoid" and no priors."""
     fits = quadrics.fit_objects(boxes, cams, IMAGE, up=up, support="ellipsoid")
-    return quadrics.volume_overlap(fits.ellipsoids, truth), len(fits)
+    return quadrics.volume_overlap(fits.ellipsoids, truth)
 
 
-def report_overlap(boxes: Array, cams: Array, truth: Ellipsoids) -> None:
-    """Print O3D with all views, three adjacent and three wide ones."""
+def overlap_table(boxes: Array, cams: Array, truth: Ellipsoids) -> str:
+    """O3D with all views, three adjacent and three wide ones."""
     adjacent = [range(k, k + 3) for k in range(6)]
-    choices: dict[str, Sequence[Sequence[int]]] = {
-        "8 views": [range(8)],
-        "3 adjacent": adjacent,
-        "0, 2, 4": [[0, 2, 4]],
-        "0, 3, 5": [[0, 3, 5]],
-    }
-    print("| views | LfD | real ellipsoids | fit_objects, up known | fit_objects, up unknown |")
-    print("|---|---|---|---|---|")
+    choices: dict[str, Sequence[Sequence[int]]] = {"all 8": [range(8)], "first 3": [range(3)]}
+    choices |= {"3 adjacent, mean of 6": adjacent, "0, 2, 4": [[0, 2, 4]], "0, 3, 5": [[0, 3, 5]]}
+    rows = []
     for name, subsets in choices.items():
-        cells = []
         picks = [np.array(s) for s in subsets]
         lfd = [lfd_score(boxes[s], cams[s], truth) for s in picks]
-        cells.append(f"{np.mean([x[0].mean() for x in lfd]):.3f}")
-        cells.append(f"{sum(x[1] for x in lfd)} of {6 * len(lfd)}")
+        row: list[object] = [name, f"{np.mean([x[0].mean() for x in lfd]):.3f}"]
+        row.append(f"{sum(x[1] for x in lfd)} of {6 * len(lfd)}")
         for up in (UP, None):
-            ours = [fit_score(boxes[s], cams[s], truth, up)[0].mean() for s in picks]
-            cells.append(f"{np.mean(ours):.3f}")
-        print(f"| {name} | " + " | ".join(cells) + " |")
+            ours = [fit_score(boxes[s], cams[s], truth, up).mean() for s in picks]
+            row.append(f"{np.mean(ours):.3f}")
+        rows.append(row)
+    head = ["views", "LfD", "real ellipsoids", "fit_objects, up known", "fit_objects, up unknown"]
+    return table(head, rows)
 
 
-def report_shapes(boxes: Array, cams: Array) -> None:
-    """Print the shape that the evidence chooses and the edge residual in millimetres."""
+def shape_table(boxes: Array, cams: Array) -> str:
+    """The shape that the evidence chooses and the edge residual in millimetres."""
     fits = quadrics.fit_objects(boxes, cams, IMAGE, up=UP, support="evidence")
-    focal = np.linalg.norm(cams[0, 0, :3] - cams[0, 0, :3] @ cams[0, 2, :3] * cams[0, 2, :3])
-    print("\n| object | shape | size mm | edge rms px | edge rms mm |\n|---|---|---|---|---|")
+    focal = np.linalg.norm(np.cross(cams[0, 0, :3], cams[0, 2, :3]))  # px
+    rows = []
     for k in range(len(fits)):
-        center = np.append(fits.ellipsoids.center_in_world[k], 1.0)
-        depth = float(np.mean(cams[:, 2] @ center))
+        depth = float(np.mean(cams[:, 2] @ np.append(fits.ellipsoids.center_in_world[k], 1.0)))
         size = " x ".join(f"{1e3 * x:.0f}" for x in fits.size[k])
         px = fits.rms_px[k]
-        print(f"| {k} | {fits.support[k]} | {size} | {px:.2f} | {1e3 * px * depth / focal:.2f} |")
+        thing = "carton" if k < 4 else "bottle"
+        rows.append([thing, fits.support[k], size, f"{px:.2f}", f"{1e3 * px * depth / focal:.2f}"])
+    return table(["object", "shape found", "size mm", "edge rms px", "edge rms mm"], rows)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -94,13 +92,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    folder = parser.parse_args(argv).folder
-    if not (folder / "gt.npy").exists():
-        print(f"error: {folder} has no gt.npy; see the top of this file", file=sys.stderr)
+    parser.add_argument("-o", type=Path, metavar="DOCS", help="folder with quadrics.md to fill in")
+    args = parser.parse_args(argv)
+    if not (args.folder / "gt.npy").exists():
+        print(f"error: {args.folder} has no gt.npy; see the top of this file", file=sys.stderr)
         return 2
-    boxes, cams, truth = load(folder)
-    report_overlap(boxes, cams, truth)
-    report_shapes(boxes, cams)
+    boxes, cams, truth = load(args.folder)
+    text = overlap_table(boxes, cams, truth) + "\n\n" + shape_table(boxes, cams)
+    print(text)
+    if args.o:
+        write_table(args.o / "quadrics.md", "tuw", text)
     return 0
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import re
 import subprocess
@@ -496,3 +497,31 @@ def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None
 def test_eval_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli("eval", tmp_path, "--gt", tmp_path / "gt.txt") == 2
     assert_one_clear_line(capsys, "TrackEval")
+
+
+class Terminal(io.StringIO):
+    """Stands in for a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line that redraws itself, also before anything is done; the last state stays."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    progress = rt.Progress("track", 10)
+    for n in (0, 4, 6):
+        progress.shown = 0.0
+        progress.step(n)
+    progress.close()
+    lines = terminal.getvalue().split("\r")
+    assert lines[1].startswith("track     0/10   0 %, ")
+    assert "10/10 100 %" in lines[-1] and lines[-1].endswith("\n")
+
+
+def test_progress_is_silent_elsewhere(capsys: pytest.CaptureFixture[str]) -> None:
+    progress = rt.Progress("track", 10)
+    progress.step(10)
+    progress.close()
+    assert capsys.readouterr().err == ""

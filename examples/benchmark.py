@@ -1,0 +1,412 @@
+#!/usr/bin/env python3
+"""Time the tracker alone and measure whether identities survive a long absence, ours and others.
+
+    python examples/benchmark.py                      # ours only
+    python examples/benchmark.py --peers build/peers  # with peers, each set in a venv made there
+
+Streams are synthetic and seeded, the same for every tracker: 500 frames of 1920x1080, boxes and
+ready-made embeddings, camera motion compensation off, nothing but the tracker's own update timed.
+  steady    objects cross the picture and are replaced; misses, occlusions, low scores, clutter
+  revisit   every object vanishes for 200-260 frames and returns at least 400 px away
+  hard      revisit with look-alikes, noisier embeddings and an appearance shifted at the return
+  shape     revisit with width and height each scaled by .5-2 at the return
+Times are CPU ms of one process with one thread; the better of two runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import venv
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Step = Callable[[Array, Array, IntArray, Array], tuple[Any, Any]]  # -> detection rows, identities
+
+ROOT = Path(__file__).resolve().parent.parent
+SIZE = np.array([1920.0, 1080.0])
+# cosine within a visit, between objects, across visits, as trackers measure them
+COSINES = {"hard": (0.82, 0.44, 0.72)}
+PACKAGES = {
+    "peers": ["deep-sort-realtime==1.3.2", "trackers==2.6.1"],
+    "norfair": ["norfair==2.3.0"],  # pins numpy<2
+}
+PEERS = {
+    "deepsort": "peers", "deepsort-tuned": "peers", "rf-sort": "peers", "rf-bytetrack": "peers",
+    "rf-ocsort": "peers", "norfair-reid": "norfair", "norfair-reid-1000": "norfair",
+}  # fmt: skip
+
+
+# ---- Streams -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """Detections (N rows, by frame) with the true object of each (-1: clutter), and the truth."""
+
+    frames: int
+    frame: IntArray  # (N,)
+    xyxy: Array  # (N, 4)
+    score: Array  # (N,)
+    class_id: IntArray  # (N,)
+    embedding: Array  # (N, E), E may be 0
+    owner: IntArray  # (N,)
+    visit: IntArray  # (N,)
+    truth: Array  # (M, 9) MOTChallenge rows: objects in view, detected or not
+
+    def save(self, path: Path) -> None:
+        np.savez(path, **{k: getattr(self, k) for k in self.__slots__})
+
+    @staticmethod
+    def load(path: Path) -> Stream:
+        with np.load(path) as data:
+            return Stream(int(data["frames"]), **{k: data[k] for k in data if k != "frames"})
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """Where objects truly are: boxes (F, O, 4) cx, cy, w, h; in view (F, O); visit (F, O)."""
+
+    box: Array
+    seen: npt.NDArray[np.bool_]
+    visit: IntArray
+
+
+def crossing_paths(rng: np.random.Generator, slots: int, frames: int) -> Paths:
+    """Objects of 1-5 px/frame cross the picture; one that leaves is replaced at a border."""
+    boxes, seen = [], []
+    for _ in range(slots):
+        start, center = 0, rng.uniform(0.05, 0.95, 2) * SIZE
+        while start < frames:
+            goal = rng.uniform(0.2, 0.8, 2) * SIZE
+            step = (goal - center) / np.linalg.norm(goal - center) * rng.uniform(1, 5)
+            xy = center + step * (np.arange(frames) - start)[:, None]  # (F, 2)
+            inside = ((xy > 0) & (xy < SIZE)).all(1) & (np.arange(frames) >= start)
+            boxes.append(np.c_[xy, np.broadcast_to(rng.uniform(40, 160, 2), (frames, 2))])
+            seen.append(inside)
+            start = frames if inside[-1] else int(np.flatnonzero(inside)[-1]) + 1
+            center = rng.uniform(0.01, 0.99, 2) * SIZE
+            side = rng.integers(2)
+            center[side] = (0.01, 0.99)[rng.integers(2)] * SIZE[side]
+    return Paths(np.stack(boxes, 1), np.stack(seen, 1), np.zeros((frames, len(seen)), np.int64))
+
+
+def revisit_paths(rng: np.random.Generator, objects: int, frames: int, shape: bool) -> Paths:
+    """Objects leave for 200-260 frames and come back at least 400 px away."""
+    t = np.arange(frames)[:, None]  # (F, 1)
+    leave = rng.integers(100, 141, objects)
+    back = leave + rng.integers(200, 261, objects)
+    visit = (t >= back).astype(np.int64)
+    here = rng.uniform(0.1, 0.9, (objects, 2)) * SIZE
+    there = rng.uniform(0.1, 0.9, (objects, 2)) * SIZE
+    near = np.linalg.norm(there - here, axis=1) < 450
+    while near.any():
+        there[near] = rng.uniform(0.1, 0.9, (int(near.sum()), 2)) * SIZE
+        near = np.linalg.norm(there - here, axis=1) < 450
+    drift = rng.normal(0, 0.3, (objects, 2))  # px/frame
+    center = np.where(visit[..., None] == 1, there, here) + drift * t[..., None]
+    size = np.broadcast_to(rng.uniform(40, 160, (objects, 2)), center.shape)
+    if shape:
+        size = size * np.where(visit[..., None] == 1, 2 ** rng.uniform(-1, 1, (objects, 2)), 1)
+    return Paths(np.concatenate([center, size], -1), (t < leave) | (t >= back), visit)
+
+
+def make_stream(kind: str, objects: int, dim: int = 128, frames: int = 500, seed: int = 0) -> Stream:
+    """Generate one of the streams: steady, stay, revisit, hard, shape."""
+    rng = np.random.default_rng([seed, objects, frames])
+    if kind == "steady":
+        paths = crossing_paths(rng, objects, frames)
+    else:
+        paths = revisit_paths(rng, objects, frames, kind == "shape")
+        if kind == "stay":
+            paths = Paths(paths.box[:1].repeat(frames, 0), np.ones_like(paths.seen), 0 * paths.visit)
+    shake = rng.normal(0, 2, (frames, 2))
+    for f in range(1, frames):
+        shake[f] += 0.9 * shake[f - 1]
+    box = paths.box + np.c_[shake, 0 * shake][:, None]  # (F, O, 4)
+    found = paths.seen & (rng.random(paths.seen.shape) > 0.05) & ~occlusions(rng, paths.seen.shape)
+    f, o = np.nonzero(found)
+    noise = np.repeat([[0.02, 0.02, 0.03, 0.03]], len(f), 0) * np.tile(box[f, o, 2:], 2)
+    measured = box[f, o] + rng.normal(0, 1, (len(f), 4)) * noise
+    low = rng.random(len(f)) < 0.08
+    score = np.where(low, rng.uniform(0.15, 0.45, len(f)), rng.uniform(0.6, 0.95, len(f)))
+    clutter = rng.integers(0, frames, round(0.02 * len(f)))
+    junk = np.c_[rng.uniform(0, 1, (len(clutter), 2)) * SIZE, rng.uniform(40, 160, (len(clutter), 2))]
+    frame = np.r_[f, clutter]
+    order = np.argsort(frame, kind="stable")
+    visit = paths.visit[f, o]
+    look = embeddings(rng, o, visit, dim, *COSINES.get(kind, (0.88, 0.31, 0.88)))
+    look = np.r_[look, unit(rng.normal(size=(len(clutter), dim)))]
+    all_box = np.r_[measured, junk]
+    xyxy = np.c_[all_box[:, :2] - all_box[:, 2:] / 2, all_box[:, :2] + all_box[:, 2:] / 2]
+    g, k = np.nonzero(paths.seen)
+    corner = np.c_[box[g, k, :2] - box[g, k, 2:] / 2, box[g, k, 2:]]
+    truth = np.c_[g + 1, k + 1, corner, np.ones((len(g), 2)), np.ones(len(g))]
+    pad = -np.ones(len(clutter), np.int64)
+    return Stream(
+        frames, frame[order], xyxy[order], np.r_[score, rng.uniform(0.3, 0.7, len(clutter))][order],
+        np.zeros(len(frame), np.int64), look[order], np.r_[o, pad][order], np.r_[visit, pad][order],
+        truth,
+    )  # fmt: skip
+
+
+def occlusions(rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+    """(F, O): hidden for 4-15 frames now and then (3 % of the time)."""
+    hidden = np.zeros(shape, bool)
+    for f, o in zip(*np.nonzero(rng.random(shape) < 0.003), strict=True):
+        hidden[f : f + rng.integers(4, 16), o] = True
+    return hidden
+
+
+def unit(rows: Array) -> Array:
+    return np.asarray(rows / np.linalg.norm(rows, axis=-1, keepdims=True))
+
+
+def embeddings(
+    rng: np.random.Generator, owner: IntArray, visit: IntArray, dim: int,
+    within: float, between: float, across: float,
+) -> Array:  # fmt: skip
+    """Unit rows (N, dim) with these mean cosines within a visit, between objects, across visits."""
+    objects = int(owner.max(initial=0)) + 1
+    noise = 1 / within - 1  # squared length of the noise on a look of length 1
+    shift = max(1 / across**2 / (1 + noise) - 1 - noise, 0.0)
+    common = between * (1 + noise)
+    own, moved = (unit(rng.normal(size=(objects, dim))) for _ in range(2))
+    look = np.sqrt(common) * unit(rng.normal(size=dim)) + np.sqrt(1 - common) * own  # (O, dim)
+    rows = look[owner] + np.sqrt(shift) * moved[owner] * (visit == 1)[:, None]
+    return unit(rows + np.sqrt(noise / dim) * rng.normal(size=rows.shape))
+
+
+# ---- Trackers: one plain function each ---------------------------------------------------------
+
+
+def _ours(**options: Any) -> Step:
+    sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(ROOT)))
+    import reobj_track as rt
+
+    tracker = rt.Tracker(rt.TrackerConfig(**options))
+
+    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+        found = rt.Detections(xyxy, score, class_id)
+        tracks = tracker.update(found, embeddings=look if look.shape[1] else None)
+        return tracks.detection_index, tracks.track_id
+
+    return step
+
+
+def _deepsort(min_score: float = 0.3, **options: Any) -> Step:
+    """deep-sort-realtime; detections below .3 are left out, as DeepSORT's own evaluation does."""
+    from deep_sort_realtime.deepsort_tracker import DeepSort
+
+    tracker = DeepSort(embedder=None, **options)
+
+    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+        rows = np.flatnonzero(score >= min_score)
+        ltwh = np.c_[xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
+        raw = [(ltwh[i].tolist(), float(score[i]), int(class_id[i])) for i in rows]
+        looks = [look[i] for i in rows] if look.shape[1] else [np.ones(1) for _ in rows]
+        tracks = tracker.update_tracks(raw, embeds=looks, others=rows.tolist())
+        # only detections of this frame: predicted boxes of the frame after are not counted
+        good = [t for t in tracks if t.is_confirmed() and t.time_since_update == 0]
+        return [t.get_det_supplementary() for t in good], [int(t.track_id) for t in good]
+
+    return step
+
+
+def _roboflow(name: str) -> Step:
+    import supervision as sv
+    import trackers
+
+    tracker = getattr(trackers, name)()
+
+    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+        rows = {"row": np.arange(len(xyxy))}
+        found = tracker.update(sv.Detections(xyxy, None, score, class_id, data=rows))
+        good = found.tracker_id >= 0 if len(found) else np.zeros(0, bool)
+        return found.data["row"][good] if len(found) else [], found.tracker_id[good] if len(found) else []
+
+    return step
+
+
+def _norfair(memory: int | None = None) -> Step:
+    import norfair
+
+    def unlike(new: Any, old: Any) -> float:
+        past = [d.embedding for d in old.past_detections if d.embedding is not None]
+        return min((1 - float(new.last_detection.embedding @ p) for p in past), default=1.0)
+
+    tracker = norfair.Tracker(
+        "iou", 0.7, reid_distance_function=unlike, reid_distance_threshold=0.35,
+        reid_hit_counter_max=memory or 30, initialization_delay=3,
+    )  # fmt: skip
+
+    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+        found = [
+            norfair.Detection(b.reshape(2, 2), data=i, embedding=look[i]) for i, b in enumerate(xyxy)
+        ]
+        tracks = tracker.update(found)
+        good = [t for t in tracks if t.last_detection in found]
+        return [t.last_detection.data for t in good], [t.id for t in good]
+
+    return step
+
+
+TUNED = {"max_age": 1000, "gating_only_position": True, "max_cosine_distance": 0.35}
+MAKERS: dict[str, Callable[[], Step]] = {
+    "ours": _ours,
+    "deepsort": _deepsort,
+    "deepsort-tuned": lambda: _deepsort(**TUNED),
+    "rf-sort": lambda: _roboflow("SORTTracker"),
+    "rf-bytetrack": lambda: _roboflow("ByteTrackTracker"),
+    "rf-ocsort": lambda: _roboflow("OCSORTTracker"),
+    "norfair-reid": _norfair,
+    "norfair-reid-1000": lambda: _norfair(1000),
+}
+
+
+def worker(name: str, job: Path, result: Path) -> None:
+    """Run one tracker over a stream in this process; write identities (N,) and CPU seconds (F,)."""
+    stream = Stream.load(job)
+    step = MAKERS[name]()
+    identity = np.zeros(len(stream.frame), np.int64)
+    seconds = np.zeros(stream.frames)
+    cuts = np.searchsorted(stream.frame, np.arange(stream.frames + 1))
+    for f, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+        part = (stream.xyxy[a:b], stream.score[a:b], stream.class_id[a:b], stream.embedding[a:b])
+        started = time.process_time()
+        rows, ids = step(*part)
+        seconds[f] = time.process_time() - started
+        identity[a + np.asarray(rows, np.int64)] = np.asarray(ids, np.int64) + (name != "ours")
+    np.savez(result, identity=identity, seconds=seconds)
+
+
+def run_tracker(name: str, stream: Stream, venvs: Path | None) -> tuple[IntArray, Array]:
+    """Run a tracker in a process (and venv) of its own: identities (N,), 0 for none; seconds (F,)."""
+    python = sys.executable if name == "ours" or venvs is None else str(python_of(venvs, PEERS[name]))
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with tempfile.TemporaryDirectory() as folder:
+        job, result = Path(folder) / "job.npz", Path(folder) / "result.npz"
+        stream.save(job)
+        command = [python, __file__, "--worker", name, str(job), str(result)]
+        subprocess.run(command, check=True, env=os.environ | threads, stderr=subprocess.PIPE)
+        with np.load(result) as data:
+            return data["identity"], data["seconds"]
+
+
+def python_of(venvs: Path, group: str) -> Path:
+    """Interpreter of a venv with the peers of a group, made at first use."""
+    folder = venvs.resolve() / group
+    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
+    if not (folder / "installed").exists():
+        venv.create(folder, with_pip=True, clear=True)
+        subprocess.run([python, "-m", "pip", "install", "-q", *PACKAGES[group]], check=True)
+        (folder / "installed").touch()
+    return python
+
+
+# ---- Scores and tables -------------------------------------------------------------------------
+
+
+def scores(stream: Stream, identity: IntArray) -> dict[str, float]:
+    """Identity scores against the truth (objects count while in view, detected or not)."""
+    sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(ROOT)))
+    import reobj_track as rt
+
+    kept = identity > 0
+    xyxy = stream.xyxy[kept]
+    rows = np.c_[stream.frame[kept] + 1, identity[kept], xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
+    return rt.score_tracks(rt.labelled(stream.truth), rt.labelled(rows))
+
+
+def recovery(stream: Stream, identity: IntArray) -> tuple[float, float]:
+    """Shares of objects whose main identity of visit 2 is their own of visit 1, or another's."""
+    main: dict[tuple[int, int], int] = {}
+    for o in range(int(stream.owner.max()) + 1):
+        for v in (0, 1):
+            ids = identity[(stream.owner == o) & (stream.visit == v) & (identity > 0)]
+            main[o, v] = int(np.bincount(ids).argmax()) if len(ids) else -1 - o
+    first = {main[o, 0]: o for o, v in main if v == 0}
+    came = [o for o, v in main if v == 1 and main[o, 1] > 0]
+    owner = [first.get(main[o, 1]) for o in came]
+    own = sum(a == b for a, b in zip(owner, came, strict=True))
+    other = sum(a is not None and a != b for a, b in zip(owner, came, strict=True))
+    return own / max(len(came), 1), other / max(len(came), 1)
+
+
+def best_of(name: str, stream: Stream, venvs: Path | None, runs: int) -> tuple[IntArray, Array]:
+    """Identities and the CPU seconds of the fastest run."""
+    results = [run_tracker(name, stream, venvs) for _ in range(runs)]
+    return min(results, key=lambda r: float(r[1].sum()))
+
+
+def steady_row(name: str, venvs: Path | None, runs: int) -> list[str]:
+    cells, extra = [name], []
+    for objects in (10, 50, 200):
+        stream = make_stream("steady", objects)
+        identity, seconds = best_of(name, stream, venvs, runs)
+        score, ms = scores(stream, identity), 1e3 * seconds
+        cells.append(f"{np.median(ms):.2f} / {np.percentile(ms, 95):.2f}")
+        extra.append(f"{score['IDF1']:.3f}")
+        if objects == 50:
+            facts = [f"{score['IDSW']:.0f}", f"{score['identities']:.0f} / {score['gt_objects']:.0f}"]
+    return [*cells, " / ".join(extra), *facts]
+
+
+def revisit_row(name: str, venvs: Path | None) -> list[str]:
+    cells = [name]
+    for kind in ("revisit", "hard", "shape"):
+        stream = make_stream(kind, 50)
+        identity, seconds = run_tracker(name, stream, venvs)
+        own, other = recovery(stream, identity)
+        cells.append(f"{100 * own:.0f} %, {100 * other:.0f} %, {scores(stream, identity)['IDF1']:.3f}")
+    return cells
+
+
+def flat_row(name: str, venvs: Path | None, runs: int) -> list[str]:
+    stream = make_stream("stay", 10, frames=1500)
+    _, seconds = best_of(name, stream, venvs, runs)
+    return [name, *(f"{1e3 * np.median(seconds[f - 25 : f + 25]):.2f}" for f in (50, 450, 950, 1450))]
+
+
+def table(title: str, header: str, rows: list[list[str]]) -> str:
+    """Format a Markdown table."""
+    lines = [f"\n{title}\n", f"| {header} |", "|---" * (header.count("|") + 1) + "|"]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def main() -> int:
+    """Run the benchmark and print its tables."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
+    parser.add_argument("--only", default="", help="names of trackers, comma-separated")
+    parser.add_argument("--runs", type=int, default=2, help="timed runs, the better one counts")
+    parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.worker:
+        worker(args.worker[0], Path(args.worker[1]), Path(args.worker[2]))
+        return 0
+    names = [n for n in ("ours", *(PEERS if args.peers else ())) if n in (args.only or n).split(",")]
+    steady = [steady_row(n, args.peers, args.runs) for n in names]
+    header = "tracker | 10 objects, ms median / p95 | 50 | 200 | IDF1 10 / 50 / 200"
+    print(table("Steady", f"{header} | IDSW 50 | ids made / real 50", steady), flush=True)
+    header = "tracker | revisit: recovered, stolen, IDF1 | hard | shape"
+    print(table("Revisit, 50 objects", header, [revisit_row(n, args.peers) for n in names]), flush=True)
+    flat = [flat_row(n, args.peers, args.runs) for n in names]
+    print(table("10 objects that stay, ms at frame", "tracker | 50 | 450 | 950 | 1450", flat))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
