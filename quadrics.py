@@ -97,8 +97,9 @@ class FitConfig:
     huber: float = 3.0  # sigma, scale of the Huber loss after the inlier test
     huber_hidden: float = 2.5  # sigma, same where the solid sticks out of the box
     behind: float = 12.0  # sigma, constant residual of a view that has the object behind it
-    size_wall: float = 4.0  # sigma, beyond it the size prior turns quartic
-    size_wall_rise: float = 4.0  # how steep: extra cost rise * (s^2 - wall^2)^2 / wall^2
+    size_wall: float = 2.5  # sigma of growth, beyond it the size prior turns quartic
+    size_wall_log: float = 0.25  # log, that sigma is at least this: a category may be wrong
+    size_wall_rise: float = 16.0  # how steep: extra cost rise * (s^2 - wall^2)^2 / wall^2
     near_depth: float = 1e-3  # of the start depth; nearer than this counts as behind
     view_outlier: float = 6.0  # mean squared residual of a view (chi2 .9999, 4 dof, is 23.5 / 4)
     edge_outlier: float = 5.0  # sigma, a single edge farther off is dropped (occlusion)
@@ -538,6 +539,7 @@ class _Edges:
     used: BoolArray  # (O, V, E)
     depth_row: Array  # (O, V, 4)
     sigma_px: Array  # (O, V, E)
+    share: Array  # (O, V, E) how many views share this one's errors; gain holds 1 / sqrt(share)
 
     def take(self, index: IntArray) -> _Edges:
         return _Edges(*(getattr(self, f.name)[index] for f in fields(self)))
@@ -584,7 +586,8 @@ def _tangent_planes(
     sigma_px = np.where(used, sigma, 1.0)
     gain = np.where(used, norm / sigma_px, 0.0)
     depth_row = np.where(used.any(-1)[..., None], cams[..., 2, :], [0.0, 0.0, 0.0, 1.0])
-    return _Edges(clean[..., :3], clean[..., 3], gain, border & used, used, depth_row, sigma_px)
+    own = (clean[..., :3], clean[..., 3], gain, border & used, used, depth_row, sigma_px)
+    return _Edges(*own, np.ones_like(gain))
 
 
 @np.errstate(all="ignore")
@@ -1128,7 +1131,8 @@ class _Problem:
 
     groups: Array  # (B, 3, 3) of AXIS_GROUPS
     size_mean: Array  # (B, 3) prior of log half axes, world units
-    size_info: Array  # (B, 3, 3) its inverse covariance
+    size_info: Array  # (B, 3, 3) its inverse covariance, round things tied
+    size_var: Array  # (B, 3) its variance an axis, floored: the scale of the wall
     up: Array  # (B, 3) unit, or zeros
     tilt_info: Array  # (B, 3) 1 / rad^2 for the three components of up in object axes
 
@@ -1291,17 +1295,19 @@ def _normal_equations(
 def _size_prior(state: _State, prob: _Problem, cfg: FitConfig) -> tuple[Array, Array, Array]:
     """Cost (B,), half gradient (B, 3) and information (B, 3, 3) of the log-normal size prior.
 
-    Quadratic in log size up to `size_wall` sigma, quartic beyond: edges that may be hidden or lie
-    on the image border leave solids free to grow, and no chair is 100 m long.
+    Quadratic in log size; quartic for growth beyond `size_wall` sigma: edges that may be hidden or
+    lie on the image border leave solids free to grow, and no chair is 100 m long. Shrinking stays
+    quadratic: of a hidden object the boxes show a part.
     """
     error = state.log_half - prob.size_mean  # (B, 3)
     pull = (prob.size_info @ error[..., None])[..., 0]
-    square = (error * pull).sum(1)  # (B,) sigma^2
+    own = (error > 0) / prob.size_var  # (B, 3)
     wall = cfg.size_wall**2
-    over = np.maximum(square - wall, 0.0)
-    steep = cfg.size_wall_rise / wall
-    weight = 1.0 + 2.0 * steep * over
-    return square + steep * over**2, weight[:, None] * pull, weight[:, None, None] * prob.size_info
+    over = np.maximum((own * error**2).sum(1) - wall, 0.0)  # (B,) sigma^2
+    steep = (2.0 * cfg.size_wall_rise / wall * over)[:, None]  # (B, 1)
+    cost = (error * pull).sum(1) + cfg.size_wall_rise / wall * over**2
+    extra = (steep * own)[:, None] * np.eye(3)  # (B, 3, 3)
+    return cost, pull + steep * own * error, prob.size_info + extra
 
 
 def _solve_step(normal: _Normal, damping: Array) -> Array:
@@ -1401,6 +1407,7 @@ class _Spec:
     up: Array  # (3,) unit or zeros
     tilt_rad: float
     round_sigma: float  # log(w / d) of round things
+    wall_sigma: float  # least log spread that the wall against growth assumes
 
 
 def _gather_data(
@@ -1418,8 +1425,8 @@ def _gather_data(
     )
     edges = _tangent_planes(picked, mats, image_size, extra, cfg)
     if cfg.correlation_deg > 0:
-        share = _redundancy(cams, index, picked, cfg)
-        edges = replace(edges, gain=edges.gain / np.sqrt(share)[..., None])
+        share = edges.share * _redundancy(cams, index, picked, cfg)[..., None]
+        edges = replace(edges, gain=edges.gain / np.sqrt(share), share=share)
     ray, extent = _rays(np.where(seen, picked, [0.0, 0.0, 1.0, 1.0]), cams, index)
     return _Data(index, ray, extent, np.where(seen, cams.center[index], 0.0), edges)
 
@@ -1468,7 +1475,9 @@ def _prior_spec(
     allowed = (wanted[:, None] == np.arange(3)) | (wanted < 0)[:, None]
     size_mean = mean - np.log(2.0) - world.log_scale
     flags = (natural, allowed, round_, upright)
-    return _Spec(size_mean, cov, *flags, world.up, world.tilt_rad, cfg.round_log_ratio)
+    return _Spec(
+        size_mean, cov, *flags, world.up, world.tilt_rad, cfg.round_log_ratio, cfg.size_wall_log
+    )
 
 
 def _shape_shift(log_half: Array, natural: IntArray, code: IntArray) -> Array:
@@ -1643,7 +1652,8 @@ def _problems(spec: _Spec, obj: IntArray, code: IntArray, axis: IntArray) -> _Pr
     info = np.linalg.inv(spec.size_cov)[obj] + round_[:, None, None] * tie
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
-    return _Problem(AXIS_GROUPS[code], mean + shift[:, None], info, up, tilt)
+    var = np.maximum(np.einsum("oii->oi", spec.size_cov), spec.wall_sigma**2)[obj]
+    return _Problem(AXIS_GROUPS[code], mean + shift[:, None], info, var, up, tilt)
 
 
 def _chunks(n: int, size: int) -> Iterator[IntArray]:
@@ -1698,7 +1708,7 @@ def _best_starts(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
         start, few_edges, obj, prob, cfg, "cauchy", cfg.start_iterations
     )
     # noise level integrated out (Student t): a poor fit must not buy an absurd size
-    pull, n = _size_prior(state, prob, cfg)[0], few_edges.used[obj].sum((1, 2))
+    pull, n = _size_prior(state, prob, cfg)[0], _count(few_edges.used[obj], few, obj)
     dof = cfg.noise_prior_dof
     cost = (dof + n) * np.log1p(np.maximum(cost - pull, 0.0) / dof) + pull
     order = np.lexsort((cost, code, obj))  # groups of one object and support, best first
@@ -1770,45 +1780,49 @@ def _all_residuals(fit: _Fit, data: _Data, cfg: FitConfig) -> Array:
         edges = data.edges.take(fit.obj[part])
         groups = AXIS_GROUPS[fit.code[part]]
         value = _residuals(fit.state.take(part), edges, groups, cfg, jacobian=False).value
-        out[part] = value.reshape(out[part].shape)
+        out[part] = value.reshape(out[part].shape) * np.sqrt(edges.share)
     return out
 
 
-def _free_dof(fit: _Fit, spec: _Spec) -> Array:
+def _free_dof(fit: _Fit, spec: _Spec, data: _Data) -> Array:
     """Residuals minus the parameters that the data determine (B,): trace of the hat matrix."""
     prior_info = np.zeros((len(fit.obj), 9, 9))
     prior_info[:, 3:6, 3:6] = np.linalg.inv(spec.size_cov)[fit.obj]
     cov = _safe_inverse(fit.hessian)
     used_up = 9.0 - np.einsum("bij,bji->b", cov, prior_info)
     used_up -= 2.0 * bool(np.any(spec.up))  # tilt: two angles held by the upright prior
-    return np.asarray(np.maximum(fit.good.sum((1, 2)) - np.clip(used_up, 3.0, 9.0), 0.5))
+    return np.asarray(np.maximum(_count(fit.good, data, fit.obj) - np.clip(used_up, 3.0, 9.0), 0.5))
 
 
-def _update_noise(fit: _Fit, value: Array, spec: _Spec, cfg: FitConfig, robust: bool) -> None:
+def _count(used: BoolArray, data: _Data, obj: IntArray) -> Array:
+    """Number (B,) of independent residuals among the edges (B, V, E) in use."""
+    return np.asarray((used / data.edges.share[obj]).sum((1, 2)))
+
+
+def _update_noise(
+    fit: _Fit, value: Array, spec: _Spec, data: _Data, cfg: FitConfig, robust: bool
+) -> None:
     """Estimate the noise factor: pooled over all objects, then each object's own, shrunk.
 
     Inverse-gamma posterior: nominal level with `noise_prior_dof`, pooled with `object_noise_dof`.
     """
-    n = np.maximum(fit.good.sum((1, 2)), 1)
-    dof = _free_dof(fit, spec)
+    n = np.maximum(_count(fit.good, data, fit.obj), 1.0)
+    dof = _free_dof(fit, spec, data)
     if robust:
         size = np.where(fit.good, np.abs(value), np.nan).reshape(len(n), -1)
         size[~fit.good.any((1, 2))] = 0.0
         square = (np.nanmedian(size, 1) / 0.6745) ** 2 * n
     else:
-        square = (np.minimum(value**2, (cfg.huber * fit.noise[:, None, None]) ** 2) * fit.good).sum(
-            (1, 2)
-        )
+        capped = np.minimum(value**2, (cfg.huber * fit.noise[:, None, None]) ** 2)
+        square = (capped * fit.good / data.edges.share[fit.obj]).sum((1, 2))
     best = np.full(int(fit.obj.max()) + 1, np.inf)
     np.minimum.at(best, fit.obj, square / dof)  # of the supports tried, the one that fits
     mine = square / dof <= best[fit.obj]
     level = square / dof
     typical = np.median(level[mine])
-    total, count = (
-        (square * mine)[level < 25 * typical].sum(),
-        (dof * mine)[level < 25 * typical].sum(),
-    )
-    pooled = (cfg.noise_prior_dof + total) / (cfg.noise_prior_dof + count)
+    mine &= level < 25 * typical
+    pooled = cfg.noise_prior_dof + square[mine].sum()
+    pooled /= cfg.noise_prior_dof + dof[mine].sum()
     own = (cfg.object_noise_dof * pooled + square) / (cfg.object_noise_dof + dof)
     fit.noise = np.clip(np.sqrt(own), *cfg.noise_range)
 
@@ -1848,9 +1862,8 @@ def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data, cfg: FitCon
     np.minimum.at(noise, fit.obj, fit.noise)  # the level that the best support reaches
     square = (value / noise[fit.obj, None, None]) ** 2
     cap = np.where(value > 0, cfg.hidden_cap, cfg.outlier_cap)
-    total = (np.minimum(square, cap) * used).sum((1, 2))
-    dof = cfg.noise_prior_dof
-    n = used.sum((1, 2))
+    total = (np.minimum(square, cap) * used / data.edges.share[fit.obj]).sum((1, 2))
+    dof, n = cfg.noise_prior_dof, _count(used, data, fit.obj)
     hessian = fit.hessian + _rotation_cap(cfg)
     misfit = (dof + n) * np.log1p(total / dof) + pull
     return np.asarray(-0.5 * (misfit + np.linalg.slogdet(hessian)[1]))
@@ -1944,7 +1957,7 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     _refit(fit, data, spec, cfg, "cauchy")
     for robust in (True, False):
         value = _all_residuals(fit, data, cfg)
-        _update_noise(fit, value, spec, cfg, robust)
+        _update_noise(fit, value, spec, data, cfg, robust)
         _mark_inliers(fit, value, data, cfg)
         _refit(fit, data, spec, cfg, "huber")
     value = _all_residuals(fit, data, cfg)
@@ -2020,7 +2033,8 @@ def _refine_up(fit: _Fit, spec: _Spec, cfg: FitConfig) -> tuple[Array, float] | 
     cov = _safe_inverse(fit.hessian + _rotation_cap(cfg))
     tilt = np.einsum("bii->bi", cov)[:, 6:8]  # (B, 2) rad^2 about the two level axes
     info = np.maximum(1.0 / tilt - 1.0 / spec.tilt_rad**2, 1e-12).min(1)
-    sigma2 = 1.0 / info + np.deg2rad(cfg.tilt_deg) ** 2
+    # an object that its solid fits badly (hidden in part, odd shape) stands askew in the fit
+    sigma2 = 1.0 / info + (np.deg2rad(cfg.tilt_deg) * (1.0 + fit.noise**2)) ** 2
     axis = fit.state.rot[:, :, 2] * np.sign(fit.state.rot[:, :, 2] @ spec.up)[:, None]
     use = upright & (sigma2 < np.deg2rad(cfg.max_tilt_deg) ** 2)
     if use.sum() < cfg.min_up_objects:
@@ -2170,52 +2184,60 @@ def _inlier_table(
     return inlier
 
 
-def _size_distance(fit: _Fit, spec: _Spec) -> Array:
-    """Distance (B,) of each fitted log size from its prior, in sigma."""
+def _size_distance(fit: _Fit, spec: _Spec) -> tuple[Array, Array]:
+    """Distance (B,) of each log size from its prior, and of its growth alone, in sigma."""
     prob = _problems(spec, fit.obj, fit.code, fit.axis)
     error = fit.state.log_half - prob.size_mean
-    return np.asarray(np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error)))
+    far = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))
+    own = (error > 0) / prob.size_var
+    return far, np.sqrt((own * error**2).sum(1))
+
+
+def _wrongs(fit: _Fit, post: Array, seen: IntArray, grown: Array, cfg: FitConfig) -> list[str]:
+    """Why each of B fits must be rejected; empty where nothing is wrong."""
+    inside = fit.views.sum(1)
+    finite = _finite(fit.state.center, 1) & _finite(post, 1)
+    tests = (
+        (~finite, "no finite solution"),
+        (fit.noise > cfg.max_noise, "the boxes fit no solid: errors {noise:.1f} times the usual"),
+        (grown > cfg.absurd_size, "size is {grown:.1f} sigma above its category's"),
+        (
+            inside < np.maximum(1.0, cfg.min_inlier_share * seen),
+            "only {inside} of {seen} boxes agree on one solid",
+        ),
+    )
+    numbers = {"noise": fit.noise, "grown": grown, "inside": inside, "seen": seen}
+    out = []
+    for b in range(len(seen)):
+        own = {name: value[b] for name, value in numbers.items()}
+        out.append(next((text.format(**own) for bad, text in tests if bad[b]), ""))
+    return out
 
 
 def _judge(
-    fit: _Fit,
-    share: Array,
-    post: Array,
-    parallax: Array,
-    seen: IntArray,
-    far: Array,
-    cfg: FitConfig,
-) -> tuple[list[str], list[str]]:
+    fit: _Fit, share: Array, post: Array, parallax: Array, seen: IntArray,
+    size: tuple[Array, Array], cfg: FitConfig,
+) -> tuple[list[str], list[str]]:  # fmt: skip
     """Honest status and its reason for each of B fits.
 
     Args:
         share, post: (B, 3) posterior / prior sigma and posterior sigma of the log axes.
-        seen: (B,) views given; far: (B,) distance of the size from its prior in sigma.
+        seen: (B,) views given; size: `_size_distance`.
     """
     weak = (share > cfg.prior_dominated) | (post > cfg.loose_log)
-    inside = fit.views.sum(1)
-    finite = _finite(fit.state.center, 1) & _finite(post, 1)
+    far, grown = size
     status, reason = [], []
-    for b in range(len(share)):
+    for b, wrong in enumerate(_wrongs(fit, post, seen, grown, cfg)):
         doubt = []
         if weak[b].any():
             axes = ", ".join("xyz"[k] for k in np.flatnonzero(weak[b]))
             doubt.append(f"size along {axes} rests on the prior")
-        if far[b] > cfg.odd_size:
-            doubt.append(f"size is {far[b]:.1f} sigma from its category's: hidden in part?")
         if parallax[b] < cfg.min_parallax_deg:
             doubt.append(f"parallax {parallax[b]:.1f} deg: depth rests on the prior")
-        wrong = ""
-        if not finite[b]:
-            wrong = "no finite solution"
-        elif fit.noise[b] > cfg.max_noise:
-            wrong = f"its boxes fit no solid: noise {fit.noise[b]:.1f} times the usual"
-        elif far[b] > cfg.absurd_size:
-            wrong = f"size is {far[b]:.1f} sigma from its category's"
-        elif inside[b] < max(1.0, cfg.min_inlier_share * seen[b]):
-            wrong = f"only {inside[b]} of {seen[b]} boxes agree on one solid"
-        leans = weak[b].any() or parallax[b] < cfg.min_parallax_deg
-        status.append("rejected" if wrong else "prior_dominated" if leans else "ok")
+        status.append("rejected" if wrong else "prior_dominated" if doubt else "ok")
+        if far[b] > cfg.odd_size:
+            why = "another thing?" if grown[b] > 0.7 * far[b] else "hidden in part?"
+            doubt.append(f"size is {far[b]:.1f} sigma from its category's: {why}")
         reason.append("; ".join([wrong] * bool(wrong) + doubt))
     return status, reason
 
@@ -2363,7 +2385,7 @@ def _report(
         fit, spec, data = solved
         wide = _curved_covariance(fit, data, spec, cfg) + fit.spread
         # the noise level is itself estimated: Student's 95 % region for three parameters
-        wide *= (1.0 + 3.5 / (cfg.object_noise_dof + _free_dof(fit, spec)))[:, None, None]
+        wide *= (1.0 + 3.5 / (cfg.object_noise_dof + _free_dof(fit, spec, data)))[:, None, None]
         found, cov[live], order = _stand_up(fit, wide)
         for name in ("center_in_world", "half_axes", "world_from_obj"):
             getattr(solids, name)[live] = getattr(found, name)
@@ -2377,8 +2399,8 @@ def _report(
         value = _all_residuals(fit, data, cfg) * data.edges.sigma_px
         count = np.maximum(fit.good.sum((1, 2)), 1)
         rms[live] = np.sqrt((value**2 * fit.good).sum((1, 2)) / count)
-        seen, far = (data.index >= 0).sum(1), _size_distance(fit, spec)
-        verdict, why = _judge(fit, share[live], post, angle[live], seen, far, cfg)
+        seen, size = (data.index >= 0).sum(1), _size_distance(fit, spec)
+        verdict, why = _judge(fit, share[live], post, angle[live], seen, size, cfg)
         for row, k in enumerate(live.tolist()):
             status[k], reason[k], names[k] = verdict[row], why[row], SUPPORTS[fit.code[row]]
         own = (boxes[:, live], usable[:, live], cams, image_size, cfg)

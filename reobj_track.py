@@ -50,7 +50,6 @@ import signal
 import subprocess
 import sys
 import time
-import urllib.error
 import urllib.request
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -178,7 +177,7 @@ class PosesConfig:
     klt_window_px: int = _opt(15, "Lucas-Kanade window on the working image")
     klt_error_px: float = _opt(1.0, "forward-backward error of a followed point")
     cache_mb: int = _opt(1000, "gray working images kept in memory; beyond it the video is read twice")
-    sift_features: int = _opt(4096, "SIFT features a keyframe")
+    sift_features: int = _opt(2000, "SIFT features a keyframe (4096: slower, no better)")
     sift_contrast: float = _opt(0.02, "SIFT contrast threshold")
     sift_contrast_low: float = _opt(0.007, "SIFT contrast threshold where less than sift_few features are found")
     sift_few: int = _opt(500, "see sift_contrast_low")
@@ -206,7 +205,7 @@ class PosesConfig:
     check_ratio: float = _opt(0.3, "direction check: another reading must be better by this factor")
     max_step_ratio: float = _opt(5.0, "refuse a PnP pose further from its neighbours than this times the median step")
 
-# ---- Poses -------------------------------------------------------------------------------------------
+# ---- Poses -------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class EmbedConfig:
     """Appearance."""
@@ -520,7 +519,7 @@ class Progress:
         return time.monotonic() - self.started
 
 
-# ---- Weights -------------------------------------------------------------------------------------
+# ---- Weights -----------------------------------------------------------------------------------
 
 DOWNLOAD_CHUNK = 1 << 16  # bytes read at a time
 DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
@@ -545,10 +544,6 @@ _DEIM = _GITHUB + "Kazuhito00/DEIMv2-ONNX-Sample/raw/f88d4382abca74edb26ed4c7f46
 _YOLOX = (_GITHUB + "Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
           "3d4f1119d0694200671c08069ecb847aa0d8495a/")  # fmt: skip
 _PICODET = _GITHUB + "hpc203/picodet-onnxruntime/raw/dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/"
-_OSNET = (_GITHUB + "akshaydhame2001/YOLOv8_Tracking_TensorRT/raw/"
-          "cb948b3224a53986e8ccc0ca940fb8fe842e145b/")  # fmt: skip
-_OMZ = (_GITHUB + "Kazuhito00/MOT-Tracking-by-Detection-Pipeline/raw/"
-        "e50a76b8b430b778276e7fd04fd4cafd5d45eab2/Tracker/person_reid/model/")  # fmt: skip
 
 WEIGHTS: tuple[Weights, ...] = (
     Weights("deimv2-femto", "detector", "deimv2_hgnetv2_femto_coco.onnx",
@@ -584,14 +579,6 @@ WEIGHTS: tuple[Weights, ...] = (
     Weights("resnet50v2-s3", "backbone", "resnet50v2_gluon_s3.onnx", "",
             "b70356f9326e334ba092ee786cb7935c454f29da5888ba09815b2a11541bf086", 36281640,
             "Apache-2.0", "ImageNet, stages 1-3"),
-    Weights("osnet-x0.25-msmt17", "reid", "osnet_x0_25_msmt17.onnx",
-            _OSNET + "osnet_x0_25_msmt17.onnx",
-            "61b2604171ef9d58d21758626f83b35a253c3d7123976523a6e03068c3c95d7b", 921616,
-            "MIT", "persons; for the comparison with DeepSORT"),
-    Weights("person-reid-0287", "reid", "person-reidentification-retail-0287.onnx",
-            _OMZ + "person-reidentification-retail-0287.onnx",
-            "f35a22885b93aa0c249d665b4cf5510d08ded92f814694c3c2fec0112b0d3a56", 2454677,
-            "Apache-2.0", "persons; for the comparison with DeepSORT"),
 )  # fmt: skip
 
 
@@ -604,21 +591,17 @@ class ModelRow:
     path: Path | None
 
 
-def _cache_folder() -> Path:
-    """Return the platform's cache folder for this tool."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = str(Path.home() / "Library" / "Caches")
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "reobj_track"
-
-
 def _model_folders() -> list[Path]:
-    """Return the folders searched for weights: REOBJ_MODELS, if set, then the cache."""
+    """Return the folders searched for weights: REOBJ_MODELS, if set, then the platform's cache."""
+    home = Path.home()
+    if sys.platform == "win32":
+        cache = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        cache = home / "Library" / "Caches"
+    else:
+        cache = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
     own = os.environ.get("REOBJ_MODELS")
-    return [Path(own).expanduser(), _cache_folder()] if own else [_cache_folder()]
+    return [*([Path(own).expanduser()] if own else []), Path(cache) / "reobj_track"]
 
 
 def _find_model(*files: str) -> Path | None:
@@ -650,12 +633,11 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
         return path
     weights = next((w for w in WEIGHTS if name in (w.name, w.file)), None)
     found = _find_model(*([weights.file] if weights else [name, name + ".onnx"]))
-    if weights is None and found is None:
+    if found is None:
+        if weights is not None:
+            return _fetch(weights, offline)
         known = ", ".join(w.name for w in WEIGHTS)
         raise ReobjError(f"model {name}: no such file, nor one of the known names ({known})")
-    if weights is not None and found is None:
-        return _fetch(weights, offline)
-    assert found is not None
     if weights is not None and (digest := _sha256(found)) != weights.sha256:
         raise ReobjError(
             f"{found}: sha256 is {digest}, expected {weights.sha256}: delete the file to fetch it "
@@ -670,10 +652,8 @@ def _fetch(weights: Weights, offline: bool) -> Path:
     if not weights.url:
         raise ReobjError(f"model {weights.name} is not offered for download: {by_hand}")
     if offline:
-        raise ReobjError(
-            f"model {weights.name} is not here and --offline forbids the download: fetch "
-            f"{weights.url} elsewhere and {by_hand}"
-        )
+        raise ReobjError(f"model {weights.name} is not here and --offline forbids the download: "
+                         f"fetch {weights.url} elsewhere and {by_hand}")  # fmt: skip
     log.warning(
         "fetching %s: %.1f MB, licence %s, from %s, sha256 %s",
         weights.name, weights.size / 1e6, weights.licence, weights.url, weights.sha256,
@@ -681,104 +661,69 @@ def _fetch(weights: Weights, offline: bool) -> Path:
     part = _part_file(weights.file)
     try:
         _download(weights, part)
-    except urllib.error.HTTPError as error:
+    except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
         raise ReobjError(
-            f"{weights.url}: the server says {error.code} {error.reason}; the file may have moved: "
-            f"find one with sha256 {weights.sha256} and {by_hand}"
+            f"{weights.url}: download failed ({error}): run again to go on from there, or get a "
+            f"file with sha256 {weights.sha256} on another machine and {by_hand}"
         ) from error
-    except (OSError, http.client.HTTPException) as error:
-        reason = getattr(error, "reason", error)
-        raise ReobjError(
-            f"no connection ({reason}): fetch {weights.url} on another machine and {by_hand}"
-        ) from error
-    _check_download(weights, part)
-    os.replace(part, part.with_suffix(""))
-    return part.with_suffix("")
-
-
-def _part_file(name: str) -> Path:
-    """Return where an unfinished download lies: in the first folder that can be written."""
-    folders = _model_folders()
-    for folder in folders:
-        part = folder / (name + ".part")
-        with contextlib.suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-            part.open("ab").close()
-            if not part.stat().st_size:
-                part.unlink()
-            return part
-    tried = " nor ".join(map(str, folders))
-    raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
-
-
-def _download(weights: Weights, part: Path) -> None:
-    """Append what is missing to the unfinished file, or start over if the server cannot resume."""
-    start = part.stat().st_size if part.exists() else 0
-    if start == weights.size:
-        return
-    start = start if start < weights.size else 0  # longer: not ours
-    headers = {"User-Agent": "reobj_track"} | ({"Range": f"bytes={start}-"} if start else {})
-    request = urllib.request.Request(weights.url, headers=headers)
-    with urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response:
-        resumed = start > 0 and response.status == 206
-        progress = Progress("fetch kB", weights.size // 1000)
-        progress.step(start // 1000 if resumed else 0)
-        with part.open("ab" if resumed else "wb") as file:
-            for chunk in _chunks(response, weights.size - (start if resumed else 0)):
-                _write_chunk(file, chunk, part)
-                progress.step(len(chunk) // 1000)
-        progress.close()
-
-
-def _chunks(response: Any, size: int) -> Iterator[bytes]:
-    """Yield what arrives until the size is reached or the connection is cut."""
-    with contextlib.suppress(OSError, http.client.HTTPException):
-        while size > 0 and (chunk := response.read(DOWNLOAD_CHUNK)):
-            yield chunk
-            size -= len(chunk)
-
-
-def _write_chunk(file: Any, chunk: bytes, part: Path) -> None:
-    try:
-        file.write(chunk)
-    except OSError as error:
-        raise ReobjError(f"{part}: cannot write ({error.strerror}): free some space") from error
-
-
-def _check_download(weights: Weights, part: Path) -> None:
-    """Refuse a download that is short (it stays, to be resumed) or wrong (it goes)."""
-    size = part.stat().st_size
-    if size < weights.size:
-        raise ReobjError(f"{weights.url}: connection cut after {size} of {weights.size} bytes: "
-                         "run again to go on from there")  # fmt: skip
     if (digest := _sha256(part)) != weights.sha256:
         part.unlink()
         raise ReobjError(
             f"{weights.url}: sha256 is {digest}, expected {weights.sha256}: file deleted; "
             "run again; if it happens again the source has changed: do not use it"
         )
+    return part.replace(part.with_suffix(""))
 
 
-# ---- Video ---------------------------------------------------------------------------------------
+def _part_file(name: str) -> Path:
+    """Return where an unfinished download lies: in the first folder that can be written."""
+    for folder in _model_folders():
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder / (name + ".part")
+    tried = " nor ".join(map(str, _model_folders()))
+    raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
+
+
+def _download(weights: Weights, part: Path) -> None:
+    """Append what is missing to the unfinished file, or start over if the server cannot resume."""
+    done = part.stat().st_size if part.exists() else 0
+    if done == weights.size:
+        return
+    asked = {"Range": f"bytes={done}-"} if 0 < done < weights.size else {}  # longer: not ours
+    request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"} | asked)
+    progress = Progress("fetch kB", weights.size // 1000)
+    with urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response:
+        done = done if response.status == 206 else 0
+        with part.open("ab" if done else "wb") as file:
+            while done < weights.size and (chunk := response.read(DOWNLOAD_CHUNK)):
+                file.write(chunk)
+                done += len(chunk)
+                progress.step(len(chunk) // 1000)
+    progress.close()
+    if done < weights.size:
+        raise ConnectionError(f"connection cut after {done} of {weights.size} bytes")
+
+
+# ---- Video -------------------------------------------------------------------------------------
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-IMAGE_FPS = 30.0  # times of image folders whose names are no timestamps
+IMAGE_FPS = 30.0  # of image folders
 SHORT_SHARE = 0.02  # of the announced frames may be missing at the end before it is worth a warning
 MAX_BAD_RUN = 64  # unreadable frames in a row after which a video has ended
-LIVE_SCHEMES = ("rtsp://", "rtsps://", "rtmp://", "udp://")
 
 
 class Video:
-    """Frames of a video file, an image folder, a glob, a camera index or a URL.
+    """Frames of a video file, an image folder, a glob or a camera index.
 
-    Iterating yields `Frame`s, as often as wanted (once for cameras). Frame numbers are those of the
-    source: rows of the sorted images, or frames of the file in order, unreadable ones counted.
+    Iterating yields `Frame`s, as often as wanted. Frame numbers are those of the source: rows of
+    the sorted images, or frames of the file in order, unreadable ones counted.
 
     Attributes:
-        source: as given. is_live: a camera or stream, which cannot be read twice.
-        size, working_size: (w, h) of the source after rotation, and of the frames.
-        names: file names of the images by frame number, empty for videos.
-        scale: working / native. fps: mean frame rate. frame_count: of the source (0 if unknown).
+        is_live: a camera, which cannot be read twice. names: of image files by frame number.
+        size, working_size: (w, h) of the source after rotation, and of the frames; scale: ratio.
+        fps: mean frame rate. frame_count: of the source (0 if unknown).
         skipped: frames of the last iteration that could not be read or had another size.
         messages: warnings, each once.
     """
@@ -790,10 +735,8 @@ class Video:
         self.skipped: list[int] = []
         self.messages: list[str] = []
         self._files = _image_files(self.source)
-        self.names = [path.name for path in self._files or []]
-        camera = self.source.isdigit() and not Path(self.source).exists()
-        self.is_live = camera or self.source.startswith(LIVE_SCHEMES)
-        self._capture: Any = None if self._files is not None else self._open()
+        self.names = [path.name for path in self._files]
+        self.is_live = self.source.isdigit() and not Path(self.source).exists()
         self.size, self.fps, self.frame_count = self._probe()
         if 0 < self.frame_count <= self.config.start:
             raise ReobjError(f"{self.source}: --start {self.config.start}, but it has only "
@@ -815,7 +758,12 @@ class Video:
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
-        for index, time_s, image in self._decoded():
+        decoded = self._from_capture()
+        if self._files:
+            stop = min(self.config.stop or self.frame_count, self.frame_count)
+            numbers = range(self.config.start, stop, self.config.every)
+            decoded = ((i, i / IMAGE_FPS, _read_image(self._files[i])) for i in numbers)
+        for index, time_s, image in decoded:
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 self.skipped.append(index)
                 continue
@@ -824,27 +772,16 @@ class Video:
                 image = np.asarray(small, np.uint8)
             yield Frame(index, time_s, image)
         if self.skipped:
-            some = _shortened(self.skipped)
-            count = len(self.skipped)
-            self._warn(f"{count} frames skipped (unreadable or of another size): {some}")
+            self._warn(f"{len(self.skipped)} frames skipped (unreadable or of another size): "
+                       f"{_shortened(self.skipped)}")  # fmt: skip
 
     def _warn(self, text: str) -> None:
-        text = f"{self.source}: {text}"
-        if text not in self.messages:
+        if (text := f"{self.source}: {text}") not in self.messages:
             self.messages.append(text)
 
-    def _decoded(self) -> Iterator[tuple[int, float, Image | None]]:
-        """Yield number, time and image of every wanted frame, None if it cannot be read."""
-        if self._files is None:
-            yield from self._from_capture()
-            return
-        times_s = _image_times(self._files)
-        stop = min(self.config.stop or len(times_s), len(times_s))
-        for index in range(self.config.start, stop, self.config.every):
-            yield index, times_s[index], _read_image(self._files[index])
-
     def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
-        capture, start, every = self._capture or self._open(), self.config.start, self.config.every
+        """Yield number, time and image of every wanted frame, None if it cannot be read."""
+        capture, start, every = self._open(), self.config.start, self.config.every
         began, previous_s, bad, index = time.monotonic(), -1.0, 0, -1
         pending: list[tuple[int, float, Image | None]] = []  # unreadable, or beyond the end
         for index in range(self.config.stop or sys.maxsize):
@@ -867,21 +804,17 @@ class Video:
             pending, bad, previous_s = [], 0, time_s
             if wanted:
                 yield index, time_s, image
-        capture.release()
-        self._capture = None
         read, stop = index + 1 - bad, self.config.stop or self.frame_count
         if min(stop, self.frame_count) - read > max(1.0, SHORT_SHARE * self.frame_count):
             self._warn(f"the file ends early: {read} of {self.frame_count} frames can be read")
 
     def _open(self) -> Any:
         """Open the source with OpenCV, which turns the frames upright by the file's rotation."""
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
-        is_url = "://" in self.source
-        is_file = not self.is_live and not is_url
-        if is_file and not Path(self.source).is_file():
+        if not self.is_live and not Path(self.source).is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        capture = cv2.VideoCapture(self.source if is_file or is_url else int(self.source))
+        capture = cv2.VideoCapture(int(self.source) if self.is_live else self.source)
         cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
             what = "camera (is it connected?)" if self.is_live else "video (damaged, or no video)"
@@ -890,21 +823,17 @@ class Video:
 
     def _probe(self) -> tuple[tuple[int, int], float, int]:
         """Return size, frame rate and number of frames, from the first readable frame."""
-        if self._files is not None:
-            images: Iterator[Image | None] = map(_read_image, self._files)
-            fps, count = _image_rate(self._files), len(self._files)
-        else:
-            images = (self._capture.read()[1] for _ in range(MAX_BAD_RUN))
-            fps = float(self._capture.get(cv2.CAP_PROP_FPS))
-            count = max(int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        images: Iterator[Image | None] = map(_read_image, self._files)
+        fps, count = IMAGE_FPS, len(self._files)
+        if not self._files:
+            capture = self._open()
+            images = (capture.read()[1] for _ in range(MAX_BAD_RUN))
+            fps = float(capture.get(cv2.CAP_PROP_FPS))
+            count = 0 if self.is_live else max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         image = next((image for image in images if image is not None), None)
         if image is None:
             raise ReobjError(f"{self.source}: not one frame can be decoded")
-        if self._files is None and not self.is_live:
-            self._capture.release()
-            self._capture = None
-        size = (image.shape[1], image.shape[0])
-        return size, fps if 0 < fps < math.inf else IMAGE_FPS, 0 if self.is_live else count
+        return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
 
 
 def _shortened(items: Sequence[Any]) -> str:
@@ -912,40 +841,18 @@ def _shortened(items: Sequence[Any]) -> str:
     return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
 
 
-def _natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key that puts image2 before image10."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in parts]
-
-
-def _image_files(source: str) -> list[Path] | None:
-    """Return the images of a folder, glob or single file, sorted; None for anything else."""
+def _image_files(source: str) -> list[Path]:
+    """Return the images of a folder, glob or single file, image2 before image10; [] for videos."""
     path = Path(source)
     if path.is_file():
-        return [path] if path.suffix.lower() in IMAGE_SUFFIXES else None
-    if path.is_dir():
-        found = [other for other in path.iterdir() if not other.name.startswith(".")]
-    elif re.search(r"[*?\[]", source) and "://" not in source:
-        found = [Path(name) for name in glob.glob(source)]
-    else:
-        return None
-    files = [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES]
+        return [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
+    if not path.is_dir() and not re.search(r"[*?\[]", source):
+        return []
+    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(source))
+    files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     if not files:
         raise ReobjError(f"{source}: no images there (looked for {' '.join(IMAGE_SUFFIXES)})")
-    return sorted(files, key=_natural_key)
-
-
-def _image_times(files: Sequence[Path]) -> list[float]:
-    """Return seconds by frame: the names if all are timestamps (12.345.png), else 30 a second."""
-    if all(re.fullmatch(r"\d+\.\d+", path.stem) for path in files):
-        return [float(path.stem) for path in files]
-    return [index / IMAGE_FPS for index in range(len(files))]
-
-
-def _image_rate(files: Sequence[Path]) -> float:
-    times_s = _image_times(files)
-    span_s = times_s[-1] - times_s[0]
-    return (len(times_s) - 1) / span_s if span_s > 0 else IMAGE_FPS
+    return sorted(files, key=lambda p: re.sub(r"\d+", lambda n: n[0].zfill(20), p.name))
 
 
 def _read_image(path: Path) -> Image | None:
@@ -958,159 +865,101 @@ def _read_image(path: Path) -> Image | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-# ---- Detections: files ---------------------------------------------------------------------------
+# ---- Detections: files -------------------------------------------------------------------------
 
 MOSTLY = 0.5  # above this share of bad boxes it is the format that is wrong, not the boxes
-BEYOND = 0.1  # boxes that reach this share of the image beyond it were made on another image size
 NORMALISED_MAX = 1.5  # coordinates up to here are shares of the image
 CACHE_FRAMES = 64  # frames in one file of the detection cache
 POLYGON_BITS = 4  # sub-pixel bits of polygon corners (cv2.fillPoly)
-COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # category ids of COCO that no image uses
-NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(?i:nan|inf(inity)?)"
-NO_COMMENT = r"\A\s*[^#\s]|,"  # a line with content; a header may start with #
-NPZ_KEYS = ("frame", "xyxy", "score", "class_id", "class_names", "image_size")
-CSV_COLUMNS = {  # what a column holds: the names it has in the wild
-    "frame": "frame frame_id frame_index frame_number",
-    "image": "image image_name file file_name filename timestamp",
-    "x1": "x1 x_min xmin left x bb_left xtl", "y1": "y1 y_min ymin top y bb_top ytl",
-    "x2": "x2 x_max xmax right xbr", "y2": "y2 y_max ymax bottom ybr",
-    "w": "w width bb_width", "h": "h height bb_height",
-    "score": "score confidence conf prob",
-    "class": "class_name name label category class class_id cls category_id coco80_class",
-}  # fmt: skip
+COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's ids 1 to 90, without a class
 Counts = npt.NDArray[np.uint32]
+NO_RUNS: Counts = np.empty(0, np.uint32)  # of a mask without any pixel
+NUMBERS = ("frame", "id", "x1", "y1", "x2", "y2", "w", "h", "score")
+MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
+CSV_ALIASES = {"x": "x1", "y": "y1", "width": "w", "height": "h", "confidence": "score",
+               "conf": "score", "class_id": "class", "class_name": "class"}  # fmt: skip
 
 
-def rle_encode(masks: BoolArray) -> tuple[Counts, IntArray]:
-    """Encode masks as run lengths down the columns, zeros first; an empty mask has no runs.
-
-    Args:
-        masks: (D, H, W) bool.
-    Returns:
-        counts: (M,) run lengths of all masks. offsets: (D + 1,): mask d has the counts from
-        offsets[d] to offsets[d + 1].
-    """
-    height, width = masks.shape[1:]
-    runs = [np.empty(0, np.uint32)]
-    for mask in masks:
-        columns = np.flatnonzero(mask.any(0))
-        if not len(columns):
-            runs.append(runs[0])
-            continue
-        first, last = int(columns[0]), int(columns[-1])
-        inner = mask[:, first : last + 1].T.ravel()  # down the columns that have pixels
-        edges = np.flatnonzero(np.diff(inner, prepend=False, append=False)) + first * height
-        counts = np.diff(edges, prepend=0, append=height * width)
-        runs.append(counts[: len(counts) - (counts[-1] == 0)].astype(np.uint32))
-    return np.concatenate(runs), np.cumsum([len(run) for run in runs]).astype(np.int64)
+def rle_encode(mask: BoolArray) -> Counts:
+    """Return the run lengths of an (H, W) mask down its columns, zeros first; [] if it is empty."""
+    flat = cv2.transpose(mask.view(np.uint8)).ravel()  # (W * H,)
+    edges = np.flatnonzero(np.diff(flat, prepend=np.uint8(0)))
+    counts = np.diff(edges, prepend=0, append=flat.size).astype(np.uint32)
+    return counts if len(counts) > 1 else NO_RUNS
 
 
-def rle_decode(counts: Counts, offsets: IntArray, size: tuple[int, int]) -> BoolArray:
-    """Decode run lengths into (D, H, W) masks of a (w, h) image; the inverse of `rle_encode`."""
-    width, height = size
-    runs = np.diff(offsets)  # (D,)
-    filled = np.flatnonzero(runs)
-    flat = np.zeros((len(runs), width * height), bool)
-    if len(filled):
-        total = np.add.reduceat(counts.astype(np.int64), offsets[:-1][filled])
-        if (total != width * height).any():
-            raise ReobjError(f"a mask has {total.max()} pixels, the image {width} x {height}")
-        odd = (np.arange(len(counts)) - np.repeat(offsets[:-1], runs)) % 2 == 1  # runs of ones
-        flat[filled] = np.repeat(odd, counts).reshape(len(filled), -1)
-    return flat.reshape(len(runs), width, height).transpose(0, 2, 1)
+def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
+    """Return the (H, W) mask of a (w, h) image; the inverse of `rle_encode`."""
+    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts) if len(counts) else np.False_
+    return np.broadcast_to(flat, size[0] * size[1]).reshape(size).T
 
 
 def coco_runs(text: str) -> Counts:
     """Decode COCO's compressed run lengths: 5 bits a character, differences to the last but one."""
-    raw = np.frombuffer(text.encode(), np.uint8).astype(np.int64) - 48
-    last = np.flatnonzero(~raw & 0x20)  # last character of each number
-    first = np.concatenate([[0], last[:-1] + 1])
-    place = np.arange(len(raw)) - np.repeat(first, last - first + 1)
-    values = np.add.reduceat((raw & 0x1F) << (5 * place), first)
-    values -= (raw[last] >> 4 & 1) << (5 * (place[last] + 1))  # sign
-    values[1::2] = np.cumsum(values[1::2])
-    values[2::2] = np.cumsum(values[2::2])
-    return values.astype(np.uint32)
-
-
-def _pick_runs(counts: Counts, offsets: IntArray, rows: IntArray) -> tuple[Counts, IntArray]:
-    """Return the run lengths of some rows as (counts, offsets)."""
-    parts = [counts[offsets[row] : offsets[row + 1]] for row in rows]
-    ends = np.cumsum([0, *map(len, parts)])
-    return np.concatenate([np.empty(0, np.uint32), *parts]), ends.astype(np.int64)
+    runs: list[int] = []
+    value = shift = 0
+    for byte in text.encode():
+        value |= (byte - 48 & 0x1F) << shift
+        shift += 5
+        if byte - 48 & 0x20:  # more to come
+            continue
+        value -= (byte - 48 >> 4 & 1) << shift  # sign
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    return np.array(runs, np.uint32)
 
 
 @dataclass(slots=True)
-class _Rows:
-    """Detections as a reader found them, unchecked: `frame` 0-based (-1: none), boxes xyxy."""
-
-    frame: IntArray
-    xyxy: Array
-    score: Array
-    class_id: IntArray
-    class_names: list[str]
-    line: IntArray  # (N,) where each one stands, for messages
-    unit: str = "line"
-    counts: Counts | None = None  # run lengths of the masks
-    offsets: IntArray | None = None
-    messages: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True, slots=True)
 class RecordedDetections:
-    """Detections read from a file and checked.
+    """Detections of a video as a struct of arrays, from a file.
 
     Attributes:
-        frame: (N,) ascending source frame numbers. xyxy: (N, 4) in native pixels.
-        row: (N,) row in the file, the index of its mask. counts, offsets: run lengths of all masks.
-        size, working_size: (w, h). messages: what was dropped or assumed.
+        frame: (N,) source frame numbers. xyxy: (N, 4) in native pixels.
+        runs: N run lengths of the masks, empty where there is none.
+        size, working_size: (w, h) of the masks and of the frames.
+        line: (N,) where each stands in the file, in `unit`s. messages: what was dropped or assumed.
     """
 
     frame: IntArray
     xyxy: Array
     score: Array
     class_id: IntArray
-    row: IntArray
+    runs: list[Counts]
     class_names: tuple[str, ...]
     size: tuple[int, int]
     working_size: tuple[int, int]
-    counts: Counts | None = None
-    offsets: IntArray | None = None
-    messages: tuple[str, ...] = ()
+    line: IntArray
+    unit: str
+    messages: list[str] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.frame)
 
-    @property
-    def frames(self) -> IntArray:
-        """Frame numbers that have detections, ascending."""
-        return np.unique(self.frame)
-
     def at(self, frame_index: int) -> Detections:
         """Return the detections of a frame at the working size, best first; decodes its masks."""
         low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
-        of = slice(low, high)
+        rows, runs, masks = slice(low, high), self.runs[low:high], None
         ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
-        masks = self._masks(self.row[of])
-        return Detections(self.xyxy[of] * ratio, self.score[of], self.class_id[of], masks)
+        if any(map(len, runs)):
+            masks = np.stack([self._working_mask(counts) for counts in runs])  # (D, H, W)
+        return Detections(self.xyxy[rows] * ratio, self.score[rows], self.class_id[rows], masks)
 
-    def _masks(self, rows: IntArray) -> BoolArray | None:
-        if self.counts is None or self.offsets is None:
-            return None
-        counts, offsets = _pick_runs(self.counts, self.offsets, rows)
-        if not len(counts):
-            return None
-        masks = rle_decode(counts, offsets, self.size)
+    def _working_mask(self, counts: Counts) -> BoolArray:
+        mask = rle_decode(counts, self.size)
         if self.working_size == self.size:
-            return masks
-        shares = masks.astype(np.float32)
-        small = [cv2.resize(m, self.working_size, interpolation=cv2.INTER_AREA) for m in shares]
-        return np.stack(small) >= 0.5
+            return mask
+        share = cv2.resize(mask.astype(np.float32), self.working_size, interpolation=cv2.INTER_AREA)
+        return np.asarray(share >= 0.5)
 
 
 def load_class_names(path: str | Path) -> tuple[str, ...]:
     """Read one class name a line."""
     return tuple(line.strip() for line in _read_text(Path(path)).splitlines() if line.strip())
+
+
+def _unnamed_class(class_id: int, count: int) -> str:
+    return (f"class {class_id}, but there are only {count} class names: give a file of names with "
+            "--set detect.class_names=FILE")  # fmt: skip
 
 
 def read_detections(
@@ -1120,14 +969,19 @@ def read_detections(
     path, config = Path(path), config or DetectConfig()
     if not path.is_file():
         raise ReobjError(f"{path}: no such file of detections")
-    names = list(load_class_names(config.class_names)) if config.class_names else []
+    names = load_class_names(config.class_names) if config.class_names else ()
     try:
-        rows = _reader_for(path)(path, names, video)
+        if path.suffix.lower() == ".npz":
+            found, _ = _read_npz(path, video.size, video.working_size)
+        else:
+            read = _read_coco if path.suffix.lower() == ".json" else _read_table
+            found = read(path, names, video)
     except ReobjError:
         raise
-    except (KeyError, TypeError, ValueError) as error:  # JSON of another make
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise ReobjError(f"{path}: an entry is not as expected: {error!r}") from error
-    return _checked(rows, path, video, config)
+    _check(found, path, config, video.frame_count)
+    return found
 
 
 def _read_text(path: Path) -> str:
@@ -1137,160 +991,116 @@ def _read_text(path: Path) -> str:
         raise ReobjError(f"{path}: cannot be read as text ({error})") from error
 
 
-def _reader_for(path: Path) -> Callable[[Path, list[str], Video], _Rows]:
-    """Choose the reader by the suffix, for text by the first line that is no comment."""
-    if path.suffix.lower() in (".npz", ".json"):
-        return _read_npz if path.suffix.lower() == ".npz" else _read_coco
-    lines = _read_text(path).splitlines()
-    first = next((line for line in lines if re.search(NO_COMMENT, line)), "")
-    start = re.split(r"[,\s]", first.strip() or "0")[0]  # nothing: MOT without rows
-    return _read_mot if re.fullmatch(NUMBER, start) else _read_csv
-
-
-def _number(cell: str, path: Path, line: int) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        raise ReobjError(f"{path}, line {line}: {cell!r} is not a number") from None
-
-
-def _refuse_nan(values: Array, path: Path, line: IntArray, unit: str = "line") -> None:
-    bad = np.flatnonzero(~np.isfinite(values).all(-1))
-    if len(bad):
-        where = f"{path}, {unit} {line[bad[0]]}"
-        raise ReobjError(f"{where}: NaN or infinite value ({len(bad)} such {unit}(s) in all)")
-
-
-def _read_mot(path: Path, names: list[str], video: Video) -> _Rows:
-    """Read MOTChallenge: frame from 1, id, left, top, w, h[, score[, class or x, y, z]]."""
-    table, line = _mot_table(path)
-    _refuse_nan(table, path, line)
-    if (table[:, 1] % 1 != 0).any():
+def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
+    """Read MOT rows (frame from 1, id, left, top, w, h[, score[, class]]), or CSV with a header."""
+    texts, lines, is_mot = _table_texts(path)
+    column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
+    if is_mot and (column["id"] % 1 != 0).any():
         raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
                          "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
-    score = table[:, 6] if table.shape[1] > 6 else np.ones(len(table))
-    class_id, class_names = _mot_classes(table, names)
-    xyxy = np.hstack([table[:, 2:4], table[:, 2:4] + table[:, 4:6]])
-    rows = _Rows(table[:, 0].astype(np.int64) - 1, xyxy, score, class_id, class_names, line)
-    if len(table) and rows.frame.min() == -1:
-        rows.frame += 1
-        rows.messages.append("MOT frames start at 1, this file has a frame 0: taken as 0-based")
-    return rows
+    if "x2" not in column:
+        column["x2"], column["y2"] = column["x1"] + column["w"], column["y1"] + column["h"]
+    xyxy = np.stack([column[role] for role in ("x1", "y1", "x2", "y2")], 1)  # (N, 4)
+    count = len(lines)
+    class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
+    messages = [f"{len(new)} class names not in the list: {_shortened(new)}"] if new else []
+    frame = column["frame"].astype(np.int64) - is_mot
+    if frame.min(initial=0) == -1 and is_mot:
+        frame += 1
+        messages.append("MOT frames start at 1, this file has a frame 0: taken as 0-based")
+    return RecordedDetections(
+        frame, xyxy, column.get("score", np.ones(count)), class_id, [NO_RUNS] * count, tuple(names),
+        video.size, video.working_size, lines, "line", messages,
+    )  # fmt: skip
 
 
-def _mot_table(path: Path) -> tuple[Array, IntArray]:
-    """Return (N, 6..10) numbers and their lines."""
-    lines: list[int] = []
-    rows: list[list[float]] = []
-    for line, text in enumerate(_read_text(path).splitlines(), 1):
-        cells = text.replace(",", " ").split()
-        if not cells or cells[0].startswith("#"):
-            continue
-        if len(cells) != (len(rows[0]) if rows else len(cells)) or not 6 <= len(cells) <= 10:
-            wanted = len(rows[0]) if rows else "6 to 10 (frame, id, left, top, w, h, score)"
-            raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {wanted}")
-        lines.append(line)
-        rows.append([_number(cell, path, line) for cell in cells])
-    return np.array(rows) if rows else np.empty((0, 7)), np.array(lines, np.int64)
+def _table_texts(path: Path) -> tuple[dict[str, list[str]], IntArray, bool]:
+    """Return the cells by column, the lines they stand on, and whether it is MOT (no header)."""
+    reader = csv.reader(_read_text(path).splitlines())
+    rows = [(reader.line_num, cells) for cells in reader if cells]
+    is_mot = not rows or rows[0][1][0].strip()[:1] in "+-.0123456789"
+    columns = MOT_COLUMNS if is_mot else _csv_columns(rows.pop(0)[1], path)
+    width = len(rows[0][1]) if is_mot and rows else len(columns)
+    known = not is_mot or width in range(6, 11)
+    expected = str(width) if known else "6 to 10 (frame, id, left, top, w, h, score)"
+    for line, cells in rows:
+        if str(len(cells)) != expected:
+            raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {expected}")
+    texts = {role: [cells[i].strip() for _, cells in rows]
+             for i, role in enumerate(columns[:width])}  # fmt: skip
+    return texts, np.array([line for line, _ in rows], np.int64), is_mot
 
 
-def _mot_classes(table: Array, names: list[str]) -> tuple[IntArray, list[str]]:
-    """Return class ids and names: column 8 if it holds classes (from 1), else all are "object"."""
-    column = table[:, 7] if table.shape[1] > 7 else np.zeros(len(table))
-    if not len(column) or (column < 1).any() or (column % 1 != 0).any():
-        return np.zeros(len(table), np.int64), ["object"]
-    new = [f"class {i + 1}" for i in range(len(names), int(column.max()))]
-    return column.astype(np.int64) - 1, names + new
-
-
-def _csv_header(text: str, path: Path) -> tuple[dict[str, int], int]:
-    """Return role -> column, and the number of the first frame (1 if the header says 1-based)."""
-    role_of = {name: role for role, names in CSV_COLUMNS.items() for name in names.split()}
-    cells = [cell.strip().lstrip("#").strip().lower() for cell in text.split(";")[0].split(",")]
-    plain = [re.sub(r"[ -]", "_", re.sub(r"\(.*?\)", "", cell).strip()) for cell in cells]
-    columns: dict[str, int] = {}
-    for column, name in enumerate(plain):
-        columns.setdefault(role_of.get(name, ""), column)
-    has_end = {"x2", "y2"} <= columns.keys() or {"w", "h"} <= columns.keys()
-    missing = [role for role in ("x1", "y1") if role not in columns]
-    missing += [] if {"frame", "image"} & columns.keys() else ["frame"]
-    missing += [] if has_end else ["x2,y2 or w,h"]
+def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
+    """Return what the columns hold by a header's names."""
+    header = re.sub(r"\(.*?\)", "", ",".join(cells)).split(";")[0].lower()  # remarks go
+    plain = [name.strip() for name in header.lstrip("# ").split(",")]
+    columns = tuple(CSV_ALIASES.get(name, name) for name in plain)
+    ends = ("w", "h") if "w" in columns else ("x2", "y2")
+    missing = [role for role in ("frame", "x1", "y1", *ends) if role not in columns]
     if missing:
-        header = ",".join(plain)
-        raise ReobjError(f"{path}, line 1: no column {', '.join(missing)} in the header {header}")
-    return columns, int("frame" in columns and "1-based" in cells[columns["frame"]])
+        raise ReobjError(f"{path}, line 1: no column {', '.join(missing)} in the header {header}: "
+                         "expected one such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
+    return columns
 
 
-def _read_csv(path: Path, names: list[str], video: Video) -> _Rows:
-    """Read a CSV file whose header names its columns (frames 0-based unless it says 1-based)."""
-    lines = enumerate(_read_text(path).splitlines(), 1)
-    texts = [(i, text) for i, text in lines if re.search(NO_COMMENT, text)]
-    header = texts.pop(0)[1].split(";")[0]
-    columns, first = _csv_header(header, path)
-    cells = list(csv.reader(text for _, text in texts))
-    line = np.array([i for i, _ in texts], np.int64)
-    width = header.count(",") + 1
-    for at, row in zip(line, cells, strict=True):
-        if len(row) != width:
-            raise ReobjError(f"{path}, line {at}: {len(row)} columns, expected {width}")
-
-    def column(role: str, default: float = math.nan) -> Array:
-        if role not in columns:
-            return np.full(len(cells), default)
-        texts = [row[columns[role]] for row in cells]
-        return np.array([_number(text, path, at) for at, text in zip(line, texts, strict=True)])
-
-    low = np.stack([column("x1"), column("y1")], 1)  # (N, 2)
-    size = np.stack([column("w"), column("h")], 1)
-    high = np.stack([column("x2"), column("y2")], 1) if "x2" in columns else low + size
-    if "frame" in columns:
-        number = column("frame")
-        _refuse_nan(number[:, None], path, line)
-        frame = number.astype(np.int64) - first
-    else:
-        lookup = _frames_by_name(video)
-        frame = np.array([lookup.get(row[columns["image"]].strip(), -1) for row in cells], np.int64)
-    no_class = np.zeros(len(cells), np.int64)
-    rows = _Rows(frame, np.hstack([low, high]), column("score", 1.0), no_class, names, line)
-    classes = [row[columns["class"]].strip() for row in cells] if "class" in columns else None
-    _csv_classes(rows, classes, path)
-    return rows
+def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
+    """Convert a column to finite numbers."""
+    values = np.full(len(cells), np.nan)
+    for i, cell in enumerate(cells):
+        with contextlib.suppress(ValueError):
+            values[i] = float(cell)
+        if not math.isfinite(values[i]):
+            raise ReobjError(f"{path}, line {lines[i]}: {cell!r} is no finite number")
+    return values
 
 
-def _csv_classes(rows: _Rows, cells: list[str] | None, path: Path) -> None:
-    """Fill in the classes: numbers count in the class names (default: COCO's), names are names."""
-    if cells is None:
-        rows.class_names = ["object"]
-        return
-    names = rows.class_names = rows.class_names or list(COCO_NAMES)
-    if not all(re.fullmatch(r"\d+(\.0*)?", cell) for cell in cells):
-        known = {name: i for i, name in enumerate(names)}
-        rows.class_id = np.array([known.setdefault(cell, len(known)) for cell in cells], np.int64)
-        _add_classes(rows, list(known)[len(names) :])
-        return
-    rows.class_id = np.array([int(float(cell)) for cell in cells], np.int64)
-    bad = np.flatnonzero(rows.class_id >= len(names))
-    if len(bad):
-        where = f"{path}, line {rows.line[bad[0]]}"
-        raise ReobjError(f"{where}: {_unnamed_class(rows.class_id[bad[0]], len(names))}")
+def _table_classes(
+    cells: Sequence[str], is_mot: bool, names: Sequence[str]
+) -> tuple[IntArray, Sequence[str], list[str]]:
+    """Return class ids, class names and those that are new; MOT counts from 1, -1 is no class."""
+    ids = np.array([int(cell) if cell.isdigit() else -1 for cell in cells], np.int64)
+    if not any(cells) or (is_mot and ids.min() < 1):
+        return np.zeros_like(ids), ("object",), []
+    if is_mot:
+        return ids - 1, [*names, *(f"class {i + 1}" for i in range(len(names), ids.max()))], []
+    names = names or COCO_NAMES
+    if ids.min() >= 0:
+        return ids, names, []
+    new = sorted(set(cells) - set(names))
+    index = {name: i for i, name in enumerate([*names, *new])}
+    return np.array([index[cell] for cell in cells], np.int64), list(index), new
 
 
-def _unnamed_class(class_id: int, count: int) -> str:
-    return (f"class {class_id}, but there are only {count} class names: give a file of names with "
-            "--set detect.class_names=FILE")  # fmt: skip
-
-
-def _add_classes(rows: _Rows, new: list[str]) -> None:
-    rows.class_names = rows.class_names + new
-    if new:
-        rows.messages.append(f"{len(new)} class names that are not in the list are kept as new "
-                             f"classes: {_shortened(new)}")  # fmt: skip
-
-
-def _frames_by_name(video: Video) -> dict[str, int]:
-    """Return frame numbers by image name, with and without the suffix."""
-    names = list(enumerate(video.names))
-    return {Path(name).stem: i for i, name in names} | {name: i for i, name in names}
+def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
+    """Read COCO results; a dataset JSON beside them says which frame and class their ids mean."""
+    entries = _load_json(path)
+    if not isinstance(entries, list):
+        raise ReobjError(f"{path}: expected COCO results: [{{image_id, category_id, bbox, score}}]")
+    frame_of, name_of, messages = _coco_dataset(path, names, video)
+    for at, entry in enumerate(entries):
+        found = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
+        if None in found.values() or len(entry["bbox"]) != 4:
+            raise ReobjError(f"{path}, entry {at}: {found}, expected two ids and a bbox of 4")
+        if entry["category_id"] not in name_of:
+            raise ReobjError(f"{path}, entry {at}: category_id {entry['category_id']} is unknown: "
+                             "put the dataset JSON beside this file, or give a file of names (ids "
+                             "from 0) with --set detect.class_names=FILE")  # fmt: skip
+        if frame_of and entry["image_id"] not in frame_of:
+            raise ReobjError(f"{path}, entry {at}: image_id {entry['image_id']} is not in the "
+                             "dataset JSON beside this file")  # fmt: skip
+    box = np.array([entry["bbox"] for entry in entries], np.float64).reshape(-1, 4)  # x, y, w, h
+    classes = list(dict.fromkeys(name_of.values()))
+    image_ids = [entry["image_id"] for entry in entries]
+    return RecordedDetections(
+        np.array([frame_of.get(i, i) for i in image_ids], np.int64),
+        np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]),
+        np.array([entry.get("score", 1.0) for entry in entries], np.float64),
+        np.array([classes.index(name_of[entry["category_id"]]) for entry in entries], np.int64),
+        [_coco_mask(entry.get("segmentation"), video.size, f"{path}, entry {at}")
+         for at, entry in enumerate(entries)],
+        tuple(classes), video.size, video.working_size, np.arange(len(entries)), "entry", messages,
+    )  # fmt: skip
 
 
 def _load_json(path: Path) -> Any:
@@ -1300,217 +1110,140 @@ def _load_json(path: Path) -> Any:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
 
 
-def _dataset_beside(path: Path) -> dict[str, Any] | None:
-    """Find the COCO dataset JSON (with `images`) in the folder of a results JSON."""
+def _coco_dataset(
+    path: Path, names: Sequence[str], video: Video
+) -> tuple[dict[int, int], dict[int, str], list[str]]:
+    """Frame of each image id (empty: the id itself), name of each category id, and messages.
+
+    The dataset is any other JSON of the folder with `images`; they belong to frames by `file_name`,
+    or by their order where the video has no file names.
+    """
+    data = None
     for other in sorted(path.parent.glob("*.json")):
-        with contextlib.suppress(ReobjError):
-            data = _load_json(other)
-            if isinstance(data, dict) and "images" in data and "categories" in data:
-                return data
-    return None
-
-
-def _coco_frames(dataset: dict[str, Any], video: Video) -> dict[Any, int]:
-    """Return frame number by image id: by file name, else `frame_id`, else the order of the ids."""
-    by_name, images = _frames_by_name(video), dataset["images"]
-    names = {image["id"]: Path(str(image.get("file_name", ""))).name for image in images}
-    if any(name in by_name for name in names.values()):
-        return {key: by_name[name] for key, name in names.items() if name in by_name}
-    if all("frame_id" in image for image in images):
-        return {image["id"]: int(image["frame_id"]) for image in images}
-    return {key: index for index, key in enumerate(sorted(names))}
-
-
-def _coco_91_names() -> list[str]:
-    """Return class names by COCO category id - 1; ids that no image uses have placeholders."""
-    names = iter(COCO_NAMES)
-    last = len(COCO_NAMES) + len(COCO_GAPS)
-    return [f"unused {i}" if i in COCO_GAPS else next(names) for i in range(1, last + 1)]
-
-
-def _read_coco(path: Path, names: list[str], video: Video) -> _Rows:
-    """Read COCO results (a list), or a COCO dataset with annotations; masks as RLE or polygons."""
-    data = _load_json(path)
-    dataset = data if isinstance(data, dict) else _dataset_beside(path)
-    entries = data.get("annotations") if isinstance(data, dict) else data
-    if not isinstance(entries, list):
-        raise ReobjError(f"{path}: expected COCO results: [{{image_id, category_id, bbox, score}}]")
-    for at, entry in enumerate(entries):
-        lacks = [key for key in ("image_id", "category_id", "bbox") if key not in entry]
-        if lacks or len(entry["bbox"]) != 4:
-            wrong = f"bbox is {entry.get('bbox')}, expected 4 numbers"
-            wrong = f"no {', '.join(lacks)}" if lacks else wrong
-            raise ReobjError(f"{path}, entry {at}: {wrong}")
-    count = len(entries)
-    xywh = np.array([entry["bbox"] for entry in entries], np.float64).reshape(count, 4)
-    score = np.array([entry.get("score", 1.0) for entry in entries], np.float64)
-    none = np.zeros(count, np.int64)
-    rows = _Rows(none, np.hstack([xywh[:, :2], xywh[:, :2] + xywh[:, 2:]]), score, none, names,
-                 np.arange(count), "entry")  # fmt: skip
-    _coco_ids(rows, entries, dataset, video, path)
-    runs = [_coco_mask(entry.get("segmentation"), video.size, f"{path}, entry {at}")
-            for at, entry in enumerate(entries)]  # fmt: skip
-    if any(map(len, runs)):
-        rows.counts, rows.offsets = np.concatenate(runs), np.cumsum([0, *map(len, runs)])
-    return rows
-
-
-def _coco_ids(
-    rows: _Rows, entries: list[Any], dataset: dict[str, Any] | None, video: Video, path: Path
-) -> None:
-    """Fill in frames and classes of COCO entries."""
-    keys, images = ([entry[key] for entry in entries] for key in ("category_id", "image_id"))
-    if dataset is not None:
-        frames = _coco_frames(dataset, video)
-        rows.frame = np.array([frames.get(key, -1) for key in images], np.int64)
-        rows.class_names = [str(category["name"]) for category in dataset["categories"]]
-        known = {category["id"]: i for i, category in enumerate(dataset["categories"])}
-        rows.class_id = np.array([known.setdefault(key, len(known)) for key in keys], np.int64)
-        _add_classes(rows, [f"category {key}" for key in list(known)[len(rows.class_names) :]])
-        return
-    rows.messages.append("no COCO dataset JSON beside the results: image_id is taken as the "
-                         "0-based frame number")  # fmt: skip
-    rows.frame = np.array(images, np.int64)
-    rows.class_id = np.array(keys, np.int64) - (0 if rows.class_names else 1)
-    rows.class_names = rows.class_names or _coco_91_names()
-    bad = np.flatnonzero((rows.class_id < 0) | (rows.class_id >= len(rows.class_names)))
-    if len(bad):
-        raise ReobjError(f"{path}, entry {bad[0]}: category_id {keys[bad[0]]} is none of COCO: put "
-                         "the dataset JSON with `categories` beside the results")  # fmt: skip
+        with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
+            found = json.loads(other.read_text()) if other != path else None
+            data = found if isinstance(found, dict) and found.get("images") else data
+    ids = list(range(len(names))) or [i for i in range(1, 91) if i not in COCO_GAPS]
+    name_of = dict(zip(ids, names or COCO_NAMES, strict=True))
+    if data is None:
+        return {}, name_of, ["no dataset JSON beside it: image_id is taken as the 0-based frame"]
+    if data.get("categories") and not names:
+        name_of = {c["id"]: c["name"] for c in data["categories"]}
+    row = {name: i for i, name in enumerate(video.names)}
+    frame_of = {
+        image["id"]: row.get(Path(image["file_name"]).name, -1) if row else i
+        for i, image in enumerate(data["images"])
+    }
+    return frame_of, name_of, []
 
 
 def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
     """Return the run lengths of a COCO segmentation: RLE (compressed or not), polygons or none."""
     if not mask:
-        return np.empty(0, np.uint32)
+        return NO_RUNS
     if isinstance(mask, dict):
         counts = mask["counts"]
-        runs = coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
-        if tuple(mask["size"]) != size[::-1] or runs.sum() != size[0] * size[1]:
-            found = f"mask of height, width {mask['size']}"
-            raise ReobjError(f"{where}: {found} in a video of {size[::-1]}")
-        return runs if len(runs) > 1 else np.empty(0, np.uint32)
+        if tuple(mask["size"]) != size[::-1]:
+            raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
+        return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
     canvas = np.zeros(size[::-1], np.uint8)
     for ring in mask:  # corner convention -> OpenCV's, where the first pixel's centre is (0, 0)
         corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)
         cv2.fillPoly(canvas, [corners], 1, shift=POLYGON_BITS)
-    return rle_encode(canvas[None] > 0)[0]
+    return rle_encode(canvas > 0)
 
 
-def _read_npz(path: Path, names: list[str], video: Video) -> _Rows:
-    """Read our own format, as `write_detections_npz` makes it."""
-    data = _load_npz(path)
-    missing = [key for key in NPZ_KEYS if key not in data]
-    if missing:
-        raise ReobjError(f"{path}: no array {', '.join(missing)} among {', '.join(data) or 'none'}")
-    count = len(data["frame"])
-    for key, shape in {"xyxy": (count, 4), "score": (count,), "class_id": (count,)}.items():
-        if data[key].shape != shape:
-            raise ReobjError(f"{path}: {key} is {data[key].shape}, expected {shape}")
-    size = tuple(data["image_size"].tolist())
-    if size != video.size:
-        raise ReobjError(f"{path}: made for images of {size} px, but the video is {video.size} px")
-    rows = _Rows(
-        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
-        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
-        data["class_names"].tolist(), np.arange(count), "row",
-        data.get("mask_counts"), data.get("mask_offsets"),
-    )  # fmt: skip
-    if count and not 0 <= rows.class_id.min() <= rows.class_id.max() < len(rows.class_names):
-        raise ReobjError(f"{path}: class_id beyond the {len(rows.class_names)} class_names")
-    if rows.offsets is not None:
-        ends = (len(rows.offsets), rows.offsets[-1], rows.counts is not None)
-        if rows.counts is None or ends != (count + 1, len(rows.counts), True):
-            raise ReobjError(f"{path}: mask_offsets do not fit mask_counts")
-    return rows
-
-
-def _load_npz(path: Path) -> dict[str, Any]:
+def _read_npz(
+    path: Path, size: tuple[int, int], working_size: tuple[int, int]
+) -> tuple[RecordedDetections, IntArray]:
+    """Read our own format, as `_pack` makes it; also the frames that were `done`, if it says so."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
+            data: dict[str, Any] = dict(file)
     except Exception as error:  # zip, zlib and numpy each have their own for damaged files
         raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
-
-
-def _checked(rows: _Rows, path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
-    """Check what was read: errors for what cannot be meant, counted messages for single rows."""
-    _refuse_nan(np.column_stack([rows.xyxy, rows.score]), path, rows.line, rows.unit)
-    keep = _real_boxes(rows, path, video.size) & _real_frames(rows, path, video)
-    rows.score = _unit_scores(rows)
-    keep &= rows.score >= config.min_score
-    if config.classes:
-        keep &= np.isin(rows.class_id, _class_filter(config.classes, rows.class_names))
-    if not len(rows.frame):
-        rows.messages.append("no detections in this file")
-    index = np.flatnonzero(keep)
-    index = index[np.lexsort((index, -rows.score[index], rows.frame[index]))]  # best first
-    frame = rows.frame[index]
-    rank = np.arange(len(index)) - np.searchsorted(frame, frame)  # within its frame
-    index = index[rank < config.max_detections]
-    messages = tuple(f"{path.name}: {text}" for text in rows.messages)
-    return RecordedDetections(
-        rows.frame[index], rows.xyxy[index], rows.score[index], rows.class_id[index], index,
-        tuple(rows.class_names), video.size, video.working_size, rows.counts, rows.offsets,
-        messages,
+    count = len(data.get("frame", ()))
+    data.setdefault("mask_counts", NO_RUNS)
+    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
+    shapes = {"frame": (count,), "xyxy": (count, 4), "score": (count,), "class_id": (count,),
+              "class_names": (-1,), "image_size": (2,), "mask_offsets": (count + 1,)}  # fmt: skip
+    for key, shape in shapes.items():
+        found = data[key].shape if key in data else "missing"
+        if found != shape and (key != "class_names" or found == "missing"):
+            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
+    if (made_for := tuple(data["image_size"].tolist())) != size:
+        raise ReobjError(f"{path}: made for images of {made_for} px, but the video is {size} px")
+    recorded = RecordedDetections(
+        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
+        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
+        np.split(data["mask_counts"], data["mask_offsets"][1:])[:count],
+        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
     )  # fmt: skip
+    return recorded, data.get("done", recorded.frame)
 
 
-def _real_boxes(rows: _Rows, path: Path, size: tuple[int, int]) -> BoolArray:
-    """Return which boxes have an area and touch the image; refuse a file where most have not."""
-    limit, image = np.array(size, np.float64), f"{size[0]} x {size[1]} image"
-    count = len(rows.frame)
-    low, high = rows.xyxy[:, :2], rows.xyxy[:, 2:]
+def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_count: int) -> None:
+    """Check detections of any format: errors for what cannot be meant, messages for single rows."""
+    finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
+    named = np.isin(found.class_id, np.arange(len(found.class_names)))
+    pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,) 0: no mask
+    fits = (pixels == 0) | (pixels == math.prod(found.size))
+    for row in np.flatnonzero(~(finite & named & fits))[:1]:
+        text = f"mask of {pixels[row]} pixels in a video of {found.size}"
+        if not finite[row]:
+            text = f"NaN or infinite value in {found.xyxy[row]}, {found.score[row]}"
+        elif not named[row]:
+            text = _unnamed_class(int(found.class_id[row]), len(found.class_names))
+        raise ReobjError(f"{path}, {found.unit} {found.line[row]}: {text}")
+    keep = _real(found, path, frame_count)
+    if len(found) and (found.score == -1).all():
+        found.messages.append("scores are all -1: taken as 1")
+        found.score = -found.score
+    if ((found.score < 0) | (found.score > 1)).any():
+        found.messages.append(f"scores from {found.score.min():g} to {found.score.max():g} clipped "
+                              "to [0, 1]")  # fmt: skip
+        found.score = np.clip(found.score, 0, 1)
+    keep &= found.score >= config.min_score
+    if config.classes:
+        keep &= np.isin(found.class_id, _class_filter(config.classes, found.class_names))
+    if not len(found):
+        found.messages.append("no detections in this file")
+    rows = np.flatnonzero(keep)
+    rows = rows[np.lexsort((rows, -found.score[rows], found.frame[rows]))]  # best first
+    frame = found.frame[rows]
+    rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
+    rows = rows[rank < config.max_detections]
+    for name in ("frame", "xyxy", "score", "class_id", "line"):
+        setattr(found, name, getattr(found, name)[rows])
+    found.runs = [found.runs[row] for row in rows]
+    found.messages[:] = [f"{path.name}: {text}" for text in found.messages]
+
+
+def _real(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
+    """Return which boxes have an area, touch the image and belong to a frame of the video."""
+    count, low, high = len(found), found.xyxy[:, :2], found.xyxy[:, 2:]
     empty = (high <= low).any(1)  # (N,)
-    outside = ~empty & ((high <= 0) | (low >= limit)).any(1)
-    beyond = ((low < -BEYOND * limit) | (high > (1 + BEYOND) * limit)).any(1)
-    if count and rows.xyxy.max() <= NORMALISED_MAX:
+    outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(found.size))).any(1))
+    missing = (found.frame < 0) | (found.frame >= (frame_count or sys.maxsize))
+    if count and found.xyxy.max() <= NORMALISED_MAX:
         raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
                          "Multiply them by the image size")  # fmt: skip
     if (empty | outside).sum() > MOSTLY * count:
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the {image}: x, y, w, h where x1, y1, x2, y2 is expected, or another video?"
+            f"the image of {found.size}: x, y, w, h where x1, y1, x2, y2 is expected, or another "
+            "video?"
         )
-    if beyond.sum() > MOSTLY * count:
-        rows.messages.append(f"{beyond.sum()} of {count} boxes reach far beyond the {image}: made "
-                             "at another size, or x, y, w, h read as x1, y1, x2, y2?")  # fmt: skip
-    for bad, what in ((empty, "without area"), (outside, "wholly outside the image")):
+    numbers = _shortened(np.unique(found.frame[missing]).tolist())
+    text = f"of frames that the video has not (0-based: {numbers}; it has {frame_count or 'some'})"
+    if count and missing.all():
+        raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
+    for bad, what in ((empty, "without area"), (outside, "wholly outside the image"),
+                      (missing, text)):  # fmt: skip
         if bad.any():
-            first = f"{rows.unit} {rows.line[bad][0]}"
-            rows.messages.append(f"{bad.sum()} boxes {what} dropped, the first at {first}")
-    return np.logical_not(empty | outside)
-
-
-def _real_frames(rows: _Rows, path: Path, video: Video) -> BoolArray:
-    """Return which detections belong to a frame of the video; refuse a file where none does."""
-    count = video.frame_count or sys.maxsize  # unknown: all may exist
-    real = np.logical_and(rows.frame >= 0, rows.frame < count)
-    if real.all():
-        return real
-    numbers = np.unique(rows.frame[~real])
-    text = (f"{(~real).sum()} detections of {len(numbers)} frames that the video has not (0-based: "
-            f"{_shortened(numbers.tolist())}; it has {video.frame_count or 'some'})")  # fmt: skip
-    if not real.any():
-        raise ReobjError(f"{path}: {text}: detections of another video?")
-    rows.messages.append(text + " ignored")
-    return real
-
-
-def _unit_scores(rows: _Rows) -> Array:
-    """Return scores in [0, 1]: all -1: none given; percentages are divided; the rest is clipped."""
-    score = rows.score
-    bad = (score < 0) | (score > 1)
-    if not bad.any():
-        return score
-    if (score == -1).all():
-        rows.messages.append("scores are all -1: taken as 1")
-        return np.ones_like(score)
-    if score.min() >= 0 and np.median(score) > NORMALISED_MAX and score.max() <= 100:
-        rows.messages.append(f"scores up to {score.max():g}: taken as percentages")
-        return score / 100
-    rows.messages.append(f"{bad.sum()} scores outside [0, 1] clipped, such as {score[bad][0]:g}")
-    return np.clip(score, 0, 1)
+            first = f"{found.unit} {found.line[bad][0]}"
+            found.messages.append(f"{bad.sum()} boxes {what} dropped, the first at {first}")
+    return np.logical_not(empty | outside | missing)
 
 
 def _class_filter(wanted: str, names: Sequence[str]) -> IntArray:
@@ -1527,17 +1260,16 @@ def _pack(
     frames: Sequence[tuple[int, Detections]], names: Sequence[str], size: tuple[int, int]
 ) -> dict[str, Any]:
     """Return the arrays of our npz format."""
-    runs, lengths = [np.empty(0, np.uint32)], [np.zeros(1, np.int64)]
-    for _, found in frames:
-        counts, offsets = np.empty(0, np.uint32), np.zeros(len(found) + 1, np.int64)
-        if found.masks is not None:
-            expected = (len(found), size[1], size[0])
-            if found.masks.shape != expected:
-                raise ReobjError(f"masks are {found.masks.shape}, expected (D, H, W) = {expected}")
-            counts, offsets = rle_encode(found.masks)
-        runs.append(counts)
-        lengths.append(np.diff(offsets))
     parts = [Detections.empty(), *(found for _, found in frames)]
+    runs = [NO_RUNS]
+    for found in parts:
+        expected = (len(found), size[1], size[0])
+        if found.masks is None:
+            runs += [NO_RUNS] * len(found)
+        elif found.masks.shape != expected:
+            raise ReobjError(f"masks are {found.masks.shape}, expected (D, H, W) = {expected}")
+        else:
+            runs += map(rle_encode, found.masks)
     return {
         "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
         "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
@@ -1546,7 +1278,7 @@ def _pack(
         "class_names": np.array(list(names), np.str_),
         "image_size": np.array(size, np.int64),
         "mask_counts": np.concatenate(runs),
-        "mask_offsets": np.cumsum(np.concatenate(lengths)),
+        "mask_offsets": np.cumsum([len(run) for run in runs]),
     }
 
 
@@ -1557,7 +1289,7 @@ def _save_npz(path: Path, arrays: dict[str, Any]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)
-        os.replace(temporary, path)
+        temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise ReobjError(f"{path}: cannot be written ({error.strerror})") from error
@@ -1582,37 +1314,25 @@ class DetectionCache:
 
     def __init__(self, folder: str | Path, image_size: tuple[int, int]) -> None:
         self.folder, self.image_size = Path(folder), image_size
-        self._stored: dict[int, tuple[dict[str, Any], slice]] = {}
+        self._stored: dict[int, RecordedDetections] = {}
         self._fresh: dict[int, Detections] = {}
         chunks = sorted(self.folder.glob("chunk_*.npz"))
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
             self._load(path)
 
-    def __len__(self) -> int:
-        return len(self._stored.keys() | self._fresh.keys())
-
     def _load(self, path: Path) -> None:
         try:
-            chunk = _load_npz(path)
-            if tuple(chunk["image_size"]) != self.image_size:
-                raise ReobjError(f"{path}: made for frames of another size")
-            ends = np.cumsum([0, *chunk["done_count"]])
-        except (ReobjError, KeyError) as error:
+            chunk, done = _read_npz(path, self.image_size, self.image_size)
+            self._stored |= dict.fromkeys(done.tolist(), chunk)
+        except ReobjError as error:
             log.warning("%s; its frames are detected again", error)
-            return
-        for index, low, high in zip(chunk["done"].tolist(), ends[:-1], ends[1:], strict=True):
-            self._stored[index] = (chunk, slice(low, high))
 
     def get(self, index: int) -> Detections | None:
         """Return the stored detections of a frame, None if it was not detected yet."""
         if index in self._fresh or index not in self._stored:
             return self._fresh.get(index)
-        chunk, of = self._stored[index]
-        rows = np.arange(of.start, of.stop)
-        counts, offsets = _pick_runs(chunk["mask_counts"], chunk["mask_offsets"], rows)
-        masks = rle_decode(counts, offsets, self.image_size) if len(counts) else None
-        return Detections(chunk["xyxy"][of], chunk["score"][of], chunk["class_id"][of], masks)
+        return self._stored[index].at(index)
 
     def put(self, index: int, detections: Detections) -> None:
         """Store the detections of a frame, also when there are none."""
@@ -1625,16 +1345,15 @@ class DetectionCache:
         if not self._fresh:
             return
         frames = sorted(self._fresh.items())
-        done = {"done": np.array([i for i, _ in frames]),
-                "done_count": np.array([len(found) for _, found in frames])}  # fmt: skip
         path = self.folder / f"chunk_{self._next:06d}.npz"
+        done = {"done": np.array([index for index, _ in frames])}
         _save_npz(path, _pack(frames, [], self.image_size) | done)
         self._next += 1
         self._fresh.clear()
         self._load(path)
 
 
-# ---- Detections: ONNX ----------------------------------------------------------------------------
+# ---- Detections: ONNX --------------------------------------------------------------------------
 
 PAD_VALUE = 114  # grey of letterbox borders (YOLOX, Ultralytics)
 DYNAMIC_SIDE = 640  # longer side for models that take any size (YOLO11 was trained so)
@@ -1643,7 +1362,7 @@ PRE_NMS = 1000  # best candidates that enter NMS
 GFL_BINS = 8  # distance bins of NanoDet-Plus and PicoDet (reg_max 7)
 YOLO_STRIDES, GFL_STRIDES = (8, 16, 32), (8, 16, 32, 64)
 RAW_YOLOX_MAX = 8.0  # median |x, y| of raw YOLOX is below 2, of decoded boxes half the image
-ZOO_MASK = (28, 28)  # masks of Mask R-CNN that cover their box
+RCNN_MASK = (28, 28)  # masks of Mask R-CNN that cover their box
 IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # RGB
 NANODET_STD = (57.375, 57.12, 58.395)  # BGR
 CAFFE_MEAN = (102.9801, 115.9465, 122.7717)  # BGR
@@ -1664,7 +1383,7 @@ class _Geometry:
 
 
 @dataclass(frozen=True, slots=True)
-class _Candidates:
+class _Found:
     """What a decoder finds: boxes in the image, and what makes the masks of chosen rows."""
 
     xyxy: Array
@@ -1674,27 +1393,22 @@ class _Candidates:
 
 
 @dataclass(frozen=True, slots=True)
-class _Signature:
-    """Inputs (name, shape, type) and outputs (name, shape, kind) of a model, from a trial run."""
+class _Trial:
+    """What a trial run tells: the outputs, for how many inputs and which (w, h)."""
 
-    inputs: list[tuple[str, list[Any], str]]
-    outputs: list[tuple[str, tuple[int, ...], str]]
-    input_size: tuple[int, int]
-
-    @property
-    def shapes(self) -> list[tuple[int, ...]]:
-        return [shape for _, shape, _ in self.outputs]
+    outputs: list[Any]
+    inputs: int
+    size: tuple[int, int]
 
     @property
     def rows(self) -> tuple[int, int]:
-        """(rows, columns) of the only output (1, rows, columns), else (0, 0)."""
-        shape = [shape for shape in self.shapes if len(shape) == 3]
-        others = any(len(shape) != 4 for shape in self.shapes if len(shape) != 3)
-        return (shape[0][1], shape[0][2]) if len(shape) == 1 and not others else (0, 0)
+        """(rows, columns) of the first output if it is the only one but for masks, else (0, 0)."""
+        first, *others = (output.shape for output in self.outputs)
+        single = len(first) == 3 and all(len(shape) == 4 for shape in others)
+        return (first[1], first[2]) if single else (0, 0)
 
     def anchors(self, strides: Sequence[int]) -> int:
-        width, height = self.input_size
-        return sum(math.ceil(width / s) * math.ceil(height / s) for s in strides)
+        return sum(math.ceil(self.size[0] / s) * math.ceil(self.size[1] / s) for s in strides)
 
 
 @dataclass(frozen=True, slots=True)
@@ -1704,21 +1418,19 @@ class _Layout:
     Attributes:
         fit: "stretch" to the input, or keep the aspect with the image in the "corner" or "centre".
         mean, std: of 0..255 values, in the order that the network wants. nms: its boxes need NMS.
-        first: label of the first class. coco91: labels are COCO's category ids.
-        classes: number of classes (0: the model does not tell).
+        first: label of the first class. classes: number of classes (0: the model does not tell).
     """
 
     name: str
-    accepts: Callable[[_Signature], bool]
-    decode: Callable[[list[Any], _Geometry], _Candidates]
+    accepts: Callable[[_Trial], bool]
+    decode: Callable[[list[Any], _Geometry], _Found]
     fit: str = "stretch"
     rgb: bool = True
     mean: tuple[float, ...] = (0.0, 0.0, 0.0)
     std: tuple[float, ...] = (255.0, 255.0, 255.0)
-    nms: bool = False
+    nms: bool = True
     first: int = 0
-    coco91: bool = False
-    classes: Callable[[_Signature], int] = lambda signature: 0
+    classes: Callable[[_Trial], int] = lambda trial: 0
 
 
 def _fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, _Geometry]:
@@ -1744,7 +1456,7 @@ def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[Array, Array]:
     return np.concatenate(cells), np.concatenate(stride)
 
 
-def _corners(centers: Array) -> Array:
+def _box_corners(centers: Array) -> Array:
     """Convert (N, 4+) centre x, y, width, height to (N, 4) corners."""
     half = centers[:, 2:4] / 2
     return np.hstack([centers[:, :2] - half, centers[:, :2] + half])
@@ -1752,19 +1464,19 @@ def _corners(centers: Array) -> Array:
 
 def _best_class(scores: Array) -> tuple[Array, IntArray]:
     """Return the best score of each row of (N, C), and its class."""
-    best = scores.argmax(1).astype(np.int64)
-    return scores[np.arange(len(scores)), best].astype(np.float64), best
+    return scores.max(1).astype(np.float64), scores.argmax(1).astype(np.int64)
 
 
-def _decode_detr(outs: list[Any], geometry: _Geometry) -> _Candidates:
-    """Labels, boxes, scores; boxes in pixels of the image, whose size was an input."""
-    boxes = next(o for o in outs if o.ndim == 3)[0]
-    labels = next(o for o in outs if o.ndim == 2 and o.dtype.kind == "i")[0]
-    scores = next(o for o in outs if o.ndim == 2 and o.dtype.kind == "f")[0]
-    return _Candidates(boxes.astype(np.float64), scores.astype(np.float64), labels.astype(np.int64))
+def _pick_outputs(outs: list[Any]) -> tuple[Array, Array, IntArray]:
+    """Return boxes (N, 4), scores (N,) and integer labels (N,) of a model with those outputs."""
+    boxes = next(o for o in outs if o.ndim in (2, 3) and o.shape[-1] == 4).reshape(-1, 4)
+    flat = [o.ravel() for o in outs if o.ndim < 3 and o.size == len(boxes)]
+    labels = next(o for o in flat if o.dtype.kind == "i")
+    scores = next(o for o in flat if o.dtype.kind == "f")
+    return boxes.astype(np.float64), scores.astype(np.float64), labels.astype(np.int64)
 
 
-def _decode_yolox(outs: list[Any], geometry: _Geometry) -> _Candidates:
+def _decode_yolox(outs: list[Any], geometry: _Geometry) -> _Found:
     """Centre, log size, objectness and classes of each cell, or the same already decoded."""
     rows = outs[0][0].astype(np.float64)  # (A, 5 + C)
     if np.median(np.abs(rows[:, :2])) < RAW_YOLOX_MAX:
@@ -1772,18 +1484,16 @@ def _decode_yolox(outs: list[Any], geometry: _Geometry) -> _Candidates:
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
     score, label = _best_class(rows[:, 5:])
-    return _Candidates(geometry.to_image(_corners(rows)), score * rows[:, 4], label)
+    return _Found(geometry.to_image(_box_corners(rows)), score * rows[:, 4], label)
 
 
-def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Candidates:
+def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Found:
     """Columns of centre, size, class scores[, mask coefficients]; mask prototypes (YOLOv8, 11)."""
-    rows = next(o for o in outs if o.ndim == 3)[0].T  # (A, 4 + C [+ 32])
-    proto = next((o[0] for o in outs if o.ndim == 4), None)  # (32, h, w)
-    end = rows.shape[1] - (0 if proto is None else len(proto))
+    rows = outs[0][0].T  # (A, 4 + C [+ 32])
+    proto = next((o[0] for o in outs[1:]), np.empty((0, 1, 1)))  # (32, h, w)
+    end = rows.shape[1] - len(proto)
     score, label = _best_class(rows[:, 4:end])
-    boxes = geometry.to_image(_corners(rows))
-    if proto is None:
-        return _Candidates(boxes, score, label)
+    boxes = geometry.to_image(_box_corners(rows))
     ratio = np.divide(proto.shape[:0:-1], geometry.input_size)  # (2,) map / input
 
     def masks(chosen: IntArray) -> BoolArray:
@@ -1791,75 +1501,46 @@ def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Candidates:
         scale, pad = ratio * geometry.scale, ratio * geometry.pad
         return _paste(maps, boxes[chosen], geometry.image_size, scale, pad, 0.0)
 
-    return _Candidates(boxes, score, label, masks)
+    return _Found(boxes, score, label, masks if len(proto) else None)
 
 
-def _decode_end_to_end(outs: list[Any], geometry: _Geometry) -> _Candidates:
-    """Rows of corners in the input, score, class (YOLOv10, and YOLO exported with NMS)."""
-    rows = outs[0][0].astype(np.float64)  # (N, 6)
-    return _Candidates(geometry.to_image(rows[:, :4]), rows[:, 4], rows[:, 5].astype(np.int64))
+def _decode_gfl(outs: list[Any], geometry: _Geometry) -> _Found:
+    """Class scores and distance bins of each cell (Generalized Focal Loss, Li et al. 2020).
 
-
-def _decode_gfl(scores: Array, bins: Array, geometry: _Geometry, strides: Sequence[int],
-                center: float) -> _Candidates:  # fmt: skip
-    """Class scores and distance bins of each cell (Generalized Focal Loss, Li et al. 2020)."""
+    NanoDet-Plus: rows of both, distances from the cell's corner. PicoDet: scores by level, then
+    bins by level, distances from the cell's centre.
+    """
+    if len(outs) == 1:
+        levels, center = len(GFL_STRIDES), 0.0
+        scores, bins = np.split(outs[0][0], [-4 * GFL_BINS], 1)
+    else:
+        levels, center = len(outs) // 2, 0.5
+        scores, bins = (np.concatenate(part, 1)[0] for part in (outs[:levels], outs[levels:]))
     score, label = _best_class(scores)
     keep = np.argsort(-score, kind="stable")[:PRE_NMS]  # bins of the rest are not worth it
-    cells, stride = (values[keep] for values in _grid(geometry.input_size, strides))
+    cells, stride = (v[keep] for v in _grid(geometry.input_size, GFL_STRIDES[:levels]))
     logits = bins[keep].reshape(-1, 4, GFL_BINS).astype(np.float64)
     weight = np.exp(logits - logits.max(2, keepdims=True))
     distance = weight @ np.arange(GFL_BINS) / weight.sum(2) * stride  # (K, 4) to the sides
     xy = (cells + center) * stride
     boxes = np.hstack([xy - distance[:, :2], xy + distance[:, 2:]])
-    return _Candidates(geometry.to_image(boxes), score[keep], label[keep])
+    return _Found(geometry.to_image(boxes), score[keep], label[keep])
 
 
-def _decode_nanodet(outs: list[Any], geometry: _Geometry) -> _Candidates:
-    """Rows of class scores and bins; distances start at the cell's corner (NanoDet-Plus)."""
-    scores, bins = np.split(outs[0][0], [-4 * GFL_BINS], 1)
-    return _decode_gfl(scores, bins, geometry, GFL_STRIDES, 0.0)
-
-
-def _decode_picodet(outs: list[Any], geometry: _Geometry) -> _Candidates:
-    """Class scores by level, then bins by level; distances start at the cell's centre (PicoDet)."""
-    half = len(outs) // 2
-    scores, bins = (np.concatenate([o[0] for o in part]) for part in (outs[:half], outs[half:]))
-    return _decode_gfl(scores, bins, geometry, GFL_STRIDES[:half], 0.5)
-
-
-def _decode_with_nms(outs: list[Any], geometry: _Geometry) -> _Candidates:
-    """Boxes, labels, scores[, masks] after the model's own NMS (Mask R-CNN, SSD, torchvision)."""
-    boxes = next(o for o in outs if o.shape[-1] == 4 and o.ndim in (2, 3)).reshape(-1, 4)
-    labels = next(o for o in outs if o.dtype.kind == "i").reshape(-1).astype(np.int64)
-    floats = (o for o in outs if o.dtype.kind == "f" and o.ndim < 3 and o.shape[-1] != 4)
-    scores = next(o for o in floats if o.size == len(labels)).reshape(-1).astype(np.float64)
+def _decode_with_nms(outs: list[Any], geometry: _Geometry) -> _Found:
+    """Boxes, labels, scores[, masks that cover the box] after the model's own NMS."""
+    boxes, scores, labels = _pick_outputs(outs)
     if len(boxes) and boxes.max() <= NORMALISED_MAX:
         boxes = boxes * np.tile(geometry.input_size, 2)
-    in_image = geometry.to_image(boxes)
-    maps = next((o[:, 0] for o in outs if o.ndim == 4), None)  # (N, h, w) probabilities
-    if maps is None:
-        return _Candidates(in_image, scores, labels)
+    boxes = geometry.to_image(boxes)
+    maps = [o[:, 0] for o in outs if o.ndim == 4]  # (N, h, w) probabilities
 
     def masks(chosen: IntArray) -> BoolArray:
-        return _rcnn_masks(maps[chosen], in_image[chosen], geometry)
+        low, high = boxes[chosen, :2], boxes[chosen, 2:]
+        ratio = np.array(RCNN_MASK) / np.maximum(high - low, 1e-6)  # (K, 2)
+        return _paste(maps[0][chosen], boxes[chosen], geometry.image_size, ratio, -low * ratio, 0.5)
 
-    return _Candidates(in_image, scores, labels, masks)
-
-
-def _rcnn_masks(maps: Any, boxes: Array, geometry: _Geometry) -> BoolArray:
-    """Paste masks that cover their box, or the whole input."""
-    if maps.shape[1:] != ZOO_MASK:
-        scale, pad = np.array(geometry.scale), np.array(geometry.pad)
-        return _paste(maps, boxes, geometry.image_size, scale, pad, 0.5)
-    ratio = np.array(ZOO_MASK) / np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6)  # (K, 2)
-    return _paste(maps, boxes, geometry.image_size, ratio, -boxes[:, :2] * ratio, 0.5)
-
-
-def _decode_tensorflow(outs: list[Any], geometry: _Geometry) -> _Candidates:
-    """Boxes y1, x1, y2, x2 normalised, classes, scores, in this order (TensorFlow)."""
-    boxes, classes, scores = (o[0].astype(np.float64) for o in outs[:3])
-    pixels = boxes[:, [1, 0, 3, 2]] * np.tile(geometry.input_size, 2)
-    return _Candidates(geometry.to_image(pixels), scores, classes.astype(np.int64))
+    return _Found(boxes, scores, labels, masks if maps else None)
 
 
 def _paste(maps: Any, boxes: Array, size: tuple[int, int], ratio: Array, offset: Array,
@@ -1881,65 +1562,38 @@ def _paste(maps: Any, boxes: Array, size: tuple[int, int], ratio: Array, offset:
     return masks
 
 
-def _is_detr(s: _Signature) -> bool:
-    kinds = sorted((len(shape), kind) for _, shape, kind in s.outputs)
-    return len(s.inputs) == 2 and kinds == [(2, "f"), (2, "i"), (3, "f")]
-
-
-def _is_picodet(s: _Signature) -> bool:
-    half = len(s.shapes) // 2
-    if half not in (3, 4) or len(s.shapes) != 2 * half or any(len(x) != 3 for x in s.shapes):
-        return False
-    anchors = sum(shape[1] for shape in s.shapes[:half])
-    bins = {shape[2] for shape in s.shapes[half:]}
-    return bins == {4 * GFL_BINS} and anchors == s.anchors(GFL_STRIDES[:half])
-
-
-def _has_nms(s: _Signature) -> bool:
-    """Say whether there are boxes (.., N, 4), integer labels and float scores of the same N."""
-    flat = [(shape, kind) for _, shape, kind in s.outputs if len(shape) in (1, 2)]
-    boxes = [shape for shape in s.shapes if len(shape) in (2, 3) and shape[-1] == 4]
-    labels = [shape for shape, kind in flat if kind == "i"]
-    scores = [shape for shape, kind in flat if kind == "f" and shape in labels]
-    return len(s.inputs) == 1 and bool(boxes and scores) and boxes[0][-2] == labels[0][-1]
-
-
-def _is_zoo_rcnn(s: _Signature) -> bool:
-    masks = [shape[2:] for shape in s.shapes if len(shape) == 4]
-    return _has_nms(s) and len(s.inputs[0][1]) == 3 and masks == [ZOO_MASK]
-
-
-def _is_gfl(s: _Signature) -> bool:
-    return s.rows[0] == s.anchors(GFL_STRIDES) and s.rows[1] > 4 * GFL_BINS
-
-
-def _yolo_classes(s: _Signature) -> int:
-    """Return the columns of YOLOv8 rows that are neither box nor mask coefficients."""
-    return s.rows[0] - 4 - sum(shape[1] for shape in s.shapes if len(shape) == 4)
+def _has_nms(trial: _Trial) -> bool:
+    """Say whether there are boxes (.., N, 4), integer labels and scores of the same N."""
+    with contextlib.suppress(StopIteration):
+        return len(_pick_outputs(trial.outputs)) == 3
+    return False
 
 
 LAYOUTS: tuple[_Layout, ...] = (  # the first that accepts a model reads it
-    _Layout("DEIM, D-FINE, RT-DETR (labels, boxes, scores)", _is_detr, _decode_detr),
-    _Layout("PicoDet", _is_picodet, _decode_picodet, mean=IMAGENET_MEAN, std=IMAGENET_STD, nms=True,
-            classes=lambda s: s.shapes[0][2]),
-    _Layout("NanoDet-Plus", _is_gfl, _decode_nanodet, rgb=False, mean=IMAGENET_MEAN[::-1],
-            std=NANODET_STD, nms=True, classes=lambda s: s.rows[1] - 4 * GFL_BINS),
-    _Layout("YOLOX", lambda s: s.rows[0] == s.anchors(YOLO_STRIDES) and s.rows[1] > 5,
-            _decode_yolox, "corner", rgb=False, std=(1.0, 1.0, 1.0), nms=True,
-            classes=lambda s: s.rows[1] - 5),
+    _Layout("DEIM, D-FINE, RT-DETR (labels, boxes, scores)",
+            lambda t: t.inputs == 2 and _has_nms(t),  # the second is the image size: no scaling
+            lambda outs, geometry: _Found(*_pick_outputs(outs)), nms=False),
+    _Layout("PicoDet",
+            lambda t: len(t.outputs) in (6, 8) and t.outputs[-1].shape[2:] == (4 * GFL_BINS,),
+            _decode_gfl, mean=IMAGENET_MEAN, std=IMAGENET_STD,
+            classes=lambda t: int(t.outputs[0].shape[2])),
+    _Layout("NanoDet-Plus",
+            lambda t: t.rows[0] == t.anchors(GFL_STRIDES) and t.rows[1] > 4 * GFL_BINS,
+            _decode_gfl, rgb=False, mean=IMAGENET_MEAN[::-1], std=NANODET_STD,
+            classes=lambda t: t.rows[1] - 4 * GFL_BINS),
+    _Layout("YOLOX", lambda t: t.rows[0] == t.anchors(YOLO_STRIDES) and t.rows[1] > 5,
+            _decode_yolox, "corner", rgb=False, std=(1.0, 1.0, 1.0),
+            classes=lambda t: t.rows[1] - 5),
     _Layout("YOLOv8, YOLO11 (and -seg)",
-            lambda s: s.rows[1] == s.anchors(YOLO_STRIDES) and s.rows[0] > 4,
-            _decode_yolo, "centre", nms=True, classes=_yolo_classes),
-    _Layout("YOLOv10, YOLO with NMS", lambda s: s.rows[1] == 6 and len(s.shapes) == 1,
-            _decode_end_to_end, "centre"),
-    _Layout("Mask R-CNN of the ONNX zoo", _is_zoo_rcnn, _decode_with_nms, "corner", rgb=False,
-            mean=CAFFE_MEAN, std=(1.0, 1.0, 1.0), first=1),
-    _Layout("torchvision detection", lambda s: _has_nms(s) and len(s.inputs[0][1]) == 3,
-            _decode_with_nms, "corner", first=1, coco91=True),
+            lambda t: t.rows[1] == t.anchors(YOLO_STRIDES) and t.rows[0] > 4,
+            _decode_yolo, "centre",
+            classes=lambda t: t.rows[0] - 4 - sum(o.shape[1] for o in t.outputs[1:])),
+    _Layout("Mask R-CNN",
+            lambda t: _has_nms(t) and any(o.shape[2:] == RCNN_MASK for o in t.outputs),
+            _decode_with_nms, "corner", rgb=False, mean=CAFFE_MEAN, std=(1.0, 1.0, 1.0),
+            nms=False, first=1),
     _Layout("SSD with built-in NMS", _has_nms, _decode_with_nms, mean=IMAGENET_MEAN,
-            std=IMAGENET_STD, first=1),
-    _Layout("TensorFlow detection API", lambda s: "detection_boxes" in s.outputs[0][0],
-            _decode_tensorflow, first=1, coco91=True),
+            std=IMAGENET_STD, nms=False, first=1),
 )  # fmt: skip
 
 
@@ -1981,11 +1635,19 @@ class OnnxDetector:
         self.path = model_path(path_or_name or self.config.model, offline)
         self._session = onnx_session(self.path, threads)
         self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
-        self._planar = self._check_input()
-        signature = self._try_out()
-        self._layout = self._find_layout(signature)
+        _, shape, kind = self._inputs[0]
+        if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
+            raise self._refusal(f"input is {kind} {shape}, expected an image (1, 3, H, W)")
+        trial = self._try_out()
+        accepting = [layout for layout in LAYOUTS if layout.accepts(trial)]
+        if not accepting:
+            outputs = zip(self._session.get_outputs(), trial.outputs, strict=True)
+            found = ", ".join(f"{output.name} {array.shape}" for output, array in outputs)
+            known = "; ".join(layout.name for layout in LAYOUTS)
+            raise self._refusal(f"outputs {found}; known layouts: {known}")
+        self._layout = accepting[0]
         self.layout = self._layout.name
-        self.class_names = self._names(self._layout.classes(signature))
+        self.class_names = self._names(self._layout.classes(trial))
         wanted = self.config.classes
         self._allowed = _class_filter(wanted, self.class_names) if wanted else None
 
@@ -2004,33 +1666,24 @@ class OnnxDetector:
         masks = found.masks(keep) if found.masks is not None else None
         return Detections(boxes[keep], found.score[keep], label[keep], masks)
 
+    def _refusal(self, reason: str) -> ReobjError:
+        return ReobjError(f"{self.path}: no known object detector: {reason}")
+
     def _select(self, boxes: Array, score: Array, label: IntArray) -> IntArray:
         """Return the rows to keep, best first: by score, class, area and NMS."""
-        has_area = (boxes[:, 2:] > boxes[:, :2]).all(1)
-        good = (score >= self.config.min_score) & has_area & (label >= 0)
+        good = (score >= self.config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
+        good &= label >= 0
         if self._allowed is not None:
             good &= np.isin(label, self._allowed)
         rows = np.flatnonzero(good)
         rows = rows[np.argsort(-score[rows], kind="stable")][:PRE_NMS]
         if self._layout.nms:
-            limit = self.config.max_detections
-            rows = rows[nms(boxes[rows], label[rows], self.config.nms_iou, limit)]
+            rows = rows[nms(boxes[rows], label[rows], self.config.nms_iou)]
         return rows[: self.config.max_detections]
-
-    def _check_input(self) -> bool:
-        """Return True for a (.., 3, H, W) input, False for (1, H, W, 3); refuse anything else."""
-        name, shape, kind = self._inputs[0]
-        planar = len(shape) in (3, 4) and shape[-3] == 3
-        known = kind in ("tensor(float)", "tensor(float16)", "tensor(uint8)")
-        if not known or not (planar or (len(shape) == 4 and shape[3] == 3)):
-            found = f"input {name} is {kind} {shape}, expected an image (1, 3, H, W)"
-            raise ReobjError(f"{self.path}: no known object detector: {found}")
-        return planar
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the (w, h) that the model is fed: its own, or the image's at DYNAMIC_SIDE."""
-        dims = self._inputs[0][1][-3:]
-        own = (dims[2], dims[1]) if self._planar else (dims[1], dims[0])
+        own = self._inputs[0][1][:-3:-1]
         ratio = DYNAMIC_SIDE / max(width, height) / SIZE_MULTIPLE
         free = [max(math.ceil(round(v * ratio, 3)), 1) * SIZE_MULTIPLE for v in (width, height)]
         w, h = (a if isinstance(a, int) else b for a, b in zip(own, free, strict=True))
@@ -2040,17 +1693,14 @@ class OnnxDetector:
         self, canvas: Image, image_size: tuple[int, int], layout: _Layout
     ) -> dict[str, Any]:
         """Return the model's inputs for a fitted BGR image."""
-        name, shape, kind = self._inputs[0]
-        blob: Any = canvas[..., ::-1] if layout.rgb else canvas
-        if kind != "tensor(uint8)":
-            mean, std = np.array([layout.mean, layout.std], np.float32)
-            blob = (blob.astype(np.float32) - mean) / std
-            blob = blob.astype(np.float16) if kind == "tensor(float16)" else blob
-        blob = blob.transpose(2, 0, 1) if self._planar else blob
-        feeds = {name: np.ascontiguousarray(blob[None] if len(shape) == 4 else blob)}
+        name, shape, _ = self._inputs[0]
+        mean, std = np.array([layout.mean, layout.std], np.float32)
+        blob = (canvas[..., ::-1] if layout.rgb else canvas).astype(np.float32)
+        blob = np.ascontiguousarray(((blob - mean) / std).transpose(2, 0, 1))  # (3, H, W)
+        feeds = {name: blob[None] if len(shape) == 4 else blob}
         return feeds | {other: np.array([image_size]) for other, _, _ in self._inputs[1:]}
 
-    def _try_out(self) -> _Signature:
+    def _try_out(self) -> _Trial:
         """Run the model on a grey image to learn the shapes of its outputs."""
         size = self._input_size(DYNAMIC_SIDE, DYNAMIC_SIDE)
         grey = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
@@ -2058,20 +1708,8 @@ class OnnxDetector:
             outputs = self._session.run(None, self._feeds(grey, size, LAYOUTS[0]))
         except Exception as error:
             reason = f"a trial run with {self._inputs} failed: {str(error).splitlines()[0]}"
-            raise ReobjError(f"{self.path}: no known object detector: {reason}") from error
-        names = [output.name for output in self._session.get_outputs()]
-        arrays = [np.asarray(output) for output in outputs]
-        found = [(n, a.shape, str(a.dtype.kind)) for n, a in zip(names, arrays, strict=True)]
-        return _Signature(self._inputs, found, size)
-
-    def _find_layout(self, signature: _Signature) -> _Layout:
-        layout = next((layout for layout in LAYOUTS if layout.accepts(signature)), None)
-        if layout is None:
-            outputs = ", ".join(f"{name} {shape}" for name, shape, _ in signature.outputs)
-            known = "; ".join(layout.name for layout in LAYOUTS)
-            text = f"outputs {outputs}; known layouts: {known}"
-            raise ReobjError(f"{self.path}: no known object detector: {text}")
-        return layout
+            raise self._refusal(reason) from error
+        return _Trial([np.asarray(output) for output in outputs], len(self._inputs), size)
 
     def _names(self, count: int) -> tuple[str, ...]:
         """Return the class names: the user's, the model's own, COCO's, or numbers."""
@@ -2080,8 +1718,6 @@ class OnnxDetector:
         own = self._session.get_modelmeta().custom_metadata_map.get("names", "")
         if own.startswith("{"):
             return tuple(str(name) for _, name in sorted(ast.literal_eval(own).items()))
-        if self._layout.coco91:
-            return tuple(_coco_91_names())
         if count in (0, len(COCO_NAMES)):
             return COCO_NAMES
         log.warning("%s: %d classes without names: give a file of names with --set "
@@ -2089,35 +1725,28 @@ class OnnxDetector:
         return tuple(f"class {i}" for i in range(count))
 
 
-def nms(xyxy: Array, class_id: IntArray, max_iou: float, limit: int = sys.maxsize) -> IntArray:
-    """Return the first `limit` rows that survive greedy NMS by class; rows come best first."""
-    area = (xyxy[:, 2:] - xyxy[:, :2]).prod(1)
-    kept: list[int] = []
-    rest = np.arange(len(xyxy))
-    while len(rest) and len(kept) < limit:
-        best, rest = int(rest[0]), rest[1:]
-        kept.append(best)
-        low = np.maximum(xyxy[best, :2], xyxy[rest, :2])
-        high = np.minimum(xyxy[best, 2:], xyxy[rest, 2:])
-        inter = np.clip(high - low, 0, None).prod(1)
-        near = inter > max_iou * (area[best] + area[rest] - inter)
-        rest = rest[~(near & (class_id[rest] == class_id[best]))]
-    return np.array(kept, np.int64)
+def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
+    """Return the rows that survive greedy NMS by class; rows come best first."""
+    xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
+    rank = np.arange(len(xyxy), 0, -1)
+    kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), rank.tolist(), class_id.tolist(), 0.0, max_iou)
+    return np.sort(np.array(kept, np.int64))
 
 
 def as_detections(found: Any) -> Detections:
     """Take detections as they come: ours, (N, 6) rows, or an object like supervision's."""
-    made: Detections = found
-    if not isinstance(found, Detections) and hasattr(found, "xyxy"):
-        xyxy = np.asarray(found.xyxy, np.float64).reshape(-1, 4)
-        values = [getattr(found, key, None) for key in ("confidence", "class_id", "mask")]
+    if isinstance(found, Detections):
+        made = found
+    elif hasattr(found, "xyxy"):
+        count, masks = len(found.xyxy), getattr(found, "mask", None)
+        score, label = getattr(found, "confidence", None), getattr(found, "class_id", None)
         made = Detections(
-            xyxy,
-            np.ones(len(xyxy)) if values[0] is None else np.asarray(values[0], np.float64),
-            np.zeros(len(xyxy), np.int64) if values[1] is None else np.asarray(values[1], np.int64),
-            None if values[2] is None else np.asarray(values[2], bool),
+            np.asarray(found.xyxy, np.float64).reshape(-1, 4),
+            np.asarray(np.ones(count) if score is None else score, np.float64),
+            np.asarray(np.zeros(count) if label is None else label, np.int64),
+            None if masks is None else np.asarray(masks, bool),
         )
-    elif not isinstance(found, Detections):
+    else:
         made = Detections.from_array(found)
     masks = made.xyxy if made.masks is None else made.masks
     lengths = [len(values) for values in (made.xyxy, made.score, made.class_id, masks)]
@@ -2444,7 +2073,8 @@ def _colour_features(frame: Image) -> Floats:
 
 
 def _direction_bins(vector: Any, bins: int = 6) -> Floats:
-    """Soft histogram (h, w, bins) of the directions of vectors (h, w, 2), weighted by length <= 1."""
+    """Soft histogram (h, w, bins) of the directions of vectors (h, w, 2), weighted by length <= 1.
+    """
     length = cv2.magnitude(vector[..., 0], vector[..., 1])[..., None] + 1e-6  # (h, w, 1)
     turn = np.arange(bins) * 2 * np.pi / bins
     aligned = (vector / length) @ np.stack([np.cos(turn), np.sin(turn)]).astype(
@@ -3099,7 +2729,8 @@ def invert_rigid(b_from_a: Array) -> Array:
 
 
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
-    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; None for an empty text.
+    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; None for an
+    empty text.
 
     >>> parse_camera("500,500,320,240", (640, 480)).model
     'PINHOLE'
@@ -3137,12 +2768,15 @@ def estimate_poses(
 
     Args:
         video: a `Video`, iterated up to twice.
-        work_dir: receives `sparse/` (COLMAP model of the keyframes, native pixels) and `pycolmap.log`.
+        work_dir: receives `sparse/` (COLMAP model of the keyframes, native pixels) and
+            `pycolmap.log`.
         progress: makes the progress line of a stage from its name and total.
-        boxes_to_mask: frame number -> (N, 4) xyxy boxes of moving things in native pixels, left out of the features.
+        boxes_to_mask: frame number -> (N, 4) xyxy boxes of moving things in native pixels, left out
+            of the features.
     Returns:
-        a pose for every frame that could be located, in the reconstruction's own world and scale. A failed
-        reconstruction is no exception: all poses are NaN and `messages` say why and what helps.
+        a pose for every frame that could be located, in the reconstruction's own world and scale. A
+        failed reconstruction is no exception: all poses are NaN and `messages` say why and what
+        helps.
     """
     if getattr(video, "is_live", False):
         raise ReobjError("poses of a live camera cannot be reconstructed: record a video first, or --poses none")
@@ -3203,7 +2837,9 @@ def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class _WorkImage:
-    """One frame at working size: its place in the video, source frame number, time, BGR and gray image."""
+    """One frame at working size: its place in the video, source frame number, time, BGR and gray
+    image.
+    """
 
     place: int
     frame: int
@@ -3213,7 +2849,9 @@ class _WorkImage:
 
 
 class _WorkVideo:
-    """A video at working size; gray images are kept in memory up to `cache_mb`, beyond it the video is read again."""
+    """A video at working size; gray images are kept in memory up to `cache_mb`, beyond it the video
+    is read again.
+    """
 
     def __init__(self, video: Any, config: PosesConfig) -> None:
         self.video, self.config, self.used_mb = video, config, 0.0
@@ -3245,7 +2883,9 @@ class _WorkVideo:
 
 
 def _klt(old: Image, new: Image, xy: Array, config: PosesConfig) -> tuple[Array, BoolArray]:
-    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back to where they began."""
+    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back to where
+    they began.
+    """
     if not len(xy):
         return xy, np.zeros(0, bool)
     start = xy.astype(np.float32).reshape(-1, 1, 2)
@@ -3270,7 +2910,9 @@ class _FlowSinceKeyframe:
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
     def step(self, gray: Image) -> tuple[float, float]:
-        """Follow into the next frame: median flow since the keyframe over the width, share of corners left."""
+        """Follow into the next frame: median flow since the keyframe over the width, share of
+        corners left.
+        """
         if self.count < self.config.min_corners:  # textureless so far: a keyframe as soon as there is something
             return 0.0, float(len(self.corners(gray)) < self.config.min_corners)
         ahead, kept = _klt(self.gray, gray, self.at, self.config)
@@ -3280,10 +2922,11 @@ class _FlowSinceKeyframe:
 
 
 def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_WorkImage]:
-    """Choose keyframes by optical flow, the sharpest near the threshold; the first and the last frame are among them.
+    """Choose keyframes by optical flow, the sharpest near the threshold; the first and the last
+    frame are among them.
 
-    When there are more than `max_keyframes`, every second one is dropped and the spacing doubles: one pass, bounded
-    memory, the same choice every time.
+    When there are more than `max_keyframes`, every second one is dropped and the spacing doubles:
+    one pass, bounded memory, the same choice every time.
     """
     keys: list[_WorkImage] = []
     again: deque[_WorkImage] = deque()  # frames behind a chosen one, to be looked at again
@@ -3316,7 +2959,8 @@ def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_Wo
 def _locate_between(
     model: _SparseModel, places: IntArray, video: _WorkVideo, config: PosesConfig, line: Progress
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Locate every frame by PnP from points followed from the registered keyframes before and after it.
+    """Locate every frame by PnP from points followed from the registered keyframes before and after
+    it.
 
     Args:
         places: (R,) place in the video of each registered keyframe, ascending.
@@ -3348,8 +2992,8 @@ def _segments(
 ) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
     """Cut the video at the registered keyframes.
 
-    Yields rows of the keyframes before and after (-1: none), and (place, image) of both and of all between. Of
-    stretches without a keyframe that are longer than `longest`, the middle is left out.
+    Yields rows of the keyframes before and after (-1: none), and (place, image) of both and of all
+    between. Of stretches without a keyframe that are longer than `longest`, the middle is left out.
     """
     row_of = {int(place): row for row, place in enumerate(places)}
     before, run = -1, deque[tuple[int, Image]](maxlen=longest)
@@ -3364,7 +3008,8 @@ def _segments(
 
 
 def _follow(model: _SparseModel, row: int, images: list[Image], config: PosesConfig) -> list[tuple[IntArray, Array]]:
-    """Follow the longest-seen 3D points of a keyframe (row; -1: none) from the first image through the others.
+    """Follow the longest-seen 3D points of a keyframe (row; -1: none) from the first image through
+    the others.
 
     Returns:
         per image: rows of `model.points` (n,) and their native pixels (n, 2), COLMAP convention.
@@ -3382,7 +3027,9 @@ def _follow(model: _SparseModel, row: int, images: list[Image], config: PosesCon
 
 
 def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
-    """Mark frames whose centre is a detour: much further from both neighbours than these are from each other."""
+    """Mark frames whose centre is a detour: much further from both neighbours than these are from
+    each other.
+    """
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     jump = np.zeros(len(cam_from_world), bool)
     if len(known) > 2:
@@ -3396,7 +3043,8 @@ def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
 def fill_gaps(
     frame: IntArray, cam_from_world: Array, status: npt.NDArray[np.str_], max_gap: int
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line; never beyond.
+    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line;
+    never beyond.
 
     (Interpolating t of cam_from_world instead would bend the path.)
     """
@@ -3440,7 +3088,9 @@ def _run_sfm(
     work_dir: Path,
     progress: Callable[[str, int], Progress],
 ) -> list[str]:
-    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why and what helps."""
+    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why and
+    what helps.
+    """
     folder = work_dir / "mapping"
     for old in (work_dir / "sparse", folder):
         shutil.rmtree(old, ignore_errors=True)
@@ -3466,7 +3116,9 @@ def _run_sfm(
 
 
 def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Progress]) -> list[str]:
-    """Run `_sfm_child` in a fresh interpreter, so that neither an abort nor chatter of COLMAP reaches the user."""
+    """Run `_sfm_child` in a fresh interpreter, so that neither an abort nor chatter of COLMAP
+    reaches the user.
+    """
     here = Path(__file__).resolve()
     command = [sys.executable, "-c", _CHILD_CODE, here.stem, str(here), str(here.parent), str(folder)]
     lines: list[Progress] = []
@@ -3493,7 +3145,9 @@ def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Prog
 
 
 def _sfm_child(folder_name: str) -> None:
-    """Child process: reconstruct the keyframes of a job folder; writes messages.json and, if it went well, sparse/."""
+    """Child process: reconstruct the keyframes of a job folder; writes messages.json and, if it
+    went well, sparse/.
+    """
     pc = _pycolmap()
     pc.logging.minloglevel = 0  # stderr is the log file here
     folder = Path(folder_name)
@@ -3577,7 +3231,9 @@ def _read_model(folder: Path) -> _SparseModel:
 
 
 def _absolute_pose(xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig) -> Array | None:
-    """PnP: cam_from_world (3, 4) from native pixels (n, 2) of world points (n, 3); None if it is not to be trusted."""
+    """PnP: cam_from_world (3, 4) from native pixels (n, 2) of world points (n, 3); None if it is
+    not to be trusted.
+    """
     if len(xy) < config.pnp_min_inliers:
         return None
     error_px = config.pnp_error_px * camera.width / work_width
@@ -3593,7 +3249,9 @@ def _absolute_pose(xy: Array, points: Array, camera: Camera, work_width: int, co
 
 
 def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: PosesConfig) -> list[Image]:
-    """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database; returns descriptors."""
+    """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database;
+    returns descriptors.
+    """
     kept = []
     pc, size = _pycolmap(), (images.shape[2], images.shape[1])
     if job["camera"] is not None:
@@ -3622,7 +3280,9 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
 
 
 def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np.float32], Image]:
-    """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2) and descriptors (N, 128) uint8."""
+    """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2) and descriptors (N, 128)
+    uint8.
+    """
     gray = cv2.cvtColor(np.ascontiguousarray(bgr), cv2.COLOR_BGR2GRAY)
     mask = np.full(gray.shape, 255, np.uint8)
     for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
@@ -3640,7 +3300,9 @@ def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np
 
 
 def _sfm_match(database: Path, descriptors: list[Image], config: PosesConfig) -> None:
-    """Match all pairs of a few keyframes, else each with those at offsets 1, 2, 4, 8 ... and with its look-alikes."""
+    """Match all pairs of a few keyframes, else each with those at offsets 1, 2, 4, 8 ... and with
+    its look-alikes.
+    """
     pc, count = _pycolmap(), len(descriptors)
     verify = {"ransac": {"random_seed": config.seed}}  # without the seed two runs differ
     options: dict[str, Any] = {"verification_options": verify, "device": pc.Device.cpu}
@@ -3657,7 +3319,9 @@ def _sfm_match(database: Path, descriptors: list[Image], config: PosesConfig) ->
 
 
 def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[int, int]]:
-    """Find the pairs of keyframes that look most alike, for loops. Ref: VLAD, Jegou et al., CVPR 2010."""
+    """Find the pairs of keyframes that look most alike, for loops. Ref: VLAD, Jegou et al., CVPR
+    2010.
+    """
     features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
     sample = features[:: max(1, len(features) // config.loop_sample)]
     if len(sample) < config.loop_words:
@@ -3749,7 +3413,9 @@ def _sfm_fixed_focal(database: Path, count: int, config: PosesConfig) -> _Attemp
 
 
 def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> _Attempt:
-    """Run a mapper on `count` keyframes, measure its largest model and name its first problem ("": it is sound)."""
+    """Run a mapper on `count` keyframes, measure its largest model and name its first problem ("":
+    it is sound).
+    """
     models = _sfm_map(database, rung, fixed, count, config)
     if not models:
         return _Attempt()
@@ -3775,7 +3441,8 @@ def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: Pos
 
 
 def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
-    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics."""
+    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics.
+    """
     pc, out = _pycolmap(), database.parent / rung
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
@@ -3796,7 +3463,9 @@ def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesCo
 
 
 def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> tuple[float, float]:
-    """Median over points of the widest triangulation angle (degrees), and median distance from the cameras."""
+    """Median over points of the widest triangulation angle (degrees), and median distance from the
+    cameras.
+    """
     ids = sorted(model.point3D_ids())
     angles, depths = [0.0][: not ids], [0.0][: not ids]
     for point_id in ids[:: max(1, len(ids) // sample)]:
@@ -3810,9 +3479,11 @@ def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> t
 
 
 def _sfm_parallax_px(model: Any) -> float:
-    """Measure what pure turns cannot explain: median residual of the best turn, upper quartile over image pairs.
+    """Measure what pure turns cannot explain: median residual of the best turn, upper quartile over
+    image pairs.
 
-    A model of a camera that only turned looks sound otherwise: a wrong focal length makes up triangulation angles.
+    A model of a camera that only turned looks sound otherwise: a wrong focal length makes up
+    triangulation angles.
     """
     rays: dict[int, dict[int, Array]] = {}
     for image_id in sorted(model.reg_image_ids()):
@@ -3833,7 +3504,9 @@ def _sfm_parallax_px(model: Any) -> float:
 
 
 def _sfm_write(model: Any, images: Any, folder: Path, names: list[str], native: tuple[int, int]) -> None:
-    """Write a COLMAP model in native pixels with the real names; points get the colour of their first observation."""
+    """Write a COLMAP model in native pixels with the real names; points get the colour of their
+    first observation.
+    """
     height, width = images.shape[1:3]
     for point_id in model.point3D_ids():
         point = model.point3D(point_id)
@@ -3871,7 +3544,8 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
     """Read poses made elsewhere, in the format `config.fmt` (auto: recognised).
 
     Args:
-        path: file or folder; video: the frames they belong to; config: its `camera` overrides the file's intrinsics.
+        path: file or folder; video: the frames they belong to; config: its `camera` overrides the
+            file's intrinsics.
     Returns:
         poses of the frames that the file knows, NaN for the others (counted in `messages`).
     """
@@ -3914,8 +3588,10 @@ def _pose_format(path: Path) -> str:
     return counts[rows.shape[1]]
 
 
-def _number_rows(path: Path, columns: tuple[int, ...], expected: str) -> tuple[Array, list[str]]:
-    """Read a table of finite numbers (N, C), C in `columns`, and where each row is (for messages)."""
+def _number_rows(
+    path: Path, columns: tuple[int, ...], expected: str, finite: bool = True
+) -> tuple[Array, list[str]]:
+    """Read a table of numbers (N, C), C in `columns`, and where each row is (for messages)."""
     rows: list[list[float]] = []
     where = []
     for number, text in enumerate(_lines(path), 1):
@@ -3928,7 +3604,7 @@ def _number_rows(path: Path, columns: tuple[int, ...], expected: str) -> tuple[A
             raise ReobjError(f"{at}: {text.strip()[:60]!r} is not a row of numbers; expected {expected}") from None
         if len(row) not in columns or (rows and len(row) != len(rows[0])):
             raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
-        if not np.isfinite(row).all():
+        if finite and not np.isfinite(row).all():
             raise ReobjError(f"{at}: a number is not finite; leave out the rows of frames without a pose")
         rows.append(row)
         where.append(at)
@@ -3955,7 +3631,9 @@ def _json_object(path: Path) -> dict[str, Any]:
 
 
 def _rigid(matrix: Array, where: Sequence[str]) -> Array:
-    """Check rigid transforms (N, 3 or 4, 4) and return (N, 3, 4) with exact rotations; rows of NaN or inf: NaN."""
+    """Check rigid transforms (N, 3 or 4, 4) and return (N, 3, 4) with exact rotations; rows of NaN
+    or inf: NaN.
+    """
     lost = ~np.isfinite(matrix).all((1, 2))
     matrix = np.where(lost[:, None, None], np.eye(4)[: matrix.shape[1]], matrix)
     rotation = matrix[:, :3, :3]
@@ -3978,7 +3656,10 @@ def _refuse(bad: BoolArray, where: Sequence[str], problem: str) -> None:
 
 
 def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
-    """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations (N, 3)."""
+    """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations
+    (N, 3).
+    """
+    _refuse(~np.isfinite(np.column_stack([xyzw, translation])).all(1), where, "a number is not finite")
     norm = np.linalg.norm(xyzw, axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
     _refuse(np.abs(norm - 1) > PosesConfig().pose_tolerance, where, what)
@@ -3986,7 +3667,9 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
 
 
 def _given_tum(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam, xyzw; metres unless our own header says otherwise."""
+    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam, xyzw; metres unless our own header
+    says otherwise.
+    """
     rows, where = _number_rows(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
     metric = not any(line.startswith("#") and _NO_SCALE in line for line in _lines(path))
@@ -3997,7 +3680,9 @@ _NO_SCALE = "units: arbitrary"
 
 
 def _given_kitti(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """KITTI: a row-major 3x4 (or 4x4) world_from_cam a line, one line for each frame of the source; metres."""
+    """KITTI: a row-major 3x4 (or 4x4) world_from_cam a line, one line for each frame of the source;
+    metres.
+    """
     rows, where = _number_rows(path, (12, 16), "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam")
     return _GivenPoses(invert_rigid(_rigid(rows.reshape(len(rows), -1, 4), where)), metric=True)
 
@@ -4013,7 +3698,9 @@ _CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 
 
 def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """Record3D metadata: `poses` [qx qy qz qw tx ty tz] world_from_cam in OpenGL axes, `K` column-major; y up."""
+    """Record3D metadata: `poses` [qx qy qz qw tx ty tz] world_from_cam in OpenGL axes, `K`
+    column-major; y up.
+    """
     data = _json_object(path)
     try:
         rows = np.array(data["poses"], np.float64).reshape(-1, 7)
@@ -4028,14 +3715,16 @@ def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
 
 
 def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """ScanNet `pose/<frame>.txt` (also 7-Scenes `*.pose.txt`): 4x4 world_from_cam, metres; inf: lost frame; z up."""
+    """ScanNet `pose/<frame>.txt` (also 7-Scenes `*.pose.txt`): 4x4 world_from_cam, metres; inf:
+    lost frame; z up.
+    """
     folder = path / "pose" if (path / "pose").is_dir() else path
     files = sorted(file for file in folder.glob("*.txt") if file.stem[-1:].isdigit() or file.stem.endswith(".pose"))
     if not files:
         raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
-    tables = [np.array([line.split() for line in _lines(file) if line.strip()], object) for file in files]
-    _refuse(np.array([t.shape != (4, 4) for t in tables]), [str(f) for f in files], "expected 4 rows of 4 numbers")
-    world_from_cam = _rigid(np.array(tables, np.float64), [str(file) for file in files])
+    tables = [_number_rows(file, (4,), "4 rows of 4 numbers", finite=False)[0] for file in files]
+    _refuse(np.array([len(t) != 4 for t in tables]), [str(f) for f in files], "expected 4 rows of 4 numbers")
+    world_from_cam = _rigid(np.array(tables), [str(file) for file in files])
     intrinsic = path / "intrinsic" / "intrinsic_color.txt"
     camera = None
     if intrinsic.exists():
@@ -4049,7 +3738,8 @@ def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
 def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
     """transforms.json of nerfstudio or instant-ngp: world_from_cam in OpenGL axes; scale unknown.
 
-    nerfstudio turned the world by `applied_transform`; this is undone: T_cv = inv(A) T diag(1, -1, -1, 1).
+    nerfstudio turned the world by `applied_transform`; this is undone: T_cv = inv(A) T diag(1, -1,
+    -1, 1).
     """
     path = path / "transforms.json" if path.is_dir() else path
     data = _json_object(path)
@@ -4087,7 +3777,9 @@ def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | 
 
 
 def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
-    """The one camera of all images; slightly different ones (autofocus) are replaced by the median one."""
+    """The one camera of all images; slightly different ones (autofocus) are replaced by the median
+    one.
+    """
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
     if not found:
         return None
@@ -4105,7 +3797,9 @@ _COLMAP_PARAMS = {
 
 
 def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """COLMAP model, text or binary (preferred), with or without rigs: cam_from_world; scale unknown."""
+    """COLMAP model, text or binary (preferred), with or without rigs: cam_from_world; scale
+    unknown.
+    """
     start = path if path.is_dir() else path.parent
     folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
     for suffix, read in ((".bin", _colmap_binary), (".txt", _colmap_text)):
@@ -4129,10 +3823,12 @@ def _colmap_binary(folder: Path) -> _GivenPoses:
 def _colmap_text(folder: Path) -> _GivenPoses:
     cameras = {}
     for at, words in _word_rows(folder / "cameras.txt"):
-        count = _COLMAP_PARAMS.get(words[1] if len(words) > 3 else "")
-        if count is None or len(words) != 4 + count:
+        try:
+            cameras[words[0]] = Camera(words[1], int(words[2]), int(words[3]), tuple(float(w) for w in words[4:]))
+        except (ValueError, IndexError):
+            words = []
+        if len(words) != 4 + _COLMAP_PARAMS.get((*words, "", "")[1], -5):
             raise ReobjError(f"{at}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] with a known model, all parameters")
-        cameras[words[0]] = Camera(words[1], int(words[2]), int(words[3]), tuple(float(w) for w in words[4:]))
     rows, where, names, used, points_next = [], [], [], [], False
     for at, words in _word_rows(folder / "images.txt", blank=True):
         points_line = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
@@ -4151,10 +3847,20 @@ def _colmap_text(folder: Path) -> _GivenPoses:
         raise ReobjError(f"{folder / 'images.txt'}: no images in it")
     table = np.array(rows)
     poses = _from_quaternions(table[:, [1, 2, 3, 0]], table[:, 4:], where)
-    file = folder / "points3D.txt"
-    points = np.array([w[1:7] for _, w in _word_rows(file)] if file.exists() else [], np.float64).reshape(-1, 6)
-    camera = _one_camera(used, folder)
+    points, camera = _colmap_text_points(folder / "points3D.txt"), _one_camera(used, folder)
     return _GivenPoses(poses, camera, tuple(names), points=points[:, :3], colors=points[:, 3:].astype(np.uint8))
+
+
+def _colmap_text_points(path: Path) -> Array:
+    """Position and colour (N, 6) of the points of a COLMAP text model."""
+    rows = []
+    for at, words in _word_rows(path) if path.exists() else ():
+        try:
+            x, y, z, red, green, blue, _ = (float(word) for word in words[1:8])
+        except ValueError:
+            raise ReobjError(f"{at}: expected POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
+        rows.append((x, y, z, red, green, blue))
+    return np.array(rows, np.float64).reshape(-1, 6)
 
 
 def _word_rows(path: Path, blank: bool = False) -> Iterator[tuple[str, list[str]]]:
@@ -4191,7 +3897,8 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
 def _rows_of_frames(
     given: _GivenPoses, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
 ) -> tuple[IntArray, list[str]]:
-    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order."""
+    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order.
+    """
     count = len(given.cam_from_world)
     messages: list[str] = []
     if given.names:
@@ -4212,7 +3919,9 @@ def _rows_of_frames(
 
 
 def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
-    """Match by path, file name or stem; otherwise by the last number in the name (from 0, or from 1 without a 0)."""
+    """Match by path, file name or stem; otherwise by the last number in the name (from 0, or from 1
+    without a 0).
+    """
     keys: list[Callable[[str], str]] = [str, lambda n: Path(n).name, lambda n: Path(n).stem]
     for key in keys:
         rows = {key(name): r for r, name in enumerate(given)}
@@ -4227,7 +3936,9 @@ def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -
 
 
 def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
-    """Match the nearest stamp within half a frame; stamps of another clock only if there is one for each frame."""
+    """Match the nearest stamp within half a frame; stamps of another clock only if there is one for
+    each frame.
+    """
     if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
         return np.arange(len(frame)), ["time stamps are of another clock than the frames: matched in order"]
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
@@ -4244,13 +3955,15 @@ def check_poses(
 ) -> str | None:
     """Find out whether poses are given in the wrong direction or with the wrong axes.
 
-    Triangulates the box centres of tracks with the poses as they are, inverted, and with OpenGL axes; the residual
-    is the angle between a ray and the direction to the point (180 deg when it is behind the camera).
+    Triangulates the box centres of tracks with the poses as they are, inverted, and with OpenGL
+    axes; the residual is the angle between a ray and the direction to the point (180 deg when it is
+    behind the camera).
 
     Args:
         tracks: per track frame numbers (n,) and centres (n, 2), native pixels.
     Returns:
-        a message that names the likely mistake if another reading explains the tracks clearly better, else None.
+        a message that names the likely mistake if another reading explains the tracks clearly
+        better, else None.
     """
     config = config or PosesConfig()
     usual = poses.cam_from_world
@@ -4281,7 +3994,9 @@ def check_poses(
 
 
 def _track_views(poses: Poses, frame: IntArray, xy: Array, config: PosesConfig) -> tuple[IntArray, Array] | None:
-    """Rows of the frames of a track that have a pose, thinned, and unit rays (n, 3) in the camera; None if too few."""
+    """Rows of the frames of a track that have a pose, thinned, and unit rays (n, 3) in the camera;
+    None if too few.
+    """
     place = np.clip(np.searchsorted(poses.frame, frame), 0, len(poses.frame) - 1)
     use = np.flatnonzero((poses.frame[place] == frame) & poses.known[place] & np.isfinite(xy).all(1))
     if len(use) < config.check_views:
@@ -4293,7 +4008,9 @@ def _track_views(poses: Poses, frame: IntArray, xy: Array, config: PosesConfig) 
 
 
 def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
-    """Meet rays (n, 3) of n cameras (n, 3, 4) in the nearest point or, if better, at infinity; median angle to it."""
+    """Meet rays (n, 3) of n cameras (n, 3, 4) in the nearest point or, if better, at infinity;
+    median angle to it.
+    """
     world_from_cam = invert_rigid(cam_from_world)
     ray, centre = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam), world_from_cam[:, :, 3]
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3) sum_i (I - d d') (X - c) = 0
@@ -4317,7 +4034,8 @@ def write_tum(path: Path, poses: Poses) -> None:
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
-    """Write a COLMAP text model of all known poses and points; pycolmap's own binary model is kept if there is one.
+    """Write a COLMAP text model of all known poses and points; pycolmap's own binary model is kept
+    if there is one.
 
     Args:
         image_names: (F,) name of every frame of `poses`.
@@ -5137,12 +4855,11 @@ class Workspace:
 
 
 def source_fingerprint(source: Any) -> str:
-    """Hash of names, sizes and modification times of a file or of a folder's files; the name itself
-    for streams.
-    """
+    """Hash of names, sizes and times of a file, a folder's files or a glob; streams: their name."""
     path = Path(str(source))
-    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-    if not path.exists():
+    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(source)))
+    files = sorted(p for p in found if p.is_file()) or [path] * path.is_file()
+    if not files:
         return str(source)
     facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
@@ -5180,7 +4897,7 @@ def run(
     seconds: dict[str, float] = {}
     poses = _supplied_poses(video, config) if "poses" in stages else None
     track = track_video(video, space, config, detections, poses, seconds)
-    if "poses" in stages and poses is None and config.poses.mode != "none":
+    if "poses" in stages and poses is None and config.poses.mode != "none" and not video.is_live:
         moving = _moving_rows(track, config.objects)
         poses = _reconstruct(video, space, config, seconds, moving)
     if poses is not None:
@@ -5195,6 +4912,8 @@ def refit(out: str | Path, config: Config | None = None) -> RunResult:
     """Link and fit again from what an output folder holds, with other options of the objects
     section.
     """
+    if not (Path(out) / "cache").is_dir():
+        raise ReobjError(f"{out}: no output folder of reobj_track; make one with `run` or `track`")
     space = Workspace(Path(out))
     track, poses = space.recall()
     source = json.loads((space.cache / "source.json").read_text())
@@ -5432,6 +5151,8 @@ def _identity_similarity(tracker: Tracker) -> Array:
 def _video_messages(video: Video, table: TrackTable) -> list[str]:
     """What the user should know about the input."""
     messages = list(video.messages)
+    if video.is_live:
+        messages.append("a live source cannot be read twice: identities only; record it for 3D")
     if not len(table):
         messages.append(
             "no object was tracked: no detections, or all below the scores of "
@@ -5675,7 +5396,8 @@ def _spans_of(rows: TrackTable) -> list[list[int]]:
 
 
 def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
-    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits."""
+    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits.
+    """
     if poses is None:
         return {"units": None, "source": "none", "registered_frames": 0, "links": []}
     scale = fits.scale if fits is not None else None
@@ -5817,7 +5539,8 @@ def _summary_world(result: RunResult) -> list[str]:
 
 
 def _options(parser: argparse.ArgumentParser, *sections: str) -> None:
-    """Add the flags that the config dataclasses declare for these sections ("" for the top level)."""
+    """Add the flags that the config dataclasses declare for these sections ("" for the top level).
+    """
     for section in sections:
         cls: Any = Config if not section else Config.__dataclass_fields__[section].default_factory
         for f in dataclasses.fields(cls):
@@ -5948,7 +5671,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
 def _add_run(sub: Any, name: str, text: str, func: Callable[[argparse.Namespace], int]) -> None:
     parser = sub.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     parser.add_argument(
-        "video", help="video file, folder of images, glob in quotes, camera index or stream URL"
+        "video", help="video file, folder of images, glob in quotes, or camera index"
     )
     parser.add_argument("-o", "--out", required=True, help="output folder")
     parser.add_argument(

