@@ -128,7 +128,7 @@ class FitConfig:
     vote_low: float = 2.5  # sigma, same below it
     min_up_objects: int = 3  # upright objects needed to trust the gravity estimate
     probe: float = 1.5  # sigma, where the cost is probed for the covariance
-    bend_weight: float = 2.0  # of q q'; second moment .75, the 95 % tail needs about 2
+    bend_weight: float = 4.0  # of q q'; its second moment is .75, the 95 % tail of nine needs more
     max_bend: float = 30.0  # sigma, limit of the bend of a principal axis
     max_widening: float = 4.0  # limit of that correction, as a factor on sigma
     smooth_cov: float = 0.05  # same for the covariance: the spread of m, near kinks
@@ -1888,8 +1888,9 @@ def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> A
 
     Along each principal axis v of the Laplace covariance the mode is displaced by +-k sigma and the
     other eight directions are re-minimised (one Gauss-Newton step): the path s v + s^2 q / 2. With
-    s ~ N(0, 1) its second moment is v v' + 3/4 q q'; where the cost along the path grows slower
-    than s^2 (kinks of box and cylinder), v is stretched. Ref: second-order delta method.
+    s ~ N(0, 1) its second moment is v v' + 3/4 q q' (`bend_weight` is more, for the tail); where
+    the cost along the path grows slower than s^2 (kinks of box and cylinder), v is stretched.
+    Ref: second-order delta method.
     """
     prob = _problems(spec, fit.obj, fit.code, fit.axis)
     soft = replace(cfg, smooth=cfg.smooth_cov)

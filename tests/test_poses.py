@@ -181,7 +181,8 @@ def text(path, rows, head=""):
 
 # writer, metric, up in world
 FORMATS = [
-    (as_tum, True, None), (as_kitti, True, None), (as_rows_of_16, True, None), (as_arkitscenes, True, None),
+    (as_tum, True, None), (as_kitti, True, None), (as_rows_of_16, True, None),
+    (as_arkitscenes, True, None),
     (as_record3d, True, (0, 1, 0)), (as_scannet, True, (0, 0, 1)), (as_instant_ngp, False, None),
     (as_nerfstudio, False, None), (as_colmap_text, False, None), (as_colmap_poses_only, False, None),
     (as_colmap_with_observations, False, None), (as_colmap_binary, False, None),

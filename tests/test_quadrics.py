@@ -536,9 +536,9 @@ def test_thousands_of_frames_use_few_views() -> None:
 
 
 def test_fast_enough() -> None:
-    """<= 1 ms an object at 1,000 objects and 8 views on a free core; here with room to spare."""
+    """<= 1 ms an object at 1,000 objects and 8 views; here with room for slow machines."""
     measured = min(syn.time_fit(400, 8, support) for support in ("ellipsoid", "ellipsoid"))
-    assert measured < 4e-3
+    assert measured < 2e-3
 
 
 # ---- Volumes -------------------------------------------------------------------------------
@@ -696,6 +696,19 @@ def test_build_priors_from_meshes_and_table(tmp_path: Path) -> None:
     assert np.allclose(q.load_priors(out).log_mean[0], np.log(sizes).mean(0), atol=1e-3)
     table.write_text("category,w\nstool,1\n")
     assert build_priors.main([str(table), "-o", str(out)]) == 2
+
+
+def test_example_scripts_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "quadrics.md"
+    page.write_text("head\n<!-- table masks -->\nold\n<!-- end masks -->\ntail\n")
+    assert syn.main(["--quick", "--only", "masks", "-o", str(tmp_path)]) == 0
+    text = page.read_text()
+    assert "hull tangents" in text and "old" not in text and text.endswith("tail\n")
+    assert "masks" in capsys.readouterr().out
+    import tuw_demo
+
+    assert tuw_demo.main([str(tmp_path)]) == 2
+    assert "gt.npy" in capsys.readouterr().err
 
 
 # ---- House rules ---------------------------------------------------------------------------
