@@ -164,8 +164,10 @@ def model(folder, cams):
     """Write our own COLMAP text model."""
     camera = rt.Camera("PINHOLE", *SIZE, (FOCAL, FOCAL, 320.0, 240.0))
     count = len(cams)
-    poses = rt.Poses(camera, np.arange(count), np.arange(count) / 30, cams, np.full(count, "supplied"), "user",
-                     points=np.ones((2, 3)), colors=np.full((2, 3), 9, np.uint8))  # fmt: skip
+    times, status = np.arange(count) / 30, np.full(count, "supplied")
+    poses = rt.Poses(camera, np.arange(count), times, cams, status, "user")
+    extra = {"points": np.ones((2, 3)), "colors": np.full((2, 3), 9, np.uint8)}
+    poses = dataclasses.replace(poses, **extra)
     rt.write_colmap(folder, poses, [f"{i:04d}.jpg" for i in range(count)])
     return folder
 
@@ -184,7 +186,8 @@ FORMATS = [
     (as_tum, True, None), (as_kitti, True, None), (as_rows_of_16, True, None),
     (as_arkitscenes, True, None),
     (as_record3d, True, (0, 1, 0)), (as_scannet, True, (0, 0, 1)), (as_instant_ngp, False, None),
-    (as_nerfstudio, False, None), (as_colmap_text, False, None), (as_colmap_poses_only, False, None),
+    (as_nerfstudio, False, None), (as_colmap_text, False, None),
+    (as_colmap_poses_only, False, None),
     (as_colmap_with_observations, False, None), (as_colmap_binary, False, None),
 ]  # fmt: skip
 

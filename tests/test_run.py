@@ -541,3 +541,13 @@ def test_fingerprint_sees_changed_files(clip: Path) -> None:
         (clip / "000.png").write_bytes((clip / "000.png").read_bytes() + b"0")
         assert rt.source_fingerprint(source) != before
     assert rt.source_fingerprint("rtsp://camera") == "rtsp://camera"
+
+
+def test_damaged_cache_is_said(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 0
+    capsys.readouterr()
+    np.savez(tmp_path / "out/cache/last-tracks.npz", frame=np.arange(3))  # of an older version
+    assert cli("objects", tmp_path / "out") == 2
+    assert_one_clear_line(capsys, "another version")
