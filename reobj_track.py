@@ -143,7 +143,10 @@ class PosesConfig:
         "--poses",
     )
     fmt: str = _opt(
-        "auto", "format of supplied poses: auto, colmap, tum, transforms", "--pose-format"
+        "auto",
+        "format of supplied poses: auto, colmap, tum, kitti, transforms, scannet, record3d, "
+        "arkitscenes",
+        "--pose-format",
     )
     camera: str = _opt(
         "",
@@ -171,41 +174,69 @@ class PosesConfig:
     corners: int = _opt(300, "corners followed to choose keyframes")
     min_corners: int = _opt(20, "with fewer corners a frame counts as textureless")
     min_keyframes: int = _opt(25, "with fewer keyframes max_flow is halved, down to min_flow")
-    max_interval: int = _opt(60, "new keyframe after this many frames if the camera moved at all (min_flow)")
+    max_interval: int = _opt(
+        60, "new keyframe after this many frames if the camera moved at all (min_flow)"
+    )
     min_flow: float = _opt(0.015, "share of the width that counts as motion")
-    sharp_window: float = _opt(0.7, "the sharpest frame is taken once the flow passed this share of max_flow")
+    sharp_window: float = _opt(
+        0.7, "the sharpest frame is taken once the flow passed this share of max_flow"
+    )
     klt_window_px: int = _opt(15, "Lucas-Kanade window on the working image")
     klt_error_px: float = _opt(1.0, "forward-backward error of a followed point")
-    cache_mb: int = _opt(1000, "gray working images kept in memory; beyond it the video is read twice")
+    cache_mb: int = _opt(
+        1000, "gray working images kept in memory; beyond it the video is read twice"
+    )
     sift_features: int = _opt(2000, "SIFT features a keyframe (4096: slower, no better)")
     sift_contrast: float = _opt(0.02, "SIFT contrast threshold")
-    sift_contrast_low: float = _opt(0.007, "SIFT contrast threshold where less than sift_few features are found")
+    sift_contrast_low: float = _opt(
+        0.007, "SIFT contrast threshold where less than sift_few features are found"
+    )
     sift_few: int = _opt(500, "see sift_contrast_low")
     loop_pairs: int = _opt(6, "look-alike keyframes matched with each keyframe, to close loops")
     loop_words: int = _opt(64, "visual words that describe the look of a keyframe")
     loop_sample: int = _opt(20000, "descriptors clustered into words")
     focal_guess: float = _opt(0.8, "first focal length over the longer side (phones .72-.85)")
-    good_registered: float = _opt(0.9, "take the first healthy model with this share of the keyframes")
-    min_points_per_image: int = _opt(30, "refuse a model with fewer 3D points seen in the median image")
-    min_parallax_px: float = _opt(3.0, "refuse a model that pure turns explain to this (turns: < 1.5, walks: > 4)")
-    strong_tri_angle_deg: float = _opt(5.0, "trust a self-calibrated focal length from this triangulation angle on")
-    strong_spread: float = _opt(0.1, "and from this spread of the cameras over the scene's depth on")
-    focal_range: tuple[float, float] = _opt((0.4, 2.0), "and only when focal / longer side lies in here")
+    good_registered: float = _opt(
+        0.9, "take the first healthy model with this share of the keyframes"
+    )
+    min_points_per_image: int = _opt(
+        30, "refuse a model with fewer 3D points seen in the median image"
+    )
+    min_parallax_px: float = _opt(
+        3.0, "refuse a model that pure turns explain to this (turns: < 1.5, walks: > 4)"
+    )
+    strong_tri_angle_deg: float = _opt(
+        5.0, "trust a self-calibrated focal length from this triangulation angle on"
+    )
+    strong_spread: float = _opt(
+        0.1, "and from this spread of the cameras over the scene's depth on"
+    )
+    focal_range: tuple[float, float] = _opt(
+        (0.4, 2.0), "and only when focal / longer side lies in here"
+    )
     tri_sample: int = _opt(2000, "points used for the median triangulation angle")
     pnp_error_px: float = _opt(4.0, "PnP inlier threshold on the working image")
     max_run: int = _opt(1000, "frames held at once between two keyframes")
-    pose_tolerance: float = _opt(5e-3, "how far supplied rotations may be from exact (7-Scenes: 1e-3)")
-    max_focal_spread: float = _opt(0.02, "supplied cameras of one video may differ in focal length by this share")
+    pose_tolerance: float = _opt(
+        5e-3, "how far supplied rotations may be from exact (7-Scenes: 1e-3)"
+    )
+    max_focal_spread: float = _opt(
+        0.02, "supplied cameras of one video may differ in focal length by this share"
+    )
     lone_frame_s: float = _opt(1 / 60, "half a frame interval when there is only one frame")
     check_tracks: int = _opt(3, "direction check: tracks needed")
     check_views: int = _opt(5, "direction check: frames of a track needed")
     check_most_tracks: int = _opt(200, "direction check: tracks used at most")
     check_most_views: int = _opt(40, "direction check: frames of a track used at most")
-    check_angle_deg: float = _opt(1.0, "direction check: never complain when the tracks meet within this angle")
+    check_angle_deg: float = _opt(
+        1.0, "direction check: never complain when the tracks meet within this angle"
+    )
     check_ratio: float = _opt(0.3, "direction check: another reading must be better by this factor")
-    max_step_ratio: float = _opt(5.0, "refuse a PnP pose further from its neighbours than this times the median step")
+    max_step_ratio: float = _opt(
+        5.0, "refuse a PnP pose further from its neighbours than this times the median step"
+    )
 
-# ---- Poses -------------------------------------------------------------------------------------
+
 @dataclass(frozen=True, slots=True)
 class EmbedConfig:
     """Appearance."""
@@ -393,8 +424,7 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One video frame: source frame number (0-based), time in seconds, BGR image (H, W, 3) uint8.
-    """
+    """One video frame: source frame number (0-based), time in seconds, BGR image (H, W, 3) uint8."""
 
     index: int
     time_s: float
@@ -519,7 +549,7 @@ class Progress:
         return time.monotonic() - self.started
 
 
-# ---- Weights -----------------------------------------------------------------------------------
+# ---- Weights -------------------------------------------------------------------------------------
 
 DOWNLOAD_CHUNK = 1 << 16  # bytes read at a time
 DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
@@ -706,7 +736,7 @@ def _download(weights: Weights, part: Path) -> None:
         raise ConnectionError(f"connection cut after {done} of {weights.size} bytes")
 
 
-# ---- Video -------------------------------------------------------------------------------------
+# ---- Video ---------------------------------------------------------------------------------------
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 IMAGE_FPS = 30.0  # of image folders
@@ -865,7 +895,7 @@ def _read_image(path: Path) -> Image | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-# ---- Detections: files -------------------------------------------------------------------------
+# ---- Detections: files ---------------------------------------------------------------------------
 
 MOSTLY = 0.5  # above this share of bad boxes it is the format that is wrong, not the boxes
 NORMALISED_MAX = 1.5  # coordinates up to here are shares of the image
@@ -1353,7 +1383,7 @@ class DetectionCache:
         self._load(path)
 
 
-# ---- Detections: ONNX --------------------------------------------------------------------------
+# ---- Detections: ONNX ----------------------------------------------------------------------------
 
 PAD_VALUE = 114  # grey of letterbox borders (YOLOX, Ultralytics)
 DYNAMIC_SIDE = 640  # longer side for models that take any size (YOLO11 was trained so)
@@ -1689,9 +1719,7 @@ class OnnxDetector:
         w, h = (a if isinstance(a, int) else b for a, b in zip(own, free, strict=True))
         return w, h
 
-    def _feeds(
-        self, canvas: Image, image_size: tuple[int, int], layout: _Layout
-    ) -> dict[str, Any]:
+    def _feeds(self, canvas: Image, image_size: tuple[int, int], layout: _Layout) -> dict[str, Any]:
         """Return the model's inputs for a fitted BGR image."""
         name, shape, _ = self._inputs[0]
         mean, std = np.array([layout.mean, layout.std], np.float32)
@@ -1994,8 +2022,7 @@ class Embedder:
 
 
 def _on_object(detections: Detections, rows: IntArray, x: Array, y: Array) -> BoolArray:
-    """For samples (N, S, S): is it on the row's own object (its mask, else the inscribed ellipse)?
-    """
+    """For samples (N, S, S): is it on the row's own object (its mask, else the inscribed ellipse)?"""
     box = _cxcywh_from_xyxy(detections.xyxy[rows])[:, :, None, None]  # (N, 4, 1, 1)
     half = np.maximum(box[:, 2:] / 2, 0.5)
     on = ((x - box[:, 0]) / half[:, 0]) ** 2 + ((y - box[:, 1]) / half[:, 1]) ** 2 <= 1
@@ -2073,8 +2100,7 @@ def _colour_features(frame: Image) -> Floats:
 
 
 def _direction_bins(vector: Any, bins: int = 6) -> Floats:
-    """Soft histogram (h, w, bins) of the directions of vectors (h, w, 2), weighted by length <= 1.
-    """
+    """Soft histogram (h, w, bins) of the directions of (h, w, 2) vectors, by their length."""
     length = cv2.magnitude(vector[..., 0], vector[..., 1])[..., None] + 1e-6  # (h, w, 1)
     turn = np.arange(bins) * 2 * np.pi / bins
     aligned = (vector / length) @ np.stack([np.cos(turn), np.sin(turn)]).astype(
@@ -2435,8 +2461,7 @@ class Tracker:
         cam_from_world: Array | None = None,
         camera: Camera | None = None,
     ) -> Tracks:
-        """As `update`, with the tentative tracks too (track_id 0): for those who look back later.
-        """
+        """As `update`, with the tentative tracks too (track_id 0): for those who look back later."""
         self.frame_number += 1
         detections = as_detections(detections)
         lazy = _LazyEmbeddings(
@@ -2722,6 +2747,9 @@ def _as_embeddings(embeddings: Embeddings | npt.ArrayLike | None, count: int) ->
     return embeddings
 
 
+# ---- Poses -------------------------------------------------------------------------------------
+
+
 def invert_rigid(b_from_a: Array) -> Array:
     """Return a_from_b (..., 3, 4) of a rigid b_from_a (..., 3, 4)."""
     rotation = np.swapaxes(b_from_a[..., :3], -1, -2)
@@ -2743,7 +2771,10 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
             numbers += [0.0] * (8 - len(numbers) if len(numbers) > 4 else 0)
             camera = Camera("OPENCV" if len(numbers) == 8 else "PINHOLE", *size, tuple(numbers))
             return _checked_camera(camera, f"--camera {text}")
-    raise ReobjError(f"--camera {text!r}: expected fx,fy,cx,cy[,k1,k2,p1,p2], pixels of the {size[0]}x{size[1]} frames")
+    raise ReobjError(
+        f"--camera {text!r}: expected fx,fy,cx,cy[,k1,k2,p1,p2], pixels of the {size[0]}x{size[1]} "
+        "frames"
+    )
 
 
 def _checked_camera(camera: Camera, where: str) -> Camera:
@@ -2751,8 +2782,10 @@ def _checked_camera(camera: Camera, where: str) -> Camera:
     size, centre, focal = np.array([camera.width, camera.height]), camera.K[:2, 2], camera.K[0, 0]
     if (np.abs(centre - size / 2) > 0.2 * size).any() or not 0.1 < focal / size.max() < 10:
         raise ReobjError(
-            f"{where}: focal length {focal:.0f} px and centre ({centre[0]:.0f}, {centre[1]:.0f}) do not fit images of "
-            f"{size[0]}x{size[1]}; give the intrinsics of the frames as they are read (rotated? resized?)"
+            f"{where}: focal length {focal:.0f} px and centre ({centre[0]:.0f}, {centre[1]:.0f}) "
+            "do not fit images of "
+            f"{size[0]}x{size[1]}; give the intrinsics of the frames as they are read (rotated? "
+            "resized?)"
         )
     return camera
 
@@ -2779,17 +2812,25 @@ def estimate_poses(
         helps.
     """
     if getattr(video, "is_live", False):
-        raise ReobjError("poses of a live camera cannot be reconstructed: record a video first, or --poses none")
+        raise ReobjError(
+            "poses of a live camera cannot be reconstructed: record a video first, or --poses none"
+        )
     size = (int(video.size[0]), int(video.size[1]))
     camera, work = parse_camera(config.camera, size), _WorkVideo(video, config)
     keys = pick_keyframes(work.first_pass(progress("keyframes", video.expected)), config)
     finer = config
-    while len(keys) < min(config.min_keyframes, len(work.frames)) and finer.max_flow > 2 * config.min_flow:
+    while (
+        len(keys) < min(config.min_keyframes, len(work.frames))
+        and finer.max_flow > 2 * config.min_flow
+    ):
         finer = dataclasses.replace(finer, max_flow=finer.max_flow / 2)
         keys = pick_keyframes(work, finer)
     if not keys:
         raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
-    boxes = [np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4)) for k in keys]
+    boxes = [
+        np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4))
+        for k in keys
+    ]
     names = [str(video.names[k.frame]) if video.names else f"frame_{k.frame:06d}.jpg" for k in keys]
     messages = _run_sfm(keys, names, boxes, camera, size, config, work_dir, progress)
     frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
@@ -2826,8 +2867,10 @@ def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
     """Say which frames have no pose and what helps."""
     step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
     text = (
-        f"{(~known).sum()} of {len(frame)} frames have no pose (frames {_spans(frame[~known].tolist(), step)}): these "
-        "parts do not connect to the rest; slower turns, fewer blurred frames and more texture help, or give --poses"
+        f"{(~known).sum()} of {len(frame)} frames have no pose (frames "
+        f"{_spans(frame[~known].tolist(), step)}): these "
+        "parts do not connect to the rest; slower turns, fewer blurred frames and more texture "
+        "help, or give --poses"
     )
     return [] if known.all() else [text]
 
@@ -2864,8 +2907,14 @@ class _WorkVideo:
             height, width = frame.image.shape[:2]
             scale = min(1.0, self.config.size_px / max(height, width))
             size = (max(1, round(width * scale)), max(1, round(height * scale)))
-            bgr = frame.image if scale == 1 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-            yield _WorkImage(place, frame.index, frame.time_s, bgr, cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY))
+            bgr = (
+                frame.image
+                if scale == 1
+                else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+            )
+            yield _WorkImage(
+                place, frame.index, frame.time_s, bgr, cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
+            )
 
     def first_pass(self, line: Progress) -> Iterator[_WorkImage]:
         for work in self:
@@ -2879,7 +2928,11 @@ class _WorkVideo:
         line.close()
 
     def grays(self) -> Iterator[Image]:
-        return (work.gray for work in self) if self.used_mb > self.config.cache_mb else iter(self.cache)
+        return (
+            (work.gray for work in self)
+            if self.used_mb > self.config.cache_mb
+            else iter(self.cache)
+        )
 
 
 def _klt(old: Image, new: Image, xy: Array, config: PosesConfig) -> tuple[Array, BoolArray]:
@@ -2890,8 +2943,12 @@ def _klt(old: Image, new: Image, xy: Array, config: PosesConfig) -> tuple[Array,
         return xy, np.zeros(0, bool)
     start = xy.astype(np.float32).reshape(-1, 1, 2)
     window = (config.klt_window_px, config.klt_window_px)
-    ahead, found, _ = cv2.calcOpticalFlowPyrLK(old, new, start, np.empty_like(start), winSize=window)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(new, old, ahead, np.empty_like(start), winSize=window)
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(
+        old, new, start, np.empty_like(start), winSize=window
+    )
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        new, old, ahead, np.empty_like(start), winSize=window
+    )
     error = np.linalg.norm(back - start, axis=2)[:, 0]  # (N,)
     kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < config.klt_error_px)
     return ahead[:, 0].astype(np.float64), kept
@@ -2913,7 +2970,9 @@ class _FlowSinceKeyframe:
         """Follow into the next frame: median flow since the keyframe over the width, share of
         corners left.
         """
-        if self.count < self.config.min_corners:  # textureless so far: a keyframe as soon as there is something
+        if (
+            self.count < self.config.min_corners
+        ):  # textureless so far: a keyframe as soon as there is something
             return 0.0, float(len(self.corners(gray)) < self.config.min_corners)
         ahead, kept = _klt(self.gray, gray, self.at, self.config)
         self.start, self.at, self.gray = self.start[kept], ahead[kept], gray
@@ -2941,14 +3000,22 @@ def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_Wo
         if flow >= config.sharp_window * wider * config.max_flow:
             window.append(work)
         due = flow > wider * config.max_flow or left < config.min_ratio**wider
-        if due or (work.place - track.place >= wider * config.max_interval and flow > config.min_flow):
-            best = max(window or [work], key=lambda w: float(cv2.Laplacian(w.gray, cv2.CV_32F).var()))
+        if due or (
+            work.place - track.place >= wider * config.max_interval and flow > config.min_flow
+        ):
+            best = max(
+                window or [work], key=lambda w: float(cv2.Laplacian(w.gray, cv2.CV_32F).var())
+            )
             again.extendleft(w for w in reversed(window) if w.place > best.place)
             keys.append(best)
             if len(keys) > config.max_keyframes:
                 keys, wider = keys[::2], 2 * wider
             window, track = [], _FlowSinceKeyframe(best, config)
-    if work is not None and work.place > keys[-1].place and (flow > config.min_flow or len(keys) == 1):
+    if (
+        work is not None
+        and work.place > keys[-1].place
+        and (flow > config.min_flow or len(keys) == 1)
+    ):
         keys.append(work)
     return keys
 
@@ -3007,7 +3074,9 @@ def _segments(
         yield before, -1, list(run)
 
 
-def _follow(model: _SparseModel, row: int, images: list[Image], config: PosesConfig) -> list[tuple[IntArray, Array]]:
+def _follow(
+    model: _SparseModel, row: int, images: list[Image], config: PosesConfig
+) -> list[tuple[IntArray, Array]]:
     """Follow the longest-seen 3D points of a keyframe (row; -1: none) from the first image through
     the others.
 
@@ -3015,9 +3084,14 @@ def _follow(model: _SparseModel, row: int, images: list[Image], config: PosesCon
         per image: rows of `model.points` (n,) and their native pixels (n, 2), COLMAP convention.
     """
     seen = np.flatnonzero(model.obs_image == row)
-    seen = seen[np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")[: config.pnp_points]]
+    seen = seen[
+        np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")[: config.pnp_points]
+    ]
     scale = np.array(images[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
-    rows, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5  # OpenCV: pixel centres at whole numbers
+    rows, xy = (
+        model.obs_point[seen],
+        model.obs_xy[seen] * scale - 0.5,
+    )  # OpenCV: pixel centres at whole numbers
     followed = [(rows, model.obs_xy[seen])]
     for old, new in itertools.pairwise(images):
         ahead, kept = _klt(old, new, xy, config)
@@ -3036,7 +3110,9 @@ def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
         centre = invert_rigid(cam_from_world[known])[:, :, 3]  # (N, 3)
         step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
         direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
-        jump[known[1:-1]] = step[1:] + step[:-1] - direct > ratio * np.maximum(direct, np.median(step))
+        jump[known[1:-1]] = step[1:] + step[:-1] - direct > ratio * np.maximum(
+            direct, np.median(step)
+        )
     return jump
 
 
@@ -3054,7 +3130,9 @@ def fill_gaps(
         if b - a > 1 and frame[b] - frame[a] - 1 <= max_gap:
             share = (frame[a + 1 : b] - frame[a]) / (frame[b] - frame[a])  # (n,)
             ends = invert_rigid(cam_from_world[[a, b]])  # (2, 3, 4) world_from_cam
-            turn = Slerp([0, 1], Rotation.from_matrix(ends[:, :, :3]))(share).as_matrix()  # (n, 3, 3)
+            turn = Slerp([0, 1], Rotation.from_matrix(ends[:, :, :3]))(
+                share
+            ).as_matrix()  # (n, 3, 3)
             centre = ends[0, :, 3] + share[:, None] * (ends[1, :, 3] - ends[0, :, 3])  # (n, 3)
             filled[a + 1 : b] = invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
             status[a + 1 : b] = "interpolated"
@@ -3064,7 +3142,8 @@ def fill_gaps(
 # Reconstruction of the keyframes in a child process
 
 _ADVICE = (
-    "move the camera sideways around the objects (turning on the spot gives no depth), keep things with texture in "
+    "move the camera sideways around the objects (turning on the spot gives no depth), keep things "
+    "with texture in "
     "view, avoid blurred frames, or give --poses; identities in 2D do not need poses"
 )
 _CHILD_CODE = """
@@ -3120,9 +3199,20 @@ def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Prog
     reaches the user.
     """
     here = Path(__file__).resolve()
-    command = [sys.executable, "-c", _CHILD_CODE, here.stem, str(here), str(here.parent), str(folder)]
+    command = [
+        sys.executable,
+        "-c",
+        _CHILD_CODE,
+        here.stem,
+        str(here),
+        str(here.parent),
+        str(folder),
+    ]
     lines: list[Progress] = []
-    with open(log_path, "wb") as errors, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors) as child:
+    with (
+        open(log_path, "wb") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors) as child,
+    ):
         try:
             for text in child.stdout or ():
                 words = text.decode(errors="replace").split()
@@ -3186,7 +3276,11 @@ def _pycolmap() -> Any:
 def _pycolmap_camera(camera: Camera, size: tuple[int, int]) -> Any:
     """Make pycolmap's camera, for images of another size."""
     made = _pycolmap().Camera(
-        camera_id=1, model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+        camera_id=1,
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
     )
     made.rescale(*size)
     return made
@@ -3213,14 +3307,23 @@ def _read_model(folder: Path) -> _SparseModel:
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     points = sorted(model.points3D.items())
     row = {point_id: r for r, (point_id, _) in enumerate(points)}
-    seen = [(r, row[p.point3D_id], *p.xy) for r, image in enumerate(images) for p in image.get_observation_points2D()]
+    seen = [
+        (r, row[p.point3D_id], *p.xy)
+        for r, image in enumerate(images)
+        for p in image.get_observation_points2D()
+    ]
     table = np.array(seen).reshape(-1, 4)
-    cameras = {i: Camera(c.model.name, c.width, c.height, tuple(c.params.tolist())) for i, c in model.cameras.items()}
+    cameras = {
+        i: Camera(c.model.name, c.width, c.height, tuple(c.params.tolist()))
+        for i, c in model.cameras.items()
+    }
     return _SparseModel(
         image_id=[image.image_id for image in images],
         names=tuple(image.name for image in images),
         cameras=[cameras[image.camera_id] for image in images],
-        cam_from_world=np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
+        cam_from_world=np.array([image.cam_from_world().matrix() for image in images]).reshape(
+            -1, 3, 4
+        ),
         points=np.array([point.xyz for _, point in points]).reshape(-1, 3),
         colors=np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
         track_length=np.array([point.track.length() for _, point in points], np.int64),
@@ -3230,7 +3333,9 @@ def _read_model(folder: Path) -> _SparseModel:
     )
 
 
-def _absolute_pose(xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig) -> Array | None:
+def _absolute_pose(
+    xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig
+) -> Array | None:
     """PnP: cam_from_world (3, 4) from native pixels (n, 2) of world points (n, 3); None if it is
     not to be trusted.
     """
@@ -3241,23 +3346,31 @@ def _absolute_pose(xy: Array, points: Array, camera: Camera, work_width: int, co
     made = _pycolmap_camera(camera, (camera.width, camera.height))
     options = {"estimation_options": {"ransac": ransac}}
     found = _pycolmap().estimate_and_refine_absolute_pose(xy, points, made, **options)
-    if found is None or found["num_inliers"] < max(config.pnp_min_inliers, config.pnp_min_ratio * len(xy)):
+    if found is None or found["num_inliers"] < max(
+        config.pnp_min_inliers, config.pnp_min_ratio * len(xy)
+    ):
         return None
     pose: Array = found["cam_from_world"].matrix()
     in_front = points[found["inlier_mask"]] @ pose[2, :3] + pose[2, 3] > 0
     return pose if in_front.all() and np.isfinite(pose).all() else None
 
 
-def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: PosesConfig) -> list[Image]:
+def _sfm_features(
+    database: Path, images: Any, job: dict[str, Any], config: PosesConfig
+) -> list[Image]:
     """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database;
     returns descriptors.
     """
     kept = []
     pc, size = _pycolmap(), (images.shape[2], images.shape[1])
     if job["camera"] is not None:
-        camera = _pycolmap_camera(Camera(job["camera"][0], *job["size"], tuple(job["camera"][1])), size)
+        camera = _pycolmap_camera(
+            Camera(job["camera"][0], *job["size"], tuple(job["camera"][1])), size
+        )
     else:
-        camera = pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", config.focal_guess * max(size), *size)
+        camera = pc.Camera.create_from_model_name(
+            1, "SIMPLE_RADIAL", config.focal_guess * max(size), *size
+        )
     camera.has_prior_focal_length = job["camera"] is not None
     cv2.setNumThreads(1)
     with contextlib.closing(pc.Database.open(str(database))) as db, ThreadPoolExecutor(2) as pool:
@@ -3265,7 +3378,9 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
         rig = pc.Rig(rig_id=1)
         rig.add_ref_sensor(camera.sensor_id)
         db.write_rig(rig, use_rig_id=True)
-        features = pool.map(lambda k: _sift(images[k], np.array(job["boxes"][k]), config), range(len(images)))
+        features = pool.map(
+            lambda k: _sift(images[k], np.array(job["boxes"][k]), config), range(len(images))
+        )
         for number, (xy, descriptors) in enumerate(features, 1):
             image = pc.Image(name=f"{number:06d}", camera_id=1, image_id=number)
             db.write_image(image, use_image_id=True)
@@ -3273,7 +3388,9 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
             frame.add_data_id(image.data_id)
             db.write_frame(frame, use_frame_id=True)
             db.write_keypoints(number, xy)
-            db.write_descriptors(number, pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors))
+            db.write_descriptors(
+                number, pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors)
+            )
             kept.append(descriptors)
             _tell("features", number, len(images))
     return kept
@@ -3294,7 +3411,9 @@ def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np
             break
     if found is None or not len(keypoints):
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
-    xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(0.5)  # COLMAP: centre of pixel 0 at .5
+    xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(
+        0.5
+    )  # COLMAP: centre of pixel 0 at .5
     root = np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-9)) * 512
     return xy, np.minimum(root, 255).astype(np.uint8)
 
@@ -3313,8 +3432,12 @@ def _sfm_match(database: Path, descriptors: list[Image], config: PosesConfig) ->
         ordered = {"overlap": config.overlap, "quadratic_overlap": True}
         pc.match_sequential(str(database), pairing_options=ordered, **options)
         pairs = database.parent / "pairs.txt"
-        pairs.write_text("".join(f"{i + 1:06d} {j + 1:06d}\n" for i, j in _look_alikes(descriptors, config)))
-        pc.match_image_pairs(str(database), pairing_options={"match_list_path": str(pairs)}, **options)
+        pairs.write_text(
+            "".join(f"{i + 1:06d} {j + 1:06d}\n" for i, j in _look_alikes(descriptors, config))
+        )
+        pc.match_image_pairs(
+            str(database), pairing_options={"match_list_path": str(pairs)}, **options
+        )
     _tell("match", 1, 1)
 
 
@@ -3328,15 +3451,21 @@ def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[in
         return []
     cv2.setRNGSeed(config.seed)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
-    _, _, words = cv2.kmeans(sample, config.loop_words, np.empty(0), stop, 1, cv2.KMEANS_PP_CENTERS)  # (W, 128)
-    looks = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sum of the residuals of each word
+    _, _, words = cv2.kmeans(
+        sample, config.loop_words, np.empty(0), stop, 1, cv2.KMEANS_PP_CENTERS
+    )  # (W, 128)
+    looks = np.zeros(
+        (len(descriptors), *words.shape), np.float32
+    )  # (K, W, 128) sum of the residuals of each word
     for look, found in zip(looks, descriptors, strict=True):
         nearest = (found @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
         np.add.at(look, nearest, found - words[nearest])
     looks /= np.maximum(np.linalg.norm(looks, axis=2, keepdims=True), 1e-9)
     flat = looks.reshape(len(looks), -1)
     alike = flat @ flat.T  # (K, K)
-    alike[np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike)))) <= 2] = -np.inf  # matched already
+    alike[
+        np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike)))) <= 2
+    ] = -np.inf  # matched already
     best = np.argsort(-alike, axis=1, kind="stable")[:, : config.loop_pairs]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
@@ -3366,11 +3495,16 @@ class _Attempt:
 
     def trusted(self, config: PosesConfig) -> bool:
         """True if the geometry is strong enough to calibrate the focal length."""
-        strong = self.tri_angle_deg >= config.strong_tri_angle_deg and self.spread >= config.strong_spread
+        strong = (
+            self.tri_angle_deg >= config.strong_tri_angle_deg
+            and self.spread >= config.strong_spread
+        )
         return strong and config.focal_range[0] <= self.focal <= config.focal_range[1]
 
 
-def _sfm_ladder(database: Path, frames: list[int], known_focal: bool, config: PosesConfig) -> tuple[Any, list[str]]:
+def _sfm_ladder(
+    database: Path, frames: list[int], known_focal: bool, config: PosesConfig
+) -> tuple[Any, list[str]]:
     """Try mappers from strict to permissive; return the best sound model (or None) and messages.
 
     Args:
@@ -3380,17 +3514,20 @@ def _sfm_ladder(database: Path, frames: list[int], known_focal: bool, config: Po
     for rung in ("strict", "relaxed", "global"):
         sound = [a for a in tried if not a.problem]
         turned = [a for a in tried if a.problem and a.parallax_px < config.min_parallax_px]
-        if any(a.registered >= config.good_registered for a in sound + turned) or (sound and rung == "global"):
+        if any(a.registered >= config.good_registered for a in sound + turned) or (
+            sound and rung == "global"
+        ):
             break
         tried.append(_sfm_attempt(database, rung, known_focal, len(frames), config))
     best = max(tried, key=lambda a: (not a.problem, a.registered))
     messages = []
     if not best.problem and not known_focal and not best.trusted(config):
-        weak = f"little parallax (rays meet at {best.tri_angle_deg:.1f} deg): the focal length cannot be calibrated"
+        angle = f"{best.tri_angle_deg:.1f} deg"
+        weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
         best = _sfm_fixed_focal(database, len(frames), config)
         messages = [
-            f"{weak} and is taken as {config.focal_guess} x the longer side; sizes and depths are rough: give "
-            "--camera fx,fy,cx,cy, or move the camera sideways around the objects"
+            f"{weak} and is taken as {config.focal_guess} x the longer side; sizes and depths are "
+            "rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
         ]
     if best.problem:
         return None, [f"no camera poses: {best.problem}; {_ADVICE}"]
@@ -3398,7 +3535,10 @@ def _sfm_ladder(database: Path, frames: list[int], known_focal: bool, config: Po
     for other in best.others:
         part = sorted(frames[i - 1] for i in other.reg_image_ids() if i not in kept)
         if len(part) >= 3:
-            messages.append(f"frames {part[0]}-{part[-1]}: a separate reconstruction, left out as it does not connect")
+            messages.append(
+                f"frames {part[0]}-{part[-1]}: a separate reconstruction, left out as it does not "
+                "connect"
+            )
     return best.model, messages
 
 
@@ -3406,34 +3546,57 @@ def _sfm_fixed_focal(database: Path, count: int, config: PosesConfig) -> _Attemp
     """Map with the focal length held at the guess."""
     with contextlib.closing(_pycolmap().Database.open(str(database))) as db:
         camera = db.read_all_cameras()[0]
-        camera.params = [config.focal_guess * max(camera.width, camera.height), *camera.params[1:3], 0.0]
+        camera.params = [
+            config.focal_guess * max(camera.width, camera.height),
+            *camera.params[1:3],
+            0.0,
+        ]
         camera.has_prior_focal_length = True
         db.update_camera(camera)
     return _sfm_attempt(database, "relaxed", True, count, config)
 
 
-def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> _Attempt:
+def _sfm_attempt(
+    database: Path, rung: str, fixed: bool, count: int, config: PosesConfig
+) -> _Attempt:
     """Run a mapper on `count` keyframes, measure its largest model and name its first problem ("":
     it is sound).
     """
     models = _sfm_map(database, rung, fixed, count, config)
     if not models:
         return _Attempt()
-    model = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))  # the first is often a stub
+    model = max(
+        models, key=lambda m: (m.num_reg_images(), m.num_points3D())
+    )  # the first is often a stub
     camera = next(iter(model.cameras.values()))
     centre = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
-    registered, focal = len(centre) / count, camera.mean_focal_length() / max(camera.width, camera.height)
+    registered, focal = (
+        len(centre) / count,
+        camera.mean_focal_length() / max(camera.width, camera.height),
+    )
     seen = [model.image(i).num_points3D for i in centre]
     parallax = _sfm_parallax_px(model)
     angle, depth = _sfm_angle_and_depth(model, centre, config.tri_sample)
     spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
     tests = (
         (registered < config.min_registered, f"only {len(centre)} of {count} keyframes connect"),
-        (model.num_points3D() < config.min_points, f"only {model.num_points3D()} points could be triangulated"),
+        (
+            model.num_points3D() < config.min_points,
+            f"only {model.num_points3D()} points could be triangulated",
+        ),
         (np.median(seen) < config.min_points_per_image, "the images share too few points"),
-        (parallax < config.min_parallax_px, "a mere turn of the camera explains all images, so there is no depth"),
-        (angle < config.min_tri_angle_deg, f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
-        (camera.has_bogus_params(*config.focal_range, 1.0), f"the focal length came out as {focal:.2f} x the width"),
+        (
+            parallax < config.min_parallax_px,
+            "a mere turn of the camera explains all images, so there is no depth",
+        ),
+        (
+            angle < config.min_tri_angle_deg,
+            f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways",
+        ),
+        (
+            camera.has_bogus_params(*config.focal_range, 1.0),
+            f"the focal length came out as {focal:.2f} x the width",
+        ),
     )
     problem = next((text for bad, text in tests if bad), "")
     others = tuple(m for m in models if m is not model)
@@ -3441,20 +3604,28 @@ def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, config: Pos
 
 
 def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
-    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics.
-    """
+    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics."""
     pc, out = _pycolmap(), database.parent / rung
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
-    options: dict[str, Any] = {"num_threads": 1, "random_seed": config.seed}  # one thread: the same result every time
+    options: dict[str, Any] = {
+        "num_threads": 1,
+        "random_seed": config.seed,
+    }  # one thread: the same result every time
     if rung == "global":
         if fixed:
-            options["mapper"] = {"bundle_adjustment": {"refine_focal_length": False, "refine_extra_params": False}}
+            options["mapper"] = {
+                "bundle_adjustment": {"refine_focal_length": False, "refine_extra_params": False}
+            }
         else:  # with a wrong focal length global mapping is wrong and looks right
             pc.calibrate_view_graph(str(database))
         return list(pc.global_mapping(*paths, options=options).values())
     options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
-    options |= {"ba_global_frames_ratio": 1.4, "ba_global_points_ratio": 1.4, "ba_global_function_tolerance": 1e-5}
+    options |= {
+        "ba_global_frames_ratio": 1.4,
+        "ba_global_points_ratio": 1.4,
+        "ba_global_function_tolerance": 1e-5,
+    }
     options |= {"ba_refine_focal_length": not fixed, "ba_refine_extra_params": not fixed}
     options |= _RELAXED if rung == "relaxed" else {}
     done = itertools.count(2)
@@ -3488,7 +3659,9 @@ def _sfm_parallax_px(model: Any) -> float:
     rays: dict[int, dict[int, Array]] = {}
     for image_id in sorted(model.reg_image_ids()):
         seen = model.image(image_id).get_observation_points2D()
-        ideal = np.asarray(model.camera(1).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2)))
+        ideal = np.asarray(
+            model.camera(1).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2))
+        )
         unit = np.column_stack([ideal.reshape(-1, 2), np.ones(len(seen))])  # (n, 3)
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
         rays[image_id] = dict(zip([p.point3D_id for p in seen], unit, strict=True))
@@ -3500,10 +3673,16 @@ def _sfm_parallax_px(model: Any) -> float:
                 one, other = (np.array([rays[i][p] for p in both]) for i in (a, b))  # (n, 3)
                 turned = Rotation.align_vectors(other, one)[0].apply(one)
                 residuals.append(np.median(np.linalg.norm(turned - other, axis=1)))
-    return float(np.percentile(residuals, 95)) * model.camera(1).mean_focal_length() if residuals else 0.0
+    return (
+        float(np.percentile(residuals, 95)) * model.camera(1).mean_focal_length()
+        if residuals
+        else 0.0
+    )
 
 
-def _sfm_write(model: Any, images: Any, folder: Path, names: list[str], native: tuple[int, int]) -> None:
+def _sfm_write(
+    model: Any, images: Any, folder: Path, names: list[str], native: tuple[int, int]
+) -> None:
     """Write a COLMAP model in native pixels with the real names; points get the colour of their
     first observation.
     """
@@ -3512,7 +3691,9 @@ def _sfm_write(model: Any, images: Any, folder: Path, names: list[str], native: 
         point = model.point3D(point_id)
         seen = point.track.elements[0]
         x, y = model.image(seen.image_id).point2D(seen.point2D_idx).xy.astype(int)
-        point.color = images[seen.image_id - 1, np.clip(y, 0, height - 1), np.clip(x, 0, width - 1), ::-1]
+        point.color = images[
+            seen.image_id - 1, np.clip(y, 0, height - 1), np.clip(x, 0, width - 1), ::-1
+        ]
     scale = np.array(native) / (width, height)
     for image_id, image in model.images.items():
         image.name = names[image_id - 1]
@@ -3551,26 +3732,40 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
     """
     path, size = Path(path), (int(video.size[0]), int(video.size[1]))
     if not path.exists():
-        raise ReobjError(f"{path}: no such file or folder; --poses takes auto, none, or poses in a known format")
+        raise ReobjError(
+            f"{path}: no such file or folder; --poses takes auto, none, or poses in a known format"
+        )
     reader = _POSE_READERS.get(_pose_format(path) if config.fmt == "auto" else config.fmt)
     if reader is None:
-        raise ReobjError(f"--pose-format {config.fmt}: unknown; known are auto, {', '.join(_POSE_READERS)}")
+        raise ReobjError(
+            f"--pose-format {config.fmt}: unknown; known are auto, {', '.join(_POSE_READERS)}"
+        )
     given = reader(path, size)
     camera = parse_camera(config.camera, size) or given.camera
     if camera is None:
-        raise ReobjError(f"{path}: this format has no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2] (pixels)")
+        raise ReobjError(
+            f"{path}: this format has no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2] "
+            "(pixels)"
+        )
     camera = _checked_camera(_resized_camera(camera, size, path), str(path))
     numbers = [(frame.index, frame.time_s) for frame in video]
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
-    row, messages = _rows_of_frames(given, path, frame, time_s, [video.names[n] for n in frame if video.names])
+    row, messages = _rows_of_frames(
+        given, path, frame, time_s, [video.names[n] for n in frame if video.names]
+    )
     poses = np.full((len(frame), 3, 4), np.nan)
     poses[row >= 0] = given.cam_from_world[row[row >= 0]]
     known = np.isfinite(poses).all((1, 2))
     if not known.all():
         lost = _spans(frame[~known].tolist())
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
-    status, extra = np.where(known, "supplied", "none"), (given.points, given.colors, tuple(messages))
-    return Poses(camera, frame, time_s, poses, status, "user", given.metric, given.up_in_world, *extra)
+    status, extra = (
+        np.where(known, "supplied", "none"),
+        (given.points, given.colors, tuple(messages)),
+    )
+    return Poses(
+        camera, frame, time_s, poses, status, "user", given.metric, given.up_in_world, *extra
+    )
 
 
 def _pose_format(path: Path) -> str:
@@ -3601,11 +3796,15 @@ def _number_rows(
         try:
             row = [float(word) for word in text.replace(",", " ").split()]
         except ValueError:
-            raise ReobjError(f"{at}: {text.strip()[:60]!r} is not a row of numbers; expected {expected}") from None
+            raise ReobjError(
+                f"{at}: {text.strip()[:60]!r} is not a row of numbers; expected {expected}"
+            ) from None
         if len(row) not in columns or (rows and len(row) != len(rows[0])):
             raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
         if finite and not np.isfinite(row).all():
-            raise ReobjError(f"{at}: a number is not finite; leave out the rows of frames without a pose")
+            raise ReobjError(
+                f"{at}: a number is not finite; leave out the rows of frames without a pose"
+            )
         rows.append(row)
         where.append(at)
     if not rows:
@@ -3617,7 +3816,9 @@ def _lines(path: Path) -> list[str]:
     try:
         return path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ReobjError(f"{path}: cannot be read as text ({error}); expected a file of poses") from None
+        raise ReobjError(
+            f"{path}: cannot be read as text ({error}); expected a file of poses"
+        ) from None
 
 
 def _json_object(path: Path) -> dict[str, Any]:
@@ -3626,7 +3827,10 @@ def _json_object(path: Path) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from None
     if not isinstance(content, dict):
-        raise ReobjError(f"{path}: expected an object with `frames` (nerfstudio, instant-ngp) or `poses` (Record3D)")
+        raise ReobjError(
+            f"{path}: expected an object with `frames` (nerfstudio, instant-ngp) or `poses` "
+            "(Record3D)"
+        )
     return content
 
 
@@ -3641,10 +3845,18 @@ def _rigid(matrix: Array, where: Sequence[str]) -> Array:
     off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))  # (N,)
     if matrix.shape[1] == 4:
         transposed = np.abs(matrix[:, 3] - [0, 0, 0, 1]).max(1) > tolerance
-        _refuse(transposed, where, "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)")
-    what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular); expected a row-major rigid pose"
-    _refuse(off > tolerance, where, f"{what} without scale")
-    _refuse(np.linalg.det(rotation) < 0, where, "the rotation is mirrored (determinant -1); turn two axes, not one")
+        _refuse(
+            transposed,
+            where,
+            "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)",
+        )
+    what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular)"
+    _refuse(off > tolerance, where, f"{what}; expected a row-major rigid pose without scale")
+    _refuse(
+        np.linalg.det(rotation) < 0,
+        where,
+        "the rotation is mirrored (determinant -1); turn two axes, not one",
+    )
     u, _, vt = np.linalg.svd(rotation)
     exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
     return np.where(lost[:, None, None], np.nan, exact)
@@ -3659,7 +3871,9 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
     """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations
     (N, 3).
     """
-    _refuse(~np.isfinite(np.column_stack([xyzw, translation])).all(1), where, "a number is not finite")
+    _refuse(
+        ~np.isfinite(np.column_stack([xyzw, translation])).all(1), where, "a number is not finite"
+    )
     norm = np.linalg.norm(xyzw, axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
     _refuse(np.abs(norm - 1) > PosesConfig().pose_tolerance, where, what)
@@ -3683,7 +3897,9 @@ def _given_kitti(path: Path, size: tuple[int, int]) -> _GivenPoses:
     """KITTI: a row-major 3x4 (or 4x4) world_from_cam a line, one line for each frame of the source;
     metres.
     """
-    rows, where = _number_rows(path, (12, 16), "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam")
+    rows, where = _number_rows(
+        path, (12, 16), "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam"
+    )
     return _GivenPoses(invert_rigid(_rigid(rows.reshape(len(rows), -1, 4), where)), metric=True)
 
 
@@ -3691,7 +3907,9 @@ def _given_arkitscenes(path: Path, size: tuple[int, int]) -> _GivenPoses:
     """ARKitScenes .traj: `t rx ry rz tx ty tz`, axis-angle, cam_from_world, metres."""
     rows, _ = _number_rows(path, (7,), "ARKitScenes rows: t rx ry rz tx ty tz")
     rotation = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
-    return _GivenPoses(np.concatenate([rotation, rows[:, 4:, None]], 2), stamps_s=rows[:, 0], metric=True)
+    return _GivenPoses(
+        np.concatenate([rotation, rows[:, 4:, None]], 2), stamps_s=rows[:, 0], metric=True
+    )
 
 
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
@@ -3707,7 +3925,9 @@ def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
         fx, fy, cx, cy = (float(data["K"][i]) for i in (0, 4, 6, 7))
         camera = Camera("PINHOLE", int(data["w"]), int(data["h"]), (fx, fy, cx, cy))
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise ReobjError(f"{path}: no Record3D metadata ({error!r}); expected poses (N x 7), K (9), w and h") from None
+        raise ReobjError(
+            f"{path}: no Record3D metadata ({error!r}); expected poses (N x 7), K (9), w and h"
+        ) from None
     where = [f"{path}, poses[{i}]" for i in range(len(rows))]
     world_from_gl = _from_quaternions(rows[:, :4], rows[:, 4:], where)
     poses = _CV_FROM_GL @ invert_rigid(world_from_gl)
@@ -3719,11 +3939,19 @@ def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
     lost frame; z up.
     """
     folder = path / "pose" if (path / "pose").is_dir() else path
-    files = sorted(file for file in folder.glob("*.txt") if file.stem[-1:].isdigit() or file.stem.endswith(".pose"))
+    files = sorted(
+        file
+        for file in folder.glob("*.txt")
+        if file.stem[-1:].isdigit() or file.stem.endswith(".pose")
+    )
     if not files:
         raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
     tables = [_number_rows(file, (4,), "4 rows of 4 numbers", finite=False)[0] for file in files]
-    _refuse(np.array([len(t) != 4 for t in tables]), [str(f) for f in files], "expected 4 rows of 4 numbers")
+    _refuse(
+        np.array([len(t) != 4 for t in tables]),
+        [str(f) for f in files],
+        "expected 4 rows of 4 numbers",
+    )
     world_from_cam = _rigid(np.array(tables), [str(file) for file in files])
     intrinsic = path / "intrinsic" / "intrinsic_color.txt"
     camera = None
@@ -3745,7 +3973,9 @@ def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
     data = _json_object(path)
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise ReobjError(f"{path}: no `frames` in it; expected the transforms.json of nerfstudio or instant-ngp")
+        raise ReobjError(
+            f"{path}: no `frames` in it; expected the transforms.json of nerfstudio or instant-ngp"
+        )
     where = [f"{path}, frames[{i}]" for i in range(len(frames))]
     try:
         matrix = np.array([f["transform_matrix"] for f in frames], np.float64).reshape(-1, 4, 4)
@@ -3754,7 +3984,9 @@ def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
         applied = np.eye(4)
         applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise ReobjError(f"{path}: a frame without a 4x4 transform_matrix and file_path ({error!r})") from None
+        raise ReobjError(
+            f"{path}: a frame without a 4x4 transform_matrix and file_path ({error!r})"
+        ) from None
     gl_from_world = invert_rigid(_rigid(matrix, where)) @ applied  # (N, 3, 4)
     return _GivenPoses(_CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
 
@@ -3769,7 +4001,12 @@ def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | 
         return None
     fisheye = data.get("is_fisheye") or "FISHEYE" in str(data.get("camera_model", "")).upper()
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-    pinhole = (focal, data.get("fl_y", focal), data.get("cx", width / 2), data.get("cy", height / 2))
+    pinhole = (
+        focal,
+        data.get("fl_y", focal),
+        data.get("cx", width / 2),
+        data.get("cy", height / 2),
+    )
     params = tuple(float(v) for v in (*pinhole, *(data.get(key, 0) for key in keys)))
     if not fisheye and not any(params[4:]):
         return Camera("PINHOLE", width, height, params[:4])
@@ -3784,15 +4021,21 @@ def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
     if not found:
         return None
     middle = found[len(found) // 2]
-    same = all((c.model, c.width, c.height) == (middle.model, middle.width, middle.height) for c in found)
+    same = all(
+        (c.model, c.width, c.height) == (middle.model, middle.width, middle.height) for c in found
+    )
     if not same or found[-1].params[0] > (1 + PosesConfig().max_focal_spread) * found[0].params[0]:
-        raise ReobjError(f"{path}: several different cameras; expected one camera for the whole video (single_camera)")
+        raise ReobjError(
+            f"{path}: several different cameras; expected one camera for the whole video "
+            "(single_camera)"
+        )
     return middle
 
 
 _COLMAP_PARAMS = {
-    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
-    "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
+    "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
 }  # fmt: skip
 
 
@@ -3806,29 +4049,40 @@ def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
         for folder in folders:
             if (folder / f"images{suffix}").exists():
                 return read(folder)
-    raise ReobjError(f"{path}: no images.bin or images.txt in it; expected a COLMAP model, or see --pose-format")
+    raise ReobjError(
+        f"{path}: no images.bin or images.txt in it; expected a COLMAP model, or see --pose-format"
+    )
 
 
 def _colmap_binary(folder: Path) -> _GivenPoses:
     try:
         model = _read_model(folder)
     except (ValueError, RuntimeError, IndexError) as error:
-        raise ReobjError(f"{folder}: not a COLMAP model ({str(error).splitlines()[0]}); write it again") from None
+        raise ReobjError(
+            f"{folder}: not a COLMAP model ({str(error).splitlines()[0]}); write it again"
+        ) from None
     if not model.names:
         raise ReobjError(f"{folder}: the COLMAP model has no registered image")
     camera = _one_camera(model.cameras, folder)
-    return _GivenPoses(model.cam_from_world, camera, model.names, points=model.points, colors=model.colors)
+    return _GivenPoses(
+        model.cam_from_world, camera, model.names, points=model.points, colors=model.colors
+    )
 
 
 def _colmap_text(folder: Path) -> _GivenPoses:
     cameras = {}
     for at, words in _word_rows(folder / "cameras.txt"):
         try:
-            cameras[words[0]] = Camera(words[1], int(words[2]), int(words[3]), tuple(float(w) for w in words[4:]))
+            cameras[words[0]] = Camera(
+                words[1], int(words[2]), int(words[3]), tuple(float(w) for w in words[4:])
+            )
         except (ValueError, IndexError):
             words = []
         if len(words) != 4 + _COLMAP_PARAMS.get((*words, "", "")[1], -5):
-            raise ReobjError(f"{at}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] with a known model, all parameters")
+            raise ReobjError(
+                f"{at}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] with a known model, all "
+                "parameters"
+            )
     rows, where, names, used, points_next = [], [], [], [], False
     for at, words in _word_rows(folder / "images.txt", blank=True):
         points_line = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
@@ -3840,7 +4094,9 @@ def _colmap_text(folder: Path) -> _GivenPoses:
             used.append(cameras[words[8]])
             names.append(" ".join([words[9], *words[10:]]))
         except (ValueError, IndexError, KeyError):
-            raise ReobjError(f"{at}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
+            raise ReobjError(
+                f"{at}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            ) from None
         where.append(at)
         points_next = True
     if not rows:
@@ -3848,7 +4104,9 @@ def _colmap_text(folder: Path) -> _GivenPoses:
     table = np.array(rows)
     poses = _from_quaternions(table[:, [1, 2, 3, 0]], table[:, 4:], where)
     points, camera = _colmap_text_points(folder / "points3D.txt"), _one_camera(used, folder)
-    return _GivenPoses(poses, camera, tuple(names), points=points[:, :3], colors=points[:, 3:].astype(np.uint8))
+    return _GivenPoses(
+        poses, camera, tuple(names), points=points[:, :3], colors=points[:, 3:].astype(np.uint8)
+    )
 
 
 def _colmap_text_points(path: Path) -> Array:
@@ -3886,9 +4144,12 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
     """Bring intrinsics to the frames' size; another shape of image is refused."""
     if (camera.width, camera.height) == size:
         return camera
-    if abs(camera.width * size[1] - camera.height * size[0]) > max(camera.width, camera.height, *size):
+    if abs(camera.width * size[1] - camera.height * size[0]) > max(
+        camera.width, camera.height, *size
+    ):
         raise ReobjError(
-            f"{path}: the poses are of {camera.width}x{camera.height} images, the frames are {size[0]}x{size[1]}; "
+            f"{path}: the poses are of {camera.width}x{camera.height} images, the frames are "
+            f"{size[0]}x{size[1]}; "
             "expected the same shape (rotated or cropped video?)"
         )
     return Camera(camera.model, *size, tuple(_pycolmap_camera(camera, size).params.tolist()))
@@ -3897,8 +4158,7 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
 def _rows_of_frames(
     given: _GivenPoses, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
 ) -> tuple[IntArray, list[str]]:
-    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order.
-    """
+    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order."""
     count = len(given.cam_from_world)
     messages: list[str] = []
     if given.names:
@@ -3906,7 +4166,8 @@ def _rows_of_frames(
         what = f"images {given.names[0]!r} ..., frames {names[0] if len(names) else frame[0]!r} ..."
     elif given.stamps_s is not None:
         row, messages = _rows_by_time(given.stamps_s, frame, time_s)
-        what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
+        what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, "
+        what += f"frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
     else:
         row = np.arange(count) if count == len(frame) else frame.copy()
         what = f"{count} rows, frame numbers up to {frame.max()}; expected one row a frame"
@@ -3940,7 +4201,9 @@ def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntA
     each frame.
     """
     if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
-        return np.arange(len(frame)), ["time stamps are of another clock than the frames: matched in order"]
+        return np.arange(len(frame)), [
+            "time stamps are of another clock than the frames: matched in order"
+        ]
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
     half = 0.5 * float(np.median(steps)) if len(steps) else PosesConfig().lone_frame_s
     nearest = np.abs(stamps_s[None] - time_s[:, None]).argmin(1)  # (F,)
@@ -3970,7 +4233,7 @@ def check_poses(
     readings = {
         "as they are": usual,
         "world_from_cam given as cam_from_world, or the other way round": invert_rigid(usual),
-        "OpenGL axes (y up, z backward) given as OpenCV axes (y down, z forward), or the other way round":
+        "OpenGL axes (y up, z backward) given as OpenCV axes (y down, z forward), or reversed":
             _CV_FROM_GL @ usual,
         "inverted and with OpenGL axes": _CV_FROM_GL @ invert_rigid(usual),
     }  # fmt: skip
@@ -3988,20 +4251,29 @@ def check_poses(
         return None
     likely = " or ".join(text for text, value in angle.items() if value <= 1.5 * best)
     return (
-        f"the poses look like {likely}: {len(views)} tracks meet in 3D within {best:.1f} deg when read that way, "
+        f"the poses look like {likely}: {len(views)} tracks meet in 3D within {best:.1f} deg when "
+        "read that way, "
         f"{asis:.1f} deg as they are; check --pose-format and the file's convention"
     )
 
 
-def _track_views(poses: Poses, frame: IntArray, xy: Array, config: PosesConfig) -> tuple[IntArray, Array] | None:
+def _track_views(
+    poses: Poses, frame: IntArray, xy: Array, config: PosesConfig
+) -> tuple[IntArray, Array] | None:
     """Rows of the frames of a track that have a pose, thinned, and unit rays (n, 3) in the camera;
     None if too few.
     """
     place = np.clip(np.searchsorted(poses.frame, frame), 0, len(poses.frame) - 1)
-    use = np.flatnonzero((poses.frame[place] == frame) & poses.known[place] & np.isfinite(xy).all(1))
+    use = np.flatnonzero(
+        (poses.frame[place] == frame) & poses.known[place] & np.isfinite(xy).all(1)
+    )
     if len(use) < config.check_views:
         return None
-    use = use[np.unique(np.linspace(0, len(use) - 1, min(len(use), config.check_most_views)).round().astype(int))]
+    use = use[
+        np.unique(
+            np.linspace(0, len(use) - 1, min(len(use), config.check_most_views)).round().astype(int)
+        )
+    ]
     ideal = poses.camera.undistort(xy[use])
     rays = np.column_stack([ideal, np.ones(len(use))]) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
     return place[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -4012,7 +4284,10 @@ def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
     median angle to it.
     """
     world_from_cam = invert_rigid(cam_from_world)
-    ray, centre = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam), world_from_cam[:, :, 3]
+    ray, centre = (
+        np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam),
+        world_from_cam[:, :, 3],
+    )
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3) sum_i (I - d d') (X - c) = 0
     point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centre), rcond=1e-9)[0]
     toward = np.stack([point - centre, np.broadcast_to(ray.mean(0), ray.shape)])  # (2, n, 3)
@@ -4026,11 +4301,17 @@ def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
 def write_tum(path: Path, poses: Poses) -> None:
     """Write the known poses as TUM rows: world_from_cam, seconds, quaternion xyzw."""
     world_from_cam = invert_rigid(poses.cam_from_world[poses.known])
-    xyzw = Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat() if len(world_from_cam) else np.empty((0, 4))
+    xyzw = (
+        Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat()
+        if len(world_from_cam)
+        else np.empty((0, 4))
+    )
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
     units = "units: metres" if poses.metric else _NO_SCALE
     rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
-    path.write_text("\n".join([f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})", *rows]) + "\n")
+    path.write_text(
+        "\n".join([f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})", *rows]) + "\n"
+    )
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
@@ -4047,7 +4328,9 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
         old.unlink()
     camera = poses.camera
     numbers = " ".join(repr(float(p)) for p in camera.params)
-    (path / "cameras.txt").write_text(f"1 {camera.model} {camera.width} {camera.height} {numbers}\n")
+    (path / "cameras.txt").write_text(
+        f"1 {camera.model} {camera.width} {camera.height} {numbers}\n"
+    )
     lines = []
     for i in np.flatnonzero(poses.known).tolist():
         xyzw = Rotation.from_matrix(poses.cam_from_world[i, :, :3]).as_quat()
@@ -4055,7 +4338,10 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
         lines.append(f"{i + 1} {' '.join(repr(float(v)) for v in values)} 1 {image_names[i]}\n\n")
     (path / "images.txt").write_text("".join(lines))
     points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
-    rows = [f"{i} {x!r} {y!r} {z!r} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(points, 1)]
+    rows = [
+        f"{i} {x!r} {y!r} {z!r} {r} {g} {b} 0\n"
+        for i, ((x, y, z), (r, g, b)) in enumerate(points, 1)
+    ]
     (path / "points3D.txt").write_text("".join(rows))
 
 
@@ -5401,8 +5687,7 @@ def _spans_of(rows: TrackTable) -> list[list[int]]:
 
 
 def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
-    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits.
-    """
+    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits."""
     if poses is None:
         return {"units": None, "source": "none", "registered_frames": 0, "links": []}
     scale = fits.scale if fits is not None else None
@@ -5544,8 +5829,7 @@ def _summary_world(result: RunResult) -> list[str]:
 
 
 def _options(parser: argparse.ArgumentParser, *sections: str) -> None:
-    """Add the flags that the config dataclasses declare for these sections ("" for the top level).
-    """
+    """Add the flags that the config dataclasses declare for these sections ("" for the top level)."""
     for section in sections:
         cls: Any = Config if not section else Config.__dataclass_fields__[section].default_factory
         for f in dataclasses.fields(cls):
