@@ -424,7 +424,8 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One video frame: source frame number (0-based), time in seconds, BGR image (H, W, 3) uint8."""
+    """One video frame: source frame number (0-based), time in seconds, BGR image (H, W, 3) uint8.
+    """
 
     index: int
     time_s: float
@@ -549,7 +550,7 @@ class Progress:
         return time.monotonic() - self.started
 
 
-# ---- Weights -------------------------------------------------------------------------------------
+# ---- Weights -----------------------------------------------------------------------------------
 
 DOWNLOAD_CHUNK = 1 << 16  # bytes read at a time
 DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
@@ -736,7 +737,7 @@ def _download(weights: Weights, part: Path) -> None:
         raise ConnectionError(f"connection cut after {done} of {weights.size} bytes")
 
 
-# ---- Video ---------------------------------------------------------------------------------------
+# ---- Video -------------------------------------------------------------------------------------
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 IMAGE_FPS = 30.0  # of image folders
@@ -895,7 +896,7 @@ def _read_image(path: Path) -> Image | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
-# ---- Detections: files ---------------------------------------------------------------------------
+# ---- Detections: files -------------------------------------------------------------------------
 
 MOSTLY = 0.5  # above this share of bad boxes it is the format that is wrong, not the boxes
 NORMALISED_MAX = 1.5  # coordinates up to here are shares of the image
@@ -1383,7 +1384,7 @@ class DetectionCache:
         self._load(path)
 
 
-# ---- Detections: ONNX ----------------------------------------------------------------------------
+# ---- Detections: ONNX --------------------------------------------------------------------------
 
 PAD_VALUE = 114  # grey of letterbox borders (YOLOX, Ultralytics)
 DYNAMIC_SIDE = 640  # longer side for models that take any size (YOLO11 was trained so)
@@ -2022,7 +2023,8 @@ class Embedder:
 
 
 def _on_object(detections: Detections, rows: IntArray, x: Array, y: Array) -> BoolArray:
-    """For samples (N, S, S): is it on the row's own object (its mask, else the inscribed ellipse)?"""
+    """For samples (N, S, S): is it on the row's own object (its mask, else the inscribed ellipse)?
+    """
     box = _cxcywh_from_xyxy(detections.xyxy[rows])[:, :, None, None]  # (N, 4, 1, 1)
     half = np.maximum(box[:, 2:] / 2, 0.5)
     on = ((x - box[:, 0]) / half[:, 0]) ** 2 + ((y - box[:, 1]) / half[:, 1]) ** 2 <= 1
@@ -2461,7 +2463,8 @@ class Tracker:
         cam_from_world: Array | None = None,
         camera: Camera | None = None,
     ) -> Tracks:
-        """As `update`, with the tentative tracks too (track_id 0): for those who look back later."""
+        """As `update`, with the tentative tracks too (track_id 0): for those who look back later.
+        """
         self.frame_number += 1
         detections = as_detections(detections)
         lazy = _LazyEmbeddings(
@@ -2843,7 +2846,8 @@ def estimate_poses(
     places = np.array([keys[i - 1].place for i in model.image_id])
     located = _locate_between(model, places, work, config, progress("pnp", len(frame)))
     cam_from_world, status = fill_gaps(frame, *located, config.max_gap)
-    messages += _lost_frames(frame, np.isfinite(cam_from_world).all((1, 2)))
+    known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
+    messages += _lost_frames(frame, known)
     found = (model.cameras[0], frame, time_s, cam_from_world, status, "pycolmap")
     return Poses(*found, points=model.points, colors=model.colors, messages=tuple(messages))
 
@@ -3364,9 +3368,9 @@ def _sfm_features(
     kept = []
     pc, size = _pycolmap(), (images.shape[2], images.shape[1])
     if job["camera"] is not None:
-        camera = _pycolmap_camera(
-            Camera(job["camera"][0], *job["size"], tuple(job["camera"][1])), size
-        )
+        model, params = job["camera"]
+        given = Camera(model, job["size"][0], job["size"][1], tuple(params))
+        camera = _pycolmap_camera(given, size)
     else:
         camera = pc.Camera.create_from_model_name(
             1, "SIMPLE_RADIAL", config.focal_guess * max(size), *size
@@ -3604,7 +3608,8 @@ def _sfm_attempt(
 
 
 def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
-    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics."""
+    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics.
+    """
     pc, out = _pycolmap(), database.parent / rung
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
@@ -3838,13 +3843,15 @@ def _rigid(matrix: Array, where: Sequence[str]) -> Array:
     """Check rigid transforms (N, 3 or 4, 4) and return (N, 3, 4) with exact rotations; rows of NaN
     or inf: NaN.
     """
-    lost = ~np.isfinite(matrix).all((1, 2))
+    lost = ~np.asarray(np.isfinite(matrix).all((1, 2)), bool)
     matrix = np.where(lost[:, None, None], np.eye(4)[: matrix.shape[1]], matrix)
     rotation = matrix[:, :3, :3]
     tolerance = PosesConfig().pose_tolerance
-    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))  # (N,)
+    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))
+    off = np.asarray(error.max((1, 2)), np.float64)  # (N,)
     if matrix.shape[1] == 4:
-        transposed = np.abs(matrix[:, 3] - [0, 0, 0, 1]).max(1) > tolerance
+        last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
+        transposed = np.asarray(last_row.max(1) > tolerance, bool)
         _refuse(
             transposed,
             where,
@@ -4158,7 +4165,8 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
 def _rows_of_frames(
     given: _GivenPoses, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
 ) -> tuple[IntArray, list[str]]:
-    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order."""
+    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order.
+    """
     count = len(given.cam_from_world)
     messages: list[str] = []
     if given.names:
@@ -5687,7 +5695,8 @@ def _spans_of(rows: TrackTable) -> list[list[int]]:
 
 
 def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
-    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits."""
+    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits.
+    """
     if poses is None:
         return {"units": None, "source": "none", "registered_frames": 0, "links": []}
     scale = fits.scale if fits is not None else None
@@ -5829,7 +5838,8 @@ def _summary_world(result: RunResult) -> list[str]:
 
 
 def _options(parser: argparse.ArgumentParser, *sections: str) -> None:
-    """Add the flags that the config dataclasses declare for these sections ("" for the top level)."""
+    """Add the flags that the config dataclasses declare for these sections ("" for the top level).
+    """
     for section in sections:
         cls: Any = Config if not section else Config.__dataclass_fields__[section].default_factory
         for f in dataclasses.fields(cls):

@@ -393,7 +393,7 @@ def test_coco(tmp_path: Path, video: rt.Video) -> None:
 
 
 def test_coco_ids_are_those_of_the_dataset_beside(tmp_path: Path, video: rt.Video) -> None:
-    """An image_id is no frame number (trap 7 of the formats): the dataset JSON says what it means."""
+    """An image_id is no frame number (trap 7 of the formats): the dataset JSON says which it is."""
     images = [{"id": 900 + i, "file_name": f"some/im{19 - i}.png"} for i in range(20)]
     dataset = {"images": images, "categories": [{"id": 7, "name": "wok"}, {"id": 9, "name": "cup"}]}
     (tmp_path / "instances.json").write_text(json.dumps(dataset))
@@ -486,7 +486,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
          "entry 0: .*'category_id': None.*expected two ids"),
         ("d.json", json.dumps(coco_entries(bbox=[1, 2, 3])),
          r"entry 0: .*'bbox': \[1, 2, 3\]}, expected .* a bbox of 4"),
-        ("d.json", json.dumps(coco_entries(category_id=500)), "entry 0: category_id 500 is unknown"),
+        ("d.json", json.dumps(coco_entries(category_id=500)), "category_id 500 is unknown"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [48, 64], "counts": [48 * 64]})),
          r"entry 0: mask of .h, w. \[48, 64\] in a video of \(480, 640\)"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": [8, 9]})),
