@@ -3858,12 +3858,11 @@ def _rigid(matrix: Array, where: Sequence[str]) -> Array:
             "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)",
         )
     what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular)"
-    _refuse(off > tolerance, where, f"{what}; expected a row-major rigid pose without scale")
-    _refuse(
-        np.linalg.det(rotation) < 0,
-        where,
-        "the rotation is mirrored (determinant -1); turn two axes, not one",
-    )
+    scaled = np.asarray(off > tolerance, bool)
+    _refuse(scaled, where, f"{what}; expected a row-major rigid pose without scale")
+    mirrored = np.asarray(np.linalg.det(rotation) < 0, bool)
+    what = "the rotation is mirrored (determinant -1); turn two axes, not one"
+    _refuse(mirrored, where, what)
     u, _, vt = np.linalg.svd(rotation)
     exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
     return np.where(lost[:, None, None], np.nan, exact)

@@ -129,6 +129,8 @@ class CropNet:
 
 def own_look(image: rt.Image, found: rt.Detections, embedder: rt.Embedder) -> Array:
     """Our embedder's foreground and background side by side."""
+    if not len(found):
+        return np.empty((0, 0))
     look = embedder(image, found)
     return np.concatenate([look.foreground, look.background], 1) / np.sqrt(2)
 
