@@ -424,8 +424,7 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One video frame: source frame number (0-based), time in seconds, BGR image (H, W, 3) uint8.
-    """
+    """One video frame: source number (0-based), time in seconds, BGR image (H, W, 3) uint8."""
 
     index: int
     time_s: float
@@ -2023,8 +2022,7 @@ class Embedder:
 
 
 def _on_object(detections: Detections, rows: IntArray, x: Array, y: Array) -> BoolArray:
-    """For samples (N, S, S): is it on the row's own object (its mask, else the inscribed ellipse)?
-    """
+    """For samples (N, S, S): on the row's own object (its mask, else the inscribed ellipse)?"""
     box = _cxcywh_from_xyxy(detections.xyxy[rows])[:, :, None, None]  # (N, 4, 1, 1)
     half = np.maximum(box[:, 2:] / 2, 0.5)
     on = ((x - box[:, 0]) / half[:, 0]) ** 2 + ((y - box[:, 1]) / half[:, 1]) ** 2 <= 1
@@ -2463,8 +2461,7 @@ class Tracker:
         cam_from_world: Array | None = None,
         camera: Camera | None = None,
     ) -> Tracks:
-        """As `update`, with the tentative tracks too (track_id 0): for those who look back later.
-        """
+        """As `update`, with the tentative tracks too (track_id 0), for those who look back."""
         self.frame_number += 1
         detections = as_detections(detections)
         lazy = _LazyEmbeddings(
@@ -3608,8 +3605,7 @@ def _sfm_attempt(
 
 
 def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
-    """Run one mapper: "strict" or "relaxed" incremental, or "global"; `fixed` keeps the intrinsics.
-    """
+    """Run a mapper: "strict" or "relaxed" incremental, "global"; `fixed` keeps the intrinsics."""
     pc, out = _pycolmap(), database.parent / rung
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
@@ -4164,8 +4160,7 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
 def _rows_of_frames(
     given: _GivenPoses, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
 ) -> tuple[IntArray, list[str]]:
-    """Find the row of each frame in a file of poses (-1: none) by name, by time stamp or by order.
-    """
+    """Find the row of each frame in a file of poses (-1: none) by name, time stamp or order."""
     count = len(given.cam_from_world)
     messages: list[str] = []
     if given.names:
@@ -5694,8 +5689,7 @@ def _spans_of(rows: TrackTable) -> list[list[int]]:
 
 
 def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
-    """The "world" part of objects.json: units, gravity, scale, registered frames, joins and splits.
-    """
+    """The "world" of objects.json: units, gravity, scale, registered frames, joins and splits."""
     if poses is None:
         return {"units": None, "source": "none", "registered_frames": 0, "links": []}
     scale = fits.scale if fits is not None else None
@@ -5837,8 +5831,7 @@ def _summary_world(result: RunResult) -> list[str]:
 
 
 def _options(parser: argparse.ArgumentParser, *sections: str) -> None:
-    """Add the flags that the config dataclasses declare for these sections ("" for the top level).
-    """
+    """Add the flags that the configs declare for these sections ("" for the top level)."""
     for section in sections:
         cls: Any = Config if not section else Config.__dataclass_fields__[section].default_factory
         for f in dataclasses.fields(cls):
