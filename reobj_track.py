@@ -3873,9 +3873,8 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
     """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations
     (N, 3).
     """
-    _refuse(
-        ~np.isfinite(np.column_stack([xyzw, translation])).all(1), where, "a number is not finite"
-    )
+    finite = np.asarray(np.isfinite(np.column_stack([xyzw, translation])).all(1), bool)
+    _refuse(~finite, where, "a number is not finite")
     norm = np.linalg.norm(xyzw, axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
     _refuse(np.abs(norm - 1) > PosesConfig().pose_tolerance, where, what)
