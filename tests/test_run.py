@@ -551,3 +551,16 @@ def test_damaged_cache_is_said(
     np.savez(tmp_path / "out/cache/last-tracks.npz", frame=np.arange(3))  # of an older version
     assert cli("objects", tmp_path / "out") == 2
     assert_one_clear_line(capsys, "another version")
+
+
+def test_a_closed_pipe_is_no_error(clip: Path, detections: Path, tmp_path: Path) -> None:
+    """`reobj_track.py objects OUT | head -1`: the rest of the table is not wanted."""
+    assert cli("track", clip, "-o", tmp_path / "out", "--detections", detections) == 0
+    code = (
+        "import os, sys, reobj_track as rt; r, w = os.pipe(); os.dup2(w, 1); os.close(w); "
+        "os.close(r); sys.exit(rt.main(sys.argv[1:]))"
+    )
+    here = Path(rt.__file__).parent
+    args = [sys.executable, "-c", code, "objects", str(tmp_path / "out")]
+    done = subprocess.run(args, capture_output=True, text=True, cwd=here)
+    assert done.returncode == 0 and "Broken pipe" not in done.stderr, done.stderr

@@ -1,0 +1,271 @@
+"""Scores against published ones, against TrackEval, and against cases worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import reobj_track as rt
+
+# TrackEval 1.3.0 on `drifting(seed)` (numbers kept so that something is checked without it)
+STORED = {
+    0: {
+        "HOTA": 0.40494081862197734,
+        "DetA": 0.4993655294235794,
+        "AssA": 0.3293713465268212,
+        "MOTA": 0.5418502202643172,
+        "IDSW": 17.0,
+        "Frag": 77.0,
+        "IDF1": 0.5214521452145214,
+        "IDP": 0.5208791208791209,
+        "IDR": 0.5220264317180616,
+    },
+    1: {
+        "HOTA": 0.3811787079108761,
+        "DetA": 0.5044888330442157,
+        "AssA": 0.28848344082415034,
+        "MOTA": 0.5310492505353319,
+        "IDSW": 20.0,
+        "Frag": 80.0,
+        "IDF1": 0.4755700325732899,
+        "IDP": 0.48237885462555063,
+        "IDR": 0.4689507494646681,
+    },
+}
+TRACKEVAL = """
+import contextlib, io, json, sys
+import numpy as np
+from trackeval.metrics import CLEAR, HOTA, Identity
+
+def overlap(a, b):
+    a, b = (np.c_[x[:, 2:4], x[:, 2:4] + x[:, 4:6]] for x in (a, b))
+    side = np.minimum(a[:, None, 2:], b[None, :, 2:]) - np.maximum(a[:, None, :2], b[None, :, :2])
+    inter = side.clip(0).prod(-1)
+    area = [(x[:, 2:] - x[:, :2]).prod(1) for x in (a, b)]
+    return inter / np.maximum(area[0][:, None] + area[1][None] - inter, 1e-12)
+
+gt, pr = (np.loadtxt(p, delimiter=",", ndmin=2) for p in sys.argv[1:])
+gt = gt[gt[:, 6] != 0]
+frames = np.union1d(gt[:, 0], pr[:, 0])
+ids = [{k: i for i, k in enumerate(np.unique(x[:, 1]))} for x in (gt, pr)]
+steps = [(gt[gt[:, 0] == f], pr[pr[:, 0] == f]) for f in frames]
+data = {
+    "num_gt_dets": len(gt), "num_tracker_dets": len(pr), "num_gt_ids": len(ids[0]),
+    "num_tracker_ids": len(ids[1]), "num_timesteps": len(frames),
+    "gt_ids": [np.array([ids[0][i] for i in g[:, 1]], int) for g, _ in steps],
+    "tracker_ids": [np.array([ids[1][i] for i in p[:, 1]], int) for _, p in steps],
+    "similarity_scores": [overlap(g, p) for g, p in steps],
+}
+with contextlib.redirect_stdout(io.StringIO()):
+    h, c, i = (m.eval_sequence(data) for m in (HOTA(), CLEAR(), Identity()))
+found = {k: float(np.mean(h[k])) for k in ("HOTA", "DetA", "AssA")}
+found |= {k: float(c[k]) for k in ("MOTA", "IDSW", "Frag")}
+print(json.dumps(found | {k: float(i[k]) for k in ("IDF1", "IDP", "IDR")}))
+"""
+
+
+def drifting(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """True and found MOTChallenge rows: misses, switches, swaps, false boxes, unmarked truth."""
+    rng = np.random.default_rng(seed)
+    gt, pr = [], []
+    for obj in range(8):
+        start, here = rng.integers(0, 20), rng.uniform(0, 500, 2)
+        name = 10 + obj
+        for frame in range(start, start + 60):
+            here = here + rng.normal(0, 2, 2)
+            flag = float(not (obj == 7 and frame < 30))  # zero-marked as in MOT15
+            gt.append([frame + 1, obj + 1, *here, 60, 90, flag, -1, -1, -1])
+            name = name + 20 if rng.random() < 0.03 else name
+            if rng.random() < 0.85:
+                pr.append([frame + 1, name, *(here + rng.normal(0, 9, 2)), 60, 90, 0.9, -1, -1, -1])
+    for k in range(40):
+        junk = [rng.integers(1, 80), 900 + k // 5, *rng.uniform(0, 500, 2)]
+        pr.append([*junk, 60, 90, 0.5, -1, -1, -1])
+    rows = np.array(pr)
+    _, first = np.unique(rows[:, :2], axis=0, return_index=True)  # an identity once a frame
+    return np.array(gt), rows[first]
+
+
+def write(path: Path, rows: np.ndarray) -> Path:
+    np.savetxt(path, rows, delimiter=",", fmt="%.6f")
+    return path
+
+
+def score(gt: Path, found: Path) -> dict[str, float]:
+    return rt.evaluate(found, gt)["tracks"]["all"]
+
+
+# ---- Against others ----
+
+
+@pytest.mark.parametrize("seed", STORED)
+def test_equals_the_stored_numbers_of_trackeval(tmp_path: Path, seed: int) -> None:
+    gt, pr = drifting(seed)
+    mine = score(write(tmp_path / "gt.txt", gt), write(tmp_path / "pr.txt", pr))
+    assert {k: mine[k] for k in STORED[seed]} == pytest.approx(STORED[seed], abs=1e-9)
+
+
+def trackeval_python(folder: Path) -> str:
+    """Interpreter with TrackEval 1.3.0, in a venv of its own (it pulls opencv-python)."""
+    given = os.environ.get("REOBJ_TRACKEVAL_PYTHON")
+    if given:
+        return given
+    venv.create(folder, with_pip=True)
+    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
+    command = [python, "-m", "pip", "install", "-q", "trackeval==1.3.0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    if done.returncode:
+        pytest.skip(f"TrackEval cannot be installed here: {done.stderr.strip()[-200:]}")
+    return str(python)
+
+
+@pytest.mark.skipif(
+    not (os.environ.get("REOBJ_TRACKEVAL_PYTHON") or os.environ.get("REOBJ_SLOW")),
+    reason="makes a venv with TrackEval: set REOBJ_SLOW=1, or REOBJ_TRACKEVAL_PYTHON to its python",
+)
+def test_equals_trackeval(tmp_path: Path) -> None:
+    python = trackeval_python(tmp_path / "venv")
+    for seed in range(5):
+        gt, pr = drifting(seed)
+        files = write(tmp_path / "gt.txt", gt), write(tmp_path / "pr.txt", pr)
+        command = [python, "-c", TRACKEVAL, *map(str, files)]
+        text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        theirs = json.loads(text.splitlines()[-1])
+        mine = score(*files)
+        assert {k: mine[k] for k in theirs} == pytest.approx(theirs, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "published"),  # py-motmetrics' README
+    [
+        ("TUD-Campus", {"IDF1": 55.8, "IDP": 73.0, "IDR": 45.1, "recall": 58.2, "precision": 94.1,
+                        "IDSW": 7, "Frag": 7, "MOTA": 52.6}),
+        ("TUD-Stadtmitte", {"IDF1": 64.5, "recall": 60.9, "precision": 94.0, "IDSW": 7, "Frag": 6,
+                            "MOTA": 56.4}),
+    ],
+)  # fmt: skip
+def test_equals_published_scores(name: str, published: dict[str, float]) -> None:
+    data = os.environ.get("REOBJ_DATA", Path(rt.__file__).resolve().parent.parent / "shared/data")
+    folder = Path(data) / "mot" / "metrics_check" / name
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there (py-motmetrics' example, not redistributed)")
+    mine = score(folder / "gt.txt", folder / "test.txt")
+    for key, value in published.items():
+        share = 1 if key in ("IDSW", "Frag") else 100
+        assert round(share * mine[key], 1) == pytest.approx(value, abs=0.051), key
+
+
+# ---- By hand ----
+
+
+def boxes(*rows: tuple[float, ...]) -> rt.LabelledBoxes:
+    """Rows frame, id, x; all boxes are 10 x 10."""
+    return rt.labelled(np.array([[f, i, x, 0, 10, 10, 1] for f, i, x in rows], float))
+
+
+def test_a_switch_halves_the_identity() -> None:
+    truth = boxes(*((f, 1, 0) for f in range(4)))
+    found = boxes((0, 5, 0), (1, 5, 0), (2, 6, 0), (3, 6, 0))
+    mine = rt.score_tracks(truth, found)
+    assert mine["IDSW"] == 1 and mine["MOTA"] == 0.75 and mine["IDF1"] == 0.5
+    assert mine["DetA"] == 1 and mine["AssA"] == 0.5 and mine["ids_per_object"] == 2
+
+
+def test_nothing_found_and_nothing_true() -> None:
+    some, none = boxes((0, 1, 0), (1, 1, 0)), rt.labelled(np.empty((0, 7)))
+    assert rt.score_tracks(some, none)["HOTA"] == 0
+    assert rt.score_tracks(none, some)["precision"] == 0
+    assert rt.score_tracks(none, none)["IDF1"] == 0
+    assert rt.score_tracks(some, some)["HOTA"] == 1
+
+
+def test_classes_never_match_each_other() -> None:
+    rows = np.array([[1, 1, 0, 0, 10, 10, 1]], float)
+    chair, cup, any_class = (rt.labelled(rows, n) for n in ("chair", "cup", ""))
+    assert rt.score_tracks(chair, cup)["recall"] == 0
+    assert rt.score_tracks(chair, any_class)["recall"] == 1
+
+
+def test_mot17_distractors_swallow_what_they_match(tmp_path: Path) -> None:
+    """Class 8 is a distractor, class 3 (car) is not: a box on the car is false."""
+    (tmp_path / "seqinfo.ini").touch()
+    (tmp_path / "gt").mkdir()
+    person, distractor, car = (1, 0, 1, 1), (2, 50, 0, 8), (3, 90, 0, 3)  # id, x, flag, class
+    gt = [[1, i, x, 0, 10, 10, f, c, 1] for i, x, f, c in (person, distractor, car)]
+    pr = [[1, i, x, 0, 10, 10, 1, -1, -1, -1] for i, x in ((1, 0), (2, 50), (3, 90))]
+    truth = write(tmp_path / "gt" / "gt.txt", np.array(gt))
+    files = truth, write(tmp_path / "pr.txt", np.array(pr))
+    mine = score(*files)
+    assert mine["gt_objects"] == 1 and mine["identities"] == 2 and mine["precision"] == 0.5
+
+
+def test_barely_visible_truth_is_ignored(tmp_path: Path) -> None:
+    gt = np.array([[1, 1, 0, 0, 10, 10, 1, 56, 0.9], [1, 2, 50, 0, 10, 10, 1, 56, 0.1]])
+    pr = np.array([[1, i, x, 0, 10, 10, 1, -1, -1, -1] for i, x in ((1, 0), (2, 50))])
+    files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
+    assert rt.evaluate(*files)["tracks"]["all"]["gt_objects"] == 2
+    strict = rt.evaluate(*files, min_visibility=0.3)["tracks"]["all"]
+    assert strict["gt_objects"] == 1 and strict["precision"] == 1
+
+
+def test_unknown_class_is_refused(tmp_path: Path) -> None:
+    gt, pr = drifting(0)
+    files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
+    with pytest.raises(rt.ReobjError, match="chiar"):
+        rt.evaluate(*files, classes=["chiar"])
+
+
+def test_command_line_prints_a_table_and_refuses_other_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gt, pr = drifting(0)
+    files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
+    assert rt.main(["eval", str(files[0]), "--gt", str(files[1])]) == 0
+    assert "IDF1" in capsys.readouterr().out
+    (tmp_path / "bad.txt").write_text("not a table\n")
+    assert rt.main(["eval", str(files[0]), "--gt", str(tmp_path / "bad.txt")]) == 2
+    assert "no MOTChallenge file" in capsys.readouterr().err
+
+
+# ---- Objects in 3D ----
+
+
+def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
+    """Our world is half as large and turned: after the alignment by cameras nothing is wrong."""
+    rng = np.random.default_rng(3)
+    centers = rng.uniform(-2, 2, (12, 3))  # of the cameras, true world
+    turn = rt.Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
+    ours = 0.5 * centers @ turn.T + [1, 2, 3]
+    pose = np.concatenate([np.tile(np.eye(3), (12, 1, 1)), -ours[:, :, None]], 2)
+    camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    frame = np.arange(12)
+    poses = rt.Poses(camera, frame, frame / 10, pose, np.full(12, "pnp"), "pycolmap")
+    c2w = np.tile(np.eye(4), (12, 1, 1))
+    c2w[:, :3, 3] = centers
+    np.savetxt(tmp_path / "poses_c2w.txt", c2w.reshape(12, 16))
+    (tmp_path / "cache").mkdir()
+    rt.save_poses(tmp_path / "cache" / "last-poses.npz", poses)
+    table = rt.TrackTable(*(np.empty(0, np.int64) for _ in range(3)), np.empty((0, 4)),
+                          np.empty(0), np.empty(0, np.int64), np.empty(0, np.int64))  # fmt: skip
+    rt.TrackResult(table, np.zeros((0, 0)), ("chair",), ()).save(tmp_path / "cache/last-tracks.npz")
+    true = {"id": 4, "center": [0.5, 0.2, 1.0], "half_axes": [0.2, 0.3, 0.4],
+            "world_from_obj": np.eye(3).tolist()}  # fmt: skip
+    (tmp_path / "gt_objects.json").write_text(json.dumps({"objects": [true]}))
+    quat = rt.quat_wxyz_from_matrix(turn[None])[0].tolist()
+    center = (0.5 * turn @ np.array(true["center"]) + [1, 2, 3]).tolist()
+    mine = {"id": 9, "class": "chair", "status": "ok", "center": center, "quat_wxyz": quat,
+            "half_axes": [0.1, 0.15, 0.2]}  # fmt: skip
+    world = {"scale": {"metres_per_unit": 2.2}}
+    (tmp_path / "objects.json").write_text(json.dumps({"objects": [mine], "world": world}))
+    files = tmp_path, tmp_path / "gt_objects.json", tmp_path / "poses_c2w.txt"
+    found = rt.score_objects(*files, {4: 9, 5: 7})
+    assert found["o3d_found"] == pytest.approx(1, abs=5e-3)
+    assert found["o3d_all"] == pytest.approx(0.5, abs=5e-3)  # the second true object has no solid
+    assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
+    assert found["scale_error"] == pytest.approx(0.1)
+
