@@ -276,13 +276,32 @@ class TrackerConfig:
     std_velocity: float = _opt(
         1 / 160, "process noise of a velocity over the box size (DeepSORT: 1/160)"
     )
-    std_measure: float = _opt(0.05, "measurement noise over the box size (DeepSORT: 1/20)")
+    std_start: float = _opt(
+        1 / 16, "spread of a new track's velocity over the box size (DeepSORT: 1/16)"
+    )
+    std_measure: float = _opt(
+        0.05, "measurement noise over the box size at score .8 (DeepSORT: 1/20)"
+    )
+    score_noise: float = _opt(
+        0.25, "and how it grows with doubt, (1 - score) to this power (StrongSORT: 1)"
+    )
     gate_chi2: float = _opt(
         9.2103, "gate on the centre's squared Mahalanobis distance (chi2 .99, 2 dof)"
     )
     gate_iou: float = _opt(0.5, "overlap that passes the gate by itself")
+    min_iou: float = _opt(0.0, "overlap needed where only the distance passes its gate")
+    gate_size: float = _opt(0.0, "most that width or height may differ, as a factor (0: any)")
+    blind_velocity: float = _opt(
+        1 / 80, "std_velocity without images, poses and embeddings: the camera's motion is in it"
+    )
+    blind_start: float = _opt(0.2, "std_start then (SORT: wide)")
+    blind_iou: float = _opt(0.2, "gate_iou then, and half of it as min_iou")
+    blind_size: float = _opt(2.0, "gate_size then")
     low_iou: float = _opt(0.3, "overlap needed for low scores and for a change of class")
     max_cost: float = _opt(0.9, "most that an accepted match may cost (0: perfect, 1: at the gate)")
+    distance_weight: float = _opt(0.2, "share of the distance in the cost, the rest is overlap")
+    missed_cost: float = _opt(0.2, "added for tracks not seen for 10 frames, in proportion before")
+    tentative_cost: float = _opt(0.2, "added for tracks that are not confirmed yet")
     class_cost: float = _opt(0.2, "added to the cost when the class differs")
     appearance_weight: float = _opt(0.5, "share of appearance in the cost of contested matches")
     foreground_weight: float = _opt(0.5, "share of the foreground in the appearance")
@@ -311,6 +330,17 @@ class TrackerConfig:
     flow_size_px: int = _opt(320, "longer side of the image for optical flow")
     flow_corners: int = _opt(200, "corners followed")
     flow_min_corners: int = _opt(8, "with fewer, the camera is taken to stand still")
+
+    def blind(self) -> TrackerConfig:
+        """The options for frames without image, pose and embeddings: boxes are all there is."""
+        return dataclasses.replace(
+            self,
+            std_velocity=self.blind_velocity,
+            std_start=self.blind_start,
+            gate_iou=self.blind_iou,
+            min_iou=self.blind_iou / 2,
+            gate_size=self.blind_size,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -2361,7 +2391,7 @@ class _Live:
             [
                 (2 * config.std_position * scale) ** 2,
                 0 * scale,
-                (10 * config.std_velocity * scale) ** 2,
+                (config.std_start * scale) ** 2,
             ],
             -1,
         )
@@ -2424,6 +2454,7 @@ class Tracker:
         self._tracklets = itertools.count(1)
         self._camera_motion = CameraMotion(self.config)
         self._last_pose: Array | None = None
+        self._motion = self.config
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
 
     def update(
@@ -2463,6 +2494,8 @@ class Tracker:
     ) -> Tracks:
         """As `update`, with the tentative tracks too (track_id 0), for those who look back."""
         self.frame_number += 1
+        blind = frame is None and cam_from_world is None and embeddings is None
+        self._motion = self.config.blind() if blind else self.config
         detections = as_detections(detections)
         lazy = _LazyEmbeddings(
             _as_embeddings(embeddings, len(detections)),
@@ -2486,7 +2519,7 @@ class Tracker:
     ) -> None:
         """Kalman prediction, then the camera's own motion."""
         live = self._live
-        live.mean, live.cov = kalman_predict(live.mean, live.cov, self.config)
+        live.mean, live.cov = kalman_predict(live.mean, live.cov, self._motion)
         live.mean[:, 2:, 0] = live.mean[:, 2:, 0].clip(1.0)  # a size stays positive
         live.missed += 1
         new_from_old = np.eye(3)
@@ -2515,7 +2548,8 @@ class Tracker:
         gate = feasible & high
         if lazy.available and self._live.look.shape[1]:
             cost = self._add_appearance(cost, gate, lazy)
-        _assign(np.where(gate, cost, np.inf), config.max_cost, track_of)
+        gate &= cost < config.max_cost
+        _assign(np.where(gate, cost + self._handicap()[:, None], np.inf), np.inf, track_of)
         free = ~np.isin(np.arange(len(iou)), track_of)
         low = (track_of < 0) & (detections.score >= config.low_score)
         second = feasible & (iou >= config.low_iou) & low & free[:, None]
@@ -2524,7 +2558,7 @@ class Tracker:
 
     def _motion_cost(self, detections: Detections, box: Array) -> tuple[Array, BoolArray, Array]:
         """Cost in [0, 1] from overlap and gated distance, feasibility and IoU, (T, D) each."""
-        live, config = self._live, self.config
+        live, config = self._live, self._motion
         iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), detections.xyxy)
         var = (
             live.cov[:, :2, 0] + (config.std_measure * _noise_scale(live.mean)[:, :2]) ** 2
@@ -2533,9 +2567,20 @@ class Tracker:
         distance = (offset**2 / var[:, None]).sum(-1)  # (T, D) squared Mahalanobis, 2 dof
         distance = distance / config.gate_chi2
         same_class = _same_class(live.votes, detections.class_id)
-        feasible = (distance < 1) | (iou > config.gate_iou)
-        cost = 0.5 * (1 - iou) + 0.5 * distance.clip(0, 1) + config.class_cost * ~same_class
+        feasible = ((distance < 1) & (iou >= config.min_iou)) | (iou > config.gate_iou)
+        if config.gate_size:
+            growth = np.log(live.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
+            feasible &= (np.abs(growth) < math.log(config.gate_size)).all(-1)
+        share = config.distance_weight
+        cost = (1 - share) * (1 - iou) + share * distance.clip(0, 1)
+        cost = cost + config.class_cost * ~same_class
         return cost, feasible & (same_class | (iou > config.low_iou)), iou
+
+    def _handicap(self) -> Array:
+        """What a match costs extra (T,): tracks just seen and confirmed ones choose first."""
+        live, config = self._live, self.config
+        waited = ((live.missed - 1) / 10).clip(0, 1)
+        return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
 
     def _add_appearance(self, cost: Array, gate: BoolArray, lazy: _LazyEmbeddings) -> Array:
         """Blend in appearance for detections and tracks whose best candidate has a close rival."""
@@ -2561,7 +2606,8 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t, live = track_of[rows], self._live
         box = _cxcywh_from_xyxy(detections.xyxy[rows])
-        noise = self.config.std_measure * _noise_scale(live.mean[t])
+        doubt = ((1 - detections.score[rows]).clip(0.05) / 0.2) ** self.config.score_noise  # (n,)
+        noise = self.config.std_measure * _noise_scale(live.mean[t]) * doubt[:, None]
         live.mean[t], live.cov[t] = kalman_update(live.mean[t], live.cov[t], box, noise)
         self._count(detections, rows, t)
 
@@ -2579,7 +2625,7 @@ class Tracker:
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
         ids = np.fromiter(self._tracklets, np.int64, len(rows))
         born = _Live.born(
-            _cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self.config
+            _cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self._motion
         )
         track_of[rows] = len(self._live.mean) + np.arange(len(rows))
         self._live = self._live.append(born)
@@ -5826,6 +5872,371 @@ def _summary_world(result: RunResult) -> list[str]:
     return lines
 
 
+# ---- Evaluation --------------------------------------------------------------------------------
+
+SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
+MOT_DISTRACTORS = (2, 7, 8, 12)  # on a vehicle, static, distractor, reflection (MOT16 and later)
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledBoxes:
+    """Boxes with identities of a whole video, truth or result (N rows, any order).
+
+    Attributes:
+        frame, identity: (N,); xyxy: (N, 4); name: (N,) class names, "" matches every class.
+        role: (N,) SCORED, IGNORED or ABSENT; all SCORED in a result.
+    """
+
+    frame: IntArray
+    identity: IntArray
+    xyxy: Array
+    name: npt.NDArray[np.str_]
+    role: IntArray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, keep: Any) -> LabelledBoxes:
+        return LabelledBoxes(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+
+
+def read_mot_rows(path: Path) -> Array:
+    """Rows of a MOTChallenge file, (N, columns)."""
+    try:
+        rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise ReobjError(f"{path}: no MOTChallenge file: {error}") from None
+    if rows.size and rows.shape[1] < 6:
+        raise ReobjError(f"{path}: {rows.shape[1]} columns; wanted frame,id,left,top,width,height")
+    return np.asarray(rows if rows.size else np.empty((0, 10)), np.float64)
+
+
+def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
+    """MOTChallenge rows with class names and roles (scalars or (N,))."""
+    n, box = len(rows), rows[:, 2:6]
+    xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
+    whole = rows[:, :2].astype(np.int64)
+    names, roles = np.broadcast_to(np.asarray(name, str), n), np.broadcast_to(role, n)
+    return LabelledBoxes(whole[:, 0], whole[:, 1], xyxy, names, np.asarray(roles, np.int64))
+
+
+def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) -> LabelledBoxes:
+    """Read a MOTChallenge gt.txt.
+
+    Column 7 is the flag (0: does not count). Column 8 is a class only in files of nine columns: of
+    MOT16 and later where seqinfo.ini stands beside the gt folder; else as `gt_mot_format.json`
+    beside the file names them, else an index into class_names. Column 9 is the visibility.
+    """
+    rows = read_mot_rows(path)
+    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
+    if rows.shape[1] != 9:  # MOT15 has ten: world coordinates in place of class and visibility
+        return labelled(rows, "", np.where(flagged, ABSENT, SCORED))
+    number = rows[:, 7].astype(np.int64)
+    if (path.parent.parent / "seqinfo.ini").exists():
+        role = np.where(flagged | (number != 1), ABSENT, SCORED)
+        role[np.isin(number, MOT_DISTRACTORS)] = IGNORED
+        return labelled(rows, "", role)
+    hidden = flagged | (rows[:, 8] < min_visibility)
+    known = path.with_name("gt_mot_format.json")
+    names = {str(i): n for i, n in enumerate(class_names)}
+    if known.exists():
+        names = json.loads(known.read_text()).get("classes", names)
+    return labelled(rows, [names.get(str(n), str(n)) for n in number], hidden * IGNORED)
+
+
+def read_result(out: Path) -> LabelledBoxes:
+    """Identities of an output folder of `run`, with the objects' classes; or of a tracks.txt."""
+    rows = read_mot_rows(out / "tracks.txt" if out.is_dir() else out)
+    classes: dict[int, str] = {}
+    if (out / "objects.json").is_file():
+        objects = json.loads((out / "objects.json").read_text())["objects"]
+        classes = {int(o["id"]): str(o["class"]) for o in objects}
+    return labelled(rows, [classes.get(int(i), "") for i in rows[:, 1]])
+
+
+_Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), their IoU (g, p)
+
+
+def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
+    """One step a frame; IoU is 0 between different classes."""
+    frames = np.union1d(truth.frame, found.frame)
+    rows = []
+    for boxes in (truth, found):
+        order = np.argsort(boxes.frame, kind="stable")
+        rows.append(np.split(order, np.searchsorted(boxes.frame[order], frames[1:])))
+    steps = []
+    for g, p in zip(*rows, strict=True):
+        a, b = truth.name[g][:, None], found.name[p][None]
+        same = (a == b) | (a == "") | (b == "")
+        steps.append((g, p, np.where(same, box_iou(truth.xyxy[g], found.xyxy[p]), 0.0)))
+    return steps
+
+
+def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
+    """Assignment of the largest total score, without pairs of score 0."""
+    rows, columns = linear_sum_assignment(-score)
+    good = score[rows, columns] > 1e-12
+    return rows[good], columns[good]
+
+
+def drop_ignored(truth: LabelledBoxes, found: LabelledBoxes) -> LabelledBoxes:
+    """Results without those whose best truth is an ignored row (as MOTChallenge does)."""
+    keep = np.ones(len(found), bool)
+    for g, p, iou in _frame_steps(truth, found) if (truth.role == IGNORED).any() else ():
+        a, b = _best_pairs(np.where(iou >= 0.5, iou, 0))
+        keep[p[b]] &= truth.role[g[a]] != IGNORED
+    return found[keep]
+
+
+def _numbered(
+    truth: LabelledBoxes, found: LabelledBoxes
+) -> tuple[IntArray, IntArray, list[_Step], IntArray, IntArray]:
+    """Identities (G,) and (P,), steps with their numbers in place of rows, boxes of each."""
+    truth = truth[truth.role == SCORED]
+    gt_ids, gt, gt_size = np.unique(truth.identity, return_inverse=True, return_counts=True)
+    ids, pr, pr_size = np.unique(found.identity, return_inverse=True, return_counts=True)
+    steps = [(gt[g], pr[p], iou) for g, p, iou in _frame_steps(truth, found)]
+    return gt_ids, ids, steps, gt_size, pr_size
+
+
+def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
+    """HOTA, CLEAR MOT and identity scores, and identities per real object, as TrackEval has them.
+
+    `ids_per_object`: different identities that were matched at IoU .5 to a real object, mean over
+    the objects that were matched at all.
+    Ref: Luiten et al., IJCV 2021; Bernardin & Stiefelhagen, 2008; Ristani et al., 2016.
+    """
+    gt_ids, ids, steps, gt, pr = _numbered(truth, drop_ignored(truth, found))
+    result = _hota(steps, gt, pr) | _clear(steps, gt, pr) | _identity(steps, gt, pr)
+    return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
+
+
+def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
+    """HOTA and its parts, mean over the IoU thresholds .05 to .95."""
+    align = np.zeros((len(gt_size), len(pr_size)))  # (G, P) soft number of frames in common
+    for g, p, iou in steps:
+        union = iou.sum(0)[None] + iou.sum(1)[:, None] - iou
+        align[g[:, None], p[None]] += iou / np.maximum(union, 1e-12)
+    align /= np.maximum(gt_size[:, None] + pr_size[None] - align, 1e-12)
+    pairs = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
+    for g, p, iou in steps:
+        a, b = _best_pairs(align[g[:, None], p[None]] * iou)
+        pairs.append((g[a], p[b], iou[a, b]))
+    g_all, p_all, iou_all = (np.concatenate(x) for x in zip(*pairs, strict=True))
+    parts = []
+    for alpha in np.arange(0.05, 0.99, 0.05):
+        hit = iou_all >= alpha - 1e-12
+        together = np.zeros_like(align)
+        np.add.at(together, (g_all[hit], p_all[hit]), 1)
+        jaccard = together / np.maximum(gt_size[:, None] + pr_size[None] - together, 1)
+        ass = (together * jaccard).sum() / max(hit.sum(), 1)
+        det = hit.sum() / max(gt_size.sum() + pr_size.sum() - hit.sum(), 1)
+        parts.append((math.sqrt(ass * det), det, ass))
+    return dict(zip(("HOTA", "DetA", "AssA"), np.mean(parts, 0).tolist(), strict=True))
+
+
+def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
+    """MOTA, switches, fragments at IoU .5; a match of the last frame is kept while it overlaps."""
+    last = np.full(len(gt_size), -1)  # identity of the last match ever
+    before = last.copy()  # and of the match in the last frame with truth
+    switches = hits = 0
+    starts = np.zeros(len(gt_size), np.int64)
+    met = np.zeros((len(gt_size), len(pr_size)), bool)
+    for g, p, iou in steps:
+        if not len(g) or not len(p):
+            continue  # as TrackEval: a frame without either does not end a match
+        kept = 1000.0 * (before[g][:, None] == p[None])
+        a, b = _best_pairs(np.where(iou >= 0.5 - 1e-12, kept + iou, 0))
+        g, p = g[a], p[b]
+        switches += int(((last[g] >= 0) & (last[g] != p)).sum())
+        hits += len(g)
+        met[g, p] = True
+        starts[g] += before[g] < 0
+        last[g] = p
+        before[:] = -1
+        before[g] = p
+    gt, pr = int(gt_size.sum()), int(pr_size.sum())
+    return {
+        "MOTA": 1 - (gt + pr - 2 * hits + switches) / max(gt, 1),
+        "IDSW": switches,
+        "Frag": int((starts - 1).clip(0).sum()),
+        "recall": hits / max(gt, 1),
+        "precision": hits / max(pr, 1),
+        "ids_per_object": float(met.sum() / max(met.any(1).sum(), 1)),
+    }
+
+
+def _identity_pairs(steps: Sequence[_Step], shape: tuple[int, ...]) -> tuple[Any, Any, Array]:
+    """Best one-to-one map of true to found identities, and their frames in common, (K,) each."""
+    common = np.zeros(shape)
+    for g, p, iou in steps:
+        common[g[:, None], p[None]] += iou >= 0.5 - 1e-12
+    a, b = _best_pairs(common)
+    return a, b, common[a, b]
+
+
+def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
+    """Identity precision, recall and F1 under the best one-to-one map of identities."""
+    right = float(_identity_pairs(steps, (len(gt_size), len(pr_size)))[2].sum())
+    gt, pr = int(gt_size.sum()), int(pr_size.sum())
+    shares = (2 * right / max(gt + pr, 1), right / max(pr, 1), right / max(gt, 1))
+    return dict(zip(("IDF1", "IDP", "IDR"), shares, strict=True))
+
+
+def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | None]:
+    """True identity -> the found identity that stands for it (most frames, one to one), or None."""
+    gt_ids, ids, steps, *_ = _numbered(truth, found)
+    a, b, _ = _identity_pairs(steps, (len(gt_ids), len(ids)))
+    pairs: dict[int, int | None] = dict.fromkeys(gt_ids.tolist())
+    return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
+
+
+def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
+    """Ids and ellipsoids of a gt_objects.json (`half_axes`, or full extents `size` with axes `R`).
+
+    Where an object has a `visible_part`, that is the truth: no camera saw the rest.
+    """
+    entries = json.loads(path.read_text())["objects"]
+    seen = [e | e.get("visible_part", {}) for e in entries]
+    half = [np.array(e["size"]) / 2 if "R" in e else np.array(e["half_axes"]) for e in seen]
+    turn = np.array([e["R"] if "R" in e else e["world_from_obj"] for e in seen])  # (O, 3, 3)
+    center = np.array([e["center"] for e in seen], np.float64)
+    half_axes = np.maximum(np.array(half), 0.005)  # (O, 3) a sheet is taken as 1 cm thick
+    return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, turn[:, :3, :3])
+
+
+def true_from_found(out: Path, truth_poses: Path | None) -> tuple[float, Array, Array]:
+    """Scale, rotation and shift from our world to the truth's, from the cameras' centres.
+
+    Ref: Umeyama, PAMI 1991. Poses that the user supplied are in the truth's world already.
+    """
+    poses = Workspace(out).recall()[1]
+    if poses is None:
+        raise ReobjError(f"{out}: no cameras here, so nothing to compare in 3D; see `run`")
+    if poses.source == "user":
+        return 1.0, np.eye(3), np.zeros(3)
+    if truth_poses is None:
+        raise ReobjError("reconstructed cameras have a world of their own: give --gt-poses")
+    centers = _true_centers(truth_poses, poses)  # (F, 3)
+    use = poses.known & np.isfinite(centers).all(1)
+    pose, goal = poses.cam_from_world[use], centers[use]
+    ours = -np.einsum("fji,fj->fi", pose[:, :, :3], pose[:, :, 3])  # (f, 3)
+    a, b = ours - ours.mean(0), goal - goal.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    turn = (u * flip) @ vt
+    scale = float((s * flip).sum() / (a**2).sum())
+    return scale, turn, goal.mean(0) - scale * turn @ ours.mean(0)
+
+
+def _true_centers(path: Path, poses: Poses) -> Array:
+    """Camera centres (F, 3) at the poses' frames: TUM by time, or 16 numbers a frame (c2w)."""
+    table = np.loadtxt(path, ndmin=2)
+    if table.shape[1] == 16:
+        frame = poses.frame.clip(0, len(table) - 1)
+        return np.where((frame == poses.frame)[:, None], table[frame][:, 3:12:4], np.nan)
+    nearest = np.abs(table[:, :1] - poses.time_s[None]).argmin(0)  # (F,)
+    far = np.abs(table[nearest, 0] - poses.time_s) > 0.02
+    return np.where(far[:, None], np.nan, table[nearest, 1:4])
+
+
+def score_objects(
+    out: Path, solids: Path, truth_poses: Path | None, pairs: dict[int, int | None]
+) -> dict[str, Any]:
+    """O3D (volume IoU), centre and size errors of the ellipsoids against the true ones.
+
+    Args:
+        pairs: every true identity -> found identity or None (`identity_map`): an object counts as
+            found only if the identities say so; `o3d_all` gives 0 to those without ellipsoid.
+    """
+    ids, truth = read_true_solids(solids)
+    scale, turn, shift = true_from_found(out, truth_poses)
+    data = json.loads((out / "objects.json").read_text())
+    entry = {int(o["id"]): o for o in data["objects"] if o["status"] != "rejected"}
+    rows = [i for i, t in enumerate(ids) if pairs.get(t) in entry]
+    mine = [entry[pairs[ids[i]] or 0] for i in rows]
+    if not mine:
+        return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
+    center = np.array([o["center"] for o in mine]) @ (scale * turn).T + shift  # (n, 3)
+    quat = np.array([o["quat_wxyz"] for o in mine])
+    axes = turn @ Rotation.from_quat(quat[:, [1, 2, 3, 0]]).as_matrix()
+    found = quadrics.Ellipsoids(center, scale * np.array([o["half_axes"] for o in mine]), axes)
+    goal = truth[np.array(rows)]
+    o3d = quadrics.volume_overlap(found, goal)  # (n,)
+    error = np.linalg.norm(center - goal.center_in_world, axis=1)
+    size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3
+    claimed = (data["world"].get("scale") or {}).get("metres_per_unit")
+    each = [
+        {"id": ids[i], "object": o["id"], "class": o["class"], "o3d": a, "center_error": b}
+        for i, o, a, b in zip(rows, mine, o3d.tolist(), error.tolist(), strict=True)
+    ]
+    return {
+        "true": len(pairs),
+        "found": len(mine),
+        "o3d_found": float(o3d.mean()),
+        "o3d_median": float(np.median(o3d)),
+        "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
+        "center_error_median": float(np.median(error)),
+        "size_error_median": float(np.expm1(np.median(size))),
+        "scale_error": None if not claimed else abs(claimed / scale - 1),
+        "objects": each,
+    }
+
+
+_COLUMNS = "HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split()
+
+
+def score_table(scores: dict[str, dict[str, float]]) -> str:
+    """Format one line for each name, shares in per cent."""
+    lines = [f"{'':<14}" + "".join(f"{c[:7]:>8}" for c in _COLUMNS)]
+    for name, score in scores.items():
+        unit = {"IDSW": 1, "Frag": 1, "ids_per_object": 1}
+        cells = [score[c] * unit.get(c, 100) for c in _COLUMNS]
+        lines.append(f"{name[:14]:<14}" + "".join(f"{cell:8.2f}" for cell in cells))
+    return "\n".join(lines)
+
+
+def evaluate(
+    out: Path,
+    gt: Path,
+    solids: Path | None = None,
+    truth_poses: Path | None = None,
+    classes: Sequence[str] = (),
+    min_visibility: float = 0.0,
+) -> dict[str, Any]:
+    """Score an output folder of `run` (or a tracks.txt): {"tracks": by class, "objects": 3D}."""
+    names: Sequence[str] = COCO_NAMES
+    found = read_result(out)
+    if (out / "cache" / "last-tracks.npz").exists():
+        names = Workspace(out).recall()[0].class_names
+    truth = read_truth(gt, names, min_visibility)
+    if (out / "cache" / "source.json").exists():
+        truth = truth[_was_read(truth.frame - 1, out)]
+    wanted = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
+    unknown = set(classes) - set(truth.name) - set(found.name)
+    if unknown:
+        raise ReobjError(f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor found")
+    if classes:
+        truth, found = (x[np.isin(x.name, [*classes, ""])] for x in (truth, found))
+    scores = {"all": score_tracks(truth, found)}
+    if len(wanted) > 1:
+        for name in wanted:
+            part = [x[np.isin(x.name, [name, ""])] for x in (truth, found)]
+            scores[name] = score_tracks(*part)
+    result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
+    if solids is not None:
+        result["objects"] = score_objects(out, solids, truth_poses, identity_map(truth, found))
+    return result
+
+
+def _was_read(frame: IntArray, out: Path) -> BoolArray:
+    """Which source frames (N,) lay within --start, --stop, --every of the run."""
+    config = InputConfig(**json.loads((out / "cache" / "source.json").read_text())["input"])
+    after = frame - config.start
+    inside = (after >= 0) & (after % config.every == 0)
+    return np.asarray(inside & (frame < (config.stop or np.inf)), bool)
+
+
 # ---- Command line ------------------------------------------------------------------------------
 
 
@@ -6053,18 +6464,39 @@ def _cmd_objects(args: argparse.Namespace) -> int:
 
 
 def _add_eval(sub: Any) -> None:
-    parser = sub.add_parser("eval", help="compare with ground truth (needs the `eval` extra)")
-    parser.add_argument("out", help="output folder of an earlier `run`")
-    parser.add_argument("--gt", required=True, help="ground truth in MOTChallenge format")
+    parser = sub.add_parser("eval", help="compare with ground truth: HOTA, IDF1, MOTA, O3D ...")
+    parser.add_argument("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
+    parser.add_argument("--gt", type=Path, required=True, help="true tracks, MOTChallenge gt.txt")
+    parser.add_argument("--gt-objects", type=Path, help="true solids, e.g. a gt_objects.json")
+    parser.add_argument(
+        "--gt-poses",
+        type=Path,
+        help="true cameras, TUM or 4x4 world_from_cam a line "
+        "(default: poses.txt or poses_c2w.txt beside --gt-objects)",
+    )
+    parser.add_argument("--classes", default="", help="score these classes only, comma-separated")
+    parser.add_argument(
+        "--min-visibility", type=float, default=0.0, help="ignore truth that is less visible"
+    )
     _common(parser)
     parser.set_defaults(func=_cmd_eval)
 
 
 def _cmd_eval(args: argparse.Namespace) -> int:
-    raise ReobjError(
-        "eval: not there yet in this version; tracks.txt is in MOTChallenge format: TrackEval "
-        "(pip install 'reobj-track[eval]', in an environment of its own) scores it"
-    )
+    poses: Path | None = args.gt_poses
+    if poses is None and args.gt_objects:
+        beside = [args.gt_objects.with_name(n) for n in ("poses_c2w.txt", "poses.txt")]
+        poses = next((p for p in beside if p.exists()), None)
+    classes = [c.strip() for c in args.classes.split(",") if c.strip()]
+    result = evaluate(args.out, args.gt, args.gt_objects, poses, classes, args.min_visibility)
+    print(score_table(result["tracks"]))
+    if "objects" in result:
+        facts = {k: v for k, v in result["objects"].items() if k != "objects"}
+        print("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in facts.items() if v is not None))
+    if args.out.is_dir():
+        with atomic(args.out / "eval.json") as part:
+            part.write_text(json.dumps(result, indent=1))
+    return 0
 
 
 def _add_models(sub: Any) -> None:

@@ -16,7 +16,7 @@ Times are CPU ms of one process with one thread; the better of two runs.
 from __future__ import annotations
 
 import argparse
-import json
+import itertools
 import os
 import subprocess
 import sys
@@ -124,33 +124,34 @@ def revisit_paths(rng: np.random.Generator, objects: int, frames: int, shape: bo
     return Paths(np.concatenate([center, size], -1), (t < leave) | (t >= back), visit)
 
 
-def make_stream(kind: str, objects: int, dim: int = 128, frames: int = 500, seed: int = 0) -> Stream:
+def make_stream(kind: str, objects: int, dim: int = 128, frames: int = 500) -> Stream:
     """Generate one of the streams: steady, stay, revisit, hard, shape."""
-    rng = np.random.default_rng([seed, objects, frames])
+    rng = np.random.default_rng([objects, frames])
     if kind == "steady":
         paths = crossing_paths(rng, objects, frames)
     else:
         paths = revisit_paths(rng, objects, frames, kind == "shape")
         if kind == "stay":
-            paths = Paths(paths.box[:1].repeat(frames, 0), np.ones_like(paths.seen), 0 * paths.visit)
+            box = paths.box[:1].repeat(frames, 0)
+            paths = Paths(box, np.ones_like(paths.seen), 0 * paths.visit)
     shake = rng.normal(0, 2, (frames, 2))
-    for f in range(1, frames):
-        shake[f] += 0.9 * shake[f - 1]
+    for i in range(1, frames):
+        shake[i] += 0.9 * shake[i - 1]
     box = paths.box + np.c_[shake, 0 * shake][:, None]  # (F, O, 4)
     found = paths.seen & (rng.random(paths.seen.shape) > 0.05) & ~occlusions(rng, paths.seen.shape)
-    f, o = np.nonzero(found)
+    f, o = (np.asarray(x, np.int64) for x in np.nonzero(found))  # (n,)
     noise = np.repeat([[0.02, 0.02, 0.03, 0.03]], len(f), 0) * np.tile(box[f, o, 2:], 2)
     measured = box[f, o] + rng.normal(0, 1, (len(f), 4)) * noise
     low = rng.random(len(f)) < 0.08
     score = np.where(low, rng.uniform(0.15, 0.45, len(f)), rng.uniform(0.6, 0.95, len(f)))
     clutter = rng.integers(0, frames, round(0.02 * len(f)))
-    junk = np.c_[rng.uniform(0, 1, (len(clutter), 2)) * SIZE, rng.uniform(40, 160, (len(clutter), 2))]
+    places, sizes = rng.uniform(0, 1, (2, len(clutter), 2))
     frame = np.r_[f, clutter]
     order = np.argsort(frame, kind="stable")
     visit = paths.visit[f, o]
     look = embeddings(rng, o, visit, dim, *COSINES.get(kind, (0.88, 0.31, 0.88)))
     look = np.r_[look, unit(rng.normal(size=(len(clutter), dim)))]
-    all_box = np.r_[measured, junk]
+    all_box = np.r_[measured, np.c_[places * SIZE, 40 + 120 * sizes]]
     xyxy = np.c_[all_box[:, :2] - all_box[:, 2:] / 2, all_box[:, :2] + all_box[:, 2:] / 2]
     g, k = np.nonzero(paths.seen)
     corner = np.c_[box[g, k, :2] - box[g, k, 2:] / 2, box[g, k, 2:]]
@@ -172,6 +173,7 @@ def occlusions(rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDArray[
 
 
 def unit(rows: Array) -> Array:
+    """Scale rows to unit length."""
     return np.asarray(rows / np.linalg.norm(rows, axis=-1, keepdims=True))
 
 
@@ -236,7 +238,7 @@ def _roboflow(name: str) -> Step:
         rows = {"row": np.arange(len(xyxy))}
         found = tracker.update(sv.Detections(xyxy, None, score, class_id, data=rows))
         good = found.tracker_id >= 0 if len(found) else np.zeros(0, bool)
-        return found.data["row"][good] if len(found) else [], found.tracker_id[good] if len(found) else []
+        return (found.data["row"][good], found.tracker_id[good]) if len(found) else ([], [])
 
     return step
 
@@ -254,9 +256,8 @@ def _norfair(memory: int | None = None) -> Step:
     )  # fmt: skip
 
     def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
-        found = [
-            norfair.Detection(b.reshape(2, 2), data=i, embedding=look[i]) for i, b in enumerate(xyxy)
-        ]
+        corners = xyxy.reshape(-1, 2, 2)
+        found = [norfair.Detection(b, data=i, embedding=look[i]) for i, b in enumerate(corners)]
         tracks = tracker.update(found)
         good = [t for t in tracks if t.last_detection in found]
         return [t.last_detection.data for t in good], [t.id for t in good]
@@ -284,7 +285,7 @@ def worker(name: str, job: Path, result: Path) -> None:
     identity = np.zeros(len(stream.frame), np.int64)
     seconds = np.full(stream.frames, np.nan)
     cuts = np.searchsorted(stream.frame, np.arange(stream.frames + 1))
-    for f, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+    for f, (a, b) in enumerate(itertools.pairwise(cuts)):
         part = (stream.xyxy[a:b], stream.score[a:b], stream.class_id[a:b], stream.embedding[a:b])
         started = time.process_time()
         rows, ids = step(*part)
@@ -296,8 +297,10 @@ def worker(name: str, job: Path, result: Path) -> None:
 
 
 def run_tracker(name: str, stream: Stream, venvs: Path | None) -> tuple[IntArray, Array]:
-    """Run a tracker in a process (and venv) of its own: identities (N,), 0 for none; seconds (F,)."""
-    python = sys.executable if name == "ours" or venvs is None else str(python_of(venvs, PEERS[name]))
+    """Run a tracker in a process of its own: identities (N,), 0 for none; CPU seconds (F,)."""
+    python = sys.executable
+    if name != "ours" and venvs is not None:
+        python = str(python_of(venvs, PEERS[name]))
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder) / "job.npz", Path(folder) / "result.npz"
@@ -365,7 +368,7 @@ def steady_row(name: str, venvs: Path | None, runs: int) -> list[str]:
         cells.append(f"{np.median(ms):.2f} / {np.percentile(ms, 95):.2f}{star}")
         extra.append(f"{score['IDF1']:.3f}")
         if objects == 50:
-            facts = [f"{score['IDSW']:.0f}", f"{score['identities']:.0f} / {score['gt_objects']:.0f}"]
+            facts = [str(score["IDSW"]), f"{score['identities']} / {score['gt_objects']}"]
     return [*cells, " / ".join(extra), *facts]
 
 
@@ -373,16 +376,17 @@ def revisit_row(name: str, venvs: Path | None) -> list[str]:
     cells = [name]
     for kind in ("revisit", "hard", "shape"):
         stream = make_stream(kind, 50)
-        identity, seconds = run_tracker(name, stream, venvs)
+        identity, _ = run_tracker(name, stream, venvs)
         own, other = recovery(stream, identity)
-        cells.append(f"{100 * own:.0f} %, {100 * other:.0f} %, {scores(stream, identity, stream.frames)['IDF1']:.3f}")
+        idf1 = scores(stream, identity, stream.frames)["IDF1"]
+        cells.append(f"{100 * own:.0f} %, {100 * other:.0f} %, {idf1:.3f}")
     return cells
 
 
 def flat_row(name: str, venvs: Path | None, runs: int) -> list[str]:
     stream = make_stream("stay", 10, frames=1500)
-    _, seconds = best_of(name, stream, venvs, runs)
-    return [name, *(f"{1e3 * np.nanmedian(seconds[f - 25 : f + 25]):.2f}" for f in (50, 450, 950, 1450))]
+    ms = 1e3 * best_of(name, stream, venvs, runs)[1]
+    return [name, *(f"{np.nanmedian(ms[f - 25 : f + 25]):.2f}" for f in (50, 450, 950, 1450))]
 
 
 def table(title: str, header: str, rows: list[list[str]]) -> str:
@@ -402,12 +406,14 @@ def main() -> int:
     if args.worker:
         worker(args.worker[0], Path(args.worker[1]), Path(args.worker[2]))
         return 0
-    names = [n for n in ("ours", *(PEERS if args.peers else ())) if n in (args.only or n).split(",")]
+    names = ["ours", *(PEERS if args.peers else ())]
+    names = [n for n in names if n in (args.only or n).split(",")]
     steady = [steady_row(n, args.peers, args.runs) for n in names]
     header = "tracker | 10 objects, ms median / p95 | 50 | 200 | IDF1 10 / 50 / 200"
     print(table("Steady", f"{header} | IDSW 50 | ids made / real 50", steady), flush=True)
     header = "tracker | revisit: recovered, stolen, IDF1 | hard | shape"
-    print(table("Revisit, 50 objects", header, [revisit_row(n, args.peers) for n in names]), flush=True)
+    revisit = [revisit_row(n, args.peers) for n in names]
+    print(table("Revisit, 50 objects", header, revisit), flush=True)
     flat = [flat_row(n, args.peers, args.runs) for n in names]
     print(table("10 objects that stay, ms at frame", "tracker | 50 | 450 | 950 | 1450", flat))
     return 0

@@ -33,6 +33,7 @@ from benchmark import PEERS, Array, IntArray, Stream, run_tracker, table
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
 import reobj_track as rt
 
+Run = tuple[IntArray, float]  # identity of every detection (N,), 0 for none; CPU seconds
 COLUMNS = "HOTA DetA AssA IDF1 MOTA IDSW ids_per_object".split()
 KITCHEN = ("chair", "dining table", "cup")  # what redkitchen's truth knows
 
@@ -132,7 +133,8 @@ def own_look(image: rt.Image, found: rt.Detections, embedder: rt.Embedder) -> Ar
     if not len(found):
         return np.empty((0, 0))
     look = embedder(image, found)
-    return np.concatenate([look.foreground, look.background], 1) / np.sqrt(2)
+    parts = [look.foreground, look.background]
+    return np.asarray(np.concatenate(parts, 1) / np.sqrt(2))
 
 
 def embed_all(seq: Sequence, net: Any) -> tuple[list[Array], float]:
@@ -154,9 +156,8 @@ def stream_of(seq: Sequence, looks: list[Array] | None) -> Stream:
     """The same detections in the benchmark's form."""
     count = [len(d) for d in seq.detections]
     frame = np.repeat(np.arange(len(count)), count)
-    box, score, cls = (
-        np.concatenate([getattr(d, k) for d in seq.detections]) for k in ("xyxy", "score", "class_id")
-    )
+    fields = ("xyxy", "score", "class_id")
+    box, score, cls = (np.concatenate([getattr(d, k) for d in seq.detections]) for k in fields)
     look = np.empty((len(frame), 0)) if looks is None else np.concatenate(looks)
     none = np.zeros(len(frame), np.int64)
     return Stream(len(count), frame, box, score, cls, look, none, none, np.empty((0, 9)))
@@ -228,7 +229,7 @@ def joined(parts: list[rt.LabelledBoxes]) -> rt.LabelledBoxes:
     return rt.LabelledBoxes(*(np.concatenate([getattr(p, k) for p in shifted]) for k in names))
 
 
-def variants(seq: Sequence, args: Any) -> dict[str, tuple[IntArray, float]]:
+def variants(seq: Sequence, args: Any) -> dict[str, Run]:
     """Identities and CPU seconds of every tracker on one sequence."""
     nets: dict[str, Any] = {}
     models = Path(os.environ.get("REOBJ_MODELS", "models"))
@@ -239,7 +240,9 @@ def variants(seq: Sequence, args: Any) -> dict[str, tuple[IntArray, float]]:
             nets["osnet" if person else "mobilenetv2"] = CropNet(models / net)
         embedder = rt.Embedder()
         nets["own look"] = lambda image, found: own_look(image, found, embedder)
-    looks = {name: embed_all(seq, net) for name, net in nets.items()} or {"no look": (None, 0.0)}
+    looks: dict[str, tuple[list[Array] | None, float]] = {"no look": (None, 0.0)}
+    if nets:
+        looks = {name: embed_all(seq, net) for name, net in nets.items()}
     result = {"ours": ours(seq, None)}
     for name, (look, spent) in looks.items():
         stream = stream_of(seq, look)
@@ -260,7 +263,7 @@ def variants(seq: Sequence, args: Any) -> dict[str, tuple[IntArray, float]]:
 # ---- Output ------------------------------------------------------------------------------------
 
 
-def report(found: dict[str, dict[str, tuple[IntArray, float]]], seqs: list[Sequence]) -> list[dict[str, Any]]:
+def report(found: dict[str, dict[str, Run]], seqs: list[Sequence]) -> list[dict[str, Any]]:
     """One row for each tracker and sequence, and for each group of sequences together."""
     rows = []
     sets = [(s.name, [s]) for s in seqs]
@@ -289,8 +292,8 @@ def markdown(rows: list[dict[str, Any]]) -> str:
              f"{r['ms_per_frame']:.1f}"]
             for r in rows if r["sequence"] == name
         ]  # fmt: skip
-        header = "tracker | HOTA | DetA | AssA | IDF1 | MOTA | IDSW | ids per object | ids / objects"
-        parts.append(table(f"**{name}**", f"{header} | CPU ms a frame", body))
+        header = "tracker | HOTA | DetA | AssA | IDF1 | MOTA | IDSW | ids per object"
+        parts.append(table(f"**{name}**", f"{header} | ids / objects | CPU ms a frame", body))
     return "\n".join(parts)
 
 

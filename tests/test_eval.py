@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 import reobj_track as rt
 
 # TrackEval 1.3.0 on `drifting(seed)` (numbers kept so that something is checked without it)
@@ -268,4 +269,3 @@ def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
     assert found["o3d_all"] == pytest.approx(0.5, abs=5e-3)  # the second true object has no solid
     assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
     assert found["scale_error"] == pytest.approx(0.1)
-

@@ -494,9 +494,9 @@ def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None
     assert "usage:" in capsys.readouterr().out
 
 
-def test_eval_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_of_no_output_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli("eval", tmp_path, "--gt", tmp_path / "gt.txt") == 2
-    assert_one_clear_line(capsys, "TrackEval")
+    assert_one_clear_line(capsys, r"tracks\.txt")
 
 
 class Terminal(io.StringIO):
