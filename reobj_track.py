@@ -5742,6 +5742,7 @@ def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) ->
         "units": "m" if poses.metric else "arbitrary",
         "source": poses.source,
         "registered_frames": int(poses.known.sum()),
+        "interpolated_frames": int((poses.status == "interpolated").sum()),
         "frames": len(poses.frame),
         "up_in_world": None if poses.up_in_world is None else _numbers(poses.up_in_world),
         "scale": None
