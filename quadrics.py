@@ -417,7 +417,10 @@ def load_priors(path: str | Path | None = None) -> Priors:
     Keys "about" and "aliases" are reserved; every other key is a category.
     """
     path = Path(__file__).with_name("priors.json") if path is None else Path(path)
-    table = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise QuadricsError(f"{path}: not valid JSON ({error}); see docs/quadrics.md") from error
     aliases = table.pop("aliases", {})
     table.pop("about", None)
     try:
@@ -1940,16 +1943,6 @@ def _second_moment(
         v = axes[:, :, i] * np.sqrt(widen)[:, None]
         total += v[:, :, None] * v[:, None] + cfg.bend_weight * bend[:, :, None] * bend[:, None]
     return total
-
-
-def _cost(state: _State, edges: _Edges, prob: _Problem, cfg: FitConfig) -> Array:
-    """Cost (B,) with the Huber loss, without derivatives."""
-    value = _residuals(state, edges, prob.groups, cfg, jacobian=False).value
-    pull = _size_prior(state, prob, cfg)[0]
-    up = (prob.up[:, None] @ state.rot)[:, 0]
-    return np.asarray(
-        _robust(value, cfg, "huber")[0].sum(1) + pull + (prob.tilt_info * up * up).sum(1)
-    )
 
 
 def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:

@@ -4356,9 +4356,9 @@ def write_tum(path: Path, poses: Poses) -> None:
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
     units = "units: metres" if poses.metric else _NO_SCALE
     rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
-    path.write_text(
-        "\n".join([f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})", *rows]) + "\n"
-    )
+    header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
+    with atomic(path) as part:
+        part.write_text("\n".join([header, *rows]) + "\n")
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
@@ -4572,7 +4572,6 @@ class Linker:
         self.identity = table.object_id[first] - 1  # (L,)
         self.similarity = similarity
         self.group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
-        self.classes = _majority(table.class_id, table.score, self.atom, len(self.tracklets))
         self.together = self._seen_together()
         self.events: list[LinkEvent] = []
 
@@ -5144,6 +5143,10 @@ class Workspace:
                 f"{out}: is not empty and not made by reobj_track; choose another -o, "
                 "or say --overwrite"
             )
+        if foreign and (out / "sparse").exists():
+            raise ReobjError(
+                f"{out}: has a sparse/ of its own that would be lost; choose another -o"
+            )
         self.cache.mkdir(parents=True, exist_ok=True)
 
     def claim(self, video: Video, overwrite: bool) -> None:
@@ -5179,6 +5182,12 @@ class Workspace:
         else:
             save_poses(self.cache / "last-poses.npz", poses)
 
+    def show_model(self, model: Path | None) -> None:
+        """Make OUT/sparse a copy of a COLMAP model; None: remove that of an earlier run."""
+        shutil.rmtree(self.out / "sparse", ignore_errors=True)
+        if model is not None and model.is_dir():
+            shutil.copytree(model, self.out / "sparse")
+
     def recall(self) -> tuple[TrackResult, Poses | None]:
         """The latest tracks and poses."""
         path = self.cache / "last-tracks.npz"
@@ -5205,7 +5214,7 @@ def run(
     config: Config | None = None,
     *,
     detections: str | Path | Callable[[Image], Any] | None = None,
-    stages: Sequence[str] = ("poses", "objects"),
+    in_3d: bool = True,
     overwrite: bool = False,
 ) -> RunResult:
     """Run the chain on a video: detect, track, poses, objects; write the files of the output
@@ -5216,7 +5225,7 @@ def run(
         out: output folder; results of earlier stages found there are used again.
         detections: file with recorded detections, or a callable image -> Detections; default:
             config.detect.model.
-        stages: what comes after tracking: () for identities only, ("poses",), ("poses", "objects").
+        in_3d: False for identities only, without cameras and ellipsoids.
     Returns:
         RunResult, also when the reconstruction fails: then without cameras and ellipsoids, and with
         a warning.
@@ -5229,17 +5238,18 @@ def run(
     space = Workspace(Path(out), overwrite)
     space.claim(video, overwrite)
     seconds: dict[str, float] = {}
-    poses = _supplied_poses(video, config) if "poses" in stages else None
+    in_3d = in_3d and config.poses.mode != "none"
+    poses = _supplied_poses(video, config) if in_3d else None
     track = track_video(video, space, config, detections, poses, seconds)
-    if "poses" in stages and poses is None and config.poses.mode != "none" and not video.is_live:
+    model = None
+    if in_3d and poses is None and not video.is_live:
         moving = _moving_rows(track, config.objects)
-        poses = _reconstruct(video, space, config, seconds, moving)
+        poses, model = _reconstruct(video, space, config, seconds, moving)
     if poses is not None:
         _check_supplied(poses, track.table)
-    space.remember(track, poses if "objects" in stages else None)
-    return _finish_objects(
-        video, space, track, poses if "objects" in stages else None, config, seconds
-    )
+    space.remember(track, poses)
+    space.show_model(model)
+    return _finish_objects(video, space, track, poses, config, seconds)
 
 
 def refit(out: str | Path, config: Config | None = None) -> RunResult:
@@ -5358,7 +5368,7 @@ def track_video(
     """Detect and track all frames, or take both from the cache."""
     source = _detection_source(video, config, detections)
     key = (source_fingerprint(video.source), config.input, source.key)
-    supplied = "" if poses is None else source_fingerprint(config.poses.mode)
+    supplied = "" if poses is None else hashlib.sha256(poses.cam_from_world.tobytes()).hexdigest()
     path = space.path("tracks", *key, config.embed, config.tracker, supplied)
     if path.exists() and source.key:
         return TrackResult.load(path)
@@ -5466,24 +5476,14 @@ def _identity_similarity(tracker: Tracker) -> Array:
     """(I, I) normalised similarity of the tracker's identities: the most alike pair of views
     counts.
     """
-    count = len(tracker.last_seen)
-    views = tracker.gallery.rows[:count]  # (I, K, E)
-    if not views.size:
-        return np.zeros((count, count))
-    return (
-        np.stack(
-            [
-                tracker.stats.normalised(
-                    tracker.gallery.similarity(
-                        views[i, : max(1, tracker.gallery.count[i])], np.arange(count)
-                    ).max(0)
-                )
-                for i in range(count)
-            ]
-        )
-        if count
-        else np.zeros((0, 0))
-    )
+    count, gallery = len(tracker.last_seen), tracker.gallery
+    cosine = np.zeros((count, count))
+    if gallery.rows.size:
+        for i in range(count):
+            views = gallery.rows[i, : max(1, gallery.count[i])]  # (k, E)
+            cosine[i] = gallery.similarity(views, np.arange(count)).max(0)
+        cosine = tracker.stats.normalised(cosine)
+    return cosine
 
 
 def _video_messages(video: Video, table: TrackTable) -> list[str]:
@@ -5532,25 +5532,27 @@ def _reconstruct(
     config: Config,
     seconds: dict[str, float],
     moving: TrackTable | None = None,
-) -> Poses:
-    """Poses from pycolmap, cached; features on moving things (people, animals) are left out."""
+) -> tuple[Poses, Path]:
+    """Poses from pycolmap and the folder of their sparse model, both cached; features on moving
+    things (people, animals) are left out.
+    """
     boxes = np.empty((0, 5)) if moving is None else np.column_stack([moving.frame, moving.xyxy])
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
     content = source_fingerprint(video.source)
     path = space.path("poses", content, config.input, config.poses, digest)
+    model = path.with_suffix(".sparse")
     if path.exists():
-        return load_poses(path)
+        return load_poses(path), model
     started = time.monotonic()
     work = space.cache / "sfm"
     mask = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
     poses = estimate_poses(video, config.poses, work, boxes_to_mask=mask)
-    if (work / "sparse").is_dir():
-        shutil.rmtree(space.out / "sparse", ignore_errors=True)
-        (work / "sparse").replace(space.out / "sparse")
     if poses.known.any():
+        shutil.rmtree(model, ignore_errors=True)
+        (work / "sparse").replace(model)
         save_poses(path, poses)
     seconds["poses"] = time.monotonic() - started
-    return poses
+    return poses, model
 
 
 def _moving_rows(track: TrackResult, config: ObjectsConfig) -> TrackTable:
@@ -5594,7 +5596,7 @@ def _fitter(
     """Bind priors, scale and gravity to `quadrics.fit_objects`."""
     priors = quadrics.load_priors(config.priors or None)
     known = parse_known_size(config.known_size)
-    up = np.array([float(x) for x in config.up.split(",")]) if config.up else poses.up_in_world
+    up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
 
     def fit(views: Views, classes: list[int]) -> Any:
@@ -5613,6 +5615,17 @@ def _fitter(
         )
 
     return fit
+
+
+def parse_up(text: str) -> Array:
+    """Parse a direction x,y,z into a unit vector (3,)."""
+    try:
+        up = np.array([float(x) for x in text.split(",")])
+    except ValueError:
+        up = np.empty(0)
+    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
+        raise ReobjError(f"--set objects.up={text}: expected a direction x,y,z, such as 0,0,1")
+    return np.asarray(up / np.linalg.norm(up))
 
 
 def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
@@ -5768,6 +5781,15 @@ CONVENTIONS = {
 }
 
 
+def write_cameras(out: Path, poses: Poses, video: Video) -> None:
+    """Write poses.txt, and sparse/ for supplied poses (pycolmap's own model has its points too)."""
+    if poses.known.any():
+        write_tum(out / "poses.txt", poses)
+        if poses.source == "user":
+            names = [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
+            write_colmap(out / "sparse", poses, names)
+
+
 def write_results(result: RunResult, video: Video, config: Config) -> None:
     """Write the files of the output folder; each appears only when it is complete."""
     out, started = result.out, time.monotonic()
@@ -5775,12 +5797,8 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
         (out / name).unlink(missing_ok=True)
     write_mot(out / "tracks.txt", result.table)
     _write_objects_json(result, video)
-    poses = result.poses
-    if poses is not None and poses.known.any():
-        write_tum(out / "poses.txt", poses)
-        if poses.source == "user":
-            names = [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
-            write_colmap(out / "sparse", poses, names)
+    if result.poses is not None:
+        write_cameras(out, result.poses, video)
     kept = np.array([o["status"] != "rejected" for o in result.objects], bool)
     solids = None if result.fits is None else result.fits.ellipsoids[kept]
     if solids is not None:
@@ -6413,7 +6431,7 @@ def _cmd_track(args: argparse.Namespace) -> int:
             args.out,
             config_from_args(args),
             detections=args.detections,
-            stages=(),
+            in_3d=False,
             overwrite=args.overwrite,
         )
     )
@@ -6431,9 +6449,11 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     space = Workspace(Path(args.out), args.overwrite)
     space.claim(video, args.overwrite)
     seconds: dict[str, float] = {}
-    poses = _supplied_poses(video, config) or _reconstruct(video, space, config, seconds)
-    if poses.known.any():
-        write_tum(space.out / "poses.txt", poses)
+    poses, model = _supplied_poses(video, config), None
+    if poses is None:
+        poses, model = _reconstruct(video, space, config, seconds)
+    space.show_model(model)
+    write_cameras(space.out, poses, video)
     print(
         f"cameras: {poses.known.sum()} of {len(poses.frame)} frames, {len(poses.points)} points; "
         f"look at: {space.out / 'poses.txt'}, {space.out / 'sparse'}"

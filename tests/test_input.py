@@ -220,9 +220,7 @@ def test_bad_images_are_skipped(tmp_path: Path) -> None:
         (lambda d: (write_video(d / "b.mp4", 3), rt.InputConfig(every=0)), "--every"),
     ],
 )
-def test_bad_sources_give_one_clear_line(
-    tmp_path: Path, make: Any, expected: str, capfd: Any
-) -> None:
+def test_bad_sources_give_one_clear_line(tmp_path: Path, make: Any, expected: str) -> None:
     made = make(tmp_path)
     source, config = made if isinstance(made, tuple) else (made, rt.InputConfig())
     with pytest.raises(rt.ReobjError, match=expected) as caught:

@@ -1,5 +1,4 @@
-"""The command line as a user meets it: whole runs, resuming, and every way the input can be wrong.
-"""
+"""The command line as a user meets it: whole runs, resuming, every way input can be wrong."""
 
 from __future__ import annotations
 
@@ -174,7 +173,7 @@ def test_python_callable_as_detector(clip: Path, tmp_path: Path) -> None:
         x = 100 - 4 * (len(calls) - 1)
         return [[x, 60, x + 40, 110, 0.9, 56]]
 
-    result = rt.run(clip, tmp_path / "out", detections=detector, stages=())
+    result = rt.run(clip, tmp_path / "out", detections=detector, in_3d=False)
     assert calls == [(240, 320, 3)] * FRAMES
     assert [o["class"] for o in result.objects] == ["chair"]
 
@@ -379,20 +378,15 @@ def rendered_tracks(folder: Path, poses: str) -> tuple[Path, Path, Path]:
     return frames, folder / "det.txt", folder / "poses.txt"
 
 
+def posed_run(tmp_path: Path, poses: str) -> tuple[object, ...]:
+    """Arguments of a run with supplied TUM poses, right or inverse."""
+    frames, det, path = rendered_tracks(tmp_path, poses)
+    files = ("--detections", det, "--poses", path, "--camera", "300,300,160,120")
+    return ("run", frames, "-o", tmp_path / "out", *files)
+
+
 def test_supplied_poses_give_ellipsoids_in_metres(tmp_path: Path) -> None:
-    frames, det, poses = rendered_tracks(tmp_path, "right")
-    args = (
-        "run",
-        frames,
-        "-o",
-        tmp_path / "out",
-        "--detections",
-        det,
-        "--poses",
-        poses,
-        "--camera",
-        "300,300,160,120",
-    )
+    args = posed_run(tmp_path, "right")
     assert cli(*args, "--support", "ellipsoid") == 0
     data = json.loads((tmp_path / "out/objects.json").read_text())
     assert data["world"]["units"] == "m" and data["world"]["registered_frames"] == 30
@@ -403,19 +397,7 @@ def test_supplied_poses_give_ellipsoids_in_metres(tmp_path: Path) -> None:
 def test_poses_in_the_wrong_direction_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frames, det, poses = rendered_tracks(tmp_path, "inverse")
-    args = (
-        "run",
-        frames,
-        "-o",
-        tmp_path / "out",
-        "--detections",
-        det,
-        "--poses",
-        poses,
-        "--camera",
-        "300,300,160,120",
-    )
+    args = posed_run(tmp_path, "inverse")
     assert cli(*args) == 2
     assert_one_clear_line(capsys, "cam_from_world")
     assert not (tmp_path / "out/objects.json").exists()
@@ -564,3 +546,59 @@ def test_a_closed_pipe_is_no_error(clip: Path, detections: Path, tmp_path: Path)
     args = [sys.executable, "-c", code, "objects", str(tmp_path / "out")]
     done = subprocess.run(args, capture_output=True, text=True, cwd=here)
     assert done.returncode == 0 and "Broken pipe" not in done.stderr, done.stderr
+
+
+def test_a_foreign_sparse_model_is_never_lost(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A COLMAP workspace as output folder: --overwrite must not cost its model."""
+    model = tmp_path / "out/sparse/0/cameras.bin"
+    model.parent.mkdir(parents=True)
+    model.write_bytes(b"precious")
+    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections)
+    assert cli(*args, "--overwrite") == 2
+    assert_one_clear_line(capsys, "sparse/ of its own")
+    assert model.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (("--set", "objects.up=north"), "expected a direction"),  # no numbers
+        (("--set", "objects.up=0,0,0"), "expected a direction"),  # no direction
+        (("--priors", "det.txt"), "not valid JSON"),  # another kind of file
+        (("--priors", "missing.json"), "missing.json"),
+        (("--support", "sphere"), "sphere"),  # no such shape
+    ],
+)
+def test_bad_options_of_the_fit(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    option: tuple[str, ...],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli(*posed_run(tmp_path, "right"), *option) == 2
+    assert_one_clear_line(capsys, message)
+
+
+def test_stale_3d_files_go_when_the_options_change(tmp_path: Path) -> None:
+    """A second run in 2D leaves no cameras or ellipsoids of the first beside its own results."""
+    args = posed_run(tmp_path, "right")
+    made = ("poses.txt", "objects.ply", "sparse")
+    assert cli(*args) == 0 and all((tmp_path / "out" / name).exists() for name in made)
+    assert cli(*args, "--poses", "none") == 0
+    assert not any((tmp_path / "out" / name).exists() for name in made)
+
+
+def test_poses_command_takes_supplied_poses(tmp_path: Path) -> None:
+    """`poses VIDEO --poses FILE` converts: TUM in, TUM and COLMAP out."""
+    run_args = posed_run(tmp_path, "right")
+    source, given = run_args[1], run_args[run_args.index("--poses") + 1]
+    args = ("poses", source, "-o", tmp_path / "out", "--poses", given)
+    assert cli(*args, "--camera", "300,300,160,120") == 0
+    np.testing.assert_allclose(
+        np.loadtxt(tmp_path / "out/poses.txt"), np.loadtxt(str(given)), atol=1e-6
+    )
+    assert (tmp_path / "out/sparse/images.txt").exists()
