@@ -462,10 +462,9 @@ def test_import_loads_no_heavy_package() -> None:
 def test_doctests() -> None:
     import doctest
 
-    for module in (rt, quadrics):
-        failed, tried = doctest.testmod(module)
-        assert failed == 0
-    assert tried is not None
+    results = [doctest.testmod(module) for module in (rt, quadrics)]
+    assert sum(r.failed for r in results) == 0
+    assert sum(r.attempted for r in results) >= 4  # they are found at all
 
 
 @pytest.mark.parametrize("command", ["", "run", "track", "poses", "objects", "eval", "models"])
