@@ -6256,6 +6256,117 @@ def _was_read(frame: IntArray, out: Path) -> BoolArray:
     return np.asarray(inside & (frame < (config.stop or np.inf)), bool)
 
 
+# ---- Export: other tools' files from an output folder ------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Saved:
+    """What an output folder of `run` holds, read back for the exports.
+
+    Attributes:
+        data: objects.json; its `objects` and `world` as documented.
+        table: the final identities in native pixels (tracks.txt); class_id counts in class_names.
+        poses: cameras and sparse points, None if there are none. video: the source, None if gone.
+    """
+
+    out: Path
+    data: dict[str, Any]
+    table: TrackTable
+    class_names: tuple[str, ...]
+    poses: Poses | None
+    video: Video | None
+
+    @staticmethod
+    def load(out: str | Path) -> Saved:
+        """Read an output folder; ReobjError when `run` or `track` did not finish there."""
+        out = Path(out)
+        if not (out / "objects.json").is_file() or not (out / "tracks.txt").is_file():
+            raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
+        data = json.loads((out / "objects.json").read_text())
+        names = tuple(dict.fromkeys(o["class"] for o in data["objects"]))
+        class_of = {o["id"]: names.index(o["class"]) for o in data["objects"]}
+        found = labelled(read_mot_rows(out / "tracks.txt"))
+        score = read_mot_rows(out / "tracks.txt")[:, 6]
+        classes = np.array([class_of[i] for i in found.identity.tolist()], np.int64)
+        unknown = np.full(len(found), -1, np.int64)
+        table = TrackTable(
+            found.frame - 1, found.identity, found.identity, found.xyxy, score, classes, unknown
+        )
+        poses, source = (out / "cache" / n for n in ("last-poses.npz", "source.json"))
+        video = None
+        if source.is_file():
+            with contextlib.suppress(ReobjError):  # moved or deleted since: most exports need none
+                facts = json.loads(source.read_text())
+                video = Video(facts["source"], InputConfig(**facts["input"]))
+        read = load_poses(poses) if poses.is_file() else None
+        return Saved(out, data, table, names, read, video)
+
+    def frames(self) -> list[int]:
+        """Numbers of the frames that were read; without the video those with a track."""
+        if self.poses is not None:
+            return [int(f) for f in self.poses.frame]
+        seen = np.unique(self.table.frame).tolist()
+        if self.video is None or not self.video.frame_count:
+            return [int(f) for f in seen]
+        config, count = self.video.config, self.video.frame_count
+        return list(range(config.start, min(config.stop or count, count), config.every))
+
+
+def export_coco_vid(saved: Saved, path: Path) -> None:
+    """Write COCO-VID (MMTracking's): videos, images with frame_id, annotations with instance_id
+    and track_id; bbox is x, y, w, h from the image's corner.
+    """
+    video, table = saved.data["video"], saved.table
+    names = saved.video.names if saved.video is not None else []
+    size = {"width": video["width"], "height": video["height"]}
+    frames = saved.frames()
+    image_id = {frame: i for i, frame in enumerate(frames, 1)}
+    images = [
+        {"id": image_id[f], "file_name": names[f] if names else f"{f:06d}.jpg", **size,
+         "video_id": 1, "frame_id": f}
+        for f in frames
+    ]  # fmt: skip
+    corners = table.xyxy.round(2)
+    boxes = np.hstack([corners[:, :2], corners[:, 2:] - corners[:, :2]]).round(2).tolist()
+    annotations = [
+        {"id": i + 1, "image_id": image_id[int(table.frame[i])], "video_id": 1,
+         "category_id": int(table.class_id[i]) + 1, "instance_id": int(table.object_id[i]),
+         "track_id": int(table.object_id[i]), "bbox": box, "area": round(box[2] * box[3], 2),
+         "iscrowd": 0, "score": float(table.score[i])}
+        for i, box in enumerate(boxes)
+    ]  # fmt: skip
+    data = {
+        "info": {"description": f"reobj_track {__version__}"},
+        "videos": [{"id": 1, "name": Path(video["path"]).name, "fps": video["fps"], **size}],
+        "categories": [{"id": i, "name": name} for i, name in enumerate(saved.class_names, 1)],
+        "images": images,
+        "annotations": annotations,
+    }
+    with atomic(path) as part:
+        part.write_text(json.dumps(data) + "\n")
+
+
+EXPORTS: dict[str, tuple[str, Callable[[Saved, Path], None]]] = {  # name: file in OUT, writer
+    "coco-vid": ("coco_vid.json", export_coco_vid),
+}
+
+
+def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
+    """Write what an output folder holds in another tool's format.
+
+    Args:
+        out: output folder of `run`. to: a name of EXPORTS. path: default: OUT/ and its own name.
+    Returns:
+        The file written.
+    """
+    if to not in EXPORTS:
+        raise ReobjError(f"no export called {to!r}; there are {', '.join(EXPORTS)}")
+    name, write = EXPORTS[to]
+    path = Path(path) if path else Path(out) / name
+    write(Saved.load(out), path)
+    return path
+
+
 # ---- Command line ------------------------------------------------------------------------------
 
 
@@ -6373,6 +6484,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(sub, "poses", "cameras only (pycolmap)", _cmd_poses)
     _add_objects(sub)
     _add_eval(sub)
+    _add_export(sub)
     _add_models(sub)
     return parser
 
@@ -6517,6 +6629,21 @@ def _cmd_eval(args: argparse.Namespace) -> int:
     if args.out.is_dir():
         with atomic(args.out / "eval.json") as part:
             part.write_text(json.dumps(result, indent=1))
+    return 0
+
+
+def _add_export(sub: Any) -> None:
+    text = "write what an output folder holds in another tool's format"
+    parser = sub.add_parser("export", help=text, description=text[0].upper() + text[1:] + ".")
+    parser.add_argument("out", help="output folder of an earlier `run`")
+    parser.add_argument("--to", required=True, choices=EXPORTS, help="the format")
+    parser.add_argument("-o", "--output", help="file to write (default: in the output folder)")
+    _common(parser)
+    parser.set_defaults(func=_cmd_export)
+
+
+def _cmd_export(args: argparse.Namespace) -> int:
+    print(export(args.out, args.to, args.output))
     return 0
 
 
