@@ -51,12 +51,14 @@ import subprocess
 import sys
 import time
 import urllib.request
+import zipfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
@@ -978,6 +980,7 @@ class RecordedDetections:
         runs: N run lengths of the masks, empty where there is none.
         size, working_size: (w, h) of the masks and of the frames.
         line: (N,) where each stands in the file, in `unit`s. messages: what was dropped or assumed.
+        identity: (N,) as the file has it, or empty.
     """
 
     frame: IntArray
@@ -991,6 +994,7 @@ class RecordedDetections:
     line: IntArray
     unit: str
     messages: list[str] = field(default_factory=list)
+    identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -1071,6 +1075,7 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
     return RecordedDetections(
         frame, xyxy, column.get("score", np.ones(count)), class_id, [NO_RUNS] * count, tuple(names),
         video.size, video.working_size, lines, "line", messages,
+        column["id"].astype(np.int64) if "id" in column else np.empty(0, np.int64),
     )  # fmt: skip
 
 
@@ -1133,11 +1138,16 @@ def _table_classes(
 
 
 def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
-    """Read COCO results; a dataset JSON beside them says which frame and class their ids mean."""
-    entries = _load_json(path)
+    """Read COCO results; a dataset JSON beside them says which frame and class their ids mean.
+
+    A dataset with annotations of its own (COCO, COCO-VID) is read in their place.
+    """
+    entries = data = _load_json(path)
+    if isinstance(data, dict) and "images" in data:
+        entries = data.get("annotations")
     if not isinstance(entries, list):
         raise ReobjError(f"{path}: expected COCO results: [{{image_id, category_id, bbox, score}}]")
-    frame_of, name_of, messages = _coco_dataset(path, names, video)
+    frame_of, name_of, messages = _coco_dataset(path, names, video, data)
     for at, entry in enumerate(entries):
         found = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
         if None in found.values() or len(entry["bbox"]) != 4:
@@ -1160,6 +1170,7 @@ def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetect
         [_coco_mask(entry.get("segmentation"), video.size, f"{path}, entry {at}")
          for at, entry in enumerate(entries)],
         tuple(classes), video.size, video.working_size, np.arange(len(entries)), "entry", messages,
+        np.array([entry.get("track_id", entry.get("instance_id", -1)) for entry in entries]),
     )  # fmt: skip
 
 
@@ -1171,15 +1182,16 @@ def _load_json(path: Path) -> Any:
 
 
 def _coco_dataset(
-    path: Path, names: Sequence[str], video: Video
+    path: Path, names: Sequence[str], video: Video, own: Any
 ) -> tuple[dict[int, int], dict[int, str], list[str]]:
     """Frame of each image id (empty: the id itself), name of each category id, and messages.
 
-    The dataset is any other JSON of the folder with `images`; they belong to frames by `file_name`,
-    or by their order where the video has no file names.
+    The dataset is the file itself (`own`) or any other JSON of the folder with `images`; they
+    belong to frames by `file_name`, or where the video has no file names by `frame_id` (COCO-VID)
+    or their order.
     """
-    data = None
-    for other in sorted(path.parent.glob("*.json")):
+    data = own if isinstance(own, dict) else None
+    for other in sorted(path.parent.glob("*.json")) if data is None else ():
         with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
             found = json.loads(other.read_text()) if other != path else None
             data = found if isinstance(found, dict) and found.get("images") else data
@@ -1191,7 +1203,7 @@ def _coco_dataset(
         name_of = {c["id"]: c["name"] for c in data["categories"]}
     row = {name: i for i, name in enumerate(video.names)}
     frame_of = {
-        image["id"]: row.get(Path(image["file_name"]).name, -1) if row else i
+        image["id"]: row.get(Path(image["file_name"]).name, -1) if row else image.get("frame_id", i)
         for i, image in enumerate(data["images"])
     }
     return frame_of, name_of, []
@@ -1273,6 +1285,7 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
     frame = found.frame[rows]
     rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
     rows = rows[rank < config.max_detections]
+    found.identity = found.identity[rows] if len(found.identity) else found.identity
     for name in ("frame", "xyxy", "score", "class_id", "line"):
         setattr(found, name, getattr(found, name)[rows])
     found.runs = [found.runs[row] for row in rows]
@@ -5188,13 +5201,17 @@ class Workspace:
         if model is not None and model.is_dir():
             shutil.copytree(model, self.out / "sparse")
 
+    def last_tracks(self) -> TrackResult | None:
+        """The latest tracks, None if there are none."""
+        path = self.cache / "last-tracks.npz"
+        return TrackResult.load(path) if path.exists() else None
+
     def recall(self) -> tuple[TrackResult, Poses | None]:
         """The latest tracks and poses."""
-        path = self.cache / "last-tracks.npz"
-        if not path.exists():
+        track, poses = self.last_tracks(), self.cache / "last-poses.npz"
+        if track is None:
             raise ReobjError(f"{self.out}: no tracks here; make them first with `run` or `track`")
-        poses = self.cache / "last-poses.npz"
-        return TrackResult.load(path), load_poses(poses) if poses.exists() else None
+        return track, load_poses(poses) if poses.exists() else None
 
 
 def source_fingerprint(source: Any) -> str:
@@ -5214,6 +5231,7 @@ def run(
     config: Config | None = None,
     *,
     detections: str | Path | Callable[[Image], Any] | None = None,
+    tracks: str | Path | None = None,
     in_3d: bool = True,
     overwrite: bool = False,
 ) -> RunResult:
@@ -5225,6 +5243,7 @@ def run(
         out: output folder; results of earlier stages found there are used again.
         detections: file with recorded detections, or a callable image -> Detections; default:
             config.detect.model.
+        tracks: file of identities that take the place of detector, tracker and linker.
         in_3d: False for identities only, without cameras and ellipsoids.
     Returns:
         RunResult, also when the reconstruction fails: then without cameras and ellipsoids, and with
@@ -5240,7 +5259,10 @@ def run(
     seconds: dict[str, float] = {}
     in_3d = in_3d and config.poses.mode != "none"
     poses = _supplied_poses(video, config) if in_3d else None
-    track = track_video(video, space, config, detections, poses, seconds)
+    if tracks:
+        track = read_tracks(tracks, video, config.detect, space.last_tracks())
+    else:
+        track = track_video(video, space, config, detections, poses, seconds)
     model = None
     if in_3d and poses is None and not video.is_live:
         moving = _moving_rows(track, config.objects)
@@ -5252,9 +5274,11 @@ def run(
     return _finish_objects(video, space, track, poses, config, seconds)
 
 
-def refit(out: str | Path, config: Config | None = None) -> RunResult:
+def refit(
+    out: str | Path, config: Config | None = None, tracks: str | Path | None = None
+) -> RunResult:
     """Link and fit again from what an output folder holds, with other options of the objects
-    section.
+    section, or with identities from a file of tracks in place of its own.
     """
     if not (Path(out) / "cache").is_dir():
         raise ReobjError(f"{out}: no output folder of reobj_track; make one with `run` or `track`")
@@ -5262,7 +5286,11 @@ def refit(out: str | Path, config: Config | None = None) -> RunResult:
     track, poses = space.recall()
     source = json.loads((space.cache / "source.json").read_text())
     config = dataclasses.replace(config or Config(), input=InputConfig(**source["input"]))
-    return _finish_objects(Video(source["source"], config.input), space, track, poses, config, {})
+    video = Video(source["source"], config.input)
+    if tracks:
+        track = read_tracks(tracks, video, config.detect, track)
+        space.remember(track, poses)
+    return _finish_objects(video, space, track, poses, config, {})
 
 
 def _finish_objects(
@@ -5292,13 +5320,14 @@ def _set_threads(threads: int) -> None:
 @dataclass(frozen=True, slots=True)
 class TrackResult:
     """Identities of a video from the tracker: rows, similarity of the identities, class names,
-    messages.
+    messages; `fixed` when they were given (--tracks) and nothing may join, split or renumber them.
     """
 
     table: TrackTable
     similarity: Array
     class_names: tuple[str, ...]
     messages: tuple[str, ...]
+    fixed: bool = False
 
     def save(self, path: Path) -> None:
         """Write as npz, atomically."""
@@ -5306,8 +5335,9 @@ class TrackResult:
         names, messages = np.array(self.class_names, str), np.array(self.messages, str)
         with atomic(path) as part, part.open("wb") as file:
             np.savez_compressed(
-                file, **columns, similarity=self.similarity, class_names=names, messages=messages
-            )
+                file, **columns, similarity=self.similarity, class_names=names, messages=messages,
+                fixed=self.fixed,
+            )  # fmt: skip
 
     @staticmethod
     def load(path: Path) -> TrackResult:
@@ -5317,11 +5347,12 @@ class TrackResult:
                 columns = [data[f.name] for f in dataclasses.fields(TrackTable)]
                 names, messages = data["class_names"].tolist(), data["messages"].tolist()
                 table, similarity = TrackTable(*columns), data["similarity"]
+                fixed = "fixed" in data and bool(data["fixed"])
         except (KeyError, ValueError, OSError) as error:
             raise ReobjError(
                 f"{path}: not readable, or of another version ({error}); delete it and run again"
             ) from error
-        return TrackResult(table, similarity, tuple(names), tuple(messages))
+        return TrackResult(table, similarity, tuple(names), tuple(messages), fixed)
 
 
 def save_poses(path: Path, poses: Poses) -> None:
@@ -5571,18 +5602,17 @@ def make_objects(
     table, events, fits, views = track.table, [], None, None
     if poses is not None and poses.known.sum() >= config.objects.min_views and len(table):
         fit = _fitter(config.objects, poses, track.class_names)
-        if config.objects.link:
+        if config.objects.link and not track.fixed:
             linker = Linker(table, track.similarity, poses, fit, config.objects)
             table, events = table.with_objects(linker.run()), linker.events
-        else:
+        elif not track.fixed:
             table = table.with_objects(table.object_id)
         classes = object_classes(table)
-        views = gather_views(
-            table, poses, table.object_id - 1, len(classes), config.objects.min_score
-        )
+        group = np.searchsorted(list(classes), table.object_id)
+        views = gather_views(table, poses, group, len(classes), config.objects.min_score)
         fits = fit(views, list(classes.values()))
-    else:
-        table = table.with_objects(table.object_id) if len(table) else table
+    elif len(table) and not track.fixed:
+        table = table.with_objects(table.object_id)
     objects = _object_entries(table, track.class_names, fits, views, config.objects)
     seconds["objects"] = time.monotonic() - started
     result = RunResult(out, table, track.class_names, objects, poses, fits, seconds, [])
@@ -5751,13 +5781,15 @@ def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) ->
     if poses is None:
         return {"units": None, "source": "none", "registered_frames": 0, "links": []}
     scale = fits.scale if fits is not None else None
+    up = fits.up if fits is not None and fits.up.any() else poses.up_in_world
     return {
         "units": "m" if poses.metric else "arbitrary",
         "source": poses.source,
         "registered_frames": int(poses.known.sum()),
         "interpolated_frames": int((poses.status == "interpolated").sum()),
         "frames": len(poses.frame),
-        "up_in_world": None if poses.up_in_world is None else _numbers(poses.up_in_world),
+        "up_in_world": None if up is None else _numbers(up),
+        "up_source": fits.up_source if fits is not None else "none" if up is None else "poses",
         "scale": None
         if scale is None
         else {
@@ -6258,6 +6290,13 @@ def _was_read(frame: IntArray, out: Path) -> BoolArray:
 
 # ---- Export: other tools' files from an output folder ------------------------------------------
 
+CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
+SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
+BOXER_COLUMNS = (
+    "time_ns,tx_world_object,ty_world_object,tz_world_object,qw_world_object,qx_world_object,"
+    "qy_world_object,qz_world_object,scale_x,scale_y,scale_z,name,instance,sem_id,prob"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Saved:
@@ -6346,9 +6385,171 @@ def export_coco_vid(saved: Saved, path: Path) -> None:
         part.write_text(json.dumps(data) + "\n")
 
 
+def export_cvat(saved: Saved, path: Path) -> None:
+    """Write "CVAT for video 1.1": a track an object, every box a keyframe, `outside` where a visit
+    ends. CVAT numbers tracks from 0 in the order of the file: track 0 is object 1.
+
+    Source: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
+    """
+    table, video = saved.table, saved.data["video"]
+    frames = saved.frames()
+    root = ET.Element("annotations")
+    ET.SubElement(root, "version").text = "1.1"
+    task = ET.SubElement(ET.SubElement(root, "meta"), "task")
+    for key, value in (("name", Path(video["path"]).name), ("mode", "interpolation"),
+                       ("start_frame", 0), ("stop_frame", max(frames, default=0))):  # fmt: skip
+        ET.SubElement(task, key).text = str(value)
+    labels, size = ET.SubElement(task, "labels"), ET.SubElement(task, "original_size")
+    for name in saved.class_names:
+        ET.SubElement(ET.SubElement(labels, "label"), "name").text = name
+    for key in ("width", "height"):
+        ET.SubElement(size, key).text = str(video[key])
+    following = dict(itertools.pairwise(frames))
+    for obj, cls in object_classes(table).items():
+        track = {"id": str(obj - 1), "label": saved.class_names[cls], "source": "auto"}
+        _cvat_boxes(ET.SubElement(root, "track", track), table[table.object_id == obj], following)
+    ET.indent(root)
+    with atomic(path) as part:
+        ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
+
+
+def _cvat_boxes(track: ET.Element, rows: TrackTable, following: dict[int, int]) -> None:
+    """Add the boxes of a track, and one `outside` in the frame that follows the end of a visit."""
+    seen = set(rows.frame.tolist())
+    for frame, box in zip(rows.frame.tolist(), rows.xyxy, strict=True):
+        corners = {k: f"{v:.2f}" for k, v in zip(CVAT_BOX, box, strict=True)}
+        ends = following.get(frame, frame) not in seen
+        for at, outside in ((frame, "0"), (following.get(frame), "1"))[: 1 + ends]:
+            facts = {"frame": str(at), "outside": outside, "occluded": "0", "keyframe": "1"}
+            ET.SubElement(track, "box", facts | corners | {"z_order": "0"})
+
+
+def export_boxer(saved: Saved, path: Path) -> None:
+    """Write Boxer's CSV of 3D boxes: centre, quaternion wxyz and full extents, in metres, z up.
+
+    One row an object at the time of the first frame, since the scene stands still. Left out:
+    rejected objects, the shape (all are boxes here), the uncertainty, the sightings.
+    Source: facebookresearch/boxer, utils/file_io.py, `read_obb_csv`.
+    """
+    world, rows = saved.data["world"], []
+    kept = [o for o in saved.data["objects"] if o["status"] != "rejected"]
+    scale, up = (world.get("scale") or {}).get("metres_per_unit"), world.get("up_in_world")
+    if kept and (not scale or world["scale"]["source"] == "none"):
+        log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
+    if kept and up is None:
+        log.warning("up is unknown: %s keeps the world's axes, Boxer expects z up", path)
+    turn = turn_onto(np.array(up if up is not None else [0.0, 0, 1]), np.array([0.0, 0, 1]))
+    time_ns = 0 if saved.poses is None else round(1e9 * float(saved.poses.time_s[0]))
+    for o in kept:
+        center = turn @ np.array(o["center"]) * (scale or 1.0)
+        own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
+        numbers = [*center, *quat_wxyz_from_matrix(turn[None] @ own)[0],
+                   *np.array(o["size"]) * (scale or 1.0)]  # fmt: skip
+        rows.append([time_ns, *(f"{v:.6f}" for v in numbers), o["class"].replace(",", " "),
+                     o["id"], saved.class_names.index(o["class"]), o["score"]])  # fmt: skip
+    with atomic(path) as part, part.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([BOXER_COLUMNS.split(","), *rows])
+
+
+def turn_onto(a: Array, b: Array) -> Array:
+    """Return the smallest rotation (3, 3) that takes the direction of a (3,) to that of b (3,)."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    axis, cosine = np.cross(a, b), float(a @ b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:  # parallel, or opposite: then about any axis across
+        axis, sine = np.cross(a, np.eye(3)[np.abs(a).argmin()]), 0.0
+    return np.asarray(
+        Rotation.from_rotvec(axis / np.linalg.norm(axis) * math.atan2(sine, cosine)).as_matrix()
+    )
+
+
 EXPORTS: dict[str, tuple[str, Callable[[Saved, Path], None]]] = {  # name: file in OUT, writer
     "coco-vid": ("coco_vid.json", export_coco_vid),
+    "cvat": ("cvat.xml", export_cvat),
+    "boxer": ("boxer_3dbbs.csv", export_boxer),
 }
+
+
+def read_tracks(
+    path: str | Path,
+    video: Video,
+    config: DetectConfig | None = None,
+    like: TrackResult | None = None,
+) -> TrackResult:
+    """Read identities made elsewhere or corrected by hand; they stand, the linker is not asked.
+
+    Args:
+        path: CVAT for video 1.1 (XML or its zip), COCO-VID JSON (track_id or instance_id), MOT rows
+            or CSV with ids, in native pixels; frames that the video's options leave out are not
+            used.
+        like: earlier tracks of the video: they lend their scores to boxes that were not moved, and
+            their classes to files that have none.
+    """
+    path, config = Path(path), config or DetectConfig()
+    limit = dataclasses.replace(config, min_score=0.0, max_detections=sys.maxsize)
+    if path.suffix.lower() in (".xml", ".zip"):
+        found = _read_cvat(path, video)
+        _check(found, path, limit, video.frame_count)
+    else:
+        found = read_detections(path, video, limit)
+    if len(found) and (not len(found.identity) or found.identity.min() < 0):
+        raise ReobjError(f"{path}: not every box has an identity: no file of tracks")
+    start, stop, every = video.config.start, video.config.stop, video.config.every
+    use = (found.frame >= start) & ((found.frame - start) % every == 0)
+    use &= found.frame < (stop or sys.maxsize)
+    pairs = np.column_stack([found.frame, found.identity])[use]  # (N, 2)
+    unique, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+    if (count > 1).any():
+        frame, obj = unique[count.argmax()]
+        raise ReobjError(f"{path}: identity {obj} has {count.max()} boxes in frame {frame} "
+                         "(0-based); an object is in one place at a time")  # fmt: skip
+    rows = np.flatnonzero(use)[first]
+    ids, unknown = found.identity[rows], np.full(len(rows), -1, np.int64)
+    table = TrackTable(found.frame[rows], ids, ids, found.xyxy[rows], found.score[rows],
+                       found.class_id[rows], unknown)  # fmt: skip
+    names = found.class_names
+    if like is not None:
+        unnamed = names == ("object",)
+        table = _as_known(like.table, table, unnamed)
+        names = like.class_names if unnamed else names
+    return TrackResult(table, np.empty((0, 0)), names, tuple(found.messages), fixed=True)
+
+
+def _as_known(known: TrackTable, table: TrackTable, unnamed: bool) -> TrackTable:
+    """Give unmoved boxes their earlier scores, and unnamed ones the class that overlaps most."""
+    class_id, score = table.class_id.copy(), table.score.copy()
+    for rows in _rows_by(table.frame):
+        there = known[known.frame == table.frame[rows[0]]]
+        iou = np.hstack([box_iou(table.xyxy[rows], there.xyxy), np.zeros((len(rows), 1))])
+        best, same = iou.argmax(1), iou.max(1) > SAME_BOX
+        score[rows[same]] = there.score[best[same]]
+        if unnamed:
+            class_id[rows] = np.append(there.class_id, -1)[best]  # -1: "object"
+    return dataclasses.replace(table, class_id=class_id, score=score)
+
+
+def _read_cvat(path: Path, video: Video) -> RecordedDetections:
+    """Read the boxes of "CVAT for video 1.1" that are not outside; identity = track id + 1."""
+    try:
+        text = path.read_bytes()
+        if zipfile.is_zipfile(path):
+            text = zipfile.ZipFile(path).read("annotations.xml")
+        tracks = [(t, b) for t in ET.fromstring(text).iter("track") for b in t.iter("box")]
+        tracks = [(t, b) for t, b in tracks if b.attrib.get("outside") != "1"]
+        xyxy = [[float(b.attrib[k]) for k in CVAT_BOX] for _, b in tracks]
+        frame = np.array([int(b.attrib["frame"]) for _, b in tracks], np.int64)
+        ids = np.array([int(t.attrib["id"]) + 1 for t, _ in tracks], np.int64)
+        labels = [t.attrib["label"] for t, _ in tracks]
+    except (OSError, ET.ParseError, KeyError, ValueError) as error:
+        raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r})") from None
+    if not tracks:
+        raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
+    names, class_id = np.unique(labels, return_inverse=True)
+    n = len(tracks)
+    return RecordedDetections(
+        frame, np.array(xyxy, np.float64), np.ones(n), class_id.astype(np.int64), [NO_RUNS] * n,
+        tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box", [], ids,
+    )  # fmt: skip
 
 
 def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
@@ -6489,6 +6690,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+TRACKS_HELP = "identities from a file instead of the tracker: CVAT XML, COCO-VID JSON, MOT, CSV"
+
+
 def _common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set",
@@ -6519,6 +6723,7 @@ def _add_run(sub: Any, name: str, text: str, func: Callable[[argparse.Namespace]
             "--detections",
             help="recorded detections instead of a detector: MOT txt, CSV, COCO JSON, npz",
         )
+        parser.add_argument("--tracks", help=TRACKS_HELP)
     _options(parser, *sections, "")
     _common(parser)
     parser.set_defaults(func=func)
@@ -6531,6 +6736,7 @@ def _cmd_run(args: argparse.Namespace) -> int:
             args.out,
             config_from_args(args),
             detections=args.detections,
+            tracks=args.tracks,
             overwrite=args.overwrite,
         )
     )
@@ -6543,6 +6749,7 @@ def _cmd_track(args: argparse.Namespace) -> int:
             args.out,
             config_from_args(args),
             detections=args.detections,
+            tracks=args.tracks,
             in_3d=False,
             overwrite=args.overwrite,
         )
@@ -6582,6 +6789,7 @@ def _add_objects(sub: Any) -> None:
     parser.add_argument(
         "--validate", action="store_true", help="only check objects.json against its format"
     )
+    parser.add_argument("--tracks", help=TRACKS_HELP)
     _options(parser, "objects")
     _common(parser)
     parser.set_defaults(func=_cmd_objects)
@@ -6593,7 +6801,7 @@ def _cmd_objects(args: argparse.Namespace) -> int:
         faults = validate_objects(out / "objects.json" if out.is_dir() else out)
         print("\n".join(faults) or "valid")
         return 2 if faults else 0
-    return _finish(refit(out, config_from_args(args)))
+    return _finish(refit(out, config_from_args(args), args.tracks))
 
 
 def _add_eval(sub: Any) -> None:

@@ -467,7 +467,10 @@ def test_doctests() -> None:
     assert sum(r.attempted for r in results) >= 4  # they are found at all
 
 
-@pytest.mark.parametrize("command", ["", "run", "track", "poses", "objects", "eval", "export", "models"])
+COMMANDS = ["", "run", "track", "poses", "objects", "eval", "export", "models"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli(*([command] if command else []), "--help")
