@@ -245,7 +245,8 @@ class EmbedConfig:
 
     model: str = _opt(
         "colour",
-        "appearance: colour (training-free), none, or a backbone name / .onnx file",
+        "appearance: colour (training-free), none, a backbone name / .onnx file, or "
+        "crops[:BACKBONE] (re-OBJ as published: two crops an object)",
         "--embed",
     )
     size_px: int = _opt(480, "longer side of the backbone's input")
@@ -258,6 +259,8 @@ class EmbedConfig:
     background_cells: int = _opt(
         4, "cells a side that the grown box is divided into for the background"
     )
+    crop_px: int = _opt(224, "side of the crops of --embed crops")
+    conv_block: str = _opt("", "trained ConvBlock (.onnx) of --embed crops; none: maps flattened")
 
 
 @dataclass(frozen=True, slots=True)
@@ -2062,6 +2065,110 @@ class Embedder:
         foreground = _pool_cells(within, owner[:, inner][:, :, inner], self.config.foreground_cells)
         background = _pool_cells(sampled, free, self.config.background_cells)
         return Embeddings(foreground, background)
+
+
+class CropEmbedder(Embedder):
+    """Foreground and background embeddings as in re-OBJ: two masked crops of every object.
+
+    The grown box is cut out twice, once with all but the object black and once with the object
+    black. A backbone turns each into a map (7 x 7 x C for 224 px), and a trained ConvBlock turns
+    the two maps, one behind the other in the channels, into one embedding. Without a ConvBlock the
+    maps are flattened: the thesis's "no-train". This is the reference for `Embedder`, which needs
+    one pass a frame instead of two crops an object.
+
+    Args:
+        model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image
+            input (any batch) and a spatial output.
+    Raises:
+        ReobjError: the model has no spatial output, or the ConvBlock does not fit it.
+    """
+
+    def __init__(
+        self,
+        model: str = "mobilenetv2",
+        config: EmbedConfig | None = None,
+        threads: int = 0,
+        offline: bool = False,
+    ) -> None:
+        self.config = config or EmbedConfig()
+        self.backbone = _Backbone(model, self.config, threads, offline)
+        self.output = self._deepest_map()
+        block = self.config.conv_block
+        self.conv_block = (
+            onnx_session(model_path(block, offline=offline), threads) if block else None
+        )
+
+    def __call__(
+        self, frame: Image, detections: Detections, rows: IntArray | None = None
+    ) -> Embeddings:
+        """Embed the detections of one frame; arguments and result as of `Embedder`."""
+        rows = np.arange(len(detections)) if rows is None else rows
+        if not len(rows):
+            return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
+        crops, on_object = self.cut(frame, detections, rows)
+        masked = np.concatenate([crops * on_object[..., None], crops * ~on_object[..., None]])
+        fore, back = np.split(self.maps(masked), 2)  # (N, C, h, w) each
+        if self.conv_block is None:
+            return Embeddings(_flat_map(fore), _flat_map(back))
+        joint = self._joint(np.concatenate([fore, back], 1))
+        return Embeddings(_unit_rows(joint), np.empty((len(rows), 0)))
+
+    def cut(self, frame: Image, detections: Detections, rows: IntArray) -> tuple[Image, BoolArray]:
+        """Grown boxes, black beyond the frame: crops (N, S, S, 3), object pixels (N, S, S)."""
+        side = self.config.crop_px
+        box = _cxcywh_from_xyxy(detections.xyxy[rows])  # (N, 4)
+        half = np.maximum(box[:, 2:] / 2 * (1 + 2 * self.config.context), 1)  # (N, 2)
+        low = np.floor(box[:, :2] - half).astype(int)  # (N, 2) whole pixels
+        high = np.ceil(box[:, :2] + half).astype(int)
+        height, width = frame.shape[:2]
+        pad = max(0, int(-low.min()), int((high - [width, height]).max()))
+        wide = cv2.copyMakeBorder(frame, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=(0, 0, 0))
+        crops = [
+            cv2.resize(wide[y1:y2, x1:x2], (side, side), interpolation=cv2.INTER_AREA)
+            for (x1, y1), (x2, y2) in zip(low + pad, high + pad, strict=True)
+        ]
+        unit = (np.arange(side) + 0.5) / side  # (S,)
+        grid = low[:, :, None] + (high - low)[:, :, None] * unit  # (N, 2, S)
+        x = grid[:, 0, None, :].repeat(side, 1)  # (N, S, S)
+        y = grid[:, 1, :, None].repeat(side, 2)
+        return np.stack(crops), _on_object(detections, rows, x, y)
+
+    def maps(self, crops: Image) -> Floats:
+        """Backbone features (B, C, h, w) of BGR images (B, S, S, 3)."""
+        net = self.backbone
+        rgb = (crops[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
+        feed = {net.input: np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32)}
+        return np.asarray(net.session.run([self.output], feed)[0], np.float32)
+
+    def _deepest_map(self) -> str:
+        """Name of the backbone's first output at stride 32 (7 x 7 for 224 px), else its first."""
+        net, side = self.backbone, self.config.crop_px
+        names: list[str] = [o.name for o in net.session.get_outputs()]
+        maps = net.session.run(names, {net.input: np.zeros((1, 3, side, side), np.float32)})
+        deep = [n for n, m in zip(names, maps, strict=True) if m.shape[2:] == (side // 32,) * 2]
+        return deep[0] if deep else str(net.output)
+
+    def _joint(self, both: Floats) -> Array:
+        """Embeddings (N, E) of the stacked maps (N, 2C, h, w)."""
+        assert self.conv_block is not None
+        entry = self.conv_block.get_inputs()[0]
+        wanted = entry.shape[1:] if len(entry.shape) == 4 else []
+        if len(wanted) != 3 or any(
+            isinstance(w, int) and w != n for w, n in zip(wanted, both.shape[1:], strict=True)
+        ):
+            raise ReobjError(
+                f"{self.config.conv_block}: takes {entry.shape}, the two maps of the backbone are "
+                f"(N, {', '.join(map(str, both.shape[1:]))}): give a ConvBlock trained with this "
+                "backbone and --set embed.crop_px"
+            )
+        joint = self.conv_block.run(None, {entry.name: both})[0]
+        return np.asarray(joint.reshape(len(both), -1), np.float64)
+
+
+def _flat_map(maps: Floats) -> Array:
+    """Maps (N, C, h, w) as unit rows (N, C * h * w); signed square root as in `_pool_cells`."""
+    flat = maps.reshape(len(maps), -1)
+    return _unit_rows(np.sign(flat) * np.sqrt(np.abs(flat)))
 
 
 def _on_object(detections: Detections, rows: IntArray, x: Array, y: Array) -> BoolArray:
@@ -5493,6 +5600,10 @@ def _detect_cached(frame: Frame, source: _Source, cache: DetectionCache | None) 
 def _embedder(config: Config) -> Embedder | None:
     if config.embed.model == "none":
         return None
+    kind, _, backbone = config.embed.model.partition(":")
+    if kind == "crops":
+        backbone = backbone or "mobilenetv2"
+        return CropEmbedder(backbone, config.embed, config.threads, config.offline)
     return Embedder(config.embed.model, config.embed, config.threads, config.offline)
 
 

@@ -1,0 +1,814 @@
+#!/usr/bin/env python3
+"""Measure re-identification: Rank-k, mAP, twins, by view angle and by time gap.
+
+    python examples/rank_k.py --rooms 900 901 902 903 904 --recording redkitchen_7scenes \\
+        --models mobilenetv2 --person osnet_x0_25_msmt17 -o OUT
+
+writes OUT/rank_k.csv, OUT/by_bin.csv, OUT/cost.csv and plots, and prints Markdown tables.
+
+Every labelled detection is a query; its gallery are the labelled detections of *other* frames.
+Protocols:
+  open    gallery: every scene of the set, every class (the thesis's Rank-k).
+  class   gallery: same class, same scene; also where only one instance of the class is there.
+  twins   as `class`, only queries whose gallery holds another instance of the class.
+  same    rendered rooms: as `twins`, but only objects of one model (they look identical).
+Gaps: `any` other frame; `away`: more than `--away` frames (default 30, the frames for which a
+tracker coasts): what is nearer in time is bridged by motion and needs no re-identification.
+Rank-k is the share of queries with a right one among the k nearest; mAP the mean average precision.
+The interval is the 95 % bootstrap over identities. By bin: the gallery are all same-class objects
+in those frames that show the queried object from such an angle, or after such a gap.
+
+Setups (thesis): `fg` object only, `bg` surroundings only, `concat` both (mean of the two cosines),
+`full` the grown crop unmasked. "frame" methods pool one feature map a frame (`Embedder`), "crops"
+send two masked crops an object through the backbone (`CropEmbedder`), "person" is an appearance
+network of DeepSORT's kind on the plain box.
+
+Scenes:
+  --rooms SEED...    rooms of render_room.py (never train on them), rendered once into --cache.
+  --recording DIR... images/ or a video, with gt_mot.txt or gt.txt (MOT), as written by `run` or
+                     annotated; poses_c2w.txt and intrinsics.json give view angles where they exist.
+  --depth DIR...     the same folder, identities from depth/ and poses: detections_*.csv back-
+                     projected and clustered (the protocol of the frozen-backbone table).
+  --scannet DIR...   ScanNet or Matterport3D layout: color/, instance-filt/ (or instance/) label
+                     images, *.aggregation.json or *.semseg.json, pose/. Options of the CLOVER
+                     protocol: --views 8 --min-mask 10000 --min-side 100.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import hashlib
+import itertools
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
+import reobj_track as rt
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+Look = Callable[[rt.Image, rt.Detections, IntArray], rt.Embeddings]
+
+ANGLES_DEG = (0, 15, 30, 45, 60, 90, 180)
+GAPS = (0, 30, 60, 120, 240, 10**9)  # frames
+RANKS = (1, 5, 20, 50)
+DRAWS = 1000  # of the bootstrap
+
+
+# ---- Scenes --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Images of one place with labelled detections, as a struct of arrays (F frames, N rows).
+
+    Attributes:
+        images: F files. number: (F,) frame numbers in the recording.
+        row: (N,) frame of each detection, an index of images. xyxy: (N, 4).
+        name: (N,) class names. model: (N,) what looks identical, -1 unknown.
+        identity: (N,) from 1; 0: not scored, only known not to be background.
+        sight: (N, 3) unit vector from the camera to the object in world axes, NaN if unknown.
+        runs: N run lengths of masks for images of `size` (w, h), empty where there is none.
+    """
+
+    title: str
+    images: list[Path]
+    number: IntArray
+    row: IntArray
+    xyxy: Array
+    name: npt.NDArray[np.str_]
+    model: IntArray
+    identity: IntArray
+    sight: Array
+    runs: list[Any]
+    size: tuple[int, int]
+
+    def at(self, f: int) -> tuple[rt.Image, rt.Detections, IntArray]:
+        """Image of frame f, all its detections, and which of them are scored."""
+        rows = np.flatnonzero(self.row == f)
+        runs = [self.runs[i] for i in rows]
+        masks = None
+        if any(map(len, runs)):
+            masks = np.stack([rt.rle_decode(r, self.size) for r in runs])  # (D, H, W)
+        classes = np.unique(self.name, return_inverse=True)[1][rows].astype(np.int64)
+        found = rt.Detections(self.xyxy[rows], np.ones(len(rows)), classes, masks)
+        return read_image(self.images[f]), found, np.flatnonzero(self.identity[rows] > 0)
+
+    @property
+    def scored(self) -> IntArray:
+        """(n,) rows that are scored, in the order of frames."""
+        order = np.argsort(self.row, kind="stable")
+        return order[self.identity[order] > 0]
+
+    def sampled(self, every: int) -> Scene:
+        """Keep every n-th frame."""
+        keep = np.arange(0, len(self.images), every)
+        rows = np.isin(self.row, keep)
+        arrays = {k: getattr(self, k)[rows] for k in ("xyxy", "name", "model", "identity", "sight")}
+        return dataclasses.replace(
+            self, **arrays, images=[self.images[f] for f in keep], number=self.number[keep],
+            row=np.searchsorted(keep, self.row[rows]),
+            runs=[r for r, kept in zip(self.runs, rows, strict=True) if kept],
+        )  # fmt: skip
+
+
+def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any]:
+    """Read an image (BGR unless flags say otherwise), or say which one cannot be read."""
+    image = cv2.imread(str(path), flags)
+    if image is None:
+        raise rt.ReobjError(f"{path}: cannot be read as an image")
+    return np.asarray(image)
+
+
+def sight_of(xyxy: Array, world_from_cam: Array, K: Array) -> Array:
+    """Unit vectors (N, 3) in world axes from a camera (3, 4) to the centres of boxes (N, 4)."""
+    center = (xyxy[:, :2] + xyxy[:, 2:]) / 2
+    ray = np.column_stack([center, np.ones(len(center))]) @ np.linalg.inv(K).T  # (N, 3)
+    ray = ray @ world_from_cam[:3, :3].T
+    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+# ---- Rendered rooms ------------------------------------------------------------------------------
+
+
+def room_scene(seed: int, cache: Path, every: int = 6, min_side: float = 24.0) -> Scene:
+    """A room of render_room.py, sampled widely; rendered once for each version of the renderer."""
+    import render_room
+
+    version = hashlib.sha256(Path(render_room.__file__).read_bytes()).hexdigest()[:8]
+    folder = cache / f"room_{seed}_{every}_{version}"
+    if not (folder / "scene.npz").exists():
+        render_scene(seed, folder, every)
+    with np.load(folder / "scene.npz") as data:
+        part = {k: data[k] for k in data.files}
+    runs = np.split(part["mask_counts"], part["mask_offsets"][1:-1])
+    side = (part["xyxy"][:, 2:] - part["xyxy"][:, :2]).min(1)
+    clear = (part["visibility"] >= 0.3) & (side >= min_side)
+    files = [folder / f"{n:05d}.jpg" for n in part["number"]]
+    return Scene(
+        f"room {seed}", files, part["number"], part["row"], part["xyxy"], part["name"],
+        part["model"], np.where(clear, part["identity"], 0), part["sight"], runs,
+        (int(part["size"][0]), int(part["size"][1])),
+    )  # fmt: skip
+
+
+def render_scene(seed: int, folder: Path, every: int) -> None:
+    """Render every n-th frame of a clip with detector-like boxes and masks into a folder."""
+    import render_room as rr
+
+    folder.mkdir(parents=True, exist_ok=True)
+    config = rr.RoomConfig(seed=seed)
+    room, K = rr.make_room(config), rr.camera_matrix(config)
+    poses = rr.camera_path(room, config)
+    rows: list[dict[str, Any]] = []
+    numbers = np.arange(0, len(poses) - 1, every)
+    for f, number in enumerate(numbers):
+        own = dataclasses.replace(config, seed=1000 * seed + int(number))  # noise and exposure
+        frame = next(rr.render_clip(room, own, poses[number : number + 2]))
+        cv2.imwrite(str(folder / f"{number:05d}.jpg"), frame.image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        rng = np.random.default_rng([seed, 5, int(number)])
+        found = rr.simulate_detections(
+            room, frame.truth, frame.instance, rr.DetectorConfig(false_positives=0), rng
+        )
+        sight = sight_of(found.xyxy, np.linalg.inv([*poses[number], [0, 0, 0, 1]]), K)
+        for i, k in enumerate(found.truth_index):
+            item = room.objects[k]
+            rows.append({
+                "row": f, "xyxy": found.xyxy[i], "name": item.class_name, "sight": sight[i],
+                "model": item.twin_group, "identity": item.index + 1,
+                "visibility": frame.truth.visibility[k], "run": rr.run_lengths(found.masks[i]),
+            })  # fmt: skip
+    lengths = [len(r["run"]) for r in rows]
+    arrays: dict[str, Any] = {k: np.array([r[k] for r in rows]) for k in rows[0] if k != "run"}
+    with rt.atomic(folder / "scene.npz") as part, part.open("wb") as file:
+        np.savez_compressed(
+            file, **arrays, number=numbers, size=np.array([config.width, config.height]),
+            mask_counts=np.concatenate([r["run"] for r in rows]),
+            mask_offsets=np.concatenate([[0], np.cumsum(lengths)]),
+        )  # fmt: skip
+
+
+# ---- Recordings ----------------------------------------------------------------------------------
+
+
+def recording_scene(folder: Path, every: int = 1, min_visibility: float = 0.0) -> Scene:
+    """A folder with images/ and gt_mot.txt, gt.txt or gt/gt.txt (MOTChallenge, 1-based frames)."""
+    known = [folder / n for n in ("gt_mot.txt", "gt.txt", "gt/gt.txt", "tracks.txt")]
+    truth_file = next((p for p in known if p.is_file()), None)
+    if truth_file is None:
+        raise rt.ReobjError(f"{folder}: expected identities in gt_mot.txt, gt.txt or gt/gt.txt")
+    files = image_files(folder)
+    truth = rt.read_truth(truth_file, rt.COCO_NAMES, min_visibility)
+    truth = truth[truth.role != rt.ABSENT]
+    if len(truth) and truth.frame.max() > len(files):
+        raise rt.ReobjError(
+            f"{truth_file}: frame {truth.frame.max()} of {len(files)} images in {folder}: give the "
+            "folder that holds every frame"
+        )
+    size = read_image(files[0]).shape[1::-1]
+    n = len(truth)
+    scene = Scene(
+        folder.name, files, np.arange(len(files)), truth.frame - 1, truth.xyxy, truth.name,
+        np.full(n, -1), np.where(truth.role == rt.SCORED, truth.identity, 0),
+        sights(folder, truth.frame - 1, truth.xyxy), [rt.NO_RUNS] * n, (size[0], size[1]),
+    )  # fmt: skip
+    return scene.sampled(every)
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Images of a recording in natural order."""
+    for name in ("images", "img1", "color", "rgb", "undistorted_color_images"):
+        files = [p for p in (folder / name).glob("*") if p.suffix.lower() in (".jpg", ".png")]
+        if files:
+            return sorted(files, key=lambda p: (len(p.stem), p.stem))
+    raise rt.ReobjError(f"{folder}: expected images in images/, img1/, color/ or rgb/")
+
+
+def sights(folder: Path, row: IntArray, xyxy: Array) -> Array:
+    """View directions (N, 3) where poses_c2w.txt and intrinsics.json exist, else NaN."""
+    sight = np.full((len(row), 3), np.nan)
+    files = (folder / "poses_c2w.txt", folder / "intrinsics.json")
+    if not all(p.is_file() for p in files):
+        return sight
+    poses = np.loadtxt(files[0]).reshape(-1, 4, 4)  # (F, 4, 4) world_from_cam
+    K = pinhole(json.loads(files[1].read_text()))
+    for f in np.unique(row):
+        sight[row == f] = sight_of(xyxy[row == f], poses[f], K)
+    return sight
+
+
+def pinhole(numbers: dict[str, Any]) -> Array:
+    """(3, 3) from fx, fy, cx, cy."""
+    fx, fy, cx, cy = (float(numbers[k]) for k in ("fx", "fy", "cx", "cy"))
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def depth_scene(folder: Path, min_score: float = 0.3, reach: float = 0.3) -> Scene:
+    """Identities without annotation: detections of the frames that have depth, clustered in 3D.
+
+    A detection's place is the median back-projected point of the middle of its box; detections of
+    a class belong together when their places chain within `reach` times 1 m (single linkage).
+    """
+    from scipy.cluster.hierarchy import fcluster, linkage
+
+    files = image_files(folder)
+    found = np.loadtxt(next(folder.glob("detections_*.csv")), delimiter=",")
+    found = found[found[:, 5] >= min_score]
+    poses = np.loadtxt(folder / "poses_c2w.txt").reshape(-1, 4, 4)
+    numbers = json.loads((folder / "intrinsics.json").read_text())
+    stems = {p.stem: f for f, p in enumerate(files)}
+    depths = {stems[p.stem]: p for p in sorted((folder / "depth").glob("*.png"))}
+    found = found[np.isin(found[:, 0], list(depths))]
+    place = np.array([
+        center_in_world(rt_depth, box, poses[int(f)], numbers)
+        for f, box in zip(found[:, 0], found[:, 1:5], strict=True)
+        for rt_depth in [depths[int(f)]]
+    ])  # (N, 3)  # fmt: skip
+    good = np.isfinite(place).all(1)
+    found, place = found[good], place[good]
+    identity, count = np.zeros(len(found), np.int64), 0
+    for c in np.unique(found[:, 6]):
+        own = np.flatnonzero(found[:, 6] == c)
+        labels = np.ones(1, int)
+        if len(own) > 1:
+            labels = fcluster(linkage(place[own], "average"), reach, "distance")
+        identity[own] = labels + count
+        count += int(labels.max())
+    row = found[:, 0].astype(np.int64)
+    size = read_image(files[0]).shape[1::-1]
+    return Scene(
+        f"{folder.name} (depth)", files, np.arange(len(files)), row, found[:, 1:5],
+        np.array(rt.COCO_NAMES)[found[:, 6].astype(int)], np.full(len(row), -1), identity,
+        sights(folder, row, found[:, 1:5]), [rt.NO_RUNS] * len(row), (size[0], size[1]),
+    )  # fmt: skip
+
+
+def center_in_world(path: Path, xyxy: Array, world_from_cam: Array, numbers: Any) -> Array:
+    """Median point (3,) of the middle of a box in a depth image (mm), NaN if there is no depth."""
+    depth = read_image(path, cv2.IMREAD_UNCHANGED).astype(np.float64) / 1000  # (H, W) m
+    K = pinhole(numbers.get("depth", numbers))
+    shift = np.asarray(numbers.get("T_color_from_depth", [0, 0, 0]), float)
+    rows, cols = np.nonzero((depth > 0.2) & (depth < 8))
+    z = depth[rows, cols]
+    points = np.stack([(cols + 0.5 - K[0, 2]) * z / K[0, 0], (rows + 0.5 - K[1, 2]) * z / K[1, 1],
+                       z], 1) + shift  # (P, 3) in the colour camera  # fmt: skip
+    pixels = points @ pinhole(numbers).T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    middle, half = (xyxy[:2] + xyxy[2:]) / 2, (xyxy[2:] - xyxy[:2]) / 4
+    inside = (np.abs(pixels - middle) <= half).all(1)
+    if inside.sum() < 5:
+        return np.full(3, np.nan)
+    point = np.median(points[inside], 0)
+    return np.asarray(world_from_cam[:3, :3] @ point + world_from_cam[:3, 3])
+
+
+# ---- ScanNet and Matterport3D --------------------------------------------------------------------
+
+
+def scannet_scene(
+    folder: Path, every: int = 1, min_mask: int = 0, min_side: float = 0.0, views: int = 0
+) -> Scene:
+    """A scene exported in ScanNet's layout; Matterport3D with rendered label images likewise.
+
+    Label images hold objectId + 1 (ScanNet's instance-filt), 0 is nothing. Every visible object
+    takes part; scored are those with `min_mask` pixels, a box side of `min_side` and fewer than two
+    image borders touched (CLOVER), at most `views` evenly chosen ones of each instance.
+    """
+    names = instance_names(folder)
+    files = image_files(folder)[::every]
+    numbers, boxes, labels, runs, rows, scored = [], [], [], [], [], []
+    size = (0, 0)
+    for f, path in enumerate(files):
+        label = label_image(folder, path.stem)
+        size = label.shape[1], label.shape[0]
+        numbers.append(int("".join(c for c in path.stem if c.isdigit()) or f))
+        for k in np.setdiff1d(np.unique(label), [0]):
+            mask = label == k
+            y, x = np.nonzero(mask)
+            box = np.array([x.min(), y.min(), x.max() + 1, y.max() + 1], float)
+            touched = (box[0] <= 0) + (box[1] <= 0) + (box[2] >= size[0]) + (box[3] >= size[1])
+            good = len(x) >= min_mask and (box[2:] - box[:2]).min() >= min_side and touched < 2
+            boxes.append(box)
+            labels.append(int(k))
+            runs.append(rt.rle_encode(np.ascontiguousarray(mask)))
+            rows.append(f)
+            scored.append(good and int(k) in names)
+    identity = np.where(scored, labels, 0)
+    if views:
+        identity = evenly(identity, views)
+    xyxy, row = np.array(boxes).reshape(-1, 4), np.array(rows, np.int64)
+    sight = scannet_sights(folder, [p.stem for p in files], row, xyxy)
+    class_name = np.array([names.get(k, "") for k in labels], str)
+    return Scene(
+        folder.name, files, np.array(numbers), row, xyxy, class_name, np.full(len(row), -1),
+        identity, sight, runs, size,
+    )  # fmt: skip
+
+
+def evenly(identity: IntArray, views: int) -> IntArray:
+    """Keep at most so many evenly spaced rows of each identity, 0 for the others."""
+    kept = np.zeros_like(identity)
+    for k in np.setdiff1d(np.unique(identity), [0]):
+        rows = np.flatnonzero(identity == k)
+        kept[rows[np.unique(np.linspace(0, len(rows) - 1, views).round().astype(int))]] = k
+    return kept
+
+
+def instance_names(folder: Path) -> dict[int, str]:
+    """Class name of each label value, from ScanNet's aggregation or Matterport3D's semseg file."""
+    files = sorted([*folder.glob("*aggregation.json"), *folder.glob("*.semseg.json")])
+    if not files:
+        raise rt.ReobjError(f"{folder}: expected SCENE.aggregation.json or SCENE.semseg.json")
+    try:
+        groups = json.loads(files[0].read_text())["segGroups"]
+        return {int(g.get("objectId", g.get("id"))) + 1: str(g["label"]) for g in groups}
+    except (KeyError, TypeError, ValueError) as error:
+        raise rt.ReobjError(f"{files[0]}: expected segGroups with objectId and label") from error
+
+
+def label_image(folder: Path, stem: str) -> IntArray:
+    """The label image of a frame, (H, W)."""
+    for name in ("instance-filt", "instance", "instance-raw"):
+        path = folder / name / f"{stem}.png"
+        if path.is_file():
+            return np.asarray(read_image(path, cv2.IMREAD_UNCHANGED), np.int64)
+    raise rt.ReobjError(f"{folder}: expected instance-filt/{stem}.png for color/{stem}")
+
+
+def scannet_sights(folder: Path, stems: Sequence[str], row: IntArray, xyxy: Array) -> Array:
+    """View directions from pose/STEM.txt (world_from_cam) and intrinsic/intrinsic_color.txt."""
+    sight = np.full((len(row), 3), np.nan)
+    intrinsic = folder / "intrinsic" / "intrinsic_color.txt"
+    for f, stem in enumerate(stems):
+        pose = folder / "pose" / f"{stem}.txt"
+        if intrinsic.is_file() and pose.is_file():
+            K = np.loadtxt(intrinsic)[:3, :3]
+            sight[row == f] = sight_of(xyxy[row == f], np.loadtxt(pose)[:3], K)
+    return sight
+
+
+# ---- Looks ---------------------------------------------------------------------------------------
+
+
+class FullCrop(rt.CropEmbedder):
+    """The grown crop as it is: the thesis's "full" setup."""
+
+    def __call__(
+        self, frame: rt.Image, detections: rt.Detections, rows: IntArray | None = None
+    ) -> rt.Embeddings:
+        rows = np.arange(len(detections)) if rows is None else rows
+        maps = self.maps(self.cut(frame, detections, rows)[0])
+        return rt.Embeddings(flat(maps), np.empty((len(rows), 0)))
+
+
+def flat(maps: npt.NDArray[Any]) -> Array:
+    """Maps (N, ...) as unit rows with the signed square root, as `CropEmbedder` without block."""
+    rows = maps.reshape(len(maps), -1).astype(np.float64)
+    rows = np.sign(rows) * np.sqrt(np.abs(rows))
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12))
+
+
+def person_look(name: str, threads: int = 1) -> Look:
+    """DeepSORT's way: the plain box, resized, through one network; pooled if it gives a map."""
+    session = rt.onnx_session(rt.model_path(name), threads)
+    entry = session.get_inputs()[0]
+    side = tuple(s if isinstance(s, int) else 128 for s in entry.shape[:1:-1])
+
+    def look(image: rt.Image, found: rt.Detections, rows: IntArray) -> rt.Embeddings:
+        crops = []
+        for x1, y1, x2, y2 in found.xyxy[rows].round().astype(int):
+            part = image[max(y1, 0) : max(y2, y1 + 1, 1), max(x1, 0) : max(x2, x1 + 1, 1)]
+            crops.append(cv2.resize(part if part.size else image[-1:, -1:], side)[..., ::-1])
+        batch = (np.array(crops, np.float32) - rt.IMAGENET_MEAN) / rt.IMAGENET_STD
+        feed = {entry.name: batch.transpose(0, 3, 1, 2).astype(np.float32)}
+        out = session.run(None, feed)[0].astype(np.float64)
+        out = out.mean((2, 3)) if out.ndim == 4 else out
+        unit = out / np.linalg.norm(out, axis=1, keepdims=True)
+        return rt.Embeddings(unit, np.empty((len(rows), 0)))
+
+    return look
+
+
+def looks(args: Any) -> dict[str, tuple[Look, tuple[str, ...]]]:
+    """Every method: how to embed, and the names of its one or two parts."""
+    parts, one = ("fg", "bg"), ("full",)
+    found: dict[str, tuple[Look, tuple[str, ...]]] = {
+        "colour, frame": (rt.Embedder(threads=1), parts)
+    }
+    for name in args.models:
+        stem = Path(name).stem
+        found[f"{stem}, frame"] = (rt.Embedder(name, threads=1), parts)
+        if not args.no_crops:
+            found[f"{stem}, crops"] = (rt.CropEmbedder(name, threads=1), parts)
+            found[f"{stem}, crop"] = (FullCrop(name, threads=1), one)
+    for name in args.person:
+        found[f"{Path(name).stem}, person"] = (person_look(name), ("box",))
+    return found
+
+
+def embed(scenes: Sequence[Scene], look: Look) -> list[npt.NDArray[np.float32]]:
+    """Unit rows of each part for all scored detections, scene after scene: [(N, E1), (N, E2)]."""
+    fore, back = [], []
+    for scene in scenes:
+        for f in np.unique(scene.row[scene.scored]):
+            image, found, rows = scene.at(int(f))
+            both = look(image, found, rows)
+            fore.append(both.foreground.astype(np.float32))
+            back.append(both.background.astype(np.float32))
+    parts = [np.concatenate(fore), np.concatenate(back)]
+    return parts if parts[1].shape[1] else parts[:1]
+
+
+def setups(
+    parts: Sequence[npt.NDArray[np.float32]], names: Sequence[str], weight: float
+) -> dict[str, npt.NDArray[np.float32]]:
+    """Cosine matrices (N, N) of each part and of both together; equal to 1e-5 is equal."""
+    cosine = [np.round(p @ p.T, 5) for p in parts]
+    found = dict(zip(names, cosine, strict=True))
+    if len(cosine) == 2:
+        found["concat"] = np.round(weight * cosine[0] + (1 - weight) * cosine[1], 5)
+    return found
+
+
+# ---- Rank-k --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """What decides which pairs of scored detections are compared (N rows, all scenes)."""
+
+    scene: IntArray  # (N,)
+    frame: IntArray  # (N,) number in the recording
+    name: IntArray  # (N,) class
+    model: IntArray  # (N,)
+    identity: IntArray  # (N,) unique over all scenes
+    sight: Array  # (N, 3)
+
+    def gallery(self, protocol: str, away: int) -> BoolArray:
+        """(N, N): does row i compare with row j?"""
+        near = self.scene[:, None] == self.scene[None]
+        near_time = np.abs(self.frame[:, None] - self.frame[None]) <= away
+        allowed = ~(near & near_time)
+        if protocol != "open":
+            allowed &= near & (self.name[:, None] == self.name[None])
+        if protocol == "same":
+            allowed &= (self.model[:, None] == self.model[None]) & (self.model >= 0)
+        return np.asarray(allowed)
+
+    def same(self) -> BoolArray:
+        """(N, N): one object?"""
+        return np.asarray(self.identity[:, None] == self.identity[None])
+
+    def angle_deg(self) -> Array:
+        """(N, N) angle between the directions of view, NaN if unknown."""
+        return np.asarray(np.degrees(np.arccos(np.clip(self.sight @ self.sight.T, -1, 1))))
+
+
+def pairs_of(scenes: Sequence[Scene]) -> Pairs:
+    """Concatenate the scored rows of all scenes; identities made unique."""
+    rows = [s.scored for s in scenes]
+    scene = np.repeat(np.arange(len(scenes)), [len(r) for r in rows])
+    both = list(zip(scenes, rows, strict=True))
+    frame = np.concatenate([s.number[s.row[r]] for s, r in both])
+    name, model, identity, sight = (
+        np.concatenate([getattr(s, k)[r] for s, r in both])
+        for k in ("name", "model", "identity", "sight")
+    )
+    identity = np.unique(np.stack([scene, identity], 1), axis=0, return_inverse=True)[1].ravel()
+    classes = np.unique(name, return_inverse=True)[1]
+    return Pairs(scene, frame, classes, model, identity, sight)
+
+
+def rank_queries(
+    cosine: npt.NDArray[Any], same: BoolArray, allowed: BoolArray, need_other: bool = True
+) -> tuple[Array, Array]:
+    """Rank (from 1) of the first right one and average precision of every query, (N,) each.
+
+    NaN where the gallery holds no right one, or (need_other) no wrong one. Ties are shared: a
+    right one counts half of the wrong ones of equal similarity as nearer.
+    """
+    positive, negative = same & allowed, ~same & allowed
+    rank, precision = np.full(len(cosine), np.nan), np.full(len(cosine), np.nan)
+    valid = positive.any(1) & (negative.any(1) | (not need_other))
+    for i in np.flatnonzero(valid):  # over queries
+        right = np.sort(cosine[i, positive[i]])[::-1]  # (P,) best first
+        wrong = np.sort(cosine[i, negative[i]])  # (M,)
+        nearer = len(wrong) - np.searchsorted(wrong, right, "right")
+        equal = len(wrong) - np.searchsorted(wrong, right, "left") - nearer
+        before = nearer + 0.5 * equal  # (P,) wrong ones in front of each right one
+        place = np.arange(1, len(right) + 1)
+        rank[i], precision[i] = 1 + before[0], np.mean(place / (place + before))
+    return rank, precision
+
+
+def hit(rank: Array, k: int) -> Array:
+    """Is the first right one among the k nearest? 1 or 0, half for a tie of two at the border."""
+    return np.asarray(np.clip(k + 1 - rank, 0, 1))
+
+
+def shares(rank: Array, identity: IntArray, draws: npt.NDArray[Any]) -> Array:
+    """Rank-1 of bootstrap draws over identities: (B,), from draws (B, identities)."""
+    good = np.isfinite(rank)
+    count = np.bincount(identity[good], minlength=draws.shape[1])
+    hits = np.bincount(identity[good], hit(rank[good], 1), minlength=draws.shape[1])
+    return np.asarray((draws @ hits) / np.maximum(draws @ count, 1))
+
+
+def bootstrap_draws(identity: IntArray, used: BoolArray, seed: int = 0) -> npt.NDArray[Any]:
+    """How often each identity is drawn, (B, identities); only those that are used."""
+    names = np.unique(identity[used])
+    draws = np.zeros((DRAWS, int(identity.max(initial=0)) + 1))
+    rng = np.random.default_rng(seed)
+    draws[:, names] = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), DRAWS)
+    return draws
+
+
+def summary(rank: Array, precision: Array, pairs: Pairs) -> dict[str, float]:
+    """Rank-k, mAP and interval of one row of the table; percent."""
+    good = np.isfinite(rank)
+    if not good.any():
+        return {}
+    boot = shares(rank, pairs.identity, bootstrap_draws(pairs.identity, good))
+    low, high = np.percentile(boot, [2.5, 97.5])
+    row: dict[str, float] = {"queries": int(good.sum())}
+    row["identities"] = len(np.unique(pairs.identity[good]))
+    row |= {f"rank{k}": 100 * float(hit(rank[good], k).mean()) for k in RANKS}
+    return {**row, "low": 100 * low, "high": 100 * high, "mAP": 100 * float(precision[good].mean())}
+
+
+def by_bin(
+    cosine: npt.NDArray[Any], pairs: Pairs, value: Array, edges: Sequence[float]
+) -> list[dict[str, float]]:
+    """Twin Rank-1 where the right ones have a value (N, N) within each bin."""
+    same, allowed = pairs.same(), pairs.gallery("twins", 0)
+    moment = np.unique(np.stack([pairs.scene, pairs.frame], 1), axis=0, return_inverse=True)[1]
+    at = np.eye(int(moment.max()) + 1, dtype=np.float32)[moment.ravel()]  # (N, moments)
+    found = []
+    for low, high in itertools.pairwise(edges):
+        right = same & allowed & (value > low) & (value <= high)
+        frames = (right.astype(np.float32) @ at) > 0  # (N, moments) that show it so
+        gallery = allowed & frames[:, moment.ravel()] & (right | ~same)
+        rank, precision = rank_queries(cosine, same, gallery)
+        found.append({"low_edge": low, "high_edge": high, **summary(rank, precision, pairs)})
+    return [row for row in found if "rank1" in row]
+
+
+# ---- Cost ----------------------------------------------------------------------------------------
+
+
+def cost_ms(scene: Scene, methods: dict[str, Any], objects: int = 10) -> dict[str, float]:
+    """Median wall ms to embed so many objects of one frame, all methods in turn (one thread)."""
+    counts = np.bincount(scene.row, minlength=len(scene.images))
+    image, found, _ = scene.at(int(counts.argmax()))
+    rows = np.resize(np.arange(len(found)), objects)
+    spent: dict[str, list[float]] = {name: [] for name in methods}
+    for _ in range(7):
+        for name, (look, _) in methods.items():
+            started = time.perf_counter()
+            look(image.copy(), found, rows)  # a new frame: nothing is remembered
+            spent[name].append(1e3 * (time.perf_counter() - started))
+    return {name: float(np.median(values[1:])) for name, values in spent.items()}
+
+
+# ---- Output --------------------------------------------------------------------------------------
+
+
+def evaluate(title: str, scenes: Sequence[Scene], args: Any) -> tuple[list[Any], list[Any]]:
+    """Rows of the table and of the bins for one set of scenes, all methods."""
+    pairs = pairs_of(scenes)
+    same, angle = pairs.same(), pairs.angle_deg()
+    gap = np.abs(pairs.frame[:, None] - pairs.frame[None]).astype(float)
+    kinds = ["open", "class", "twins", *(["same"] if (pairs.model >= 0).any() else [])]
+    rows, bins = [], []
+    for method, (look, names) in looks(args).items():
+        started = time.time()
+        cosines = setups(embed(scenes, look), names, args.weight)
+        for setup, cosine in cosines.items():
+            head = {"set": title, "method": method, "setup": setup}
+            for kind in kinds:
+                for label, away in (("any", 0), ("away", args.away)):
+                    ranks = rank_queries(cosine, same, pairs.gallery(kind, away), kind != "class")
+                    row = summary(*ranks, pairs)
+                    rows.append({**head, "protocol": kind, "gap": label, **row, "ranks": ranks[0]})
+            for label, value, edges in (("angle", angle, ANGLES_DEG), ("gap", gap, GAPS)):
+                bins += [{**head, "by": label, **r} for r in by_bin(cosine, pairs, value, edges)]
+        print(f"{title}: {method} {time.time() - started:.0f} s", file=sys.stderr)
+    return [{**r, "identity": pairs.identity} for r in rows if "rank1" in r], bins
+
+
+def ratio(rows: Sequence[dict[str, Any]], ours: str, protocol: str, gap: str) -> str:
+    """Rank-1 of a method's concat over the best of its own fg, full crops and person networks."""
+    part = [r for r in rows if r["protocol"] == protocol and r["gap"] == gap]
+    best = [r for r in part if r["method"] == ours and r["setup"] == "concat"]
+    others = [r for r in part if r["setup"] in ("full", "box") or
+              (r["method"] == ours and r["setup"] == "fg")]  # fmt: skip
+    if not best or not others:
+        return ""
+    rival = max(others, key=lambda r: r["rank1"])
+    draws = bootstrap_draws(rival["identity"], np.isfinite(rival["ranks"]))
+    drawn = [shares(r["ranks"], r["identity"], draws) for r in (best[0], rival)]
+    low, high = np.percentile(drawn[0] / np.maximum(drawn[1], 1e-9), [2.5, 97.5])
+    return (
+        f"{ours} concat {best[0]['rank1']:.1f} / {rival['method']} {rival['setup']} "
+        f"{rival['rank1']:.1f} = {best[0]['rank1'] / max(rival['rank1'], 1e-9):.2f} "
+        f"[{low:.2f}, {high:.2f}] ({protocol}, {gap})"
+    )
+
+
+def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write rows with the columns of the first."""
+    hidden = ("ranks", "identity")
+    with rt.atomic(path) as part, part.open("w", newline="") as file:
+        names = list(dict.fromkeys(k for r in rows for k in r if k not in hidden))
+        writer = csv.DictWriter(file, names, extrasaction="ignore")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()})
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """One table for each set, protocol and gap."""
+    parts = []
+    for key in dict.fromkeys((r["set"], r["protocol"], r["gap"]) for r in rows):
+        part = [r for r in rows if (r["set"], r["protocol"], r["gap"]) == key]
+        count = f"{part[0]['queries']} queries, {part[0]['identities']} identities"
+        lines = [f"**{key[0]}, {key[1]}, {key[2]}** ({count})", ""]
+        lines += ["| method | setup | Rank-1 [95 %] | 5 | 20 | 50 | mAP |", "|---" * 7 + "|"]
+        lines += [
+            f"| {r['method']} | {r['setup']} | {r['rank1']:.1f} [{r['low']:.0f}, {r['high']:.0f}] "
+            f"| {r['rank5']:.1f} | {r['rank20']:.1f} | {r['rank50']:.1f} | {r['mAP']:.1f} |"
+            for r in part
+        ]
+        parts.append("\n".join(lines) + "\n")
+    return "\n".join(parts)
+
+
+def plot_bins(bins: Sequence[dict[str, Any]], out: Path) -> None:
+    """Twin Rank-1 against view angle and time gap, one picture a set."""
+    plt = pyplot()
+    for title in dict.fromkeys(r["set"] for r in bins):
+        figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True)
+        for ax, by in zip(axes, ("angle", "gap"), strict=True):
+            part = [r for r in bins if r["set"] == title and r["by"] == by]
+            for key in dict.fromkeys((r["method"], r["setup"]) for r in part):
+                own = [r for r in part if (r["method"], r["setup"]) == key]
+                texts = [f"{r['low_edge']}-{r['high_edge'] if r['high_edge'] < 1e8 else ''}"
+                         for r in own]  # fmt: skip
+                style = {"concat": "-", "bg": ":"}.get(key[1], "--")
+                ax.plot(texts, [r["rank1"] for r in own], style, marker=".", label=" ".join(key))
+            ax.set_xlabel("view angle, deg" if by == "angle" else "time gap, frames")
+            ax.grid(alpha=0.3)
+        axes[0].set_ylabel("twin Rank-1, %")
+        axes[1].legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5))
+        figure.suptitle(title, fontsize=10)
+        figure.tight_layout()
+        figure.savefig(out / f"rank_k_{title.replace(' ', '_')}.png", dpi=80)
+        plt.close(figure)
+
+
+def pyplot() -> Any:
+    """matplotlib without a display."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise rt.ReobjError("plots need matplotlib: pip install matplotlib") from error
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
+
+
+def scene_sets(args: Any) -> dict[str, list[Scene]]:
+    """The scenes to measure, by title."""
+    sets: dict[str, list[Scene]] = {}
+    if args.rooms:
+        sets["rooms"] = [room_scene(seed, args.cache, args.every) for seed in args.rooms]
+    for folder in args.recording:
+        sets[folder.name] = [recording_scene(folder, args.every)]
+    for folder in args.depth:
+        sets[f"{folder.name} (depth)"] = [depth_scene(folder)]
+    if args.scannet:
+        sets["scannet"] = [
+            scannet_scene(f, args.every, args.min_mask, args.min_side, args.views)
+            for f in args.scannet
+        ]
+    return sets
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("-o", "--out", type=Path, required=True)
+    add("--rooms", type=int, nargs="*", default=[], metavar="SEED")
+    add("--recording", type=Path, nargs="*", default=[], metavar="DIR")
+    add("--depth", type=Path, nargs="*", default=[], metavar="DIR")
+    add("--scannet", type=Path, nargs="*", default=[], metavar="DIR")
+    add("--cache", type=Path, default=Path("build/rank_k"), help="for rendered rooms")
+    add("--every", type=int, default=6, help="use every n-th frame (default %(default)s)")
+    add("--away", type=int, default=30, help="frames that count as away (default %(default)s)")
+    add("--models", nargs="*", default=[], help="backbones beside the colour descriptor")
+    add("--person", nargs="*", default=[], help="networks for the plain box (DeepSORT's way)")
+    add("--no-crops", action="store_true", help="leave out the slow crop references")
+    add("--weight", type=float, default=rt.TrackerConfig().foreground_weight,
+        help="share of the foreground in concat (default %(default)s)")  # fmt: skip
+    add("--views", type=int, default=0, help="ScanNet: images of each instance (0: all)")
+    add("--min-mask", type=int, default=0, help="ScanNet: pixels of a scored mask")
+    add("--min-side", type=float, default=0, help="ScanNet: side of a scored box")
+    return parser
+
+
+def measure(args: Any) -> None:
+    """Measure all sets, write the files, print the tables."""
+    sets = scene_sets(args)
+    if not sets:
+        raise rt.ReobjError("nothing to measure: give --rooms, --recording, --depth or --scannet")
+    args.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Any] = []
+    bins: list[Any] = []
+    for title, scenes in sets.items():
+        own, own_bins = evaluate(title, scenes, args)
+        rows, bins = rows + own, bins + own_bins
+    write_csv(args.out / "rank_k.csv", rows)
+    write_csv(args.out / "by_bin.csv", bins)
+    plot_bins(bins, args.out)
+    print(markdown(rows))
+    methods = looks(args)
+    for title in sets:
+        own = [r for r in rows if r["set"] == title]
+        for method in methods:
+            print(*filter(None, [ratio(own, method, p, g) for p in ("twins", "same")
+                                 for g in ("any", "away")]), sep="\n")  # fmt: skip
+    spent = cost_ms(next(iter(sets.values()))[0], methods)
+    write_csv(args.out / "cost.csv", [{"method": k, "ms_of_10": v} for k, v in spent.items()])
+    print("\n".join(f"{k}: {v:.1f} ms for 10 objects" for k, v in spent.items()))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line entry; 0 on success, 2 on bad input."""
+    args = build_parser().parse_args(argv)
+    try:
+        measure(args)
+    except rt.ReobjError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
