@@ -456,6 +456,15 @@ class Detections:
         rows = np.asarray(rows, np.float64).reshape(-1, 6) if np.size(rows) else np.empty((0, 6))
         return Detections(rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64))
 
+    @staticmethod
+    def from_supervision(found: Any) -> Detections:
+        """Make from an object with xyxy (N, 4), confidence, class_id and mask, as supervision's.
+
+        What is None there counts as score 1, class 0, no mask. `Tracker.update` takes such objects
+        as they are; `Tracks.to_supervision` goes back.
+        """
+        return as_detections(found)
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -2472,9 +2481,25 @@ class Tracks:
         return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
     def to_array(self) -> Array:
-        """(M, 8) rows x1, y1, x2, y2, id, score, class, detection index."""
+        """(M, 8) rows x1, y1, x2, y2, id, score, class, detection index.
+
+        >>> tracker = Tracker(TrackerConfig(n_init=1))
+        >>> tracker.update(np.array([[10, 10, 50, 90, 0.9, 56]])).to_array().astype(int)
+        array([[10, 10, 50, 90,  1,  0, 56,  0]])
+        """
         columns = (self.xyxy, self.track_id, self.score, self.class_id, self.detection_index)
         return np.column_stack(columns).astype(np.float64).reshape(-1, 8)
+
+    def to_supervision(self, detections: Any) -> Any:
+        """The rows of supervision's `Detections` that are tracked, with `tracker_id` set.
+
+        Args:
+            detections: what was handed to `update` (anything that has `tracker_id` and can be
+                indexed by rows); its masks and data are kept, itself it stays as it is.
+        """
+        found = detections[self.detection_index]
+        found.tracker_id = self.track_id
+        return found
 
 
 @dataclass(slots=True)
@@ -5516,6 +5541,32 @@ def track_video(
     seconds["track"] = time.monotonic() - started
     result.save(path)
     return result
+
+
+def track(
+    source: str | Path | int | Video,
+    config: Config | None = None,
+    *,
+    detections: str | Path | Callable[[Image], Any] | None = None,
+) -> Iterator[tuple[Frame, Tracks]]:
+    """Track a video as it is read: yields each frame with the tracks decided in it.
+
+    Args:
+        source: video file, folder of images, glob, camera index, stream URL, or a `Video`.
+        detections: as for `run`: file, callable image -> detections, or None for the detector.
+    Yields:
+        Frame, and its Tracks in pixels of the frame's image. Online: without the linking in 3D and
+        the look back of `run`.
+
+    >>> for frame, tracks in track("room.mp4", detections="det.txt"):  # doctest: +SKIP
+    ...     print(frame.index, tracks.track_id)
+    """
+    config = config or Config()
+    video = source if isinstance(source, Video) else Video(source, config.input)
+    found = _detection_source(video, config, detections)
+    tracker = Tracker(config.tracker, _embedder(config))
+    for frame in video:
+        yield frame, tracker.update(found.detect(frame), frame.image)
 
 
 @dataclass(frozen=True, slots=True)
