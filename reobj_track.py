@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import base64
 import contextlib
 import csv
 import dataclasses
@@ -397,6 +398,14 @@ class OutputConfig:
     overlay: bool = _opt(True, "write overlay.mp4")
     overlay_size_px: int = _opt(1280, "longer side of the overlay")
     ply_detail: int = _opt(2, "subdivisions of the ellipsoids in objects.ply")
+    scene: bool = _opt(True, "write scene.html")
+    scene_crops: int = _opt(8, "pictures of each object in scene.html")
+    scene_max_crops: int = _opt(480, "and of all objects together")
+    scene_crop_px: int = _opt(112, "longer side of these pictures")
+    scene_frames: int = _opt(60, "video frames in scene.html, shown beside the time slider")
+    scene_frame_px: int = _opt(320, "longer side of these frames")
+    scene_steps: int = _opt(1500, "steps of the time slider (longer videos: every n-th camera)")
+    scene_points: int = _opt(20000, "sparse points in scene.html (more: every n-th)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -5187,13 +5196,18 @@ class VideoWriter:
 
 
 def write_overlay(
-    result: RunResult, solids: quadrics.Ellipsoids | None, video: Video, config: OutputConfig
+    result: RunResult,
+    solids: quadrics.Ellipsoids | None,
+    video: Video,
+    config: OutputConfig,
+    take: Callable[[Frame], None] = lambda frame: None,
 ) -> None:
     """Write overlay.mp4: boxes, identities and back-projected ellipsoids of every frame.
 
     Args:
         solids: ellipsoids of the objects that are not rejected, in their order. Those that rest on
             a prior are drawn only while they are detected.
+        take: called with every frame, so that the video is read once for all outputs.
     """
     width, height = video.size
     shrink = min(1.0, config.overlay_size_px / max(width, height))
@@ -5220,6 +5234,7 @@ def write_overlay(
                 draw_ellipses(image, dual_c, drawn, ids, seen)
             draw_tracks(image, rows, labels, scale)
             writer.write(image)
+            take(frame)
             progress.step()
         complete = True
     finally:
@@ -5245,6 +5260,198 @@ def _project_all(
     )
     dual_c, visible = quadrics.project(ellipsoids.dual_quadrics(), img_from_world)
     return {int(f): (dual_c[i], visible[i]) for i, f in enumerate(poses.frame[poses.known])}
+
+
+# ---- Scene page: one self-contained HTML file --------------------------------------------------
+
+
+class Pictures:
+    """Small JPEGs for the scene page, cut while the video is read: crops of every object and
+    frames for the time slider.
+
+    Attributes:
+        crops: [frame number, base64] of each object's pictures, by identity, by time.
+        frames: [frame number, base64] of whole frames with their boxes.
+    """
+
+    def __init__(self, result: RunResult, video: Video, config: OutputConfig) -> None:
+        self.table, self.config, self.scale = result.table, config, video.scale
+        self.crops: dict[int, list[tuple[int, str]]] = {o["id"]: [] for o in result.objects}
+        self.frames: list[tuple[int, str]] = []
+        count = config.scene_max_crops // max(len(result.objects), 1)
+        count = min(max(count, 1), config.scene_crops)
+        ranked = sorted(result.objects, key=lambda o: -o["frames_seen"])
+        chosen = {
+            o["id"]: diverse_rows(result.table, o, result.poses, count)
+            for o in ranked[: config.scene_max_crops]
+        }
+        self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
+        shown = scene_frames(result)
+        self.whole = set(shown[:: math.ceil(len(shown) / config.scene_frames) or 1].tolist())
+
+    def take(self, frame: Frame) -> None:
+        """Cut what is wanted from this frame."""
+        rows = self.wanted[self.table.frame[self.wanted] == frame.index]
+        height, width = frame.image.shape[:2]
+        for obj, box in zip(self.table.object_id[rows], self.table.xyxy[rows], strict=True):
+            margin = 0.1 * (box[2:] - box[:2])
+            x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
+            x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
+            if x1 < x2 and y1 < y2:
+                crop = _jpeg(frame.image[y1:y2, x1:x2], self.config.scene_crop_px)
+                self.crops[int(obj)].append((frame.index, crop))
+        if frame.index in self.whole:
+            image = _shrunk(frame.image, self.config.scene_frame_px)
+            low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
+            scale = self.scale * image.shape[1] / width
+            draw_tracks(image, self.table[slice(low, high)], {}, scale)
+            self.frames.append((frame.index, _jpeg(image, self.config.scene_frame_px)))
+
+
+def _shrunk(image: Image, size_px: int) -> Image:
+    """A copy whose longer side is at most size_px."""
+    ratio = min(1.0, size_px / max(image.shape[:2]))
+    size = [max(1, round(side * ratio)) for side in image.shape[1::-1]]
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _jpeg(image: Image, size_px: int) -> str:
+    """Base64 of a small JPEG."""
+    data = cv2.imencode(".jpg", _shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    return base64.b64encode(data.tobytes()).decode()
+
+
+def diverse_rows(
+    table: TrackTable, entry: dict[str, Any], poses: Poses | None, count: int
+) -> IntArray:
+    """Row numbers (<= count,) of the views of one object that differ most: in time and, where there
+    are cameras, in viewing direction; large boxes with good scores first.
+    """
+    rows = np.flatnonzero(table.object_id == entry["id"])
+    frame, box = table.frame[rows], table.xyxy[rows]
+    quality = table.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
+    place = 2 * (frame / max(int(table.frame.max(initial=0)), 1))[:, None]  # (N, 1)
+    if poses is not None and entry["center"] is not None:
+        world_from_cam = invert_rigid(poses.cam_from_world)  # (F, 3, 4)
+        at = np.searchsorted(poses.frame, frame).clip(max=len(poses.frame) - 1)
+        ray = world_from_cam[at, :, 3] - entry["center"]
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        place = np.hstack([place, np.nan_to_num(ray)])  # (N, 4)
+        quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # no pose: last
+    chosen = [int(quality.argmax())]
+    while len(chosen) < min(count, len(rows)):
+        gap = np.linalg.norm(place[:, None] - place[chosen], axis=2).min(1)  # (N,)
+        best = int((gap * quality**0.5).argmax())
+        if gap[best] == 0:
+            break
+        chosen.append(best)
+    return np.asarray(rows[chosen], np.int64)
+
+
+def scene_frames(result: RunResult) -> IntArray:
+    """Frame numbers that the time slider of the scene page goes through, before thinning."""
+    return np.unique(result.table.frame) if result.poses is None else result.poses.frame
+
+
+def guessed_up(cam_from_world: Array) -> Array:
+    """Direction against gravity (3,) when nobody knows it: people hold the horizon level, so it is
+    the one most at right angles to all cameras' x axes (F, 3, 4); else the mean of their -y axes.
+    """
+    upward = -cam_from_world[:, 1, :3].mean(0)
+    _, strength, axes = np.linalg.svd(cam_from_world[:, 0, :3])
+    if len(strength) > 2 and strength[1] > 0.2 * strength[0]:  # the cameras turned, not only moved
+        upward = axes[2] * (1 if axes[2] @ upward >= 0 else -1)
+    return np.asarray(upward / (np.linalg.norm(upward) or 1))
+
+
+def write_scene(result: RunResult, pictures: Pictures, video: Video, config: Config) -> None:
+    """Write scene.html: ellipsoids, cameras, points and pictures in one page that needs no network.
+
+    The page is `scene_template.html`; its data are objects.json's entries without covariance, and
+    base64 of little-endian float32 / uint8 arrays.
+    """
+    limits, frames = config.output, scene_frames(result)
+    steps = frames[:: math.ceil(len(frames) / limits.scene_steps) or 1]  # (S,)
+    seconds = config.input.every / (video.fps or 30.0) * len(frames) / max(1, len(steps))
+    data = {
+        "title": Path(str(video.source)).name,
+        "facts": _scene_facts(result.world),
+        "warnings": result.warnings,
+        "world": {k: v for k, v in result.world.items() if k != "links"},
+        "links": [
+            link | {"place_iou": _rounded(link["place_iou"], 2), "look": _rounded(link["look"], 2)}
+            for link in result.world["links"]
+        ],
+        "objects": [_scene_object(o, result.table, steps, pictures) for o in result.objects],
+        "thumbs": pictures.frames,
+        "why_flat": _why_flat(result),
+        "steps": {"frame": steps.tolist(), "seconds": seconds},
+        **_scene_cameras(result.poses, steps, limits),
+    }
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    head, tail = Path(__file__).with_name("scene_template.html").read_text().split("@DATA@")
+    with atomic(result.out / "scene.html") as part:
+        part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
+
+
+def _base64(values: npt.NDArray[Any], kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
+
+
+def _scene_cameras(poses: Poses | None, steps: IntArray, limits: OutputConfig) -> dict[str, Any]:
+    """Cameras of the steps, sparse points and the upward direction, for the page."""
+    if poses is None or not poses.known.any():
+        return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
+    thin = slice(None, None, math.ceil(len(poses.points) / limits.scene_points) or 1)
+    K, up = poses.camera.K, poses.up_in_world
+    up = guessed_up(poses.cam_from_world[poses.known]) if up is None else up
+    size = {"width": poses.camera.width, "height": poses.camera.height}
+    return {
+        "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
+        "poses": _base64(invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)]), "<f4"),
+        "points": _base64(poses.points[thin], "<f4"),
+        "colors": _base64(poses.colors[thin], "u1"),
+        "up": _numbers(up),
+    }
+
+
+def _scene_object(
+    entry: dict[str, Any], table: TrackTable, steps: IntArray, pictures: Pictures
+) -> dict[str, Any]:
+    """An object for the page: its entry of objects.json, colour, steps in which it is seen (first,
+    last, first, last ...) and pictures.
+    """
+    seen = np.isin(steps, table.frame[table.object_id == entry["id"]])
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
+    runs[1::2] -= 1
+    return {k: v for k, v in entry.items() if k != "cov"} | {
+        "color": object_color(entry["id"])[::-1],
+        "seen": runs.tolist(),
+        "crops": pictures.crops[entry["id"]],
+    }
+
+
+def _why_flat(result: RunResult) -> str:
+    """Why the page has nothing to show in 3D; "" when it has."""
+    if result.poses is not None and result.poses.known.any():
+        return ""
+    reasons = [w for w in result.warnings if "pose" in w or "identities only" in w]
+    return reasons[0] if reasons else "no camera poses (`track`, or --poses none)"
+
+
+def _scene_facts(world: dict[str, Any]) -> str:
+    """One line on cameras and scale."""
+    if not world["registered_frames"]:
+        return ""
+    facts = [f"cameras of {world['registered_frames']} of {world['frames']} frames"]
+    scale = world.get("scale")
+    if scale and scale["source"] != "none":
+        facts.append(f"scale from {scale['source']}, ± {100 * (scale['rel_sigma'] or 0):.0f} %")
+    else:
+        facts.append(f"units: {world['units']}")
+    facts.append(f"up: {'known' if world['up_in_world'] else 'guessed from the cameras'}")
+    return " · ".join(facts)
+
 
 
 # ---- Run: the whole chain ----------------------------------------------------------------------
@@ -5987,7 +6194,7 @@ def write_cameras(out: Path, poses: Poses, video: Video) -> None:
 def write_results(result: RunResult, video: Video, config: Config) -> None:
     """Write the files of the output folder; each appears only when it is complete."""
     out, started = result.out, time.monotonic()
-    for name in ("poses.txt", "objects.ply", "overlay.mp4"):  # of an earlier run with other options
+    for name in ("poses.txt", "objects.ply", "overlay.mp4", "scene.html"):  # of an earlier run
         (out / name).unlink(missing_ok=True)
     write_mot(out / "tracks.txt", result.table)
     _write_objects_json(result, video)
@@ -5998,8 +6205,14 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
     if solids is not None:
         ids = [o["id"] for o in result.objects if o["status"] != "rejected"]
         write_ply(out / "objects.ply", solids, ids, config.output.ply_detail)
+    pictures = Pictures(result, video, config.output)
     if config.output.overlay and not video.is_live:
-        write_overlay(result, solids, video, config.output)
+        write_overlay(result, solids, video, config.output, pictures.take)
+    elif config.output.scene and not video.is_live:
+        for frame in video:
+            pictures.take(frame)
+    if config.output.scene:
+        write_scene(result, pictures, video, config)
     result.seconds["write"] = time.monotonic() - started
 
 
@@ -6080,7 +6293,12 @@ def _summary_world(result: RunResult) -> list[str]:
             )
     lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()))
     lines.append(
-        "look at: " + ", ".join(str(result.out / f) for f in ("overlay.mp4", "objects.json"))
+        "look at: "
+        + ", ".join(
+            str(result.out / name)
+            for name in ("scene.html", "overlay.mp4", "objects.json")
+            if (result.out / name).exists()
+        )
     )
     return lines
 

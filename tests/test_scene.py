@@ -1,0 +1,483 @@
+"""The scene page in a real browser, and its bytes: what it holds, how large it is, that it is
+safe.
+
+The browser is driven through Chromium's own protocol over two pipes, so no package is needed.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import dataclasses
+import json
+import os
+import select
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quadrics
+import reobj_track as rt
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --enable-unsafe-swiftshader --use-angle=swiftshader "
+    "--disable-quic --no-first-run --disable-background-networking --disable-component-update "
+    "--disable-sync --hide-scrollbars --remote-debugging-pipe"
+)
+EVIL = "</script><script>window.hacked=1</script><img src=x onerror=hacked=1>"
+
+
+class Browser:
+    """One page of a headless Chromium."""
+
+    def __init__(self, profile: Path) -> None:
+        (theirs_in, self.out), (self.inp, theirs_out) = os.pipe(), os.pipe()
+        command = f'exec "$0" {FLAGS} --user-data-dir="$1" 3<&{theirs_in} 4>&{theirs_out}'
+        self.process = subprocess.Popen(
+            ["bash", "-c", command, str(CHROMIUM), str(profile)],
+            pass_fds=(theirs_in, theirs_out),
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self.rest, self.number, self.session = b"", 0, ""
+        self.errors: list[str] = []
+        target = self.send("Target.createTarget", url="about:blank")["targetId"]
+        attach = {"targetId": target, "flatten": True}
+        self.session = self.send("Target.attachToTarget", **attach)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.send(f"{domain}.enable")
+
+    def send(self, method: str, **params: Any) -> dict[str, Any]:
+        """Send a command and wait for its answer."""
+        self.number += 1
+        message: dict[str, Any] = {"id": self.number, "method": method, "params": params}
+        if self.session:
+            message["sessionId"] = self.session
+        os.write(self.out, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self.receive()
+            if answer.get("id") == self.number:
+                assert "error" not in answer, answer
+                return dict(answer["result"])
+
+    def receive(self, seconds: float = 60) -> dict[str, Any]:
+        """The next message; what the page complains about, or asks the network for, is kept."""
+        while b"\0" not in self.rest:
+            assert select.select([self.inp], [], [], seconds)[0], "the browser does not answer"
+            chunk = os.read(self.inp, 1 << 20)
+            assert chunk, "the browser is gone"
+            self.rest += chunk
+        text, self.rest = self.rest.split(b"\0", 1)
+        message = json.loads(text)
+        kind, about = message.get("method"), message.get("params", {})
+        if kind == "Runtime.exceptionThrown":
+            self.errors.append(json.dumps(about))
+        if kind == "Runtime.consoleAPICalled" and about["type"] in ("error", "warning", "assert"):
+            self.errors.append(json.dumps(about["args"]))
+        if kind == "Log.entryAdded" and about["entry"]["level"] in ("error", "warning"):
+            self.errors.append(about["entry"]["text"])
+        if kind == "Network.requestWillBeSent":
+            url = about["request"]["url"]
+            if not url.startswith(("data:", "file:", "about:")):
+                self.errors.append(f"asked the network for {url}")
+        return dict(message)
+
+    def open(self, path: Path, width: int = 1280, height: int = 800, phone: bool = False) -> None:
+        """Load a file in a window of this size."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=2 if phone else 1,
+            mobile=phone,
+        )
+        self.send("Emulation.setTouchEmulationEnabled", enabled=phone)
+        self.send("Page.navigate", url=path.resolve().as_uri())
+        while self.receive().get("method") != "Page.loadEventFired":
+            pass
+        self.settle()
+
+    def eval(self, expression: str) -> Any:
+        """Value of a JavaScript expression in the page."""
+        wanted = {"expression": expression, "returnByValue": True, "awaitPromise": True}
+        answer = self.send("Runtime.evaluate", **wanted)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def settle(self) -> None:
+        """Wait until two frames are drawn."""
+        self.eval("new Promise(f => requestAnimationFrame(() => requestAnimationFrame(f)))")
+
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def click(self, x: float, y: float) -> None:
+        for kind in ("mousePressed", "mouseReleased"):
+            self.mouse(kind, x, y, button="left", clickCount=1)
+        self.settle()
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], button: str) -> None:
+        self.mouse("mousePressed", *start, button=button, clickCount=1)
+        buttons = {"left": 1, "right": 2}[button]
+        self.mouse("mouseMoved", *end, button=button, buttons=buttons)
+        self.mouse("mouseReleased", *end, button=button, clickCount=1)
+        self.settle()
+
+    def touch(self, kind: str, *points: tuple[float, float]) -> None:
+        places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        self.send("Input.dispatchTouchEvent", type=kind, touchPoints=places)
+        self.settle()
+
+    def picture(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot")["data"]))
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            os.close(self.out)
+        self.process.terminate()
+        self.process.wait(20)
+        os.close(self.inp)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+    page = Browser(tmp_path_factory.mktemp("profile"))
+    yield page
+    page.close()
+
+
+# ---- A small scene ----
+
+NAMES = ("chair", EVIL, "suitcase", "person")
+CENTERS = ((-1.6, 0.0, 0.4), (0.0, 0.2, 0.5), (1.6, 0.0, 0.3), (0.0, 1.5, 0.6))
+FRAMES, WIDTH, HEIGHT = 24, 320, 240
+
+
+def poses_of_walk() -> rt.Poses:
+    """Cameras that walk past the objects, looking at them, z up; frame 5 has no pose."""
+    at = np.stack([np.linspace(-2, 2, FRAMES), np.full(FRAMES, -4.0), np.full(FRAMES, 1.5)], 1)
+    forward = np.array([0, 0, 0.5]) - at
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    cam_from_world = np.empty((FRAMES, 3, 4))
+    cam_from_world[:, :, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    cam_from_world[:, :, 3] = -np.einsum("fij,fj->fi", cam_from_world[:, :, :3], at)
+    cam_from_world[5] = np.nan
+    rng = np.random.default_rng(0)
+    return rt.Poses(
+        camera=rt.Camera("PINHOLE", WIDTH, HEIGHT, (250.0, 250.0, WIDTH / 2, HEIGHT / 2)),
+        frame=np.arange(FRAMES),
+        time_s=np.arange(FRAMES) / 25,
+        cam_from_world=cam_from_world,
+        status=np.where(np.arange(FRAMES) == 5, "none", "supplied"),
+        source="user",
+        metric=True,
+        up_in_world=np.array([0, 0, 1.0]),
+        points=rng.uniform(-2, 2, (500, 3)),
+        colors=rng.integers(0, 255, (500, 3)).astype(np.uint8),
+    )
+
+
+def tracks_of_walk(poses: rt.Poses) -> rt.TrackResult:
+    """Boxes of the objects in every frame; the second one is out of sight for a while."""
+    n = len(CENTERS)
+    half = np.tile([0.3, 0.25, 0.4], (n, 1))
+    solids = quadrics.Ellipsoids(np.array(CENTERS), half, np.tile(np.eye(3), (n, 1, 1)))
+    cams = np.nan_to_num(poses.cam_from_world)
+    cams[5] = cams[4]
+    boxes = quadrics.solid_boxes(solids, "box", poses.camera.K @ cams)  # (F, O, 4)
+    frame, obj = np.nonzero(np.ones((FRAMES, n)))
+    keep = ~((obj == 1) & (frame > 8) & (frame < 15))
+    frame, obj = frame[keep], obj[keep]
+    tracklet = obj + 1 + n * ((obj == 1) & (frame > 8))
+    score = np.full(len(frame), 0.9)
+    table = rt.TrackTable(frame, obj + 1, tracklet, boxes[frame, obj], score, obj, obj)
+    return rt.TrackResult(table, np.eye(n), NAMES, ("a <b>warning</b>",))
+
+
+def write_page(folder: Path, in_3d: bool = True, config: rt.Config | None = None) -> Path:
+    """An output folder with the page of the small scene."""
+    import cv2
+
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(1)
+    (folder / "frames").mkdir()
+    for i in range(FRAMES):
+        image = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8), (0, 0), 3)
+        cv2.imwrite(str(folder / f"frames/{i:03d}.png"), image)
+    video, config = rt.Video(folder / "frames"), config or rt.Config()
+    poses = poses_of_walk()
+    tracks = tracks_of_walk(poses)
+    space = rt.Workspace(folder / "out")
+    rt._finish_objects(video, space, tracks, poses if in_3d else None, config, {})
+    return folder / "out/scene.html"
+
+
+def data_of(page: Path) -> Any:
+    """The data embedded in a page."""
+    text = page.read_text()
+    return json.loads(text.split('id="data">')[1].split("</script>")[0])
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_page(tmp_path_factory.mktemp("scene") / "a")
+
+
+SCREENSHOTS = Path(__file__).resolve().parent.parent / "build/screenshots"
+
+
+def complaints(browser: Browser) -> list[str]:
+    """Errors of the page; the driver's remark on screenshots is not the page's."""
+    return [e for e in browser.errors if "GPU stall due to ReadPixels" not in e]
+
+
+def center_of(browser: Browser, number: int) -> tuple[float, float]:
+    """Place of an object's centre in the window."""
+    x, y, left, top = browser.eval(
+        f"(r => [...project(solid.find(o => o.id === {number}).center).slice(0, 2), r.left, r.top])"
+        "($('view').getBoundingClientRect())"
+    )
+    return x + left, y + top
+
+
+# ---- In the browser ----
+
+
+def test_a_click_on_an_object_opens_its_panel(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    assert browser.eval("!!gl && document.title") == "frames: 4 objects"
+    for number, name in zip((1, 2, 3), NAMES, strict=False):
+        browser.click(*center_of(browser, number))
+        assert browser.eval("state.selected.id") == number
+        text = browser.eval("$('panel').innerText")
+        assert f"{number} {name}" in text
+        assert "size, m" in text and "±" in text and "tracklets" in text
+        loaded = "[...document.querySelectorAll('.crops img')].map(i => i.naturalWidth > 8)"
+        crops = browser.eval(f"new Promise(f => setTimeout(() => f({loaded}), 50))")
+        assert len(crops) == 8 and all(crops)
+    browser.picture(SCREENSHOTS / "desktop.png")
+    browser.eval("$('close').click()")
+    assert browser.eval("$('panel').innerText") == "" and browser.eval("state.selected") is None
+    assert browser.eval("window.hacked") is None and complaints(browser) == []
+
+
+def test_rejected_objects_are_listed_with_their_reason(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    assert browser.eval("solid.length") == 3
+    row = browser.eval("S.objects[3].row.innerText")
+    assert "4" in row and "objects of this class move" in row
+    browser.eval("S.objects[3].row.click()")
+    assert "rejected: objects of this class move" in browser.eval("$('panel').innerText")
+    assert "a <b>warning</b>" in browser.eval("$('list').innerText")
+
+
+def test_merges_and_splits_are_told(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    data = data_of(page)
+    assert [link["kind"] for link in data["links"]] == ["join"] or data["links"] == []
+    browser.eval("""S.links.push({kind: "join", tracklets: [1, 3], place_iou: 0.2, look: 0.9,
+        kept: false}, {kind: "split", tracklets: [1, 2], place_iou: 0, look: 1, kept: true})""")
+    browser.eval("select(S.objects[0])")
+    text = browser.eval("$('panel').innerText")
+    assert "tracklets 1 (object 1), 3 (object 3): overlap of places 0.2" in text
+    assert "tried and undone" in text and "1 (object 1), 2 (object 2) show different" in text
+
+
+def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    before = browser.send("Page.captureScreenshot")["data"]
+    browser.eval("$('slider').focus()")
+    for kind in ("keyDown", "keyUp"):
+        browser.send("Input.dispatchKeyEvent", type=kind, key="End", windowsVirtualKeyCode=35)
+    browser.settle()
+    assert browser.eval("[state.step, $('clock').textContent]") == [23, "frame 23"]
+    assert browser.eval("$('frame').naturalWidth") > 100
+    assert browser.send("Page.captureScreenshot")["data"] != before
+    seen = "S.objects.filter(o => o.row.classList.contains('now')).map(o => o.id)"
+    assert browser.eval(seen) == [1, 2, 3, 4]
+    browser.eval("goTo(10)")
+    assert browser.eval(seen) == [1, 3, 4]
+    browser.eval("goTo(5)")
+    assert browser.eval("$('clock').textContent") == "frame 5 (no pose)"
+    browser.eval("$('play').click()")
+    moved = browser.eval("new Promise(f => setTimeout(() => f(state.step), 600))")
+    browser.eval("$('play').click()")
+    assert moved != 5 and complaints(browser) == []
+
+
+def test_riding_along_sees_what_the_camera_saw(browser: Browser, page: Path) -> None:
+    """The page's projection against K [R | t]."""
+    browser.open(page)
+    poses = poses_of_walk()
+    browser.eval("$('ride').checked = true; goTo(17)")
+    browser.settle()
+    width, height = browser.eval("[canvas.clientWidth, canvas.clientHeight]")
+    scale = min(width / WIDTH, height / HEIGHT)
+    for obj in data_of(page)["objects"][:3]:
+        x, y, z = poses.camera.K @ poses.cam_from_world[17] @ [*obj["center"], 1]
+        expected = [width / 2 + (x / z - WIDTH / 2) * scale, height / 2 + (y / z - 120) * scale]
+        index = obj["id"]
+        found = browser.eval(f"project(solid.find(o => o.id === {index}).center).slice(0, 2)")
+        np.testing.assert_allclose(found, expected, atol=0.1)
+
+
+def test_classes_can_be_hidden(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    at = center_of(browser, 3)
+    labels = "[...$('labels').children].map(l => l.textContent)"
+    assert "3 suitcase" in browser.eval(labels)
+    x, y = browser.eval("""(r => [r.left + r.width / 2, r.top + r.height / 2])(
+        [...document.querySelectorAll('.class')].find(l => l.innerText.includes('suitcase'))
+        .querySelector('input').getBoundingClientRect())""")
+    browser.click(x, y)
+    assert "3 suitcase" not in browser.eval(labels)
+    browser.click(*at)
+    assert browser.eval("state.selected") is None
+    assert browser.eval("S.objects[2].row.hidden") is True
+
+
+def test_mouse_turns_zooms_and_pans(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    view = "[state.yaw, state.pitch, state.distance, ...state.target]"
+    start = browser.eval(view)
+    browser.drag((700, 300), (760, 320), "left")
+    turned = browser.eval(view)
+    assert turned[0] != start[0] and turned[1] != start[1] and turned[2:] == start[2:]
+    browser.mouse("mouseWheel", 700, 300, deltaX=0, deltaY=-200)
+    browser.settle()
+    zoomed = browser.eval(view)
+    assert zoomed[2] < turned[2]
+    browser.drag((700, 300), (640, 300), "right")
+    assert browser.eval(view)[3:] != zoomed[3:] and browser.eval("state.selected") is None
+
+
+def test_fingers_and_a_phone_screen(browser: Browser, page: Path) -> None:
+    browser.open(page, 390, 844, phone=True)
+    view = "[state.yaw, state.distance]"
+    start = browser.eval(view)
+    browser.touch("touchStart", (200, 200))
+    browser.touch("touchMove", (260, 200))
+    browser.touch("touchEnd")
+    assert browser.eval(view)[0] != start[0]
+    browser.touch("touchStart", (180, 200), (220, 200))
+    browser.touch("touchMove", (120, 200), (280, 200))
+    browser.touch("touchEnd")
+    assert browser.eval(view)[1] < start[1] / 2
+    browser.open(page, 390, 844, phone=True)
+    at = center_of(browser, 1)
+    browser.touch("touchStart", at)
+    browser.touch("touchEnd")
+    assert browser.eval("state.selected?.id") == 1
+    assert browser.eval("document.documentElement.scrollWidth") <= 390
+    browser.picture(SCREENSHOTS / "phone.png")
+    assert complaints(browser) == []
+
+
+def test_identities_only_still_open(browser: Browser, tmp_path: Path) -> None:
+    """No cameras: pictures and a timeline, and the reason."""
+    browser.open(write_page(tmp_path / "flat", in_3d=False))
+    assert "No 3D view: no camera poses" in browser.eval("$('why').innerText")
+    browser.eval("S.objects[1].row.click(); goTo(3)")
+    browser.settle()
+    assert browser.eval("document.querySelectorAll('.crops img').length") == 8
+    assert browser.eval("S.objects[1].row.querySelectorAll('.bar span').length") == 2
+    browser.picture(SCREENSHOTS / "flat.png")
+    assert complaints(browser) == []
+
+
+# ---- Without a browser ----
+
+
+def test_same_input_same_page(page: Path, tmp_path: Path) -> None:
+    assert write_page(tmp_path / "again").read_bytes() == page.read_bytes()
+
+
+def test_no_name_can_leave_the_data(page: Path) -> None:
+    text = page.read_text()
+    assert EVIL not in text and text.count("</script>") == 2 and text.count("<script") == 2
+    assert data_of(page)["objects"][1]["class"] == EVIL
+    assert "http://" not in text and "https://" not in text and "default-src 'none'" in text
+
+
+def test_the_page_holds_the_scene(page: Path) -> None:
+    data, poses = data_of(page), poses_of_walk()
+    found = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(-1, 3, 4)
+    np.testing.assert_allclose(found, rt.invert_rigid(poses.cam_from_world), atol=1e-6)
+    points = np.frombuffer(base64.b64decode(data["points"]), "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(points, poses.points, atol=1e-6)
+    assert data["objects"][1]["seen"] == [0, 8, 15, 23] and data["up"] == [0, 0, 1]
+    assert [tuple(o["color"]) for o in data["objects"]] == [
+        rt.object_color(i)[::-1] for i in (1, 2, 3, 4)
+    ]
+
+
+def test_scene_can_be_switched_off(tmp_path: Path) -> None:
+    config = rt.Config(output=rt.OutputConfig(scene=False))
+    assert not write_page(tmp_path / "off", config=config).exists()
+
+
+def test_three_minutes_stay_below_ten_megabytes(tmp_path: Path) -> None:
+    """5,400 frames, 50 objects, 100,000 points, and pictures that do not compress at all."""
+    frames, objects = 5400, 50
+    rng = np.random.default_rng(0)
+    walk = poses_of_walk()
+    frame, obj = (a.ravel() for a in np.mgrid[:frames, :objects])
+    corner = rng.uniform(0, 100, (len(frame), 2))
+    box = np.hstack([corner, corner + rng.uniform(30, 130, (len(frame), 2))])
+    score = np.full(len(frame), 0.9)
+    table = rt.TrackTable(frame, obj + 1, obj + 1, box, score, 0 * obj, obj)
+    poses = dataclasses.replace(
+        walk,
+        frame=np.arange(frames),
+        time_s=np.arange(frames) / 30,
+        cam_from_world=np.repeat(walk.cam_from_world, frames // FRAMES, 0),
+        status=np.full(frames, "pnp"),
+        points=rng.normal(size=(100_000, 3)),
+        colors=rng.integers(0, 255, (100_000, 3)).astype(np.uint8),
+    )
+    entries = rt._object_entries(table, ("chair",), None, None, rt.ObjectsConfig())
+    result = rt.RunResult(tmp_path, table, ("chair",), entries, poses, None, {}, [])
+    result.world = rt._world_entry(poses, None, [])
+    config = rt.Config()
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    video = rt.Video(tmp_path / "0.png")
+    pictures = rt.Pictures(result, video, config.output)
+    noise = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    for index in sorted({*frame[pictures.wanted].tolist(), *pictures.whole}):
+        pictures.take(rt.Frame(int(index), index / 30, noise))
+    rt.write_scene(result, pictures, video, config)
+    assert 2e6 < (tmp_path / "scene.html").stat().st_size < 10e6
+
+
+def test_pictures_show_different_views() -> None:
+    """The views chosen of an object are spread over time and directions, not neighbours."""
+    poses = poses_of_walk()
+    entry = {"id": 3, "center": list(CENTERS[2])}
+    table = tracks_of_walk(poses).table
+    frames = np.sort(table.frame[rt.diverse_rows(table, entry, poses, 4)])
+    assert len(frames) == 4 and np.diff(frames).min() >= 4
+    assert set(table.object_id[rt.diverse_rows(table, entry, None, 30)]) == {3}
+
+
+def test_up_is_guessed_from_level_cameras() -> None:
+    """Pitch and yaw do not matter, only that the horizon is level; z is up in the walk."""
+    poses = poses_of_walk()
+    np.testing.assert_allclose(
+        rt.guessed_up(poses.cam_from_world[poses.known]), [0, 0, 1], atol=1e-6
+    )
+    up = rt.guessed_up(poses.cam_from_world[:1])  # one camera: its own up, pitched
+    assert up[2] > 0.9 and up[2] < 1
