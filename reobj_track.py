@@ -5386,7 +5386,7 @@ def write_scene(result: RunResult, pictures: Pictures, video: Video, config: Con
         "thumbs": pictures.frames,
         "why_flat": _why_flat(result),
         "steps": {"frame": steps.tolist(), "seconds": seconds},
-        **_scene_cameras(result.poses, steps, limits),
+        **_scene_cameras(result.poses, result.world.get("up_in_world"), steps, limits),
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = Path(__file__).with_name("scene_template.html").read_text().split("@DATA@")
@@ -5398,20 +5398,22 @@ def _base64(values: npt.NDArray[Any], kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
 
 
-def _scene_cameras(poses: Poses | None, steps: IntArray, limits: OutputConfig) -> dict[str, Any]:
+def _scene_cameras(
+    poses: Poses | None, up_in_world: Sequence[float] | None, steps: IntArray, limits: OutputConfig
+) -> dict[str, Any]:
     """Cameras of the steps, sparse points and the upward direction, for the page."""
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
     thin = slice(None, None, math.ceil(len(poses.points) / limits.scene_points) or 1)
-    K, up = poses.camera.K, poses.up_in_world
-    up = guessed_up(poses.cam_from_world[poses.known]) if up is None else up
+    K = poses.camera.K
+    up = guessed_up(poses.cam_from_world[poses.known]) if up_in_world is None else up_in_world
     size = {"width": poses.camera.width, "height": poses.camera.height}
     return {
         "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
         "poses": _base64(invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)]), "<f4"),
         "points": _base64(poses.points[thin], "<f4"),
         "colors": _base64(poses.colors[thin], "u1"),
-        "up": _numbers(up),
+        "up": _numbers(np.asarray(up)),
     }
 
 
@@ -5449,7 +5451,7 @@ def _scene_facts(world: dict[str, Any]) -> str:
         facts.append(f"scale from {scale['source']}, ± {100 * (scale['rel_sigma'] or 0):.0f} %")
     else:
         facts.append(f"units: {world['units']}")
-    facts.append(f"up: {'known' if world['up_in_world'] else 'guessed from the cameras'}")
+    facts += [] if world["up_in_world"] else ["up is guessed from the cameras"]
     return " · ".join(facts)
 
 
