@@ -6441,7 +6441,76 @@ def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]
     """
     gt_ids, ids, steps, gt, pr = _numbered(truth, drop_ignored(truth, found))
     result = _hota(steps, gt, pr) | _clear(steps, gt, pr) | _identity(steps, gt, pr)
+    result |= _returns(truth, drop_ignored(truth, found))
     return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
+
+
+def visits(truth: LabelledBoxes, away: int = 30) -> IntArray:
+    """Visit of each true box (N,), from 0: a new one after `away` frames without the object."""
+    order = np.lexsort((truth.frame, truth.identity))
+    new = np.append(True, np.diff(truth.identity[order]) != 0)[: len(order)]
+    late = np.append(False, np.diff(truth.frame[order]) > away)[: len(order)] & ~new
+    count = np.cumsum(late)
+    visit = np.empty(len(order), np.int64)
+    visit[order] = count - np.maximum.accumulate(np.where(new, count, 0))
+    return visit
+
+
+def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, IntArray]:
+    """Rows of truth and result that show one object (M,): best pairs of IoU >= .5 a frame."""
+    pairs = [np.empty((2, 0), np.int64)]
+    for g, p, iou in _frame_steps(truth, found):
+        a, b = _best_pairs(np.where(iou >= 0.5 - 1e-12, iou, 0))
+        pairs.append(np.stack([g[a], p[b]]))
+    rows = np.concatenate(pairs, 1)
+    scored = truth.role[rows[0]] == SCORED
+    return rows[0][scored], rows[1][scored]
+
+
+def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
+    """Returns of true objects (see `visits`) and the share that kept an identity of before.
+
+    The main identity of the visit counts; visits without any match are left out.
+    """
+    visit = visits(truth)
+    g, p = matched_rows(truth, found)
+    known: dict[int, set[int]] = {}
+    kept = []
+    for rows in _rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+        ids, votes = np.unique(found.identity[p[rows]], return_counts=True)
+        before = known.setdefault(int(truth.identity[g[rows[0]]]), set())
+        kept += [int(ids[votes.argmax()]) in before] if before else []
+        before.add(int(ids[votes.argmax()]))
+    return {"returns": len(kept), "returns_kept": sum(kept) / len(kept) if kept else math.nan}
+
+
+def return_ranks(truth: LabelledBoxes, found: LabelledBoxes, look: npt.NDArray[Any]) -> IntArray:
+    """Rank of the right object, by looks alone, for the first views of every return.
+
+    A query is a box of the first 10 frames of a return (see `visits`), the gallery all boxes before
+    the return of objects of its class; an object's best view counts. Rank-k: share of ranks <= k.
+
+    Args:
+        look: (N, E) unit rows, one for each row of `found`; NaN where there is none.
+    Returns:
+        ranks from 1, (Q,).
+    """
+    visit = visits(truth)
+    g, p = matched_rows(truth, found)
+    use = np.isfinite(look[p]).all(1)
+    g, p = g[use], p[use]
+    ranks = []
+    for rows in _rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+        start, me = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
+        known = np.flatnonzero(truth.frame[g] < start)
+        known = known[truth.name[g[known]] == truth.name[g[rows[0]]]]
+        ids, of = np.unique(truth.identity[g[known]], return_inverse=True)
+        if me in ids:
+            first = rows[truth.frame[g[rows]] < start + 10]
+            best = np.full((len(ids), len(first)), -np.inf)
+            np.maximum.at(best, of, look[p[known]] @ look[p[first]].T)
+            ranks.append(1 + (best > best[ids == me]).sum(0))
+    return np.concatenate(ranks) if ranks else np.empty(0, np.int64)
 
 
 def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:

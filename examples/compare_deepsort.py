@@ -1,12 +1,18 @@
 #!/usr/bin/env python3
 """Compare identities on the same detections: ours, DeepSORT and today's trackers.
 
-    python examples/compare_deepsort.py --peers build/peers --rooms examples/room ... \\
+    python examples/compare_deepsort.py --peers build/peers --rooms examples/room --render 1,2 \\
         --kitchen redkitchen_7scenes --mot mot -o OUT
 
-Writes OUT/compare.csv, OUT/compare_*.png and prints Markdown tables. The same settings for all
-sequences; every tracker's rows are the detections it gave an identity to, never predicted boxes;
-identities of `whole chain` are decided over the whole video, all others frame by frame.
+Writes OUT/compare.html (all of it on one page), compare.csv, compare_*.png; prints Markdown tables.
+The same settings for all sequences; every tracker's rows are the detections it gave an identity to,
+never predicted boxes; identities of `whole chain` are decided over the whole video, all others
+frame by frame. Every result is kept in OUT/runs: an interrupted comparison goes on where it
+stopped, and a changed reobj_track.py runs only our own rows again.
+
+Rank-1: share of the returns (a true object in view again after >= 30 frames) whose first detection
+is, by the tracker's appearance alone, most like an earlier view of the same object (of its class).
+Returns: share of these returns that the tracker itself gave the identity of the visits before.
 
 Appearance networks (folder REOBJ_MODELS): persons osnet_x0_25_msmt17.onnx, rooms
 mobilenetv2_feat.onnx (ImageNet, as DeepSORT's own embedder), one crop a box; "own look" are the
@@ -18,24 +24,46 @@ the last view; `tuned` is max_age 1000, position-only gate, cosine distance .35.
 from __future__ import annotations
 
 import argparse
+import base64
 import csv
+import functools
+import hashlib
+import html
+import inspect
 import os
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from benchmark import PEERS, Array, IntArray, Stream, run_tracker, table
+import render_room
+from benchmark import PEERS, TUNED, Array, IntArray, Stream, run_tracker, table
 
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
 import reobj_track as rt
 
 Run = tuple[IntArray, float]  # identity of every detection (N,), 0 for none; CPU seconds
-COLUMNS = "HOTA DetA AssA IDF1 MOTA IDSW ids_per_object".split()
+Looks = tuple[list[Array], float]  # embeddings of every frame's detections; CPU seconds
 KITCHEN = ("chair", "dining table", "cup")  # what redkitchen's truth knows
+
+
+def digest(*parts: Any) -> str:
+    """Twelve hex digits of bytes, arrays, the contents of files (paths) or anything that prints."""
+    total = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            total.update(part.tobytes())
+        else:
+            total.update(part.read_bytes() if isinstance(part, Path) else str(part).encode())
+    return total.hexdigest()[:12]
+
+
+_LOOK = (rt.EmbedConfig, rt.Embedder, rt._colour_features, rt._direction_bins, rt._pool_cells)
+EMBEDDER = digest([inspect.getsource(x) for x in _LOOK])  # what the own look depends on
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +136,7 @@ class CropNet:
     """Unit rows from one crop a box, as DeepSORT does: resized, ImageNet mean and deviation."""
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         self.session = rt.onnx_session(path, 1)
         entry = self.session.get_inputs()[0]
         self.name, shape = entry.name, entry.shape
@@ -163,8 +192,9 @@ def stream_of(seq: Sequence, looks: list[Array] | None) -> Stream:
     return Stream(len(count), frame, box, score, cls, look, none, none, np.empty((0, 9)))
 
 
-def per_class(name: str, stream: Stream, venvs: Path) -> tuple[IntArray, float]:
+def peer_run(name: str, seq: Sequence, venvs: Path, looks: list[Array] | None) -> Run:
     """Run a peer once for every class, as its users do: identities (N,) and CPU seconds."""
+    stream = stream_of(seq, looks)
     identity, seconds = np.zeros(len(stream.frame), np.int64), 0.0
     for cls in np.unique(stream.class_id):
         rows = np.flatnonzero(stream.class_id == cls)
@@ -195,25 +225,28 @@ def ours(
     return np.concatenate(identity), seconds
 
 
-def whole_chain(seq: Sequence, out: Path) -> tuple[IntArray, float]:
-    """`run` with reconstructed cameras and linker; the identities of all detections."""
+def whole_chain(seq: Sequence, out: Path, poses: str) -> Run:
+    """`run`, identities decided over the whole video; seconds of tracking and linking, no poses."""
     assert seq.images is not None
     at = iter(seq.detections)
-    started = time.process_time()
-    result = rt.run(seq.images, out / seq.name, detections=lambda image: next(at), overwrite=True)
-    seconds, table_ = time.process_time() - started, result.table
+    config = rt.Config(poses=rt.PosesConfig(mode=poses), output=rt.OutputConfig(overlay=False))
+    result = rt.run(
+        seq.images, out / seq.name, config, detections=lambda image: next(at), overwrite=True
+    )
     first = np.cumsum([0, *(len(d) for d in seq.detections)])
     identity = np.zeros(first[-1], np.int64)
-    identity[first[table_.frame] + table_.detection_index] = table_.object_id
-    return identity, seconds
+    identity[first[result.table.frame] + result.table.detection_index] = result.table.object_id
+    return identity, result.seconds["track"] + result.seconds["objects"]
 
 
-def result_boxes(seq: Sequence, identity: IntArray) -> rt.LabelledBoxes:
+def result_boxes(
+    seq: Sequence, identity: IntArray, stream: Stream | None = None
+) -> rt.LabelledBoxes:
     """Detections with an identity; the class of an identity is the one with the most score."""
-    stream = stream_of(seq, None)
+    stream = stream or stream_of(seq, None)
     kept = np.flatnonzero(identity > 0)
     ids, row = np.unique(identity[kept], return_inverse=True)
-    votes = np.zeros((len(ids), len(rt.COCO_NAMES)))
+    votes = np.zeros((len(ids), len(rt.COCO_NAMES)), np.float32)
     np.add.at(votes, (row, stream.class_id[kept]), stream.score[kept])
     names = "" if seq.group == "pedestrians" else np.array(rt.COCO_NAMES)[votes.argmax(1)][row]
     xyxy = stream.xyxy[kept]
@@ -229,72 +262,163 @@ def joined(parts: list[rt.LabelledBoxes]) -> rt.LabelledBoxes:
     return rt.LabelledBoxes(*(np.concatenate([getattr(p, k) for p in shifted]) for k in names))
 
 
-def variants(seq: Sequence, args: Any) -> dict[str, Run]:
-    """Identities and CPU seconds of every tracker on one sequence."""
-    nets: dict[str, Any] = {}
-    models = Path(os.environ.get("REOBJ_MODELS", "models"))
-    if seq.images is not None:
-        person = seq.group == "pedestrians"
-        net = "osnet_x0_25_msmt17.onnx" if person else "mobilenetv2_feat.onnx"
-        if (models / net).exists():
-            nets["osnet" if person else "mobilenetv2"] = CropNet(models / net)
-        embedder = rt.Embedder()
-        nets["own look"] = lambda image, found: own_look(image, found, embedder)
-    looks: dict[str, tuple[list[Array] | None, float]] = {"no look": (None, 0.0)}
-    if nets:
-        looks = {name: embed_all(seq, net) for name, net in nets.items()}
-    result = {"ours": ours(seq, None)}
-    for name, (look, spent) in looks.items():
-        stream = stream_of(seq, look)
-        if name not in ("own look", "no look"):
-            identity, seconds = ours(seq, look)
-            result[f"ours, {name}"] = identity, seconds + spent
-        for peer in ("deepsort", "deepsort-tuned") if args.peers else ():
-            identity, seconds = per_class(peer, stream, args.peers)
-            result[f"{peer}, {name}"] = identity, seconds + spent
+def cached(path: Path, make: Callable[[], Run]) -> Run:
+    """The result in the file, or made and written there."""
+    if path.exists():
+        with np.load(path) as data:
+            return data["identity"], float(data["seconds"])
+    identity, seconds = make()
+    with rt.atomic(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, identity=identity, seconds=seconds)
+    return identity, seconds
+
+
+def networks(seq: Sequence) -> dict[str, Any]:
+    """Appearance by name for a sequence: (image, detections) -> rows."""
+    if seq.images is None:
+        return {}
+    person = seq.group == "pedestrians"
+    file = "osnet_x0_25_msmt17.onnx" if person else "mobilenetv2_feat.onnx"
+    path = Path(os.environ.get("REOBJ_MODELS", "models")) / file
+    own = functools.partial(own_look, embedder=rt.Embedder())
+    nets = {file.split("_")[0]: CropNet(path)} if path.exists() else {}
+    return nets | {"own look": own}
+
+
+def look_ranks(seq: Sequence, looks: Callable[[], Looks]) -> Run:
+    """Ranks of the right object by appearance alone (`rt.return_ranks`); seconds of embedding."""
+    stream = stream_of(seq, looks()[0])
+    found = result_boxes(seq, 1 + np.arange(len(stream.frame)), stream)
+    return rt.return_ranks(seq.truth, found, stream.embedding), looks()[1]
+
+
+def with_looks(make: Callable[[list[Array]], Run], looks: Callable[[], Looks]) -> Run:
+    """A tracker's run on embeddings that are only computed now."""
+    return make(looks()[0])
+
+
+def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], Run]]]:
+    """For every tracker: what its result depends on, and how to make it.
+
+    `look NAME` gives the ranks of the returns in place of identities, and the time of embedding.
+    """
+    source = digest(Path(rt.__file__), Path(rt.__file__).with_name("quadrics.py"))
+    part = functools.partial
+    result: dict[str, tuple[str, Callable[[], Run]]] = {"ours": (source, part(ours, seq, None))}
+    deepsorts = ["deepsort", "deepsort-tuned"] if args.peers else []
+    nets = networks(seq)
+    for name, net in nets.items():
+        looks = functools.cache(part(embed_all, seq, net))
+        key = str(net.path) if name != "own look" else EMBEDDER
+        result[f"look {name}"] = (key, part(look_ranks, seq, looks))
+        if name != "own look":
+            result[f"ours, {name}"] = (source + key, part(with_looks, part(ours, seq), looks))
+        for peer in deepsorts:
+            run = part(peer_run, peer, seq, args.peers)
+            result[f"{peer}, {name}"] = (key + str(TUNED), part(with_looks, run, looks))
     for peer in PEERS if args.peers else ():
-        if peer.startswith("rf-"):
-            result[peer] = per_class(peer, stream_of(seq, None), args.peers)
+        if peer.startswith("rf-") or (peer in deepsorts and not nets):
+            label = f"{peer}, no look" if peer in deepsorts else peer
+            result[label] = (str(TUNED), part(peer_run, peer, seq, args.peers, None))
     if seq.images is not None and seq.group == "rooms":
-        result["ours, whole chain"] = whole_chain(seq, args.out / "chain")
+        chain = args.out / "chain"
+        result["ours, whole video, no poses"] = (source, part(whole_chain, seq, chain, "none"))
+        result["ours, whole chain"] = (source, part(whole_chain, seq, chain, "auto"))
+    return result
+
+
+def variants(seq: Sequence, args: Any) -> dict[str, Run]:
+    """Identities and CPU seconds of every tracker on one sequence, from OUT/runs where known."""
+    stream = stream_of(seq, None)
+    boxes = digest(stream.frame, stream.xyxy, stream.score, stream.class_id)
+    result = {}
+    for tracker, (key, make) in jobs(seq, args).items():
+        name = f"{seq.name}-{tracker}-{digest(boxes, key)}.npz".replace(", ", "-").replace(" ", "_")
+        path = args.out / "runs" / name
+        if not path.exists():
+            print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
+        result[tracker] = cached(path, make)
     return result
 
 
 # ---- Output ------------------------------------------------------------------------------------
 
 
-def report(found: dict[str, dict[str, Run]], seqs: list[Sequence]) -> list[dict[str, Any]]:
-    """One row for each tracker and sequence, and for each group of sequences together."""
-    rows = []
-    sets = [(s.name, [s]) for s in seqs]
+def sets_of(seqs: list[Sequence]) -> dict[str, list[Sequence]]:
+    """Every sequence alone, and the sequences of a kind together."""
+    sets = {s.name: [s] for s in seqs}
     for group in sorted({s.group for s in seqs}):
         for images in (True, False):
             members = [s for s in seqs if s.group == group and (s.images is not None) == images]
-            label = f"all {group} {'with' if images else 'without'} images"
-            sets += [(label, members)] if len(members) > 1 else []
-    for label, members in sets:
-        for tracker in found[members[0].name]:
-            boxes = joined([result_boxes(s, found[s.name][tracker][0]) for s in members])
-            score = rt.score_tracks(joined([s.truth for s in members]), boxes)
-            seconds = sum(found[s.name][tracker][1] for s in members)
+            if len(members) > 1:
+                sets[f"all {group} {'with' if images else 'without'} images"] = members
+    return sets
+
+
+def report(found: dict[str, dict[str, Run]], seqs: list[Sequence]) -> list[dict[str, Any]]:
+    """One row for each tracker and sequence, and for each group of sequences together."""
+    rows = []
+    for label, members in sets_of(seqs).items():
+        for tracker in [t for t in found[members[0].name] if not t.startswith("look ")]:
+            runs = [found[s.name] for s in members]
+            boxes = [result_boxes(s, r[tracker][0]) for s, r in zip(members, runs, strict=True)]
+            score = rt.score_tracks(joined([s.truth for s in members]), joined(boxes))
+            name = tracker.partition(", ")[2]
+            look = "look own look" if tracker == "ours" or "whole" in name else f"look {name}"
+            ranks = [r[look] for r in runs if look in r]
+            seconds = sum(r[tracker][1] for r in runs)
+            seconds += 0 if tracker == "ours" or "whole" in name else sum(s for _, s in ranks)
+            first = np.concatenate([k for k, _ in ranks]) == 1 if ranks else np.empty(0)
             ms = 1e3 * seconds / sum(len(s.detections) for s in members)
-            rows.append({"sequence": label, "tracker": tracker, **score, "ms_per_frame": ms})
+            rows.append({"sequence": label, "tracker": tracker, **score, "ms_per_frame": ms,
+                         "rank1": float(first.mean()) if len(first) else float("nan")})  # fmt: skip
     return rows
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """One line of a table."""
+    share = [f"{100 * row[c]:.1f}" for c in "HOTA DetA AssA IDF1 MOTA".split()]
+    kept = f"{round(row['returns'] * row['returns_kept'])} of {row['returns']}"
+    rank1 = "-" if np.isnan(row["rank1"]) else f"{100 * row['rank1']:.0f}"
+    ids = [f"{row['ids_per_object']:.2f}", f"{row['identities']} / {row['gt_objects']}"]
+    speed = f"{row['ms_per_frame']:.1f} ({1e3 / row['ms_per_frame']:.0f})"
+    return [row["tracker"], *share, str(row["IDSW"]), *ids, kept, rank1, speed]
+
+
+HEADER = (
+    "tracker | HOTA | DetA | AssA | IDF1 | MOTA | IDSW | ids per object | ids / objects | "
+    "returns kept | Rank-1 | CPU ms a frame (fps)"
+)
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """One table for each sequence."""
-    parts = []
-    for name in dict.fromkeys(r["sequence"] for r in rows):
-        body = [
-            [r["tracker"], *(f"{100 * r[c]:.1f}" for c in COLUMNS[:5]), str(r["IDSW"]),
-             f"{r['ids_per_object']:.2f}", f"{r['identities']} / {r['gt_objects']}",
-             f"{r['ms_per_frame']:.1f}"]
-            for r in rows if r["sequence"] == name
-        ]  # fmt: skip
-        header = "tracker | HOTA | DetA | AssA | IDF1 | MOTA | IDSW | ids per object"
-        parts.append(table(f"**{name}**", f"{header} | ids / objects | CPU ms a frame", body))
-    return "\n".join(parts)
+    names = dict.fromkeys(r["sequence"] for r in rows)
+    body = {n: [cells(r) for r in rows if r["sequence"] == n] for n in names}
+    return "\n".join(table(f"**{n}**", HEADER, lines) for n, lines in body.items())
+
+
+def write_page(rows: list[dict[str, Any]], out: Path) -> None:
+    """compare.html: the plots and all tables on one page that needs nothing else."""
+    parts = ["<!doctype html><meta charset=utf-8><title>Identities compared</title><style>"
+             "body{font:14px sans-serif;margin:2em}td,th{padding:2px 9px;text-align:right}"
+             "td:first-child{text-align:left}tr.ours{background:#e3f4e3}img{max-width:100%}"
+             "</style><h1>Identities on the same detections</h1><pre>",
+             html.escape(__doc__), "</pre>"]  # fmt: skip
+    for name in list(dict.fromkeys(r["sequence"] for r in rows))[::-1]:
+        parts.append(f"<h2>{html.escape(name)}</h2>")
+        picture = out / f"compare_{name[4:].replace(' ', '_')}.png"
+        if name.startswith("all ") and picture.exists():
+            code = base64.b64encode(picture.read_bytes()).decode()
+            parts.append(f'<img src="data:image/png;base64,{code}">')
+        head = "".join(f"<th>{h.strip()}</th>" for h in HEADER.split("|"))
+        parts.append(f"<table><tr>{head}</tr>")
+        for row in (r for r in rows if r["sequence"] == name):
+            line = "".join(f"<td>{html.escape(c)}</td>" for c in cells(row))
+            parts.append(f"<tr class={row['tracker'][:4]}>{line}</tr>")
+        parts.append("</table>")
+    with rt.atomic(out / "compare.html") as part:
+        part.write_text("\n".join(parts))
 
 
 def plots(rows: list[dict[str, Any]], out: Path) -> None:
@@ -319,25 +443,39 @@ def plots(rows: list[dict[str, Any]], out: Path) -> None:
         plt.close(figure)
 
 
+def rendered(seeds: str, folder: Path) -> list[Path]:
+    """Rooms of render_room.py with these seeds, made where they are missing."""
+    rooms = [folder / f"room_{seed}" for seed in seeds.split(",") if seed]
+    for room in rooms:
+        if not (room / "gt_mot.txt").exists() or not (room / "detections.npz").exists():
+            render_room.main(["-o", str(room), "--seed", room.name[5:]])
+    return rooms
+
+
 def main() -> int:
     """Run the comparison."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
     parser.add_argument("--rooms", type=Path, nargs="*", default=[], help="of render_room.py")
+    parser.add_argument("--render", default="", metavar="SEEDS", help="more rooms: 1,2 (OUT/rooms)")
     parser.add_argument("--kitchen", type=Path, nargs="*", default=[], help="recordings")
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    seqs = [room_sequence(p) for p in args.rooms] + [kitchen_sequence(p) for p in args.kitchen]
+    rooms = [*args.rooms, *rendered(args.render, args.out / "rooms")]
+    seqs = [room_sequence(p) for p in rooms] + [kitchen_sequence(p) for p in args.kitchen]
     seqs += mot_sequences(args.mot) if args.mot else []
     found = {s.name: variants(s, args) for s in seqs}
     rows = report(found, seqs)
-    with (args.out / "compare.csv").open("w", newline="") as file:
+    with rt.atomic(args.out / "compare.csv") as part, part.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
     plots(rows, args.out)
+    write_page(rows, args.out)
     print(markdown(rows))
     return 0
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import sys
 import venv
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import reobj_track as rt
 
+ROOT = Path(rt.__file__).resolve().parent
 # TrackEval 1.3.0 on `drifting(seed)` (numbers kept so that something is checked without it)
 STORED = {
     0: {
@@ -177,6 +180,29 @@ def test_a_switch_halves_the_identity() -> None:
     assert mine["DetA"] == 1 and mine["AssA"] == 0.5 and mine["ids_per_object"] == 2
 
 
+def test_returns_keep_their_identity_or_not() -> None:
+    """Object 1 is away for 40 frames twice: first recognised, then taken for a newcomer."""
+    truth = boxes(*((f, 1, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 2, 50))
+    found = boxes(*((f, 5 if f < 84 else 6, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 7, 50))
+    assert rt.visits(truth).tolist() == [0, 0, 1, 1, 2, 2, 0]
+    mine = rt.score_tracks(truth, found)
+    assert mine["returns"] == 2 and mine["returns_kept"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("look", "ranks"),
+    [
+        ([[1, 0], [0, 1], [0.9, 0.1]], [1]),  # like its own first view
+        ([[1, 0], [0, 1], [0.1, 0.9]], [2]),  # like the other object
+        ([[1, 0], [np.nan, np.nan], [0.1, 0.9]], [1]),  # the other one has no look
+        ([[np.nan, np.nan], [0, 1], [0.1, 0.9]], []),  # its own first view has none: no query
+    ],
+)
+def test_rank_of_a_return(look: list[list[float]], ranks: list[int]) -> None:
+    truth = boxes((0, 1, 0), (0, 2, 50), (50, 1, 90))
+    assert rt.return_ranks(truth, truth, np.array(look)).tolist() == ranks
+
+
 def test_nothing_found_and_nothing_true() -> None:
     some, none = boxes((0, 1, 0), (1, 1, 0)), rt.labelled(np.empty((0, 7)))
     assert rt.score_tracks(some, none)["HOTA"] == 0
@@ -231,6 +257,30 @@ def test_command_line_prints_a_table_and_refuses_other_files(
     (tmp_path / "bad.txt").write_text("not a table\n")
     assert rt.main(["eval", str(files[0]), "--gt", str(tmp_path / "bad.txt")]) == 2
     assert "no MOTChallenge file" in capsys.readouterr().err
+
+
+def test_failure_gallery_names_the_error_and_its_cause(tmp_path: Path) -> None:
+    """One object, away for 5 frames, comes back at the border under a second identity."""
+    frames = [*range(10), *range(15, 19)]
+    (tmp_path / "images").mkdir()
+    for i in range(20):
+        cv2.imwrite(str(tmp_path / "images" / f"{i:04d}.png"), np.full((48, 64, 3), 90, np.uint8))
+    x = np.where(np.array(frames) < 15, 20.0, 0.0)
+    gt = [[f + 1, 1, a, 9, 20, 30, 1] for f, a in zip(frames, x, strict=True)]
+    det = [[f + 1, -1, a, 9, 20, 30, 0.9] for f, a in zip(frames, x, strict=True)]
+    gt_file, out = write(tmp_path / "gt.txt", np.array(gt)), tmp_path / "out"
+    images, boxes_file = str(tmp_path / "images"), str(write(tmp_path / "det.txt", np.array(det)))
+    assert rt.main(["track", images, "--detections", boxes_file, "-o", str(out)]) == 0
+    text = (out / "tracks.txt").read_text().splitlines()
+    text[10:] = [",".join([line.split(",")[0], "2", *line.split(",")[2:]]) for line in text[10:]]
+    (out / "tracks.txt").write_text("\n".join(text))
+    command = [sys.executable, ROOT / "examples" / "failure_gallery.py", out, "--gt", gt_file]
+    command += ["-o", tmp_path / "gallery.png"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True)
+    error = "object 1: a second identity (id 2, right 1), 4 frames from 16"
+    assert f"| {error} | out of view for 5 frames; cut by the border |" in done.stdout
+    picture = cv2.imread(str(tmp_path / "gallery.png"))
+    assert picture is not None and picture.shape[1] == 1200
 
 
 # ---- Objects in 3D ----

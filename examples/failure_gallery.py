@@ -1,0 +1,240 @@
+#!/usr/bin/env python3
+"""Show the worst identity errors of a run beside the truth, each with its likely cause.
+
+    python examples/failure_gallery.py OUT --gt gt.txt -o gallery.png [--classes chair,cup]
+
+An error is a true object that carries, for some frames, an identity that does not stand for it
+(`rt.identity_map`): either a second identity of its own (split), or the identity of another object
+(taken for). The errors with the most frames come first. For each: the object with its right
+identity, the first frame of the error, and the object that the identity stands for. Thick: the
+object in question, its identity in the colour of the identity; white: the truth. Prints a Markdown
+table with the causes that can be read off boxes, scores and classes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import reobj_track as rt
+
+IntArray = npt.NDArray[np.int64]
+WIDTH_PX, CAPTION_PX = 400, 22
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Everything about one run: truth, result, which rows of both show one object, scores."""
+
+    truth: rt.LabelledBoxes
+    found: rt.LabelledBoxes
+    truth_row: IntArray  # (M,) matched rows
+    found_row: IntArray  # (M,)
+    visibility: rt.Array  # (N,) of the truth, NaN where the file does not say
+    score: rt.Array  # of the result's rows
+    seen_as: npt.NDArray[np.str_]  # class of each detection, "" where unknown
+
+
+@dataclass(frozen=True, slots=True)
+class Error:
+    """A true object under an identity that does not stand for it.
+
+    Attributes:
+        right: identity that stands for it (None: no identity does); wrong: the one it has here.
+        owner: true object that `wrong` stands for, or None.
+        pairs: rows of `Case.truth_row` (and `found_row`) where that is so, by frame.
+    """
+
+    true: int
+    right: int | None
+    wrong: int
+    owner: int | None
+    pairs: IntArray
+
+
+def read_case(out: Path, gt: Path, classes: list[str]) -> Case:
+    """Read an output folder of `run` or `track` and its truth."""
+    track = rt.Workspace(out).recall()[0]
+    truth, rows = rt.read_truth(gt, track.class_names, 0.0), rt.read_mot_rows(gt)
+    visibility = rows[:, 8] if rows.shape[1] == 9 else np.full(len(rows), np.nan)
+    found, score = rt.read_result(out), rt.read_mot_rows(out / "tracks.txt")[:, 6]
+    seen_as = np.array(track.class_names)[track.table.class_id]  # rows are those of tracks.txt
+    if classes:
+        use, keep = np.isin(truth.name, [*classes, ""]), np.isin(found.name, [*classes, ""])
+        truth, visibility = truth[use], visibility[use]
+        found, score, seen_as = found[keep], score[keep], seen_as[keep]
+    return Case(truth, found, *rt.matched_rows(truth, found), visibility, score, seen_as)
+
+
+def find_errors(case: Case) -> list[Error]:
+    """All errors, those with the most frames first."""
+    stands = rt.identity_map(case.truth, case.found)
+    owner = {v: k for k, v in stands.items() if v is not None}
+    true, wrong = case.truth.identity[case.truth_row], case.found.identity[case.found_row]
+    errors = []
+    for t, w in sorted(set(zip(true.tolist(), wrong.tolist(), strict=True))):
+        if stands[t] != w:
+            rows = np.flatnonzero((true == t) & (wrong == w))
+            order = np.argsort(case.truth.frame[case.truth_row[rows]], kind="stable")
+            errors.append(Error(t, stands[t], w, owner.get(w), rows[order]))
+    return sorted(errors, key=lambda e: -len(e.pairs))
+
+
+def absence(case: Case, true: int, start: int) -> str:
+    """How long the object had been unmatched before frame `start`, and why."""
+    mine = case.truth.frame[case.truth.identity == true]
+    visible = case.visibility[case.truth.identity == true]
+    matched = case.truth.frame[case.truth_row][case.truth.identity[case.truth_row] == true]
+    last = matched[matched < start].max(initial=-1)
+    if last < 0:
+        return "at first sight"
+    if last == start - 1:
+        return "switched while in view"
+    gap = (mine > last) & (mine < start)
+    away, hidden = start - last - 1 - gap.sum(), int((visible[gap] < 0.5).sum())
+    parts = [f"out of view for {away} frames"] if away else []
+    if gap.any():
+        parts.append(f"not detected for {gap.sum()} frames ({hidden} of them half hidden)")
+    return "; ".join(parts)
+
+
+def causes(case: Case, error: Error, size: tuple[int, int]) -> str:
+    """What the boxes, scores and classes say about how the error began; size: of the image."""
+    g, p = (int(rows[error.pairs[0]]) for rows in (case.truth_row, case.found_row))
+    start, box, name = int(case.truth.frame[g]), case.truth.xyxy[g], case.truth.name[g]
+    same = (case.truth.frame == start) & (case.truth.name == name)
+    twins = case.truth.xyxy[same & (case.truth.identity != error.true)]
+    facts = {
+        absence(case, error.true, start): True,
+        "cut by the border": (box[:2] < 3).any() or (box[2:] > np.array(size) - 3).any(),
+        "the right identity has another box (two boxes on one object, or a swap)": error.right
+        in case.found.identity[case.found.frame == start],
+        f"{100 * case.visibility[g]:.0f} % visible": case.visibility[g] < 0.6,
+        "low scores": np.median(case.score[case.found_row[error.pairs[:5]]]) < 0.5,
+        f"seen as {case.seen_as[p]}": bool(name) and case.seen_as[p] != name,
+        "overlaps its twin": len(twins) and rt.box_iou(box[None], twins).max() > 0.2,
+    }
+    return "; ".join(text for text, true in facts.items() if true)
+
+
+def title(case: Case, error: Error) -> str:
+    """One line that says what went wrong."""
+    frames = case.truth.frame[case.truth_row[error.pairs]]
+    name = case.truth.name[case.truth_row[error.pairs[0]]] or "object"
+    what = "a second identity" if error.owner is None else f"taken for {name} {error.owner}"
+    span = f"{len(frames)} frames from {frames[0]}"
+    return f"{name} {error.true}: {what} (id {error.wrong}, right {error.right}), {span}"
+
+
+# ---- Stills ------------------------------------------------------------------------------------
+
+
+def panels(case: Case, error: Error) -> list[tuple[int, int, str]]:
+    """(frame, true object, caption): right, wrong, and the object that the identity stands for."""
+    true, ids = case.truth.identity[case.truth_row], case.found.identity[case.found_row]
+    frame = case.truth.frame[case.truth_row]
+    start = int(frame[error.pairs[0]])
+    result = [(start, error.true, "the error")]
+    for who, identity, text in (
+        (error.true, error.right, "right"),
+        (error.owner, error.wrong, f"what id {error.wrong} stands for"),
+    ):
+        at = frame[(true == who) & (ids == identity)]
+        if len(at):
+            nearest = int(at[np.argmin(np.abs(at - start))])
+            result.append((nearest, int(who or 0), text))
+    return result
+
+
+def colour(identity: int) -> tuple[int, int, int]:
+    """A bright colour of an identity, BGR."""
+    hsv = np.array([[[identity * 47 % 180, 200, 255]]], np.uint8)
+    b, g, r = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].tolist()
+    return b, g, r
+
+
+def still(case: Case, image: rt.Image, frame: int, true: int, caption: str) -> rt.Image:
+    """One frame, all identities thin, the object in question thick, the truth white."""
+    scale = WIDTH_PX / image.shape[1]
+    canvas = np.asarray(cv2.resize(image, None, fx=scale, fy=scale), np.uint8)
+    matched = {int(p): int(case.truth.identity[g])
+               for g, p in zip(case.truth_row, case.found_row, strict=True)}  # fmt: skip
+    for p in np.flatnonzero(case.found.frame == frame):
+        identity, thick = int(case.found.identity[p]), 1 + 2 * (matched.get(int(p)) == true)
+        x1, y1, x2, y2 = (case.found.xyxy[p] * scale).round().astype(int).tolist()
+        cv2.rectangle(canvas, (x1, y1), (x2, y2), colour(identity), thick)
+        put(canvas, f"id {identity}", (x1 + 2, min(y2 - 3, canvas.shape[0] - 3)), colour(identity))
+    for g in np.flatnonzero((case.truth.frame == frame) & (case.truth.identity == true)):
+        x1, y1, x2, y2 = (case.truth.xyxy[g] * scale).round().astype(int).tolist()
+        cv2.rectangle(canvas, (x1, y1), (x2, y2), (255, 255, 255), 1)
+        put(canvas, f"true {true}", (x1 + 2, max(y1 + 11, 11)), (255, 255, 255))
+    put(canvas, f"frame {frame}: {caption}", (4, 12), (255, 255, 255))
+    return canvas
+
+
+def put(image: rt.Image, text: str, at: tuple[int, int], bgr: tuple[int, int, int]) -> None:
+    """Small text on a dark plate."""
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    (width, height), low = cv2.getTextSize(text, font, 0.38, 1)
+    x, y = at
+    cv2.rectangle(image, (x - 1, y - height - 1), (x + width + 1, y + low), (30, 30, 30), -1)
+    cv2.putText(image, text, at, font, 0.38, bgr, 1, cv2.LINE_AA)
+
+
+def montage(case: Case, errors: list[Error], video: rt.Video) -> tuple[rt.Image, list[str]]:
+    """One row of stills for each error, and the lines of the table."""
+    plans = [panels(case, e) for e in errors]
+    wanted = {f for plan in plans for f, _, _ in plan}
+    images = {f.index + 1: f.image for f in video if f.index + 1 in wanted}
+    rows, lines = [], []
+    for error, plan in zip(errors, plans, strict=True):
+        stills = [still(case, images[f], f, true, text) for f, true, text in plan if f in images]
+        height, width = images[plan[0][0]].shape[:2]
+        why = causes(case, error, (width, height))
+        lines.append(f"| {title(case, error)} | {why} |")
+        blank = np.full_like(stills[0], 40)
+        strip = np.hstack([*stills, *[blank] * (3 - len(stills))])
+        caption = np.full((CAPTION_PX, strip.shape[1], 3), 40, np.uint8)
+        put(caption, f"{title(case, error)}: {why}", (4, 15), (255, 255, 255))
+        rows += [caption, strip]
+    return np.vstack(rows), lines
+
+
+def main() -> int:
+    """Write the montage and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", type=Path, metavar="OUT", help="output folder of run or track")
+    parser.add_argument("--gt", type=Path, required=True, help="MOTChallenge truth")
+    parser.add_argument("-o", "--image", type=Path, required=True, help="picture to write")
+    parser.add_argument("--classes", default="", help="only these")
+    parser.add_argument("--limit", type=int, default=8, help="errors shown")
+    args = parser.parse_args()
+    try:
+        case = read_case(args.out, args.gt, [c for c in args.classes.split(",") if c])
+        errors = find_errors(case)[: args.limit]
+        if not errors:
+            print("no identity errors")
+            return 0
+        source = json.loads((args.out / "cache" / "source.json").read_text())
+        video = rt.Video(source["source"], rt.InputConfig(**source["input"]))
+        picture, lines = montage(case, errors, video)
+    except rt.ReobjError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    cv2.imwrite(str(args.image), picture)
+    print("\n".join(["| error | cause |", "|---|---|", *lines]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
