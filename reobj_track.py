@@ -45,11 +45,13 @@ import json
 import logging
 import math
 import os
+import queue
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 import zipfile
@@ -795,16 +797,22 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 IMAGE_FPS = 30.0  # of image folders
 SHORT_SHARE = 0.02  # of the announced frames may be missing at the end before it is worth a warning
 MAX_BAD_RUN = 64  # unreadable frames in a row after which a video has ended
+STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
+LIVE_WAITING = 2  # newest frames of a live source that wait for the tracker; older ones are dropped
+LIVE_SILENCE_S = 2.0  # without any frame: a live source has ended
 
 
 class Video:
-    """Frames of a video file, an image folder, a glob or a camera index.
+    """Frames of a video file, an image folder, a glob, a camera index or a stream's URL.
 
     Iterating yields `Frame`s, as often as wanted. Frame numbers are those of the source: rows of
-    the sorted images, or frames of the file in order, unreadable ones counted.
+    the sorted images, or frames of the file in order, unreadable ones counted. A live source never
+    waits: what comes while its frames are worked on is dropped, except for the newest; dropped
+    frames are counted too.
 
     Attributes:
-        is_live: a camera, which cannot be read twice. names: of image files by frame number.
+        is_live: a camera or stream, which cannot be read twice; read, dropped: its frames so far.
+        source: what was given, without a URL's password. names: of image files by frame number.
         size, working_size: (w, h) of the source after rotation, and of the frames; scale: ratio.
         fps: mean frame rate. frame_count: of the source (0 if unknown).
         skipped: frames of the last iteration that could not be read or had another size.
@@ -812,14 +820,18 @@ class Video:
     """
 
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
-        self.source, self.config = str(source), config or InputConfig()
+        self._address, self.config = str(source), config or InputConfig()
+        self.source = without_password(self._address)
         if self.config.every < 1 or self.config.start < 0 or self.config.max_size < 0:
             raise ReobjError("--every must be at least 1, --start and --max-size at least 0")
         self.skipped: list[int] = []
         self.messages: list[str] = []
-        self._files = _image_files(self.source)
+        self.read = self.dropped = 0
+        self._live: Any = None  # the opened capture of a live source until it is iterated
+        is_url = bool(STREAM.match(self._address))
+        self._files = [] if is_url else _image_files(self.source)
         self.names = [path.name for path in self._files]
-        self.is_live = self.source.isdigit() and not Path(self.source).exists()
+        self.is_live = is_url or (self.source.isdigit() and not Path(self.source).exists())
         self.size, self.fps, self.frame_count = self._probe()
         if 0 < self.frame_count <= self.config.start:
             raise ReobjError(f"{self.source}: --start {self.config.start}, but it has only "
@@ -841,7 +853,7 @@ class Video:
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
-        decoded = self._from_capture()
+        decoded = self._from_live() if self.is_live else self._from_capture()
         if self._files:
             stop = min(self.config.stop or self.frame_count, self.frame_count)
             numbers = range(self.config.start, stop, self.config.every)
@@ -865,16 +877,14 @@ class Video:
     def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
         """Yield number, time and image of every wanted frame, None if it cannot be read."""
         capture, start, every = self._open(), self.config.start, self.config.every
-        began, previous_s, bad, index = time.monotonic(), -1.0, 0, -1
+        previous_s, bad, index = -1.0, 0, -1
         pending: list[tuple[int, float, Image | None]] = []  # unreadable, or beyond the end
         for index in range(self.config.stop or sys.maxsize):
             wanted = index >= start and (index - start) % every == 0
             grabbed = capture.grab()
             # Right after the grab this is the frame's true time, also at a variable rate.
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            if self.is_live:
-                time_s = time.monotonic() - began
-            elif time_s <= previous_s:  # some containers have no times
+            if time_s <= previous_s:  # some containers have no times
                 time_s = previous_s + 1 / self.fps
             ok, image = capture.retrieve() if grabbed and wanted else (grabbed, None)
             if not ok:
@@ -891,16 +901,69 @@ class Video:
         if min(stop, self.frame_count) - read > max(1.0, SHORT_SHARE * self.frame_count):
             self._warn(f"the file ends early: {read} of {self.frame_count} frames can be read")
 
+    def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
+        """Yield the newest frames of a live source; a thread reads them all and drops the rest."""
+        capture, self._live = self._live or self._open(), None
+        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_WAITING)
+        stopped = threading.Event()
+        thread = threading.Thread(
+            target=self._read_live, args=(capture, frames, stopped), daemon=True
+        )
+        thread.start()
+        try:
+            while (item := frames.get()) is not None:
+                yield item
+        finally:
+            stopped.set()
+            thread.join(LIVE_SILENCE_S)
+            if not thread.is_alive():  # else it hangs in the driver; the process may still end
+                capture.release()
+
+    def _read_live(
+        self,
+        capture: Any,
+        frames: queue.Queue[tuple[int, float, Image] | None],
+        stopped: threading.Event,
+    ) -> None:
+        """Read a live source until it ends; only the last LIVE_WAITING wanted frames wait."""
+        began = last = time.monotonic()
+        self.read = self.dropped = index = 0
+        try:
+            while not stopped.is_set() and time.monotonic() - last < LIVE_SILENCE_S:
+                if 0 < self.config.stop <= index:
+                    break
+                ok, image = capture.read()
+                if not ok:
+                    time.sleep(0.01)
+                    continue
+                last, at, index = time.monotonic(), index, index + 1
+                if at < self.config.start or (at - self.config.start) % self.config.every:
+                    continue
+                self.read += 1
+                if frames.full():
+                    with contextlib.suppress(queue.Empty):  # the tracker was faster
+                        frames.get_nowait()
+                        self.dropped += 1
+                frames.put((at, last - began, image))  # this thread alone puts: there is room
+        finally:
+            while not stopped.is_set():  # say that it ended, behind the frames that wait
+                with contextlib.suppress(queue.Full):
+                    frames.put(None, timeout=0.1)
+                    break
+
     def _open(self) -> Any:
         """Open the source with OpenCV, which turns the frames upright by the file's rotation."""
         if not self.is_live and not Path(self.source).is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        capture = cv2.VideoCapture(int(self.source) if self.is_live else self.source)
+        is_camera = self.is_live and self._address.isdigit()
+        capture = cv2.VideoCapture(int(self._address) if is_camera else self._address)
         cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
-            what = "camera (is it connected?)" if self.is_live else "video (damaged, or no video)"
+            what = "video (damaged, or no video)"
+            if self.is_live:
+                what = "camera (is it connected?)" if is_camera else "stream (is it there?)"
             raise ReobjError(f"{self.source}: cannot be opened as a {what}")
         return capture
 
@@ -912,11 +975,23 @@ class Video:
             capture = self._open()
             images = (capture.read()[1] for _ in range(MAX_BAD_RUN))
             fps = float(capture.get(cv2.CAP_PROP_FPS))
-            count = 0 if self.is_live else max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+            if not self._address.isdigit():
+                count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+            self.is_live = self.is_live and not count  # a URL may be that of a file
+            self._live = capture if self.is_live else None
         image = next((image for image in images if image is not None), None)
         if image is None:
             raise ReobjError(f"{self.source}: not one frame can be decoded")
         return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
+
+
+def without_password(text: str) -> str:
+    """Return a text whose URLs have lost user and password: what may be shown and written.
+
+    >>> without_password("rtsp://me:secret@10.0.0.7/stream")
+    'rtsp://10.0.0.7/stream'
+    """
+    return re.sub(r"(?<=://)[^/@\s]*@", "", text)
 
 
 def _shortened(items: Sequence[Any]) -> str:
@@ -5580,7 +5655,8 @@ def run(
     folder.
 
     Args:
-        source: video file, folder of images, glob, or camera index.
+        source: video file, folder of images, glob, camera index or URL of a stream. Ctrl-C ends a
+            live one: its files are written.
         out: output folder; results of earlier stages found there are used again.
         detections: file with recorded detections, or a callable image -> Detections; default:
             config.detect.model.
@@ -5739,6 +5815,8 @@ def track_video(
 ) -> TrackResult:
     """Detect and track all frames, or take both from the cache."""
     source = _detection_source(video, config, detections)
+    if video.is_live:  # what it showed before is no answer
+        source = dataclasses.replace(source, key="")
     key = (source_fingerprint(video.source), config.input, source.key)
     supplied = "" if poses is None else hashlib.sha256(poses.cam_from_world.tobytes()).hexdigest()
     path = space.path("tracks", *key, config.embed, config.tracker, supplied)
@@ -5819,30 +5897,28 @@ def _track_frames(
         {} if poses is None else dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
     )
     camera = None if poses is None else _scaled_camera(poses.camera, video.scale)
-    frames: list[int] = []
-    steps: list[Tracks] = []
+    steps: list[tuple[int, Tracks]] = []
     progress = Progress("track", video.expected)
     try:
         for frame in video:
             detections = _detect_cached(frame, source, cache)
             pose = pose_of.get(frame.index)
             step = tracker.step(detections, frame.image, cam_from_world=pose, camera=camera)
-            steps.append(step)
-            frames.append(frame.index)
+            steps.append((frame.index, step))
             progress.step()
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
             raise
     finally:
         progress.close()
         if cache is not None:
             cache.flush()
-    if not frames:
+    if not steps:
         raise ReobjError(
             f"{video.source}: no frame could be read (--start/--stop/--every leave none, "
             "or the file is damaged)"
         )
-    table = TrackTable.from_steps(frames, steps, video.scale)
+    table = TrackTable.from_steps([i for i, _ in steps], [s for _, s in steps], video.scale)
     messages = [*source.messages, *_video_messages(video, table)]
     return TrackResult(table, _identity_similarity(tracker), source.class_names, tuple(messages))
 
@@ -5892,6 +5968,8 @@ def _video_messages(video: Video, table: TrackTable) -> list[str]:
     """What the user should know about the input."""
     messages = list(video.messages)
     if video.is_live:
+        messages.append(f"live: {video.read} frames came, {video.dropped} of them were dropped to "
+                        "keep up")  # fmt: skip
         messages.append("a live source cannot be read twice: identities only; record it for 3D")
     if not len(table):
         messages.append(
@@ -6232,7 +6310,7 @@ def _write_objects_json(result: RunResult, video: Video) -> None:
     data = {
         "format": "reobj-objects",
         "version": 1,
-        "command": " ".join(sys.argv),
+        "command": without_password(" ".join(sys.argv)),
         "reobj_track": __version__,
         "versions": versions,
         "conventions": CONVENTIONS,
@@ -7158,7 +7236,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
 def _add_run(sub: Any, name: str, text: str, func: Callable[[argparse.Namespace], int]) -> None:
     parser = sub.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
     parser.add_argument(
-        "video", help="video file, folder of images, glob in quotes, or camera index"
+        "video", help="video file, folder of images, glob in quotes, camera index, stream URL"
     )
     parser.add_argument("-o", "--out", required=True, help="output folder")
     parser.add_argument(
@@ -7331,7 +7409,10 @@ def _cmd_models(args: argparse.Namespace) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns 0, 2 for bad input, 130 after Ctrl-C, 1 for a fault of ours."""
+    """Run the command line; returns 0, 2 for bad input, 130 after Ctrl-C, 1 for a fault of ours.
+
+    Ctrl-C is the way to end a live source: its files are written, and 0 is returned.
+    """
     args = _parser().parse_args(argv)
     level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
     logging.addLevelName(logging.WARNING, "warning")
