@@ -49,6 +49,7 @@ import queue
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -6820,6 +6821,7 @@ def _was_read(frame: IntArray, out: Path) -> BoolArray:
 # ---- Export: other tools' files from an output folder ------------------------------------------
 
 CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
+MANY_CAMERAS = 200  # in a GLB; of longer videos every n-th
 SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
 BOXER_COLUMNS = (
     "time_ns,tx_world_object,ty_world_object,tz_world_object,qw_world_object,qx_world_object,"
@@ -6960,24 +6962,40 @@ def export_boxer(saved: Saved, path: Path) -> None:
     rejected objects, the shape (all are boxes here), the uncertainty, the sightings.
     Source: facebookresearch/boxer, utils/file_io.py, `read_obb_csv`.
     """
-    world, rows = saved.data["world"], []
+    rows = []
     kept = [o for o in saved.data["objects"] if o["status"] != "rejected"]
-    scale, up = (world.get("scale") or {}).get("metres_per_unit"), world.get("up_in_world")
-    if kept and (not scale or world["scale"]["source"] == "none"):
-        log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
-    if kept and up is None:
-        log.warning("up is unknown: %s keeps the world's axes, Boxer expects z up", path)
-    turn = turn_onto(np.array(up if up is not None else [0.0, 0, 1]), np.array([0.0, 0, 1]))
+    scale, turn = _upright(saved, path, [0.0, 0, 1])
     time_ns = 0 if saved.poses is None else round(1e9 * float(saved.poses.time_s[0]))
     for o in kept:
-        center = turn @ np.array(o["center"]) * (scale or 1.0)
+        center = turn @ np.array(o["center"]) * scale
         own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
         numbers = [*center, *quat_wxyz_from_matrix(turn[None] @ own)[0],
-                   *np.array(o["size"]) * (scale or 1.0)]  # fmt: skip
+                   *np.array(o["size"]) * scale]  # fmt: skip
         rows.append([time_ns, *(f"{v:.6f}" for v in numbers), o["class"].replace(",", " "),
                      o["id"], saved.class_names.index(o["class"]), o["score"]])  # fmt: skip
     with atomic(path) as part, part.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([BOXER_COLUMNS.split(","), *rows])
+
+
+def _upright(saved: Saved, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
+    """Metres per unit (1 if unknown) and the rotation (3, 3) that brings the world's up onto this
+    axis; what is unknown is said.
+    """
+    world = saved.data["world"]
+    scale, up = world.get("scale") or {}, world.get("up_in_world")
+    metres = scale.get("metres_per_unit") if scale.get("source") != "none" else None
+    if any(o["center"] for o in saved.data["objects"]):
+        if not metres:
+            log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
+        if up is None:
+            log.warning("up is unknown: %s keeps the world's axes", path)
+    turn = turn_onto(np.array(up or up_axis), np.array(up_axis))
+    return metres or 1.0, turn
+
+
+def _xyzw(rotation: Array) -> list[float]:
+    """Unit quaternion of a rotation matrix (3, 3), w last."""
+    return [float(v) for v in np.roll(quat_wxyz_from_matrix(rotation[None])[0], -1)]
 
 
 def turn_onto(a: Array, b: Array) -> Array:
@@ -6992,10 +7010,151 @@ def turn_onto(a: Array, b: Array) -> Array:
     )
 
 
+def export_glb(saved: Saved, path: Path) -> None:
+    """Write binary glTF 2.0: y up, in metres if the scale is known; a named node an object (a unit
+    sphere scaled to the ellipsoid; its facts in `extras`), up to MANY_CAMERAS cameras, the points.
+
+    Source: the glTF 2.0 specification of Khronos.
+    """
+    scale, turn = _upright(saved, path, [0.0, 1, 0])
+    kept = [o for o in saved.data["objects"] if o["status"] != "rejected"]
+    sphere, faces = _icosphere(OutputConfig().ply_detail)  # (P, 3), (T, 3)
+    arrays = [sphere.astype("<f4"), faces.reshape(-1, 1).astype("<u4")]  # accessors 0 and 1
+    ball = {"attributes": {"POSITION": 0, "NORMAL": 0}, "indices": 1}
+    meshes = [{"primitives": [ball | {"material": i}]} for i in range(len(kept))]
+    nodes = [
+        {"name": f"{o['class']} {o['id']}", "mesh": i, "translation": o["center"],
+         "rotation": np.roll(o["quat_wxyz"], -1).tolist(), "scale": o["half_axes"],
+         "extras": {k: o[k] for k in ("id", "class", "status", "support", "size_m")}}
+        for i, o in enumerate(kept)
+    ]  # fmt: skip
+    extra: dict[str, Any] = {}
+    if saved.poses is not None and len(saved.poses.points):
+        opaque = np.insert(saved.poses.colors, 3, 255, axis=1)  # (N, 4)
+        arrays += [saved.poses.points.astype("<f4"), opaque]
+        dots = {"attributes": {"POSITION": 2, "COLOR_0": 3}, "mode": 0}
+        nodes.append({"name": "points", "mesh": len(meshes)})
+        meshes.append({"primitives": [dots]})
+    if saved.poses is not None and saved.poses.known.any():
+        extra["cameras"], cameras = _glb_cameras(saved.poses)
+        nodes += cameras
+    root = {"name": "world", "scale": [scale] * 3, "rotation": _xyzw(turn)}
+    nodes.append(root | {"children": list(range(len(nodes)))} if nodes else root)
+    materials = [
+        {"name": f"object {o['id']}", "pbrMetallicRoughness": {"metallicFactor": 0.0,
+         "baseColorFactor": [(c / 255) ** 2.2 for c in object_color(o["id"])[::-1]] + [1.0]}}
+        for o in kept
+    ]  # fmt: skip
+    extra |= {"scenes": [{"nodes": [len(nodes) - 1]}], "nodes": nodes}
+    extra |= {"meshes": meshes, "materials": materials}
+    _write_glb(path, arrays, {key: value for key, value in extra.items() if value})
+
+
+def _glb_cameras(poses: Poses) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The camera of a glTF scene and a node for each pose; glTF cameras look along -z, y up."""
+    camera, known = poses.camera, np.flatnonzero(poses.known)
+    known = known[:: math.ceil(len(known) / MANY_CAMERAS)]
+    yfov = 2 * math.atan(camera.height / 2 / camera.K[1, 1])
+    lens = {"yfov": yfov, "aspectRatio": camera.width / camera.height, "znear": 0.01}
+    world_from_cam = invert_rigid(poses.cam_from_world[known]) @ np.diag([1.0, -1, -1, 1])
+    nodes = [
+        {"name": f"camera {frame}", "camera": 0, "rotation": _xyzw(m[:, :3]),
+         "translation": m[:, 3].tolist()}
+        for frame, m in zip(poses.frame[known], world_from_cam, strict=True)
+    ]  # fmt: skip
+    return [{"type": "perspective", "perspective": lens}], nodes
+
+
+def _write_glb(path: Path, arrays: Sequence[npt.NDArray[Any]], scene: dict[str, Any]) -> None:
+    """Write a .glb: the arrays (N, k) become its accessors, in their order; all of 4-byte rows."""
+    types, components = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}, {"f": 5126, "I": 5125, "B": 5121}
+    offsets = np.cumsum([0] + [a.nbytes for a in arrays]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": at, "byteLength": a.nbytes}
+        for at, a in zip(offsets, arrays, strict=False)
+    ]
+    accessors = [
+        {"bufferView": i, "componentType": components[a.dtype.char], "count": len(a),
+         "type": types[a.shape[1]], "min": a.min(0).tolist(), "max": a.max(0).tolist(),
+         "normalized": a.dtype.char == "B"}
+        for i, a in enumerate(arrays)
+    ]  # fmt: skip
+    head = {"asset": {"version": "2.0", "generator": f"reobj_track {__version__}"}, "scene": 0}
+    head |= {"buffers": [{"byteLength": offsets[-1]}], "bufferViews": views, "accessors": accessors}
+    text = json.dumps(head | scene, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    blob = b"".join(a.tobytes() for a in arrays)
+    with atomic(path) as part, part.open("wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob)))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", len(blob), b"BIN\0") + blob)
+
+
+def export_rrd(saved: Saved, path: Path) -> None:
+    """Write a recording for the rerun viewer: z up, in metres if the scale is known; ellipsoids,
+    points, and on the timeline `frame` the camera and the boxes it sees. Needs rerun-sdk.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
+    scale, turn = _upright(saved, path, [0.0, 0, 1])
+    names = {o["id"]: f"{o['id']} {o['class']}" for o in saved.data["objects"]}
+    rec = rr.RecordingStream("reobj_track", recording_id=Path(saved.data["video"]["path"]).name)
+    rec.set_log_time_enabled(False)  # when the export was made is of no interest
+    with atomic(path) as part:
+        rec.save(part)
+        views = rr.blueprint.Spatial3DView(), rr.blueprint.Spatial2DView(origin="world/camera")
+        rec.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Horizontal(*views)))
+        rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        rec.log("world", rr.Transform3D(mat3x3=turn, scale=scale), static=True)
+        for o in saved.data["objects"]:
+            if o["status"] != "rejected":
+                solid = rr.Ellipsoids3D(
+                    half_sizes=[o["half_axes"]], centers=[o["center"]], labels=[names[o["id"]]],
+                    quaternions=[np.roll(o["quat_wxyz"], -1)], fill_mode="solid",
+                    colors=[object_color(o["id"])[::-1]],
+                )  # fmt: skip
+                rec.log(["world", "objects", o["class"], str(o["id"])], solid, static=True)
+        if saved.poses is not None:
+            cloud = rr.Points3D(saved.poses.points, colors=saved.poses.colors)
+            rec.log("world/points", cloud, static=True)
+        _rrd_frames(rr, rec, saved, names)
+        rec.disconnect()  # writes what is left
+
+
+def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str]) -> None:
+    """Log each frame's camera, if it has one, and boxes."""
+    poses, table, frames = saved.poses, saved.table, saved.frames()
+    pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
+    fps = saved.data["video"]["fps"] or IMAGE_FPS
+    for frame in frames:
+        rec.set_time("frame", sequence=frame)
+        rec.set_time("time", duration=frame / fps)
+        pose = pose_of.get(frame)
+        if poses is None or pose is None or not np.isfinite(pose).all():
+            rec.log("world/camera", rr.Clear(recursive=False))
+        else:
+            lens = {"image_from_camera": poses.camera.K, "camera_xyz": rr.ViewCoordinates.RDF}
+            size = [poses.camera.width, poses.camera.height]
+            to_child = {"relation": rr.TransformRelation.ChildFromParent}
+            move = rr.Transform3D(translation=pose[:, 3], mat3x3=pose[:, :3], **to_child)
+            rec.log("world/camera", rr.Pinhole(**lens, resolution=size), move)
+        rows = table[table.frame == frame]
+        boxes = rr.Boxes2D(
+            array=rows.xyxy, array_format=rr.Box2DFormat.XYXY,
+            labels=[names[i] for i in rows.object_id.tolist()],
+            colors=[object_color(i)[::-1] for i in rows.object_id.tolist()],
+        )  # fmt: skip
+        rec.log("world/camera/boxes", boxes)
+
+
 EXPORTS: dict[str, tuple[str, Callable[[Saved, Path], None]]] = {  # name: file in OUT, writer
     "coco-vid": ("coco_vid.json", export_coco_vid),
     "cvat": ("cvat.xml", export_cvat),
     "boxer": ("boxer_3dbbs.csv", export_boxer),
+    "glb": ("objects.glb", export_glb),
+    "rrd": ("scene.rrd", export_rrd),
 }
 
 

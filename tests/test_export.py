@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+import subprocess
+import sys
 import zipfile
 from collections import defaultdict
 from pathlib import Path
@@ -323,3 +326,103 @@ def test_export_of_no_output_folder(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert cli("export", tmp_path, "--to", "cvat") == 2
     assert "make them first with `run`" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+# ---- GLB, rerun, COLMAP ----
+
+
+def upright(out: Path, axis: list[float]) -> tuple[np.ndarray, float, list[dict[str, object]]]:
+    """Rotation of the world's up onto an axis, metres per unit, and the objects with a solid."""
+    data = json.loads((out / "objects.json").read_text())
+    turn = rt.turn_onto(np.array(data["world"]["up_in_world"]), np.array(axis))
+    kept = [o for o in data["objects"] if o["status"] != "rejected"]
+    return turn, data["world"]["scale"]["metres_per_unit"], kept
+
+
+def test_glb_in_trimesh(room: Path, tmp_path: Path) -> None:
+    """Every ellipsoid is a named node in its place and colour, y up, in metres."""
+    trimesh = pytest.importorskip("trimesh")
+    scene = trimesh.load(rt.export(room, "glb", tmp_path / "a.glb"))
+    turn, scale, kept = upright(room, [0.0, 1, 0])
+    names = {f"{o['class']} {o['id']}" for o in kept}
+    assert names <= set(scene.graph.nodes_geometry) and len(names) == len(kept) > 5
+    for o in kept:
+        matrix, mesh = scene.graph[f"{o['class']} {o['id']}"]
+        points = scene.geometry[mesh].vertices @ matrix[:3, :3].T + matrix[:3, 3]  # (P, 3)
+        own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
+        inside = ((points / scale @ turn - o["center"]) @ own) / o["half_axes"]
+        np.testing.assert_allclose(np.linalg.norm(inside, axis=1), 1, atol=1e-3)
+        red, green, blue = rt.object_color(int(o["id"]))[::-1]
+        color = scene.geometry[mesh].visual.material.baseColorFactor[:3]
+        np.testing.assert_allclose(
+            (color / 255) ** (1 / 2.2), np.divide((red, green, blue), 255), atol=0.03
+        )
+
+
+def test_glb_follows_the_specification(room: Path, tmp_path: Path) -> None:
+    """Sizes, alignment, and cameras that look along -z from where poses.txt has them."""
+    raw = rt.export(room, "glb", tmp_path / "a.glb").read_bytes()
+    assert raw[:4] == b"glTF" and np.frombuffer(raw[4:12], "<u4").tolist() == [2, len(raw)]
+    length = int(np.frombuffer(raw[12:16], "<u4")[0])
+    gltf = json.loads(raw[20 : 20 + length])
+    assert length % 4 == 0 and gltf["buffers"][0]["byteLength"] == len(raw) - 28 - length
+    assert all(v["byteOffset"] % 4 == 0 for v in gltf["bufferViews"])
+    cameras = [n for n in gltf["nodes"] if n["name"].startswith("camera ")]
+    tum = np.loadtxt(room / "poses.txt")
+    np.testing.assert_allclose([n["translation"] for n in cameras], tum[:, 1:4], atol=1e-5)
+    forward = Rotation.from_quat([n["rotation"] for n in cameras]).apply([0, 0, -1])
+    np.testing.assert_allclose(forward, Rotation.from_quat(tum[:, 4:]).apply([0, 0, 1]), atol=1e-5)
+
+
+def test_glb_without_cameras_or_objects(tmp_path: Path) -> None:
+    """Identities only: a file that opens, with nothing in it."""
+    out = tmp_path / "out"
+    args = ("--detections", ROOM / "detections.npz", "--stop", 3, "--set", "output.overlay=false")
+    assert cli("track", ROOM / "room.mp4", "-o", out, *args) == 0
+    raw = rt.export(out, "glb").read_bytes()
+    gltf = json.loads(raw[20 : 20 + int(np.frombuffer(raw[12:16], "<u4")[0])])
+    assert [n["name"] for n in gltf["nodes"]] == ["world"] and "meshes" not in gltf
+
+
+def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
+    """Read back by rerun itself: every ellipsoid, camera and box."""
+    pytest.importorskip("rerun", reason="pip install .[viewer]")
+    from rerun.chunk import RrdReader
+
+    found = defaultdict(list)
+    for chunk in RrdReader(rt.export(room, "rrd", tmp_path / "a.rrd")).stream().to_chunks():
+        found[chunk.entity_path] += chunk.to_record_batch().to_pylist()
+    _, _, kept = upright(room, [0.0, 0, 1])
+    for o in kept:
+        (row,) = found[f"/world/objects/{str(o['class']).replace(' ', chr(92) + ' ')}/{o['id']}"]
+        np.testing.assert_allclose(row["Ellipsoids3D:half_sizes"], [o["half_axes"]], rtol=1e-5)
+        np.testing.assert_allclose(row["Ellipsoids3D:centers"], [o["center"]], rtol=1e-5)
+        quat = np.roll(o["quat_wxyz"], -1)
+        np.testing.assert_allclose(row["Ellipsoids3D:quaternions"], [quat], atol=1e-5)
+    frames = sorted(row["frame"] for row in found["/world/camera"])
+    assert frames == list(range(0, 120, 3))
+    boxes = [len(row["Boxes2D:centers"]) for row in found["/world/camera/boxes"]]
+    assert sum(boxes) == len(mot(room / "tracks.txt"))
+    (points,) = found["/world/points"] or [{"Points3D:positions": []}]
+    assert isinstance(points["Points3D:positions"], list)
+
+
+def test_rrd_without_rerun_says_what_to_install(
+    room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert cli("export", room, "--to", "rrd") == 2
+    assert "pip install" in capsys.readouterr().err and not (room / "scene.rrd").exists()
+
+
+def test_colmap_opens_sparse(room: Path) -> None:
+    """pycolmap, and COLMAP itself where it is installed, read OUT/sparse."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(room / "sparse"))
+    assert model.num_reg_images() == 40 and model.num_cameras() == 1
+    if (colmap := shutil.which("colmap")) is None:
+        pytest.skip("pycolmap reads it; no colmap here to ask too: apt-get install colmap")
+    command = [colmap, "model_analyzer", "--path", str(room / "sparse")]
+    answer = subprocess.run(command, capture_output=True, text=True)
+    assert "Registered images: 40" in answer.stdout + answer.stderr
