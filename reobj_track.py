@@ -367,8 +367,19 @@ class ObjectsConfig:
         "", "world direction against gravity: x,y,z (default: from the poses or the objects)"
     )
     link: bool = _opt(True, "join and split tracklets by 3D evidence")
+    look_ratio: float = _opt(
+        1.3, "join by looks only what is this much nearer than any rival (cosine distance)"
+    )
+    look_gap: int = _opt(30, "views of a tracklet this many frames apart show how looks vary")
+    look_prior: tuple[float, float] = _opt(
+        (0.09, 0.18), "1 - cosine of one object and of two before the video has shown any"
+    )
+    look_prior_weight: float = _opt(10.0, "number of observed pairs that these are worth")
+    double_iou: float = _opt(
+        0.5, "boxes of a frame that overlap more may be two boxes on one object (IoU)"
+    )
     link_look: float = _opt(
-        0.0, "never join objects that look less alike than this (0: as different ones)"
+        -1.0, "never join by place what looks less alike than this (log of the distance ratio)"
     )
     link_place: float = _opt(
         0.25, "candidates for a join overlap at least this much when cross-projected (IoU)"
@@ -2684,6 +2695,7 @@ class Tracker:
         self._tracklets = itertools.count(1)
         self._camera_motion = CameraMotion(self.config)
         self._last_pose: Array | None = None
+        self._latest: _LazyEmbeddings | None = None  # of the latest frame
         self._motion = self.config
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
 
@@ -2713,6 +2725,13 @@ class Tracker:
         )
         return tracks[tracks.track_id > 0]
 
+    def latest_looks(self) -> tuple[IntArray, Floats]:
+        """Which detections of the latest frame were embedded (n,), and their fused rows (n, E)."""
+        lazy = self._latest
+        if lazy is None or lazy.rows is None:
+            return np.empty(0, np.int64), np.empty((0, 0), np.float32)
+        return np.flatnonzero(lazy.done), lazy.rows[lazy.done]
+
     def step(
         self,
         detections: Any,
@@ -2734,6 +2753,7 @@ class Tracker:
             detections,
             self.config.foreground_weight,
         )
+        self._latest = lazy
         self._predict(frame, cam_from_world, camera)
         track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
         self._correct(detections, track_of)
@@ -4762,13 +4782,17 @@ def _undistort_boxes(xyxy: Array, camera: Camera) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class LinkEvent:
-    """A join or a split of tracklets and its evidence (IoU of cross-projection, similarity of
-    looks).
+    """A join or a split of tracklets and its evidence.
+
+    Attributes:
+        place_iou: IoU of cross-projection, None where only looks decided.
+        look: how much nearer (> 0) or further (< 0) the looks are than those that tell one object
+            from two, log of the ratio of cosine distances.
     """
 
     kind: str
     tracklets: tuple[int, ...]
-    place_iou: float
+    place_iou: float | None
     look: float
     kept: bool
 
@@ -4776,49 +4800,116 @@ class LinkEvent:
 class Linker:
     """Decide over the whole video which tracklets are one object.
 
-    Atoms are the tracklets, cut at gaps (where a tracker slips to a twin); those that the tracker
-    recognised as one identity start together. A start is undone where two well-measured places
+    Two tracklets seen in one frame are never the same object. First by looks: tracklets are joined
+    as long as their most alike views are nearer than the video's own middle between one object and
+    two, the most alike first, and only if no rival (seen beside one of the two) is about as near.
+    This replaces what the tracker decided at first sight. Then, with poses, by place: tracklets are
+    cut at gaps (where a tracker slips to a twin); a join is undone where two well-measured places
     differ; groups that explain each other's boxes are joined, refitted and kept only if the joint
     solid overlaps the boxes of both in most frames (merge, re-project, undo: the idea of OA-SLAM).
-    Two tracklets seen in one frame are never the same object.
 
     Args:
-        table: track rows with the tracker's identities.
-        similarity: (I, I) normalised similarity of the tracker's identities (0: as different, 1: as
-            same objects).
+        track: rows with the tracker's identities, and their looks.
+        poses, fit: None for looks alone.
     """
 
     def __init__(
         self,
-        table: TrackTable,
-        similarity: Array,
-        poses: Poses,
-        fit: Callable[[Views, list[int]], Any],
+        track: TrackResult,
+        poses: Poses | None,
+        fit: Callable[[Views, list[int]], Any] | None,
         config: ObjectsConfig,
     ) -> None:
+        table = track.table
         self.table, self.poses, self.fit, self.config = table, poses, fit, config
+        self.located = np.empty(0) if poses is None else poses.frame[poses.known]  # (V,)
         self.atom, first = _segments_of(table, config.cut_gap)  # (N,), (L,)
         self.tracklets = table.tracklet_id[first]  # (L,)
-        self.identity = table.object_id[first] - 1  # (L,)
-        self.similarity = similarity
+        self.identity = table.object_id[first]  # (L,)
+        self.classes = _majority(table.class_id, table.score, self.atom, len(first))  # (L,)
+        self.together, self.apart = self._seen_together()
+        self.near = self._nearness(self._look_distance(track.look, track.look_row))
         self.group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
-        self.together = self._seen_together()
         self.events: list[LinkEvent] = []
 
     def run(self) -> IntArray:
         """Return the object of every row of the table, (N,), any numbering."""
-        self._split()
-        rejected: set[tuple[int, ...]] = set()
-        while self._join_round(rejected):
-            pass
+        if np.isfinite(self.near).any():
+            self._join_looks()
+        if self.poses is not None:
+            self._split()
+            rejected: set[tuple[int, ...]] = set()
+            while self._join_round(rejected):
+                pass
         return np.asarray(self.group[self.atom], np.int64)
 
-    def _seen_together(self) -> BoolArray:
-        """(L, L): tracklets with a detection in the same frame."""
-        frames, row = np.unique(self.table.frame, return_inverse=True)
-        seen = np.zeros((len(self.tracklets), len(frames)), np.float32)
-        seen[self.atom, row] = 1
-        return np.asarray(seen @ seen.T > 0)
+    def _seen_together(self) -> tuple[BoolArray, BoolArray]:
+        """(L, L): atoms with detections in the same frame; those of them that are surely two
+        objects, that is never so close that they could be two boxes on one object.
+        """
+        count = len(self.tracklets)
+        together, double = np.zeros((count, count), bool), np.zeros((count, count), bool)
+        for rows in _rows_by(self.table.frame):
+            here, box = self.atom[rows], self.table.xyxy[rows]
+            together[here[:, None], here[None]] = True
+            double[here[:, None], here[None]] |= box_iou(box, box) > self.config.double_iou
+        return together, together & ~double
+
+    def _look_distance(self, look: npt.NDArray[Any], look_row: IntArray) -> Array:
+        """(L, L) log(1 - cosine) of the most alike views of two atoms, NaN where there is none;
+        diagonal: of views of one atom at least look_gap frames apart.
+        """
+        distance = np.full((len(self.tracklets),) * 2, np.nan)
+        if not look.size:
+            return distance
+        order = np.argsort(self.atom[look_row], kind="stable")
+        rows, unit = look_row[order], _unit_rows(look[order])
+        atoms, starts = np.unique(self.atom[rows], return_index=True)
+        for atom, mine in zip(atoms, np.split(np.arange(len(rows)), starts[1:]), strict=True):
+            cosine = unit[mine] @ unit.T  # (k, n)
+            frame = self.table.frame[rows[mine]]
+            soon = np.abs(frame[:, None] - frame) < self.config.look_gap
+            cosine[:, mine] = np.where(soon, -np.inf, cosine[:, mine])
+            best = np.maximum.reduceat(cosine.max(0), starts)  # (atoms,)
+            distance[atom, atoms] = np.where(np.isinf(best), np.nan, 1 - best)
+        return np.asarray(np.log(distance.clip(1e-3)))
+
+    def _nearness(self, distance: Array) -> Array:
+        """(L, L) how much nearer than the middle between one object and two looks are (log).
+
+        Both are known without labels: atoms of a class seen side by side, and views of one atom
+        some time apart. A few invented pairs stand in while the video has shown none.
+        """
+        pairs = np.triu(self.apart & (self.classes[:, None] == self.classes), 1)
+        same, different = np.log(self.config.look_prior)
+        middle = 0.0
+        for seen, prior in ((distance[pairs], different), (np.diag(distance), same)):
+            seen = seen[np.isfinite(seen)]
+            weight = self.config.look_prior_weight
+            middle += (seen.sum() + weight * prior) / (len(seen) + weight) / 2
+        return np.asarray(middle - distance)
+
+    def _join_looks(self) -> None:
+        """Group the tracklets anew by their looks and list what differs from the tracker."""
+        whole = np.unique(self.tracklets, return_inverse=True)[1]  # (L,) tracklet of each atom
+        other = self.classes[:, None] != self.classes
+        near = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), whole)  # (T, T)
+        banned, apart = (_grouped_max(x, whole) for x in (self.together | other, self.apart))
+        margin = math.log(self.config.look_ratio)
+        before, self.group = self.group, _most_alike_first(near, banned, apart, margin)[whole]
+        self._list_changes(before, self.group, "join")
+        self._list_changes(self.group, before, "split")
+
+    def _list_changes(self, parts: IntArray, whole: IntArray, kind: str) -> None:
+        """Events for the groups of `whole` that hold several groups of `parts`."""
+        for g in np.unique(whole):
+            atoms = np.flatnonzero(whole == g)
+            pieces = [atoms[parts[atoms] == part] for part in np.unique(parts[atoms])]
+            for piece in pieces[1:]:
+                rest = np.setdiff1d(atoms, piece)
+                look = np.nan_to_num(self.near[np.ix_(rest, piece)], nan=-np.inf).max()
+                ids = tuple(np.unique(self.tracklets[atoms if kind == "join" else piece]).tolist())
+                self.events.append(LinkEvent(kind, ids, None, float(max(look, -9.0)), True))
 
     def _cross_iou(self, labels: IntArray, count: int) -> tuple[Array, Array]:
         """Fit all groups of atoms; how well does each solid explain the boxes of each other group?
@@ -4827,6 +4918,7 @@ class Linker:
             place: (G, G) median IoU of solid g in the frames of group h.
             own: (V, G) IoU of each solid with its own boxes.
         """
+        assert self.poses is not None and self.fit is not None
         rows = labels[self.atom]  # (N,)
         views = gather_views(self.table, self.poses, rows, count, self.config.min_score)
         classes = _majority(self.table.class_id, self.table.score, rows, count)
@@ -4868,10 +4960,11 @@ class Linker:
             anchors = anchors if len(anchors) else members[[np.argmax(length[members])]]
             for atom in np.setdiff1d(members, anchors):
                 iou = float(max(place[anchors, atom].max(), place[atom, anchors].max()))
+                look = float(np.nan_to_num(self.near[anchors, atom], nan=-np.inf).max(initial=-9))
                 if iou < self.config.split_place:
                     self.group[atom] = self.group.max() + 1
                     ids = (int(self.tracklets[anchors[0]]), int(self.tracklets[atom]))
-                    self.events.append(LinkEvent("split", ids, iou, 1.0, True))
+                    self.events.append(LinkEvent("split", ids, iou, look, True))
 
     def _join_round(self, rejected: set[tuple[int, ...]]) -> bool:
         """Join the best disjoint pairs of groups; returns whether another round could find more."""
@@ -4901,32 +4994,23 @@ class Linker:
         self, place: Array, count: int, rejected: set[tuple[int, ...]]
     ) -> list[tuple[int, int, float, float]]:
         """Disjoint pairs of groups worth a joint fit: (a, b, cross IoU, look), best first."""
-        member = np.zeros((count, len(self.group)), np.float32)
-        member[self.group, np.arange(len(self.group))] = 1
-        apart = member @ self.together.astype(np.float32) @ member.T > 0  # (G, G) cannot be one
+        apart = _grouped_max(self.together, self.group)  # (G, G) cannot be one
         classes = _majority(self.table.class_id, self.table.score, self.group[self.atom], count)
-        look = self._look(count)
+        look = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), self.group)  # (G, G)
+        look = np.where(np.isfinite(look), look, 0.0)  # nothing known speaks for nothing
         score = np.maximum(place, place.T)
         good = ~apart & (classes[:, None] == classes[None]) & (score >= self.config.link_place)
         good &= look >= self.config.link_look
         a, b = np.nonzero(np.triu(good, 1))
         pairs: list[tuple[int, int, float, float]] = []
         used: set[int] = set()
-        for i in np.argsort(-(score[a, b] + 0.5 * look[a, b]), kind="stable"):
+        for i in np.argsort(-(score[a, b] + 0.2 * look[a, b].clip(-1, 1)), kind="stable"):
             pair = (int(a[i]), int(b[i]))
             ids = tuple(sorted(self.tracklets[np.isin(self.group, pair)].tolist()))
             if ids not in rejected and not used & set(pair):
                 used |= set(pair)
                 pairs.append((*pair, float(score[pair]), float(look[pair])))
         return pairs
-
-    def _look(self, count: int) -> Array:
-        """(G, G) best similarity of looks between the identities that two groups hold."""
-        best = np.full((count, len(self.similarity)), -1.0)
-        np.maximum.at(best, self.group, self.similarity[self.identity])  # (G, I)
-        result = np.full((count, count), -1.0)
-        np.maximum.at(result.T, self.group, best.T[self.identity])
-        return result
 
     def _verify(self, own_iou: Array, a: int, b: int) -> bool:
         """Does the joint solid explain the boxes of both parts?"""
@@ -4946,7 +5030,49 @@ class Linker:
     def _views_of(self, rows: BoolArray) -> BoolArray:
         """(V,) frames with a pose in which one of the rows is seen."""
         seen = self.table.frame[rows & (self.table.score >= self.config.min_score)]
-        return np.isin(self.poses.frame[self.poses.known], seen)
+        return np.isin(self.located, seen)
+
+
+def _grouped_max(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArray[Any]:
+    """(G, G) largest entry of a matrix (L, L) between the members of two groups, (L,) from 0."""
+    order = np.argsort(group, kind="stable")
+    starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 1))
+    by_row = np.maximum.reduceat(matrix[np.ix_(order, order)], starts, axis=0)
+    return np.asarray(np.maximum.reduceat(by_row, starts, axis=1))
+
+
+def _most_alike_first(near: Array, banned: BoolArray, apart: BoolArray, margin: float) -> IntArray:
+    """Join G things as long as two are alike (near > 0) and no rival is within the margin.
+
+    Args:
+        near: (G, G) how alike, log; banned: which must never be joined; apart: which are surely
+            different, so that one rivals the other. Between groups the most alike members count.
+    Returns:
+        group of each, (G,).
+    """
+    near, banned, apart = np.where(banned, -np.inf, near), banned.copy(), apart.copy()
+    np.fill_diagonal(near, -np.inf)
+    np.fill_diagonal(apart, False)
+    i, j = np.nonzero(np.triu(near > 0, 1))
+    order = np.argsort(-near[i, j], kind="stable")
+    pairs = np.column_stack([i, j])[order]
+    group, joined = np.arange(len(near)), True
+    while joined:
+        joined = False
+        for a, b in group[pairs]:
+            a, b = group[a], group[b]
+            rival = near[a, b] - margin
+            if near[a, b] <= 0 or (near[a, apart[b]] > rival).any():
+                continue
+            if (near[b, apart[a]] > rival).any():
+                continue
+            near[a] = near[:, a] = np.maximum(near[a], near[b])
+            banned[a] = banned[:, a] = banned[a] | banned[b]
+            apart[a] = apart[:, a] = apart[a] | apart[b]
+            near[b] = near[:, b] = near[a, a] = near[a, banned[a]] = near[banned[a], a] = -np.inf
+            apart[b] = apart[:, b] = apart[a, a] = False
+            group[group == b], joined = a, True
+    return np.unique(group, return_inverse=True)[1]
 
 
 def _segments_of(table: TrackTable, cut_gap: int) -> tuple[IntArray, IntArray]:
@@ -5600,7 +5726,7 @@ class Workspace:
 
     def path(self, stage: str, *key: Any) -> Path:
         """File of a stage's result for this key (configs and strings)."""
-        columns = [f.name for f in dataclasses.fields(TrackTable)]
+        columns = [f.name for x in (TrackTable, TrackResult) for f in dataclasses.fields(x)]
         text = json.dumps([__version__, columns, key], sort_keys=True, default=dataclasses.asdict)
         return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
@@ -5737,40 +5863,44 @@ def _set_threads(threads: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class TrackResult:
-    """Identities of a video from the tracker: rows, similarity of the identities, class names,
-    messages; `fixed` when they were given (--tracks) and nothing may join, split or renumber them.
+    """Identities of a video from the tracker.
+
+    Attributes:
+        table: the rows; look: (n, E) fused embeddings of those of them that the tracker embedded,
+            look_row: (n,) which these are.
+        class_names; messages: for the user.
+        fixed: identities were given (--tracks): nothing may join, split or renumber them.
     """
 
     table: TrackTable
-    similarity: Array
     class_names: tuple[str, ...]
-    messages: tuple[str, ...]
+    messages: tuple[str, ...] = ()
     fixed: bool = False
+    look: npt.NDArray[np.float16] = field(default_factory=lambda: np.empty((0, 0), np.float16))
+    look_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def save(self, path: Path) -> None:
         """Write as npz, atomically."""
         columns = {f.name: getattr(self.table, f.name) for f in dataclasses.fields(TrackTable)}
+        columns |= {"look": self.look, "look_row": self.look_row}
         names, messages = np.array(self.class_names, str), np.array(self.messages, str)
         with atomic(path) as part, part.open("wb") as file:
-            np.savez_compressed(
-                file, **columns, similarity=self.similarity, class_names=names, messages=messages,
-                fixed=self.fixed,
-            )  # fmt: skip
+            facts = {"class_names": names, "messages": messages, "fixed": np.array(self.fixed)}
+            np.savez_compressed(file, **columns | facts)
 
     @staticmethod
     def load(path: Path) -> TrackResult:
         """Read what `save` wrote."""
         try:
             with np.load(path, allow_pickle=False) as data:
-                columns = [data[f.name] for f in dataclasses.fields(TrackTable)]
-                names, messages = data["class_names"].tolist(), data["messages"].tolist()
-                table, similarity = TrackTable(*columns), data["similarity"]
-                fixed = "fixed" in data and bool(data["fixed"])
+                table = TrackTable(*(data[f.name] for f in dataclasses.fields(TrackTable)))
+                names, messages = (tuple(data[k].tolist()) for k in ("class_names", "messages"))
+                fixed, look = bool(data["fixed"]), data["look"]
+                return TrackResult(table, names, messages, fixed, look, data["look_row"])
         except (KeyError, ValueError, OSError) as error:
             raise ReobjError(
                 f"{path}: not readable, or of another version ({error}); delete it and run again"
             ) from error
-        return TrackResult(table, similarity, tuple(names), tuple(messages), fixed)
 
 
 def save_poses(path: Path, poses: Poses) -> None:
@@ -5899,6 +6029,7 @@ def _track_frames(
     )
     camera = None if poses is None else _scaled_camera(poses.camera, video.scale)
     steps: list[tuple[int, Tracks]] = []
+    looks: list[tuple[IntArray, Floats]] = []
     progress = Progress("track", video.expected)
     try:
         for frame in video:
@@ -5906,6 +6037,7 @@ def _track_frames(
             pose = pose_of.get(frame.index)
             step = tracker.step(detections, frame.image, cam_from_world=pose, camera=camera)
             steps.append((frame.index, step))
+            looks.append(tracker.latest_looks())
             progress.step()
     except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
@@ -5921,7 +6053,21 @@ def _track_frames(
         )
     table = TrackTable.from_steps([i for i, _ in steps], [s for _, s in steps], video.scale)
     messages = [*source.messages, *_video_messages(video, table)]
-    return TrackResult(table, _identity_similarity(tracker), source.class_names, tuple(messages))
+    look, look_row = _table_looks(table, [i for i, _ in steps], looks)
+    return TrackResult(table, source.class_names, tuple(messages), False, look, look_row)
+
+
+def _table_looks(
+    table: TrackTable, frames: Sequence[int], looks: Sequence[tuple[IntArray, Floats]]
+) -> tuple[npt.NDArray[np.float16], IntArray]:
+    """Embeddings that the tracker computed, (n, E), and the table rows they belong to, (n,)."""
+    keys = zip(table.frame.tolist(), table.detection_index.tolist(), strict=True)
+    at = {key: i for i, key in enumerate(keys)}
+    found = zip(frames, looks, strict=True)
+    rows = [at.get((frame, d), -1) for frame, (index, _) in found for d in index.tolist()]
+    row = np.array(rows, np.int64)
+    parts = [part for _, part in looks if part.size] or [np.empty((0, 0), np.float32)]
+    return np.concatenate(parts)[row >= 0].astype(np.float16), row[row >= 0]
 
 
 def _detect_cached(frame: Frame, source: _Source, cache: DetectionCache | None) -> Detections:
@@ -5949,20 +6095,6 @@ def _scaled_camera(camera: Camera, scale: float) -> Camera:
     K = camera.K
     params = (K[0, 0] * scale, K[1, 1] * scale, K[0, 2] * scale, K[1, 2] * scale)
     return Camera("PINHOLE", round(camera.width * scale), round(camera.height * scale), params)
-
-
-def _identity_similarity(tracker: Tracker) -> Array:
-    """(I, I) normalised similarity of the tracker's identities: the most alike pair of views
-    counts.
-    """
-    count, gallery = len(tracker.last_seen), tracker.gallery
-    cosine = np.zeros((count, count))
-    if gallery.rows.size:
-        for i in range(count):
-            views = gallery.rows[i, : max(1, gallery.count[i])]  # (k, E)
-            cosine[i] = gallery.similarity(views, np.arange(count)).max(0)
-        cosine = tracker.stats.normalised(cosine)
-    return cosine
 
 
 def _video_messages(video: Video, table: TrackTable) -> list[str]:
@@ -6045,24 +6177,22 @@ def _moving_rows(track: TrackResult, config: ObjectsConfig) -> TrackTable:
 def make_objects(
     track: TrackResult, poses: Poses | None, config: Config, out: Path, seconds: dict[str, float]
 ) -> RunResult:
-    """Link tracklets and fit one solid per object; without poses the tracker's identities are the
-    objects.
-    """
+    """Link tracklets, by looks and with poses by place, and fit one solid per object."""
     started = time.monotonic()
-    table, events, fits, views = track.table, [], None, None
-    if poses is not None and poses.known.sum() >= config.objects.min_views and len(table):
+    table, events, fits, views, fit = track.table, [], None, None, None
+    located = poses is not None and poses.known.sum() >= config.objects.min_views
+    if located and poses is not None:
         fit = _fitter(config.objects, poses, track.class_names)
-        if config.objects.link and not track.fixed:
-            linker = Linker(table, track.similarity, poses, fit, config.objects)
-            table, events = table.with_objects(linker.run()), linker.events
-        elif not track.fixed:
-            table = table.with_objects(table.object_id)
+    if len(table) and config.objects.link and not track.fixed:
+        linker = Linker(track, poses if located else None, fit, config.objects)
+        table, events = table.with_objects(linker.run()), linker.events
+    elif len(table) and not track.fixed:
+        table = table.with_objects(table.object_id)
+    if len(table) and poses is not None and fit is not None:
         classes = object_classes(table)
         group = np.searchsorted(list(classes), table.object_id)
         views = gather_views(table, poses, group, len(classes), config.objects.min_score)
         fits = fit(views, list(classes.values()))
-    elif len(table) and not track.fixed:
-        table = table.with_objects(table.object_id)
     objects = _object_entries(table, track.class_names, fits, views, config.objects)
     seconds["objects"] = time.monotonic() - started
     result = RunResult(out, table, track.class_names, objects, poses, fits, seconds, [])
@@ -6209,8 +6339,8 @@ def _reject(entry: dict[str, Any], reason: str) -> None:
     entry |= {"status": "rejected", "reason": reason}
 
 
-def _rounded(value: float, digits: int) -> float | None:
-    return round(float(value), digits) if math.isfinite(value) else None
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
 def _numbers(values: Array) -> list[float]:
@@ -6229,7 +6359,12 @@ def _spans_of(rows: TrackTable) -> list[list[int]]:
 def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
     """The "world" of objects.json: units, gravity, scale, registered frames, joins and splits."""
     if poses is None:
-        return {"units": None, "source": "none", "registered_frames": 0, "links": []}
+        return {
+            "units": None,
+            "source": "none",
+            "registered_frames": 0,
+            "links": [dataclasses.asdict(e) for e in events],
+        }
     scale = fits.scale if fits is not None else None
     up = fits.up if fits is not None and fits.up.any() else poses.up_in_world
     return {
@@ -7200,7 +7335,7 @@ def read_tracks(
         unnamed = names == ("object",)
         table = _as_known(like.table, table, unnamed)
         names = like.class_names if unnamed else names
-    return TrackResult(table, np.empty((0, 0)), names, tuple(found.messages), fixed=True)
+    return TrackResult(table, names, tuple(found.messages), fixed=True)
 
 
 def _as_known(known: TrackTable, table: TrackTable, unnamed: bool) -> TrackTable:

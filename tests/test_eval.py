@@ -303,7 +303,7 @@ def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
     rt.save_poses(tmp_path / "cache" / "last-poses.npz", poses)
     table = rt.TrackTable(*(np.empty(0, np.int64) for _ in range(3)), np.empty((0, 4)),
                           np.empty(0), np.empty(0, np.int64), np.empty(0, np.int64))  # fmt: skip
-    rt.TrackResult(table, np.zeros((0, 0)), ("chair",), ()).save(tmp_path / "cache/last-tracks.npz")
+    rt.TrackResult(table, ("chair",)).save(tmp_path / "cache/last-tracks.npz")
     true = {"id": 4, "center": [0.5, 0.2, 1.0], "half_axes": [0.2, 0.3, 0.4],
             "world_from_obj": np.eye(3).tolist()}  # fmt: skip
     (tmp_path / "gt_objects.json").write_text(json.dumps({"objects": [true]}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -71,11 +72,11 @@ def table_of(poses: rt.Poses, seed: int = 0) -> rt.TrackTable:
 
 
 def linked(
-    table: rt.TrackTable, poses: rt.Poses, similarity: np.ndarray | None = None
+    table: rt.TrackTable, poses: rt.Poses | None, look: np.ndarray | None = None
 ) -> rt.RunResult:
-    count = int(table.object_id.max())
-    similarity = np.ones((count, count)) if similarity is None else similarity
-    track = rt.TrackResult(table, similarity, NAMES, ())
+    """`make_objects`; look: (N, E) of the rows, default none."""
+    seen = {} if look is None else {"look": look, "look_row": np.arange(len(table))}
+    track = rt.TrackResult(table, NAMES, **seen)  # type: ignore[arg-type]
     return rt.make_objects(track, poses, rt.Config(), Path("unused"), {})
 
 
@@ -174,6 +175,68 @@ def test_different_classes_are_never_joined() -> None:
     assert [o["class"] for o in linked(table, poses).objects] == ["chair", "cup"]
 
 
+@pytest.mark.parametrize(
+    ("near", "banned", "apart", "group"),
+    [
+        ([(0, 1, 3.0)], [], [], [0, 0, 1]),  # alike
+        ([(0, 1, 0.9)], [], [], [0, 1, 2]),  # further apart than the middle
+        ([(0, 1, 3.0)], [(0, 1)], [(0, 1)], [0, 1, 2]),  # seen together
+        ([(0, 1, 3.0), (1, 2, 3.0)], [], [], [0, 0, 0]),  # through a third
+        ([(0, 1, 3.0), (1, 2, 2.0)], [(0, 2)], [(0, 2)], [0, 0, 1]),  # the better one of two twins
+        ([(0, 1, 3.0), (1, 2, 2.9)], [(0, 2)], [(0, 2)], [0, 1, 2]),  # twins about as near: apart
+        ([(0, 1, 3.0), (1, 2, 2.9)], [(0, 2)], [], [0, 0, 1]),  # two boxes on one are no rivals
+    ],
+)
+def test_most_alike_are_joined_first(
+    near: list[tuple[int, int, float]],
+    banned: list[tuple[int, int]],
+    apart: list[tuple[int, int]],
+    group: list[int],
+) -> None:
+    matrix, no = np.full((3, 3), -np.inf), np.zeros((2, 3, 3), bool)
+    for i, j, ratio in near:
+        matrix[i, j] = matrix[j, i] = np.log(ratio)
+    for k, pairs in enumerate((banned, apart)):
+        for i, j in pairs:
+            no[k, i, j] = no[k, j, i] = True
+    assert rt._most_alike_first(matrix, no[0], no[1], np.log(1.3)).tolist() == group
+
+
+def looks_of(table: rt.TrackTable, chair: np.ndarray, twins: float) -> np.ndarray:
+    """Noisy looks (N, 12) of the true chairs (N,), with this cosine between chairs 0 and 1."""
+    own = np.eye(3, 12)
+    own[1] = twins * own[0] + np.sqrt(1 - twins**2) * own[1]
+    rows = own[chair] + np.random.default_rng(1).normal(0, 0.03, (len(table), 12))
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize(
+    ("tracker", "twins", "objects", "kinds"),
+    [
+        ([1, 2, 3, 4, 5, 6], 0.5, 3, {"join"}),  # all came back under new identities
+        ([1, 2, 3, 2, 1, 3], 0.5, 3, {"join", "split"}),  # two were taken for each other
+        ([1, 2, 3, 1, 2, 3], 0.5, 3, set()),  # right already
+        ([1, 2, 3, 4, 5, 3], 0.999, 5, set()),  # twins that nothing tells apart stay apart
+    ],
+)
+def test_looks_alone_decide_without_poses(
+    tracker: list[int], twins: float, objects: int, kinds: set[str]
+) -> None:
+    """Three chairs, each seen before frame 40 and after frame 80; what the tracker made of them."""
+    table = table_of(walk())
+    table = table[(table.frame < 40) | (table.frame >= 80)]
+    chair, visit = table.detection_index, (table.frame >= 80).astype(np.int64)
+    piece = chair + 3 * visit
+    ids = np.array(tracker)[piece]
+    table = dataclasses.replace(table, object_id=ids, tracklet_id=piece + 1)
+    result = linked(table, None, looks_of(table, chair, twins))
+    assert len(result.objects) == objects
+    assert {e["kind"] for e in result.world["links"]} == kinds
+    assert all(e["place_iou"] is None and e["kept"] for e in result.world["links"])
+    found = result.table.object_id
+    assert all(len({*chair[found == o].tolist()}) == 1 for o in np.unique(found))
+
+
 # ---- Fitting ----
 
 
@@ -192,7 +255,7 @@ def test_objects_come_out_where_they_are() -> None:
 def test_without_poses_objects_are_the_tracks() -> None:
     result = linked(table_of(walk()), walk())
     flat = rt.make_objects(
-        rt.TrackResult(table_of(walk()), np.ones((3, 3)), NAMES, ()),
+        rt.TrackResult(table_of(walk()), NAMES),
         None,
         rt.Config(),
         Path("x"),

@@ -203,7 +203,7 @@ def tracks_of_walk(poses: rt.Poses) -> rt.TrackResult:
     tracklet = obj + 1 + n * ((obj == 1) & (frame > 8))
     score = np.full(len(frame), 0.9)
     table = rt.TrackTable(frame, obj + 1, tracklet, boxes[frame, obj], score, obj, obj)
-    return rt.TrackResult(table, np.eye(n), NAMES, ("a <b>warning</b>",))
+    return rt.TrackResult(table, NAMES, ("a <b>warning</b>",))
 
 
 def write_page(folder: Path, in_3d: bool = True, config: rt.Config | None = None) -> Path:
