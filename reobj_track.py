@@ -57,7 +57,7 @@ import time
 import urllib.request
 import zipfile
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -323,8 +323,11 @@ class TrackerConfig:
     novelty: float = _opt(
         0.95, "a view less similar than this to all kept ones is a new view (cosine)"
     )
+    return_probability: float = _opt(
+        0.5, "recognise a return from this probability (appearance models with a calibration)"
+    )
     return_similarity: float = _opt(
-        0.5, "recognise a return above this similarity (0: as different objects, 1: as same)"
+        0.5, "other models: above this similarity (0: as different objects, 1: as same)"
     )
     return_margin: float = _opt(0.15, "and only if no other identity comes closer than this")
     prior_different: float = _opt(
@@ -2195,7 +2198,7 @@ class CropEmbedder(Embedder):
         threads: int = 0,
         offline: bool = False,
     ) -> None:
-        self.config = config or EmbedConfig()
+        self.config, self.model = config or EmbedConfig(), f"crops:{model}"
         self.backbone = _Backbone(model, self.config, threads, offline)
         self.output = self._deepest_map()
         block = self.config.conv_block
@@ -2410,6 +2413,7 @@ class _LazyEmbeddings:
         self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
         self.weight = weight
         self.rows: Floats | None = None  # (D, E)
+        self.split = 0  # width of the foreground in the rows
         self.done = np.zeros(len(detections), bool)
 
     @property
@@ -2434,7 +2438,7 @@ class _LazyEmbeddings:
             assert self.embedder is not None and self.frame is not None
             embeddings = self.embedder(self.frame, self.detections, rows)
             parts = (embeddings.foreground, embeddings.background)
-        weight = self.weight if parts[1].shape[1] else 1.0
+        weight, self.split = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
         fused = np.concatenate(
             [
                 math.sqrt(weight) * _unit_rows(parts[0]),
@@ -2461,6 +2465,7 @@ class Gallery:
         self.config = config
         self.rows = np.zeros((0, config.views, 0), np.float32)  # (I, K, E)
         self.count = np.zeros(0, np.int64)  # (I,) views held
+        self.split = 0  # width of the foreground in the rows
 
     def add(self, identity: IntArray, rows: Floats) -> None:
         """Store one new view (E,) for each of N different identities: a new one if it is novel,
@@ -2500,6 +2505,23 @@ class Gallery:
         empty = np.arange(views.shape[1]) >= self.count[identity][:, None]  # (I, K)
         return np.asarray(np.where(empty, -2.0, cosine).max(2), np.float64)
 
+    def parts(self, rows: Floats, identity: IntArray) -> tuple[Array, Array]:
+        """Cosines of foreground and background (N, I) between each row (N, E) and the most
+        similar view of each identity (I,); NaN where there is none.
+        """
+        shape = (len(rows), len(identity), self.config.views)
+        if not rows.size or not len(identity) or self.rows.shape[2] != rows.shape[1]:
+            return np.full(shape[:2], np.nan), np.full(shape[:2], np.nan)
+        views = self.rows[identity].reshape(-1, rows.shape[1])  # (I * K, E)
+        empty = np.arange(self.config.views) >= self.count[identity][:, None]  # (I, K)
+        fused = np.where(empty, -2.0, (rows @ views.T).reshape(shape))  # (N, I, K)
+        best = fused.argmax(2)[..., None]
+        fore, back = (
+            np.where(empty, np.nan, part.reshape(shape))
+            for part in part_cosines(rows, views, self.split)
+        )
+        return np.take_along_axis(fore, best, 2)[..., 0], np.take_along_axis(back, best, 2)[..., 0]
+
     def _grow(self, identities: int, width: int) -> None:
         if self.rows.shape[2] == 0:
             self.rows = np.zeros((len(self.count), self.config.views, width), np.float32)
@@ -2513,29 +2535,148 @@ class Gallery:
             self.count = np.concatenate([self.count, np.zeros(extra, np.int64)])
 
 
-class SimilarityStats:
-    """Distribution of the cosine between different objects and between views of one object, from
-    the video itself.
+class SameObject:
+    """Is it the same object? From the cosines of foreground and background to a probability.
 
-    Two detections in one frame are different objects; a track's new view and its last one are the
-    same. Both are seen in every frame, so the decision adapts to any embedding without training
-    labels.
+    With a calibration (fitted by `examples/rank_k.py --calibrate` and kept beside the model) the
+    log odds are linear in `closeness`, and their slopes change with the angle between the views
+    and the time between them: a background is worth less from another side. How close different
+    objects of the video are (two detections of one frame) shifts the zero of the closeness.
+    Without a calibration, the fused cosine is compared with what the video itself shows: two
+    detections of one frame are different objects, a track's new view and its first one are the
+    same. That adapts to any embedding without labels.
+
+    Args:
+        calibration: coefficients of `terms` for each set of known inputs: "f" the foreground, "b"
+            the background, "a" the angle, "g" the gap, "r" the closest rival; "f", "fb", "fa" ...;
+            and "apart", the mean closeness of both parts of different objects in one frame.
+    Attributes:
+        sums: count, sum, sum of squares of the fused cosine of different and of same objects.
+        apart: (3,) count and sums of the closeness of both parts of different objects of a frame.
     """
 
-    def __init__(self, config: TrackerConfig) -> None:
+    KNOWN = "fbagr"
+
+    def __init__(
+        self, config: TrackerConfig, calibration: Mapping[str, Sequence[float]] | None = None
+    ) -> None:
+        self.config, self.weight = config, config.foreground_weight
+        self.calibration = {k: np.asarray(v, np.float64) for k, v in (calibration or {}).items()}
+        self.usual = self.calibration.pop("apart", np.zeros(2))  # (2,)
+        self.apart = config.prior_weight * np.append(1.0, self.usual)
+        prior = {False: config.prior_different, True: config.prior_same}
         self.sums = {
-            False: np.array(
-                [1.0, config.prior_different, config.prior_different**2 + config.prior_std**2]
-            ),
-            True: np.array([1.0, config.prior_same, config.prior_same**2 + config.prior_std**2]),
+            same: config.prior_weight * np.array([1.0, mean, mean**2 + config.prior_std**2])
+            for same, mean in prior.items()
         }
-        for same in self.sums:
-            self.sums[same] *= config.prior_weight
+
+    @staticmethod
+    def for_model(config: TrackerConfig, model: str) -> SameObject:
+        """Look for the calibration of an appearance model; without one, learn from the video."""
+        path = calibration_file(model)
+        if not path.is_file():
+            return SameObject(config)
+        try:
+            return SameObject(config, json.loads(path.read_text())["same_object"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ReobjError(
+                f"{path}: no calibration ({error!r}): delete it, or fit one with "
+                "examples/rank_k.py --calibrate"
+            ) from error
+
+    @staticmethod
+    def closeness(cosine: npt.ArrayLike) -> Array:
+        """Monotone in the cosine, steep where two views are nearly equal."""
+        return np.asarray(-np.log(1.03 - np.minimum(cosine, 1.0)))
+
+    def terms(self, letters: str, inputs: Array) -> Array:
+        """Regressors (N, T) of inputs (N, 5), in the order of KNOWN: 1, the closeness of each part,
+        the lead over the rival, and angle and gap with their products with the parts.
+        """
+        shift = self.apart[1:] / self.apart[0] - self.usual  # (2,) of this video
+        parts = (self.closeness(inputs[:, :2]) - shift)[:, : 1 + ("b" in letters)]  # (N, 1 or 2)
+        columns = [np.ones((len(parts), 1)), parts]
+        if "r" in letters:
+            fused = self.fused(inputs[:, 0], inputs[:, 1])
+            columns.append((self.closeness(fused) - self.closeness(inputs[:, 4]))[:, None])
+        for letter, value in (("a", inputs[:, 2] / 90), ("g", np.log1p(inputs[:, 3]) / 6)):
+            if letter in letters:
+                columns += [value[:, None], value[:, None] * parts]
+        return np.concatenate(columns, 1)
+
+    def fused(self, foreground: Array, background: Array) -> Array:
+        """Weighted mean of the two cosines; of the foreground's alone where the other is NaN."""
+        both = self.weight * foreground + (1 - self.weight) * background
+        return np.where(np.isnan(background), foreground, both)
+
+    def logit(
+        self,
+        foreground: npt.ArrayLike,
+        background: npt.ArrayLike | None = None,
+        view_angle_deg: npt.ArrayLike | None = None,
+        gap_frames: npt.ArrayLike | None = None,
+        rival: npt.ArrayLike | None = None,
+    ) -> Array:
+        """Log of the odds that it is the same object, where both are equally likely beforehand;
+        within about +-7: one case in a thousand is like nothing that was seen.
+
+        Args:
+            foreground, background: cosines; any shapes that broadcast, NaN or None: unknown.
+            view_angle_deg: angle between the directions of view; gap_frames: frames between them.
+            rival: fused cosine of the most similar other candidate: then, the odds that the better
+                of the two is right (calibrated models only).
+        """
+        given = (foreground, background, view_angle_deg, gap_frames, rival)
+        arrays = [np.asarray(np.nan if x is None else x, np.float64) for x in given]
+        inputs = np.stack([x.ravel() for x in np.broadcast_arrays(*arrays)], 1)  # (N, 5)
+        result = np.full(len(inputs), -np.inf)  # no look: nothing speaks for it
+        if not self.calibration:
+            result = self._logit_of_video(self.fused(inputs[:, 0], inputs[:, 1]))
+        known = np.isfinite(inputs)
+        for letters, weights in sorted(self.calibration.items(), key=lambda item: len(item[0])):
+            rows = known[:, [self.KNOWN.index(c) for c in letters]].all(1)  # the fullest set last
+            result[rows] = self.terms(letters, inputs[rows]) @ weights
+        return _with_outliers(result).reshape(np.broadcast_shapes(*(x.shape for x in arrays)))
+
+    def probability(
+        self,
+        foreground: npt.ArrayLike,
+        background: npt.ArrayLike | None = None,
+        view_angle_deg: npt.ArrayLike | None = None,
+        gap_frames: npt.ArrayLike | None = None,
+        rival: npt.ArrayLike | None = None,
+        prior: float = 0.5,
+    ) -> Array:
+        """Probability of the same object, given how likely it was beforehand; see `logit`."""
+        logit = self.logit(foreground, background, view_angle_deg, gap_frames, rival)
+        return np.asarray(1 / (1 + np.exp(-logit - math.log(prior / (1 - prior)))))
+
+    def returned(
+        self, foreground: Array, background: Array, gap: npt.ArrayLike, rival: Array
+    ) -> BoolArray:
+        """Is the best candidate of a newcomer the same object? (n,) arrays; rival: NaN for none.
+
+        Without a calibration: closer to "same" than to "different", and clearly before the rival.
+        """
+        if self.calibration:
+            chance = self.probability(foreground, background, None, gap, rival)
+            return np.asarray(chance >= self.config.return_probability)
+        alike = self.normalised(self.fused(foreground, background))
+        lead = alike - np.nan_to_num(self.normalised(rival), nan=-1.0)
+        return np.asarray(
+            (alike >= self.config.return_similarity) & (lead >= self.config.return_margin)
+        )
 
     def add(self, cosine: Array, same: bool) -> None:
-        """Add observed cosines (N,)."""
+        """Add cosines (N,) of the fused embeddings that the video showed."""
         cosine = cosine[cosine > -1.5]
         self.sums[same] += [len(cosine), cosine.sum(), (cosine**2).sum()]
+
+    def add_apart(self, foreground: Array, background: Array) -> None:
+        """Add cosines (N,) of detections of one class in one frame: different objects."""
+        both = self.closeness(np.stack([foreground, background], 1))  # (N, 2)
+        both = both[np.isfinite(both).all(1)]
+        self.apart += np.append(len(both), both.sum(0))
 
     def mean_std(self, same: bool) -> tuple[float, float]:
         """Mean and standard deviation of the cosine of pairs of the same / of different objects."""
@@ -2547,6 +2688,39 @@ class SimilarityStats:
         """Map cosines so that 0 is the mean of different and 1 the mean of same objects."""
         different, same = self.mean_std(False)[0], self.mean_std(True)[0]
         return (cosine - different) / max(same - different, 0.05)
+
+    def _logit_of_video(self, cosine: Array) -> Array:
+        """Linear discriminant of the two normal distributions seen in the video, (N,)."""
+        (low, low_std), (high, high_std) = self.mean_std(False), self.mean_std(True)
+        gap, var = max(high - low, 0.05), max((low_std**2 + high_std**2) / 2, 0.03**2)
+        return np.asarray(np.nan_to_num(gap / var * (cosine - (low + high) / 2), nan=-np.inf))
+
+
+def _with_outliers(logit: Array, share: float = 1e-3) -> Array:
+    """Bound log odds as if this share of either kind were like the other; -inf stays."""
+    odds = np.exp(logit.clip(None, 50))
+    return np.asarray(np.where(odds > 0, np.log((odds + share) / (1 + share * odds)), -np.inf))
+
+
+def part_cosines(a: npt.NDArray[Any], b: npt.NDArray[Any], split: int) -> tuple[Array, Array]:
+    """Cosines (N, M) of the foregrounds and of the backgrounds of fused rows (N, E) and (M, E);
+    split: width of the foreground part. NaN where a row has no such part.
+    """
+    return _cosine(a[:, :split], b[:, :split]), _cosine(a[:, split:], b[:, split:])
+
+
+def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
+    """Cosines (N, M) of rows (N, E) and (M, E), NaN for rows of zeros."""
+    length = np.outer(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
+    return np.asarray(np.where(length > 1e-9, (a @ b.T) / np.maximum(length, 1e-9), np.nan))
+
+
+def calibration_file(model: str) -> Path:
+    """Where the calibration of an appearance model lies: beside its file, else in models/."""
+    kind, _, backbone = model.rpartition(":")
+    path = Path(backbone)
+    folder = path.parent if path.suffix == ".onnx" else Path(__file__).resolve().parent / "models"
+    return folder / f"{kind + '_' if kind else ''}{path.stem}.json"
 
 
 # ---- Tracker -----------------------------------------------------------------------------------
@@ -2689,7 +2863,7 @@ class Tracker:
         """Forget everything: the next video starts with identity 1."""
         self.frame_number = -1
         self.gallery = Gallery(self.config)
-        self.stats = SimilarityStats(self.config)
+        self.stats = SameObject.for_model(self.config, getattr(self.embedder, "model", ""))
         self.last_seen = np.zeros(0, np.int64)  # (I,) frame of each identity's last detection
         self.identity_class = np.zeros(0, np.int64)  # (I,)
         self._tracklets = itertools.count(1)
@@ -2754,6 +2928,8 @@ class Tracker:
             self.config.foreground_weight,
         )
         self._latest = lazy
+        if embeddings is not None and self.stats.calibration:  # of another model
+            self.stats = SameObject(self.config)
         self._predict(frame, cam_from_world, camera)
         track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
         self._correct(detections, track_of)
@@ -2898,6 +3074,7 @@ class Tracker:
         if not len(rows):
             return
         look = lazy.get(rows)  # (n, E)
+        self.gallery.split = lazy.split
         live.look = _widen(live.look, look)
         known = live.embedded[t] >= 0
         keep = np.where(known, self.config.look_momentum, 0.0)[:, None]
@@ -2910,6 +3087,8 @@ class Tracker:
         cosine = (look @ look.T).astype(np.float64)  # (n, n)
         pair = np.triu(class_id[:, None] == class_id[None], 1)
         self.stats.add(cosine[pair], same=False)
+        fore, back = part_cosines(look, look, self.gallery.split)
+        self.stats.add_apart(fore[pair], back[pair])
         old = identity >= 0
         views = (
             self.gallery.rows[identity[old]]
@@ -2952,32 +3131,35 @@ class Tracker:
         return self._drop(stale, track_of)
 
     def _returns(self, ready: IntArray) -> IntArray:
-        """Recognise known identities in newly confirmed tracks: appearance, with a margin against
-        every other.
+        """Recognise known identities in newly confirmed tracks: the look must be probably the same,
+        also in view of the next best candidate.
 
         Never gated by overlap, aspect ratio or pixel distance: the camera may return from anywhere.
         An identity that was seen while the newcomer was already in view is another object.
         """
-        live, config = self._live, self.config
+        live = self._live
         result = np.full(len(ready), -1, np.int64)
         if not len(ready) or not live.look.shape[1] or not self.config.remember:
             return result
         identity = np.flatnonzero(self.last_seen < live.first[ready].max(initial=0))  # (I,)
-        alike = self.stats.normalised(self.gallery.similarity(live.look[ready], identity))  # (n, I)
+        gone = np.tile(self.frame_number - self.last_seen[identity], (len(ready), 1))
+        fore, back = self.gallery.parts(live.look[ready], identity)  # (n, I)
         possible = self.last_seen[identity][None] < live.first[ready][:, None]
         possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
-        alike = np.where(possible & (live.embedded[ready] >= 0)[:, None], alike, -1.0)
+        possible &= (live.embedded[ready] >= 0)[:, None] & np.isfinite(fore)
+        fused = np.where(possible, self.stats.fused(fore, back), -np.inf)  # (n, I)
         claimed = np.full(len(identity), -1, np.int64)
-        _assign(
-            np.where(alike >= config.return_similarity, 2 - alike, np.inf).clip(0), np.inf, claimed
-        )
-        for column in np.flatnonzero(claimed >= 0):
-            row = claimed[column]
-            rivals = np.concatenate(
-                [np.delete(alike[row], column), np.delete(alike[:, column], row), [-1.0]]
-            )
-            if alike[row, column] - rivals.max() >= config.return_margin:
-                result[row] = identity[column]
+        likely = possible & (self.stats.logit(fore, back, None, gone) >= 0)
+        _assign(np.where(likely, 1 - fused, np.inf).clip(0), np.inf, claimed)
+        column = np.flatnonzero(claimed >= 0)
+        row, pick = claimed[column], np.arange(len(column))
+        others_of_row, others_of_column = fused[row], fused[:, column].T  # (m, I), (m, n)
+        others_of_row[pick, column] = others_of_column[pick, row] = -np.inf
+        rival = np.concatenate([others_of_row, others_of_column], 1).max(1, initial=-np.inf)
+        rival[np.isinf(rival)] = np.nan
+        at = (row, column)
+        good = self.stats.returned(fore[at], back[at], gone[at], rival)
+        result[row[good]] = identity[column[good]]
         return result
 
     def _drop(self, rows: BoolArray, track_of: IntArray) -> IntArray:

@@ -11,6 +11,8 @@ Protocols:
   open    gallery: every scene of the set, every class (the thesis's Rank-k).
   class   gallery: same class, same scene; also where only one instance of the class is there.
   twins   as `class`, only queries whose gallery holds another instance of the class.
+  single  as `twins`, but one random view of each object in the gallery (mean of 10 draws): the
+          single-shot protocol of re-identification, and what a tracker meets after one short visit.
   same    rendered rooms: as `twins`, but only objects of one model (they look identical).
 Gaps: `any` other frame; `away`: more than `--away` frames (default 30, the frames for which a
 tracker coasts): what is nearer in time is bridged by motion and needs no re-identification.
@@ -66,6 +68,7 @@ ANGLES_DEG = (0, 15, 30, 45, 60, 90, 180)
 GAPS = (0, 30, 60, 120, 240, 10**9)  # frames
 RANKS = (1, 5, 20, 50)
 DRAWS = 1000  # of the bootstrap
+DRAWN_GALLERIES = 10  # of the single-shot protocol
 
 
 # ---- Scenes --------------------------------------------------------------------------------------
@@ -554,6 +557,27 @@ def rank_queries(
     return rank, precision
 
 
+def one_view(pairs: Pairs, allowed: BoolArray, rng: np.random.Generator) -> BoolArray:
+    """(N, N) allowed, thinned at random to one view of each object for every query."""
+    order = np.argsort(pairs.identity, kind="stable")
+    _, first = np.unique(pairs.identity[order], return_index=True)
+    key = np.where(allowed, rng.random(allowed.shape), -1)  # (N, N)
+    best = np.maximum.reduceat(key[:, order], first, 1)  # (N, identities)
+    return np.asarray(allowed & (key == best[:, np.unique(pairs.identity, return_inverse=True)[1]]))
+
+
+def rank_pairs(cosine: npt.NDArray[Any], pairs: Pairs, kind: str, away: int) -> tuple[Array, Array]:
+    """`rank_queries` of a protocol; (N,) or, where a gallery is drawn, (DRAWN_GALLERIES * N,)."""
+    same = pairs.same()
+    if kind != "single":
+        return rank_queries(cosine, same, pairs.gallery(kind, away), kind != "class")
+    allowed, rng = pairs.gallery("twins", away), np.random.default_rng(0)
+    drawn = [
+        rank_queries(cosine, same, one_view(pairs, allowed, rng)) for _ in range(DRAWN_GALLERIES)
+    ]
+    return np.concatenate([d[0] for d in drawn]), np.concatenate([d[1] for d in drawn])
+
+
 def hit(rank: Array, k: int) -> Array:
     """Is the first right one among the k nearest? 1 or 0, half for a tie of two at the border."""
     return np.asarray(np.clip(k + 1 - rank, 0, 1))
@@ -581,10 +605,11 @@ def summary(rank: Array, precision: Array, pairs: Pairs) -> dict[str, float]:
     good = np.isfinite(rank)
     if not good.any():
         return {}
-    boot = shares(rank, pairs.identity, bootstrap_draws(pairs.identity, good))
+    identity = np.resize(pairs.identity, len(rank))  # drawn galleries follow each other
+    boot = shares(rank, identity, bootstrap_draws(identity, good))
     low, high = np.percentile(boot, [2.5, 97.5])
-    row: dict[str, float] = {"queries": int(good.sum())}
-    row["identities"] = len(np.unique(pairs.identity[good]))
+    row: dict[str, float] = {"queries": int(good[: len(pairs.identity)].sum())}
+    row["identities"] = len(np.unique(identity[good]))
     row |= {f"rank{k}": 100 * float(hit(rank[good], k).mean()) for k in RANKS}
     return {**row, "low": 100 * low, "high": 100 * high, "mAP": 100 * float(precision[good].mean())}
 
@@ -604,6 +629,220 @@ def by_bin(
         rank, precision = rank_queries(cosine, same, gallery)
         found.append({"low_edge": low, "high_edge": high, **summary(rank, precision, pairs)})
     return [row for row in found if "rank1" in row]
+
+
+# ---- Calibration ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Cases:
+    """Decisions as a tracker meets them: a detection against what is remembered of one object.
+
+    Of the remembered views the most similar counts, as in the tracker's gallery.
+
+    Attributes:
+        inputs: (M, 5) of `SameObject.KNOWN`: cosines of foreground and background, view angle,
+            gap, and the fused cosine of the most similar other object, NaN if there is none.
+        same: (M,). best: (M,) most similar of all objects that are remembered.
+    """
+
+    inputs: Array
+    same: BoolArray
+    best: BoolArray
+    apart: tuple[Array, Array]  # cosines of both parts of same-class objects in one frame
+
+    def decider(self, calibration: dict[str, list[float]] | None = None) -> rt.SameObject:
+        """`SameObject` that has seen which objects of these scenes are apart, as in a video."""
+        found = rt.SameObject(rt.TrackerConfig(), calibration)
+        found.add_apart(*self.apart)
+        return found
+
+    def of(self, letters: str) -> Cases:
+        """Cases that know the inputs named, the other inputs hidden; with a rival only the best."""
+        keep = [c in letters for c in rt.SameObject.KNOWN]
+        inputs = np.where(keep, self.inputs, np.nan)
+        rows = np.isfinite(inputs[:, keep]).all(1) & (self.best | ("r" not in letters))
+        return Cases(inputs[rows], self.same[rows], self.best[rows], self.apart)
+
+    def balance(self) -> Array:
+        """Weights (M,) under which both answers are equally likely at every known angle and gap:
+        how often an object is seen again from near is no look, but the camera's path. Where the
+        rival is known, a whole decision is asked for, and the cases count as they come.
+        """
+        if np.isfinite(self.inputs[:, 4]).all():
+            return np.ones(len(self.same))
+        cell = 100 * np.digitize(self.inputs[:, 2], ANGLES_DEG[1:-1])
+        cell += np.digitize(self.inputs[:, 3], GAPS[1:-1])
+        cell = np.unique(cell, return_inverse=True)[1]
+        both = np.stack([np.bincount(cell, self.same == s) for s in (False, True)])  # (2, cells)
+        weight = np.where(both.min(0) >= 5, both.sum(0) / np.maximum(2 * both, 1), 0)
+        return np.asarray(weight[self.same.astype(int), cell])
+
+
+def cases_of(scene: Scene, parts: Sequence[npt.NDArray[Any]], weight: float, seed: int) -> Cases:
+    """Every detection of a scene against every object of its class that was seen before: some
+    random 1-12 of its views, at least some random time ago. An object seen for the first time is
+    not remembered: then the most similar one is another.
+    """
+    pairs, rng = pairs_of([scene]), np.random.default_rng(seed)
+    cosines = [p @ p.T for p in parts]
+    fused, angle = weight * cosines[0] + (1 - weight) * cosines[1], pairs.angle_deg()
+    allowed, rows = pairs.gallery("class", 0), []
+    for q in range(len(fused)):  # over queries
+        away, views = rng.choice((15, 30, 60, 120)), rng.choice((1, 2, 4, 8, 12))
+        gap = pairs.frame[q] - pairs.frame
+        known = allowed[q] & (gap > away)
+        best = []
+        for k in np.unique(pairs.identity[known]):
+            own = np.flatnonzero(known & (pairs.identity == k))
+            own = rng.choice(own, min(views, len(own)), replace=False)
+            best.append((own[fused[q, own].argmax()], gap[own].min()))
+        order = sorted(best, key=lambda b: -fused[q, b[0]])
+        for i, (j, wait) in enumerate(order):
+            rival = fused[q, order[1 if i == 0 else 0][0]] if len(order) > 1 else np.nan
+            inputs = (cosines[0][q, j], cosines[1][q, j], angle[q, j], wait, rival)
+            rows.append((*inputs, pairs.identity[j] == pairs.identity[q], i == 0))
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    apart = ~pairs.same() & (pairs.frame[:, None] == pairs.frame[None])
+    apart &= np.triu(pairs.name[:, None] == pairs.name[None], 1)
+    shown = (cosines[0][apart].astype(np.float64), cosines[1][apart].astype(np.float64))
+    return Cases(table[:, :5], table[:, 5] > 0, table[:, 6] > 0, shown)
+
+
+def fit_logistic(terms: Array, same: BoolArray, weight: Array, ridge: float = 1e-4) -> Array:
+    """Coefficients (T,) of a logistic regression by Newton's method; ridge on all but the first."""
+    coefficients = np.zeros(terms.shape[1])
+    penalty = ridge * weight.sum() * np.diag([1e-6] + [1.0] * (terms.shape[1] - 1))
+    for _ in range(50):
+        p = 1 / (1 + np.exp(-(terms @ coefficients).clip(-30, 30)))
+        slope = terms.T @ (weight * (same - p)) - penalty @ coefficients
+        curvature = (terms.T * (weight * p * (1 - p))) @ terms + penalty
+        step = np.linalg.solve(curvature, slope)
+        coefficients += step
+        if np.abs(step).max() < 1e-6:
+            break
+    return coefficients
+
+
+def known_inputs() -> list[str]:
+    """All sets of inputs: the foreground is always known."""
+    rest = rt.SameObject.KNOWN[1:]
+    chosen = [itertools.combinations(rest, n) for n in range(len(rest) + 1)]
+    return ["f" + "".join(c) for c in itertools.chain(*chosen)]
+
+
+def calibrate(scenes: Sequence[Cases]) -> dict[str, list[float]]:
+    """Coefficients of `SameObject` for each set of known inputs, from the cases of each scene."""
+    shown = [rt.SameObject.closeness(np.stack(c.apart)).mean(1) for c in scenes if len(c.apart[0])]
+    usual = [round(float(v), 4) for v in np.mean(shown, 0)]
+    found: dict[str, list[float]] = {"apart": usual}
+    for letters in known_inputs():
+        own = [c.of(letters) for c in scenes]
+        terms = [c.decider({"apart": usual}).terms(letters, c.inputs) for c in own]
+        inputs, same, best = (
+            np.concatenate([getattr(c, k) for c in own]) for k in ("inputs", "same", "best")
+        )
+        joined = Cases(inputs, same, best, own[0].apart)
+        if min(joined.same.sum(), (~joined.same).sum()) < 20:  # unknown in these scenes
+            continue
+        weights = fit_logistic(np.concatenate(terms), joined.same, joined.balance())
+        found[letters] = [round(float(w), 4) for w in weights]
+    return found
+
+
+def reliability(
+    probability: Array, same: BoolArray, weight: Array, bins: int = 10
+) -> list[dict[str, float]]:
+    """Weighted mean probability and share of right ones in equal bins of probability."""
+    row = np.minimum((probability * bins).astype(int), bins - 1)
+    total = np.bincount(row, weight, bins)
+    said = np.bincount(row, weight * probability, bins) / np.maximum(total, 1e-12)
+    right = np.bincount(row, weight * same, bins) / np.maximum(total, 1e-12)
+    return [
+        {"said": said[i], "right": right[i], "share": total[i] / total.sum()}
+        for i in range(bins) if total[i] > 0
+    ]  # fmt: skip
+
+
+def expected_error(rows: Sequence[dict[str, float]]) -> float:
+    """Expected calibration error of `reliability`'s rows."""
+    return float(sum(r["share"] * abs(r["said"] - r["right"]) for r in rows))
+
+
+def unmasked(scene: Scene) -> Scene:
+    """The scene as a detector without masks sees it."""
+    return dataclasses.replace(scene, runs=[rt.NO_RUNS] * len(scene.runs))
+
+
+def scene_cases(
+    scenes: Sequence[Scene], parts: Sequence[npt.NDArray[Any]], weight: float, draws: int = 3
+) -> list[Cases]:
+    """Cases of each scene, from the rows of all scenes; some random draws."""
+    ends = np.cumsum([len(s.scored) for s in scenes])[:-1]
+    own = zip(*(np.split(p, ends) for p in parts), strict=True)
+    return [
+        cases_of(s, rows, weight, seed)
+        for s, rows in zip(scenes, own, strict=True) for seed in range(draws)
+    ]  # fmt: skip
+
+
+def write_calibrations(args: Any) -> None:
+    """Fit `SameObject` for every frame method on rooms with and without masks; write it beside
+    the model.
+    """
+    rooms = [room_scene(seed, args.cache, args.every) for seed in args.calibrate]
+    rooms += [unmasked(scene) for scene in rooms]
+    for model in ("colour", *args.models):
+        parts = embed(rooms, rt.Embedder(model, threads=1))
+        found = calibrate(scene_cases(rooms, parts, args.weight))
+        path = rt.calibration_file(str(rt.model_path(model)) if model != "colour" else model)
+        path.parent.mkdir(exist_ok=True)
+        fitted = f"examples/rank_k.py --calibrate {' '.join(map(str, args.calibrate))}"
+        text = json.dumps({"fitted_by": fitted, "same_object": found}).replace('], "', '],\n "')
+        with rt.atomic(path) as part:
+            part.write_text(text.replace("{", "{\n ") + "\n")
+        print(f"wrote {path}", file=sys.stderr)
+
+
+def reliabilities(cases: Sequence[Cases], calibration: Any) -> list[dict[str, Any]]:
+    """Calibration error, log loss and the bins of the reliability diagram, by known inputs."""
+    rows: list[dict[str, Any]] = []
+    for letters in ("f", "fb", "fba", "fbg", "fbag", "fbr", "fbgr", "fbagr"):
+        own = [c for c in (c.of(letters) for c in cases) if len(c.same)]
+        if not own:
+            continue
+        p = np.concatenate([c.decider(calibration).probability(*c.inputs.T) for c in own])
+        same, weight = (np.concatenate(x) for x in zip(*((c.same, c.balance()) for c in own),
+                                                       strict=True))  # fmt: skip
+        bins = reliability(p, same, weight)
+        loss = -(weight * np.log(np.where(same, p, 1 - p))).sum() / weight.sum()
+        right = (weight * ((p > 0.5) == same)).sum() / weight.sum()
+        rows.append({"known": letters, "cases": len(p), "same": float(same.mean()), "right": right,
+                     "ece": expected_error(bins), "log_loss": loss, "bins": bins})  # fmt: skip
+    return rows
+
+
+def plot_reliability(rows: Sequence[dict[str, Any]], out: Path) -> None:
+    """Said against true probability, one panel a method; solid: a pair, dashed: a decision."""
+    plt = pyplot()
+    methods = list(dict.fromkeys(r["method"] for r in rows))
+    figure, axes = plt.subplots(1, len(methods), figsize=(4.2 * len(methods), 4), squeeze=False)
+    for ax, method in zip(axes[0], methods, strict=True):
+        ax.plot([0, 1], [0, 1], color="gray", lw=0.8)
+        own = [r for r in rows if r["method"] == method and r["known"] in ("fb", "fbgr")]
+        titles = list(dict.fromkeys(r["set"] for r in own))
+        for r in own:
+            said, right = ([b[k] for b in r["bins"]] for k in ("said", "right"))
+            kind = "pair" if r["known"] == "fb" else "decision"
+            ax.plot(said, right, "-o" if kind == "pair" else "--s", ms=3,
+                    color=f"C{titles.index(r['set'])}",
+                    label=f"{r['set']}, {kind}: ECE {r['ece']:.3f}")  # fmt: skip
+        ax.set(title=method, xlabel="probability said", ylabel="share that is the same object")
+        ax.legend(fontsize=7)
+        ax.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(out / "calibration.png", dpi=80)
+    plt.close(figure)
 
 
 # ---- Cost ----------------------------------------------------------------------------------------
@@ -626,27 +865,40 @@ def cost_ms(scene: Scene, methods: dict[str, Any], objects: int = 10) -> dict[st
 # ---- Output --------------------------------------------------------------------------------------
 
 
-def evaluate(title: str, scenes: Sequence[Scene], args: Any) -> tuple[list[Any], list[Any]]:
-    """Rows of the table and of the bins for one set of scenes, all methods."""
+def evaluate(
+    title: str, scenes: Sequence[Scene], args: Any
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Rows of the table, of the bins and of the calibration for a set of scenes, all methods."""
     pairs = pairs_of(scenes)
-    same, angle = pairs.same(), pairs.angle_deg()
+    angle = pairs.angle_deg()
     gap = np.abs(pairs.frame[:, None] - pairs.frame[None]).astype(float)
-    kinds = ["open", "class", "twins", *(["same"] if (pairs.model >= 0).any() else [])]
-    rows, bins = [], []
+    kinds = ["open", "class", "twins", "single", *(["same"] if (pairs.model >= 0).any() else [])]
+    rows, bins, trust = [], [], []
     for method, (look, names) in looks(args).items():
         started = time.time()
-        cosines = setups(embed(scenes, look), names, args.weight)
+        parts = embed(scenes, look)
+        calibration = calibration_of(look)
+        if calibration is not None:
+            found = reliabilities(scene_cases(scenes, parts, args.weight), calibration)
+            trust += [{"set": title, "method": method, **r} for r in found]
+        cosines = setups(parts, names, args.weight)
         for setup, cosine in cosines.items():
             head = {"set": title, "method": method, "setup": setup}
             for kind in kinds:
                 for label, away in (("any", 0), ("away", args.away)):
-                    ranks = rank_queries(cosine, same, pairs.gallery(kind, away), kind != "class")
+                    ranks = rank_pairs(cosine, pairs, kind, away)
                     row = summary(*ranks, pairs)
                     rows.append({**head, "protocol": kind, "gap": label, **row, "ranks": ranks[0]})
             for label, value, edges in (("angle", angle, ANGLES_DEG), ("gap", gap, GAPS)):
                 bins += [{**head, "by": label, **r} for r in by_bin(cosine, pairs, value, edges)]
         print(f"{title}: {method} {time.time() - started:.0f} s", file=sys.stderr)
-    return [{**r, "identity": pairs.identity} for r in rows if "rank1" in r], bins
+    return [{**r, "identity": pairs.identity} for r in rows if "rank1" in r], bins, trust
+
+
+def calibration_of(look: Any) -> Any:
+    """The calibration beside a method's model, or None."""
+    path = rt.calibration_file(getattr(look, "model", ""))
+    return json.loads(path.read_text())["same_object"] if path.is_file() else None
 
 
 def ratio(rows: Sequence[dict[str, Any]], ours: str, protocol: str, gap: str) -> str:
@@ -658,8 +910,9 @@ def ratio(rows: Sequence[dict[str, Any]], ours: str, protocol: str, gap: str) ->
     if not best or not others:
         return ""
     rival = max(others, key=lambda r: r["rank1"])
-    draws = bootstrap_draws(rival["identity"], np.isfinite(rival["ranks"]))
-    drawn = [shares(r["ranks"], r["identity"], draws) for r in (best[0], rival)]
+    identity = np.resize(rival["identity"], len(rival["ranks"]))
+    draws = bootstrap_draws(identity, np.isfinite(rival["ranks"]))
+    drawn = [shares(r["ranks"], identity, draws) for r in (best[0], rival)]
     low, high = np.percentile(drawn[0] / np.maximum(drawn[1], 1e-9), [2.5, 97.5])
     return (
         f"{ours} concat {best[0]['rank1']:.1f} / {rival['method']} {rival['setup']} "
@@ -669,8 +922,8 @@ def ratio(rows: Sequence[dict[str, Any]], ours: str, protocol: str, gap: str) ->
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows with the columns of the first."""
-    hidden = ("ranks", "identity")
+    """Write rows, lists left out."""
+    hidden = ("ranks", "identity", "bins")
     with rt.atomic(path) as part, part.open("w", newline="") as file:
         names = list(dict.fromkeys(k for r in rows for k in r if k not in hidden))
         writer = csv.DictWriter(file, names, extrasaction="ignore")
@@ -764,6 +1017,8 @@ def build_parser() -> argparse.ArgumentParser:
     add("--away", type=int, default=30, help="frames that count as away (default %(default)s)")
     add("--models", nargs="*", default=[], help="backbones beside the colour descriptor")
     add("--person", nargs="*", default=[], help="networks for the plain box (DeepSORT's way)")
+    add("--calibrate", type=int, nargs="*", default=[], metavar="SEED",
+        help="first fit the probability of the same object on these rooms")  # fmt: skip
     add("--no-crops", action="store_true", help="leave out the slow crop references")
     add("--weight", type=float, default=rt.TrackerConfig().foreground_weight,
         help="share of the foreground in concat (default %(default)s)")  # fmt: skip
@@ -775,24 +1030,26 @@ def build_parser() -> argparse.ArgumentParser:
 
 def measure(args: Any) -> None:
     """Measure all sets, write the files, print the tables."""
+    if args.calibrate:
+        write_calibrations(args)
     sets = scene_sets(args)
     if not sets:
         raise rt.ReobjError("nothing to measure: give --rooms, --recording, --depth or --scannet")
     args.out.mkdir(parents=True, exist_ok=True)
-    rows: list[Any] = []
-    bins: list[Any] = []
-    for title, scenes in sets.items():
-        own, own_bins = evaluate(title, scenes, args)
-        rows, bins = rows + own, bins + own_bins
+    found = [evaluate(title, scenes, args) for title, scenes in sets.items()]
+    rows, bins, trust = ([r for part in found for r in part[i]] for i in range(3))
     write_csv(args.out / "rank_k.csv", rows)
     write_csv(args.out / "by_bin.csv", bins)
     plot_bins(bins, args.out)
+    if trust:
+        write_csv(args.out / "calibration.csv", trust)
+        plot_reliability(trust, args.out)
     print(markdown(rows))
     methods = looks(args)
     for title in sets:
         own = [r for r in rows if r["set"] == title]
         for method in methods:
-            print(*filter(None, [ratio(own, method, p, g) for p in ("twins", "same")
+            print(*filter(None, [ratio(own, method, p, g) for p in ("twins", "single", "same")
                                  for g in ("any", "away")]), sep="\n")  # fmt: skip
     spent = cost_ms(next(iter(sets.values()))[0], methods)
     write_csv(args.out / "cost.csv", [{"method": k, "ms_of_10": v} for k, v in spent.items()])

@@ -248,3 +248,87 @@ def test_crops_are_an_embedder_of_the_tool(tmp_path: Path) -> None:
     backbone(tmp_path / "net.onnx", tmp_path / "block.onnx")
     config = rt.Config(embed=rt.EmbedConfig(model=f"crops:{tmp_path / 'net.onnx'}"))
     assert isinstance(rt._embedder(config), rt.CropEmbedder)
+
+
+def logistic_cases(n: int = 4000) -> rk.Cases:
+    """Cosines whose true log odds are known: 4 * closeness of the foreground - 6, at even prior."""
+    closeness = RNG.uniform(0, 3, n)
+    same = RNG.random(n) < 1 / (1 + np.exp(6 - 4 * closeness))
+    inputs = np.full((n, 5), np.nan)
+    inputs[:, 0] = 1.03 - np.exp(-closeness)
+    inputs[:, 1] = RNG.uniform(0, 1, n)  # says nothing
+    inputs[:, 2], inputs[:, 3] = RNG.uniform(0, 90, n), RNG.uniform(0, 300, n)
+    inputs[:, 4] = RNG.uniform(0, 1, n)
+    return rk.Cases(inputs, same, np.ones(n, bool), (np.array([0.5]), np.array([0.5])))
+
+
+def test_calibration_finds_the_true_odds() -> None:
+    cases = logistic_cases()
+    found = rk.calibrate([cases])
+    assert set(found) == {"apart", *rk.known_inputs()}
+    own = cases.of("fb")
+    p = own.decider(found).probability(*own.inputs.T)
+    assert rk.expected_error(rk.reliability(p, own.same, own.balance())) < 0.03
+    assert found["fb"][1] == pytest.approx(4, rel=0.15) and abs(found["fb"][2]) < 0.3
+    always_sure = np.where(p > 0.5, 0.999, 0.001)
+    assert rk.expected_error(rk.reliability(always_sure, own.same, own.balance())) > 0.05
+
+
+def test_calibrated_probability_follows_its_evidence() -> None:
+    """Monotone in both cosines; a background from another side counts less; bounded."""
+    inputs = np.array([1.0, 2.0])
+    weights = {"fb": [-4, *inputs], "fba": [-4, *inputs, 0, 0, -2], "f": [-3, 1], "apart": [0, 0]}
+    same = rt.SameObject(rt.TrackerConfig(), weights)
+    high, low = same.logit(0.9, 0.9), same.logit(0.9, 0.2)
+    assert high > low and same.logit(0.95, 0.9) > high
+    near = same.logit(0.9, [0.2, 0.9], 0.0)
+    side = same.logit(0.9, [0.2, 0.9], 90.0)
+    assert np.ptp(near) > 5 * np.ptp(side)
+    assert same.logit(0.9, np.nan) == same.logit(0.9)  # no background: another set of weights
+    assert np.abs(same.logit([1.0, -1.0], [1.0, -1.0])).max() < 7
+    assert same.probability(0.9, 0.9, prior=0.1) < same.probability(0.9, 0.9)
+    assert same.logit(np.full((2, 3), 0.5), 0.4).shape == (2, 3)
+    assert same.logit(np.nan, 0.5) == -np.inf and same.probability(np.nan) == 0
+
+
+def test_probability_adapts_to_the_video() -> None:
+    """Where all objects look alike, the same cosine says less; with and without calibration."""
+    weights = {"fb": [-4, 1, 2], "apart": [0.5, 0.5]}
+    for calibration in (weights, None):
+        plain, alike = (rt.SameObject(rt.TrackerConfig(), calibration) for _ in range(2))
+        alike.add_apart(np.full(200, 0.9), np.full(200, 0.9))
+        alike.add(np.full(200, 0.9), same=False)
+        assert alike.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
+
+
+def test_calibration_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(b"")
+    file = rt.calibration_file(str(net))
+    assert file == tmp_path / "net.json"
+    assert rt.calibration_file(f"crops:{net}") == tmp_path / "crops_net.json"
+    assert not rt.SameObject.for_model(rt.TrackerConfig(), str(net)).calibration
+    file.write_text(json.dumps({"same_object": {"apart": [1, 1], "fb": [0, 1, 1]}}))
+    assert set(rt.SameObject.for_model(rt.TrackerConfig(), str(net)).calibration) == {"fb"}
+    file.write_text("{}")
+    with pytest.raises(rt.ReobjError, match=r"net\.json.*--calibrate"):
+        rt.SameObject.for_model(rt.TrackerConfig(), str(net))
+
+
+def test_part_cosines_of_fused_rows() -> None:
+    fore, back = (rt._unit_rows(RNG.normal(size=(4, n))) for n in (6, 3))
+    fused = np.concatenate([np.sqrt(0.7) * fore, np.sqrt(0.3) * back], 1)
+    got = rt.part_cosines(fused, fused[:2], 6)
+    assert np.allclose(got[0], fore @ fore[:2].T) and np.allclose(got[1], back @ back[:2].T)
+    assert np.isnan(rt.part_cosines(fused[:, :6], fused[:, :6], 6)[1]).all()
+
+
+def test_gallery_parts_are_of_the_most_similar_view() -> None:
+    gallery = rt.Gallery(rt.TrackerConfig())
+    gallery.split = 2
+    views = np.array([[1, 0, 1, 0], [0, 1, 0, 1.0]], np.float32) / np.sqrt(2)
+    for view in views:
+        gallery.add(np.array([0]), view[None])
+    fore, back = gallery.parts(views[1:], np.array([0]))
+    assert (fore, back) == (pytest.approx(1), pytest.approx(1))
+    assert np.isnan(gallery.parts(views, np.array([], int))[0]).size == 0
