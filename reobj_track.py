@@ -7424,23 +7424,24 @@ def export_rrd(saved: Saved, path: Path) -> None:
         views = rr.blueprint.Spatial3DView(), rr.blueprint.Spatial2DView(origin="world/camera")
         rec.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Horizontal(*views)))
         rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        rec.log("world", rr.Transform3D(mat3x3=turn, scale=scale), static=True)
+        rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
         for o in saved.data["objects"]:
             if o["status"] != "rejected":
                 solid = rr.Ellipsoids3D(
-                    half_sizes=[o["half_axes"]], centers=[o["center"]], labels=[names[o["id"]]],
+                    half_sizes=scale * np.array([o["half_axes"]]), labels=[names[o["id"]]],
+                    centers=scale * np.array([o["center"]]),
                     quaternions=[np.roll(o["quat_wxyz"], -1)], fill_mode="solid",
                     colors=[object_color(o["id"])[::-1]],
                 )  # fmt: skip
                 rec.log(["world", "objects", o["class"], str(o["id"])], solid, static=True)
         if saved.poses is not None:
-            cloud = rr.Points3D(saved.poses.points, colors=saved.poses.colors)
+            cloud = rr.Points3D(scale * saved.poses.points, colors=saved.poses.colors)
             rec.log("world/points", cloud, static=True)
-        _rrd_frames(rr, rec, saved, names)
+        _rrd_frames(rr, rec, saved, names, scale)
         rec.disconnect()  # writes what is left
 
 
-def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str]) -> None:
+def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str], scale: float) -> None:
     """Log each frame's camera, if it has one, and boxes."""
     poses, table, frames = saved.poses, saved.table, saved.frames()
     pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
@@ -7455,7 +7456,7 @@ def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str]) -> None:
             lens = {"image_from_camera": poses.camera.K, "camera_xyz": rr.ViewCoordinates.RDF}
             size = [poses.camera.width, poses.camera.height]
             to_child = {"relation": rr.TransformRelation.ChildFromParent}
-            move = rr.Transform3D(translation=pose[:, 3], mat3x3=pose[:, :3], **to_child)
+            move = rr.Transform3D(translation=scale * pose[:, 3], mat3x3=pose[:, :3], **to_child)
             rec.log("world/camera", rr.Pinhole(**lens, resolution=size), move)
         rows = table[table.frame == frame]
         boxes = rr.Boxes2D(

@@ -392,11 +392,12 @@ def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
     found = defaultdict(list)
     for chunk in RrdReader(rt.export(room, "rrd", tmp_path / "a.rrd")).stream().to_chunks():
         found[chunk.entity_path] += chunk.to_record_batch().to_pylist()
-    _, _, kept = upright(room, [0.0, 0, 1])
+    _, scale, kept = upright(room, [0.0, 0, 1])
     for o in kept:
         (row,) = found[f"/world/objects/{str(o['class']).replace(' ', chr(92) + ' ')}/{o['id']}"]
-        np.testing.assert_allclose(row["Ellipsoids3D:half_sizes"], [o["half_axes"]], rtol=1e-5)
-        np.testing.assert_allclose(row["Ellipsoids3D:centers"], [o["center"]], rtol=1e-5)
+        half, center = scale * np.array([o["half_axes"]]), scale * np.array([o["center"]])
+        np.testing.assert_allclose(row["Ellipsoids3D:half_sizes"], half, rtol=1e-5)
+        np.testing.assert_allclose(row["Ellipsoids3D:centers"], center, rtol=1e-5, atol=1e-6)
         quat = np.roll(o["quat_wxyz"], -1)
         np.testing.assert_allclose(row["Ellipsoids3D:quaternions"], [quat], atol=1e-5)
     frames = sorted(row["frame"] for row in found["/world/camera"])
