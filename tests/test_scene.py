@@ -397,6 +397,16 @@ def test_identities_only_still_open(browser: Browser, tmp_path: Path) -> None:
     assert complaints(browser) == []
 
 
+def test_without_webgl_the_list_remains(browser: Browser, page: Path) -> None:
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    script = browser.send("Page.addScriptToEvaluateOnNewDocument", source=source)
+    browser.open(page)
+    browser.send("Page.removeScriptToEvaluateOnNewDocument", **script)
+    assert "no WebGL" in browser.eval("$('why').innerText")
+    browser.eval("S.objects[1].row.click()")
+    assert "size, m" in browser.eval("$('panel').innerText") and complaints(browser) == []
+
+
 # ---- Without a browser ----
 
 
