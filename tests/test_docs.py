@@ -1,0 +1,173 @@
+"""docs/: tutorials are executed, the API reference is current, links lead somewhere."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import reobj_track as rt
+
+ROOT = Path(__file__).resolve().parent.parent
+TUTORIALS = ROOT / "docs" / "tutorials"
+ROOM = ROOT / "examples" / "room"
+FOCAL, CENTRE = 492.756788421, (320.0, 240.0)  # COLMAP's: the first pixel's centre is (.5, .5)
+
+
+def true_poses() -> np.ndarray:
+    """(240, 4, 4) world_from_cam of the example clip."""
+    rows = np.loadtxt(ROOM / "poses.txt")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return poses
+
+
+# ---- What the reader of a tutorial has lying there ----
+
+
+def nothing(_: Path) -> None:
+    pass
+
+
+def scannet(folder: Path) -> None:
+    """A scene as SensReader writes it, 24 frames; one is lost."""
+    scene = folder / "scene0000_00"
+    for name in ("color", "pose", "intrinsic"):
+        (scene / name).mkdir(parents=True)
+    K = np.eye(4)
+    K[[0, 1], [0, 1]], K[:2, 2] = FOCAL, np.subtract(CENTRE, 0.5)
+    np.savetxt(scene / "intrinsic/intrinsic_color.txt", K)
+    poses = true_poses()
+    for i, frame in enumerate(rt.Video(ROOM / "room.mp4", rt.InputConfig(every=4, stop=96))):
+        cv2.imwrite(str(scene / f"color/{i}.jpg"), frame.image)
+        pose = poses[frame.index] if i != 7 else np.full((4, 4), np.inf)
+        np.savetxt(scene / f"pose/{i}.txt", pose)
+
+
+def arkit(folder: Path) -> None:
+    """A recording, boxes for it, and the log of an app: world_from_camera in OpenGL axes."""
+    shutil.copy(ROOM / "room.mp4", folder / "recording.mp4")
+    shutil.copy(ROOM / "detections.npz", folder / "recording.npz")
+    K = np.array([[FOCAL, 0, CENTRE[0] - 0.5], [0, FOCAL, CENTRE[1] - 0.5], [0, 0, 1]])
+    lines = [
+        json.dumps({"t": i / 12, "transform": (pose @ np.diag([1, -1, -1, 1])).T.ravel().tolist(),
+                    "intrinsics": K.T.ravel().tolist()})
+        for i, pose in enumerate(true_poses())
+    ]  # fmt: skip
+    (folder / "arkit.jsonl").write_text("\n".join(lines) + "\n")
+
+
+def objects(out: Path) -> list[dict[str, object]]:
+    return json.loads((out / "objects.json").read_text())["objects"]
+
+
+def check_phone(folder: Path) -> None:
+    assert len([o for o in objects(folder / "out") if o["center"]]) >= 8
+    assert json.loads((folder / "out/objects.json").read_text())["world"]["links"] == []
+
+
+def check_scannet(folder: Path) -> None:
+    data = json.loads((folder / "out/objects.json").read_text())
+    assert data["world"]["units"] == "m" and data["world"]["registered_frames"] == 12
+    assert (folder / "boxes.csv").read_text().startswith("time_ns,")
+
+
+def check_ar(folder: Path) -> None:
+    """The poses came through the phone's axes: the camera's own path is the true one."""
+    rows, true = np.loadtxt(folder / "poses.txt"), true_poses()
+    np.testing.assert_allclose(rows[:, 1:4], true[:, :3, 3], atol=1e-6)
+    again = np.loadtxt(folder / "out/poses.txt")
+    np.testing.assert_allclose(again[:, 1:4], true[::3, :3, 3], atol=1e-6)
+    assert sum(o["status"] == "ok" for o in objects(folder / "out")) >= 5
+
+
+def check_detector(folder: Path) -> None:
+    (chair,) = objects(folder / "out_file")
+    assert chair["class"] == "chair" and chair["frames_seen"] == 4
+
+
+def check_training(folder: Path) -> None:
+    assert (folder / "trained/reobj.onnx").is_file() and objects(folder / "out")
+
+
+Step = Callable[[Path], None]
+PAGES: dict[str, tuple[Step, Step]] = {
+    "phone_video": (nothing, check_phone),
+    "scannet_scene": (scannet, check_scannet),
+    "ar_poses": (arkit, check_ar),
+    "own_detector": (nothing, check_detector),
+}
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Fenced blocks of `sh` and `python`, in order."""
+    return re.findall(r"^```(sh|python)\n(.*?)^```$", page.read_text(), re.M | re.S)
+
+
+def need(page: str) -> None:
+    """Skip where this machine lacks what the page says it needs."""
+    if page == "scannet_scene":
+        try:
+            rt.model_path("deimv2-femto", offline=True)
+        except rt.ReobjError as error:
+            pytest.skip(f"no weights here: {error}")
+    if page == "training":
+        pytest.importorskip("torch")
+        pytest.importorskip("onnx")
+
+
+def test_every_tutorial_is_executed() -> None:
+    pages = {path.stem for path in TUTORIALS.glob("*.md")} - {"README"}
+    assert pages == set(PAGES)
+    listed = re.findall(r"\]\((\w+)\.md\)", (TUTORIALS / "README.md").read_text())
+    assert set(listed) == pages
+    assert all(blocks(TUTORIALS / f"{page}.md") for page in pages)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_tutorial(page: str, tmp_path: Path) -> None:
+    """As a reader does: in a checkout, one block after the other."""
+    need(page)
+    prepare, check = PAGES[page]
+    for path in (*ROOT.glob("*.*"), ROOT / "examples"):
+        (tmp_path / path.name).symlink_to(path)
+    prepare(tmp_path)
+    env = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    for kind, text in blocks(TUTORIALS / f"{page}.md"):
+        shell = ["bash", "-euo", "pipefail", "-c"] if kind == "sh" else [sys.executable, "-c"]
+        done = subprocess.run([*shell, text], cwd=tmp_path, env=env, capture_output=True, text=True)
+        said = done.stdout[-2000:] + done.stderr[-3000:]
+        assert done.returncode == 0, f"{page}:\n{text}\n{said}"
+    check(tmp_path)
+
+
+def test_links_lead_somewhere() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    missing = []
+    for page in pages:
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
+            if "://" not in target and not (page.parent / target).exists():
+                missing.append(f"{page.relative_to(ROOT)}: {target}")
+    assert missing == []
+
+
+def test_api_reference_is_current() -> None:
+    spec = importlib.util.spec_from_file_location("api", ROOT / "examples" / "api_reference.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.reference() == (ROOT / "docs" / "api.md").read_text(), (
+        "run: python examples/api_reference.py -o docs/api.md"
+    )
