@@ -4982,13 +4982,15 @@ class LinkEvent:
 class Linker:
     """Decide over the whole video which tracklets are one object.
 
-    Two tracklets seen in one frame are never the same object. First by looks: tracklets are joined
-    as long as their most alike views are nearer than the video's own middle between one object and
-    two, the most alike first, and only if no rival (seen beside one of the two) is about as near.
-    This replaces what the tracker decided at first sight. Then, with poses, by place: tracklets are
-    cut at gaps (where a tracker slips to a twin); a join is undone where two well-measured places
-    differ; groups that explain each other's boxes are joined, refitted and kept only if the joint
-    solid overlaps the boxes of both in most frames (merge, re-project, undo: the idea of OA-SLAM).
+    Two tracklets seen in one frame are never the same object, and classes that move stay as the
+    tracker has them: neither their place nor what surrounds them lasts.
+    First by looks: tracklets are joined as long as their most alike views are nearer than the
+    video's own middle between one object and two, the most alike first, and only if no rival (seen
+    beside one of the two) is about as near. This replaces what the tracker decided at first sight.
+    Then, with poses, by place: tracklets are cut at gaps (where a tracker slips to a twin); a join
+    is undone where two well-measured places differ; groups that explain each other's boxes are
+    joined, refitted and kept only if the joint solid overlaps the boxes of both in most frames
+    (merge, re-project, undo: the idea of OA-SLAM).
 
     Args:
         track: rows with the tracker's identities, and their looks.
@@ -5009,6 +5011,8 @@ class Linker:
         self.tracklets = table.tracklet_id[first]  # (L,)
         self.identity = table.object_id[first]  # (L,)
         self.classes = _majority(table.class_id, table.score, self.atom, len(first))  # (L,)
+        names = np.array([*track.class_names, ""])[self.classes.clip(max=len(track.class_names))]
+        self.moving = np.isin(names, config.moving.split(","))  # (L,) as the tracker has them
         self.together, self.apart = self._seen_together()
         self.near = self._nearness(self._look_distance(track.look, track.look_row))
         self.group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
@@ -5073,8 +5077,9 @@ class Linker:
 
     def _join_looks(self) -> None:
         """Group the tracklets anew by their looks and list what differs from the tracker."""
-        whole = np.unique(self.tracklets, return_inverse=True)[1]  # (L,) tracklet of each atom
-        other = self.classes[:, None] != self.classes
+        keep = np.where(self.moving, -self.identity, self.tracklets)
+        whole = np.unique(keep, return_inverse=True)[1]  # (L,) tracklet of each atom
+        other = (self.classes[:, None] != self.classes) | self.moving[:, None] | self.moving
         near = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), whole)  # (T, T)
         banned, apart = (_grouped_max(x, whole) for x in (self.together | other, self.apart))
         margin = math.log(self.config.look_ratio)
@@ -5140,7 +5145,7 @@ class Linker:
             members = np.flatnonzero(self.group == g)
             anchors = members[~worse[members]]
             anchors = anchors if len(anchors) else members[[np.argmax(length[members])]]
-            for atom in np.setdiff1d(members, anchors):
+            for atom in np.setdiff1d(members[~self.moving[members]], anchors):
                 iou = float(max(place[anchors, atom].max(), place[atom, anchors].max()))
                 look = float(np.nan_to_num(self.near[anchors, atom], nan=-np.inf).max(initial=-9))
                 if iou < self.config.split_place:
@@ -5183,6 +5188,8 @@ class Linker:
         score = np.maximum(place, place.T)
         good = ~apart & (classes[:, None] == classes[None]) & (score >= self.config.link_place)
         good &= look >= self.config.link_look
+        still = ~np.isin(np.arange(count), self.group[self.moving])
+        good &= still[:, None] & still
         a, b = np.nonzero(np.triu(good, 1))
         pairs: list[tuple[int, int, float, float]] = []
         used: set[int] = set()
@@ -7122,9 +7129,29 @@ def evaluate(
             part = [x[np.isin(x.name, [name, ""])] for x in (truth, found)]
             scores[name] = score_tracks(*part)
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
+    result["ranks"] = score_looks(out, truth)
     if solids is not None:
         result["objects"] = score_objects(out, solids, truth_poses, identity_map(truth, found))
     return result
+
+
+def score_looks(out: Path, truth: LabelledBoxes) -> dict[str, float]:
+    """Share of the returns whose object is among the k most alike, by looks alone (Rank-k).
+
+    Empty where the folder holds no looks (made by another version, or with --embed none).
+    """
+    if not (out / "cache" / "last-tracks.npz").exists():
+        return {}
+    track = Workspace(out).recall()[0]
+    if not track.look.size:
+        return {}
+    table = track.table[track.look_row]
+    box = np.c_[table.xyxy[:, :2], table.xyxy[:, 2:] - table.xyxy[:, :2]]
+    rows = np.c_[table.frame + 1, np.arange(len(table)), box]
+    found = labelled(rows, np.array(track.class_names)[table.class_id])
+    rank = return_ranks(truth, found, _unit_rows(track.look))
+    shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}
+    return {"queries": len(rank), **shares}
 
 
 def _was_read(frame: IntArray, out: Path) -> BoolArray:
@@ -7837,6 +7864,7 @@ def _cmd_eval(args: argparse.Namespace) -> int:
     classes = [c.strip() for c in args.classes.split(",") if c.strip()]
     result = evaluate(args.out, args.gt, args.gt_objects, poses, classes, args.min_visibility)
     print(score_table(result["tracks"]))
+    print(_ranks_line(result["ranks"]))
     if "objects" in result:
         facts = {k: v for k, v in result["objects"].items() if k != "objects"}
         print("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in facts.items() if v is not None))
@@ -7859,6 +7887,14 @@ def _add_export(sub: Any) -> None:
 def _cmd_export(args: argparse.Namespace) -> int:
     print(export(args.out, args.to, args.output))
     return 0
+
+
+def _ranks_line(ranks: dict[str, float]) -> str:
+    """One line on Rank-k, or why there is none."""
+    if not ranks:
+        return "Rank-k: no embeddings here (an output folder of `run` or `track` keeps them)"
+    shares = ", ".join(f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in list(ranks.items())[1:])
+    return f"returns by looks alone, {ranks['queries']:.0f} queries: {shares or 'no returns'}"
 
 
 def _add_models(sub: Any) -> None:

@@ -203,6 +203,22 @@ def test_rank_of_a_return(look: list[list[float]], ranks: list[int]) -> None:
     assert rt.return_ranks(truth, truth, np.array(look)).tolist() == ranks
 
 
+def test_eval_ranks_the_looks_that_the_folder_holds(tmp_path: Path) -> None:
+    """Two cups, one comes back twice: once like itself, once like the other (Rank-1 .5)."""
+    frame, obj = np.array([0, 0, 40, 80]), np.array([1, 2, 1, 1])
+    xyxy = np.array([[x, 0, x + 10, 10] for x in (0, 50, 0, 0)], float)
+    cup = np.full(4, 41)
+    table = rt.TrackTable(frame, obj, obj, xyxy, np.ones(4), cup, np.zeros(4, np.int64))
+    look = np.array([[1, 0], [0, 1], [0.9, 0.1], [0.1, 0.9]], np.float16)
+    track = rt.TrackResult(table, rt.COCO_NAMES, look=look, look_row=np.arange(4))
+    track.save(tmp_path / "cache" / "last-tracks.npz")
+    rt.write_mot(tmp_path / "tracks.txt", table)
+    gt = write(tmp_path / "gt.txt", np.array([[f + 1, i, x, 0, 10, 10, 1] for f, i, x in
+                                              zip(frame, obj, xyxy[:, 0], strict=True)]))  # fmt: skip
+    ranks = rt.evaluate(tmp_path, gt)["ranks"]
+    assert ranks == {"queries": 2, "rank1": 0.5, "rank5": 1.0, "rank20": 1.0, "rank50": 1.0}
+
+
 def test_nothing_found_and_nothing_true() -> None:
     some, none = boxes((0, 1, 0), (1, 1, 0)), rt.labelled(np.empty((0, 7)))
     assert rt.score_tracks(some, none)["HOTA"] == 0
@@ -253,7 +269,8 @@ def test_command_line_prints_a_table_and_refuses_other_files(
     gt, pr = drifting(0)
     files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
     assert rt.main(["eval", str(files[0]), "--gt", str(files[1])]) == 0
-    assert "IDF1" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "IDF1" in text and "Rank-k: no embeddings here" in text
     (tmp_path / "bad.txt").write_text("not a table\n")
     assert rt.main(["eval", str(files[0]), "--gt", str(tmp_path / "bad.txt")]) == 2
     assert "no MOTChallenge file" in capsys.readouterr().err
