@@ -264,9 +264,9 @@ def test_a_click_on_an_object_opens_its_panel(browser: Browser, page: Path) -> N
         text = browser.eval("$('panel').innerText")
         assert f"{number} {name}" in text
         assert "size, m" in text and "±" in text and "tracklets" in text
-        loaded = "[...document.querySelectorAll('.crops img')].map(i => i.naturalWidth > 8)"
-        crops = browser.eval(f"new Promise(f => setTimeout(() => f({loaded}), 50))")
-        assert len(crops) == 8 and all(crops)
+        wide = browser.eval("""Promise.all([...document.querySelectorAll('.crops img')]
+            .map(i => i.decode().then(() => i.naturalWidth)))""")
+        assert len(wide) == 8 and min(wide) > 8
     browser.picture(SCREENSHOTS / "desktop.png")
     browser.eval("$('close').click()")
     assert browser.eval("$('panel').innerText") == "" and browser.eval("state.selected") is None
@@ -312,9 +312,10 @@ def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
     browser.eval("goTo(5)")
     assert browser.eval("$('clock').textContent") == "frame 5 (no pose)"
     browser.eval("$('play').click()")
-    moved = browser.eval("new Promise(f => setTimeout(() => f(state.step), 600))")
+    moved = "new Promise(f => setInterval(() => state.step !== 5 && f(state.step), 20))"
+    assert browser.eval(moved) == 6
     browser.eval("$('play').click()")
-    assert moved != 5 and complaints(browser) == []
+    assert browser.eval("$('play').textContent") == "▶" and complaints(browser) == []
 
 
 def test_riding_along_sees_what_the_camera_saw(browser: Browser, page: Path) -> None:
@@ -471,6 +472,31 @@ def test_three_minutes_stay_below_ten_megabytes(tmp_path: Path) -> None:
         pictures.take(rt.Frame(int(index), index / 30, noise))
     rt.write_scene(result, pictures, video, config)
     assert 2e6 < (tmp_path / "scene.html").stat().st_size < 10e6
+
+
+def test_pictures_show_the_object(tmp_path: Path) -> None:
+    """Crops and frames of a video that is read at half its size: the green box is in place."""
+    import cv2
+
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[60:120, 200:280] = (0, 255, 0)
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    zero, one = np.zeros(1, np.int64), np.ones(1, np.int64)
+    box = np.array([[200.0, 60, 280, 120]])
+    table = rt.TrackTable(zero, one, one, box, np.ones(1), zero, zero)
+    entries = rt._object_entries(table, ("chair",), None, None, rt.ObjectsConfig())
+    result = rt.RunResult(tmp_path, table, ("chair",), entries, None, None, {}, [])
+    video = rt.Video(tmp_path / "0.png", rt.InputConfig(max_size=WIDTH // 2))
+    pictures = rt.Pictures(result, video, rt.OutputConfig())
+    for frame in video:
+        pictures.take(frame)
+    jpeg = [np.frombuffer(base64.b64decode(d), np.uint8) for d in
+            (pictures.crops[1][0][1], pictures.frames[0][1])]  # fmt: skip
+    crop, whole = (cv2.imdecode(data, cv2.IMREAD_COLOR) for data in jpeg)
+    assert crop.shape[1] / crop.shape[0] == pytest.approx(80 / 60, abs=0.1)
+    assert crop[8:-8, 8:-8, 1].min() > 200  # the margin is 10 % on each side, 3 or 4 pixels here
+    assert crop[[0, -1]].max() < 60 and crop[:, [0, -1]].max() < 60
+    assert whole.shape[:2] == (HEIGHT // 2, WIDTH // 2) and whole[45, 120, 1] > 200
 
 
 def test_pictures_show_different_views() -> None:
