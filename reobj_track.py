@@ -283,10 +283,10 @@ class TrackerConfig:
         0.05, "process noise of a position over the box size (DeepSORT: 1/20)"
     )
     std_velocity: float = _opt(
-        1 / 160, "process noise of a velocity over the box size (DeepSORT: 1/160)"
+        1 / 80, "process noise of a velocity over the box size (DeepSORT: 1/160)"
     )
     std_start: float = _opt(
-        1 / 16, "spread of a new track's velocity over the box size (DeepSORT: 1/16)"
+        0.2, "spread of a new track's velocity over the box size (DeepSORT: 1/16; SORT: wide)"
     )
     std_measure: float = _opt(
         0.05, "measurement noise over the box size at score .8 (DeepSORT: 1/20)"
@@ -297,24 +297,23 @@ class TrackerConfig:
     gate_chi2: float = _opt(
         9.2103, "gate on the centre's squared Mahalanobis distance (chi2 .99, 2 dof)"
     )
-    gate_iou: float = _opt(0.5, "overlap that passes the gate by itself")
-    min_iou: float = _opt(0.0, "overlap needed where only the distance passes its gate")
-    gate_size: float = _opt(0.0, "most that width or height may differ, as a factor (0: any)")
-    blind_velocity: float = _opt(
-        1 / 80, "std_velocity without images, poses and embeddings: the camera's motion is in it"
-    )
-    blind_start: float = _opt(0.2, "std_start then (SORT: wide)")
-    blind_iou: float = _opt(0.2, "gate_iou then, and half of it as min_iou")
-    blind_size: float = _opt(2.0, "gate_size then")
+    gate_iou: float = _opt(0.2, "overlap that passes the gate by itself")
+    blind_iou: float = _opt(0.1, "overlap needed by all where there is no look to compare")
+    blind_size: float = _opt(2.0, "and most that width or height may differ then, as a factor")
     low_iou: float = _opt(0.3, "overlap needed for low scores and for a change of class")
     max_cost: float = _opt(0.9, "most that an accepted match may cost (0: perfect, 1: at the gate)")
     distance_weight: float = _opt(0.2, "share of the distance in the cost, the rest is overlap")
     missed_cost: float = _opt(0.2, "added for tracks not seen for 10 frames, in proportion before")
     tentative_cost: float = _opt(0.2, "added for tracks that are not confirmed yet")
     class_cost: float = _opt(0.2, "added to the cost when the class differs")
-    appearance_weight: float = _opt(0.5, "share of appearance in the cost of contested matches")
+    appearance_weight: float = _opt(0.7, "share of appearance in the cost of doubtful matches")
     foreground_weight: float = _opt(0.5, "share of the foreground in the appearance")
-    rival_cost: float = _opt(0.3, "appearance decides where a rival costs less than this more")
+    rival_cost: float = _opt(0.3, "a match is doubtful where a rival costs less than this more")
+    doubt_cost: float = _opt(0.3, "and where it costs more than this: perhaps a new object")
+    look_odds: float = _opt(
+        3.0, "log odds that the look must give a doubtful match of boxes that do not overlap"
+    )
+    iou_odds: float = _opt(10.0, "log odds that full overlap is worth")
     embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
     look_momentum: float = _opt(
         0.8, "memory of a track's running mean appearance (StrongSORT: .9 every frame)"
@@ -342,17 +341,6 @@ class TrackerConfig:
     flow_size_px: int = _opt(320, "longer side of the image for optical flow")
     flow_corners: int = _opt(200, "corners followed")
     flow_min_corners: int = _opt(8, "with fewer, the camera is taken to stand still")
-
-    def blind(self) -> TrackerConfig:
-        """The options for frames without image, pose and embeddings: boxes are all there is."""
-        return dataclasses.replace(
-            self,
-            std_velocity=self.blind_velocity,
-            std_start=self.blind_start,
-            gate_iou=self.blind_iou,
-            min_iou=self.blind_iou / 2,
-            gate_size=self.blind_size,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -2684,6 +2672,18 @@ class SameObject:
         mean = total / count
         return mean, math.sqrt(max(squares / count - mean**2, 1e-6))
 
+    def logit(self, cosine: Array) -> Array:
+        """Log of how much more probable a cosine is for views of one object than of two: two
+        Gaussians, monotone, with a floor for outliers.
+        """
+        (different, spread), (same, width) = self.mean_std(False), self.mean_std(True)
+        below = (same - cosine).clip(0) / max(width, 0.02)
+        above = (cosine - different).clip(0) / max(spread, 0.02)
+        likely = np.exp(-(below**2) / 2) / max(width, 0.02) + 1e-3
+        return np.asarray(
+            np.log(likely / (np.exp(-(above**2) / 2) / max(spread, 0.02) + 1e-3)), np.float64
+        )
+
     def normalised(self, cosine: Array) -> Array:
         """Map cosines so that 0 is the mean of different and 1 the mean of same objects."""
         different, same = self.mean_std(False)[0], self.mean_std(True)[0]
@@ -2864,13 +2864,13 @@ class Tracker:
         self.frame_number = -1
         self.gallery = Gallery(self.config)
         self.stats = SameObject.for_model(self.config, getattr(self.embedder, "model", ""))
+        self.look_stats = SameObject(self.config)  # of a track's look and the next detection
         self.last_seen = np.zeros(0, np.int64)  # (I,) frame of each identity's last detection
         self.identity_class = np.zeros(0, np.int64)  # (I,)
         self._tracklets = itertools.count(1)
         self._camera_motion = CameraMotion(self.config)
         self._last_pose: Array | None = None
         self._latest: _LazyEmbeddings | None = None  # of the latest frame
-        self._motion = self.config
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
 
     def update(
@@ -2917,8 +2917,6 @@ class Tracker:
     ) -> Tracks:
         """As `update`, with the tentative tracks too (track_id 0), for those who look back."""
         self.frame_number += 1
-        blind = frame is None and cam_from_world is None and embeddings is None
-        self._motion = self.config.blind() if blind else self.config
         detections = as_detections(detections)
         lazy = _LazyEmbeddings(
             _as_embeddings(embeddings, len(detections)),
@@ -2945,7 +2943,7 @@ class Tracker:
     ) -> None:
         """Kalman prediction, then the camera's own motion."""
         live = self._live
-        live.mean, live.cov = kalman_predict(live.mean, live.cov, self._motion)
+        live.mean, live.cov = kalman_predict(live.mean, live.cov, self.config)
         live.mean[:, 2:, 0] = live.mean[:, 2:, 0].clip(1.0)  # a size stays positive
         live.missed += 1
         new_from_old = np.eye(3)
@@ -2969,11 +2967,10 @@ class Tracker:
         config = self.config
         track_of = np.full(len(detections), -1, np.int64)
         box = _cxcywh_from_xyxy(detections.xyxy)
-        cost, feasible, iou = self._motion_cost(detections, box)  # (T, D)
-        high = detections.score >= config.high_score
-        gate = feasible & high
+        cost, feasible, iou = self._motion_cost(detections, box, lazy.available)  # (T, D)
+        gate = feasible & (detections.score >= config.high_score)
         if lazy.available and self._live.look.shape[1]:
-            cost = self._add_appearance(cost, gate, lazy)
+            cost, gate = self._compare_looks(cost, gate, iou, lazy)
         gate &= cost < config.max_cost
         _assign(np.where(gate, cost + self._handicap()[:, None], np.inf), np.inf, track_of)
         free = ~np.isin(np.arange(len(iou)), track_of)
@@ -2982,9 +2979,11 @@ class Tracker:
         _assign(np.where(second, 1 - iou, np.inf), 1.0, track_of)
         return track_of
 
-    def _motion_cost(self, detections: Detections, box: Array) -> tuple[Array, BoolArray, Array]:
+    def _motion_cost(
+        self, detections: Detections, box: Array, looks: bool
+    ) -> tuple[Array, BoolArray, Array]:
         """Cost in [0, 1] from overlap and gated distance, feasibility and IoU, (T, D) each."""
-        live, config = self._live, self._motion
+        live, config = self._live, self.config
         iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), detections.xyxy)
         var = (
             live.cov[:, :2, 0] + (config.std_measure * _noise_scale(live.mean)[:, :2]) ** 2
@@ -2993,10 +2992,11 @@ class Tracker:
         distance = (offset**2 / var[:, None]).sum(-1)  # (T, D) squared Mahalanobis, 2 dof
         distance = distance / config.gate_chi2
         same_class = _same_class(live.votes, detections.class_id)
-        feasible = ((distance < 1) & (iou >= config.min_iou)) | (iou > config.gate_iou)
-        if config.gate_size:
+        feasible = (distance < 1) | (iou > config.gate_iou)
+        if not looks:
             growth = np.log(live.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
-            feasible &= (np.abs(growth) < math.log(config.gate_size)).all(-1)
+            feasible &= (np.abs(growth) < math.log(config.blind_size)).all(-1)
+            feasible &= iou >= config.blind_iou
         share = config.distance_weight
         cost = (1 - share) * (1 - iou) + share * distance.clip(0, 1)
         cost = cost + config.class_cost * ~same_class
@@ -3008,24 +3008,33 @@ class Tracker:
         waited = ((live.missed - 1) / 10).clip(0, 1)
         return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
 
-    def _add_appearance(self, cost: Array, gate: BoolArray, lazy: _LazyEmbeddings) -> Array:
-        """Blend in appearance for detections and tracks whose best candidate has a close rival."""
+    def _compare_looks(
+        self, cost: Array, gate: BoolArray, iou: Array, lazy: _LazyEmbeddings
+    ) -> tuple[Array, BoolArray]:
+        """Blend in appearance where a match is doubtful; forbid what the evidence speaks against.
+
+        Doubtful: a rival costs little more, or the match is so dear that the detection may be of an
+        object without a track. There overlap and look together must speak for the same object.
+        """
+        config, live = self.config, self._live
         open_cost = np.where(gate, cost, np.inf)
-        close = open_cost <= self.config.rival_cost + np.minimum(
-            open_cost.min(0, initial=np.inf)[None, :], open_cost.min(1, initial=np.inf)[:, None]
+        best = np.minimum(
+            open_cost.min(0, initial=np.inf)[None], open_cost.min(1, initial=np.inf)[:, None]
         )
-        close &= gate
-        contested = close & ((close.sum(0) > 1)[None, :] | (close.sum(1) > 1)[:, None])
-        rows = np.flatnonzero(contested.any(0))
+        close = gate & (cost <= best + config.rival_cost)
+        doubtful = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
+        known = (live.embedded >= 0)[:, None]
+        doubtful |= gate & known & (cost > config.doubt_cost)
+        rows = np.flatnonzero(doubtful.any(0))
         if not len(rows):
-            return cost
-        cosine = self._live.look @ lazy.get(rows).T  # (T, n)
-        alike = self.stats.normalised(cosine.astype(np.float64)).clip(0, 1)
-        known = (self._live.embedded >= 0)[:, None]
-        weight = self.config.appearance_weight * known
-        cost = cost.copy()
-        cost[:, rows] = (1 - weight) * cost[:, rows] + weight * (1 - alike)
-        return cost
+            return cost, gate
+        logit = self.look_stats.logit((live.look @ lazy.get(rows).T).astype(np.float64))  # (T, n)
+        weight = config.appearance_weight * known
+        cost, gate = cost.copy(), gate.copy()
+        cost[:, rows] = (1 - weight) * cost[:, rows] + weight / (1 + np.exp(logit))
+        against = logit + config.iou_odds * iou[:, rows] < config.look_odds
+        gate[:, rows] &= ~(known & doubtful[:, rows] & against)
+        return cost, gate
 
     def _correct(self, detections: Detections, track_of: IntArray) -> None:
         """Kalman update of the matched tracks."""
@@ -3051,7 +3060,7 @@ class Tracker:
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
         ids = np.fromiter(self._tracklets, np.int64, len(rows))
         born = _Live.born(
-            _cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self._motion
+            _cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self.config
         )
         track_of[rows] = len(self._live.mean) + np.arange(len(rows))
         self._live = self._live.append(born)
@@ -3069,7 +3078,8 @@ class Tracker:
         t = track_of[rows]
         soon = (live.identity[t] < 0) & (live.hits[t] >= self.config.n_init - 1)
         due = soon | (self.frame_number % self.config.embed_every == 0)  # all in one pass
-        rows = rows[due | lazy.done[rows]]
+        self._learn_looks(detections, track_of, rows[lazy.done[rows] | due], lazy)
+        rows = rows[due]  # not those of doubtful matches: their view may be half of a neighbour
         t = track_of[rows]
         if not len(rows):
             return
@@ -3081,6 +3091,20 @@ class Tracker:
         live.look[t] = _unit_rows(keep * live.look[t] + (1 - keep) * look)
         live.embedded[t] = self.frame_number
         self._learn(look, live.identity[t], detections.class_id[rows])
+
+    def _learn_looks(
+        self, detections: Detections, track_of: IntArray, rows: IntArray, lazy: _LazyEmbeddings
+    ) -> None:
+        """Feed the statistics of a track's look against the detections of the next frames."""
+        live = self._live
+        rows = rows[(live.embedded[track_of[rows]] >= 0) & (live.identity[track_of[rows]] >= 0)]
+        if not len(rows):
+            return
+        cosine = (live.look[track_of[rows]] @ lazy.get(rows).T).astype(np.float64)  # (n, n)
+        own = np.eye(len(rows), dtype=bool)
+        class_id = detections.class_id[rows]
+        self.look_stats.add(cosine[own], same=True)
+        self.look_stats.add(cosine[(class_id[:, None] == class_id[None]) & ~own], same=False)
 
     def _learn(self, look: Floats, identity: IntArray, class_id: IntArray) -> None:
         """Feed the similarity statistics and the gallery with embeddings (n, E) of one frame."""
