@@ -337,6 +337,13 @@ class TrackerConfig:
     )
     prior_std: float = _opt(0.1, "spread of both")
     prior_weight: float = _opt(20.0, "number of observed pairs that these priors are worth")
+    place_views: int = _opt(16, "with poses: views kept of every object to tell its place in 3D")
+    place_every: int = _opt(
+        5, "frames between them; when they are full every other one goes and this doubles"
+    )
+    place_refit: int = _opt(10, "places are fitted again every so many frames, where views are new")
+    place_in_view: float = _opt(0.5, "a detection is expected from this share of a box in view on")
+    place_parallax_deg: float = _opt(2.0, "a place counts from this angle between its views on")
     camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
     flow_size_px: int = _opt(320, "longer side of the image for optical flow")
     flow_corners: int = _opt(200, "corners followed")
@@ -2723,6 +2730,82 @@ def calibration_file(model: str) -> Path:
     return folder / f"{kind + '_' if kind else ''}{path.stem}.json"
 
 
+class Places:
+    """Where every identity is in 3D, for a tracker that is told the camera's poses.
+
+    Of every identity a few views are kept, evenly over its life, and an ellipsoid is fitted to
+    them now and then. Rows grow with the number of identities, not with time.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self.config = config
+        views = config.place_views
+        self.frame = np.zeros((0, views), np.int64)  # (I, V), < 0: free
+        self.boxes = np.zeros((0, views, 4))  # (I, V, 4)
+        self.img_from_world = np.zeros((0, views, 3, 4))  # (I, V, 3, 4)
+        self.every = np.zeros(0, np.int64)  # (I,) frames between views
+        self.fresh = np.zeros(0, np.int64)  # (I,) views since the last fit
+        self.dual_q = np.zeros((0, 4, 4))  # (I, 4, 4), NaN: unknown
+
+    def add(self, frame: int, identity: IntArray, xyxy: Array, img_from_world: Array) -> None:
+        """Keep boxes (N, 4) of N different identities in this frame as views, where one is due."""
+        self._grow(int(identity.max(initial=-1)) + 1)
+        due = frame - self.frame[identity].max(1) >= self.every[identity]
+        for i, box in zip(identity[due], xyxy[due], strict=True):
+            if (self.frame[i] >= 0).all():
+                self.frame[i, 1::2], self.every[i] = -1000, 2 * self.every[i]
+            slot = self.frame[i].argmin()
+            self.frame[i, slot], self.boxes[i, slot] = frame, box
+            self.img_from_world[i, slot] = img_from_world
+            self.fresh[i] += 1
+
+    def refit(self, image_size: tuple[int, int]) -> bool:
+        """Fit the ellipsoids of all identities with enough new views, all at once; any?"""
+        seen = self.frame >= 0
+        due = np.flatnonzero((seen.sum(1) >= 3) & (self.fresh > seen.sum(1) // 4))
+        if not len(due):
+            return False
+        at, slot = np.nonzero(seen[due])
+        frames, first, row = np.unique(
+            self.frame[due][at, slot], return_index=True, return_inverse=True
+        )
+        boxes = np.full((len(frames), len(due), 4), np.nan)
+        boxes[row, at] = self.boxes[due][at, slot]
+        cameras = self.img_from_world[due][at, slot][first]  # (F, 3, 4)
+        fast = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
+        fits = quadrics.fit_objects(boxes, cameras, image_size, support="ellipsoid", config=fast)
+        good = (fits.status != "rejected") & (fits.parallax_deg >= self.config.place_parallax_deg)
+        self.dual_q[due] = np.where(good[:, None, None], fits.ellipsoids.dual_quadrics(), np.nan)
+        self.fresh[due] = 0
+        return True
+
+    @property
+    def known(self) -> BoolArray:
+        """(I,): is the place of the identity known?"""
+        return np.asarray(np.isfinite(self.dual_q[:, 0, 0]), bool)
+
+    def project(self, img_from_world: Array, image_size: tuple[int, int]) -> Array:
+        """Boxes cx, cy, w, h (I, 4) of the ellipsoids' parts in an image; NaN where the place is
+        unknown, or less than half of the box lies in the image.
+        """
+        dual_c, before_camera = quadrics.project(self.dual_q, img_from_world[None])
+        boxes = quadrics.boxes_from_dual_conics(dual_c[0])  # (I, 4)
+        cut = quadrics.clip_boxes(boxes, image_size)
+        area, whole = ((b[:, 2:] - b[:, :2]).prod(1) for b in (cut, boxes))
+        seen = before_camera[0] & (area > self.config.place_in_view * whole)
+        return np.where(seen[:, None], _cxcywh_from_xyxy(cut), np.nan)
+
+    def _grow(self, identities: int) -> None:
+        extra = identities - len(self.frame)
+        if extra > 0:
+            extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
+            fills = {"frame": -1000, "dual_q": np.nan, "every": self.config.place_every}
+            for name in ("frame", "boxes", "img_from_world", "every", "fresh", "dual_q"):
+                old = getattr(self, name)
+                new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
+                setattr(self, name, np.concatenate([old, new]))
+
+
 # ---- Tracker -----------------------------------------------------------------------------------
 
 
@@ -2869,8 +2952,11 @@ class Tracker:
         self.identity_class = np.zeros(0, np.int64)  # (I,)
         self._tracklets = itertools.count(1)
         self._camera_motion = CameraMotion(self.config)
+        self.places = Places(self.config)
+        self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
         self._last_pose: Array | None = None
         self._latest: _LazyEmbeddings | None = None  # of the latest frame
+        self._view: Array | None = None  # (3, 4) img_from_world of the frame
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
 
     def update(
@@ -2936,6 +3022,8 @@ class Tracker:
         track_of = self._confirm(track_of)
         result = self._report(detections, track_of)
         self._retire()
+        if camera is not None and self._view is not None:
+            self._locate(result, self._view, (camera.width, camera.height))
         return result
 
     def _predict(
@@ -2945,20 +3033,47 @@ class Tracker:
         live = self._live
         live.mean, live.cov = kalman_predict(live.mean, live.cov, self.config)
         live.mean[:, 2:, 0] = live.mean[:, 2:, 0].clip(1.0)  # a size stays positive
-        live.missed += 1
-        new_from_old = np.eye(3)
-        if cam_from_world is not None and camera is not None:
-            if self._last_pose is not None and np.isfinite(cam_from_world).all():
-                rotation = cam_from_world[:, :3] @ self._last_pose[:, :3].T
-                new_from_old = (
-                    camera.K @ rotation @ np.linalg.inv(camera.K)
-                )  # exact for any depth if t = 0
-            if np.isfinite(cam_from_world).all():
-                self._last_pose = np.asarray(cam_from_world, np.float64)
+        self._view, in_view = None, np.ones(len(live.mean), bool)
+        if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
+            in_view = self._move_with_pose(np.asarray(cam_from_world, np.float64), camera)
         elif frame is not None and self.config.camera_motion:
-            new_from_old = self._camera_motion(frame)
-        if len(live.mean):
-            live.mean, live.cov = _warp_state(live.mean, live.cov, new_from_old)
+            live.mean, live.cov = _warp_state(live.mean, live.cov, self._camera_motion(frame))
+        live.missed += in_view | (live.missed == 0)
+
+    def _move_with_pose(self, cam_from_world: Array, camera: Camera) -> BoolArray:
+        """Move tracks with the known camera: those of known place as their ellipsoid's image does,
+        others by its rotation. Returns (T,): should a detection be expected?
+        """
+        live, size = self._live, (camera.width, camera.height)
+        self._view = view = camera.K @ cam_from_world  # (3, 4)
+        turn = np.eye(3)
+        if self._last_pose is not None:
+            rotation = cam_from_world[:, :3] @ self._last_pose[:, :3].T
+            turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for what is far
+        self._last_pose = cam_from_world
+        predicted = live.mean[..., 0]
+        live.mean, live.cov = _warp_state(live.mean, live.cov, turn)
+        now, before = self.places.project(view, size), self._place_boxes
+        self._place_boxes = now
+        known = _rows_of(self.places.known, live.identity, False)
+        now, before = (_rows_of(boxes, live.identity, np.nan) for boxes in (now, before))
+        in_view = ~known | np.isfinite(now[:, 0])
+        followed = known & (live.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
+        shift, grown = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
+        moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * grown], 1)  # (T, 4)
+        live.mean[followed, :, 0] = moved[followed]
+        lost = known & (live.missed > 0)
+        where = np.where(in_view[:, None], now, -1e6)  # out of view: nothing can match
+        again = _Live.born(where[lost], live.tracklet[lost], 0, self.config)
+        live.mean[lost], live.cov[lost] = again.mean, again.cov
+        return np.asarray(in_view, bool)
+
+    def _locate(self, tracks: Tracks, view: Array, image_size: tuple[int, int]) -> None:
+        """Keep the boxes of this frame as views of their objects, and fit places now and then."""
+        own = tracks[tracks.track_id > 0]
+        self.places.add(self.frame_number, own.track_id - 1, own.xyxy, view)
+        if self.frame_number % self.config.place_refit == 0 and self.places.refit(image_size):
+            self._place_boxes = self.places.project(view, image_size)
 
     def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
         """Match detections to live tracks: high scores with motion and appearance, then low scores
@@ -3211,6 +3326,12 @@ class Tracker:
             live.identity < 0, np.minimum(live.hits, self.config.n_init), self.config.coast_frames
         )
         self._live = live.select(live.missed <= patience)
+
+
+def _rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
+    """Rows of a table of identities (I, ...), `missing` where the identity has none: (T, ...)."""
+    table = np.concatenate([rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)])
+    return np.asarray(table[np.where(identity < len(rows), identity, -1)])
 
 
 def _same_class(votes: Array, class_id: IntArray) -> BoolArray:
