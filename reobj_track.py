@@ -2784,15 +2784,17 @@ class Places:
         """(I,): is the place of the identity known?"""
         return np.asarray(np.isfinite(self.dual_q[:, 0, 0]), bool)
 
-    def project(self, img_from_world: Array, image_size: tuple[int, int]) -> Array:
+    def project(
+        self, img_from_world: Array, image_size: tuple[int, int], share: float
+    ) -> Array:
         """Boxes cx, cy, w, h (I, 4) of the ellipsoids' parts in an image; NaN where the place is
-        unknown, or less than half of the box lies in the image.
+        unknown, or no more than this share of the box lies in the image.
         """
         dual_c, before_camera = quadrics.project(self.dual_q, img_from_world[None])
         boxes = quadrics.boxes_from_dual_conics(dual_c[0])  # (I, 4)
         cut = quadrics.clip_boxes(boxes, image_size)
         area, whole = ((b[:, 2:] - b[:, :2]).prod(1) for b in (cut, boxes))
-        seen = before_camera[0] & (area > self.config.place_in_view * whole)
+        seen = before_camera[0] & (area > share * whole)
         return np.where(seen[:, None], _cxcywh_from_xyxy(cut), np.nan)
 
     def _grow(self, identities: int) -> None:
@@ -2957,6 +2959,7 @@ class Tracker:
         self._last_pose: Array | None = None
         self._latest: _LazyEmbeddings | None = None  # of the latest frame
         self._view: Array | None = None  # (3, 4) img_from_world of the frame
+        self._image_size = (0, 0)
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
 
     def update(
@@ -3022,8 +3025,8 @@ class Tracker:
         track_of = self._confirm(track_of)
         result = self._report(detections, track_of)
         self._retire()
-        if camera is not None and self._view is not None:
-            self._locate(result, self._view, (camera.width, camera.height))
+        if self._view is not None:
+            self._locate(result, self._view)
         return result
 
     def _predict(
@@ -3044,7 +3047,8 @@ class Tracker:
         """Move tracks with the known camera: those of known place as their ellipsoid's image does,
         others by its rotation. Returns (T,): should a detection be expected?
         """
-        live, size = self._live, (camera.width, camera.height)
+        live = self._live
+        self._image_size = size = (camera.width, camera.height)
         self._view = view = camera.K @ cam_from_world  # (3, 4)
         turn = np.eye(3)
         if self._last_pose is not None:
@@ -3053,7 +3057,7 @@ class Tracker:
         self._last_pose = cam_from_world
         predicted = live.mean[..., 0]
         live.mean, live.cov = _warp_state(live.mean, live.cov, turn)
-        now, before = self.places.project(view, size), self._place_boxes
+        now, before = self.places.project(view, size, self.config.place_in_view), self._place_boxes
         self._place_boxes = now
         known = _rows_of(self.places.known, live.identity, False)
         now, before = (_rows_of(boxes, live.identity, np.nan) for boxes in (now, before))
@@ -3068,12 +3072,13 @@ class Tracker:
         live.mean[lost], live.cov[lost] = again.mean, again.cov
         return np.asarray(in_view, bool)
 
-    def _locate(self, tracks: Tracks, view: Array, image_size: tuple[int, int]) -> None:
+    def _locate(self, tracks: Tracks, view: Array) -> None:
         """Keep the boxes of this frame as views of their objects, and fit places now and then."""
         own = tracks[tracks.track_id > 0]
         self.places.add(self.frame_number, own.track_id - 1, own.xyxy, view)
-        if self.frame_number % self.config.place_refit == 0 and self.places.refit(image_size):
-            self._place_boxes = self.places.project(view, image_size)
+        if self.frame_number % self.config.place_refit == 0 and self.places.refit(self._image_size):
+            share = self.config.place_in_view
+            self._place_boxes = self.places.project(view, self._image_size, share)
 
     def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
         """Match detections to live tracks: high scores with motion and appearance, then low scores
@@ -3143,7 +3148,8 @@ class Tracker:
         rows = np.flatnonzero(doubtful.any(0))
         if not len(rows):
             return cost, gate
-        logit = self.look_stats.logit((live.look @ lazy.get(rows).T).astype(np.float64))  # (T, n)
+        cosine = (live.look @ lazy.get(rows).T).astype(np.float64)  # (T, n)
+        logit = _with_outliers(self.look_stats._logit_of_video(cosine))
         weight = config.appearance_weight * known
         cost, gate = cost.copy(), gate.copy()
         cost[:, rows] = (1 - weight) * cost[:, rows] + weight / (1 + np.exp(logit))
@@ -3251,7 +3257,9 @@ class Tracker:
             (live.identity < 0) & (live.hits >= self.config.n_init) & (live.missed == 0)
         )
         self.last_seen[live.identity[(live.identity >= 0) & (live.missed == 0)]] = self.frame_number
-        returning = self._returns(ready)  # (n,) identity or -1
+        returning = self._returns_home(ready)  # (n,) identity or -1
+        away = returning < 0
+        returning[away] = self._returns(ready[away])
         fresh = ready[returning < 0]
         ids = len(self.last_seen) + np.arange(len(fresh))
         self.last_seen = np.append(self.last_seen, np.zeros(len(fresh), np.int64))
@@ -3269,6 +3277,46 @@ class Tracker:
             self.gallery.add(live.identity[seen], live.look[seen])
         return self._drop(stale, track_of)
 
+    def _home_iou(self, ready: IntArray, identity: IntArray) -> Array:
+        """Overlap (n, I) of tracks with the places of identities in this frame; NaN: unknown."""
+        iou = np.full((len(ready), len(identity)), np.nan)
+        if self._view is not None and len(identity):
+            places = self.places.project(self._view, self._image_size, 0.0)
+            homes = _rows_of(places, identity, np.nan)  # (I, 4)
+            box = _xyxy_from_cxcywh(self._live.mean[ready, :, 0])
+            iou = np.nan_to_num(box_iou(box, _xyxy_from_cxcywh(homes)))
+            iou[:, ~_rows_of(self.places.known, identity, False)] = np.nan
+        return iou
+
+    def _elsewhere(self, ready: IntArray, identity: IntArray) -> BoolArray:
+        """(n, I): is the track nowhere near where the identity stands? Things that move stand
+        nowhere: no ellipsoid fits their views.
+        """
+        return np.asarray(self._home_iou(ready, identity) == 0, bool)
+
+    def _returns_home(self, ready: IntArray) -> IntArray:
+        """Recognise newly confirmed tracks where a lost identity has its place, unless their look
+        speaks against it.
+        """
+        live, config = self._live, self.config
+        result = np.full(len(ready), -1, np.int64)
+        if self._view is None or not len(ready) or not config.remember:
+            return result
+        identity = np.flatnonzero(self.last_seen < live.first[ready].max())
+        iou = np.nan_to_num(self._home_iou(ready, identity))
+        odds = config.iou_odds * iou - config.look_odds
+        if live.look.shape[1]:
+            cosine = self.gallery.similarity(live.look[ready], identity)  # (n, I)
+            logit = _with_outliers(self.look_stats._logit_of_video(cosine))
+            odds += np.where(cosine > -2, logit, 0)
+        possible = (self.last_seen[identity][None] < live.first[ready][:, None]) & (odds > 0)
+        possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
+        claimed = np.full(len(identity), -1, np.int64)
+        _assign(np.where(possible & (iou > config.low_iou), 1 - iou, np.inf), np.inf, claimed)
+        column = np.flatnonzero(claimed >= 0)
+        result[claimed[column]] = identity[column]
+        return result
+
     def _returns(self, ready: IntArray) -> IntArray:
         """Recognise known identities in newly confirmed tracks: the look must be probably the same,
         also in view of the next best candidate.
@@ -3285,6 +3333,7 @@ class Tracker:
         fore, back = self.gallery.parts(live.look[ready], identity)  # (n, I)
         possible = self.last_seen[identity][None] < live.first[ready][:, None]
         possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
+        possible &= ~self._elsewhere(ready, identity)
         possible &= (live.embedded[ready] >= 0)[:, None] & np.isfinite(fore)
         fused = np.where(possible, self.stats.fused(fore, back), -np.inf)  # (n, I)
         claimed = np.full(len(identity), -1, np.int64)
