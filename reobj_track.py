@@ -2679,18 +2679,6 @@ class SameObject:
         mean = total / count
         return mean, math.sqrt(max(squares / count - mean**2, 1e-6))
 
-    def logit(self, cosine: Array) -> Array:
-        """Log of how much more probable a cosine is for views of one object than of two: two
-        Gaussians, monotone, with a floor for outliers.
-        """
-        (different, spread), (same, width) = self.mean_std(False), self.mean_std(True)
-        below = (same - cosine).clip(0) / max(width, 0.02)
-        above = (cosine - different).clip(0) / max(spread, 0.02)
-        likely = np.exp(-(below**2) / 2) / max(width, 0.02) + 1e-3
-        return np.asarray(
-            np.log(likely / (np.exp(-(above**2) / 2) / max(spread, 0.02) + 1e-3)), np.float64
-        )
-
     def normalised(self, cosine: Array) -> Array:
         """Map cosines so that 0 is the mean of different and 1 the mean of same objects."""
         different, same = self.mean_std(False)[0], self.mean_std(True)[0]
@@ -2753,7 +2741,8 @@ class Places:
         due = frame - self.frame[identity].max(1) >= self.every[identity]
         for i, box in zip(identity[due], xyxy[due], strict=True):
             if (self.frame[i] >= 0).all():
-                self.frame[i, 1::2], self.every[i] = -1000, 2 * self.every[i]
+                self.frame[i, self.frame[i].argsort()[1::2]] = -1000
+                self.every[i] *= 2
             slot = self.frame[i].argmin()
             self.frame[i, slot], self.boxes[i, slot] = frame, box
             self.img_from_world[i, slot] = img_from_world
@@ -3067,7 +3056,7 @@ class Tracker:
         moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * grown], 1)  # (T, 4)
         live.mean[followed, :, 0] = moved[followed]
         lost = known & (live.missed > 0)
-        where = np.where(in_view[:, None], now, -1e6)  # out of view: nothing can match
+        where = np.where(in_view[:, None], now, [-1e6, -1e6, 1, 1])  # out of view: matches nothing
         again = _Live.born(where[lost], live.tracklet[lost], 0, self.config)
         live.mean[lost], live.cov[lost] = again.mean, again.cov
         return np.asarray(in_view, bool)
@@ -3088,10 +3077,10 @@ class Tracker:
         track_of = np.full(len(detections), -1, np.int64)
         box = _cxcywh_from_xyxy(detections.xyxy)
         cost, feasible, iou = self._motion_cost(detections, box, lazy.available)  # (T, D)
-        gate = feasible & (detections.score >= config.high_score)
+        high = detections.score >= config.high_score
         if lazy.available and self._live.look.shape[1]:
-            cost, gate = self._compare_looks(cost, gate, iou, lazy)
-        gate &= cost < config.max_cost
+            cost, feasible = self._compare_looks(cost, feasible, high, iou, lazy)
+        gate = feasible & high & (cost < config.max_cost)
         _assign(np.where(gate, cost + self._handicap()[:, None], np.inf), np.inf, track_of)
         free = ~np.isin(np.arange(len(iou)), track_of)
         low = (track_of < 0) & (detections.score >= config.low_score)
@@ -3129,7 +3118,7 @@ class Tracker:
         return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
 
     def _compare_looks(
-        self, cost: Array, gate: BoolArray, iou: Array, lazy: _LazyEmbeddings
+        self, cost: Array, feasible: BoolArray, high: BoolArray, iou: Array, lazy: _LazyEmbeddings
     ) -> tuple[Array, BoolArray]:
         """Blend in appearance where a match is doubtful; forbid what the evidence speaks against.
 
@@ -3137,6 +3126,7 @@ class Tracker:
         object without a track. There overlap and look together must speak for the same object.
         """
         config, live = self.config, self._live
+        gate = feasible & high
         open_cost = np.where(gate, cost, np.inf)
         best = np.minimum(
             open_cost.min(0, initial=np.inf)[None], open_cost.min(1, initial=np.inf)[:, None]
@@ -3147,15 +3137,15 @@ class Tracker:
         doubtful |= gate & known & (cost > config.doubt_cost)
         rows = np.flatnonzero(doubtful.any(0))
         if not len(rows):
-            return cost, gate
+            return cost, feasible
         cosine = (live.look @ lazy.get(rows).T).astype(np.float64)  # (T, n)
         logit = _with_outliers(self.look_stats._logit_of_video(cosine))
         weight = config.appearance_weight * known
-        cost, gate = cost.copy(), gate.copy()
+        cost, feasible = cost.copy(), feasible.copy()
         cost[:, rows] = (1 - weight) * cost[:, rows] + weight / (1 + np.exp(logit))
         against = logit + config.iou_odds * iou[:, rows] < config.look_odds
-        gate[:, rows] &= ~(known & doubtful[:, rows] & against)
-        return cost, gate
+        feasible[:, rows] &= ~(known & doubtful[:, rows] & against)
+        return cost, feasible
 
     def _correct(self, detections: Detections, track_of: IntArray) -> None:
         """Kalman update of the matched tracks."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
+import quadrics
 import reobj_track as rt
 
 CHAIR, CUP = 56, 41
@@ -333,6 +334,110 @@ def test_state_does_not_grow_with_time() -> None:
         if frame in (100, 1499):
             sizes.append((tracker.gallery.rows.nbytes, len(tracker._live.mean)))
     assert sizes[0] == sizes[1]
+
+
+def test_a_newcomer_does_not_take_over_a_missed_track() -> None:
+    """An object is missed and another one turns up beside it: alike, the track goes on; unlike, the
+    detection starts a track of its own and the missed object comes back to its own.
+    """
+    looks = unit(np.random.default_rng(14), 3)
+    here, beside = (100, 100, 160, 160), (125, 105, 185, 165)
+    for newcomer, expected in ((looks[0], [1]), (looks[2], [2])):
+        tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+        for _ in range(20):
+            tracker.update(rows(here), embeddings=looks[:1])
+        for _ in range(3):
+            found = tracker.update(rows(beside), embeddings=newcomer[None])
+        assert found.track_id.tolist() == expected
+    both = tracker.update(rows(here, beside), embeddings=looks[[0, 2]])
+    assert both.track_id.tolist() == [1, 2]
+
+
+# ---- With poses ----
+
+CAMERA = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+BALLS = quadrics.Ellipsoids(  # two in a row, their twin far to the right
+    np.array([[-0.5, 0, 4.0], [0.5, 0.1, 4.2], [3.5, 0, 4.0]]),
+    np.full((3, 3), 0.2),
+    np.repeat(np.eye(3)[None], 3, 0),
+)
+
+
+def pose_at(x: float, turn_deg: float = 0.0) -> np.ndarray:
+    """cam_from_world of a camera at (x, 0, 0), turned to the right."""
+    a = np.radians(turn_deg)
+    turn = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
+    return np.c_[turn, turn @ [-x, 0, 0]]
+
+
+def balls_seen(pose: np.ndarray) -> tuple[rt.Detections, np.ndarray]:
+    """Detections of the balls in the image, and which ones they are."""
+    dual_c, before = quadrics.project(BALLS.dual_quadrics(), (CAMERA.K @ pose)[None])
+    boxes = quadrics.boxes_from_dual_conics(dual_c[0])
+    inside = before[0] & (boxes[:, :2] > 0).all(1) & (boxes[:, 2:] < (640, 480)).all(1)
+    return rows(*map(tuple, boxes[inside])), np.flatnonzero(inside)
+
+
+def walk(tracker: rt.Tracker, poses: list[np.ndarray], posed: bool = True) -> list[dict[int, int]]:
+    """Identity of every ball in every frame."""
+    told = [{"cam_from_world": p, "camera": CAMERA} if posed else {} for p in poses]
+    result = []
+    for pose, known in zip(poses, told, strict=True):
+        found, which = balls_seen(pose)
+        tracks = tracker.update(found, **known)
+        ids = zip(which[tracks.detection_index].tolist(), tracks.track_id.tolist(), strict=True)
+        result.append(dict(ids))
+    return result
+
+
+PAST = [pose_at(0.02 * i - 0.5) for i in range(50)]
+AWAY = [pose_at(0.5, 3.0 * i) for i in range(60)]  # half a turn
+HOME = [pose_at(0.5 - 0.01 * i, 180 - 3.0 * i) for i in range(61)]
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_with_poses_objects_are_known_by_their_place(posed: bool) -> None:
+    """No look at all: the camera turns away for 100 frames and comes back from another spot."""
+    seen = walk(rt.Tracker(), PAST + AWAY + HOME, posed)
+    before, after = seen[49], seen[-1]
+    assert sorted(before) == sorted(after) == [0, 1]
+    assert (before == after) is posed
+
+
+def test_with_poses_a_twin_elsewhere_is_another_object() -> None:
+    """All balls look the same. The third is first seen when the others are out of view."""
+    tracker, look = rt.Tracker(), unit(np.random.default_rng(15), 1)
+    ids: dict[int, set[int]] = {}
+    for pose in (
+        PAST + [pose_at(0.5, t) for t in range(60)] + [pose_at(0.5, 60 - t) for t in range(61)]
+    ):
+        found, which = balls_seen(pose)
+        tracks = tracker.update(
+            found, embeddings=look.repeat(len(found), 0), cam_from_world=pose, camera=CAMERA
+        )
+        for ball, track in zip(which[tracks.detection_index], tracks.track_id, strict=True):
+            ids.setdefault(int(ball), set()).add(int(track))
+    assert [len(ids[k]) for k in range(3)] == [1, 1, 1]
+    assert len(set.union(*ids.values())) == 3
+
+
+def test_a_frame_without_pose_changes_no_place() -> None:
+    tracker = rt.Tracker()
+    walk(tracker, PAST)
+    places = tracker.places.dual_q.copy()
+    assert tracker.places.known.sum() == 2
+    for _ in range(20):
+        tracker.update(rt.Detections.empty(), cam_from_world=np.full((3, 4), np.nan), camera=CAMERA)
+    np.testing.assert_array_equal(tracker.places.dual_q, places)
+
+
+def test_places_hold_few_views_over_the_whole_life() -> None:
+    places = rt.Places(rt.TrackerConfig(place_views=8, place_every=1))
+    for frame in range(1000):
+        places.add(frame, np.array([0]), np.ones((1, 4)), np.eye(3, 4))
+    kept = np.sort(places.frame[0][places.frame[0] >= 0])
+    assert 4 <= len(kept) <= 8
+    assert kept[0] < 200 and kept[-1] > 800 and np.diff(kept).max() < 300
 
 
 # ---- Embedder ----
