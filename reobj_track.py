@@ -255,7 +255,8 @@ class EmbedConfig:
     )
     size_px: int = _opt(480, "longer side of the backbone's input")
     context: float = _opt(0.5, "background: the box grown by this share of its size on every side")
-    samples: int = _opt(16, "samples a side over the grown box")
+    reach: float = _opt(0.0, "and at least by this share of the image's longer side")
+    samples: int = _opt(4, "samples a side of every cell")
     object_score: float = _opt(
         0.3, "detections from this score on are no background for the others"
     )
@@ -2098,14 +2099,19 @@ class Embedder:
     """Foreground and background embeddings from one feature map a frame, pooled under masks.
 
     The thesis (re-OBJ) sends two masked crops of each object through a ResNet; here one pass over
-    the frame serves all objects. The expanded box is sampled on a grid; samples under the object's
-    mask (or the ellipse inscribed in its box) make the foreground, samples under no mask at all the
-    background; both keep a coarse spatial layout (cells).
+    the frame serves all objects. The box and the expanded box are sampled on grids; samples under
+    the object's mask (or the ellipse inscribed in its box) make the foreground, samples under no
+    mask at all the background; both keep a coarse spatial layout (cells). A trained model brings a
+    head that turns the cells into two short embeddings.
 
     Args:
         model: "colour" for the training-free descriptor (soft colour histogram and gradient
             orientations), or a backbone: a name listed by `reobj_track.py models` or a path to an
-            ONNX file with an image input and a spatial output.
+            ONNX file with an image input and a spatial output (of `train_embedding.py`: its head
+            and its layout are found through the file).
+
+    Attributes:
+        layout: where the map is sampled; that of the model if it was trained, else the config's.
     """
 
     def __init__(
@@ -2115,13 +2121,13 @@ class Embedder:
         threads: int = 0,
         offline: bool = False,
     ) -> None:
-        self.config = config or EmbedConfig()
+        self.layout = config or EmbedConfig()
         self.model = model
-        self._features: Callable[[Image], Floats] = (
-            _colour_features
-            if model == "colour"
-            else _Backbone(model, self.config, threads, offline)
-        )
+        self.backbone: _Backbone | None = None
+        self._features: Callable[[Image], Floats] = _colour_features
+        if model != "colour":
+            self.backbone = _Backbone(model, self.layout, threads, offline)
+            self.layout, self._features = self.backbone.layout, self.backbone
         self._last: tuple[Image, Floats] | None = None
 
     def __call__(
@@ -2137,37 +2143,87 @@ class Embedder:
         rows = np.arange(len(detections)) if rows is None else rows
         if self._last is None or self._last[0] is not frame:
             self._last = (frame, self._features(frame))
-        return self._pool(self._last[1], frame.shape[:2], detections, rows)
+        return self.pool(self._last[1], frame.shape[:2], detections, rows)
 
-    def _pool(
+    def pool(
         self,
         features: Floats,
         size_hw: tuple[int, ...],
         detections: Detections,
         rows: IntArray,
     ) -> Embeddings:
-        """Pool a (h, w, C) feature map under foreground and background of the chosen rows."""
-        height, width = size_hw
-        box = _cxcywh_from_xyxy(detections.xyxy)  # (D, 4)
-        side = self.config.samples
-        unit = (np.arange(side) + 0.5) / side * 2 - 1  # (S,) in [-1, 1] over the expanded box
-        half = box[rows, 2:] / 2 * (1 + 2 * self.config.context)  # (N, 2)
-        x = (box[rows, 0, None] + half[:, :1] * unit)[:, None, :].repeat(side, 1)  # (N, S, S)
-        y = (box[rows, 1, None] + half[:, 1:] * unit)[:, :, None].repeat(side, 2)
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        rows_f = (y / height * features.shape[0]).astype(int).clip(0, features.shape[0] - 1)
-        cols_f = (x / width * features.shape[1]).astype(int).clip(0, features.shape[1] - 1)
-        sampled = features[rows_f, cols_f]  # (N, S, S, C)
-        owner = _on_object(detections, rows, x, y) & inside  # (N, S, S)
-        sure = detections[detections.score >= self.config.object_score]
-        free = ~_object_map(sure, size_hw, features.shape[:2])[rows_f, cols_f] & inside & ~owner
-        inner = np.abs(unit) <= 1 / (
-            1 + 2 * self.config.context
-        )  # (S,) samples within the box itself
-        within = sampled[:, inner][:, :, inner]  # (N, s, s, C)
-        foreground = _pool_cells(within, owner[:, inner][:, :, inner], self.config.foreground_cells)
-        background = _pool_cells(sampled, free, self.config.background_cells)
-        return Embeddings(foreground, background)
+        """Embed the chosen rows from a (h, w, C) feature map of a frame of this size."""
+        parts = part_samples(detections, rows, size_hw, features.shape[:2], self.layout)
+        flat = features.reshape(-1, features.shape[-1])
+        means = [_cell_mean(flat[part.index], part.weight, part.cells) for part in parts]
+        if self.backbone is not None and self.backbone.head is not None:
+            return self.backbone.embed(parts, means)
+        return Embeddings(*map(_unit_histogram, means, (part.share for part in parts)))
+
+
+@dataclass(frozen=True, slots=True)
+class PartSamples:
+    """Where N objects look at a feature map for their foreground or their background.
+
+    Attributes:
+        index: (N, S, S) flat index into the map's cells. weight: (N, S, S) bool, samples that
+            count. cells: parts a side; S is a multiple of it.
+        share: (N, cells, cells) of the samples that count. others: same, of those on other objects.
+    """
+
+    index: IntArray
+    weight: BoolArray
+    cells: int
+    share: Array
+    others: Array
+
+
+def part_samples(
+    detections: Detections,
+    rows: IntArray,
+    size_hw: tuple[int, ...],
+    shape: tuple[int, int],
+    layout: EmbedConfig,
+) -> tuple[PartSamples, PartSamples]:
+    """Sample boxes (foreground) and grown boxes (background) of the chosen rows (N,).
+
+    Args:
+        detections: of one frame of size_hw. shape: (h, w) of the feature map of that frame.
+    """
+    box = _cxcywh_from_xyxy(detections.xyxy[rows])  # (N, 4)
+    least = layout.reach * max(size_hw[:2])
+    grown = box[:, 2:] / 2 + np.maximum(box[:, 2:] * layout.context, least)  # (N, 2)
+    sure = detections[detections.score >= layout.object_score]
+    objects = _object_map(sure, size_hw, shape)  # (h, w)
+    parts = []
+    for half, cells, behind in ((box[:, 2:] / 2, layout.foreground_cells, False),
+                                (grown, layout.background_cells, True)):  # fmt: skip
+        side = cells * layout.samples
+        unit = (np.arange(side) + 0.5) / side * 2 - 1  # (S,) in [-1, 1]
+        x = (box[:, 0, None] + half[:, :1] * unit)[:, None, :].repeat(side, 1)  # (N, S, S)
+        y = (box[:, 1, None] + half[:, 1:] * unit)[:, :, None].repeat(side, 2)
+        inside = (x >= 0) & (x < size_hw[1]) & (y >= 0) & (y < size_hw[0])
+        row = (y / size_hw[0] * shape[0]).astype(int).clip(0, shape[0] - 1)
+        column = (x / size_hw[1] * shape[1]).astype(int).clip(0, shape[1] - 1)
+        own = _on_object(detections, rows, x, y) & inside
+        others = objects[row, column] & inside & ~own
+        weight = inside & ~own & ~others if behind else own
+        share = [_cell_sum(w, cells) / layout.samples**2 for w in (weight, others)]
+        parts.append(PartSamples(row * shape[1] + column, weight, cells, *share))
+    return parts[0], parts[1]
+
+
+def _cell_sum(values: npt.NDArray[Any], cells: int) -> npt.NDArray[Any]:
+    """Sum (N, S, S, ...) over the samples of each cell: (N, cells, cells, ...)."""
+    edges = np.arange(cells) * (values.shape[1] // cells)
+    values = values if values.dtype != bool else values.astype(np.float32)
+    return np.asarray(np.add.reduceat(np.add.reduceat(values, edges, 1), edges, 2))
+
+
+def _cell_mean(sampled: Floats, weight: BoolArray, cells: int) -> Floats:
+    """Mean (N, cells, cells, C) of the samples (N, S, S, C) that count; 0 where none does."""
+    total = _cell_sum(np.where(weight[..., None], sampled, 0), cells)
+    return np.asarray(total / np.maximum(_cell_sum(weight, cells), 1)[..., None], np.float32)
 
 
 class CropEmbedder(Embedder):
@@ -2309,28 +2365,15 @@ def _object_map(
     return np.asarray(canvas, bool)
 
 
-def _pool_cells(sampled: Floats, weight: BoolArray, cells: int) -> Array:
-    """Mean feature of each of cells x cells parts, concatenated to unit rows (N, cells * cells *
-    C).
+def _unit_histogram(mean: Floats, share: Array) -> Array:
+    """Cells (N, k, k, C) side by side as unit rows (N, k * k * C).
 
     The signed square root makes a cosine of histograms a Hellinger kernel and tames strong
-    channels.
+    channels; part-empty cells count less.
     """
-    n, side = sampled.shape[:2]
-    edges = np.linspace(0, side, cells + 1).astype(int)[:-1]
-    total = np.where(weight[..., None], sampled, 0)
-    total = np.add.reduceat(np.add.reduceat(total, edges, 1), edges, 2)  # (N, cells, cells, C)
-    count = np.add.reduceat(
-        np.add.reduceat(weight.astype(np.float32), edges, 1), edges, 2
-    )  # (N, cells, cells)
-    mean = total / np.maximum(count, 1)[..., None]
-    share = np.sqrt(
-        count / np.maximum(count.max((1, 2), keepdims=True), 1)
-    )  # part-empty cells count less
-    rows = (
-        (np.sign(mean) * np.sqrt(np.abs(mean)) * share[..., None]).reshape(n, -1).astype(np.float64)
-    )
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9))
+    trust = np.sqrt(share / np.maximum(share.max((1, 2), keepdims=True), 1e-9))
+    rows = np.sign(mean) * np.sqrt(np.abs(mean)) * trust[..., None]
+    return _unit_rows(rows.reshape(len(mean), -1))
 
 
 def _colour_features(frame: Image) -> Floats:
@@ -2365,11 +2408,19 @@ def _direction_bins(vector: Any, bins: int = 6) -> Floats:
 
 
 class _Backbone:
-    """Feature map of a frame from an ONNX backbone with an image input and a spatial output."""
+    """Feature map of a frame from an ONNX backbone with an image input and a spatial output.
+
+    Files of `examples/train_embedding.py` say in their metadata ("reobj", JSON) how the frame is
+    resized, where the map is sampled and which file holds the head; they take BGR bytes and give
+    channels last. Any other backbone: RGB, ImageNet mean and deviation, channels first.
+
+    Attributes:
+        layout: where its maps are sampled. head: session of the trained head, or None.
+    """
 
     def __init__(self, model: str, config: EmbedConfig, threads: int, offline: bool) -> None:
-        self.config = config
-        self.session = onnx_session(model_path(model, offline=offline), threads)
+        path = model_path(model, offline=offline)
+        self.session = onnx_session(path, threads)
         spatial = [o.name for o in self.session.get_outputs() if len(o.shape) == 4]
         if not spatial or len(self.session.get_inputs()[0].shape) != 4:
             raise ReobjError(
@@ -2378,20 +2429,54 @@ class _Backbone:
                 "give another --embed model, or --embed colour"
             )
         self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
+        own = self.session.get_modelmeta().custom_metadata_map.get("reobj")
+        self.layout, self.multiple = config, 32
+        self.head: Any = None
+        if own is not None:
+            facts = json.loads(own)
+            self.layout = dataclasses.replace(config, **facts["layout"])
+            self.multiple = int(facts["multiple"])
+            self.head = onnx_session(path.parent / facts["head"], threads)
 
     def __call__(self, frame: Image) -> Floats:
-        """Return (h, w, C) features; ImageNet mean and deviation, RGB, size a multiple of 32."""
-        shrink = min(1.0, self.config.size_px / max(frame.shape[:2]))
-        size = [max(32, round(side * shrink / 32) * 32) for side in frame.shape[1::-1]]
-        rgb = (
-            cv2.resize(frame, size, interpolation=cv2.INTER_AREA)[..., ::-1].astype(np.float32)
-            / 255
-        )
+        """Return the features (h, w, C) of a frame (H, W, 3) BGR."""
+        shrink = min(1.0, self.layout.size_px / max(frame.shape[:2]))
+        side = self.multiple
+        size = [max(side, round(n * shrink / side) * side) for n in frame.shape[1::-1]]
+        small = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+        return self.maps(np.asarray(small, np.uint8)[None])[0]
+
+    def maps(self, images: Image) -> Floats:
+        """Return the features (N, h, w, C) of BGR images (N, H, W, 3) of a fit size."""
+        if self.head is not None:
+            own: Floats = self.session.run([self.output], {self.input: images})[0]
+            return own
+        rgb = images[..., ::-1].astype(np.float32) / 255
         rgb = (rgb - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
-        (maps,) = self.session.run(
-            [self.output], {self.input: rgb.transpose(2, 0, 1)[None].astype(np.float32)}
-        )
-        return np.ascontiguousarray(maps[0].transpose(1, 2, 0))
+        planes = np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32)
+        (maps,) = self.session.run([self.output], {self.input: planes})
+        return np.ascontiguousarray(maps.transpose(0, 2, 3, 1))
+
+    def embed(self, parts: Sequence[PartSamples], means: Sequence[Floats]) -> Embeddings:
+        """Both parts' cells through the head, all objects at once."""
+        fed = head_inputs(parts, means)
+        if not len(means[0]):
+            return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
+        foreground, background = self.head.run(None, dict(zip(("fg", "bg"), fed, strict=True)))
+        return Embeddings(np.asarray(foreground, np.float64), np.asarray(background, np.float64))
+
+
+def head_inputs(parts: Sequence[PartSamples], means: Sequence[Floats]) -> tuple[Floats, Floats]:
+    """What a head sees of each cell: mean feature, share that counts, share on other objects.
+
+    Returns (N, cells * cells * (C + 2)) for the foreground and for the background.
+    """
+    rows = [
+        np.concatenate([mean, part.share[..., None], part.others[..., None]], -1)
+        for part, mean in zip(parts, means, strict=True)
+    ]
+    foreground, background = (r.reshape(len(r), -1).astype(np.float32) for r in rows)
+    return foreground, background
 
 
 class _LazyEmbeddings:

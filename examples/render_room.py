@@ -9,8 +9,10 @@ seed, same bytes (the video file itself depends on the codec of the OpenCV build
 `examples/room` was made with `--seed 0 --frames 240 --crf 21`.
 
 How it works:
-  1. `make_room`: a seeded floor plan; furniture from textured parallelograms, discs, spheres and
-     frustums ("patches"); procedural textures in one atlas; light baked by marching through voxels.
+  1. `make_room`: a seeded floor plan (`--plan varied --path tour`: another room, other sets of
+     twins, another look and walk for every seed, as training needs); furniture from textured
+     parallelograms, discs, spheres and frustums ("patches"); procedural textures in one atlas;
+     light baked by marching through voxels.
   2. `camera_path`: a smooth walk with hand shake that leaves its first view and returns.
   3. `render`: per patch, 1/z, s/z, t/z are linear in the pixel (quads) or follow from a root of ray
      and quadric (round parts); z-buffer at twice the size, then one texture and one light look-up.
@@ -31,7 +33,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -87,7 +89,8 @@ class RoomConfig:
     plants: int = 2
     couch: bool = True
     extras: bool = True  # laptop, keyboard, mouse, vase, clock, teddy bear, ball, suitcase, bowl
-    path: str = "revisit"  # revisit (leave and come back) | walk (once around) | orbit (one table)
+    path: str = "revisit"  # revisit (leave, come back) | walk (around) | orbit (one table) | tour
+    plan: str = "home"  # home (the plan of examples/room) | varied (another room for every seed)
     eye_m: float = 1.5  # camera height
     shake_deg: float = 0.5  # amplitude of the hand's rotation
     shake_m: float = 0.012  # amplitude of the hand's translation
@@ -767,6 +770,44 @@ def chair_model() -> Model:
     return Model("chair", "box", tuple(parts))
 
 
+def office_chair_model() -> Model:
+    """Swivel chair: five-armed foot, gas lift, padded seat and back."""
+    parts = [frustum((0, 0, 0.1), 0.34, (0.03, 0.025), "plastic")]
+    for turn in np.arange(5) * 2 * np.pi / 5:
+        tip = (0.15 * float(np.sin(turn)), -0.15 * float(np.cos(turn)), 0.08)
+        parts += box(tip, (0.05, 0.3, 0.04), "plastic", None, rotation_z(float(turn)))
+    cloth = {side: "chair_cloth" for side in ("top", "front", "back")}
+    parts += box((0, -0.02, 0.47), (0.48, 0.46, 0.08), "chair_cloth", cloth)
+    parts += box((0, 0.24, 0.56), (0.07, 0.04, 0.3), "plastic")
+    parts += box((0, 0.22, 0.84), (0.44, 0.07, 0.46), "chair_cloth", cloth, rotation_x(-0.12))
+    for x in (-0.27, 0.27):
+        parts += box((x, 0.02, 0.66), (0.05, 0.26, 0.03), "plastic")
+        parts += box((x, 0.1, 0.57), (0.03, 0.04, 0.18), "plastic")
+    return Model("chair", "box", tuple(parts))
+
+
+def tub_chair_model() -> Model:
+    """Low arm chair of one colour on a round plinth."""
+    parts = upright((0, 0, 0), 0.22, (0.2, 0.24), "plastic", "plastic")
+    parts += upright((0, 0, 0.22), 0.2, (0.3, 0.33), "chair_cloth", "chair_cloth")
+    for turn in np.linspace(-1.9, 1.9, 9):
+        spot = (0.3 * np.sin(turn), 0.3 * np.cos(turn), 0.55)
+        parts += box(spot, (0.16, 0.08, 0.3), "chair_cloth", None, rotation_z(-float(turn)))
+    return Model("chair", "box", tuple(parts))
+
+
+def stretched(model: Model, factors: npt.ArrayLike) -> Model:
+    """The model with other proportions: (3,) factors along x, y, z."""
+    parts = []
+    for part in model.parts:
+        frame = np.diag(np.asarray(factors, float)) @ part.obj_from_patch
+        if part.kind in (QUAD, DISC):
+            into = np.cross(frame[:, 0], frame[:, 1])
+            frame[:, 2] = into / np.linalg.norm(into)
+        parts.append(replace(part, obj_from_patch=frame))
+    return Model(model.class_name, model.support, tuple(parts))
+
+
 def table_model(size: tuple[float, float, float], wood_name: str) -> Model:
     """Four-legged table with aprons."""
     w, d, h = size
@@ -1249,6 +1290,135 @@ def clutter(size: tuple[float, float, float]) -> list[Part]:
     return parts
 
 
+def turned(places: Sequence[Place], yaw_rad: float, x: float, y: float) -> list[Place]:
+    """Turn a group about the origin and move it there."""
+    turn, at = rotation_z(yaw_rad), np.array([x, y, 0.0])
+    spots = [turn @ np.asarray(place.position) + at for place in places]
+    return [
+        Place(
+            place.model, (float(spot[0]), float(spot[1]), float(spot[2])), place.yaw_rad + yaw_rad
+        )
+        for place, spot in zip(places, spots, strict=True)
+    ]
+
+
+def varied_group(config: RoomConfig, rng: Rng) -> list[Place]:
+    """A table with chairs, a desk or a lounge around the origin; some things missing."""
+    kind = rng.choice(3, p=[0.4, 0.4, 0.2])
+    if kind == 0:
+        group = dining_places(config, rng, (0.0, 0.0))
+    elif kind == 1:
+        group = turned(desk_places(rng, (0.8, 0.0, 0.0)), 0.0, 0.35, 0.55)
+    else:
+        group = turned(lounge_places(rng, (3.4, 1.0, 0.0)), 0.0, -0.55, 0.4)
+        group = [place for place in group if place.position[0] < 1.6]
+    second = rng.random() < 0.3
+    names = {"chair": "chair2"} if second else {}
+    names |= {
+        f"{kind}{i}": f"{kind}{rng.integers(2)}" for kind in ("bottle", "book") for i in (0, 1)
+    }
+    large = ("table", "desk", "couch", "coffee")
+    return [
+        replace(place, model=names.get(place.model, place.model))
+        for place in group
+        if place.model in large or rng.random() < 0.8
+    ]
+
+
+def varied_plan(
+    config: RoomConfig, rng: Rng, size: tuple[float, float, float]
+) -> tuple[list[Place], list[Part]]:
+    """Groups on a jittered grid, each turned by its own right angle; furniture and pictures on
+    walls of this seed's choice.
+    """
+    w, d, h = size
+    columns, rows = max(int((w - 0.6) / 2.5), 1), max(int((d - 0.6) / 2.3), 1)
+    plan: list[Place] = []
+    for cell in rng.permutation(columns * rows)[: max(2, columns * rows - int(rng.integers(2)))]:
+        x = (cell % columns + 0.5) / columns * (w - 0.8) - (w - 0.8) / 2
+        y = (cell // columns + 0.5) / rows * (d - 0.8) - (d - 0.8) / 2
+        yaw = float(rng.integers(4)) * np.pi / 2 + float(rng.normal(0, 0.08))
+        jitter = rng.normal(0, 0.12, 2)
+        plan += turned(varied_group(config, rng), yaw, x + jitter[0], y + jitter[1])
+    quarter = int(rng.integers(4))
+    fixed = fixed_furniture((d, w, h) if quarter % 2 else size)
+    parts = [moved(part, rotation_z(quarter * np.pi / 2), np.zeros(3)) for part in fixed]
+    inside = np.array([w / 2 - 0.3, d / 2 - 0.3])
+    kept = [place for place in plan if (np.abs(place.position[:2]) < inside).all()]
+    return kept, parts + wall_things(rng, size)
+
+
+def wall_things(rng: Rng, size: tuple[float, float, float]) -> list[Part]:
+    """Pictures, boxes, boards and radiators along all walls: background of which no two spots are
+    alike.
+    """
+    names = ["carton", "basket", "side_wood", "case_wood", "white_wood", "curtain", "plastic"]
+    names += [f"poster{i}" for i in range(12)] + [f"spines{i}" for i in range(5)]
+    parts: list[Part] = []
+    for _ in range(int(rng.integers(14, 34))):
+        side = int(rng.integers(4))
+        reach, length = (size[1], size[0]) if side % 2 == 0 else (size[0], size[1])
+        hung = rng.random() < 0.6
+        extent = rng.uniform([0.12, 0.02, 0.15], [0.9, 0.06 if hung else 0.45, 0.9])
+        z = rng.uniform(0.9, 2.0) if hung else extent[2] / 2
+        along = rng.uniform(-0.5, 0.5) * (length - 1.0)
+        center = rotation_z(side * np.pi / 2) @ [along, reach / 2 - extent[1] / 2 - 0.01, z]
+        name = names[int(rng.integers(len(names)))]
+        faces = {"front": name}
+        parts += box(center, extent.tolist(), name, faces, rotation_z(side * np.pi / 2))
+    return parts
+
+
+def varied_models(rng: Rng, models: dict[str, Model]) -> dict[str, Model]:
+    """Other proportions for everything and two kinds of chairs."""
+    chairs = [chair_model(), office_chair_model(), tub_chair_model()]
+    first, second = rng.permutation(3)[:2]
+    models = models | {"chair": chairs[first], "chair2": chairs[second]}
+    return {
+        name: stretched(model, rng.uniform(0.87, 1.15) * rng.uniform(0.93, 1.07, 3))
+        if name not in ("table", "desk", "coffee")  # things stand on them
+        else stretched(model, (*rng.uniform(0.9, 1.2, 2), 1.0))
+        for name, model in models.items()
+    }
+
+
+def varied_textures(rng: Rng, config: RoomConfig, size: tuple[int, int, int]) -> dict[str, Image]:
+    """Walls, floor, woods and cloths of another look; `size` in texels."""
+
+    def tone(strong: float) -> Color:
+        pale = rng.random() > strong
+        return pale_color(rng) if pale else random_color(rng, 60, 200)
+
+    def paint(
+        height: int, width: int, kinds: Sequence[Callable[..., Image]], strong: float
+    ) -> Image:
+        return kinds[int(rng.integers(len(kinds)))](rng, height, width, tone(strong))
+
+    w, d, h = size
+    walls = (plain, plaster, plaster, wallpaper, bricks, planks)
+    textures = {
+        f"wall_{side}": paint(h, w if side in ("north", "south") else d, walls, 0.3)
+        for side in ("north", "south", "east", "west")
+    }
+    if rng.random() < 0.5:  # as most rooms: all walls alike
+        textures["wall_north"] = textures["wall_south"]
+        textures["wall_east"] = textures["wall_west"]
+    textures["floor"] = paint(d, w, (planks, planks, plain, fabric, plaster, bricks), 0.6)
+    for name in ("chair_wood", "table_wood", "desk_wood", "case_wood", "side_wood"):
+        textures[name] = paint(512, 512, (wood, wood, plain), 0.8)
+    for name in ("chair_cloth", "couch", "couch_cushion", "pillow"):
+        textures[name] = fabric(rng, 512, 512, tone(0.8), bool(rng.random() < 0.4))
+    for name in ("plastic", "china", "alu", "glass", "cap"):
+        textures[name] = plain(rng, 256, 256, tone(0.6))
+    return textures
+
+
+def pale_color(rng: Rng) -> Color:
+    """Nearly grey, from dim to white: most walls."""
+    color = np.clip(rng.uniform(90, 235) + rng.normal(0, 9, 3), 20, 248)
+    return float(color[0]), float(color[1]), float(color[2])
+
+
 def lamp_spots() -> tuple[tuple[float, float], ...]:
     """Where the two ceiling panels hang (x, y in m)."""
     return ((-1.4, -0.5), (1.5, 0.4))
@@ -1612,28 +1782,36 @@ def part_extremes(part: Part) -> Array:
 
 
 def make_room(config: RoomConfig) -> Room:
-    """Plan, furnish, paint and light a room; the same config gives the same room."""
+    """Plan, furnish, paint and light a room; the same config gives the same room.
+
+    Raises: ValueError for an unknown plan.
+    """
+    if config.plan not in ("home", "varied"):
+        raise ValueError(f"plan {config.plan!r} is unknown: use home or varied")
+    varied = config.plan == "varied"
     rng = np.random.default_rng([config.seed, 1])
-    w, d, h = (
-        side * (1 + float(rng.uniform(-1, 1)) * config.room_jitter) for side in config.room_m
-    )
+    sides = rng.uniform((5.0, 4.4, 2.4), (8.6, 7.2, 3.1)) if varied else config.room_m
+    w, d, h = (side * (1 + float(rng.uniform(-1, 1)) * config.room_jitter) for side in sides)
     size = (w, d, h)
     models = furniture_models(rng)
-    center = (-w / 2 + 1.65 + float(rng.uniform(-0.1, 0.1)), -0.95 + float(rng.uniform(-0.1, 0.1)))
-    plan = (
-        dining_places(config, rng, center)
-        + desk_places(rng, size)
-        + lounge_places(rng, size)
-        + shelf_places(size)
-    )
+    if varied:
+        models = varied_models(rng, models)
+        plan, fixed = varied_plan(config, rng, size)
+    else:
+        plan = limit_places(home_plan(config, rng, size), config)
+        fixed = wall_pictures(size, rng) + fixed_furniture(size)
     placed = [
         place_object(i, place, models[place.model], list(models).index(place.model))
-        for i, place in enumerate(limit_places(plan, config))
+        for i, place in enumerate(plan)
     ]
-    parts = room_shell(size) + skirting(size) + wall_pictures(size, rng) + fixed_furniture(size)
+    parts = room_shell(size) + skirting(size) + fixed
     owners = [-1] * len(parts) + [truth.index for truth, own, _ in placed for _ in own]
     parts += [part for _, own, _ in placed for part in own]
-    atlas, rects = build_atlas(make_textures(rng, config, size))
+    textures = make_textures(rng, config, size)
+    if varied:
+        texels = (int(w * config.texels_per_m), int(d * config.texels_per_m))
+        textures |= varied_textures(rng, config, (*texels, int(h * config.texels_per_m)))
+    atlas, rects = build_atlas(textures)
     windows = object_windows(
         parts, owners, rects, config, rng, [truth.twin_group for truth, _, _ in placed]
     )
@@ -1641,6 +1819,20 @@ def make_room(config: RoomConfig) -> Room:
     light = bake_light(surfaces, size, light_height, config.light_rays, rng)
     return Room(
         size, tuple(t for t, _, _ in placed), surfaces, atlas, light, tuple(o for _, _, o in placed)
+    )
+
+
+def home_plan(config: RoomConfig, rng: Rng, size: tuple[float, float, float]) -> list[Place]:
+    """Dining table, desk, lounge and shelves, each at its own place."""
+    center = (
+        -size[0] / 2 + 1.65 + float(rng.uniform(-0.1, 0.1)),
+        -0.95 + float(rng.uniform(-0.1, 0.1)),
+    )
+    return (
+        dining_places(config, rng, center)
+        + desk_places(rng, size)
+        + lounge_places(rng, size)
+        + shelf_places(size)
     )
 
 
@@ -2071,7 +2263,26 @@ def camera_matrix(config: RoomConfig) -> Array:
     return np.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1.0]])
 
 
-def path_keys(room: Room, kind: str) -> tuple[Array, Array, Array]:
+def tour_keys(room: Room, seed: int) -> list[tuple[float, tuple[float, float], Any]]:
+    """Twice past every table, desk and couch, in another order and from another side."""
+    rng = np.random.default_rng([seed, 6])
+    large = [o for o in room.objects if o.class_name in ("dining table", "couch")]
+    targets = np.array([o.center_in_world for o in large or room.objects])  # (T, 3)
+    angle = rng.uniform(0, 2 * np.pi, len(targets))
+    limit = np.array(room.size_m[:2]) / 2 - 0.5
+    stops = []
+    for _ in range(2):
+        for t in rng.permutation(len(targets)):
+            turn = angle[t] + rng.normal(0, 0.6)
+            for step in (0.0, rng.normal(0, 0.5)):
+                away = rng.uniform(1.1, 3.0) * np.array([np.cos(turn + step), np.sin(turn + step)])
+                spot = np.clip(targets[t, :2] + away, -limit, limit)
+                aim = targets[t] + rng.normal(0, 0.25, 3)
+                stops.append(((float(spot[0]), float(spot[1])), aim))
+    return [(i / (len(stops) - 1), spot, aim) for i, (spot, aim) in enumerate(stops)]
+
+
+def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array]:
     """Where the walk passes: time (K,) in 0..1, camera x, y (K, 2), what it looks at (K, 3)."""
     w, d, _ = room.size_m
     dining = (-w / 2 + 1.75, -0.9, 0.62)
@@ -2099,8 +2310,10 @@ def path_keys(room: Room, kind: str) -> tuple[Array, Array, Array]:
         turns = np.radians(np.linspace(-18, 82, 8))
         spots = [(dining[0] + 2.5 * np.cos(a), dining[1] + 2.5 * np.sin(a)) for a in turns]
         keys = [(i / 7, spot, dining) for i, spot in enumerate(spots)]
+    elif kind == "tour":
+        keys = tour_keys(room, seed)
     elif kind != "revisit":
-        raise ValueError(f"path {kind!r} is unknown: use revisit, walk or orbit")
+        raise ValueError(f"path {kind!r} is unknown: use revisit, walk, orbit or tour")
     times, spots_xy, targets = zip(*keys, strict=True)
     return np.array(times), np.array(spots_xy), np.array(targets)
 
@@ -2127,7 +2340,7 @@ def hand_shake(rng: Rng, seconds: Array) -> Array:
 def camera_path(room: Room, config: RoomConfig) -> Array:
     """Walk through the room by hand: cam_from_world (F, 3, 4), always translating, seeded."""
     rng = np.random.default_rng([config.seed, 2])
-    times, spots, targets = path_keys(room, config.path)
+    times, spots, targets = path_keys(room, config.path, config.seed)
     aim = targets - np.column_stack([spots, np.full(len(spots), config.eye_m)])  # (K, 3)
     yaw = np.unwrap(np.arctan2(aim[:, 1], aim[:, 0]))
     pitch = np.arctan2(aim[:, 2], np.hypot(aim[:, 0], aim[:, 1]))
@@ -2518,6 +2731,8 @@ def objects_json(room: Room, config: RoomConfig) -> dict[str, Any]:
         "pixels": "corner (COLMAP)",
     }
     settings = {name: getattr(config, name) for name in config.__slots__}
+    if config.plan == "home":
+        del settings["plan"]
     head: dict[str, Any] = {
         "format": "reobj-room-truth",
         "version": 1,
@@ -2648,10 +2863,11 @@ def build_parser() -> argparse.ArgumentParser:
     add("--fps", type=float, default=base.fps)
     add(
         "--path",
-        choices=("revisit", "walk", "orbit"),
+        choices=("revisit", "walk", "orbit", "tour"),
         default=base.path,
         help="how the camera moves",
     )
+    add("--plan", choices=("home", "varied"), default=base.plan, help="varied: a room of its own")
     add("--chairs", type=int, default=base.chairs, help="identical chairs, up to 6")
     add("--monitors", type=int, default=base.monitors)
     add("--noise", type=float, default=base.noise, help="sensor noise in grey levels")
@@ -2687,6 +2903,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         frames=args.frames,
         fps=args.fps,
         path=args.path,
+        plan=args.plan,
         chairs=args.chairs,
         monitors=args.monitors,
         noise=args.noise,

@@ -1,0 +1,902 @@
+#!/usr/bin/env python3
+"""Train the embedding of `reobj_track.py`: one small backbone pass a frame, two parts an object.
+
+    python examples/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
+
+writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`), OUT/last.pt (go on
+with --resume), OUT/log.csv and OUT/curves.png. Needs `pip install torch matplotlib onnx` (CPU or
+GPU; the GPU is used when there is one).
+
+What it learns from; every source may be given several times:
+  --rooms A:B           seeds of rendered rooms with sets of identical twins (render_room.py
+                        `--plan varied --path tour`), rendered on the fly into --cache.
+  --sparse IMAGES=DIR   self-supervision of poses: a COLMAP model of the images, such as `sparse/`
+                        of an output folder of `run`. A ball around a 3D point is a pseudo-object:
+                        the views that observe the point show the same place from another side.
+  --tracks IMAGES=FILE  `tracks.txt` of `run` (MOTChallenge): identity by 3D object.
+Validation: --val-rooms A:B, --val-sparse.
+
+Method: each step takes several scenes and several views of each, and changes every picture as
+phones do (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of
+masks half of the time). Triplet loss on cosines of (foreground, background) together and of each
+alone; for every anchor and positive the negative is semi-hard at first (nearest of those further
+than the positive), later the hardest of the same scene: an identical twin elsewhere in the room.
+Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
+al., MobileNetV2, CVPR 2018 (inverted residual).
+
+Axes: B frames of a batch, D detections of a frame, N of a batch, C channels of the map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
+import render_room as rr  # noqa: E402
+
+import reobj_track as rt  # noqa: E402
+
+try:
+    import torch
+    from torch import nn
+    from torch.nn import functional as F
+except ImportError:
+    sys.exit("train_embedding.py needs PyTorch: pip install torch matplotlib onnx")
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+IntArray = npt.NDArray[np.int64]
+
+SIZE_WH = (320, 240)  # of a training picture; in use the longer side is 320, any shape
+STRIDE = 16  # sides of the network's input are multiples of it
+LAYOUT = {"size_px": 320, "context": 0.5, "reach": 0.05, "samples": 4,
+          "foreground_cells": 3, "background_cells": 4}  # fmt: skip
+COLOURS, LEARNED = 17, 48  # channels of the map: fixed colour histogram, learned features
+CHANNELS, WIDTH = COLOURS + LEARNED, 128  # of the map and of each embedding
+
+
+# ---- Clips: pictures with identified boxes -------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Clip:
+    """Views of one scene, as lists over its F frames.
+
+    Attributes:
+        images: (H, W, 3) BGR. labels: (H, W) uint8 row of `identity` + 1 at each pixel, or None.
+        xyxy: (D, 4) boxes. identity: (D,) within the clip. look: (D,) things of one look share it.
+        sure: (D,) whether it hides the background of others (pseudo-objects do not).
+    """
+
+    name: str
+    images: list[Image]
+    labels: list[Image] | None
+    xyxy: list[Array]
+    identity: list[IntArray]
+    look: list[IntArray]
+    sure: bool
+
+    def shared(self) -> npt.NDArray[np.float32]:
+        """(F, F) number of identities that two frames have in common."""
+        count = max((int(i.max(initial=-1)) for i in self.identity), default=-1) + 1
+        seen = np.zeros((len(self.images), count), np.float32)
+        for row, identity in zip(seen, self.identity, strict=True):
+            row[identity] = 1
+        return np.asarray(seen @ seen.T, np.float32)
+
+
+def room_config(seed: int, frames: int = 40) -> rr.RoomConfig:
+    """One training room: small pictures, coarse light, its own lens and eye height."""
+    rng = np.random.default_rng([seed, 8])
+    lens, eye = float(rng.uniform(52, 76)), float(rng.uniform(1.15, 1.75))
+    return rr.RoomConfig(seed=seed, frames=frames, width=SIZE_WH[0], height=SIZE_WH[1],
+                         texels_per_m=200.0, light_rays=4, shutter=0.0, noise=0.0, exposure=0.1,
+                         plan="varied", path="tour", hfov_deg=lens, eye_m=eye)  # fmt: skip
+
+
+def room_clip(seed: int, cache: Path, frames: int = 40) -> Clip:
+    """Render a room, or read it from the cache."""
+    path = cache / f"room_{seed}.npz"
+    if not path.exists():
+        render_to(path, room_config(seed, frames))
+    data = np.load(path)
+    boxes, visibility, labels = data["xyxy"], data["visibility"], data["instance"]
+    sides = (boxes[..., 2:] - boxes[..., :2]).min(2)  # (F, O), NaN where not in view
+    seen = (visibility > 0.3) & (np.nan_to_num(sides) >= 7)
+    rows = [np.flatnonzero(row) for row in seen]
+    return Clip(
+        f"room {seed}", list(data["image"]), [label + np.uint8(1) for label in labels],
+        [box[row].astype(float) for box, row in zip(boxes, rows, strict=True)],
+        rows, [data["look"][row] for row in rows], True,
+    )  # fmt: skip
+
+
+def render_to(path: Path, config: rr.RoomConfig) -> None:
+    """Render one room into a cache file."""
+    room = rr.make_room(config)
+    frames = list(rr.render_clip(room, config))
+    part = path.with_suffix(".part.npz")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        part,
+        image=np.stack([f.image for f in frames]),
+        instance=np.stack([f.instance for f in frames]).astype(np.uint8),  # -1 becomes 255
+        xyxy=np.stack([f.truth.visible_xyxy for f in frames]).astype(np.float32),
+        visibility=np.stack([f.truth.visibility for f in frames]).astype(np.float32),
+        class_id=np.array([o.class_id for o in room.objects]),
+        look=np.array([o.twin_group for o in room.objects]),
+    )
+    part.replace(path)
+
+
+def read_pictures(folder: Path) -> dict[str, tuple[Image, float]]:
+    """All images of a folder with a longer side of 1.5 times the network's, and their scale."""
+    pictures = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in (".jpg", ".jpeg", ".png"):
+            continue
+        image = cv2.imread(str(path))
+        if image is None:
+            raise SystemExit(f"error: {path}: not an image that OpenCV reads")
+        scale = min(1.0, 1.5 * SIZE_WH[0] / max(image.shape[:2]))
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        pictures[path.name] = np.asarray(small, np.uint8), scale
+    if not pictures:
+        raise SystemExit(f"error: {folder}: no images (.jpg, .png) in it")
+    return pictures
+
+
+def sparse_clip(folder: Path, model: Path, seed: int = 0, points: int = 400) -> Clip:
+    """Pseudo-objects of a COLMAP model: balls around 3D points that three views or more observe."""
+    import pycolmap
+
+    pictures = read_pictures(folder)
+    scene = pycolmap.Reconstruction(str(model))
+    rng = np.random.default_rng([seed, 9])
+    long = sorted(i for i, point in scene.points3D.items() if point.track.length() >= 3)
+    keep = rng.permutation(long)[: 4 * points]
+    row_of = {int(point): row for row, point in enumerate(keep)}
+    share = np.exp(rng.uniform(np.log(0.05), np.log(0.3), len(keep)))  # box side / picture's height
+    size = np.zeros(len(keep))  # ball's diameter, set by the first view
+    clip = Clip(f"{folder.parent.name}/{folder.name}", [], None, [], [], [], False)
+    for image in sorted(scene.images.values(), key=lambda image: str(image.name)):
+        if image.name not in pictures or not image.has_pose:
+            continue
+        picture, _ = pictures[image.name]
+        seen = [p for p in image.points2D if p.has_point3D() and int(p.point3D_id) in row_of]
+        rows = np.array([row_of[int(p.point3D_id)] for p in seen], np.int64)
+        world = np.array([scene.points3D[int(p.point3D_id)].xyz for p in seen]).reshape(-1, 3)
+        pose = np.asarray(image.cam_from_world().matrix())
+        depth = np.maximum(world @ pose[2, :3] + pose[2, 3], 1e-6)
+        focal = image.camera.mean_focal_length() / image.camera.height
+        size[rows] = np.where(size[rows] > 0, size[rows], share[rows] * depth / focal)
+        side = size[rows] * focal / depth * picture.shape[0]
+        xy = np.array([p.xy for p in seen]).reshape(-1, 2) * (picture.shape[1] / image.camera.width)
+        add_view(clip, picture, np.c_[xy - side[:, None] / 2, xy + side[:, None] / 2], rows)
+    center = np.array([scene.points3D[int(point)].xyz for point in keep])
+    return keep_identities(clip, apart(center, size)[:points])
+
+
+def apart(center: Array, size: Array) -> IntArray:
+    """Rows of balls that were seen and hardly overlap with an earlier one.
+
+    Overlapping balls would be the same place under two names.
+    """
+    kept: list[int] = []
+    for row in np.flatnonzero(size > 0):
+        distance = np.linalg.norm(center[kept] - center[row], axis=1)
+        if (distance > 0.375 * (size[kept] + size[row])).all():
+            kept.append(int(row))
+    return np.array(kept, np.int64)
+
+
+def keep_identities(clip: Clip, wanted: IntArray) -> Clip:
+    """Drop all boxes but those of the wanted identities."""
+    for frame, identity in enumerate(clip.identity):
+        keep = np.isin(identity, wanted)
+        clip.xyxy[frame], clip.identity[frame] = clip.xyxy[frame][keep], identity[keep]
+        clip.look[frame] = clip.look[frame][keep]
+    return clip
+
+
+def tracks_clip(folder: Path, tracks: Path) -> Clip:
+    """Identities of `tracks.txt` (frame, id, x, y, w, h, ...; frame 1 is the first image)."""
+    rows = np.loadtxt(tracks, delimiter=",", ndmin=2)
+    clip = Clip(f"{folder.parent.name}/{tracks.name}", [], None, [], [], [], True)
+    for number, (picture, scale) in enumerate(read_pictures(folder).values(), 1):
+        own = rows[rows[:, 0] == number]
+        corners = np.c_[own[:, 2:4], own[:, 2:4] + own[:, 4:6]] * scale
+        add_view(clip, picture, corners, own[:, 1].astype(np.int64))
+    return clip
+
+
+def add_view(clip: Clip, picture: Image, xyxy: Array, identity: IntArray) -> None:
+    """Append a view with those boxes that lie in it for the most part and are neither tiny nor
+    huge.
+    """
+    limit = np.array(picture.shape[1::-1] * 2, float)
+    inside = np.clip(xyxy, 0, limit)
+    area = np.prod(inside[:, 2:] - inside[:, :2], axis=1)
+    share = area / np.maximum(np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1), 1e-9)
+    side = (inside[:, 2:] - inside[:, :2]).min(1, initial=np.inf) / limit[0]
+    keep = (share > 0.6) & (side > 0.025) & (side < 0.8)
+    clip.images.append(picture)
+    clip.xyxy.append(inside[keep])
+    clip.identity.append(identity[keep])
+    clip.look.append(identity[keep])
+
+
+# ---- Augmentation --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One augmented picture with the samples of its boxes on the feature map."""
+
+    picture: Image  # (H, W, 3)
+    identity: IntArray  # (D,)
+    look: IntArray  # (D,)
+    parts: tuple[rt.PartSamples, rt.PartSamples]
+
+
+def photo_tone(rng: np.random.Generator, strength: float) -> Callable[[Image], Image]:
+    """A random change of gamma, gain, white balance, contrast and saturation."""
+    gamma = np.exp(rng.normal(0, 0.3 * strength))
+    gains = np.exp(rng.normal(0, 0.16 * strength) + rng.normal(0, 0.09 * strength, 3))
+    lift = rng.uniform(0, 0.1 * strength)
+    fade = np.clip(rng.normal(1 - 0.15 * strength, 0.25 * strength), 0.1, 1.6)
+    table = np.arange(256)[:, None] / 255.0
+    curve = np.clip((table**gamma * gains) * (1 - lift) + lift, 0, 1) * 255
+    lut = np.ascontiguousarray(curve.astype(np.uint8)[None])  # (1, 256, 3)
+
+    def change(image: Image) -> Image:
+        image = np.asarray(cv2.LUT(image, lut), np.uint8)
+        gray = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+        return np.asarray(cv2.addWeighted(image, fade, gray, 1 - fade, 0), np.uint8)
+
+    return change
+
+
+def degrade(rng: np.random.Generator, image: Image) -> Image:
+    """Blur of motion or focus, coarser resolution, sensor noise, JPEG."""
+    kind = rng.random()
+    if kind < 0.2:
+        kernel = np.zeros((9, 9), np.float32)
+        reach, turn = rng.uniform(1, 4), rng.uniform(0, np.pi)
+        step = np.array([np.cos(turn), np.sin(turn)]) * reach
+        ends = np.round(4 + np.stack([-step, step])).astype(int).tolist()
+        cv2.line(kernel, ends[0], ends[1], (1.0,))
+        image = np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()), np.uint8)
+    elif kind < 0.4:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.3)), np.uint8)
+    if rng.random() < 0.5:
+        noise = rng.standard_normal(image.shape, np.float32) * np.float32(rng.uniform(1, 6))
+        image = np.asarray(np.clip(image + noise, 0, 255), np.uint8)
+    if rng.random() < 0.4:
+        code = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 95))]
+        image = np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, code)[1], 1), np.uint8)
+    return image
+
+
+def crop_window(rng: np.random.Generator, image: Image, least: float) -> tuple[Array, float]:
+    """Corner (2,) and factor of a random window with the training picture's shape."""
+    height, width = image.shape[:2]
+    fit = min(width / SIZE_WH[0], height / SIZE_WH[1]) * rng.uniform(least, 1.0)
+    extent = np.array(SIZE_WH) * fit
+    return rng.uniform(0, 1, 2) * (np.array([width, height]) - extent), float(1 / fit)
+
+
+def make_view(
+    clip: Clip,
+    frame: int,
+    rng: np.random.Generator,
+    change: Callable[[Image], Image] | None,
+    flip: bool,
+    wanted: IntArray,
+) -> View:
+    """Augment one frame (change None: leave it, for validation) and sample its boxes."""
+    image, augment = clip.images[frame], change is not None
+    corner, factor = crop_window(rng, image, 0.72 if augment else 1.0)
+    warp = np.array([[factor, 0, -factor * corner[0]], [0, factor, -factor * corner[1]]])
+    if flip:
+        warp = np.array([[-1.0, 0, SIZE_WH[0]], [0, 1.0, 0]]) @ np.vstack([warp, [0, 0, 1]])
+    pixel = warp.copy()
+    pixel[:, 2] += warp[:, :2] @ [0.5, 0.5] - 0.5  # pixel centres lie at .5
+    flags = cv2.INTER_LINEAR if factor >= 1 else cv2.INTER_AREA
+    picture = np.asarray(cv2.warpAffine(image, pixel, SIZE_WH, flags=flags), np.uint8)
+    xyxy = clip.xyxy[frame] @ np.kron(np.eye(2), warp[:, :2]).T + np.tile(warp[:, 2], 2)
+    xyxy = np.c_[np.minimum(xyxy[:, :2], xyxy[:, 2:]), np.maximum(xyxy[:, :2], xyxy[:, 2:])]
+    if change is not None:
+        picture = degrade(rng, photo_tone(rng, 0.25)(change(picture)))
+    keep, boxes = jittered(rng, xyxy, 0.04 if augment else 0.0)
+    keep &= np.isin(clip.identity[frame], wanted)
+    masks = None
+    if clip.labels is not None and (not augment or rng.random() < 0.5):
+        label = cv2.warpAffine(clip.labels[frame], pixel, SIZE_WH, flags=cv2.INTER_NEAREST)
+        masks = label[None] == (clip.identity[frame] + 1)[:, None, None]
+    score = np.full(len(boxes), float(clip.sure))
+    if augment and not clip.sure:
+        score = (rng.random(len(boxes)) < 0.03).astype(float)
+    found = rt.Detections(boxes, score, np.zeros(len(boxes), np.int64), masks)
+    rows, shape = np.flatnonzero(keep), (SIZE_WH[1] // 4, SIZE_WH[0] // 4)
+    parts = rt.part_samples(found, rows, SIZE_WH[::-1], shape, layout())
+    return View(picture, clip.identity[frame][rows], clip.look[frame][rows], parts)
+
+
+def layout() -> rt.EmbedConfig:
+    """Where the map is sampled."""
+    return rt.EmbedConfig(**LAYOUT)  # type: ignore[arg-type]
+
+
+def jittered(
+    rng: np.random.Generator, xyxy: Array, sigma: float
+) -> tuple[npt.NDArray[np.bool_], Array]:
+    """Boxes as a detector would draw them, and which of them are still in view (40 %)."""
+    extent = np.tile(xyxy[:, 2:] - xyxy[:, :2], 2)
+    moved = xyxy + rng.normal(0, 1, xyxy.shape) * sigma * extent
+    cut = np.clip(moved, 0, [*SIZE_WH, *SIZE_WH])
+    sides = cut[:, 2:] - cut[:, :2]
+    keep = (sides.prod(1) > 0.4 * extent[:, :2].prod(1)) & (sides.min(1, initial=np.inf) >= 6)
+    return keep, cut
+
+
+def pick_frames(clip: Clip, shared: Any, views: int, rng: np.random.Generator) -> IntArray:
+    """A frame, frames that show some of the same objects, and two of anywhere."""
+    first = int(rng.choice(len(shared), p=shared.diagonal() / shared.diagonal().sum()))
+    chance = np.minimum(shared[first], 6) + 0.0
+    chance[first] = 0
+    friends = rng.permutation(np.flatnonzero(chance))
+    weights = chance[friends] / max(chance.sum(), 1e-9)
+    count = min(views - 3, len(friends))
+    chosen = rng.choice(friends, count, replace=False, p=weights) if count else friends
+    rest = np.setdiff1d(np.arange(len(shared)), [first, *chosen])
+    others = rng.choice(rest, min(views - 1 - count, len(rest)), replace=False)
+    return np.concatenate([[first], chosen, others]).astype(np.int64)
+
+
+def draw_scene(
+    clip: Clip, shared: Any, views: int, rng: np.random.Generator, most: int = 24
+) -> list[View]:
+    """Several augmented views of one scene with at most so many identities."""
+    frames = pick_frames(clip, shared, views, rng)
+    tone, flip = photo_tone(rng, 1.0), bool(rng.random() < 0.5)
+    seen, times = np.unique(np.concatenate([clip.identity[f] for f in frames]), return_counts=True)
+    order = np.argsort(-times + rng.random(len(times)))
+    wanted = seen[order[:most]]
+    return [make_view(clip, int(f), rng, tone, flip, wanted) for f in frames]
+
+
+# ---- Network -------------------------------------------------------------------------------------
+
+
+def block(inner: int, outer: int, kernel: int = 3, stride: int = 1, groups: int = 1) -> nn.Module:
+    """Convolution, batch norm, ReLU."""
+    conv = nn.Conv2d(inner, outer, kernel, stride, kernel // 2, groups=groups, bias=False)
+    return nn.Sequential(conv, nn.BatchNorm2d(outer), nn.ReLU(inplace=True))
+
+
+class Residual(nn.Module):
+    """Inverted residual: widen, filter each channel, narrow again."""
+
+    def __init__(self, inner: int, outer: int, stride: int = 1) -> None:
+        super().__init__()
+        wide = 2 * inner
+        self.body = nn.Sequential(
+            block(inner, wide, 1),
+            block(wide, wide, 3, stride, wide),
+            nn.Conv2d(wide, outer, 1, bias=False),
+            nn.BatchNorm2d(outer),
+        )
+        self.same = stride == 1 and inner == outer
+
+    def forward(self, x: Any) -> Any:
+        return x + self.body(x) if self.same else self.body(x)
+
+
+class ColourMap(nn.Module):
+    """Soft histogram of Lab colour and gradients (`reobj_track._colour_features`), at 1/4: fixed.
+
+    Three colour values in [0, 1] (B, 3, H, W), BGR, to (B, 17, H / 4, W / 4).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        turn = torch.arange(6) * (2 * np.pi / 6)
+        self.register_buffer("turns", torch.stack([turn.cos(), turn.sin()], 1)[..., None, None])
+        xyz = [[0.1805 / 0.9505, 0.3576 / 0.9505, 0.4124 / 0.9505], [0.0722, 0.7152, 0.2126],
+               [0.9505 / 1.089, 0.1192 / 1.089, 0.0193 / 1.089]]  # fmt: skip
+        self.register_buffer("xyz", torch.tensor(xyz)[..., None, None])  # sRGB, D65, BGR order
+        sobel = torch.tensor([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 2
+        self.register_buffer("sobel", torch.stack([sobel, sobel.T])[:, None])
+        self.register_buffer("levels", torch.arange(5.0)[None, :, None, None])
+
+    def forward(self, x: Any) -> Any:
+        x = F.avg_pool2d(x, 2)
+        x = x * (x * (x * 0.305306011 + 0.682171111) + 0.012522878)  # sRGB to linear light
+        f = F.conv2d(x, self.xyz).clamp_min(0.001) ** (1 / 3)
+        lightness = 1.16 * f[:, 1:2] - 0.16  # L / 100
+        chroma = torch.cat([5.0 * (f[:, :1] - f[:, 1:2]), 2.0 * (f[:, 1:2] - f[:, 2:])], 1) * 2.5
+        levels = F.relu(1 - (lightness * 4 - self.levels).abs()) * 0.5
+        edges = F.conv2d(F.pad(lightness, (1, 1, 1, 1), mode="replicate"), self.sobel)
+        bins = torch.cat([self.directions(chroma), levels, self.directions(edges)], 1)
+        return F.avg_pool2d(bins, 2)
+
+    def directions(self, vector: Any) -> Any:
+        length = ((vector**2).sum(1, keepdim=True) + 1e-8) ** 0.5
+        aligned = F.relu(F.conv2d(vector, self.turns) / length)
+        return aligned**4 * length.clamp_max(1.0)
+
+
+class Backbone(nn.Module):
+    """BGR bytes (B, H, W, 3) to a map (B, H / 4, W / 4, CHANNELS): down to 1/16 and up again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.colour = ColourMap()
+        self.stem = nn.Sequential(block(3, 16, 3, 2), block(16, 24, 3, 2))
+        self.down8 = nn.Sequential(block(24, 40, 3, 2), Residual(40, 40))
+        self.down16 = nn.Sequential(Residual(40, 80, 2), Residual(80, 80), Residual(80, 80))
+        self.side16 = nn.Conv2d(80, LEARNED, 1)
+        self.side8 = nn.Conv2d(40, LEARNED, 1)
+        self.side4 = nn.Conv2d(24, LEARNED, 1)
+        self.mix8 = nn.Sequential(
+            block(LEARNED, LEARNED, 3, 1, LEARNED), block(LEARNED, LEARNED, 1)
+        )
+        self.mix4 = block(LEARNED, LEARNED, 3, 1, LEARNED)
+
+    def forward(self, image: Any) -> Any:
+        x = image.permute(0, 3, 1, 2).float()
+        x4 = self.stem(x / 64 - 2)
+        x8 = self.down8(x4)
+        x16 = self.side16(self.down16(x8))
+        y8 = self.mix8(self.side8(x8) + F.interpolate(x16, scale_factor=2.0, mode="nearest"))
+        y4 = self.mix4(self.side4(x4) + F.interpolate(y8, scale_factor=2.0, mode="nearest"))
+        return torch.cat([self.colour(x / 255), y4], 1).permute(0, 2, 3, 1)
+
+
+class PartHead(nn.Module):
+    """Cells (N, cells * cells * (C + 2)) of one part to unit rows (N, WIDTH).
+
+    A linear map of the colour histogram, which starts as its principal components (so that
+    training starts from the training-free descriptor), plus a perceptron of everything.
+    """
+
+    def __init__(self, side: int) -> None:
+        super().__init__()
+        self.cells = side * side
+        self.project = nn.Linear(self.cells * COLOURS, WIDTH, bias=False)
+        self.mix = nn.Sequential(
+            nn.Linear(self.cells * (CHANNELS + 2), 192, bias=False),
+            nn.BatchNorm1d(192),
+            nn.ReLU(),
+            nn.Linear(192, WIDTH),
+        )
+        nn.init.zeros_(self.mix[-1].weight)
+        nn.init.zeros_(self.mix[-1].bias)
+
+    def histogram(self, cells: Any) -> Any:
+        """Unit rows (N, cells * cells * COLOURS) of square roots; part-empty cells count less."""
+        share = cells[..., CHANNELS : CHANNELS + 1]
+        trust = share / share.amax(1, keepdim=True).clamp_min(1e-6)
+        rows = (cells[..., :COLOURS] * trust + 1e-12).sqrt()
+        return F.normalize(rows.reshape(-1, self.cells * COLOURS), dim=1)
+
+    def forward(self, rows: Any) -> Any:
+        cells = rows.reshape(-1, self.cells, CHANNELS + 2)
+        colours = (cells[..., :COLOURS] + 1e-6).sqrt()
+        mixed = torch.cat([colours, cells[..., COLOURS:]], -1).reshape(-1, rows.shape[1])
+        return F.normalize(self.project(self.histogram(cells)) + self.mix(mixed), dim=1)
+
+
+class Head(nn.Module):
+    """Cells of foreground and background to two unit embeddings."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        sides = (int(LAYOUT["foreground_cells"]), int(LAYOUT["background_cells"]))
+        self.parts = nn.ModuleList([PartHead(side) for side in sides])
+
+    def forward(self, fg: Any, bg: Any) -> tuple[Any, Any]:
+        return self.parts[0](fg), self.parts[1](bg)
+
+
+class Net(nn.Module):
+    """Backbone, pooling as in `reobj_track.Embedder.pool`, head."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.backbone, self.head = Backbone(), Head()
+
+    def forward(self, views: Sequence[View], device: Any) -> tuple[Any, Any]:
+        images = torch.from_numpy(np.stack([v.picture for v in views])).to(device)
+        result: tuple[Any, Any] = self.head(*self.cells(views, images))
+        return result
+
+    def cells(self, views: Sequence[View], images: Any) -> list[Any]:
+        """What the heads see of all objects of the views."""
+        maps = self.backbone(images)
+        flat = maps.reshape(-1, CHANNELS)
+        return [pooled(flat, views, part, maps.shape[1] * maps.shape[2]) for part in (0, 1)]
+
+    def start_from_colour(self, views: Sequence[View], device: Any) -> None:
+        """Set the heads' linear maps to the principal components of these views' histograms."""
+        with torch.no_grad():
+            images = torch.from_numpy(np.stack([v.picture for v in views])).to(device)
+            for head, cells in zip(self.head.parts, self.cells(views, images), strict=True):
+                rows = head.histogram(cells.reshape(-1, head.cells, CHANNELS + 2))
+                axes = torch.linalg.svd(rows.T @ rows)[0].T[:WIDTH]  # (WIDTH, in)
+                head.project.weight[: len(axes)] = axes
+
+
+def pooled(flat: Any, views: Sequence[View], part: int, cells_a_map: int) -> Any:
+    """What the head sees of one part of all N objects (`reobj_track.head_inputs` in torch)."""
+    samples = [v.parts[part] for v in views]
+    index = np.concatenate([s.index + i * cells_a_map for i, s in enumerate(samples)])
+    weight = np.concatenate([s.weight for s in samples]).astype(np.float32)
+    n, side, cells = len(index), index.shape[1], samples[0].cells
+    fine = side // cells
+    weight /= (
+        np.maximum(weight.reshape(n, cells, fine, cells, fine).sum((2, 4), keepdims=True), 1)
+        .repeat(fine, 2)
+        .repeat(fine, 4)
+        .reshape(weight.shape)
+    )
+    values = flat[torch.from_numpy(index.ravel()).to(flat.device)].reshape(n, side, side, -1)
+    values = values * torch.from_numpy(weight).to(flat.device)[..., None]
+    mean = values.reshape(n, cells, fine, cells, fine, -1).sum((2, 4))
+    shares = np.concatenate([np.stack([s.share, s.others], -1) for s in samples])
+    extra = torch.from_numpy(shares.astype(np.float32)).to(flat.device)
+    return torch.cat([mean, extra], -1).reshape(n, -1)
+
+
+# ---- Loss ----------------------------------------------------------------------------------------
+
+
+def triplet_loss(rows: Any, same: Any, different: Any, hard: bool, temperature: float = 0.1) -> Any:
+    """Soft-margin triplet loss log(1 + exp((s_an - s_ap) / T)) over all anchors and positives.
+
+    Args:
+        rows: (N, E) unit rows. same, different: (N, N) bool, positives and negatives of each row.
+        hard: the negative is the nearest one; else the nearest that is further than the positive
+            (if there is none, the nearest one counts a tenth).
+    """
+    cosine = rows @ rows.T
+    anchor, positive = torch.nonzero(same & different.any(1)[:, None], as_tuple=True)
+    if not len(anchor):
+        return rows.sum() * 0
+    near = cosine[anchor, positive]  # (P,)
+    others = cosine[anchor].masked_fill(~different[anchor], -2.0)  # (P, N)
+    weight = torch.ones_like(near)
+    far = others.max(1).values
+    if not hard:
+        semi = others.masked_fill(others > near[:, None].detach(), -2.0).max(1).values
+        weight = torch.where(semi > -1.5, 1.0, 0.1)
+        far = torch.where(semi > -1.5, semi, far)
+    loss = F.softplus((far - near) / temperature) * temperature
+    return (loss * weight).sum() / weight.sum()
+
+
+def batch_loss(foreground: Any, background: Any, scenes: list[list[View]], hard: bool) -> Any:
+    """Triplet loss of both parts together, and half as much of each alone."""
+    views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
+    device = foreground.device
+    scene = np.concatenate([np.full(len(v.identity), s) for s, _, v in views])
+    identity = np.concatenate([v.identity + 10000 * s for s, _, v in views])
+    look = np.concatenate([v.look + 10000 * s for s, _, v in views])
+    frame = np.concatenate([np.full(len(v.identity), f) for _, f, v in views])
+    one = torch.from_numpy(identity[:, None] == identity).to(device)
+    apart = torch.from_numpy(frame[:, None] != frame).to(device)
+    near = torch.from_numpy(scene[:, None] == scene).to(device)
+    alike = torch.from_numpy(look[:, None] == look).to(device)
+    fused = torch.cat([foreground, background], 1) * 0.5**0.5
+    same, different = one & apart, ~one & (near if hard else torch.ones_like(near))
+    loss = triplet_loss(fused, same, different, hard)
+    loss = loss + 0.5 * triplet_loss(background, same, different, hard)
+    return loss + 0.5 * triplet_loss(foreground, same, ~alike, hard)
+
+
+# ---- Validation ----------------------------------------------------------------------------------
+
+
+def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
+    """Rank-1 among things of the same scene: `twins`: only those that look alike, where there are
+    two or more; `all`: any. Queries search frames at least 30 % of the clip away from their own.
+    """
+    net.eval()
+    hits: dict[str, list[float]] = {f"{p}_{g}": [] for p in PARTS for g in ("twins", "all")}
+    for clip in clips:
+        rng = np.random.default_rng(0)
+        everything = np.unique(np.concatenate(clip.identity))
+        step = max(1, len(clip.images) // 40)
+        views = [make_view(clip, f, rng, None, False, everything)
+                 for f in range(0, len(clip.images), step)]  # fmt: skip
+        with torch.no_grad():
+            done = [net(views[i : i + 10], device) for i in range(0, len(views), 10)]
+        rows = [torch.cat([d[k] for d in done]).cpu().numpy() for k in (0, 1)]
+        frame = np.concatenate([np.full(len(v.identity), f) for f, v in enumerate(views)])
+        identity = np.concatenate([v.identity for v in views])
+        look = np.concatenate([v.look for v in views])
+        cosines = (rows[0] @ rows[0].T, rows[1] @ rows[1].T)
+        for part, cosine in zip(PARTS, (*cosines, cosines[0] + cosines[1]), strict=True):
+            for group, pool in (("twins", look[:, None] == look), ("all", np.ones_like(cosine))):
+                away = max(1, int(0.3 * len(views)))
+                hits[f"{part}_{group}"] += first_hits(cosine, frame, identity, pool > 0, away)
+    net.train()
+    return {name: float(np.mean(found)) if found else float("nan") for name, found in hits.items()}
+
+
+PARTS = ("fg", "bg", "fused")
+
+
+def first_hits(
+    cosine: Any, frame: IntArray, identity: IntArray, pool: Any, away: int
+) -> list[float]:
+    """For each query with a positive and a negative in its gallery: is the nearest one right?"""
+    gallery = pool & (np.abs(frame[:, None] - frame) >= away)
+    same = identity[:, None] == identity
+    asked = (gallery & same).any(1) & (gallery & ~same).any(1)
+    best = np.where(gallery, cosine, -9.0).argmax(1)
+    return [float(hit) for hit in (identity[best] == identity)[asked]]
+
+
+# ---- Training ------------------------------------------------------------------------------------
+
+
+def real_clips(args: argparse.Namespace) -> list[Clip]:
+    """Clips of recordings."""
+    clips = [sparse_clip(images, model, args.seed) for images, model in args.sparse]
+    return clips + [tracks_clip(images, tracks) for images, tracks in args.tracks]
+
+
+class Pool:
+    """Training clips; rooms that appear in the cache while training runs join in."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args = args
+        self.real = [(clip, clip.shared()) for clip in real_clips(args)]
+        self.rooms: list[tuple[Clip, Any]] = []
+        self.waiting = list(parse_range(args.rooms)) if args.rooms else []
+        self.fill()
+        if not self.real and not self.rooms:
+            raise SystemExit("error: nothing to train on: give --rooms, --sparse or --tracks")
+
+    def fill(self) -> None:
+        """Take in rooms: those of the cache, or render one if there is nothing at all yet."""
+        for seed in list(self.waiting):
+            there = (self.args.cache / f"room_{seed}.npz").exists()
+            if there or not self.args.no_render:
+                clip = room_clip(seed, self.args.cache, self.args.frames)
+                self.rooms.append((clip, clip.shared()))
+                self.waiting.remove(seed)
+
+    def draw(self, rng: np.random.Generator) -> list[list[View]]:
+        """Scenes of one batch: recordings for a third of them, if there are any."""
+        scenes: list[list[View]] = []
+        while len(scenes) < self.args.scenes:
+            pool = (
+                self.real if self.real and (not self.rooms or rng.random() < 0.34) else self.rooms
+            )
+            clip, shared = pool[int(rng.integers(len(pool)))]
+            views = draw_scene(clip, shared, self.args.views, rng)
+            if sum(len(v.identity) for v in views) >= 4:
+                scenes.append(views)
+        return scenes
+
+
+class Trainer:
+    """Network, optimiser and where training stands."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        torch.manual_seed(args.seed)
+        torch.set_num_threads(args.threads)
+        self.args = args
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.net = Net().to(self.device)
+        self.optimizer = torch.optim.AdamW(self.net.parameters(), args.rate, weight_decay=0.02)
+        self.step, self.seconds = 0, 0.0
+        last = args.out / "last.pt"
+        if args.resume and last.exists():
+            state = torch.load(last, map_location=self.device, weights_only=True)
+            self.net.load_state_dict(state["net"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.step, self.seconds = state["step"], state["seconds"]
+        args.out.mkdir(parents=True, exist_ok=True)
+        self.pool = Pool(args)
+        if args.start and self.step == 0:
+            state = torch.load(args.start, map_location=self.device, weights_only=True)["net"]
+            own = {k: v for k, v in state.items() if k.startswith("backbone.")}
+            self.net.load_state_dict(own, strict=False)
+        if self.step == 0:
+            self.start()
+        rooms = parse_range(args.val_rooms) if args.val_rooms else ()
+        self.val = {
+            "room": [room_clip(seed, args.cache, args.frames) for seed in rooms],
+            "real": [sparse_clip(*source) for source in args.val_sparse],
+        }
+
+    def start(self) -> None:
+        """Start the heads from the training-free descriptor."""
+        rng = np.random.default_rng([self.args.seed, 10])
+        views = [view for _ in range(12) for scene in self.pool.draw(rng) for view in scene]
+        self.net.eval()
+        self.net.start_from_colour(views, self.device)
+        self.net.train()
+
+    def progress(self) -> float:
+        """Share of the training that is done, by steps or by time."""
+        limit = self.args.minutes * 60
+        return max(self.step / self.args.steps, self.seconds / limit if limit else 0.0)
+
+    def learn(self) -> float:
+        """One step; returns the loss."""
+        rng, done = np.random.default_rng([self.args.seed, self.step]), min(self.progress(), 1.0)
+        rate = min((self.step + 1) / 40, max(0.02, 0.5 + 0.5 * float(np.cos(np.pi * done))))
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.args.rate * rate
+        scenes = self.pool.draw(rng)
+        parts = self.net([view for scene in scenes for view in scene], self.device)
+        loss = batch_loss(parts[0], parts[1], scenes, done > self.args.hard_after)
+        self.optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
+        self.optimizer.step()
+        self.step += 1
+        value: float = loss.item()
+        return value
+
+    def run(self) -> None:
+        """Train to the end; log, validate and save every so many steps."""
+        losses: list[float] = []
+        while self.progress() < 1:
+            began = time.monotonic()
+            losses.append(self.learn())
+            self.seconds += time.monotonic() - began
+            if self.step % self.args.every == 0 or self.progress() >= 1:
+                self.report(float(np.mean(losses)))
+                losses.clear()
+                self.pool.fill()
+
+    def report(self, loss: float) -> None:
+        """A row of the log and a checkpoint."""
+        row: dict[str, float] = {"step": self.step, "minutes": round(self.seconds / 60, 2)}
+        row |= {"rooms": len(self.pool.rooms), "loss": round(loss, 5)}
+        for name, clips in self.val.items():
+            found = rank_one(self.net, clips, self.device)
+            row |= {f"{name}_{k}": round(v, 4) for k, v in found.items()}
+        log = self.args.out / "log.csv"
+        fresh = not log.exists()
+        with log.open("a", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            if fresh:
+                writer.writeheader()
+            writer.writerow(row)
+        print(json.dumps(row), flush=True)
+        state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
+        state |= {"step": self.step, "seconds": self.seconds}
+        part = self.args.out / "last.part"
+        torch.save(state, part)
+        part.replace(self.args.out / "last.pt")
+
+
+def draw_curves(log: Path, picture: Path) -> None:
+    """Loss and Rank-1 over the steps as a PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    with log.open() as file:
+        rows = list(csv.DictReader(file))
+    step = [float(row["step"]) for row in rows]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    left.plot(step, [float(row["loss"]) for row in rows])
+    left.set(xlabel="step", ylabel="triplet loss")
+    for name in rows[0]:
+        if name.endswith("_twins"):
+            right.plot(step, [float(row[name]) for row in rows], label=name.replace("_", " "))
+    right.set(xlabel="step", ylabel="Rank-1, validation")
+    right.legend()
+    figure.savefig(picture, dpi=90)
+    plt.close(figure)
+
+
+# ---- Export --------------------------------------------------------------------------------------
+
+
+def export(net: Net, out: Path, summary: dict[str, Any]) -> None:
+    """Write `reobj.onnx` (BGR bytes to map; metadata "reobj") and `reobj_head.onnx`."""
+    import onnx
+
+    net = net.cpu().eval()
+    cells = [int(LAYOUT[f"{part}_cells"]) ** 2 for part in ("foreground", "background")]
+    image = torch.zeros(1, SIZE_WH[1], SIZE_WH[0], 3, dtype=torch.uint8)
+    sizes = {0: "n", 1: "h", 2: "w"}
+    rows = tuple(torch.zeros(2, n * (CHANNELS + 2)) for n in cells)
+    names = ("fg", "bg", "foreground", "background")
+    plain: dict[str, Any] = {"dynamo": False, "opset_version": 17}
+    torch.onnx.export(net.backbone, (image,), str(out / "reobj.onnx"), input_names=["image"],
+                      output_names=["map"], dynamic_axes={"image": sizes, "map": sizes},
+                      **plain)  # fmt: skip
+    torch.onnx.export(net.head, rows, str(out / "reobj_head.onnx"), input_names=names[:2],
+                      output_names=names[2:], dynamic_axes={name: {0: "n"} for name in names},
+                      **plain)  # fmt: skip
+    facts = {"layout": LAYOUT, "multiple": STRIDE, "head": "reobj_head.onnx", "trained": summary}
+    model = onnx.load(out / "reobj.onnx")
+    onnx.helper.set_model_props(model, {"reobj": json.dumps(facts)})
+    onnx.save(model, out / "reobj.onnx")
+
+
+# ---- Command line --------------------------------------------------------------------------------
+
+
+def parse_range(text: str) -> range:
+    """A:B as a range, A as one number."""
+    first, _, last = text.partition(":")
+    return range(int(first), int(last) if last else int(first) + 1)
+
+
+def pair(text: str) -> tuple[Path, Path]:
+    """IMAGES=OTHER as two paths that exist."""
+    left, _, right = text.partition("=")
+    for part in (left, right):
+        if not part or not Path(part).exists():
+            raise argparse.ArgumentTypeError(f"{text}: {part or 'IMAGES=PATH'} does not exist")
+    return Path(left), Path(right)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add: Callable[..., Any] = parser.add_argument
+    add("-o", "--out", type=Path, required=True, help="folder for models, checkpoint, log")
+    add("--rooms", default="", help="A:B, seeds of rendered rooms to train on")
+    add("--val-rooms", default="", help="A:B, seeds to validate with")
+    add("--cache", type=Path, default=Path("rooms_cache"), help="folder of rendered rooms")
+    add("--frames", type=int, default=40, help="views of each room")
+    add("--no-render", action="store_true", help="use the cache only, as another process fills it")
+    for name in ("--sparse", "--val-sparse", "--tracks"):
+        add(name, type=pair, action="append", default=[], metavar="IMAGES=PATH")
+    add("--scenes", type=int, default=3, help="scenes a step")
+    add("--views", type=int, default=8, help="views of each scene")
+    add("--steps", type=int, default=3000)
+    add("--minutes", type=float, default=0.0, help="stop after so many minutes of steps (0: never)")
+    add("--rate", type=float, default=2e-3, help="peak learning rate (AdamW, cosine)")
+    add("--hard-after", type=float, default=0.25, help="hardest negatives from this share on")
+    add("--every", type=int, default=100, help="steps between two rows of the log")
+    add("--seed", type=int, default=0)
+    add("--threads", type=int, default=1)
+    add("--start", type=Path, help="take the backbone of this checkpoint (.pt) to begin with")
+    add("--resume", action="store_true", help="go on from OUT/last.pt")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train, draw the curves, export."""
+    args = build_parser().parse_args(argv)
+    trainer = Trainer(args)
+    trainer.run()
+    out: Path = args.out
+    draw_curves(out / "log.csv", out / "curves.png")
+    summary = {"steps": trainer.step, "seed": args.seed, "minutes": round(trainer.seconds / 60, 1)}
+    summary |= {"rooms": len(trainer.pool.rooms), "torch": torch.__version__}
+    export(trainer.net, out, summary)
+    print(f"{out / 'reobj.onnx'}: use it with --embed {out / 'reobj.onnx'}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
