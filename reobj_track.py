@@ -700,8 +700,17 @@ def _model_folders() -> list[Path]:
     return [*([Path(own).expanduser()] if own else []), Path(cache) / "reobj_track"]
 
 
+def own_models() -> Path:
+    """Return the folder of the weights that come with this module: `models`, installed
+    `reobj_models`.
+    """
+    installed = Path(__file__).resolve().parent / "reobj_models"
+    return installed if installed.is_dir() else installed.with_name("models")
+
+
 def _find_model(*files: str) -> Path | None:
-    paths = (folder / file for folder in _model_folders() for file in files)
+    folders = [*_model_folders(), own_models()]
+    paths = (folder / file for folder in folders for file in files)
     return next((path for path in paths if path.is_file()), None)
 
 
@@ -2123,11 +2132,11 @@ class Embedder:
     ) -> None:
         self.layout = config or EmbedConfig()
         self.model = model
-        self.backbone: _Backbone | None = None
+        self._net: _Backbone | None = None
         self._features: Callable[[Image], Floats] = _colour_features
         if model != "colour":
-            self.backbone = _Backbone(model, self.layout, threads, offline)
-            self.layout, self._features = self.backbone.layout, self.backbone
+            self._net = _Backbone(model, self.layout, threads, offline)
+            self.layout, self._features = self._net.layout, self._net
         self._last: tuple[Image, Floats] | None = None
 
     def __call__(
@@ -2156,8 +2165,8 @@ class Embedder:
         parts = part_samples(detections, rows, size_hw, features.shape[:2], self.layout)
         flat = features.reshape(-1, features.shape[-1])
         means = [_cell_mean(flat[part.index], part.weight, part.cells) for part in parts]
-        if self.backbone is not None and self.backbone.head is not None:
-            return self.backbone.embed(parts, means)
+        if self._net is not None and self._net.head is not None:
+            return self._net.embed(parts, means)
         return Embeddings(*map(_unit_histogram, means, (part.share for part in parts)))
 
 
@@ -2444,18 +2453,19 @@ class _Backbone:
         side = self.multiple
         size = [max(side, round(n * shrink / side) * side) for n in frame.shape[1::-1]]
         small = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
-        return self.maps(np.asarray(small, np.uint8)[None])[0]
+        return np.asarray(self.maps(np.asarray(small, np.uint8)[None])[0])
 
     def maps(self, images: Image) -> Floats:
         """Return the features (N, h, w, C) of BGR images (N, H, W, 3) of a fit size."""
         if self.head is not None:
-            own: Floats = self.session.run([self.output], {self.input: images})[0]
-            return own
+            return self._run(images)
         rgb = images[..., ::-1].astype(np.float32) / 255
         rgb = (rgb - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
-        planes = np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32)
-        (maps,) = self.session.run([self.output], {self.input: planes})
+        maps = self._run(np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32))
         return np.ascontiguousarray(maps.transpose(0, 2, 3, 1))
+
+    def _run(self, images: npt.NDArray[Any]) -> Floats:
+        return np.asarray(self.session.run([self.output], {self.input: images})[0], np.float32)
 
     def embed(self, parts: Sequence[PartSamples], means: Sequence[Floats]) -> Embeddings:
         """Both parts' cells through the head, all objects at once."""
@@ -2799,7 +2809,7 @@ def calibration_file(model: str) -> Path:
     """Where the calibration of an appearance model lies: beside its file, else in models/."""
     kind, _, backbone = model.rpartition(":")
     path = Path(backbone)
-    folder = path.parent if path.suffix == ".onnx" else Path(__file__).resolve().parent / "models"
+    folder = path.parent if path.suffix == ".onnx" else own_models()
     return folder / f"{kind + '_' if kind else ''}{path.stem}.json"
 
 

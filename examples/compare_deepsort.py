@@ -62,7 +62,7 @@ def digest(*parts: Any) -> str:
     return total.hexdigest()[:12]
 
 
-_LOOK = (rt.EmbedConfig, rt.Embedder, rt._colour_features, rt._direction_bins, rt._pool_cells)
+_LOOK = (rt.EmbedConfig, rt.Embedder, rt._colour_features, rt._direction_bins, rt.part_samples)
 EMBEDDER = digest([inspect.getsource(x) for x in _LOOK])  # what the own look depends on
 
 

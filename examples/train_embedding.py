@@ -737,7 +737,7 @@ class Trainer:
     def progress(self) -> float:
         """Share of the training that is done, by steps or by time."""
         limit = self.args.minutes * 60
-        return max(self.step / self.args.steps, self.seconds / limit if limit else 0.0)
+        return float(max(self.step / self.args.steps, self.seconds / limit if limit else 0.0))
 
     def learn(self) -> float:
         """One step; returns the loss."""
@@ -753,8 +753,7 @@ class Trainer:
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimizer.step()
         self.step += 1
-        value: float = loss.item()
-        return value
+        return float(np.asarray(loss.detach().cpu()))
 
     def run(self) -> None:
         """Train to the end; log, validate and save every so many steps."""
