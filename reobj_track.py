@@ -666,6 +666,9 @@ WEIGHTS: tuple[Weights, ...] = (
     Weights("yolo11n-seg", "detector", "yolo11n-seg_dyn.onnx", "",
             "f75628d5ebbbb652f34adc33fcb163fe3a123e5a8bddc70125cb76b6f3c79005", 11560385,
             "AGPL-3.0", "COCO with masks, AP 39.5, 154 ms; strong copyleft"),
+    Weights("reobj", "backbone", "reobj.onnx", "",
+            "4ae14d5c97598cc37d56cb7a550bc01676aa0aac278997f8468238a56cc3ac44", 404309,
+            "MIT", "ours, comes along: foreground and background, trained with its head"),
     Weights("mobilenetv2", "backbone", "mobilenetv2_feat.onnx", "",
             "2e2d63ad6239eb67ad4e132a0858da4ecbaf3022560007a659d05a1afd8fbc7f", 8849494,
             "Apache-2.0", "ImageNet, convolution layers only"),
@@ -2469,9 +2472,9 @@ class _Backbone:
 
     def embed(self, parts: Sequence[PartSamples], means: Sequence[Floats]) -> Embeddings:
         """Both parts' cells through the head, all objects at once."""
-        fed = head_inputs(parts, means)
         if not len(means[0]):
             return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
+        fed = head_inputs(parts, means)
         foreground, background = self.head.run(None, dict(zip(("fg", "bg"), fed, strict=True)))
         return Embeddings(np.asarray(foreground, np.float64), np.asarray(background, np.float64))
 

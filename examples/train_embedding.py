@@ -34,6 +34,7 @@ import csv
 import json
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -319,7 +320,7 @@ def make_view(
     xyxy = clip.xyxy[frame] @ np.kron(np.eye(2), warp[:, :2]).T + np.tile(warp[:, 2], 2)
     xyxy = np.c_[np.minimum(xyxy[:, :2], xyxy[:, 2:]), np.maximum(xyxy[:, :2], xyxy[:, 2:])]
     if change is not None:
-        picture = degrade(rng, photo_tone(rng, 0.25)(change(picture)))
+        picture = degrade(rng, photo_tone(rng, 0.15)(change(picture)))
     keep, boxes = jittered(rng, xyxy, 0.04 if augment else 0.0)
     keep &= np.isin(clip.identity[frame], wanted)
     masks = None
@@ -589,22 +590,21 @@ def triplet_loss(rows: Any, same: Any, different: Any, hard: bool, temperature: 
 
 
 def batch_loss(foreground: Any, background: Any, scenes: list[list[View]], hard: bool) -> Any:
-    """Triplet loss of both parts together, and half as much of each alone."""
+    """Triplet loss of both parts together, and a quarter as much of each alone."""
     views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
     device = foreground.device
     scene = np.concatenate([np.full(len(v.identity), s) for s, _, v in views])
     identity = np.concatenate([v.identity + 10000 * s for s, _, v in views])
-    look = np.concatenate([v.look + 10000 * s for s, _, v in views])
     frame = np.concatenate([np.full(len(v.identity), f) for _, f, v in views])
     one = torch.from_numpy(identity[:, None] == identity).to(device)
     apart = torch.from_numpy(frame[:, None] != frame).to(device)
     near = torch.from_numpy(scene[:, None] == scene).to(device)
-    alike = torch.from_numpy(look[:, None] == look).to(device)
     fused = torch.cat([foreground, background], 1) * 0.5**0.5
     same, different = one & apart, ~one & (near if hard else torch.ones_like(near))
     loss = triplet_loss(fused, same, different, hard)
-    loss = loss + 0.5 * triplet_loss(background, same, different, hard)
-    return loss + 0.5 * triplet_loss(foreground, same, ~alike, hard)
+    for alone in (foreground, background):
+        loss = loss + 0.25 * triplet_loss(alone, same, different, hard)
+    return loss
 
 
 # ---- Validation ----------------------------------------------------------------------------------
@@ -825,6 +825,8 @@ def export(net: Net, out: Path, summary: dict[str, Any]) -> None:
     rows = tuple(torch.zeros(2, n * (CHANNELS + 2)) for n in cells)
     names = ("fg", "bg", "foreground", "background")
     plain: dict[str, Any] = {"dynamo": False, "opset_version": 17}
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
+    warnings.filterwarnings("ignore", message=".*(legacy|Constant folding|removed).*")
     torch.onnx.export(net.backbone, (image,), str(out / "reobj.onnx"), input_names=["image"],
                       output_names=["map"], dynamic_axes={"image": sizes, "map": sizes},
                       **plain)  # fmt: skip
@@ -873,8 +875,8 @@ def build_parser() -> argparse.ArgumentParser:
     add("--views", type=int, default=8, help="views of each scene")
     add("--steps", type=int, default=3000)
     add("--minutes", type=float, default=0.0, help="stop after so many minutes of steps (0: never)")
-    add("--rate", type=float, default=2e-3, help="peak learning rate (AdamW, cosine)")
-    add("--hard-after", type=float, default=0.25, help="hardest negatives from this share on")
+    add("--rate", type=float, default=1e-3, help="peak learning rate (AdamW, cosine)")
+    add("--hard-after", type=float, default=0.6, help="hardest negatives from this share on")
     add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)

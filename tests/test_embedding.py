@@ -1,0 +1,238 @@
+"""The trained two-part embedding: sampling of the map, the weights that come along, training."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+
+import reobj_track as rt
+
+ROOT = Path(__file__).resolve().parents[1]
+LAYOUT = rt.EmbedConfig(context=0.5, samples=4, foreground_cells=3, background_cells=4)
+
+
+def boxes(*xyxy: tuple[float, float, float, float], masks: np.ndarray | None = None):
+    n = len(xyxy)
+    return rt.Detections(np.array(xyxy, float), np.full(n, 0.9), np.zeros(n, np.int64), masks)
+
+
+def samples(detections: rt.Detections, layout: rt.EmbedConfig = LAYOUT):
+    rows = np.arange(len(detections))
+    return rt.part_samples(detections, rows, (200, 400), (50, 100), layout)
+
+
+# ---- Sampling ----
+
+
+def test_foreground_is_the_inscribed_ellipse_and_background_the_rest() -> None:
+    fore, back = samples(boxes((100, 50, 200, 150)))
+    assert fore.weight.mean() == pytest.approx(np.pi / 4, abs=0.03)
+    assert back.weight.mean() == pytest.approx(1 - np.pi / 16, abs=0.03)
+    row, column = np.divmod(back.index[0][back.weight[0]], 100)
+    assert column.min() * 4 >= 48 and column.max() * 4 <= 250  # grown by half a box on every side
+    assert row.min() <= 2 and row.max() >= 47  # rows 0..200
+    assert fore.share.shape == (1, 3, 3) and back.share.shape == (1, 4, 4)
+    assert back.others.mean() < 0.02  # the rim of its own outline, drawn on the coarse map
+
+
+def test_masks_of_all_objects_are_no_background() -> None:
+    masks = np.zeros((2, 200, 400), bool)
+    masks[0, 50:150, 100:150] = masks[1, :, 200:] = True
+    fore, back = samples(boxes((100, 50, 200, 150), (200, 0, 400, 200), masks=masks))
+    left = fore.index[0] % 100 < 37  # the mask is the left half of the box
+    np.testing.assert_array_equal(fore.weight[0], left)
+    right = back.index[0] % 100 >= 50
+    assert (
+        not (back.weight[0] & right).any() and not (back.weight[0] & masks_at(masks[0], back)).any()
+    )
+    np.testing.assert_allclose(back.others[0][:, 3], 1.0)
+
+
+def masks_at(mask: np.ndarray, part: rt.PartSamples) -> np.ndarray:
+    row, column = np.divmod(part.index[0], 100)
+    return np.asarray(mask[row * 4 + 2, column * 4 + 2])
+
+
+def test_small_boxes_reach_further() -> None:
+    wide = rt.EmbedConfig(context=0.5, reach=0.1, samples=4)
+    _, near = samples(boxes((100, 100, 110, 110)))
+    _, far = samples(boxes((100, 100, 110, 110)), wide)
+    assert np.ptp(near.index % 100) * 4 <= 20 and np.ptp(far.index % 100) * 4 >= 76
+
+
+@pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])
+def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
+    for part in samples(boxes(box)):
+        assert part.index.min() >= 0 and part.index.max() < 5000
+        assert part.share.max() <= 1
+    assert box[0] != 900 or not samples(boxes(box))[0].weight.any()
+
+
+# ---- The weights that come along ----
+
+
+def scene_with_twins() -> tuple[np.ndarray, rt.Detections]:
+    """Two identical patches on different backgrounds."""
+    rng = np.random.default_rng(13)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (240, 480, 3), dtype=np.uint8), (0, 0), 8)
+    image[:, :240] = (0.5 * image[:, :240] + [100, 20, 20]).clip(0, 255).astype(np.uint8)
+    image[:, 240:] = (0.5 * image[:, 240:] + [20, 20, 100]).clip(0, 255).astype(np.uint8)
+    patch = cv2.GaussianBlur(rng.integers(0, 256, (60, 60, 3), dtype=np.uint8), (0, 0), 3)
+    image[90:150, 90:150] = image[90:150, 330:390] = patch
+    return image, boxes((90, 90, 150, 150), (330, 90, 390, 150))
+
+
+def test_own_weights_are_found_without_a_download(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("REOBJ_MODELS", str(tmp_path))
+    path = rt.model_path("reobj", offline=True)
+    assert path.parent == rt.own_models()
+    assert sum(f.stat().st_size for f in path.parent.iterdir()) < 5e6
+    state = {row.weights.name: row.state for row in rt.list_models()}
+    assert state["reobj"] == "verified"
+
+
+def test_own_weights_tell_twins_apart_by_their_background() -> None:
+    image, detections = scene_with_twins()
+    found = rt.Embedder("reobj", threads=1)(image, detections)
+    assert found.foreground.shape == found.background.shape == (2, 128)
+    np.testing.assert_allclose(np.linalg.norm(found.foreground, axis=1), 1, atol=1e-5)
+    alike = found.foreground[0] @ found.foreground[1]
+    assert found.background[0] @ found.background[1] < alike - 0.2
+
+
+def test_own_weights_embed_some_rows_as_all_rows() -> None:
+    image, detections = scene_with_twins()
+    embedder = rt.Embedder("reobj", threads=1)
+    whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
+    np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-5)
+    assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
+
+
+def test_own_weights_say_how_they_were_trained() -> None:
+    session = rt.onnx_session(rt.model_path("reobj"), 1)
+    facts = json.loads(session.get_modelmeta().custom_metadata_map["reobj"])
+    assert {"layout", "multiple", "head", "trained"} <= set(facts)
+    assert {"steps", "seed", "minutes", "rooms"} <= set(facts["trained"])
+
+
+# ---- Training ----
+
+
+@pytest.fixture(scope="module")
+def te() -> ModuleType:
+    """examples/train_embedding.py, which is in no package."""
+    pytest.importorskip("torch", reason="needs pip install torch")
+    path = ROOT / "examples" / "train_embedding.py"
+    spec = importlib.util.spec_from_file_location("train_embedding", path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["train_embedding"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def trained(te, tmp_path_factory) -> Path:
+    """Two steps on one small room, then two more from the checkpoint."""
+    folder = tmp_path_factory.mktemp("train")
+    command = ["-o", str(folder), "--rooms", "3:4", "--cache", str(folder / "rooms")]
+    command += [
+        "--frames",
+        "6",
+        "--val-rooms",
+        "3",
+        "--scenes",
+        "2",
+        "--views",
+        "4",
+        "--every",
+        "1",
+    ]
+    assert te.main([*command, "--steps", "2"]) == 0
+    assert te.main([*command, "--steps", "3", "--resume"]) == 0
+    return folder
+
+
+def test_training_logs_resumes_and_draws_curves(trained) -> None:
+    with (trained / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == [1, 2, 3]
+    assert all(np.isfinite(float(row["loss"])) for row in rows)
+    assert cv2.imread(str(trained / "curves.png")) is not None
+
+
+def test_exported_model_equals_the_trained_network(te, trained) -> None:
+    """Pooling in numpy and the ONNX graphs give what the network gives in PyTorch."""
+    import torch
+
+    clip = te.room_clip(3, trained / "rooms")
+    net = te.Net()
+    net.load_state_dict(torch.load(trained / "last.pt", weights_only=True)["net"])
+    net.eval()
+    frame, rng = int(np.argmax([len(i) for i in clip.identity])), np.random.default_rng(0)
+    view = te.make_view(clip, frame, rng, None, False, clip.identity[frame])
+    with torch.no_grad():
+        expected = net([view], "cpu")
+    masks = clip.labels[frame][None] == (clip.identity[frame] + 1)[:, None, None]
+    n = len(masks)
+    detections = rt.Detections(clip.xyxy[frame], np.ones(n), np.zeros(n, np.int64), masks)
+    found = rt.Embedder(str(trained / "reobj.onnx"), threads=1)(view.picture, detections)
+    assert n == len(view.identity) >= 3
+    for mine, theirs in zip((found.foreground, found.background), expected, strict=True):
+        np.testing.assert_allclose(mine, theirs.numpy(), atol=2e-4)
+
+
+def test_colour_channels_are_those_of_the_training_free_descriptor(te) -> None:
+    import torch
+
+    image, _ = scene_with_twins()
+    image = cv2.GaussianBlur(image, (0, 0), 2)[:, :320]
+    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].float() / 255
+    own = te.ColourMap()(planes)[0].numpy().transpose(1, 2, 0)  # (60, 80, 17)
+    other = cv2.resize(rt._colour_features(image), (80, 60), interpolation=cv2.INTER_AREA)
+    assert np.corrcoef(own[..., :11].ravel(), other[..., :11].ravel())[0, 1] > 0.98
+
+
+@pytest.mark.parametrize(("hard", "expected"), [(True, 0.9), (False, 0.5)])
+def test_triplet_loss_picks_the_negative(te, hard: bool, expected: float) -> None:
+    """Anchor 0, positive 1 at cosine .6, negatives at .9 (hardest) and .5 (semi-hard)."""
+    import torch
+
+    cosines = (1.0, 0.6, 0.9, 0.5)
+    rows = torch.tensor([[c, (1 - c * c) ** 0.5] for c in cosines])
+    same, different = torch.zeros(4, 4, dtype=torch.bool), torch.zeros(4, 4, dtype=torch.bool)
+    same[0, 1] = different[0, 2] = different[0, 3] = True
+    loss = float(te.triplet_loss(rows, same, different, hard))
+    assert loss == pytest.approx(0.1 * np.log1p(np.exp((expected - 0.6) / 0.1)), abs=1e-4)
+
+
+def test_overlapping_pseudo_objects_are_dropped(te) -> None:
+    center = np.array([[0.0, 0, 0], [0.1, 0, 0], [2.0, 0, 0], [5.0, 0, 0]])
+    assert te.apart(center, np.array([1.0, 1.0, 1.0, 0.0])).tolist() == [0, 2]
+
+
+def test_mot_tracks_become_a_clip(te, tmp_path) -> None:
+    (tmp_path / "images").mkdir()
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((480, 640, 3), 90 * i, np.uint8))
+    (tmp_path / "tracks.txt").write_text(
+        "1,7,100,100,200,200,.9,-1,-1,-1\n2,7,90,90,200,200,.9,-1,-1,-1\n"
+    )
+    clip = te.tracks_clip(tmp_path / "images", tmp_path / "tracks.txt")
+    assert [i.tolist() for i in clip.identity] == [[7], [7]]
+    np.testing.assert_allclose(clip.xyxy[0], [[75, 75, 225, 225]])  # 480 px on the longer side
+
+
+@pytest.mark.parametrize("command", [["-o", "x"], ["-o", "x", "--sparse", "no=where"]])
+def test_bad_input_is_refused(te, command: list[str], tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        te.main(command)
