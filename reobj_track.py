@@ -851,10 +851,10 @@ class Video:
         self.messages: list[str] = []
         self.read = self.dropped = 0
         self._live: Any = None  # the opened capture of a live source until it is iterated
-        is_url = bool(STREAM.match(self._address))
-        self._files = [] if is_url else _image_files(self.source)
+        self._is_url = bool(STREAM.match(self._address))
+        self._files = [] if self._is_url else _image_files(self.source)
         self.names = [path.name for path in self._files]
-        self.is_live = is_url or (self.source.isdigit() and not Path(self.source).exists())
+        self.is_live = self._is_url or (self.source.isdigit() and not Path(self.source).exists())
         self.size, self.fps, self.frame_count = self._probe()
         if 0 < self.frame_count <= self.config.start:
             raise ReobjError(f"{self.source}: --start {self.config.start}, but it has only "
@@ -976,7 +976,7 @@ class Video:
 
     def _open(self) -> Any:
         """Open the source with OpenCV, which turns the frames upright by the file's rotation."""
-        if not self.is_live and not Path(self.source).is_file():
+        if not self.is_live and not self._is_url and not Path(self.source).is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import http.server
 import itertools
 import json
@@ -189,6 +190,32 @@ def test_a_stream_is_read_to_its_end(stream: tuple[Stream, str], quick: None) ->
     assert seen[-1][0] == 38 and [i for i, _ in seen] == sorted({i for i, _ in seen})
     for index, grey in seen:
         assert abs(grey - index - 1) <= 2  # the number in the picture; JPEG
+
+
+def test_a_file_behind_a_url_is_read_like_a_file(tmp_path: Path) -> None:
+    """Its length is known: no thread, nothing dropped, as often as wanted."""
+    writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 25, SIZE)
+    for n in range(12):
+        writer.write(np.full((SIZE[1], SIZE[0], 3), 20 * n, np.uint8))
+    writer.release()
+    handler = functools.partial(QuietFiles, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/"
+        video = rt.Video(url + "a.mp4", rt.InputConfig(every=3))
+        assert not video.is_live and video.frame_count == 12
+        for _ in range(2):
+            assert [f.index for f in video] == [0, 3, 6, 9]
+        with pytest.raises(rt.ReobjError, match=r"none\.mp4: cannot be opened as a stream"):
+            rt.Video(url + "none.mp4")
+        server.shutdown()
+
+
+class QuietFiles(http.server.SimpleHTTPRequestHandler):
+    """Files of a folder, without a log."""
+
+    def log_message(self, *_: object) -> None:
+        pass
 
 
 @pytest.mark.parametrize("stream", [(10**6, 0.01)], indirect=True)
