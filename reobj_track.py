@@ -7166,7 +7166,7 @@ def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
         before = known.setdefault(int(truth.identity[g[rows[0]]]), set())
         kept += [int(ids[votes.argmax()]) in before] if before else []
         before.add(int(ids[votes.argmax()]))
-    return {"returns": len(kept), "returns_kept": sum(kept) / len(kept) if kept else math.nan}
+    return {"returns": len(kept), "returns_kept": sum(kept) / max(len(kept), 1)}
 
 
 def return_ranks(truth: LabelledBoxes, found: LabelledBoxes, look: npt.NDArray[Any]) -> IntArray:
