@@ -31,6 +31,7 @@ import hashlib
 import html
 import inspect
 import os
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -62,6 +63,7 @@ def digest(*parts: Any) -> str:
     return total.hexdigest()[:12]
 
 
+SOURCE = digest(Path(rt.__file__), Path(rt.__file__).with_name("quadrics.py"))  # our own rows
 _LOOK = (rt.EmbedConfig, rt.Embedder, rt._colour_features, rt._direction_bins, rt.part_samples)
 EMBEDDER = digest([inspect.getsource(x) for x in _LOOK])  # what the own look depends on
 
@@ -302,8 +304,7 @@ def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], Run]]]:
 
     `look NAME` gives the ranks of the returns in place of identities, and the time of embedding.
     """
-    source = digest(Path(rt.__file__), Path(rt.__file__).with_name("quadrics.py"))
-    part = functools.partial
+    part, source = functools.partial, SOURCE
     result: dict[str, tuple[str, Callable[[], Run]]] = {"ours": (source, part(ours, seq, None))}
     deepsorts = ["deepsort", "deepsort-tuned"] if args.peers else []
     nets = networks(seq)
@@ -452,6 +453,15 @@ def rendered(seeds: str, folder: Path) -> list[Path]:
     return rooms
 
 
+def fill_in(document: Path, rows: list[dict[str, Any]]) -> None:
+    """Replace the tables of a Markdown file that follow a line <!-- compare: SEQUENCE -->."""
+    for name in dict.fromkeys(r["sequence"] for r in rows):
+        body = table("", HEADER, [cells(r) for r in rows if r["sequence"] == name]).strip()
+        mark = re.escape(f"<!-- compare: {name} -->") + r"\n\n?(\|.*\n)*"
+        text = document.read_text()
+        document.write_text(re.sub(mark, f"<!-- compare: {name} -->\n\n{body}\n", text))
+
+
 def main() -> int:
     """Run the comparison."""
     parser = argparse.ArgumentParser(
@@ -462,6 +472,7 @@ def main() -> int:
     parser.add_argument("--render", default="", metavar="SEEDS", help="more rooms: 1,2 (OUT/rooms)")
     parser.add_argument("--kitchen", type=Path, nargs="*", default=[], help="recordings")
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
+    parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -476,6 +487,8 @@ def main() -> int:
         writer.writerows(rows)
     plots(rows, args.out)
     write_page(rows, args.out)
+    if args.fill:
+        fill_in(args.fill, rows)
     print(markdown(rows))
     return 0
 

@@ -213,8 +213,8 @@ def test_eval_ranks_the_looks_that_the_folder_holds(tmp_path: Path) -> None:
     track = rt.TrackResult(table, rt.COCO_NAMES, look=look, look_row=np.arange(4))
     track.save(tmp_path / "cache" / "last-tracks.npz")
     rt.write_mot(tmp_path / "tracks.txt", table)
-    gt = write(tmp_path / "gt.txt", np.array([[f + 1, i, x, 0, 10, 10, 1] for f, i, x in
-                                              zip(frame, obj, xyxy[:, 0], strict=True)]))  # fmt: skip
+    true = np.c_[frame + 1, obj, xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2], np.ones(4)]
+    gt = write(tmp_path / "gt.txt", true)
     ranks = rt.evaluate(tmp_path, gt)["ranks"]
     assert ranks == {"queries": 2, "rank1": 0.5, "rank5": 1.0, "rank20": 1.0, "rank50": 1.0}
 
