@@ -2823,6 +2823,8 @@ class Places:
     them now and then. Rows grow with the number of identities, not with time.
     """
 
+    ARRAYS = ("frame", "boxes", "img_from_world", "every", "fresh", "dual_q")
+
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
         views = config.place_views
@@ -2889,7 +2891,7 @@ class Places:
         if extra > 0:
             extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
             fills = {"frame": -1000, "dual_q": np.nan, "every": self.config.place_every}
-            for name in ("frame", "boxes", "img_from_world", "every", "fresh", "dual_q"):
+            for name in self.ARRAYS:
                 old = getattr(self, name)
                 new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
                 setattr(self, name, np.concatenate([old, new]))
@@ -2942,6 +2944,9 @@ class Tracks:
         found = detections[self.detection_index]
         found.tracker_id = self.track_id
         return found
+
+
+STATE_VERSION = 1  # of the files of Tracker.save
 
 
 @dataclass(slots=True)
@@ -3039,7 +3044,7 @@ class Tracker:
         self.look_stats = SameObject(self.config)  # of a track's look and the next detection
         self.last_seen = np.zeros(0, np.int64)  # (I,) frame of each identity's last detection
         self.identity_class = np.zeros(0, np.int64)  # (I,)
-        self._tracklets = itertools.count(1)
+        self._next_tracklet = 1
         self._camera_motion = CameraMotion(self.config)
         self.places = Places(self.config)
         self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
@@ -3048,6 +3053,57 @@ class Tracker:
         self._view: Array | None = None  # (3, 4) img_from_world of the frame
         self._image_size = (0, 0)
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
+
+    def save(self, path: str | Path) -> None:
+        """Write the whole state, without the embedder, as an .npz file: what `load` reads goes on
+        as if it had never stopped.
+        """
+        state: dict[str, Any] = {}
+        for key, (owner, name) in self._state().items():
+            value = getattr(owner, name)
+            if value is not None:
+                state[key] = list(value.values()) if isinstance(value, dict) else value
+        facts = {"version": STATE_VERSION, "config": dataclasses.asdict(self.config)}
+        _save_npz(Path(path), state | {"facts": json.dumps(facts)})
+
+    @classmethod
+    def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
+        """Read a tracker that `save` wrote; embedder: as the saved one had."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                state = dict(data)
+            facts = json.loads(str(state.pop("facts")))
+            if facts["version"] != STATE_VERSION:
+                raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
+            tracker = cls(TrackerConfig(**facts["config"]), embedder)
+            for key, (owner, name) in tracker._state().items():
+                old = getattr(owner, name)
+                if old is None and key not in state:
+                    continue
+                value: Any = state[key]
+                value = dict(zip(old, value, strict=True)) if isinstance(old, dict) else value
+                setattr(owner, name, int(value) if isinstance(old, int) else value)
+        except (OSError, EOFError, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+            raise ReobjError(
+                f"{path}: not the state of a tracker of this version ({error}); "
+                "expected a file written by Tracker.save"
+            ) from error
+        return tracker
+
+    def _state(self) -> dict[str, tuple[Any, str]]:
+        """All that changes from frame to frame: owners and names of their attributes, by name."""
+        own = "frame_number last_seen identity_class _next_tracklet _last_pose _place_boxes"
+        stats = ("sums", "apart")
+        parts: dict[str, tuple[Any, Sequence[str]]] = {
+            "tracker": (self, own.split()),
+            "live": (self._live, [f.name for f in dataclasses.fields(_Live)]),
+            "gallery": (self.gallery, ("rows", "count", "split")),
+            "places": (self.places, Places.ARRAYS),
+            "stats": (self.stats, stats),
+            "look_stats": (self.look_stats, stats),
+            "camera": (self._camera_motion, ("_gray", "_corners")),
+        }
+        return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
 
     def update(
         self,
@@ -3267,7 +3323,8 @@ class Tracker:
     def _begin(self, detections: Detections, track_of: IntArray) -> IntArray:
         """Start a tentative track at every unmatched detection of sufficient score."""
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
-        ids = np.fromiter(self._tracklets, np.int64, len(rows))
+        ids = self._next_tracklet + np.arange(len(rows))
+        self._next_tracklet += len(rows)
         born = _Live.born(
             _cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self.config
         )

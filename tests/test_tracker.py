@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
 
 CHAIR, CUP = 56, 41
+ROOM = Path(__file__).parent.parent / "examples" / "room"
 
 
 def rows(*boxes: tuple[float, ...], score: float = 0.9, class_id: int = CHAIR) -> rt.Detections:
@@ -351,6 +356,57 @@ def test_a_newcomer_does_not_take_over_a_missed_track() -> None:
         assert found.track_id.tolist() == expected
     both = tracker.update(rows(here, beside), embeddings=looks[[0, 2]])
     assert both.track_id.tolist() == [1, 2]
+
+
+# ---- Saved state ----
+
+
+def rows_of_clip(tracker: rt.Tracker, frames: list[rt.Frame], posed: bool) -> list[np.ndarray]:
+    """What the tracker says about frames of the example clip."""
+    recorded = rt.read_detections(ROOM / "detections.npz", rt.Video(ROOM / "room.mp4"))
+    told: list[dict[str, object]] = [{}] * 100
+    if posed:
+        camera = rt.Camera("PINHOLE", 640, 480, (492.756788421, 492.756788421, 320.0, 240.0))
+        quat = np.loadtxt(ROOM / "poses.txt")  # TUM: seconds, camera centre, quaternion xyzw
+        cam_from_world = Rotation.from_quat(quat[:, 4:]).inv().as_matrix()
+        pose = np.concatenate([cam_from_world, -cam_from_world @ quat[:, 1:4, None]], 2)
+        told = [{"cam_from_world": p, "camera": camera} for p in pose]
+    step = [tracker.step(recorded.at(f.index), f.image, **told[f.index]) for f in frames]
+    return [np.c_[t.to_array(), t.tracklet_id] for t in step]
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_a_restored_tracker_goes_on_as_if_it_had_never_stopped(posed: bool, tmp_path: Path) -> None:
+    frames = list(itertools.islice(rt.Video(ROOM / "room.mp4"), 60))
+    whole = rows_of_clip(rt.Tracker(embedder=rt.Embedder()), frames, posed)
+    first = rt.Tracker(rt.TrackerConfig(), rt.Embedder())
+    rows_of_clip(first, frames[:33], posed)
+    first.save(tmp_path / "state.npz")
+    second = rt.Tracker.load(tmp_path / "state.npz", rt.Embedder())
+    for one, other in zip(whole[33:], rows_of_clip(second, frames[33:], posed), strict=True):
+        np.testing.assert_array_equal(one, other)
+    second.save(tmp_path / "again.npz")
+    assert sum(len(w) for w in whole[33:]) > 300 and second.places.known.any() == posed
+
+
+@pytest.mark.parametrize("options", [{}, {"n_init": 1, "coast_frames": 7}])
+def test_an_unused_tracker_can_be_saved(options: dict[str, int], tmp_path: Path) -> None:
+    rt.Tracker(rt.TrackerConfig(**options)).save(tmp_path / "state.npz")
+    loaded = rt.Tracker.load(tmp_path / "state.npz")
+    assert loaded.config == rt.TrackerConfig(**options)
+    assert len(loaded.update(rows((0, 0, 50, 50)))) == (options.get("n_init") == 1)
+
+
+def test_what_is_no_saved_tracker_is_refused(tmp_path: Path) -> None:
+    """Missing, no npz, another npz, another version."""
+    np.savez(tmp_path / "other.npz", a=1)
+    np.savez(tmp_path / "old.npz", facts='{"version": 0, "config": {}}')
+    (tmp_path / "text.npz").write_text("hello")
+    rt.Tracker().save(tmp_path / "cut.npz")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:2000])
+    for name in ("none", "other", "old", "text", "cut"):
+        with pytest.raises(rt.ReobjError, match=rf"{name}\.npz: not the state of a tracker"):
+            rt.Tracker.load(tmp_path / f"{name}.npz")
 
 
 # ---- With poses ----
