@@ -2220,22 +2220,23 @@ def part_samples(
         own = _on_object(detections, rows, x, y) & inside
         others = objects[row, column] & inside & ~own
         weight = inside & ~own & ~others if behind else own
-        share = [_cell_sum(w, cells) / layout.samples**2 for w in (weight, others)]
+        share = [_by_cell(w, cells).mean(-1, dtype=np.float32) for w in (weight, others)]
         parts.append(PartSamples(row * shape[1] + column, weight, cells, *share))
     return parts[0], parts[1]
 
 
-def _cell_sum(values: npt.NDArray[Any], cells: int) -> npt.NDArray[Any]:
-    """Sum (N, S, S, ...) over the samples of each cell: (N, cells, cells, ...)."""
-    edges = np.arange(cells) * (values.shape[1] // cells)
-    values = values if values.dtype != bool else values.astype(np.float32)
-    return np.asarray(np.add.reduceat(np.add.reduceat(values, edges, 1), edges, 2))
+def _by_cell(values: npt.NDArray[Any], cells: int) -> npt.NDArray[Any]:
+    """Regroup (N, S, S, ...) as (N, cells, cells, samples of the cell, ...)."""
+    n, fine, rest = len(values), values.shape[1] // cells, values.shape[3:]
+    grid = values.reshape(n, cells, fine, cells, fine, *rest).swapaxes(2, 3)
+    return grid.reshape(n, cells, cells, fine * fine, *rest)
 
 
 def _cell_mean(sampled: Floats, weight: BoolArray, cells: int) -> Floats:
     """Mean (N, cells, cells, C) of the samples (N, S, S, C) that count; 0 where none does."""
-    total = _cell_sum(np.where(weight[..., None], sampled, 0), cells)
-    return np.asarray(total / np.maximum(_cell_sum(weight, cells), 1)[..., None], np.float32)
+    share = _by_cell(weight, cells).astype(np.float32)[..., None, :]  # (N, cells, cells, 1, s)
+    share /= np.maximum(share.sum(-1, keepdims=True), 1)
+    return np.asarray((share @ _by_cell(sampled, cells))[..., 0, :], np.float32)
 
 
 class CropEmbedder(Embedder):

@@ -426,7 +426,7 @@ class ColourMap(nn.Module):
     def forward(self, x: Any) -> Any:
         x = F.avg_pool2d(x, 2)
         x = x * (x * (x * 0.305306011 + 0.682171111) + 0.012522878)  # sRGB to linear light
-        f = F.conv2d(x, self.xyz).clamp_min(0.001) ** (1 / 3)
+        f = (F.conv2d(x, self.xyz).clamp_min(0.001).log() / 3).exp()  # cube root, vectorised
         lightness = 1.16 * f[:, 1:2] - 0.16  # L / 100
         chroma = torch.cat([5.0 * (f[:, :1] - f[:, 1:2]), 2.0 * (f[:, 1:2] - f[:, 2:])], 1) * 2.5
         levels = F.relu(1 - (lightness * 4 - self.levels).abs()) * 0.5
@@ -435,9 +435,10 @@ class ColourMap(nn.Module):
         return F.avg_pool2d(bins, 2)
 
     def directions(self, vector: Any) -> Any:
-        length = ((vector**2).sum(1, keepdim=True) + 1e-8) ** 0.5
+        length = ((vector * vector).sum(1, keepdim=True) + 1e-8).sqrt()
         aligned = F.relu(F.conv2d(vector, self.turns) / length)
-        return aligned**4 * length.clamp_max(1.0)
+        aligned = aligned * aligned
+        return aligned * aligned * length.clamp_max(1.0)
 
 
 class Backbone(nn.Module):
