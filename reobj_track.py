@@ -667,7 +667,7 @@ WEIGHTS: tuple[Weights, ...] = (
             "f75628d5ebbbb652f34adc33fcb163fe3a123e5a8bddc70125cb76b6f3c79005", 11560385,
             "AGPL-3.0", "COCO with masks, AP 39.5, 154 ms; strong copyleft"),
     Weights("reobj", "backbone", "reobj.onnx", "",
-            "4ae14d5c97598cc37d56cb7a550bc01676aa0aac278997f8468238a56cc3ac44", 404309,
+            "cb90c0c4c6e039fb5d0ee321788e64c51be1e26fa79b0773174e73d3a27fa6f6", 404061,
             "MIT", "ours, comes along: foreground and background, trained with its head"),
     Weights("mobilenetv2", "backbone", "mobilenetv2_feat.onnx", "",
             "2e2d63ad6239eb67ad4e132a0858da4ecbaf3022560007a659d05a1afd8fbc7f", 8849494,

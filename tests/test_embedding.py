@@ -99,13 +99,18 @@ def test_own_weights_are_found_without_a_download(tmp_path, monkeypatch) -> None
     assert state["reobj"] == "verified"
 
 
-def test_own_weights_tell_twins_apart_by_their_background() -> None:
+def test_own_weights_tell_twins_apart_and_know_an_object_again() -> None:
     image, detections = scene_with_twins()
-    found = rt.Embedder("reobj", threads=1)(image, detections)
-    assert found.foreground.shape == found.background.shape == (2, 128)
-    np.testing.assert_allclose(np.linalg.norm(found.foreground, axis=1), 1, atol=1e-5)
-    alike = found.foreground[0] @ found.foreground[1]
-    assert found.background[0] @ found.background[1] < alike - 0.2
+    moved = np.roll(image, (5, 9), (0, 1)).astype(int) + 12
+    later = boxes((99, 95, 159, 155), (339, 95, 399, 155))
+    embedder, looks = rt.Embedder("reobj", threads=1), []
+    for picture, found in ((image, detections), (moved.clip(0, 255).astype(np.uint8), later)):
+        look = embedder(picture, found)
+        assert look.foreground.shape == look.background.shape == (2, 128)
+        np.testing.assert_allclose(np.linalg.norm(look.foreground, axis=1), 1, atol=1e-5)
+        looks.append(np.concatenate([look.foreground, look.background], 1))
+    cosine = looks[0] @ looks[1].T / 2  # rows: before, columns: after
+    assert cosine.diagonal().min() > cosine[~np.eye(2, dtype=bool)].max() + 0.2
 
 
 def test_own_weights_embed_some_rows_as_all_rows() -> None:

@@ -256,3 +256,74 @@ def test_shipped_clip_is_complete() -> None:
     }
     back = [o for o in objects if away.get(o["id"], 0) >= 60]
     assert sum(o["class"] == "chair" for o in back) >= 2 and len(back) >= 5
+
+
+# ---- Rooms of every seed ----
+
+VARIED = rr.RoomConfig(
+    seed=5, width=160, height=120, frames=48, texels_per_m=40, light_rays=1,
+    plan="varied", path="tour",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def varied():
+    return rr.make_room(VARIED)
+
+
+def test_varied_rooms_differ_and_repeat(varied) -> None:
+    again, other = rr.make_room(VARIED), rr.make_room(rr.replace(VARIED, seed=6))
+    assert rr.objects_json(again, VARIED) == rr.objects_json(varied, VARIED)
+    np.testing.assert_array_equal(again.light, varied.light)
+    assert all(np.array_equal(a, b) for a, b in zip(varied.atlas, again.atlas, strict=True))
+    assert other.size_m != varied.size_m and len(other.objects) != len(varied.objects)
+
+
+def test_varied_rooms_hold_twins_inside_their_walls(varied) -> None:
+    groups = [o.twin_group for o in varied.objects]
+    assert sum(groups.count(g) >= 2 for g in set(groups)) >= 2
+    limit = np.array(varied.size_m[:2]) / 2
+    for item in varied.objects:
+        assert (np.abs(item.center_in_world[:2]) < limit).all(), item.class_name
+        rects = varied.surfaces.texture_rect[varied.surfaces.owner == item.index]
+        first = varied.surfaces.owner == groups.index(item.twin_group)
+        np.testing.assert_array_equal(rects, varied.surfaces.texture_rect[first])
+
+
+def test_tour_stays_in_the_room_and_sees_things_twice(varied) -> None:
+    poses = rr.camera_path(varied, VARIED)
+    centers = -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3])
+    assert (np.abs(centers[:, :2]) < np.array(varied.size_m[:2]) / 2 - 0.2).all()
+    K, seen = rr.camera_matrix(VARIED), []
+    for pose in poses[::3]:
+        _, instance, _ = rr.render(varied, K, pose, (VARIED.width, VARIED.height), 1)
+        seen.append(np.bincount(instance.ravel() + 1, minlength=len(varied.objects) + 1)[1:] > 20)
+    early, late = np.array(seen[:8]).any(0), np.array(seen[8:]).any(0)
+    assert (early & late).sum() >= 0.4 * len(varied.objects)
+
+
+def test_stretched_model_keeps_unit_normals() -> None:
+    model = rr.stretched(rr.office_chair_model(), (0.9, 1.1, 1.2))
+    flat = [part for part in model.parts if part.kind in (rr.QUAD, rr.DISC)]
+    normals = np.stack([part.obj_from_patch[:, 2] for part in flat])
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    for part in flat:
+        np.testing.assert_allclose(
+            part.obj_from_patch[:, :2].T @ part.obj_from_patch[:, 2], 0, atol=1e-9
+        )
+
+
+def test_the_committed_room_is_still_what_its_seed_gives() -> None:
+    config = rr.RoomConfig(seed=0, frames=240, texels_per_m=40, light_rays=1)
+    found = rr.objects_json(rr.make_room(config), config)
+    golden = json.loads((ROOT / "examples" / "room" / "gt_objects.json").read_text())
+    for name in ("room_m", "K", "objects"):
+        assert found[name] == golden[name]
+    assert found["config"].keys() == golden["config"].keys()
+
+
+@pytest.mark.parametrize("change", [{"plan": "castle"}, {"path": "flight"}])
+def test_unknown_plan_or_path_is_refused(change: dict[str, str], room) -> None:
+    config = rr.replace(SMALL, **change)
+    with pytest.raises(ValueError, match="unknown"):
+        rr.camera_path(room if "path" in change else rr.make_room(config), config)
