@@ -254,7 +254,10 @@ def connect(address: str, workers: int, cpus: int) -> Any:
     if address == "local":
         ray.init("local", num_cpus=workers * cpus, object_store_memory=10**8, **quiet)
     else:
-        ray.init(address, log_to_driver=False)
+        try:
+            ray.init(address, log_to_driver=False)
+        except ConnectionError as error:
+            raise rt.ReobjError(f"{address}: no Ray cluster answers there ({error})") from None
     return ray
 
 
