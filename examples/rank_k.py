@@ -26,7 +26,9 @@ send two masked crops an object through the backbone (`CropEmbedder`), "person" 
 network of DeepSORT's kind on the plain box.
 
 Scenes:
-  --rooms SEED...    rooms of render_room.py (never train on them), rendered once into --cache.
+  --rooms SEED...    rooms of render_room.py (never train on them), rendered once into --cache;
+                     one set for each --plan (home: that of examples/room; varied: another room,
+                     other twins and another walk for every seed).
   --recording DIR... images/ or a video, with gt_mot.txt or gt.txt (MOT), as written by `run` or
                      annotated; poses_c2w.txt and intrinsics.json give view angles where they exist.
   --depth DIR...     the same folder, identities from depth/ and poses: detections_*.csv back-
@@ -147,14 +149,20 @@ def sight_of(xyxy: Array, world_from_cam: Array, K: Array) -> Array:
 # ---- Rendered rooms ------------------------------------------------------------------------------
 
 
-def room_scene(seed: int, cache: Path, every: int = 6, min_side: float = 24.0) -> Scene:
+def room_scene(
+    seed: int, cache: Path, every: int = 6, plan: str = "home", min_side: float = 24.0
+) -> Scene:
     """A room of render_room.py, sampled widely; rendered once for each version of the renderer."""
     import render_room
 
     version = hashlib.sha256(Path(render_room.__file__).read_bytes()).hexdigest()[:8]
-    folder = cache / f"room_{seed}_{every}_{version}"
+    folder = cache / f"{plan}_{seed}_{every}_{version}"
     if not (folder / "scene.npz").exists():
-        render_scene(seed, folder, every)
+        config = render_room.RoomConfig(seed=seed)
+        if plan != "home":
+            changes: dict[str, Any] = {"plan": plan, "path": "tour"}
+            config = dataclasses.replace(config, **changes)
+        render_scene(config, folder, every)
     with np.load(folder / "scene.npz") as data:
         part = {k: data[k] for k in data.files}
     runs = np.split(part["mask_counts"], part["mask_offsets"][1:-1])
@@ -162,19 +170,18 @@ def room_scene(seed: int, cache: Path, every: int = 6, min_side: float = 24.0) -
     clear = (part["visibility"] >= 0.3) & (side >= min_side)
     files = [folder / f"{n:05d}.jpg" for n in part["number"]]
     return Scene(
-        f"room {seed}", files, part["number"], part["row"], part["xyxy"], part["name"],
+        f"{plan} {seed}", files, part["number"], part["row"], part["xyxy"], part["name"],
         part["model"], np.where(clear, part["identity"], 0), part["sight"], runs,
         (int(part["size"][0]), int(part["size"][1])),
     )  # fmt: skip
 
 
-def render_scene(seed: int, folder: Path, every: int) -> None:
+def render_scene(config: Any, folder: Path, every: int) -> None:
     """Render every n-th frame of a clip with detector-like boxes and masks into a folder."""
     import render_room as rr
 
     folder.mkdir(parents=True, exist_ok=True)
-    config = rr.RoomConfig(seed=seed)
-    room, K = rr.make_room(config), rr.camera_matrix(config)
+    seed, room, K = config.seed, rr.make_room(config), rr.camera_matrix(config)
     poses = rr.camera_path(room, config)
     rows: list[dict[str, Any]] = []
     numbers = np.arange(0, len(poses) - 1, every)
@@ -790,14 +797,16 @@ def write_calibrations(args: Any) -> None:
     """Fit `SameObject` for every frame method on rooms with and without masks; write it beside
     the model.
     """
-    rooms = [room_scene(seed, args.cache, args.every) for seed in args.calibrate]
+    plans = [(plan, seed) for plan in args.plan for seed in args.calibrate]
+    rooms = [room_scene(seed, args.cache, args.every, plan) for plan, seed in plans]
     rooms += [unmasked(scene) for scene in rooms]
     for model in ("colour", *args.models):
         parts = embed(rooms, rt.Embedder(model, threads=1))
         found = calibrate(scene_cases(rooms, parts, args.weight))
         path = rt.calibration_file(str(rt.model_path(model)) if model != "colour" else model)
         path.parent.mkdir(exist_ok=True)
-        fitted = f"examples/rank_k.py --calibrate {' '.join(map(str, args.calibrate))}"
+        seeds, kinds = (" ".join(map(str, x)) for x in (args.calibrate, args.plan))
+        fitted = f"examples/rank_k.py --calibrate {seeds} --plan {kinds}"
         text = json.dumps({"fitted_by": fitted, "same_object": found}).replace('], "', '],\n "')
         with rt.atomic(path) as part:
             part.write_text(text.replace("{", "{\n ") + "\n")
@@ -968,7 +977,7 @@ def plot_bins(bins: Sequence[dict[str, Any]], out: Path) -> None:
         axes[1].legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5))
         figure.suptitle(title, fontsize=10)
         figure.tight_layout()
-        figure.savefig(out / f"rank_k_{title.replace(' ', '_')}.png", dpi=80)
+        figure.savefig(out / f"rank_k_{title.replace(', ', '_').replace(' ', '_')}.png", dpi=80)
         plt.close(figure)
 
 
@@ -988,7 +997,9 @@ def scene_sets(args: Any) -> dict[str, list[Scene]]:
     """The scenes to measure, by title."""
     sets: dict[str, list[Scene]] = {}
     if args.rooms:
-        sets["rooms"] = [room_scene(seed, args.cache, args.every) for seed in args.rooms]
+        for plan in args.plan:
+            rooms = [room_scene(seed, args.cache, args.every, plan) for seed in args.rooms]
+            sets[f"rooms, {plan}"] = rooms
     for folder in args.recording:
         sets[folder.name] = [recording_scene(folder, args.every)]
     for folder in args.depth:
@@ -1009,6 +1020,7 @@ def build_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("-o", "--out", type=Path, required=True)
     add("--rooms", type=int, nargs="*", default=[], metavar="SEED")
+    add("--plan", nargs="*", default=["home", "varied"], help="floor plans (default %(default)s)")
     add("--recording", type=Path, nargs="*", default=[], metavar="DIR")
     add("--depth", type=Path, nargs="*", default=[], metavar="DIR")
     add("--scannet", type=Path, nargs="*", default=[], metavar="DIR")
