@@ -2245,8 +2245,9 @@ class CropEmbedder(Embedder):
     The grown box is cut out twice, once with all but the object black and once with the object
     black. A backbone turns each into a map (7 x 7 x C for 224 px), and a trained ConvBlock turns
     the two maps, one behind the other in the channels, into one embedding. Without a ConvBlock the
-    maps are flattened: the thesis's "no-train". This is the reference for `Embedder`, which needs
-    one pass a frame instead of two crops an object.
+    maps are flattened: the thesis's "no-train". A model of `train_embedding.py` has its own head:
+    its cells are pooled from the crops' maps as `Embedder` does from the frame's. This is the
+    reference for `Embedder`, which needs one pass a frame instead of two crops an object.
 
     Args:
         model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image
@@ -2262,10 +2263,10 @@ class CropEmbedder(Embedder):
         threads: int = 0,
         offline: bool = False,
     ) -> None:
-        self.config, self.model = config or EmbedConfig(), f"crops:{model}"
-        self.backbone = _Backbone(model, self.config, threads, offline)
+        super().__init__(model, config, threads, offline)
+        self.model = f"crops:{model}"
         self.output = self._deepest_map()
-        block = self.config.conv_block
+        block = self.layout.conv_block
         self.conv_block = (
             onnx_session(model_path(block, offline=offline), threads) if block else None
         )
@@ -2279,6 +2280,8 @@ class CropEmbedder(Embedder):
             return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
         crops, on_object = self.cut(frame, detections, rows)
         masked = np.concatenate([crops * on_object[..., None], crops * ~on_object[..., None]])
+        if self._net is not None and self._net.head is not None:
+            return self._trained(masked, detections, rows, frame.shape[:2], on_object)
         fore, back = np.split(self.maps(masked), 2)  # (N, C, h, w) each
         if self.conv_block is None:
             return Embeddings(_flat_map(fore), _flat_map(back))
@@ -2287,12 +2290,8 @@ class CropEmbedder(Embedder):
 
     def cut(self, frame: Image, detections: Detections, rows: IntArray) -> tuple[Image, BoolArray]:
         """Grown boxes, black beyond the frame: crops (N, S, S, 3), object pixels (N, S, S)."""
-        side = self.config.crop_px
-        box = _cxcywh_from_xyxy(detections.xyxy[rows])  # (N, 4)
-        half = np.maximum(box[:, 2:] / 2 * (1 + 2 * self.config.context), 1)  # (N, 2)
-        low = np.floor(box[:, :2] - half).astype(int)  # (N, 2) whole pixels
-        high = np.ceil(box[:, :2] + half).astype(int)
-        height, width = frame.shape[:2]
+        side, (height, width) = self.layout.crop_px, frame.shape[:2]
+        low, high = self._windows(detections.xyxy[rows], frame.shape[:2])
         pad = max(0, int(-low.min()), int((high - [width, height]).max()))
         wide = cv2.copyMakeBorder(frame, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=(0, 0, 0))
         crops = [
@@ -2305,16 +2304,77 @@ class CropEmbedder(Embedder):
         y = grid[:, 1, :, None].repeat(side, 2)
         return np.stack(crops), _on_object(detections, rows, x, y)
 
+    def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
+        """Corners (N, 2) of the grown boxes, whole pixels; may lie beyond the frame."""
+        box = _cxcywh_from_xyxy(xyxy)  # (N, 4)
+        least = max(1.0, self.layout.reach * max(size_hw))
+        half = box[:, 2:] / 2 + np.maximum(box[:, 2:] * self.layout.context, least)  # (N, 2)
+        low, high = np.floor(box[:, :2] - half), np.ceil(box[:, :2] + half)
+        return low.astype(np.int64), high.astype(np.int64)
+
+    def _trained(
+        self,
+        masked: Image,
+        detections: Detections,
+        rows: IntArray,
+        size_hw: tuple[int, ...],
+        on_object: BoolArray,
+    ) -> Embeddings:
+        """Pool the maps of foreground and background crops (2N, S, S, 3) for a trained head."""
+        net, side, count = self._net, self.layout.crop_px, len(rows)
+        assert net is not None
+        low, high = self._windows(detections.xyxy[rows], size_hw)
+        own = (detections.xyxy[rows] - np.tile(low, 2)) * np.tile(side / (high - low), 2)  # (N, 4)
+        sure = detections[detections.score >= self.layout.object_score]
+        others = self._crop_objects(sure, size_hw, low, high) & ~on_object  # (N, S, S)
+        maps = net.maps(masked)  # (2N, h, w, C)
+        fed = []
+        for i in range(2 * count):  # over crops: each has a map of its own
+            k = i % count
+            some = [True, bool(others[k].any())]
+            found = Detections(
+                np.stack([own[k], [0, 0, side, side]])[some],
+                np.ones(sum(some)),
+                np.zeros(sum(some), np.int64),
+                np.stack([on_object[k], others[k]])[some],
+            )
+            parts = part_samples(found, np.arange(1), (side, side), maps.shape[1:3], self.layout)
+            flat = maps[i].reshape(-1, maps.shape[-1])
+            means = [_cell_mean(flat[part.index], part.weight, part.cells) for part in parts]
+            fed.append(head_inputs(parts, means)[i // count])
+        fore, back = np.concatenate(fed[:count]), np.concatenate(fed[count:])
+        found_rows = net.head.run(None, {"fg": fore, "bg": back})
+        return Embeddings(*(np.asarray(part, np.float64) for part in found_rows))
+
+    def _crop_objects(
+        self, detections: Detections, size_hw: tuple[int, ...], low: IntArray, high: IntArray
+    ) -> BoolArray:
+        """(N, S, S): which pixels of the crops show any object."""
+        height, width = size_hw
+        objects = _object_map(detections, size_hw, (height, width))  # (H, W)
+        side = self.layout.crop_px
+        unit = (np.arange(side) + 0.5) / side
+        at = (low[:, :, None] + (high - low)[:, :, None] * unit).astype(int)  # (N, 2, S)
+        x, y = at[:, 0, None, :], at[:, 1, :, None]
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return np.asarray(objects[y.clip(0, height - 1), x.clip(0, width - 1)] & inside)
+
     def maps(self, crops: Image) -> Floats:
         """Backbone features (B, C, h, w) of BGR images (B, S, S, 3)."""
-        net = self.backbone
+        net = self._net
+        assert net is not None
+        if net.head is not None:
+            return np.ascontiguousarray(net.maps(crops).transpose(0, 3, 1, 2))
         rgb = (crops[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         feed = {net.input: np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32)}
         return np.asarray(net.session.run([self.output], feed)[0], np.float32)
 
     def _deepest_map(self) -> str:
         """Name of the backbone's first output at stride 32 (7 x 7 for 224 px), else its first."""
-        net, side = self.backbone, self.config.crop_px
+        net, side = self._net, self.layout.crop_px
+        assert net is not None
+        if net.head is not None:
+            return str(net.output)
         names: list[str] = [o.name for o in net.session.get_outputs()]
         maps = net.session.run(names, {net.input: np.zeros((1, 3, side, side), np.float32)})
         deep = [n for n, m in zip(names, maps, strict=True) if m.shape[2:] == (side // 32,) * 2]
@@ -2329,7 +2389,7 @@ class CropEmbedder(Embedder):
             isinstance(w, int) and w != n for w, n in zip(wanted, both.shape[1:], strict=True)
         ):
             raise ReobjError(
-                f"{self.config.conv_block}: takes {entry.shape}, the two maps of the backbone are "
+                f"{self.layout.conv_block}: takes {entry.shape}, the two maps of the backbone are "
                 f"(N, {', '.join(map(str, both.shape[1:]))}): give a ConvBlock trained with this "
                 "backbone and --set embed.crop_px"
             )
@@ -2338,7 +2398,7 @@ class CropEmbedder(Embedder):
 
 
 def _flat_map(maps: Floats) -> Array:
-    """Maps (N, C, h, w) as unit rows (N, C * h * w); signed square root as in `_pool_cells`."""
+    """Maps (N, C, h, w) as unit rows (N, C * h * w); signed square root as in `_unit_histogram`."""
     flat = maps.reshape(len(maps), -1)
     return _unit_rows(np.sign(flat) * np.sqrt(np.abs(flat)))
 

@@ -332,3 +332,18 @@ def test_gallery_parts_are_of_the_most_similar_view() -> None:
     fore, back = gallery.parts(views[1:], np.array([0]))
     assert (fore, back) == (pytest.approx(1), pytest.approx(1))
     assert np.isnan(gallery.parts(views, np.array([], int))[0]).size == 0
+
+
+def test_trained_crops_see_only_their_part() -> None:
+    """With the shipped model: another wall changes the background's rows alone."""
+    mask = np.zeros((1, 120, 160), bool)
+    mask[0, 40:80, 60:100] = True
+    found = rt.Detections(np.array([[60.0, 40, 100, 80]]), np.ones(1), np.zeros(1, int), mask)
+    walls = np.full((2, 120, 160, 3), 60, np.uint8)
+    walls[0, ..., 2] = walls[1, ..., 0] = 200  # red, blue
+    walls[:, 40:80, 60:100] = RNG.integers(0, 255, (40, 40, 3), np.uint8)
+    crops = rt.CropEmbedder("reobj", rt.EmbedConfig(crop_px=64), threads=1)
+    one, other = (crops(wall, found) for wall in walls)
+    assert one.foreground.shape == one.background.shape == (1, 128)
+    assert np.allclose(one.foreground, other.foreground, atol=1e-4)
+    assert (one.background @ other.background.T).item() < 0.99
