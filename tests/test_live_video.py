@@ -54,7 +54,7 @@ class FakeCamera:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rt, "LIVE_SILENCE_S", 0.2)
+    monkeypatch.setattr(rt, "LIVE_SILENCE_S", 1.0)
 
 
 def opened(monkeypatch: pytest.MonkeyPatch, *cameras: FakeCamera) -> None:
@@ -63,7 +63,7 @@ def opened(monkeypatch: pytest.MonkeyPatch, *cameras: FakeCamera) -> None:
 
 
 def wait_until(condition: Any) -> None:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
@@ -218,21 +218,34 @@ class QuietFiles(http.server.SimpleHTTPRequestHandler):
         pass
 
 
+SAYS_WHEN_IT_TRACKS = """
+import pathlib, sys, reobj_track as rt
+step = rt.Tracker.step
+def counted(self, *args, **options):
+    if self.frame_number == 40:
+        pathlib.Path(sys.argv[1]).touch()
+    return step(self, *args, **options)
+rt.Tracker.step = counted
+sys.exit(rt.main(sys.argv[2:]))
+"""
+
+
 @pytest.mark.parametrize("stream", [(10**6, 0.01)], indirect=True)
 def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path) -> None:
     """A live run ended by SIGINT: exit code 0, all its files whole, and what was lost is said."""
     server, url = stream
+    ready = tmp_path / "ready"
     rows = [f"{i},-1,{x},60,40,50,0.9,-1,-1,-1" for i in range(1, 5000) for x in (100, 220)]
     (tmp_path / "det.txt").write_text("\n".join(rows) + "\n")
     out, env = tmp_path / "out", os.environ | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "reobj_track", "run", url, "-o", str(out)]
+    command = [sys.executable, "-c", SAYS_WHEN_IT_TRACKS, str(ready), "run", url, "-o", str(out)]
     for _ in range(2):  # again into the same folder: what it shows now, not what is cached
-        sent = server.sent
         process = subprocess.Popen(
             [*command, "--detections", str(tmp_path / "det.txt"), "--embed", "none"],
             env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
-        wait_until(lambda sent=sent, p=process: server.sent > sent + 150 or p.poll() is not None)
+        wait_until(lambda p=process: ready.exists() or p.poll() is not None)
+        ready.unlink()
         process.send_signal(signal.SIGINT)
         text, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
