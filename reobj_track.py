@@ -380,6 +380,9 @@ class ObjectsConfig:
     link_look: float = _opt(
         -1.0, "never join by place what looks less alike than this (log of the distance ratio)"
     )
+    link_class: float = _opt(
+        0.1, "join by place only where the detector's classes agree in this share of the scores"
+    )
     link_place: float = _opt(
         0.25, "candidates for a join overlap at least this much when cross-projected (IoU)"
     )
@@ -5410,7 +5413,7 @@ class Linker:
         self.atom, first = _segments_of(table, config.cut_gap)  # (N,), (L,)
         self.tracklets = table.tracklet_id[first]  # (L,)
         self.identity = table.object_id[first]  # (L,)
-        self.classes = _majority(table.class_id, table.score, self.atom, len(first))  # (L,)
+        self.classes = _class_shares(table, self.atom, len(first)).argmax(1)  # (L,)
         names = np.array([*track.class_names, ""])[self.classes.clip(max=len(track.class_names))]
         self.moving = np.isin(names, config.moving.split(","))  # (L,) as the tracker has them
         self.together, self.apart = self._seen_together()
@@ -5508,7 +5511,7 @@ class Linker:
         assert self.poses is not None and self.fit is not None
         rows = labels[self.atom]  # (N,)
         views = gather_views(self.table, self.poses, rows, count, self.config.min_score)
-        classes = _majority(self.table.class_id, self.table.score, rows, count)
+        classes = _class_shares(self.table, rows, count).argmax(1)
         fits = self.fit(views, classes.tolist())
         solids = quadrics.solid_boxes(
             fits.ellipsoids, list(fits.support), views.img_from_world
@@ -5582,11 +5585,12 @@ class Linker:
     ) -> list[tuple[int, int, float, float]]:
         """Disjoint pairs of groups worth a joint fit: (a, b, cross IoU, look), best first."""
         apart = _grouped_max(self.together, self.group)  # (G, G) cannot be one
-        classes = _majority(self.table.class_id, self.table.score, self.group[self.atom], count)
+        share = _class_shares(self.table, self.group[self.atom], count)  # (G, C)
+        confused = np.minimum(share[:, None], share).sum(-1) >= self.config.link_class  # (G, G)
         look = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), self.group)  # (G, G)
         look = np.where(np.isfinite(look), look, 0.0)  # nothing known speaks for nothing
         score = np.maximum(place, place.T)
-        good = ~apart & (classes[:, None] == classes[None]) & (score >= self.config.link_place)
+        good = ~apart & confused & (score >= self.config.link_place)
         good &= look >= self.config.link_look
         still = ~np.isin(np.arange(count), self.group[self.moving])
         good &= still[:, None] & still
@@ -5692,11 +5696,11 @@ def _paired_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
     return np.nan_to_num(np.asarray(inter / np.maximum(union, 1e-9), np.float64))
 
 
-def _majority(class_id: IntArray, score: Array, group: IntArray, count: int) -> IntArray:
-    """Class with the largest sum of scores in each group, (count,)."""
-    votes = np.zeros((count, int(class_id.max(initial=0)) + 1))
-    np.add.at(votes, (group, class_id.clip(0)), score)
-    return np.asarray(votes.argmax(1), np.int64)
+def _class_shares(table: TrackTable, group: IntArray, count: int) -> Array:
+    """Share of every class in the scores of each group of rows, (count, C)."""
+    votes = np.zeros((count, int(table.class_id.max(initial=0)) + 1))
+    np.add.at(votes, (group, table.class_id.clip(0)), table.score)
+    return np.asarray(votes / np.maximum(votes.sum(1, keepdims=True), 1e-9))
 
 
 # ---- Writers -----------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Compare identities on the same detections: ours, DeepSORT and today's trackers.
 
-    python examples/compare_deepsort.py --peers build/peers --rooms examples/room --render 1,2 \\
-        --kitchen redkitchen_7scenes --mot mot -o OUT
+    python examples/compare_deepsort.py --peers build/peers --rooms examples/room \\
+        --render 1,2,v900,v901 --kitchen redkitchen_7scenes --mot mot -o OUT
 
 Writes OUT/compare.html (all of it on one page), compare.csv, compare_*.png; prints Markdown tables.
 The same settings for all sequences; every tracker's rows are the detections it gave an identity to,
@@ -445,11 +445,12 @@ def plots(rows: list[dict[str, Any]], out: Path) -> None:
 
 
 def rendered(seeds: str, folder: Path) -> list[Path]:
-    """Rooms of render_room.py with these seeds, made where they are missing."""
+    """Rooms of render_room.py with these seeds, made where missing; v7: of its own plan."""
     rooms = [folder / f"room_{seed}" for seed in seeds.split(",") if seed]
     for room in rooms:
+        seed, own = room.name[5:].lstrip("v"), ["--plan", "varied", "--path", "tour"]
         if not (room / "gt_mot.txt").exists() or not (room / "detections.npz").exists():
-            render_room.main(["-o", str(room), "--seed", room.name[5:]])
+            render_room.main(["-o", str(room), "--seed", seed, *own * ("v" in room.name)])
     return rooms
 
 
@@ -469,7 +470,7 @@ def main() -> int:
     )
     parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
     parser.add_argument("--rooms", type=Path, nargs="*", default=[], help="of render_room.py")
-    parser.add_argument("--render", default="", metavar="SEEDS", help="more rooms: 1,2 (OUT/rooms)")
+    parser.add_argument("--render", default="", metavar="SEEDS", help="more rooms: 1,2,v900")
     parser.add_argument("--kitchen", type=Path, nargs="*", default=[], help="recordings")
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
     parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")

@@ -105,8 +105,7 @@ def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
 
 
 def test_a_wrong_return_is_split_by_its_place() -> None:
-    """The tracker took the third chair for the first one that came back: two places, two objects.
-    """
+    """The tracker took the third chair for the first one that came back: two places, two objects."""
     poses = walk()
     table = table_of(poses)
     table = table[
@@ -158,21 +157,19 @@ def test_objects_seen_together_are_never_joined() -> None:
     assert len(linked(double, poses).objects) == 2
 
 
-def test_different_classes_are_never_joined() -> None:
+@pytest.mark.parametrize(
+    ("every", "classes"),  # every n-th late box is still called a chair, the others a cup
+    [(10**6, ["chair", "cup"]), (3, ["chair"])],
+)
+def test_only_classes_that_the_detector_confuses_are_joined(every: int, classes: list[str]) -> None:
     poses = walk()
     table = table_of(poses)
     table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
     late = (table.frame > 70).astype(np.int64)
-    table = rt.TrackTable(
-        table.frame,
-        1 + late,
-        1 + late,
-        table.xyxy,
-        table.score,
-        np.where(late == 1, CUP, CHAIR),
-        table.detection_index,
-    )
-    assert [o["class"] for o in linked(table, poses).objects] == ["chair", "cup"]
+    cup = (late == 1) & (table.frame % every != 0)
+    class_id = np.where(cup, CUP, CHAIR)
+    table = dataclasses.replace(table, object_id=1 + late, tracklet_id=1 + late, class_id=class_id)
+    assert [o["class"] for o in linked(table, poses).objects] == classes
 
 
 @pytest.mark.parametrize(
