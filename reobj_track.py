@@ -5995,14 +5995,14 @@ def write_overlay(
     solids: quadrics.Ellipsoids | None,
     video: Video,
     config: OutputConfig,
-    take: Callable[[Frame], None] = lambda frame: None,
+    pictures: Pictures | None = None,
 ) -> None:
     """Write overlay.mp4: boxes, identities and back-projected ellipsoids of every frame.
 
     Args:
         solids: ellipsoids of the objects that are not rejected, in their order. Those that rest on
             a prior are drawn only while they are detected.
-        take: called with every frame, so that the video is read once for all outputs.
+        pictures: takes its own from every frame, so that the video is read once for both.
     """
     width, height = video.size
     shrink = min(1.0, config.overlay_size_px / max(width, height))
@@ -6029,7 +6029,8 @@ def write_overlay(
                 draw_ellipses(image, dual_c, drawn, ids, seen)
             draw_tracks(image, rows, labels, scale)
             writer.write(image)
-            take(frame)
+            if pictures is not None:
+                pictures.take(frame)
             progress.step()
         complete = True
     finally:
@@ -7014,13 +7015,13 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
     if solids is not None:
         ids = [o["id"] for o in result.objects if o["status"] != "rejected"]
         write_ply(out / "objects.ply", solids, ids, config.output.ply_detail)
-    pictures = Pictures(result, video, config.output)
+    pictures = Pictures(result, video, config.output) if config.output.scene else None
     if config.output.overlay and not video.is_live:
-        write_overlay(result, solids, video, config.output, pictures.take)
-    elif config.output.scene and not video.is_live:
+        write_overlay(result, solids, video, config.output, pictures)
+    elif pictures is not None and not video.is_live:
         for frame in video:
             pictures.take(frame)
-    if config.output.scene:
+    if pictures is not None:
         write_scene(result, pictures, video, config)
     result.seconds["write"] = time.monotonic() - started
 
