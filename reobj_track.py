@@ -7604,13 +7604,13 @@ class Saved:
         data = json.loads((out / "objects.json").read_text())
         names = tuple(dict.fromkeys(o["class"] for o in data["objects"]))
         class_of = {o["id"]: names.index(o["class"]) for o in data["objects"]}
-        found = labelled(read_mot_rows(out / "tracks.txt"))
-        score = read_mot_rows(out / "tracks.txt")[:, 6]
+        tracks = out / "tracks.txt"
+        rows = read_mot_rows(tracks) if tracks.stat().st_size else np.empty((0, 10))
+        found = labelled(rows)
         classes = np.array([class_of[i] for i in found.identity.tolist()], np.int64)
         unknown = np.full(len(found), -1, np.int64)
-        table = TrackTable(
-            found.frame - 1, found.identity, found.identity, found.xyxy, score, classes, unknown
-        )
+        ids, score = found.identity, rows[:, 6]
+        table = TrackTable(found.frame - 1, ids, ids, found.xyxy, score, classes, unknown)
         poses, source = (out / "cache" / n for n in ("last-poses.npz", "source.json"))
         video = None
         if source.is_file():

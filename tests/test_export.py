@@ -309,6 +309,23 @@ def test_track_only_folder(room: Path, tmp_path: Path) -> None:
         assert len(list(csv.reader(file))) == 1
 
 
+def test_a_video_without_objects(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
+) -> None:
+    """Empty files of the right form, and no complaint."""
+    (tmp_path / "det.csv").write_text("frame,x1,y1,x2,y2,score,class\n")
+    out, few = tmp_path / "out", ("--stop", 3, "--set", "output.overlay=false")
+    args = ("--detections", tmp_path / "det.csv", "-o", out)
+    assert cli("track", ROOM / "room.mp4", *args, *few) == 0
+    capsys.readouterr()
+    for to in ("coco-vid", "cvat", "boxer"):
+        assert cli("export", out, "--to", to) == 0
+    assert capsys.readouterr().err == "" and not list(recwarn)
+    data = json.loads((out / "coco_vid.json").read_text())
+    assert len(data["images"]) == 3 and data["annotations"] == []
+    assert not list(ET.parse(out / "cvat.xml").getroot().iter("track"))
+
+
 def test_the_video_may_be_gone(room: Path, tmp_path: Path) -> None:
     import shutil
 
