@@ -3352,7 +3352,7 @@ class Tracker:
         close = gate & (cost <= best + config.rival_cost)
         doubtful = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
         known = (live.embedded >= 0)[:, None]
-        doubtful |= gate & known & (cost > config.doubt_cost)
+        doubtful |= close & known & (cost > config.doubt_cost)
         rows = np.flatnonzero(doubtful.any(0))
         if not len(rows):
             return cost, feasible
