@@ -248,8 +248,8 @@ class EmbedConfig:
     """Appearance."""
 
     model: str = _opt(
-        "colour",
-        "appearance: colour (training-free), none, a backbone name / .onnx file, or "
+        "reobj",
+        "appearance: reobj (comes along), colour (training-free), none, a backbone name / .onnx file, or "
         "crops[:BACKBONE] (re-OBJ as published: two crops an object)",
         "--embed",
     )
@@ -670,7 +670,7 @@ WEIGHTS: tuple[Weights, ...] = (
             "f75628d5ebbbb652f34adc33fcb163fe3a123e5a8bddc70125cb76b6f3c79005", 11560385,
             "AGPL-3.0", "COCO with masks, AP 39.5, 154 ms; strong copyleft"),
     Weights("reobj", "backbone", "reobj.onnx", "",
-            "cb90c0c4c6e039fb5d0ee321788e64c51be1e26fa79b0773174e73d3a27fa6f6", 404061,
+            "cabea9ded15a4cd18b0040ba9f35b894f09c0d182aa187ab61da52220a891c25", 404063,
             "MIT", "ours, comes along: foreground and background, trained with its head"),
     Weights("mobilenetv2", "backbone", "mobilenetv2_feat.onnx", "",
             "2e2d63ad6239eb67ad4e132a0858da4ecbaf3022560007a659d05a1afd8fbc7f", 8849494,
@@ -2120,10 +2120,10 @@ class Embedder:
     head that turns the cells into two short embeddings.
 
     Args:
-        model: "colour" for the training-free descriptor (soft colour histogram and gradient
-            orientations), or a backbone: a name listed by `reobj_track.py models` or a path to an
-            ONNX file with an image input and a spatial output (of `train_embedding.py`: its head
-            and its layout are found through the file).
+        model: "reobj" for the weights that come along, "colour" for the training-free descriptor
+            (soft colour histogram and gradient orientations), or a backbone: a name listed by
+            `reobj_track.py models` or a path to an ONNX file with an image input and a spatial
+            output (of `train_embedding.py`: its head and its layout are found through the file).
 
     Attributes:
         layout: where the map is sampled; that of the model if it was trained, else the config's.
@@ -2131,7 +2131,7 @@ class Embedder:
 
     def __init__(
         self,
-        model: str = "colour",
+        model: str = "reobj",
         config: EmbedConfig | None = None,
         threads: int = 0,
         offline: bool = False,

@@ -65,7 +65,9 @@ def digest(*parts: Any) -> str:
 
 SOURCE = digest(Path(rt.__file__), Path(rt.__file__).with_name("quadrics.py"))  # our own rows
 _LOOK = (rt.EmbedConfig, rt.Embedder, rt._colour_features, rt._direction_bins, rt.part_samples)
-EMBEDDER = digest([inspect.getsource(x) for x in _LOOK])  # what the own look depends on
+EMBEDDER = digest(  # what the own look depends on
+    [inspect.getsource(x) for x in _LOOK], *sorted(rt.own_models().glob("*.onnx"))
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,8 +19,9 @@ Validation: --val-rooms A:B, --val-sparse.
 Method: each step takes several scenes and several views of each, and changes every picture as
 phones do (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of
 masks half of the time). Triplet loss on cosines of (foreground, background) together and of each
-alone; for every anchor and positive the negative is semi-hard at first (nearest of those further
-than the positive), later the hardest of the same scene: an identical twin elsewhere in the room.
+alone; for every anchor and positive the negative is semi-hard (the nearest of those further than
+the positive: mostly an identical twin elsewhere in the room); with --hard-after, the nearest of all
+of the same scene from then on.
 Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
 al., MobileNetV2, CVPR 2018 (inverted residual).
 
@@ -877,7 +878,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--steps", type=int, default=3000)
     add("--minutes", type=float, default=0.0, help="stop after so many minutes of steps (0: never)")
     add("--rate", type=float, default=1e-3, help="peak learning rate (AdamW, cosine)")
-    add("--hard-after", type=float, default=0.6, help="hardest negatives from this share on")
+    add("--hard-after", type=float, default=1.0, help="hardest negatives from this share on")
     add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)

@@ -512,7 +512,7 @@ def scene_with_twins() -> tuple[np.ndarray, rt.Detections]:
 
 def test_embedder_separates_foreground_from_background() -> None:
     image, detections = scene_with_twins()
-    found = rt.Embedder()(image, detections)
+    found = rt.Embedder("colour")(image, detections)
     assert found.foreground[0] @ found.foreground[1] > 0.98
     assert found.background[0] @ found.background[1] < 0.9
 
@@ -525,19 +525,19 @@ def test_embedder_uses_masks() -> None:
     masks = np.zeros((2, *image.shape[:2]), bool)
     masks[0, 90:150, 90:120] = masks[1, 90:150, 330:360] = True
     masked = rt.Detections(detections.xyxy, detections.score, detections.class_id, masks)
-    before = rt.Embedder()(image, masked).foreground[0]
+    before = rt.Embedder("colour")(image, masked).foreground[0]
     changed = image.copy()
     changed[95:145, 135:150] = 255  # in the box, outside the mask
-    after = rt.Embedder()(changed, masked).foreground[0]
-    plain = rt.Embedder()(changed, detections).foreground[0]
-    unmasked_before = rt.Embedder()(image, detections).foreground[0]
+    after = rt.Embedder("colour")(changed, masked).foreground[0]
+    plain = rt.Embedder("colour")(changed, detections).foreground[0]
+    unmasked_before = rt.Embedder("colour")(image, detections).foreground[0]
     assert before @ after > 0.99
     assert plain @ unmasked_before < before @ after
 
 
 def test_embedding_some_rows_equals_embedding_all() -> None:
     image, detections = scene_with_twins()
-    embedder = rt.Embedder()
+    embedder = rt.Embedder("colour")
     whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
     np.testing.assert_array_equal(whole.foreground[1:], part.foreground)
     np.testing.assert_array_equal(whole.background[1:], part.background)
@@ -548,5 +548,5 @@ def test_embedding_some_rows_equals_embedding_all() -> None:
 )
 def test_embedder_takes_boxes_at_and_over_the_border(box: tuple[float, ...]) -> None:
     image, _ = scene_with_twins()
-    found = rt.Embedder()(image, rows(box))
+    found = rt.Embedder("colour")(image, rows(box))
     assert np.isfinite(found.foreground).all() and np.isfinite(found.background).all()
