@@ -32,6 +32,7 @@ import html
 import inspect
 import os
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -456,13 +457,15 @@ def rendered(seeds: str, folder: Path) -> list[Path]:
     return rooms
 
 
-def fill_in(document: Path, rows: list[dict[str, Any]]) -> None:
-    """Replace the tables of a Markdown file that follow a line <!-- compare: SEQUENCE -->."""
+def fill_in(document: Path, rows: list[dict[str, Any]], pictures: Path) -> None:
+    """Renew the tables of a Markdown file that follow <!-- compare: SEQUENCE -->, and its plots."""
+    for picture in pictures.glob("compare_*.png"):
+        shutil.copy(picture, document.parent / "img")
     for name in dict.fromkeys(r["sequence"] for r in rows):
         body = table("", HEADER, [cells(r) for r in rows if r["sequence"] == name]).strip()
-        mark = re.escape(f"<!-- compare: {name} -->") + r"\n\n?(\|.*\n)*"
+        mark = re.escape(f"<!-- compare: {name} -->") + r"\n+(\|.*\n)*\n*"
         text = document.read_text()
-        document.write_text(re.sub(mark, f"<!-- compare: {name} -->\n\n{body}\n", text))
+        document.write_text(re.sub(mark, f"<!-- compare: {name} -->\n\n{body}\n\n", text))
 
 
 def main() -> int:
@@ -491,7 +494,7 @@ def main() -> int:
     plots(rows, args.out)
     write_page(rows, args.out)
     if args.fill:
-        fill_in(args.fill, rows)
+        fill_in(args.fill, rows, args.out)
     print(markdown(rows))
     return 0
 

@@ -105,7 +105,7 @@ def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
 
 
 def test_a_wrong_return_is_split_by_its_place() -> None:
-    """The tracker took the third chair for the first one that came back: two places, two objects."""
+    """The tracker took the third chair for the first one that came back: two places."""
     poses = walk()
     table = table_of(poses)
     table = table[
