@@ -1,0 +1,67 @@
+"""examples/live_ar.py: identities and ellipsoids while poses arrive with the frames."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import reobj_track as rt
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+
+@pytest.fixture(scope="module")
+def live_ar() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("live_ar", EXAMPLES / "live_ar.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_objects_stand_where_they_are(
+    live_ar: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """60 frames of the example clip: the ellipsoids' centres are those of the true objects."""
+    assert live_ar.main(["-o", str(tmp_path), "--frames", "60", "--embed", "none"]) == 0
+    objects = json.loads((tmp_path / "live_objects.json").read_text())
+    truth = json.loads((EXAMPLES / "room" / "gt_objects.json").read_text())["objects"]
+    places = np.array([t["center_in_world"] for t in truth])
+    miss = [
+        min(
+            np.linalg.norm(np.array(o["center_in_world"]) - p)
+            for p, t in zip(places, truth, strict=True)
+            if t["category"] == o["category"]
+        )
+        for o in objects
+    ]
+    assert len(objects) >= 8
+    assert np.median(miss) < 0.15  # m
+    assert rt.read_mot_rows(tmp_path / "tracks.txt")[:, 0].max() == 60
+    assert (tmp_path / "objects.ply").stat().st_size > 1000
+    assert "ms" in capsys.readouterr().out
+
+
+def test_a_session_goes_on_from_its_state(live_ar: ModuleType, tmp_path: Path) -> None:
+    """The second session sees the same frames again: the same objects, no new identities."""
+    state = ["--state", str(tmp_path / "state.npz"), "--frames", "40"]
+    found = []
+    for name in ("first", "second"):
+        assert live_ar.main(["-o", str(tmp_path / name), *state]) == 0
+        rows = rt.read_mot_rows(tmp_path / name / "tracks.txt")
+        last = rows[rows[:, 0] == 40]
+        found.append({tuple(r[2:6].round()): int(r[1]) for r in last})
+    assert len(found[0]) > 5
+    assert found[0] == {box: found[1][box] for box in found[0]}
+
+
+@pytest.mark.parametrize("option", ["--poses", "--detections"])
+def test_a_missing_file_is_one_line(
+    live_ar: ModuleType, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert live_ar.main(["-o", str(tmp_path), option, str(tmp_path / "none.txt")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
