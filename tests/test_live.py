@@ -30,12 +30,12 @@ def test_objects_stand_where_they_are(
     assert live_ar.main(["-o", str(tmp_path), "--frames", "60", "--embed", "none"]) == 0
     objects = json.loads((tmp_path / "live_objects.json").read_text())
     truth = json.loads((EXAMPLES / "room" / "gt_objects.json").read_text())["objects"]
-    places = np.array([t["center_in_world"] for t in truth])
+    places = np.array([t["center"] for t in truth])
     miss = [
         min(
             np.linalg.norm(np.array(o["center_in_world"]) - p)
             for p, t in zip(places, truth, strict=True)
-            if t["category"] == o["category"]
+            if t["class"] == o["category"]
         )
         for o in objects
     ]
