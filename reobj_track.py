@@ -249,8 +249,8 @@ class EmbedConfig:
 
     model: str = _opt(
         "reobj",
-        "appearance: reobj (comes along), colour (training-free), none, a backbone name / .onnx file, or "
-        "crops[:BACKBONE] (re-OBJ as published: two crops an object)",
+        "appearance: reobj (comes along), colour (training-free), none, a backbone name / .onnx "
+        "file, or crops[:BACKBONE] (re-OBJ as published: two crops an object)",
         "--embed",
     )
     size_px: int = _opt(480, "longer side of the backbone's input")

@@ -91,6 +91,11 @@ def check_ar(folder: Path) -> None:
     again = np.loadtxt(folder / "out/poses.txt")
     np.testing.assert_allclose(again[:, 1:4], true[::3, :3, 3], atol=1e-6)
     assert sum(o["status"] == "ok" for o in objects(folder / "out")) >= 5
+    first, second = (
+        set(np.loadtxt(folder / out / "tracks.txt", delimiter=",")[:, 1])
+        for out in ("live", "again")
+    )
+    assert len(first) > 10 and second <= first  # nothing new: the identities were kept
 
 
 def check_detector(folder: Path) -> None:
