@@ -402,13 +402,36 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     return "\n".join(table(f"**{n}**", HEADER, lines) for n, lines in body.items())
 
 
+def verdicts(rows: list[dict[str, Any]]) -> list[str]:
+    """For every sequence: ours online against the best peer, and identities against DeepSORT."""
+    lines = []
+    for name in dict.fromkeys(r["sequence"] for r in rows):
+        part = {r["tracker"]: r for r in rows if r["sequence"] == name}
+        peers = [r for t, r in part.items() if not t.startswith("ours")]
+        if not peers:
+            continue
+        text = ", ".join(
+            f"{100 * (part['ours'][c] - max(p[c] for p in peers)):+.1f} {c}"
+            for c in ("IDF1", "AssA", "HOTA")
+        )
+        other = next(p["ids_per_object"] for p in peers if p["tracker"].startswith("deepsort"))
+        mine = [r["ids_per_object"] for t, r in part.items() if t.startswith("ours")]
+        online, last = (f"{100 * (ids / other - 1):+.0f} %" for ids in (mine[0], mine[-1]))
+        lines.append(
+            f"{name}: ours {text} against the best peer; identities per real object against "
+            f"DeepSORT {online} online, {last} in our last row"
+        )
+    return lines
+
+
 def write_page(rows: list[dict[str, Any]], out: Path) -> None:
     """compare.html: the plots and all tables on one page that needs nothing else."""
     parts = ["<!doctype html><meta charset=utf-8><title>Identities compared</title><style>"
              "body{font:14px sans-serif;margin:2em}td,th{padding:2px 9px;text-align:right}"
              "td:first-child{text-align:left}tr.ours{background:#e3f4e3}img{max-width:100%}"
              "</style><h1>Identities on the same detections</h1><pre>",
-             html.escape(__doc__), "</pre>"]  # fmt: skip
+             html.escape(__doc__), "</pre><ul>", *(f"<li>{html.escape(v)}" for v in verdicts(rows)),
+             "</ul>"]  # fmt: skip
     for name in list(dict.fromkeys(r["sequence"] for r in rows))[::-1]:
         parts.append(f"<h2>{html.escape(name)}</h2>")
         picture = out / f"compare_{name[4:].replace(' ', '_')}.png"
@@ -495,7 +518,7 @@ def main() -> int:
     write_page(rows, args.out)
     if args.fill:
         fill_in(args.fill, rows, args.out)
-    print(markdown(rows))
+    print(markdown(rows), *verdicts(rows), sep="\n- ")
     return 0
 
 
