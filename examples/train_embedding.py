@@ -805,10 +805,11 @@ def draw_curves(log: Path, picture: Path) -> None:
     left.plot(step, [float(row["loss"]) for row in rows])
     left.set(xlabel="step", ylabel="triplet loss")
     for name in rows[0]:
-        if name.endswith("_twins"):
-            right.plot(step, [float(row[name]) for row in rows], label=name.replace("_", " "))
+        rank = [float(row[name]) for row in rows if name.startswith(("room", "real"))]
+        if name.endswith("_twins" if "room" in name else "_all") and np.isfinite(rank).all():
+            right.plot(step, rank, label=name.replace("_", " "))
     right.set(xlabel="step", ylabel="Rank-1, validation")
-    right.legend()
+    right.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(picture, dpi=90)
     plt.close(figure)
 
