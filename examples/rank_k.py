@@ -456,7 +456,7 @@ def looks(args: Any) -> dict[str, tuple[Look, tuple[str, ...]]]:
     """Every method: how to embed, and the names of its one or two parts."""
     parts, one = ("fg", "bg"), ("full",)
     found: dict[str, tuple[Look, tuple[str, ...]]] = {
-        "colour, frame": (rt.Embedder(threads=1), parts)
+        "colour, frame": (rt.Embedder("colour", threads=1), parts)
     }
     for name in args.models:
         stem = Path(name).stem

@@ -3,9 +3,9 @@
 
     python examples/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
 
-writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`), OUT/last.pt (go on
-with --resume), OUT/log.csv and OUT/curves.png. Needs `pip install torch matplotlib onnx` (CPU or
-GPU; the GPU is used when there is one).
+writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`; the checkpoint of the
+best validation, OUT/best.pt), OUT/last.pt (go on with --resume), OUT/log.csv and OUT/curves.png.
+Needs `pip install torch matplotlib onnx`; the GPU is used when there is one.
 
 What it learns from; every source may be given several times:
   --rooms A:B           seeds of rendered rooms with sets of identical twins (render_room.py
@@ -707,13 +707,14 @@ class Trainer:
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.net = Net().to(self.device)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), args.rate, weight_decay=0.02)
-        self.step, self.seconds = 0, 0.0
+        self.step, self.seconds, self.best = 0, 0.0, -1.0
         last = args.out / "last.pt"
         if args.resume and last.exists():
             state = torch.load(last, map_location=self.device, weights_only=True)
             self.net.load_state_dict(state["net"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.step, self.seconds = state["step"], state["seconds"]
+            self.best = state.get("best", -1.0)
         args.out.mkdir(parents=True, exist_ok=True)
         self.pool = Pool(args)
         if args.start and self.step == 0:
@@ -784,11 +785,22 @@ class Trainer:
                 writer.writeheader()
             writer.writerow(row)
         print(json.dumps(row), flush=True)
+        score = float(np.nan_to_num(row["room_fused_twins"])) + float(
+            np.nan_to_num(row["real_fused_all"])
+        )
+        names = ["last.pt", "best.pt"] if score >= self.best else ["last.pt"]
+        self.best = max(self.best, score)
         state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
-        state |= {"step": self.step, "seconds": self.seconds}
-        part = self.args.out / "last.part"
-        torch.save(state, part)
-        part.replace(self.args.out / "last.pt")
+        state |= {"step": self.step, "seconds": self.seconds, "best": self.best}
+        for name in names:
+            torch.save(state, self.args.out / "part")
+            (self.args.out / "part").replace(self.args.out / name)
+
+    def take_best(self) -> None:
+        """Go back to the checkpoint with the best validation (the last one of equals)."""
+        state = torch.load(self.args.out / "best.pt", map_location=self.device, weights_only=True)
+        self.net.load_state_dict(state["net"])
+        self.step = state["step"]
 
 
 def draw_curves(log: Path, picture: Path) -> None:
@@ -893,6 +905,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = build_parser().parse_args(argv)
     trainer = Trainer(args)
     trainer.run()
+    trainer.take_best()
     out: Path = args.out
     draw_curves(out / "log.csv", out / "curves.png")
     summary = {"steps": trainer.step, "seed": args.seed, "minutes": round(trainer.seconds / 60, 1)}

@@ -180,7 +180,7 @@ def test_exported_model_equals_the_trained_network(te, trained) -> None:
 
     clip = te.room_clip(3, trained / "rooms")
     net = te.Net()
-    net.load_state_dict(torch.load(trained / "last.pt", weights_only=True)["net"])
+    net.load_state_dict(torch.load(trained / "best.pt", weights_only=True)["net"])
     net.eval()
     frame, rng = int(np.argmax([len(i) for i in clip.identity])), np.random.default_rng(0)
     view = te.make_view(clip, frame, rng, None, False, clip.identity[frame])
