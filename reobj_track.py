@@ -68,6 +68,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
+from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, Slerp
 
 import quadrics
@@ -179,7 +180,7 @@ class PosesConfig:
     seed: int = _opt(0, "random seed of the reconstruction")
     corners: int = _opt(300, "corners followed to choose keyframes")
     min_corners: int = _opt(20, "with fewer corners a frame counts as textureless")
-    min_keyframes: int = _opt(25, "with fewer keyframes max_flow is halved, down to min_flow")
+    min_keyframes: int = _opt(40, "with fewer keyframes max_flow is halved, down to min_flow")
     max_interval: int = _opt(
         60, "new keyframe after this many frames if the camera moved at all (min_flow)"
     )
@@ -221,6 +222,18 @@ class PosesConfig:
         (0.4, 2.0), "and only when focal / longer side lies in here"
     )
     tri_sample: int = _opt(2000, "points used for the median triangulation angle")
+    match_chunk: int = _opt(100, "pairs of keyframes matched between two ticks of the progress")
+    refine_px: float = _opt(
+        0.5, "scale of the robust (soft L1) loss of the last adjustment, px of the working image"
+    )
+    min_part: int = _opt(3, "keyframes that make a separate reconstruction worth keeping")
+    join_objects: int = _opt(
+        4, "objects seen in two separate reconstructions that must agree before they are joined"
+    )
+    max_center_shift: float = _opt(
+        0.05, "calibrate the principal point unless it moves by more than this share of the size"
+    )
+    smooth: int = _opt(0, "smooth the path over this many frames (odd; 0: leave the hand's shake)")
     pnp_error_px: float = _opt(4.0, "PnP inlier threshold on the working image")
     max_run: int = _opt(1000, "frames held at once between two keyframes")
     pose_tolerance: float = _opt(
@@ -559,6 +572,9 @@ class Poses:
         up_in_world: (3,) unit vector against gravity, or None if unknown.
         points: (N, 3) sparse points in world; colors (N, 3) uint8 RGB.
         messages: what the user should know (spans without poses and what helps).
+        cov: (F, 6, 6) covariance of the error of each pose in camera axes: rotation vector (rad),
+            then camera centre (world units); NaN where unknown, (0, 6, 6) for supplied poses.
+        parts: reconstructions of other frames that do not connect, each in a world of its own.
     """
 
     camera: Camera
@@ -572,6 +588,8 @@ class Poses:
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
     messages: tuple[str, ...] = ()
+    cov: Array = field(default_factory=lambda: np.empty((0, 6, 6)))
+    parts: tuple[Poses, ...] = ()
 
     @property
     def known(self) -> BoolArray:
@@ -3637,6 +3655,19 @@ def invert_rigid(b_from_a: Array) -> Array:
     return np.concatenate([rotation, -rotation @ b_from_a[..., 3:]], -1)
 
 
+def similarity(points: Array, target: Array) -> tuple[float, Array, Array]:
+    """Scale, rotation (3, 3) and shift (3,) that bring points (N, 3) closest to target (N, 3).
+
+    Ref: Umeyama, PAMI 1991.
+    """
+    a, b = points - points.mean(0), target - target.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    turn = (u * flip) @ vt
+    scale = float((s * flip).sum() / (a**2).sum())
+    return scale, turn, target.mean(0) - scale * turn @ points.mean(0)
+
+
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; None for an
     empty text.
@@ -3712,22 +3743,54 @@ def estimate_poses(
         np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4))
         for k in keys
     ]
-    names = [str(video.names[k.frame]) if video.names else f"frame_{k.frame:06d}.jpg" for k in keys]
-    messages = _run_sfm(keys, names, boxes, camera, size, config, work_dir, progress)
+    names = [_frame_name(video, key.frame) for key in keys]
+    guesses = [] if camera else [*filter(None, [_exif_focal(video)]), config.focal_guess]
+    messages = _run_sfm(keys, names, boxes, camera, size, guesses, config, work_dir, progress)
     frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
     if not (work_dir / "sparse").exists():
         guess = (config.focal_guess * max(size), size[0] / 2, size[1] / 2)
         camera = camera or Camera("SIMPLE_PINHOLE", *size, guess)
         nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
         return Poses(camera, frame, time_s, nothing, none, "none", messages=tuple(messages))
-    model = _read_model(work_dir / "sparse")
-    places = np.array([keys[i - 1].place for i in model.image_id])
-    located = _locate_between(model, places, work, config, progress("pnp", len(frame)))
-    cam_from_world, status = fill_gaps(frame, *located, config.max_gap)
-    known = np.asarray(np.isfinite(cam_from_world).all((1, 2)), bool)
-    messages += _lost_frames(frame, known)
+    poses, *parts = (
+        _located(folder, video, work, config, progress("pnp", len(frame)))
+        for folder in [work_dir / "sparse", *sorted((work_dir / "mapping").glob("part-*"))]
+    )
+    for part in parts:
+        span = f"frames {frame[part.known][0]}-{frame[part.known][-1]}"
+        messages.append(f"{span}: a separate reconstruction, left out as it does not connect")
+    shutil.rmtree(work_dir / "mapping")
+    messages += _lost_frames(frame, poses.known)
+    return dataclasses.replace(poses, messages=tuple(messages), parts=tuple(parts))
+
+
+def _located(
+    folder: Path, video: Any, work: _WorkVideo, config: PosesConfig, line: Progress
+) -> Poses:
+    """Poses of all frames that a COLMAP model of keyframes locates."""
+    model = _read_model(folder)
+    frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
+    place_of = {_frame_name(video, number): place for place, number in enumerate(work.frames)}
+    places = np.array([place_of[name] for name in model.names])
+    cam_from_world, status, cov = _locate_between(model, places, work, config, line)
+    cam_from_world, status = fill_gaps(frame, cam_from_world, status, config.max_gap)
+    cam_from_world = smooth_path(cam_from_world, config.smooth) if config.smooth else cam_from_world
     found = (model.cameras[0], frame, time_s, cam_from_world, status, "pycolmap")
-    return Poses(*found, points=model.points, colors=model.colors, messages=tuple(messages))
+    return Poses(*found, points=model.points, colors=model.colors, cov=cov)
+
+
+def _frame_name(video: Any, number: int) -> str:
+    return str(video.names[number]) if video.names else f"frame_{number:06d}.jpg"
+
+
+def _exif_focal(video: Any) -> float:
+    """Focal length over the longer side from the EXIF of the first photo; 0 if there is none."""
+    for path in getattr(video, "_files", [])[:1]:
+        with contextlib.suppress(ValueError, RuntimeError):  # formats that pycolmap cannot read
+            camera = _pycolmap().infer_camera_from_image(str(path))
+            if camera.has_prior_focal_length:
+                return float(camera.mean_focal_length() / max(camera.width, camera.height))
+    return 0.0
 
 
 def _spans(numbers: Iterable[int], step: int = 1) -> str:
@@ -3907,18 +3970,23 @@ def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_Wo
 
 def _locate_between(
     model: _SparseModel, places: IntArray, video: _WorkVideo, config: PosesConfig, line: Progress
-) -> tuple[Array, npt.NDArray[np.str_]]:
+) -> tuple[Array, npt.NDArray[np.str_], Array]:
     """Locate every frame by PnP from points followed from the registered keyframes before and after
     it.
 
     Args:
         places: (R,) place in the video of each registered keyframe, ascending.
     Returns:
-        cam_from_world (F, 3, 4), NaN where PnP was refused, and status (F,).
+        cam_from_world (F, 3, 4), NaN where PnP was refused, status (F,), and cov (F, 6, 6), NaN
+        where there is no pose; see `Poses`.
     """
-    count = len(video.frames)
+    count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
+    cov = np.full((count, 6, 6), np.nan)
     cam_from_world[places], status[places] = model.cam_from_world, "keyframe"
+    for row, (place, pose) in enumerate(zip(places, model.cam_from_world, strict=True)):
+        seen = model.obs_image == row
+        cov[place] = pose_cov(model.obs_xy[seen], model.points[model.obs_point[seen]], pose, camera)
     for before, after, run in _segments(places, video.grays(), config.max_run):
         images = [gray for _, gray in run]
         ahead = _follow(model, before, images, config)
@@ -3926,14 +3994,14 @@ def _locate_between(
         for (place, gray), (rows_a, xy_a), (rows_b, xy_b) in zip(run, ahead, back, strict=True):
             if status[place] == "none":
                 points, xy = model.points[np.r_[rows_a, rows_b]], np.r_[xy_a, xy_b]
-                pose = _absolute_pose(xy, points, model.cameras[0], gray.shape[1], config)
-                if pose is not None:
-                    cam_from_world[place], status[place] = pose, "pnp"
+                found = _absolute_pose(xy, points, camera, gray.shape[1], config)
+                if found is not None:
+                    (cam_from_world[place], cov[place]), status[place] = found, "pnp"
         line.step(len(run) - 1)
     line.close()
     jump = _jumps(cam_from_world, config.max_step_ratio) & (status == "pnp")
-    cam_from_world[jump], status[jump] = np.nan, "none"
-    return cam_from_world, status
+    cam_from_world[jump], status[jump], cov[jump] = np.nan, "none", np.nan
+    return cam_from_world, status, cov
 
 
 def _segments(
@@ -4021,6 +4089,24 @@ def fill_gaps(
     return filled, status
 
 
+def smooth_path(cam_from_world: Array, frames: int) -> Array:
+    """Smooth poses (F, 3, 4) over a window of this many frames (odd, >= 5): a parabola fitted to
+    centres and quaternions (Savitzky-Golay). Runs shorter than the window stay.
+    """
+    window, smoothed = max(frames | 1, 5), cam_from_world.copy()
+    known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
+    for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
+        if len(run) >= window:
+            world_from_cam = invert_rigid(cam_from_world[run])
+            quat = Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat()
+            turns = np.cumprod(np.r_[1, np.where((quat[1:] * quat[:-1]).sum(1) < 0, -1, 1)])
+            table = np.column_stack([quat * turns[:, None], world_from_cam[:, :, 3]])  # (n, 7)
+            table = savgol_filter(table, window, 2, axis=0)
+            turn = Rotation.from_quat(table[:, :4]).as_matrix()
+            smoothed[run] = invert_rigid(np.concatenate([turn, table[:, 4:, None]], 2))
+    return smoothed
+
+
 # Reconstruction of the keyframes in a child process
 
 _ADVICE = (
@@ -4045,6 +4131,7 @@ def _run_sfm(
     boxes: list[Array],
     camera: Camera | None,
     size: tuple[int, int],
+    guesses: list[float],
     config: PosesConfig,
     work_dir: Path,
     progress: Callable[[str, int], Progress],
@@ -4053,12 +4140,11 @@ def _run_sfm(
     what helps.
     """
     folder = work_dir / "mapping"
-    for old in (work_dir / "sparse", folder):
-        shutil.rmtree(old, ignore_errors=True)
     if len(keys) < 3:
         return [f"no camera poses: only {len(keys)} different views; {_ADVICE}"]
-    folder.mkdir(parents=True)
-    np.save(folder / "keyframes.npy", np.stack([key.bgr for key in keys]))
+    digest = hashlib.sha256()
+    for key in keys:
+        digest.update(key.bgr.tobytes())
     scale = np.tile(np.array(keys[0].gray.shape[::-1]) / size, 2)
     job = {
         "names": names,
@@ -4066,13 +4152,21 @@ def _run_sfm(
         "boxes": [(xyxy * scale).tolist() for xyxy in boxes],
         "camera": None if camera is None else [camera.model, list(camera.params)],
         "size": size,
+        "guesses": guesses,
         "config": dataclasses.asdict(config),
+        "images": digest.hexdigest(),
     }
-    (folder / "job.json").write_text(json.dumps(job))
+    text, path = json.dumps(job), folder / "job.json"
+    if not path.exists() or path.read_text() != text:  # else go on where a killed run stopped
+        for old in (work_dir / "sparse", folder):
+            shutil.rmtree(old, ignore_errors=True)
+        folder.mkdir(parents=True)
+        np.save(folder / "keyframes.npy", np.stack([key.bgr for key in keys]))
+        with atomic(path) as part:
+            part.write_text(text)
     messages = _run_child(folder, work_dir / "pycolmap.log", progress)
     if (folder / "sparse").exists():
         (folder / "sparse").replace(work_dir / "sparse")
-    shutil.rmtree(folder)
     return messages
 
 
@@ -4126,10 +4220,22 @@ def _sfm_child(folder_name: str) -> None:
     job = json.loads((folder / "job.json").read_text())
     config, database = PosesConfig(**job["config"]), folder / "database.db"
     images = np.load(folder / "keyframes.npy", mmap_mode="r")  # (K, h, w, 3) BGR
-    _sfm_match(database, _sfm_features(database, images, job, config), config)
-    model, messages = _sfm_ladder(database, job["frames"], job["camera"] is not None, config)
-    if model is not None:
-        _sfm_write(model, images, folder / "sparse", job["names"], tuple(job["size"]))
+    if not (folder / "features").exists():
+        database.unlink(missing_ok=True)
+        _sfm_features(database, images, job, config)
+        (folder / "features").touch()
+    _sfm_match(database, config)
+    found = []
+    for guess in job["guesses"] or [0.0]:  # 0: the intrinsics are given
+        tried = dataclasses.replace(config, focal_guess=guess)
+        found.append(_sfm_ladder(database, job["frames"], not guess, tried))
+        if found[-1][2]:
+            break
+    models, messages, _ = max(found, key=lambda f: (f[2], len(f[0])))
+    for i, model in enumerate(models):
+        folder_of = folder / ("sparse" if i == 0 else f"part-{i}")
+        shutil.rmtree(folder_of, ignore_errors=True)
+        _sfm_write(model, images, folder_of, job["names"], tuple(job["size"]))
     (folder / "messages.json").write_text(json.dumps(messages))
 
 
@@ -4217,9 +4323,9 @@ def _read_model(folder: Path) -> _SparseModel:
 
 def _absolute_pose(
     xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig
-) -> Array | None:
-    """PnP: cam_from_world (3, 4) from native pixels (n, 2) of world points (n, 3); None if it is
-    not to be trusted.
+) -> tuple[Array, Array] | None:
+    """PnP: cam_from_world (3, 4) and its covariance (6, 6) from native pixels (n, 2) of world
+    points (n, 3); None if it is not to be trusted.
     """
     if len(xy) < config.pnp_min_inliers:
         return None
@@ -4233,17 +4339,38 @@ def _absolute_pose(
     ):
         return None
     pose: Array = found["cam_from_world"].matrix()
-    in_front = points[found["inlier_mask"]] @ pose[2, :3] + pose[2, 3] > 0
-    return pose if in_front.all() and np.isfinite(pose).all() else None
+    xy, points = xy[found["inlier_mask"]], points[found["inlier_mask"]]
+    if not np.isfinite(pose).all() or (points @ pose[2, :3] + pose[2, 3] <= 0).any():
+        return None
+    return pose, pose_cov(xy, points, pose, camera)
 
 
-def _sfm_features(
-    database: Path, images: Any, job: dict[str, Any], config: PosesConfig
-) -> list[Image]:
-    """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database;
-    returns descriptors.
+def pose_cov(xy: Array, points: Array, cam_from_world: Array, camera: Camera) -> Array:
+    """Covariance (6, 6) of a pose fitted to pixels (n, 2) of world points (n, 3): rotation vector
+    (rad), then camera centre (units of the points), both in camera axes.
+
+    From the Jacobian of the ideal pixels and the robust spread of the residuals; the points count
+    as exact. NaN when they do not fix the pose.
     """
-    kept = []
+    in_cam = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]  # (n, 3)
+    depth, focal = in_cam[:, 2:], camera.K[[0, 1], [0, 1]]
+    ray = in_cam[:, :2] / depth
+    residual = camera.undistort(xy) - camera.K[:2, 2] - ray * focal  # (n, 2)
+    by_point = np.zeros((len(xy), 2, 3))
+    by_point[:, [0, 1], [0, 1]] = focal / depth
+    by_point[:, :, 2] = -ray * focal / depth
+    turn = np.cross(np.eye(3)[None], in_cam[:, None])  # (n, 3, 3) rows: e_i x p
+    moved = np.concatenate([np.swapaxes(turn, 1, 2), np.tile(-np.eye(3), (len(xy), 1, 1))], 2)
+    jacobian = (by_point @ moved).reshape(-1, 6)  # (2n, 6)
+    free = 2 * len(xy) - 6
+    if free <= 0 or np.linalg.matrix_rank(jacobian) < 6:
+        return np.full((6, 6), np.nan)
+    sigma2 = (1.4826 * np.median(np.abs(residual))) ** 2 * 2 * len(xy) / free  # MAD of a normal
+    return np.asarray(sigma2 * np.linalg.inv(jacobian.T @ jacobian))
+
+
+def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: PosesConfig) -> None:
+    """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database."""
     pc, size = _pycolmap(), (images.shape[2], images.shape[1])
     if job["camera"] is not None:
         model, params = job["camera"]
@@ -4273,9 +4400,7 @@ def _sfm_features(
             db.write_descriptors(
                 number, pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors)
             )
-            kept.append(descriptors)
             _tell("features", number, len(images))
-    return kept
 
 
 def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np.float32], Image]:
@@ -4300,27 +4425,30 @@ def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np
     return xy, np.minimum(root, 255).astype(np.uint8)
 
 
-def _sfm_match(database: Path, descriptors: list[Image], config: PosesConfig) -> None:
+def _sfm_match(database: Path, config: PosesConfig) -> None:
     """Match all pairs of a few keyframes, else each with those at offsets 1, 2, 4, 8 ... and with
-    its look-alikes.
+    its look-alikes. (COLMAP skips the pairs that a killed run has matched.)
     """
-    pc, count = _pycolmap(), len(descriptors)
-    verify = {"ransac": {"random_seed": config.seed}}  # without the seed two runs differ
-    options: dict[str, Any] = {"verification_options": verify, "device": pc.Device.cpu}
-    _tell("match", 0, 1)
-    if count <= config.exhaustive_below:
-        pc.match_exhaustive(str(database), **options)
-    else:
-        ordered = {"overlap": config.overlap, "quadratic_overlap": True}
-        pc.match_sequential(str(database), pairing_options=ordered, **options)
-        pairs = database.parent / "pairs.txt"
-        pairs.write_text(
-            "".join(f"{i + 1:06d} {j + 1:06d}\n" for i, j in _look_alikes(descriptors, config))
-        )
+    pc, listed = _pycolmap(), database.parent / "pairs.txt"
+    with contextlib.closing(pc.Database.open(str(database))) as db:
+        count = db.num_images()
+        descriptors = [np.asarray(db.read_descriptors(i + 1).data) for i in range(count)]
+    pairs = set(itertools.combinations(range(count), 2))
+    if count > config.exhaustive_below:
+        steps = [1 << k for k in range(config.overlap)]
+        pairs = {(i, i + step) for step in steps for i in range(count - step)}
+        pairs |= set(_look_alikes(descriptors, config))
+    ordered = sorted(pairs)
+    for start in range(0, len(ordered), config.match_chunk):
+        chunk = ordered[start : start + config.match_chunk]
+        listed.write_text("".join(f"{i + 1:06d} {j + 1:06d}\n" for i, j in chunk))
         pc.match_image_pairs(
-            str(database), pairing_options={"match_list_path": str(pairs)}, **options
+            str(database),
+            pairing_options={"match_list_path": str(listed)},
+            verification_options={"ransac": {"random_seed": config.seed}},  # else two runs differ
+            device=pc.Device.cpu,
         )
-    _tell("match", 1, 1)
+        _tell("match", start + len(chunk), len(ordered))
 
 
 def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[int, int]]:
@@ -4386,13 +4514,16 @@ class _Attempt:
 
 def _sfm_ladder(
     database: Path, frames: list[int], known_focal: bool, config: PosesConfig
-) -> tuple[Any, list[str]]:
-    """Try mappers from strict to permissive; return the best sound model (or None) and messages.
+) -> tuple[list[Any], list[str], bool]:
+    """Try mappers from strict to permissive; return the best sound model, followed by those of
+    other keyframes (none if nothing is sound), messages, and whether its focal length is trusted.
 
     Args:
         frames: frame number of each keyframe.
     """
     tried: list[_Attempt] = []
+    if not known_focal:
+        _sfm_guess_focal(database, False, config)
     for rung in ("strict", "relaxed", "global"):
         sound = [a for a in tried if not a.problem]
         turned = [a for a in tried if a.problem and a.parallax_px < config.min_parallax_px]
@@ -4406,26 +4537,25 @@ def _sfm_ladder(
     if not best.problem and not known_focal and not best.trusted(config):
         angle = f"{best.tri_angle_deg:.1f} deg"
         weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
-        best = _sfm_fixed_focal(database, len(frames), config)
+        _sfm_guess_focal(database, True, config)
+        best = _sfm_attempt(database, "relaxed", True, len(frames), config)
         messages = [
-            f"{weak} and is taken as {config.focal_guess} x the longer side; sizes and depths are "
-            "rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
+            f"{weak} and is taken as {config.focal_guess:.3g} x the longer side; sizes and depths "
+            "are rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
         ]
     if best.problem:
-        return None, [f"no camera poses: {best.problem}; {_ADVICE}"]
-    kept = set(best.model.reg_image_ids())
+        return [], [f"no camera poses: {best.problem}; {_ADVICE}"], known_focal
+    _sfm_refine(best.model, bool(known_focal or messages), config)
+    models, seen = [best.model], set(best.model.reg_image_ids())
     for other in best.others:
-        part = sorted(frames[i - 1] for i in other.reg_image_ids() if i not in kept)
-        if len(part) >= 3:
-            messages.append(
-                f"frames {part[0]}-{part[-1]}: a separate reconstruction, left out as it does not "
-                "connect"
-            )
-    return best.model, messages
+        if len(set(other.reg_image_ids()) - seen) >= config.min_part:
+            seen |= set(other.reg_image_ids())
+            models.append(other)
+    return models, messages, known_focal or not messages
 
 
-def _sfm_fixed_focal(database: Path, count: int, config: PosesConfig) -> _Attempt:
-    """Map with the focal length held at the guess."""
+def _sfm_guess_focal(database: Path, trusted: bool, config: PosesConfig) -> None:
+    """Set the camera's focal length to the guess."""
     with contextlib.closing(_pycolmap().Database.open(str(database))) as db:
         camera = db.read_all_cameras()[0]
         camera.params = [
@@ -4433,9 +4563,8 @@ def _sfm_fixed_focal(database: Path, count: int, config: PosesConfig) -> _Attemp
             *camera.params[1:3],
             0.0,
         ]
-        camera.has_prior_focal_length = True
+        camera.has_prior_focal_length = trusted
         db.update_camera(camera)
-    return _sfm_attempt(database, "relaxed", True, count, config)
 
 
 def _sfm_attempt(
@@ -4513,6 +4642,42 @@ def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesCo
     done = itertools.count(2)
     tick = {"next_image_callback": lambda: _tell("mapping", min(next(done), count), count)}
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
+
+
+def _sfm_refine(model: Any, fixed: bool, config: PosesConfig) -> None:
+    """Adjust cameras and points once more; unless the intrinsics are `fixed`, with a second
+    distortion term and the principal point (if that stays near the centre).
+    """
+    pc, camera = _pycolmap(), model.camera(1)
+    size = np.array([camera.width, camera.height])
+    if fixed:
+        _sfm_adjust(model, config.refine_px, False, False)
+        return
+    focal, _, _, distortion = camera.params
+    camera.model = pc.CameraModelId.RADIAL
+    for move_center in (True, False):
+        camera.params = [focal, *size / 2, distortion, 0]
+        _sfm_adjust(model, config.refine_px, True, move_center)
+        shift = np.abs(np.array([camera.principal_point_x, camera.principal_point_y]) - size / 2)
+        if (shift <= config.max_center_shift * size).all():
+            break
+
+
+def _sfm_adjust(model: Any, loss_px: float, calibrate: bool, move_center: bool) -> None:
+    """Bundle adjustment of all images with a robust loss, first and second camera as gauge."""
+    pc = _pycolmap()
+    options, chosen = pc.BundleAdjustmentOptions(), pc.BundleAdjustmentConfig()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = calibrate
+    options.refine_principal_point = move_center
+    options.ceres.loss_function_type = pc.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = loss_px
+    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.num_threads = 1  # the same result every time
+    for i in model.reg_image_ids():
+        chosen.add_image(i)
+    chosen.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pc.create_default_bundle_adjuster(options, chosen, model).solve()
 
 
 def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> tuple[float, float]:
@@ -5161,20 +5326,117 @@ def _track_views(
     return place[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
+def _meet(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, Array, Array]:
+    """World directions (n, 3) of unit rays, camera centres (n, 3), and the point (3,) nearest to
+    all rays.
+    """
+    world_from_cam = invert_rigid(cam_from_world)
+    ray = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam)
+    centre = world_from_cam[:, :, 3]
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3) sum_i (I - d d') (X - c) = 0
+    point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centre), rcond=1e-9)[0]
+    return ray, centre, point
+
+
 def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
     """Meet rays (n, 3) of n cameras (n, 3, 4) in the nearest point or, if better, at infinity;
     median angle to it.
     """
-    world_from_cam = invert_rigid(cam_from_world)
-    ray, centre = (
-        np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam),
-        world_from_cam[:, :, 3],
-    )
-    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3) sum_i (I - d d') (X - c) = 0
-    point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centre), rcond=1e-9)[0]
+    ray, centre, point = _meet(cam_from_world, rays_in_cam)
     toward = np.stack([point - centre, np.broadcast_to(ray.mean(0), ray.shape)])  # (2, n, 3)
     cosine = (ray * toward).sum(2) / np.maximum(np.linalg.norm(toward, axis=2), 1e-12)
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)), axis=1).min()))
+
+
+# Separate reconstructions, joined by the objects that both see
+
+
+def join_parts(
+    poses: Poses, tracks: Sequence[tuple[IntArray, Array]], config: PosesConfig | None = None
+) -> Poses:
+    """Bring the separate reconstructions into the world of the largest one where the same objects,
+    by their identities, are seen in both and agree on how; the others stay left out.
+
+    Args:
+        tracks: per identity frame numbers (n,) and boxes (n, 4) xyxy, native pixels.
+    """
+    config, left = config or PosesConfig(), []
+    for part in poses.parts:
+        found = align_by_objects(part, poses, tracks, config)
+        new = part.known & ~poses.known
+        if found is None or not new.any():
+            left.append(part)
+            continue
+        (scale, turn, shift), count = found
+        moved = poses.cam_from_world.copy()
+        moved[new, :, :3] = part.cam_from_world[new, :, :3] @ turn.T
+        moved[new, :, 3] = scale * part.cam_from_world[new, :, 3] - moved[new, :, :3] @ shift
+        cov = poses.cov.copy()
+        unit = np.repeat([1, scale], 3)
+        cov[new] = part.cov[new] * np.outer(unit, unit)
+        span = f"frames {part.frame[part.known][0]}-{part.frame[part.known][-1]}: a separate "
+        text = f"{span}reconstruction, joined to the rest by {count} objects seen in both"
+        kept = [m for m in poses.messages if not m.startswith(span)]
+        status = np.where(new, part.status, poses.status)
+        poses = dataclasses.replace(poses, cam_from_world=moved, cov=cov, status=status)
+        poses = dataclasses.replace(poses, messages=(*kept, text))
+    return dataclasses.replace(poses, parts=tuple(left))
+
+
+def align_by_objects(
+    part: Poses, whole: Poses, tracks: Sequence[tuple[IntArray, Array]], config: PosesConfig
+) -> tuple[tuple[float, Array, Array], int] | None:
+    """Find the similarity (scale, rotation, shift) whole_from_part from objects seen in both, and
+    how many agree; None unless `join_objects` of them, and most of all, do.
+
+    Every three objects propose one; an object agrees if its centre from either reconstruction
+    projects into its boxes of the other (median over the frames).
+    """
+    shared = []  # per object: box centre in both worlds
+    for frame, xyxy in tracks:
+        centre = (xyxy[:, :2] + xyxy[:, 2:]) / 2
+        a, b = (_track_views(poses, frame, centre, config) for poses in (part, whole))
+        if a is not None and b is not None:
+            in_part = _meet(part.cam_from_world[a[0]], a[1])[2]
+            in_whole = _meet(whole.cam_from_world[b[0]], b[1])[2]
+            shared.append((frame, xyxy, in_part, in_whole))
+    if len(shared) < config.join_objects:
+        return None
+    here, there = (np.array([s[i] for s in shared]) for i in (2, 3))  # (O, 3)
+    best: tuple[int, BoolArray] = (0, np.zeros(len(shared), bool))
+    for triple in itertools.islice(itertools.combinations(range(len(shared)), 3), 2000):
+        agree = _agree(similarity(here[list(triple)], there[list(triple)]), shared, part, whole)
+        best = max(best, (int(agree.sum()), agree), key=lambda b: b[0])
+    if best[0] < max(config.join_objects, 0.6 * len(shared)):
+        return None
+    found = similarity(here[best[1]], there[best[1]])
+    count = int(_agree(found, shared, part, whole).sum())
+    return (found, count) if count >= config.join_objects else None
+
+
+def _agree(
+    whole_from_part: tuple[float, Array, Array], shared: list[Any], part: Poses, whole: Poses
+) -> BoolArray:
+    """(O,) True for objects whose centre from one world lies in its boxes in the other, both ways;
+    their distance from the box centres is at most a quarter of the box in the median frame.
+    """
+    scale, turn, shift = whole_from_part
+    agree = []
+    for frame, xyxy, in_part, in_whole in shared:
+        for poses, point in (
+            (whole, scale * turn @ in_part + shift),
+            (part, turn.T @ (in_whole - shift) / scale),
+        ):
+            place = np.clip(np.searchsorted(poses.frame, frame), 0, len(poses.frame) - 1)
+            use = (poses.frame[place] == frame) & poses.known[place]
+            in_cam = poses.cam_from_world[place[use]] @ np.r_[point, 1]  # (n, 3)
+            xy = in_cam @ poses.camera.K.T
+            box = xyxy[use]
+            off = np.abs(xy[:, :2] / xy[:, 2:] - (box[:, :2] + box[:, 2:]) / 2)
+            off = np.where(in_cam[:, 2:] > 0, off, np.inf) / (box[:, 2:] - box[:, :2])
+            agree.append(float(np.median(off.max(1))) <= 0.25)
+    both = np.array(agree, bool).reshape(-1, 2)
+    return np.asarray(both.all(1), bool)
 
 
 # Writers
@@ -5194,6 +5456,23 @@ def write_tum(path: Path, poses: Poses) -> None:
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:
         part.write_text("\n".join([header, *rows]) + "\n")
+
+
+def write_camera_table(path: Path, poses: Poses) -> None:
+    """Write a CSV row for every frame: status, and standard deviations of position (world units)
+    and rotation (degrees), root mean square over the axes, empty where unknown.
+    """
+    rows = ["frame,time_s,status,position_sigma,rotation_sigma_deg"]
+    cov = poses.cov if len(poses.cov) else np.full((len(poses.frame), 6, 6), np.nan)
+    sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2).reshape(-1, 2, 3).mean(2))  # (F, 2)
+    for frame, time_s, status, (turn, shift) in zip(
+        poses.frame, poses.time_s, poses.status, sigma, strict=True
+    ):
+        known = np.isfinite(shift)
+        numbers = f"{shift:.6g},{np.degrees(turn):.6g}" if known else ","
+        rows.append(f"{frame},{time_s:.6f},{status},{numbers}")
+    with atomic(path) as part:
+        part.write_text("\n".join(rows) + "\n")
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
@@ -6405,6 +6684,9 @@ def run(
     if in_3d and poses is None and not video.is_live:
         moving = _moving_rows(track, config.objects)
         poses, model = _reconstruct(video, space, config, seconds, moving)
+        rows = _rows_by(track.table.object_id)
+        tracks = [(track.table.frame[r], track.table.xyxy[r]) for r in rows]
+        poses = join_parts(poses, tracks, config.poses)
     if poses is not None:
         _check_supplied(poses, track.table)
     space.remember(track, poses)
@@ -6507,17 +6789,23 @@ def save_poses(path: Path, poses: Poses) -> None:
         "messages": poses.messages,
     }
     arrays = {k: getattr(poses, k) for k in _POSE_ARRAYS}
+    for i, other in enumerate(poses.parts):
+        save_poses(path.with_suffix(f".{i}.part"), other)
     with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, facts=np.array(json.dumps(facts)), **arrays)
+        np.savez_compressed(
+            file, facts=np.array(json.dumps(facts)), parts=len(poses.parts), **arrays
+        )
 
 
-_POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors")
+_POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors", "cov")
 
 
 def load_poses(path: Path) -> Poses:
     """Read what `save_poses` wrote."""
     with np.load(path, allow_pickle=False) as data:
-        facts, arrays = json.loads(str(data["facts"])), {k: data[k] for k in _POSE_ARRAYS}
+        facts = json.loads(str(data["facts"]))
+        arrays = {k: data[k] for k in _POSE_ARRAYS if k in data}
+        parts = range(int(data["parts"]) if "parts" in data else 0)
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
     return Poses(
@@ -6526,6 +6814,7 @@ def load_poses(path: Path) -> Poses:
         metric=facts["metric"],
         up_in_world=up,
         messages=tuple(facts["messages"]),
+        parts=tuple(load_poses(path.with_suffix(f".{i}.part")) for i in parts),
         **arrays,
     )
 
@@ -6996,6 +7285,7 @@ def write_cameras(out: Path, poses: Poses, video: Video) -> None:
     """Write poses.txt, and sparse/ for supplied poses (pycolmap's own model has its points too)."""
     if poses.known.any():
         write_tum(out / "poses.txt", poses)
+        write_camera_table(out / "cameras.csv", poses)
         if poses.source == "user":
             names = [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
             write_colmap(out / "sparse", poses, names)
@@ -7004,7 +7294,8 @@ def write_cameras(out: Path, poses: Poses, video: Video) -> None:
 def write_results(result: RunResult, video: Video, config: Config) -> None:
     """Write the files of the output folder; each appears only when it is complete."""
     out, started = result.out, time.monotonic()
-    for name in ("poses.txt", "objects.ply", "overlay.mp4", "scene.html"):  # of an earlier run
+    old = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html")
+    for name in old:  # of an earlier run
         (out / name).unlink(missing_ok=True)
     write_mot(out / "tracks.txt", result.table)
     _write_objects_json(result, video)
@@ -7418,7 +7709,7 @@ def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
 def true_from_found(out: Path, truth_poses: Path | None) -> tuple[float, Array, Array]:
     """Scale, rotation and shift from our world to the truth's, from the cameras' centres.
 
-    Ref: Umeyama, PAMI 1991. Poses that the user supplied are in the truth's world already.
+    Poses that the user supplied are in the truth's world already.
     """
     poses = Workspace(out).recall()[1]
     if poses is None:
@@ -7431,12 +7722,7 @@ def true_from_found(out: Path, truth_poses: Path | None) -> tuple[float, Array, 
     use = poses.known & np.isfinite(centers).all(1)
     pose, goal = poses.cam_from_world[use], centers[use]
     ours = -np.einsum("fji,fj->fi", pose[:, :, :3], pose[:, :, 3])  # (f, 3)
-    a, b = ours - ours.mean(0), goal - goal.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    turn = (u * flip) @ vt
-    scale = float((s * flip).sum() / (a**2).sum())
-    return scale, turn, goal.mean(0) - scale * turn @ ours.mean(0)
+    return similarity(ours, goal)
 
 
 def _true_centers(path: Path, poses: Poses) -> Array:

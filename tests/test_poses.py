@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -747,20 +748,20 @@ def test_mapper_on_a_synthetic_dataset(tmp_path):
     pycolmap.set_random_seed(0)
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         truth = pycolmap.synthesize_dataset(options, database)
-    model, messages = rt._sfm_ladder(
-        tmp_path / "database.db", list(range(12)), False, rt.PosesConfig()
+    (model,), messages, trusted = rt._sfm_ladder(
+        tmp_path / "database.db", list(range(12)), True, rt.PosesConfig()
     )
-    assert not messages and model.num_reg_images() == 12
+    assert trusted and not messages and model.num_reg_images() == 12
     names = [image.name for image in truth.images.values()]
     stack = [
         np.array([m.find_image_with_name(n).cam_from_world().matrix() for n in names])
         for m in (model, truth)
     ]
     assert ate_percent(*stack) < 0.1
-    none, messages = rt._sfm_ladder(
-        tmp_path / "database.db", list(range(30)), False, rt.PosesConfig()
+    none, messages, _ = rt._sfm_ladder(
+        tmp_path / "database.db", list(range(30)), True, rt.PosesConfig()
     )
-    assert none is None and "only 12 of 30 keyframes connect" in messages[0]
+    assert none == [] and "only 12 of 30 keyframes connect" in messages[0]
 
 
 def test_living_room(tmp_path):
@@ -786,6 +787,190 @@ def test_rendered_room_against_its_truth(tmp_path):
         and ate_percent(poses.cam_from_world[both], truth.cam_from_world[both]) < 0.6
     )
     assert poses.camera.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)
+
+
+# ---- Uncertainty, smoothing, EXIF, a killed run --------------------------------------------------
+
+
+@pytest.mark.parametrize("params", [(500.0, 500.0, 320.0, 240.0), (500.0, 320.0, 240.0, -0.05)])
+def test_covariance_of_a_pose_agrees_with_monte_carlo(params):
+    """Errors of repeated PnP, seen from the camera, spread as the covariance says (6 numbers)."""
+    model = "PINHOLE" if params[1] > 400 else "SIMPLE_RADIAL"
+    camera, rng = rt.Camera(model, *SIZE, params), np.random.default_rng(0)
+    pose = some_cameras()[4]
+    in_cam = np.column_stack([rng.uniform(-1.2, 1.2, (80, 2)), rng.uniform(2, 6, 80)])
+    points = (in_cam - pose[:, 3]) @ pose[:, :3]
+    exact = np.array(rt._pycolmap_camera(camera, SIZE).img_from_cam(in_cam))
+    errors, covs = [], []
+    for _ in range(300):
+        xy = exact + rng.normal(0, 0.7, exact.shape)
+        found, cov = rt._absolute_pose(xy, points, camera, 640, rt.PosesConfig())
+        turn = Rotation.from_matrix(found[:, :3] @ pose[:, :3].T).as_rotvec()
+        shift = pose[:, :3] @ (rt.invert_rigid(found) - rt.invert_rigid(pose))[:, 3]
+        errors.append(np.r_[turn, shift])
+        covs.append(cov)
+    errors = np.array(errors)
+    spread, said = np.cov(errors.T), np.median(covs, axis=0)
+    ratio = np.sqrt(np.diag(spread) / np.diag(said))
+    assert (ratio > 0.85).all() and (ratio < 1.2).all()
+    distance = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(said), errors)
+    assert 5.0 < distance.mean() < 7.5  # chi-square with 6 degrees of freedom: the signs fit too
+
+
+def test_covariance_is_unknown_when_points_do_not_fix_the_pose():
+    camera = rt.Camera("PINHOLE", *SIZE, (FOCAL, FOCAL, 320.0, 240.0))
+    line = np.column_stack([np.zeros((9, 2)), np.linspace(2, 4, 9)])
+    assert np.isnan(rt.pose_cov(np.full((9, 2), 5.0), line, np.eye(4)[:3], camera)).all()
+    assert np.isnan(rt.pose_cov(np.zeros((2, 2)), line[:2], np.eye(4)[:3], camera)).all()
+
+
+def test_frames_have_a_sigma_that_is_kept_and_written(walk, tmp_path):
+    _, truth, _, poses = walk
+    sigma = np.sqrt(np.diagonal(poses.cov, axis1=1, axis2=2))
+    assert sigma.shape == (40, 6) and np.isfinite(sigma).all()
+    assert np.degrees(sigma[:, :3]).max() < 1
+    rt.save_poses(tmp_path / "poses.npz", poses)
+    np.testing.assert_array_equal(rt.load_poses(tmp_path / "poses.npz").cov, poses.cov)
+    unknown = np.arange(40)[:, None, None] == 3
+    lost = dataclasses.replace(poses, cov=np.where(unknown, np.nan, poses.cov))
+    rt.write_camera_table(tmp_path / "cameras.csv", lost)
+    rows = (tmp_path / "cameras.csv").read_text().splitlines()
+    assert rows[0] == "frame,time_s,status,position_sigma,rotation_sigma_deg" and len(rows) == 41
+    assert rows[4].endswith(",,") and float(rows[5].split(",")[3]) > 0
+    rt.write_camera_table(tmp_path / "given.csv", given(truth))
+    assert (tmp_path / "given.csv").read_text().splitlines()[1] == "0,0.000000,supplied,,"
+
+
+def test_smoothing_is_off_by_default_and_keeps_a_parabola():
+    s = np.linspace(-1, 1, 21)
+    centres = np.column_stack([s, s**2, 0 * s])
+    cams = np.array([look_at(c, c + np.array([0.1, 4, -1])) for c in centres])
+    cams[10] = np.nan
+    cams[4, :, 3] += 0.05
+    smoothed = rt.smooth_path(cams, 7)
+    assert rt.PosesConfig().smooth == 0 and np.isnan(smoothed[10]).all()
+    np.testing.assert_allclose(smoothed[11:], cams[11:], atol=1e-9)
+    centre = rt.invert_rigid(smoothed[4])[:, 3]
+    moved = np.linalg.norm(rt.invert_rigid(cams[4])[:, 3] - centres[4])
+    assert np.linalg.norm(centre - centres[4]) < 0.5 * moved
+    np.testing.assert_array_equal(rt.smooth_path(cams[:3], 7), cams[:3])  # shorter than the window
+
+
+def photo_with_exif(path, image, focal_35mm):
+    """Write a JPEG whose EXIF says FocalLengthIn35mmFilm."""
+    number = struct.pack("<H", 1)
+    tiff = b"II*\0\x08\0\0\0" + number + struct.pack("<HHII", 0x8769, 4, 1, 26) + bytes(4)
+    tiff += number + struct.pack("<HHIHH", 0xA405, 3, 1, focal_35mm, 0) + bytes(4)
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    head = b"Exif\0\0" + tiff
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(head) + 2) + head + data[2:])
+
+
+def test_exif_focal_length_is_a_start_not_the_answer(tmp_path):
+    """True: .9 of the width. A wrong one, with which no model can be trusted, is left for the
+    usual guess.
+    """
+    for i, image in enumerate(textured_room(16, 0.25, -2)[0]):
+        photo_with_exif(tmp_path / f"{i:03d}.jpg", image, 48)
+    video = rt.Video(tmp_path)
+    assert rt._exif_focal(video) == pytest.approx(1.387, abs=0.01)
+    poses = rt.estimate_poses(video, config(**FEW), tmp_path / "work")
+    assert poses.camera.K[0, 0] / 480 == pytest.approx(0.9, rel=0.03) and not poses.messages
+    assert rt._exif_focal(blank(1)) == 0
+
+
+def test_killed_while_mapping_goes_on_where_it_stopped(walk, tmp_path, monkeypatch):
+    """The second run takes features and matches from the first and ends with the same cameras."""
+    stages, started = [], []
+
+    def note(stage, total):
+        started.append(stage)
+        if stage == "mapping" and stages == []:
+            stages.extend(started)
+            raise KeyboardInterrupt
+        return rt.Progress(stage, total)
+
+    with pytest.raises(KeyboardInterrupt):
+        rt.estimate_poses(walk[0], config(**FEW), tmp_path, note)
+    assert "features" in started and (tmp_path / "mapping" / "database.db").exists()
+    started.clear()
+    poses = rt.estimate_poses(walk[0], config(**FEW), tmp_path, note)
+    assert "features" not in started and "mapping" in started
+    np.testing.assert_array_equal(poses.cam_from_world, walk[3].cam_from_world)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["pycolmap.log", "sparse"]
+
+
+# ---- Separate reconstructions --------------------------------------------------------------------
+
+
+def split(cams, tracks, noise, rng):
+    """The first half as `whole`, the second in a world of its own; boxes of identities around the
+    track's centres.
+    """
+    half = np.arange(len(cams)) < len(cams) // 2
+    turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+    scale, shift = 0.37, np.array([2.0, -1, 0.5])  # whole = scale * turn @ part + shift
+    other = cams.copy()
+    other[:, :, :3] = cams[:, :, :3] @ turn
+    other[:, :, 3] = (cams[:, :, 3] + cams[:, :, :3] @ shift) / scale
+    boxes = []
+    for frame, xy in tracks:
+        size = np.array([60, 50]) * rng.uniform(0.8, 1.5)
+        boxes.append((frame, np.column_stack([xy - size / 2, xy + size / 2])))
+    cov = np.tile(np.eye(6), (len(cams), 1, 1))
+    whole, part = (
+        dataclasses.replace(
+            given(np.where(use[:, None, None], c, np.nan)), source="pycolmap", cov=cov
+        )
+        for use, c in ((half, cams), (~half, other))
+    )
+    message = "frames 30-59: a separate reconstruction, left out as it does not connect"
+    return dataclasses.replace(whole, parts=(part,), messages=(message,)), boxes
+
+
+def swapped(boxes, rng):
+    """Identities of the second half given to other objects: what a twin does."""
+    order = rng.permutation(len(boxes))
+    mixed = []
+    for a, b in enumerate(order):
+        first, second = boxes[a][0] < 30, boxes[b][0] >= 30
+        rows = [np.concatenate([boxes[a][i][first], boxes[b][i][second]]) for i in (0, 1)]
+        mixed.append(tuple(rows))
+    return mixed
+
+
+@pytest.mark.parametrize("noise_px, most_percent", [(1, 1.0), (4, 3.0)])
+def test_parts_are_joined_by_objects_seen_in_both(noise_px, most_percent):
+    cams = motion("orbit")
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        whole, boxes = split(cams, box_tracks(cams, noise_px, seed), noise_px, rng)
+        joined = rt.join_parts(whole, boxes)
+        assert joined.known.all() and not joined.parts
+        assert "joined to the rest" in joined.messages[0]
+        centre = rt.invert_rigid(joined.cam_from_world)[:, :, 3]
+        error = np.linalg.norm(centre - rt.invert_rigid(cams)[:, :, 3], axis=1)
+        assert 100 * error.max() / 7 < most_percent  # of the path's extent
+        assert joined.cov[40, 5, 5] == pytest.approx(0.37**2, rel=0.1)
+
+
+def test_parts_stay_apart_when_identities_are_wrong_or_few():
+    cams = motion("orbit")
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        whole, boxes = split(cams, box_tracks(cams, 2, seed), 2, rng)
+        for wrong in (swapped(boxes, rng), boxes[:3], []):
+            apart = rt.join_parts(whole, wrong)
+            assert len(apart.parts) == 1 and not apart.known[30:].any()
+            assert apart.messages == whole.messages
+
+
+def test_parts_are_kept_with_the_poses(tmp_path):
+    cams = motion("orbit")
+    whole, _ = split(cams, box_tracks(cams, 2, 0), 2, np.random.default_rng(0))
+    rt.save_poses(tmp_path / "poses.npz", whole)
+    back = rt.load_poses(tmp_path / "poses.npz").parts[0]
+    np.testing.assert_array_equal(back.cam_from_world, whole.parts[0].cam_from_world)
 
 
 def test_import_loads_no_pycolmap():

@@ -1,0 +1,210 @@
+#!/usr/bin/env python3
+"""Measure the cameras: reconstruct clips with known poses and print one table row each.
+
+    python examples/pose_accuracy.py -o OUT [--data FOLDER] [--set FIELD=VALUE]... [NAME...]
+
+Clips: the recordings of FOLDER that are there, examples/room, and every folder of
+`examples/render_room.py` given with --room. Nothing is tuned to a clip: all run with the defaults
+(but for --set, which changes a field of PosesConfig for an experiment). Each runs in a process of
+its own, so that its memory can be told.
+
+Columns: frames with a pose; error of the camera centres after a similarity alignment (Umeyama, PAMI
+1991) as median, root mean square and largest, in % of the diagonal of the path's bounding box, and
+the median in cm where the truth is metric; median angle between the orientations after the same
+alignment; median error of the frames located by PnP over that of the keyframes; focal length over
+the true one; frames per second of the whole step; memory (largest resident size of the parent plus
+that of the mapper's process: an upper bound).
+
+redkitchen's own poses (a Kinect's) are good to about 3 cm. `redkitchen-sfm` compares the same
+cameras with a dense reconstruction made here: COLMAP's own features on every second frame at
+full size, exhaustive neighbours, an OPENCV camera (about 10 min once, kept in OUT).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import reobj_track as rt
+
+ROOT = Path(__file__).resolve().parent.parent
+HEADER = (
+    "| clip | with pose | error median / rmse / max, % | median, cm | turn, deg | "
+    "PnP / keyframes | focal / true | frames/s | MB |\n|---|---|---|---|---|---|---|---|---|"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """A source, and how to get the true poses: a reader of reobj_track with its intrinsics."""
+
+    source: Path
+    truth: Path | None = None
+    camera: str = ""
+    metric: bool = False
+
+
+def clips(data: Path, rooms: list[Path]) -> dict[str, Clip]:
+    """Name every clip that is on this machine."""
+    kitchen, studio = data / "redkitchen_7scenes", data / "studio_room"
+    office, cabinet = data / "office_loop" / "images", data / "cubeslam_cabinet"
+    tum = data / "tum_fr3_office"
+    found = {
+        "redkitchen": Clip(kitchen / "images", kitchen / "poses_c2w.txt", "530,530,322,238", True),
+        "studio_room": Clip(studio / "images", studio / "colmap_text"),
+        "office_loop": Clip(office),
+        "tum_fr3": Clip(tum / "images17", tum / "poses17_c2w.txt", "535.4,539.2,320.6,248.1", True),
+        "cubeslam": Clip(cabinet / "images"),
+    }
+    for room in rooms:
+        camera = ",".join((room / "camera.txt").read_text().split()[4:])
+        found[room.name] = Clip(room / "room.mp4", room / "poses.txt", camera, True)
+    return {name: clip for name, clip in found.items() if clip.source.exists()}
+
+
+def main() -> int:
+    """Run every clip in a process of its own and print its rows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", help="only these clips")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument(
+        "--room", type=Path, action="append", default=[], help="a rendered room (repeatable)"
+    )
+    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
+    parser.add_argument("--known-camera", action="store_true", help="give the true intrinsics")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    found = clips(args.data, [ROOT / "examples" / "room", *args.room])
+    names = args.names or list(found)
+    if unknown := sorted(set(names) - set(found)):
+        parser.error(f"no such clip here: {', '.join(unknown)}; there are {', '.join(found)}")
+    if args.child:
+        print("\n".join(rows(names[0], found[names[0]], args)))
+        return 0
+    print(HEADER, flush=True)
+    for name in names:
+        rest = [a for a in sys.argv[1:] if a not in args.names]
+        subprocess.run([sys.executable, __file__, name, "--child", *rest], check=False)
+    return 0
+
+
+def rows(name: str, clip: Clip, args: argparse.Namespace) -> Iterator[str]:
+    """Reconstruct one clip and format its row(s)."""
+    config = rt.PosesConfig(camera=clip.camera if args.known_camera else "")
+    for item in args.set:
+        field, _, value = item.partition("=")
+        config = dataclasses.replace(config, **{field: json.loads(value)})
+    video, work = rt.Video(clip.source), args.out / name
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    started = time.monotonic()
+    poses = rt.estimate_poses(video, config, work)
+    seconds = time.monotonic() - started
+    kib = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, -1))
+    end = f"{len(poses.frame) / seconds:.1f} | {kib / 1000:.0f} |"
+    rt.save_poses(work / "poses.npz", poses)
+    truth = None
+    if clip.truth is not None:
+        given = rt.PosesConfig(camera=clip.camera)
+        truth = rt.read_poses(clip.truth, video, given)
+    yield row(name, poses, truth, clip.metric) + end
+    for message in poses.messages:
+        print(f"{name}: {message}", file=sys.stderr)
+    if name == "redkitchen" and truth is not None:
+        dense = metric_like(dense_reference(clip.source, video, args.out / "dense"), truth)
+        yield row("redkitchen-sfm", poses, dense, True) + " | |"
+        yield row("(dense to Kinect)", dense, truth, True) + " | |"
+
+
+def row(name: str, found: rt.Poses, truth: rt.Poses | None, metric: bool) -> str:
+    """Format the accuracy columns of one clip."""
+    located = f"| {name} | {found.known.sum()} of {len(found.frame)} | "
+    if truth is None or found.known.sum() < 3:
+        return located + "- | - | - | - | - | "
+    scores = score(found, truth)
+    error = " / ".join(f"{scores[k]:.2f}" for k in ("median", "rmse", "max"))
+    cm = f"{scores['cm']:.2f}" if metric else "-"
+    ratio = f"{scores['pnp']:.2f}" if np.isfinite(scores["pnp"]) else "-"
+    focal = found.camera.K[0, 0] / truth.camera.K[0, 0]
+    return f"{located}{error} | {cm} | {scores['turn']:.2f} | {ratio} | {focal:.4f} | "
+
+
+def score(found: rt.Poses, truth: rt.Poses) -> dict[str, float]:
+    """Compare cameras after a similarity alignment: see the columns in the head of this file."""
+    both = found.known & truth.known
+    a, b = (rt.invert_rigid(poses.cam_from_world[both]) for poses in (found, truth))  # (F, 3, 4)
+    scale, rotation, shift = rt.similarity(a[:, :, 3], b[:, :, 3])
+    error = np.linalg.norm(scale * a[:, :, 3] @ rotation.T + shift - b[:, :, 3], axis=1)  # (F,)
+    turn = np.swapaxes(rotation @ a[:, :, :3], 1, 2) @ b[:, :, :3]
+    cosine = np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)
+    share = 100 / float(np.linalg.norm(np.ptp(b[:, :, 3], axis=0)))
+    status = found.status[both]
+    ratio = float("nan")
+    if (status == "pnp").any() and (status == "keyframe").any():
+        ratio = np.median(error[status == "pnp"]) / np.median(error[status == "keyframe"])
+    return {
+        "median": share * float(np.median(error)),
+        "rmse": share * float(np.sqrt((error**2).mean())),
+        "max": share * float(error.max()),
+        "cm": 100 * float(np.median(error)),
+        "turn": float(np.degrees(np.median(np.arccos(cosine)))),
+        "pnp": float(ratio),
+    }
+
+
+def metric_like(poses: rt.Poses, truth: rt.Poses) -> rt.Poses:
+    """Scale a reconstruction to the units of poses that are metric."""
+    both = poses.known & truth.known
+    a, b = (rt.invert_rigid(p.cam_from_world[both])[:, :, 3] for p in (poses, truth))
+    cams = poses.cam_from_world.copy()
+    cams[:, :, 3] *= rt.similarity(a, b)[0]
+    return dataclasses.replace(poses, cam_from_world=cams)
+
+
+def dense_reference(images: Path, video: rt.Video, folder: Path) -> rt.Poses:
+    """Reconstruct every second frame with COLMAP's own features and an OPENCV camera."""
+    import pycolmap
+
+    if not (folder / "model").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        database, out = str(folder / "database.db"), folder / "out"
+        pycolmap.logging.minloglevel = 3
+        features: dict[str, Any] = {
+            "image_names": video.names[::2],
+            "camera_mode": pycolmap.CameraMode.SINGLE,
+            "reader_options": {"camera_model": "OPENCV", "default_focal_length_factor": 0.8},
+        }
+        matching: dict[str, Any] = {
+            "pairing_options": {"overlap": 12, "quadratic_overlap": True},
+            "verification_options": {"ransac": {"random_seed": 0}},
+        }
+        mapping: Any = {"num_threads": 1, "random_seed": 0, "extract_colors": False}
+        pycolmap.extract_features(database, images, device=pycolmap.Device.cpu, **features)
+        pycolmap.match_sequential(database, device=pycolmap.Device.cpu, **matching)
+        out.mkdir()
+        models = pycolmap.incremental_mapping(database, images, out, options=mapping)
+        best = max(models.values(), key=lambda model: model.num_reg_images())
+        (folder / "part").mkdir()
+        best.write(folder / "part")
+        (folder / "part").replace(folder / "model")
+    return rt.read_poses(folder / "model", video, rt.PosesConfig())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
