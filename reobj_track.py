@@ -6732,8 +6732,8 @@ def run(
         moving = _moving_rows(track, config.objects)
         poses, model = _reconstruct(video, space, config, seconds, moving)
         rows = _rows_by(track.table.object_id)
-        tracks = [(track.table.frame[r], track.table.xyxy[r]) for r in rows]
-        poses = join_parts(poses, tracks, config.poses)
+        boxes = [(track.table.frame[r], track.table.xyxy[r]) for r in rows]
+        poses = join_parts(poses, boxes, config.poses)
     if poses is not None:
         _check_supplied(poses, track.table)
     space.remember(track, poses)
