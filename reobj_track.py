@@ -5808,9 +5808,11 @@ class Linker:
         """Group the tracklets anew by their looks and list what differs from the tracker."""
         keep = np.where(self.moving, -self.identity, self.tracklets)
         whole = np.unique(keep, return_inverse=True)[1]  # (L,) tracklet of each atom
-        other = (self.classes[:, None] != self.classes) | self.moving[:, None] | self.moving
+        kind = _class_shares(self.table, whole[self.atom], int(whole.max()) + 1).argmax(1)  # (T,)
+        kind[whole[self.moving]] = -1 - whole[self.moving]  # a kind of its own
         near = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), whole)  # (T, T)
-        banned, apart = (_grouped_max(x, whole) for x in (self.together | other, self.apart))
+        banned, apart = (_grouped_max(x, whole) for x in (self.together, self.apart))
+        banned |= kind[:, None] != kind
         margin = math.log(self.config.look_ratio)
         before, self.group = self.group, _most_alike_first(near, banned, apart, margin)[whole]
         self._list_changes(before, self.group, "join")

@@ -234,6 +234,19 @@ def test_looks_alone_decide_without_poses(
     assert all(len({*chair[found == o].tolist()}) == 1 for o in np.unique(found))
 
 
+def test_a_misnamed_piece_does_not_ban_the_return_of_its_tracklet() -> None:
+    """A gap within the second tracklet of a chair, before it the detector says cup."""
+    table = table_of(walk())
+    table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
+    late = (table.frame >= 80).astype(np.int64)
+    class_id = np.where((late == 1) & (table.frame < 84), CUP, CHAIR)
+    table = dataclasses.replace(table, object_id=1 + late, tracklet_id=1 + late, class_id=class_id)[
+        (table.frame < 84) | (table.frame > 93)
+    ]
+    result = linked(table, None, looks_of(table, table.detection_index, 0.5))
+    assert [o["class"] for o in result.objects] == ["chair"]
+
+
 # ---- Fitting ----
 
 
