@@ -973,6 +973,28 @@ def test_parts_are_kept_with_the_poses(tmp_path):
     np.testing.assert_array_equal(back.cam_from_world, whole.parts[0].cam_from_world)
 
 
+@pytest.mark.parametrize("noise_px, used", [(0, 4), (150, 0)])
+def test_objects_as_landmarks_never_worsen_the_points(walk, noise_px, used):
+    pycolmap, rng = pytest.importorskip("pycolmap"), np.random.default_rng(0)
+    model = pycolmap.Reconstruction(str(walk[2] / "sparse"))
+    longest = sorted(model.points3D.values(), key=lambda p: -p.track.length())[:4]
+    objects = [
+        {
+            model.image(e.image_id).name: np.tile(
+                model.image(e.image_id).point2D(e.point2D_idx).xy + rng.normal(0, noise_px, 2), 2
+            )
+            + np.array([-20, -15, 20, 15])
+            for e in point.track.elements
+        }
+        for point in longest
+    ]
+    adjusted, alone, together, count = rt.refine_together(model, objects)
+    assert count == used and (adjusted is model) == (used == 0)
+    if used:
+        assert together <= 1.001 * alone and adjusted.num_points3D() == model.num_points3D()
+    assert rt.refine_together(model, [])[0] is model
+
+
 def test_import_loads_no_pycolmap():
     code = "import sys, reobj_track; sys.exit('pycolmap' in sys.modules)"
     assert (
