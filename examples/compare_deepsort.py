@@ -67,7 +67,7 @@ def digest(*parts: Any) -> str:
 SOURCE = digest(Path(rt.__file__), Path(rt.__file__).with_name("quadrics.py"))  # our own rows
 _LOOK = (rt.EmbedConfig, rt.Embedder, rt._colour_features, rt._direction_bins, rt.part_samples)
 EMBEDDER = digest(  # what the own look depends on
-    [inspect.getsource(x) for x in _LOOK], *sorted(rt.own_models().glob("*.onnx"))
+    [inspect.getsource(x) for x in _LOOK], *sorted(rt.own_models().glob("*.*"))
 )
 
 
@@ -307,7 +307,7 @@ def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], Run]]]:
 
     `look NAME` gives the ranks of the returns in place of identities, and the time of embedding.
     """
-    part, source = functools.partial, SOURCE
+    part, source = functools.partial, SOURCE + EMBEDDER
     result: dict[str, tuple[str, Callable[[], Run]]] = {"ours": (source, part(ours, seq, None))}
     deepsorts = ["deepsort", "deepsort-tuned"] if args.peers else []
     nets = networks(seq)
