@@ -3749,6 +3749,7 @@ def estimate_poses(
     messages = _run_sfm(keys, names, boxes, camera, size, guesses, config, work_dir, progress)
     frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
     if not (work_dir / "sparse").exists():
+        shutil.rmtree(work_dir / "mapping", ignore_errors=True)
         guess = (config.focal_guess * max(size), size[0] / 2, size[1] / 2)
         camera = camera or Camera("SIMPLE_PINHOLE", *size, guess)
         nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
@@ -4165,6 +4166,7 @@ def _run_sfm(
         np.save(folder / "keyframes.npy", np.stack([key.bgr for key in keys]))
         with atomic(path) as part:
             part.write_text(text)
+    (folder / "messages.json").unlink(missing_ok=True)
     messages = _run_child(folder, work_dir / "pycolmap.log", progress)
     if (folder / "sparse").exists():
         (folder / "sparse").replace(work_dir / "sparse")
