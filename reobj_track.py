@@ -2301,13 +2301,18 @@ class CropEmbedder(Embedder):
             return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
         crops, on_object = self.cut(frame, detections, rows)
         masked = np.concatenate([crops * on_object[..., None], crops * ~on_object[..., None]])
-        if self._net is not None and self._net.head is not None:
+        if self.trained:
             return self._trained(masked, detections, rows, frame.shape[:2], on_object)
         fore, back = np.split(self.maps(masked), 2)  # (N, C, h, w) each
         if self.conv_block is None:
             return Embeddings(_flat_map(fore), _flat_map(back))
         joint = self._joint(np.concatenate([fore, back], 1))
         return Embeddings(_unit_rows(joint), np.empty((len(rows), 0)))
+
+    @property
+    def trained(self) -> bool:
+        """Does the model come with a head of its own?"""
+        return self._net is not None and self._net.head is not None
 
     def cut(self, frame: Image, detections: Detections, rows: IntArray) -> tuple[Image, BoolArray]:
         """Grown boxes, black beyond the frame: crops (N, S, S, 3), object pixels (N, S, S)."""

@@ -462,8 +462,10 @@ def looks(args: Any) -> dict[str, tuple[Look, tuple[str, ...]]]:
         stem = Path(name).stem
         found[f"{stem}, frame"] = (rt.Embedder(name, threads=1), parts)
         if not args.no_crops:
-            found[f"{stem}, crops"] = (rt.CropEmbedder(name, threads=1), parts)
-            found[f"{stem}, crop"] = (FullCrop(name, threads=1), one)
+            crops = rt.CropEmbedder(name, threads=1)
+            found[f"{stem}, crops"] = (crops, parts)
+            if not crops.trained:  # a trained head knows two parts only
+                found[f"{stem}, crop"] = (FullCrop(name, threads=1), one)
     for name in args.person:
         found[f"{Path(name).stem}, person"] = (person_look(name), ("box",))
     return found
