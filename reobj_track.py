@@ -337,10 +337,12 @@ class TrackerConfig:
         0.95, "a view less similar than this to all kept ones is a new view (cosine)"
     )
     return_probability: float = _opt(
-        0.5, "recognise a return from this probability (appearance models with a calibration)"
+        0.0,
+        "recognise a return from this calibrated probability (.5: more likely than not); 0, or a "
+        "model without calibration: by what the video shows",
     )
     return_similarity: float = _opt(
-        0.5, "other models: above this similarity (0: as different objects, 1: as same)"
+        0.5, "by the video: above this similarity (0: as different objects, 1: as same)"
     )
     return_margin: float = _opt(0.15, "and only if no other identity comes closer than this")
     prior_different: float = _opt(
@@ -2838,7 +2840,7 @@ class SameObject:
 
         Without a calibration: closer to "same" than to "different", and clearly before the rival.
         """
-        if self.calibration:
+        if self.calibration and self.config.return_probability:
             chance = self.probability(foreground, background, None, gap, rival)
             return np.asarray(chance >= self.config.return_probability)
         alike = self.normalised(self.fused(foreground, background))
@@ -3570,7 +3572,7 @@ class Tracker:
         possible &= (live.embedded[ready] >= 0)[:, None] & np.isfinite(fore)
         fused = np.where(possible, self.stats.fused(fore, back), -np.inf)  # (n, I)
         claimed = np.full(len(identity), -1, np.int64)
-        likely = possible & (self.stats.logit(fore, back, None, gone) >= 0)
+        likely = possible & (self.stats.logit(fore, back, None, gone) >= -1)
         _assign(np.where(likely, 1 - fused, np.inf).clip(0), np.inf, claimed)
         column = np.flatnonzero(claimed >= 0)
         row, pick = claimed[column], np.arange(len(column))

@@ -69,6 +69,15 @@ Look = Callable[[rt.Image, rt.Detections, IntArray], rt.Embeddings]
 ANGLES_DEG = (0, 15, 30, 45, 60, 90, 180)
 GAPS = (0, 30, 60, 120, 240, 10**9)  # frames
 RANKS = (1, 5, 20, 50)
+COLUMNS = (
+    ("twins", "any"),
+    ("twins", "away"),
+    ("single", "any"),
+    ("single", "away"),
+    ("same", "away"),
+    ("class", "any"),
+    ("open", "away"),
+)  # of the printed table
 DRAWS = 1000  # of the bootstrap
 DRAWN_GALLERIES = 10  # of the single-shot protocol
 
@@ -653,12 +662,17 @@ class Cases:
         inputs: (M, 5) of `SameObject.KNOWN`: cosines of foreground and background, view angle,
             gap, and the fused cosine of the most similar other object, NaN if there is none.
         same: (M,). best: (M,) most similar of all objects that are remembered.
+        remembered: (M,) is the right object among those that are remembered?
+        apart: cosines of both parts of objects of one class in one frame.
+        returns: share of the newcomers (not seen for 30 frames) that were seen before.
     """
 
     inputs: Array
     same: BoolArray
     best: BoolArray
-    apart: tuple[Array, Array]  # cosines of both parts of same-class objects in one frame
+    remembered: BoolArray
+    apart: tuple[Array, Array]
+    returns: float
 
     def decider(self, calibration: dict[str, list[float]] | None = None) -> rt.SameObject:
         """`SameObject` that has seen which objects of these scenes are apart, as in a video."""
@@ -671,15 +685,18 @@ class Cases:
         keep = [c in letters for c in rt.SameObject.KNOWN]
         inputs = np.where(keep, self.inputs, np.nan)
         rows = np.isfinite(inputs[:, keep]).all(1) & (self.best | ("r" not in letters))
-        return Cases(inputs[rows], self.same[rows], self.best[rows], self.apart)
+        same, best, remembered = self.same[rows], self.best[rows], self.remembered[rows]
+        return Cases(inputs[rows], same, best, remembered, self.apart, self.returns)
 
     def balance(self) -> Array:
         """Weights (M,) under which both answers are equally likely at every known angle and gap:
         how often an object is seen again from near is no look, but the camera's path. Where the
-        rival is known, a whole decision is asked for, and the cases count as they come.
+        rival is known, a whole decision is asked for: as many are remembered as of newcomers.
         """
         if np.isfinite(self.inputs[:, 4]).all():
-            return np.ones(len(self.same))
+            share = float(self.remembered.mean()) if len(self.same) else 1.0
+            odds = self.returns / max(share, 1e-9), (1 - self.returns) / max(1 - share, 1e-9)
+            return np.asarray(np.where(self.remembered, *odds))
         cell = 100 * np.digitize(self.inputs[:, 2], ANGLES_DEG[1:-1])
         cell += np.digitize(self.inputs[:, 3], GAPS[1:-1])
         cell = np.unique(cell, return_inverse=True)[1]
@@ -710,12 +727,23 @@ def cases_of(scene: Scene, parts: Sequence[npt.NDArray[Any]], weight: float, see
         for i, (j, wait) in enumerate(order):
             rival = fused[q, order[1 if i == 0 else 0][0]] if len(order) > 1 else np.nan
             inputs = (cosines[0][q, j], cosines[1][q, j], angle[q, j], wait, rival)
-            rows.append((*inputs, pairs.identity[j] == pairs.identity[q], i == 0))
-    table = np.array(rows, np.float64).reshape(-1, 7)
+            known_itself = bool((known & (pairs.identity == pairs.identity[q])).any())
+            rows.append((*inputs, pairs.identity[j] == pairs.identity[q], i == 0, known_itself))
+    table = np.array(rows, np.float64).reshape(-1, 8)
     apart = ~pairs.same() & (pairs.frame[:, None] == pairs.frame[None])
     apart &= np.triu(pairs.name[:, None] == pairs.name[None], 1)
     shown = (cosines[0][apart].astype(np.float64), cosines[1][apart].astype(np.float64))
-    return Cases(table[:, :5], table[:, 5] > 0, table[:, 6] > 0, shown)
+    flags = table[:, 5:] > 0
+    known = share_of_returns(pairs)
+    return Cases(table[:, :5], flags[:, 0], flags[:, 1], flags[:, 2], shown, known)
+
+
+def share_of_returns(pairs: Pairs, away: int = 30) -> float:
+    """Share of the newcomers whose class was seen before that are known objects, of one scene."""
+    ago: Any = pairs.frame[:, None] - pairs.frame[None]  # (N, N) frames since row j
+    alike, same = pairs.name[:, None] == pairs.name[None], pairs.same()
+    fresh = ~(same & (ago > 0) & (ago <= away)).any(1) & (alike & (ago > away)).any(1)
+    return float((same & (ago > away)).any(1)[fresh].mean()) if fresh.any() else 1.0
 
 
 def fit_logistic(terms: Array, same: BoolArray, weight: Array, ridge: float = 1e-4) -> Array:
@@ -748,10 +776,12 @@ def calibrate(scenes: Sequence[Cases]) -> dict[str, list[float]]:
     for letters in known_inputs():
         own = [c.of(letters) for c in scenes]
         terms = [c.decider({"apart": usual}).terms(letters, c.inputs) for c in own]
-        inputs, same, best = (
-            np.concatenate([getattr(c, k) for c in own]) for k in ("inputs", "same", "best")
+        inputs, same, best, remembered = (
+            np.concatenate([getattr(c, k) for c in own])
+            for k in ("inputs", "same", "best", "remembered")
         )
-        joined = Cases(inputs, same, best, own[0].apart)
+        returns = float(np.mean([c.returns for c in own]))
+        joined = Cases(inputs, same, best, remembered, own[0].apart, returns)
         if min(joined.same.sum(), (~joined.same).sum()) < 20:  # unknown in these scenes
             continue
         weights = fit_logistic(np.concatenate(terms), joined.same, joined.balance())
@@ -802,7 +832,7 @@ def write_calibrations(args: Any) -> None:
     plans = [(plan, seed) for plan in args.plan for seed in args.calibrate]
     rooms = [room_scene(seed, args.cache, args.every, plan) for plan, seed in plans]
     rooms += [unmasked(scene) for scene in rooms]
-    for model in ("colour", *args.models):
+    for model in args.models or ["colour"]:
         parts = embed(rooms, rt.Embedder(model, threads=1))
         found = calibrate(scene_cases(rooms, parts, args.weight))
         path = rt.calibration_file(str(rt.model_path(model)) if model != "colour" else model)
@@ -944,18 +974,28 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """One table for each set, protocol and gap."""
+    """One table a set: Rank-1 with its interval for each protocol, more ranks for the open one."""
     parts = []
-    for key in dict.fromkeys((r["set"], r["protocol"], r["gap"]) for r in rows):
-        part = [r for r in rows if (r["set"], r["protocol"], r["gap"]) == key]
-        count = f"{part[0]['queries']} queries, {part[0]['identities']} identities"
-        lines = [f"**{key[0]}, {key[1]}, {key[2]}** ({count})", ""]
-        lines += ["| method | setup | Rank-1 [95 %] | 5 | 20 | 50 | mAP |", "|---" * 7 + "|"]
-        lines += [
-            f"| {r['method']} | {r['setup']} | {r['rank1']:.1f} [{r['low']:.0f}, {r['high']:.0f}] "
-            f"| {r['rank5']:.1f} | {r['rank20']:.1f} | {r['rank50']:.1f} | {r['mAP']:.1f} |"
-            for r in part
-        ]
+    for title in dict.fromkeys(r["set"] for r in rows):
+        own = {(r["protocol"], r["gap"], r["method"], r["setup"]): r
+               for r in rows if r["set"] == title}  # fmt: skip
+        asked = [k for k in COLUMNS if any(key[:2] == k for key in own)]
+        names = [f"{k}, {g}" for k, g in asked]
+        lines = [f"**{title}**: Rank-1 [95 %], percent", ""]
+        lines.append(f"| method | setup | {' | '.join(names)} | open: Rank-5 / 20 / 50, mAP |")
+        lines.append("|---" * (len(asked) + 3) + "|")
+        counts = [next(r for key, r in own.items() if key[:2] == k) for k in asked]
+        cells = [f"{r['queries']} / {r['identities']}" for r in counts]
+        lines.append(f"| *queries / objects* | | {' | '.join(cells)} | |")
+        for key in dict.fromkeys(k[2:] for k in own):
+            found = [own.get((*k, *key)) for k in asked]
+            cells = [
+                f"{r['rank1']:.1f} [{r['low']:.0f}, {r['high']:.0f}]" if r else "" for r in found
+            ]
+            far = own.get(("open", "away", *key), {})
+            text = " / ".join(f"{far.get(f'rank{k}', np.nan):.1f}" for k in RANKS[1:])
+            more = f"{text}, {far.get('mAP', np.nan):.1f}"
+            lines.append(f"| {key[0]} | {key[1]} | {' | '.join(cells)} | {more} |")
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
 

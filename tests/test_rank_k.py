@@ -259,7 +259,8 @@ def logistic_cases(n: int = 4000) -> rk.Cases:
     inputs[:, 1] = RNG.uniform(0, 1, n)  # says nothing
     inputs[:, 2], inputs[:, 3] = RNG.uniform(0, 90, n), RNG.uniform(0, 300, n)
     inputs[:, 4] = RNG.uniform(0, 1, n)
-    return rk.Cases(inputs, same, np.ones(n, bool), (np.array([0.5]), np.array([0.5])))
+    yes = np.ones(n, bool)
+    return rk.Cases(inputs, same, yes, yes, (np.array([0.5]), np.array([0.5])), 1.0)
 
 
 def test_calibration_finds_the_true_odds() -> None:
