@@ -292,6 +292,22 @@ def test_calibrated_probability_follows_its_evidence() -> None:
     assert same.logit(np.nan, 0.5) == -np.inf and same.probability(np.nan) == 0
 
 
+def test_calibrated_decision_only_where_asked() -> None:
+    """A lead over the rival decides by the calibration from return_probability on, else by the
+    video.
+    """
+    weights = {"fb": [-4, 1, 2], "fbr": [-9, 0, 0, 30]}
+    one = np.full(1, 0.9)
+    by_video, asked = (
+        rt.SameObject(rt.TrackerConfig(return_probability=p), weights) for p in (0.0, 0.5)
+    )
+    for rival, lead in ((0.5, True), (0.89, False)):
+        assert asked.returned(one, one, 40, np.full(1, rival)) == lead
+        assert by_video.returned(one, one, 40, np.full(1, rival)) == (rival < 0.85)
+    closer = rt.SameObject(rt.TrackerConfig(return_probability=0.999), weights)
+    assert not closer.returned(one, one, 40, np.full(1, 0.85))
+
+
 def test_probability_adapts_to_the_video() -> None:
     """Where all objects look alike, the same cosine says less; with and without calibration."""
     weights = {"fb": [-4, 1, 2], "apart": [0.5, 0.5]}
