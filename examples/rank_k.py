@@ -867,7 +867,7 @@ def plot_reliability(rows: Sequence[dict[str, Any]], out: Path) -> None:
     """Said against true probability, one panel a method; solid: a pair, dashed: a decision."""
     plt = pyplot()
     methods = list(dict.fromkeys(r["method"] for r in rows))
-    figure, axes = plt.subplots(1, len(methods), figsize=(4.2 * len(methods), 4), squeeze=False)
+    figure, axes = plt.subplots(1, len(methods), figsize=(4.5 * len(methods), 5.2), squeeze=False)
     for ax, method in zip(axes[0], methods, strict=True):
         ax.plot([0, 1], [0, 1], color="gray", lw=0.8)
         own = [r for r in rows if r["method"] == method and r["known"] in ("fb", "fbgr")]
@@ -879,7 +879,7 @@ def plot_reliability(rows: Sequence[dict[str, Any]], out: Path) -> None:
                     color=f"C{titles.index(r['set'])}",
                     label=f"{r['set']}, {kind}: ECE {r['ece']:.3f}")  # fmt: skip
         ax.set(title=method, xlabel="probability said", ylabel="share that is the same object")
-        ax.legend(fontsize=7)
+        ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15))
         ax.grid(alpha=0.3)
     figure.tight_layout()
     figure.savefig(out / "calibration.png", dpi=80)
@@ -1006,17 +1006,18 @@ def plot_bins(bins: Sequence[dict[str, Any]], out: Path) -> None:
     for title in dict.fromkeys(r["set"] for r in bins):
         figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True)
         for ax, by in zip(axes, ("angle", "gap"), strict=True):
-            part = [r for r in bins if r["set"] == title and r["by"] == by]
+            part = [r for r in bins if (r["set"], r["by"]) == (title, by)]
+            part = [r for r in part if r["setup"] not in ("fg", "bg") and r["queries"] >= 20]
             for key in dict.fromkeys((r["method"], r["setup"]) for r in part):
                 own = [r for r in part if (r["method"], r["setup"]) == key]
                 texts = [f"{r['low_edge']}-{r['high_edge'] if r['high_edge'] < 1e8 else ''}"
                          for r in own]  # fmt: skip
-                style = {"concat": "-", "bg": ":"}.get(key[1], "--")
-                ax.plot(texts, [r["rank1"] for r in own], style, marker=".", label=" ".join(key))
+                ax.plot(texts, [r["rank1"] for r in own], marker=".", label=" ".join(key))
             ax.set_xlabel("view angle, deg" if by == "angle" else "time gap, frames")
             ax.grid(alpha=0.3)
         axes[0].set_ylabel("twin Rank-1, %")
-        axes[1].legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5))
+        if axes[1].lines:
+            axes[1].legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5))
         figure.suptitle(title, fontsize=10)
         figure.tight_layout()
         figure.savefig(out / f"rank_k_{title.replace(', ', '_').replace(' ', '_')}.png", dpi=80)
