@@ -7237,10 +7237,9 @@ def _object_entries(
             if name in moving:
                 _reject(entry, "objects of this class move")
             elif entry["views"] < config.min_views:
+                frames = "1 frame" if entry["views"] == 1 else f"{entry['views']} frames"
                 _reject(
-                    entry,
-                    f"seen in {entry['views']} frames with a camera pose; "
-                    f"{config.min_views} are needed",
+                    entry, f"seen in {frames} with a camera pose; {config.min_views} are needed"
                 )
         entries.append(entry)
     return entries
