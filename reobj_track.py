@@ -3377,8 +3377,7 @@ class Tracker:
         close = gate & (cost <= best + config.rival_cost)
         doubtful = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
         known = (live.embedded >= 0)[:, None]
-        wanted = close if lazy.given is None else gate  # given looks cost nothing
-        doubtful |= wanted & known & (cost > config.doubt_cost)
+        doubtful |= gate & known & (cost > config.doubt_cost)
         rows = np.flatnonzero(doubtful.any(0))
         if not len(rows):
             return cost, feasible
