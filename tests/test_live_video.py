@@ -243,6 +243,8 @@ def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path
         process = subprocess.Popen(
             [*command, "--detections", str(tmp_path / "det.txt"), "--embed", "none"],
             env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            # a job in the background is started with SIGINT ignored
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )  # fmt: skip
         wait_until(lambda p=process: ready.exists() or p.poll() is not None)
         ready.unlink()
