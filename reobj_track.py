@@ -3736,16 +3736,7 @@ def estimate_poses(
         )
     size = (int(video.size[0]), int(video.size[1]))
     camera, work = parse_camera(config.camera, size), _WorkVideo(video, config)
-    keys = pick_keyframes(work.first_pass(progress("keyframes", video.expected)), config)
-    finer = config
-    while (
-        len(keys) < min(config.min_keyframes, len(work.frames))
-        and finer.max_flow > 2 * config.min_flow
-    ):
-        finer = dataclasses.replace(finer, max_flow=finer.max_flow / 2)
-        keys = pick_keyframes(work, finer)
-    if not keys:
-        raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
+    keys = _enough_keyframes(work, config, progress("keyframes", video.expected))
     boxes = [
         np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4))
         for k in keys
@@ -3770,6 +3761,18 @@ def estimate_poses(
     shutil.rmtree(work_dir / "mapping")
     messages += _lost_frames(frame, poses.known)
     return dataclasses.replace(poses, messages=tuple(messages), parts=tuple(parts))
+
+
+def _enough_keyframes(work: _WorkVideo, config: PosesConfig, line: Progress) -> list[_WorkImage]:
+    """Pick keyframes, twice as dense as long as they are fewer than `min_keyframes`."""
+    keys = pick_keyframes(work.first_pass(line), config)
+    wanted, finer = min(config.min_keyframes, len(work.frames)), config
+    while len(keys) < wanted and finer.max_flow > 2 * config.min_flow:
+        finer = dataclasses.replace(finer, max_flow=finer.max_flow / 2)
+        keys = pick_keyframes(work, finer)
+    if not keys:
+        raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
+    return keys
 
 
 def _located(

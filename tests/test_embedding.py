@@ -12,6 +12,7 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
+from test_tracker import scene_with_twins
 
 import reobj_track as rt
 
@@ -77,17 +78,6 @@ def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
 
 
 # ---- The weights that come along ----
-
-
-def scene_with_twins() -> tuple[np.ndarray, rt.Detections]:
-    """Two identical patches on different backgrounds."""
-    rng = np.random.default_rng(13)
-    image = cv2.GaussianBlur(rng.integers(0, 256, (240, 480, 3), dtype=np.uint8), (0, 0), 8)
-    image[:, :240] = (0.5 * image[:, :240] + [100, 20, 20]).clip(0, 255).astype(np.uint8)
-    image[:, 240:] = (0.5 * image[:, 240:] + [20, 20, 100]).clip(0, 255).astype(np.uint8)
-    patch = cv2.GaussianBlur(rng.integers(0, 256, (60, 60, 3), dtype=np.uint8), (0, 0), 3)
-    image[90:150, 90:150] = image[90:150, 330:390] = patch
-    return image, boxes((90, 90, 150, 150), (330, 90, 390, 150))
 
 
 def test_own_weights_are_found_without_a_download(tmp_path, monkeypatch) -> None:
