@@ -2962,9 +2962,7 @@ class Places:
         """(I,): is the place of the identity known?"""
         return np.asarray(np.isfinite(self.dual_q[:, 0, 0]), bool)
 
-    def project(
-        self, img_from_world: Array, image_size: tuple[int, int], share: float
-    ) -> Array:
+    def project(self, img_from_world: Array, image_size: tuple[int, int], share: float) -> Array:
         """Boxes cx, cy, w, h (I, 4) of the ellipsoids' parts in an image; NaN where the place is
         unknown, or no more than this share of the box lies in the image.
         """
@@ -6589,7 +6587,6 @@ def _scene_facts(world: dict[str, Any]) -> str:
         facts.append(f"units: {world['units']}")
     facts += [] if world["up_in_world"] else ["up is guessed from the cameras"]
     return " · ".join(facts)
-
 
 
 # ---- Run: the whole chain ----------------------------------------------------------------------

@@ -343,8 +343,7 @@ def test_mot_variants(tmp_path: Path, video: rt.Video, text: str, names: tuple[s
         CSV.replace("frame,", "# frame(0-based row),").replace(
             "class\n", "class(COCO-80) ; some tool, 640\n"
         ),
-        "class_id,confidence,frame,x,y,width,height\n"
-        "56,.9,0,10,20,30,40\n41,.5,2,50,60,30,40\n",
+        "class_id,confidence,frame,x,y,width,height\n56,.9,0,10,20,30,40\n41,.5,2,50,60,30,40\n",
         "Frame,X1,Y1,X2,Y2,Conf,class_name\n0,10,20,40,60,.9,chair\n2,50,60,80,100,.5,cup\n",
     ],
 )
