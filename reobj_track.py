@@ -277,6 +277,14 @@ class EmbedConfig:
     background_cells: int = _opt(
         4, "cells a side that the grown box is divided into for the background"
     )
+    wide: float = _opt(
+        0.0, "surroundings with other objects in them: the box grown by this share (0: none)"
+    )
+    wide_reach: float = _opt(0.2, "and at least by this share of the image's longer side")
+    wide_cells: int = _opt(4, "cells a side of the surroundings")
+    foreground_channels: int = _opt(
+        0, "the foreground reads only so many channels of the map, the first ones (0: all)"
+    )
     crop_px: int = _opt(224, "side of the crops of --embed crops")
     conv_block: str = _opt("", "trained ConvBlock (.onnx) of --embed crops; none: maps flattened")
 
@@ -2189,11 +2197,11 @@ class Embedder:
     ) -> Embeddings:
         """Embed the chosen rows from a (h, w, C) feature map of a frame of this size."""
         parts = part_samples(detections, rows, size_hw, features.shape[:2], self.layout)
-        flat = features.reshape(-1, features.shape[-1])
-        means = [_cell_mean(flat[part.index], part.weight, part.cells) for part in parts]
+        means = cell_means(features, parts, self.layout)
         if self._net is not None and self._net.head is not None:
             return self._net.embed(parts, means)
-        return Embeddings(*map(_unit_histogram, means, (part.share for part in parts)))
+        foreground, *background = map(_unit_histogram, means, (part.share for part in parts))
+        return Embeddings(foreground, _unit_rows(np.concatenate(background, 1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -2219,20 +2227,23 @@ def part_samples(
     size_hw: tuple[int, ...],
     shape: tuple[int, int],
     layout: EmbedConfig,
-) -> tuple[PartSamples, PartSamples]:
-    """Sample boxes (foreground) and grown boxes (background) of the chosen rows (N,).
+) -> list[PartSamples]:
+    """Sample boxes (foreground), grown boxes (background, no other object) and, if the layout has
+    them, wider boxes (everything but the object) of the chosen rows (N,).
 
     Args:
         detections: of one frame of size_hw. shape: (h, w) of the feature map of that frame.
     """
     box = _cxcywh_from_xyxy(detections.xyxy[rows])  # (N, 4)
-    least = layout.reach * max(size_hw[:2])
-    grown = box[:, 2:] / 2 + np.maximum(box[:, 2:] * layout.context, least)  # (N, 2)
+    grow = [(0.0, 0.0, layout.foreground_cells)]
+    grow += [(layout.context, layout.reach, layout.background_cells)]
+    grow += [(layout.wide, layout.wide_reach, layout.wide_cells)] * (layout.wide > 0)
     sure = detections[detections.score >= layout.object_score]
     objects = _object_map(sure, size_hw, shape)  # (h, w)
-    parts = []
-    for half, cells, behind in ((box[:, 2:] / 2, layout.foreground_cells, False),
-                                (grown, layout.background_cells, True)):  # fmt: skip
+    parts: list[PartSamples] = []
+    for share_of_box, share_of_image, cells in grow:
+        least = share_of_image * max(size_hw[:2])
+        half = box[:, 2:] / 2 + np.maximum(box[:, 2:] * share_of_box, least)  # (N, 2)
         side = cells * layout.samples
         unit = (np.arange(side) + 0.5) / side * 2 - 1  # (S,) in [-1, 1]
         x = (box[:, 0, None] + half[:, :1] * unit)[:, None, :].repeat(side, 1)  # (N, S, S)
@@ -2242,10 +2253,20 @@ def part_samples(
         column = (x / size_hw[1] * shape[1]).astype(int).clip(0, shape[1] - 1)
         own = _on_object(detections, rows, x, y) & inside
         others = objects[row, column] & inside & ~own
-        weight = inside & ~own & ~others if behind else own
+        weight = (own, inside & ~own & ~others, inside & ~own)[len(parts)]
         share = [_by_cell(w, cells).mean(-1, dtype=np.float32) for w in (weight, others)]
         parts.append(PartSamples(row * shape[1] + column, weight, cells, *share))
-    return parts[0], parts[1]
+    return parts
+
+
+def cell_means(features: Floats, parts: Sequence[PartSamples], layout: EmbedConfig) -> list[Floats]:
+    """Mean features (N, cells, cells, C) of every part's cells on a map (h, w, C)."""
+    flat = features.reshape(-1, features.shape[-1])
+    read = [flat[:, : layout.foreground_channels or None]] + [flat] * (len(parts) - 1)
+    return [
+        _cell_mean(columns[part.index], part.weight, part.cells)
+        for columns, part in zip(read, parts, strict=True)
+    ]
 
 
 def _by_cell(values: npt.NDArray[Any], cells: int) -> npt.NDArray[Any]:
@@ -2335,8 +2356,11 @@ class CropEmbedder(Embedder):
     def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
         """Corners (N, 2) of the grown boxes, whole pixels; may lie beyond the frame."""
         box = _cxcywh_from_xyxy(xyxy)  # (N, 4)
-        least = max(1.0, self.layout.reach * max(size_hw))
-        half = box[:, 2:] / 2 + np.maximum(box[:, 2:] * self.layout.context, least)  # (N, 2)
+        grow, reach = self.layout.context, self.layout.reach
+        if self.layout.wide:
+            grow, reach = max(grow, self.layout.wide), max(reach, self.layout.wide_reach)
+        least = max(1.0, reach * max(size_hw))
+        half = box[:, 2:] / 2 + np.maximum(box[:, 2:] * grow, least)  # (N, 2)
         low, high = np.floor(box[:, :2] - half), np.ceil(box[:, :2] + half)
         return low.astype(np.int64), high.astype(np.int64)
 
@@ -2367,9 +2391,7 @@ class CropEmbedder(Embedder):
                 np.stack([on_object[k], others[k]])[some],
             )
             parts = part_samples(found, np.arange(1), (side, side), maps.shape[1:3], self.layout)
-            flat = maps[i].reshape(-1, maps.shape[-1])
-            means = [_cell_mean(flat[part.index], part.weight, part.cells) for part in parts]
-            fed.append(head_inputs(parts, means)[i // count])
+            fed.append(head_inputs(parts, cell_means(maps[i], parts, self.layout))[i // count])
         fore, back = np.concatenate(fed[:count]), np.concatenate(fed[count:])
         found_rows = net.head.run(None, {"fg": fore, "bg": back})
         return Embeddings(*(np.asarray(part, np.float64) for part in found_rows))
@@ -2571,14 +2593,16 @@ class _Backbone:
 def head_inputs(parts: Sequence[PartSamples], means: Sequence[Floats]) -> tuple[Floats, Floats]:
     """What a head sees of each cell: mean feature, share that counts, share on other objects.
 
-    Returns (N, cells * cells * (C + 2)) for the foreground and for the background.
+    Returns (N, cells * cells * (C + 2)) for the foreground and for the background, where the
+    grown box's cells come before the wider box's.
     """
     rows = [
         np.concatenate([mean, part.share[..., None], part.others[..., None]], -1)
+        .reshape(len(mean), -1)
+        .astype(np.float32)
         for part, mean in zip(parts, means, strict=True)
     ]
-    foreground, background = (r.reshape(len(r), -1).astype(np.float32) for r in rows)
-    return foreground, background
+    return rows[0], np.concatenate(rows[1:], 1)
 
 
 class _LazyEmbeddings:

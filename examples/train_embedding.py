@@ -13,15 +13,17 @@ What it learns from; every source may be given several times:
   --sparse IMAGES=DIR   self-supervision of poses: a COLMAP model of the images, such as `sparse/`
                         of an output folder of `run`. A ball around a 3D point is a pseudo-object:
                         the views that observe the point show the same place from another side.
-  --tracks IMAGES=FILE  `tracks.txt` of `run` (MOTChallenge): identity by 3D object.
+  --tracks IMAGES=FILE  `tracks.txt` of `run` (MOTChallenge): identity by 3D object. Masks
+                        are those of the detector (OUT/cache, or a detections .npz beside FILE).
+  --scannet DIR         a scene in ScanNet's or Matterport3D's layout, as rank_k.py reads it.
 Validation: --val-rooms A:B, --val-sparse.
 
 Method: each step takes several scenes and several views of each, and changes every picture as
 phones do (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of
 masks half of the time). Triplet loss on cosines of (foreground, background) together and of each
-alone; for every anchor and positive the negative is semi-hard (the nearest of those further than
-the positive: mostly an identical twin elsewhere in the room); with --hard-after, the nearest of all
-of the same scene from then on.
+alone; for every anchor and positive the negative is the soft maximum of all (mostly an identical
+twin elsewhere in the room), or with --loss triplet semi-hard (the nearest of those further than the
+positive) and with --hard-after, the nearest of all of the same scene from then on.
 Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
 al., MobileNetV2, CVPR 2018 (inverted residual).
 
@@ -32,7 +34,13 @@ from __future__ import annotations
 
 import argparse
 import csv
+import functools
+import itertools
 import json
+import multiprocessing
+import os
+import queue
+import signal
 import sys
 import time
 import warnings
@@ -63,10 +71,12 @@ IntArray = npt.NDArray[np.int64]
 
 SIZE_WH = (320, 240)  # of a training picture; in use the longer side is 320, any shape
 STRIDE = 16  # sides of the network's input are multiples of it
-LAYOUT = {"size_px": 320, "context": 0.5, "reach": 0.05, "samples": 4,
-          "foreground_cells": 3, "background_cells": 4}  # fmt: skip
-COLOURS, LEARNED = 17, 48  # channels of the map: fixed colour histogram, learned features
-CHANNELS, WIDTH = COLOURS + LEARNED, 128  # of the map and of each embedding
+# Channels of the map: fixed colours, learned from 15 pixels, learned from the surroundings.
+COLOURS, NEAR, DEEP = 17, 24, 40
+CHANNELS, WIDTH = COLOURS + NEAR + DEEP, 128  # of the map and of each embedding
+LAYOUT = {"size_px": 320, "context": 0.5, "reach": 0.05, "samples": 3, "foreground_cells": 3,
+          "background_cells": 4, "wide": 1.5, "wide_reach": 0.2, "wide_cells": 4,
+          "foreground_channels": COLOURS + NEAR}  # fmt: skip
 
 
 # ---- Clips: pictures with identified boxes -------------------------------------------------------
@@ -77,7 +87,7 @@ class Clip:
     """Views of one scene, as lists over its F frames.
 
     Attributes:
-        images: (H, W, 3) BGR. labels: (H, W) uint8 row of `identity` + 1 at each pixel, or None.
+        images: (H, W, 3) BGR. labels: (H, W) uint8 `identity` + 1 at each pixel, or None.
         xyxy: (D, 4) boxes. identity: (D,) within the clip. look: (D,) things of one look share it.
         sure: (D,) whether it hides the background of others (pseudo-objects do not).
     """
@@ -143,6 +153,7 @@ def render_to(path: Path, config: rr.RoomConfig) -> None:
     part.replace(path)
 
 
+@functools.lru_cache
 def read_pictures(folder: Path) -> dict[str, tuple[Image, float]]:
     """All images of a folder with a longer side of 1.5 times the network's, and their scale."""
     pictures = {}
@@ -214,19 +225,80 @@ def keep_identities(clip: Clip, wanted: IntArray) -> Clip:
 
 
 def tracks_clip(folder: Path, tracks: Path) -> Clip:
-    """Identities of `tracks.txt` (frame, id, x, y, w, h, ...; frame 1 is the first image)."""
-    rows = np.loadtxt(tracks, delimiter=",", ndmin=2)
-    clip = Clip(f"{folder.parent.name}/{tracks.name}", [], None, [], [], [], True)
+    """Identities of `tracks.txt` (frame, id, x, y, w, h, ...; frame 1 is the first image).
+
+    Masks come from the detections beside it: OUT/cache of `run`, or a detections .npz.
+    """
+    rows, found = np.loadtxt(tracks, delimiter=",", ndmin=2), recorded_masks(tracks.parent)
+    clip = Clip(f"{folder.parent.name}/{tracks.name}", [], [] if found else None, [], [], [], True)
+    names, identity = np.unique(rows[:, 1], return_inverse=True)
+    if len(names) > 254:
+        clip.labels = None  # more than a byte holds
     for number, (picture, scale) in enumerate(read_pictures(folder).values(), 1):
-        own = rows[rows[:, 0] == number]
-        corners = np.c_[own[:, 2:4], own[:, 2:4] + own[:, 4:6]] * scale
-        add_view(clip, picture, corners, own[:, 1].astype(np.int64))
+        own = rows[:, 0] == number
+        corners = np.c_[rows[own, 2:4], rows[own, 2:4] + rows[own, 4:6]] * scale
+        label = np.zeros(picture.shape[:2], np.uint8)
+        for recorded in found:
+            paint(label, recorded.at(number - 1), corners, identity[own])
+        add_view(clip, picture, corners, identity[own], label=label)
     return clip
 
 
-def add_view(clip: Clip, picture: Image, xyxy: Array, identity: IntArray) -> None:
+def recorded_masks(folder: Path) -> list[rt.RecordedDetections]:
+    """Detections with masks in an output folder of `run` or beside a tracks.txt."""
+    found = []
+    for path in sorted([*folder.glob("cache/*/chunk_*.npz"), *folder.glob("*.npz")]):
+        with np.load(path) as data:
+            if "mask_counts" not in data or not len(data["mask_counts"]):
+                continue
+            size = tuple(data["image_size"].tolist())
+        found.append(rt._read_npz(path, size, size)[0])
+    return found
+
+
+def paint(label: Image, found: rt.Detections, xyxy: Array, identity: IntArray) -> None:
+    """Draw into a label image (H, W) the masks of detections that overlap with a box by 70 %."""
+    if found.masks is None or not len(identity):
+        return
+    ratio = np.tile(np.divide(label.shape[::-1], found.masks.shape[:0:-1]), 2)
+    overlap = rt.box_iou(xyxy, found.xyxy * ratio)  # (D, M)
+    for row in np.flatnonzero(overlap.max(1) > 0.7):
+        mask = found.masks[overlap[row].argmax()].astype(np.uint8)
+        label[cv2.resize(mask, label.shape[::-1]) > 0] = identity[row] + 1
+
+
+def scannet_clip(folder: Path) -> Clip:
+    """Instances of a scene in ScanNet's layout (`rank_k.scannet_scene`), 120 views at most."""
+    import rank_k
+
+    scene = rank_k.scannet_scene(folder)
+    scene = scene.sampled(-(-len(scene.images) // 120))
+    names, identity = np.unique(scene.identity, return_inverse=True)
+    looks = np.unique(scene.name, return_inverse=True)[1]
+    labels: list[Image] | None = [] if len(names) < 255 else None
+    clip = Clip(folder.name, [], labels, [], [], [], True)
+    for f in range(len(scene.images)):
+        rows = np.flatnonzero((scene.row == f) & (scene.identity > 0))
+        image, found, scored = scene.at(f)
+        scale = min(1.0, 1.5 * SIZE_WH[0] / max(image.shape[:2]))
+        picture = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        corners = scene.xyxy[rows] * (picture.shape[1] / scene.size[0])
+        label = np.zeros(picture.shape[:2], np.uint8)
+        paint(label, found[scored], corners, identity[rows])
+        add_view(clip, np.asarray(picture, np.uint8), corners, identity[rows], looks[rows], label)
+    return clip
+
+
+def add_view(
+    clip: Clip,
+    picture: Image,
+    xyxy: Array,
+    identity: IntArray,
+    look: IntArray | None = None,
+    label: Image | None = None,
+) -> None:
     """Append a view with those boxes that lie in it for the most part and are neither tiny nor
-    huge.
+    huge. look: default, the identity. label: for clips that have labels.
     """
     limit = np.array(picture.shape[1::-1] * 2, float)
     inside = np.clip(xyxy, 0, limit)
@@ -237,7 +309,9 @@ def add_view(clip: Clip, picture: Image, xyxy: Array, identity: IntArray) -> Non
     clip.images.append(picture)
     clip.xyxy.append(inside[keep])
     clip.identity.append(identity[keep])
-    clip.look.append(identity[keep])
+    clip.look.append((identity if look is None else look)[keep])
+    if clip.labels is not None and label is not None:
+        clip.labels.append(label)
 
 
 # ---- Augmentation --------------------------------------------------------------------------------
@@ -250,7 +324,7 @@ class View:
     picture: Image  # (H, W, 3)
     identity: IntArray  # (D,)
     look: IntArray  # (D,)
-    parts: tuple[rt.PartSamples, rt.PartSamples]
+    parts: list[rt.PartSamples]
 
 
 def photo_tone(rng: np.random.Generator, strength: float) -> Callable[[Image], Image]:
@@ -310,7 +384,7 @@ def make_view(
 ) -> View:
     """Augment one frame (change None: leave it, for validation) and sample its boxes."""
     image, augment = clip.images[frame], change is not None
-    corner, factor = crop_window(rng, image, 0.72 if augment else 1.0)
+    corner, factor = crop_window(rng, image, 0.6 if augment else 1.0)
     warp = np.array([[factor, 0, -factor * corner[0]], [0, factor, -factor * corner[1]]])
     if flip:
         warp = np.array([[-1.0, 0, SIZE_WH[0]], [0, 1.0, 0]]) @ np.vstack([warp, [0, 0, 1]])
@@ -357,7 +431,7 @@ def jittered(
 def pick_frames(clip: Clip, shared: Any, views: int, rng: np.random.Generator) -> IntArray:
     """A frame, frames that show some of the same objects, and two of anywhere."""
     first = int(rng.choice(len(shared), p=shared.diagonal() / shared.diagonal().sum()))
-    chance = np.minimum(shared[first], 6) + 0.0
+    chance = np.minimum(shared[first], 3) + 0.0  # so that the other visit is not outnumbered
     chance[first] = 0
     friends = rng.permutation(np.flatnonzero(chance))
     weights = chance[friends] / max(chance.sum(), 1e-9)
@@ -392,9 +466,9 @@ def block(inner: int, outer: int, kernel: int = 3, stride: int = 1, groups: int 
 class Residual(nn.Module):
     """Inverted residual: widen, filter each channel, narrow again."""
 
-    def __init__(self, inner: int, outer: int, stride: int = 1) -> None:
+    def __init__(self, inner: int, outer: int, stride: int = 1, widen: int = 2) -> None:
         super().__init__()
-        wide = 2 * inner
+        wide = widen * inner
         self.body = nn.Sequential(
             block(inner, wide, 1),
             block(wide, wide, 3, stride, wide),
@@ -410,7 +484,7 @@ class Residual(nn.Module):
 class ColourMap(nn.Module):
     """Soft histogram of Lab colour and gradients (`reobj_track._colour_features`), at 1/4: fixed.
 
-    Three colour values in [0, 1] (B, 3, H, W), BGR, to (B, 17, H / 4, W / 4).
+    Three colour values of 0 to 255 (B, 3, H, W), BGR, to (B, 17, H / 4, W / 4).
     """
 
     def __init__(self) -> None:
@@ -425,15 +499,14 @@ class ColourMap(nn.Module):
         self.register_buffer("levels", torch.arange(5.0)[None, :, None, None])
 
     def forward(self, x: Any) -> Any:
-        x = F.avg_pool2d(x, 2)
+        x = F.avg_pool2d(x, 4) / 255
         x = x * (x * (x * 0.305306011 + 0.682171111) + 0.012522878)  # sRGB to linear light
         f = (F.conv2d(x, self.xyz).clamp_min(0.001).log() / 3).exp()  # cube root, vectorised
         lightness = 1.16 * f[:, 1:2] - 0.16  # L / 100
         chroma = torch.cat([5.0 * (f[:, :1] - f[:, 1:2]), 2.0 * (f[:, 1:2] - f[:, 2:])], 1) * 2.5
         levels = F.relu(1 - (lightness * 4 - self.levels).abs()) * 0.5
         edges = F.conv2d(F.pad(lightness, (1, 1, 1, 1), mode="replicate"), self.sobel)
-        bins = torch.cat([self.directions(chroma), levels, self.directions(edges)], 1)
-        return F.avg_pool2d(bins, 2)
+        return torch.cat([self.directions(chroma), levels, self.directions(edges)], 1)
 
     def directions(self, vector: Any) -> Any:
         length = ((vector * vector).sum(1, keepdim=True) + 1e-8).sqrt()
@@ -443,64 +516,101 @@ class ColourMap(nn.Module):
 
 
 class Backbone(nn.Module):
-    """BGR bytes (B, H, W, 3) to a map (B, H / 4, W / 4, CHANNELS): down to 1/16 and up again."""
+    """BGR bytes (B, H, W, 3) to a map (B, H / 4, W / 4, CHANNELS).
+
+    Fixed colours, features that see 15 pixels (for the foreground), and features of a way down to
+    1/16 and up again, which see the surroundings.
+    """
 
     def __init__(self) -> None:
         super().__init__()
+        self.scaled = True  # pictures are divided by 64; in the exported graph the weights are
         self.colour = ColourMap()
-        self.stem = nn.Sequential(block(3, 16, 3, 2), block(16, 24, 3, 2))
+        self.stem = nn.Sequential(
+            block(3, 16, 3, 2),
+            block(16, 16, 3, 2, 16),
+            block(16, 24, 1),
+            Residual(24, 24, widen=1),
+        )
+        self.near = block(24, NEAR, 1)
         self.down8 = nn.Sequential(block(24, 40, 3, 2), Residual(40, 40))
         self.down16 = nn.Sequential(Residual(40, 80, 2), Residual(80, 80), Residual(80, 80))
-        self.side16 = nn.Conv2d(80, LEARNED, 1)
-        self.side8 = nn.Conv2d(40, LEARNED, 1)
-        self.side4 = nn.Conv2d(24, LEARNED, 1)
-        self.mix8 = nn.Sequential(
-            block(LEARNED, LEARNED, 3, 1, LEARNED), block(LEARNED, LEARNED, 1)
-        )
-        self.mix4 = block(LEARNED, LEARNED, 3, 1, LEARNED)
+        self.side16 = nn.Conv2d(80, DEEP, 1)
+        self.side8 = nn.Conv2d(40, DEEP, 1)
+        self.side4 = nn.Conv2d(24, DEEP, 1)
+        self.mix8 = nn.Sequential(block(DEEP, DEEP, 3, 1, DEEP), block(DEEP, DEEP, 1))
+        self.mix4 = block(DEEP, DEEP, 3, 1, DEEP)
 
     def forward(self, image: Any) -> Any:
         x = image.permute(0, 3, 1, 2).float()
-        x4 = self.stem(x / 64 - 2)
+        x4 = self.stem(x / 64 if self.scaled else x)
         x8 = self.down8(x4)
         x16 = self.side16(self.down16(x8))
         y8 = self.mix8(self.side8(x8) + F.interpolate(x16, scale_factor=2.0, mode="nearest"))
         y4 = self.mix4(self.side4(x4) + F.interpolate(y8, scale_factor=2.0, mode="nearest"))
-        return torch.cat([self.colour(x / 255), y4], 1).permute(0, 2, 3, 1)
+        return torch.cat([self.colour(x), self.near(x4), y4], 1).permute(0, 2, 3, 1)
 
 
 class PartHead(nn.Module):
-    """Cells (N, cells * cells * (C + 2)) of one part to unit rows (N, WIDTH).
+    """Cells of one part, (N, cells * (C + 2)) of one or more square grids, to unit rows (N, WIDTH).
 
     A linear map of the colour histogram, which starts as its principal components (so that
-    training starts from the training-free descriptor), plus a perceptron of everything.
+    training starts from the training-free descriptor), plus a perceptron that sees the cells as
+    they lie and their rows, left and right forgotten: what is beside an object from the front is
+    behind it from the side, but above stays above.
     """
 
-    def __init__(self, side: int) -> None:
+    def __init__(
+        self, sides: Sequence[int], channels: int, word: int = 64, brief: int = 24
+    ) -> None:
         super().__init__()
-        self.cells = side * side
+        self.sides, self.channels = tuple(sides), channels
+        self.cells = sum(side * side for side in sides)
         self.project = nn.Linear(self.cells * COLOURS, WIDTH, bias=False)
+        self.word = nn.Sequential(
+            nn.Linear(channels + 2, word), nn.ReLU(), nn.Linear(word, word), nn.ReLU()
+        )
+        self.brief = nn.Linear(word, brief, bias=False)
         self.mix = nn.Sequential(
-            nn.Linear(self.cells * (CHANNELS + 2), 192, bias=False),
-            nn.BatchNorm1d(192),
+            nn.Linear(self.cells * brief + sum(sides) * word * 2, 144, bias=False),
+            nn.BatchNorm1d(144),
             nn.ReLU(),
-            nn.Linear(192, WIDTH),
+            nn.Linear(144, WIDTH),
         )
         nn.init.zeros_(self.mix[-1].weight)
         nn.init.zeros_(self.mix[-1].bias)
 
+    def grids(self, cells: Any) -> list[Any]:
+        """(N, cells, C) as (N, side, side, C) of every grid."""
+        split = cells.split([side * side for side in self.sides], 1)
+        return [g.reshape(-1, n, n, g.shape[-1]) for n, g in zip(self.sides, split, strict=True)]
+
     def histogram(self, cells: Any) -> Any:
-        """Unit rows (N, cells * cells * COLOURS) of square roots; part-empty cells count less."""
-        share = cells[..., CHANNELS : CHANNELS + 1]
-        trust = share / share.amax(1, keepdim=True).clamp_min(1e-6)
-        rows = (cells[..., :COLOURS] * trust + 1e-12).sqrt()
-        return F.normalize(rows.reshape(-1, self.cells * COLOURS), dim=1)
+        """Unit rows (N, cells * COLOURS) of square roots; part-empty cells count less."""
+        rows = []
+        for grid in self.grids(cells):
+            share = grid[..., self.channels : self.channels + 1]
+            trust = share / share.amax((1, 2), keepdim=True).clamp_min(1e-6)
+            rows.append((grid[..., :COLOURS] * trust + 1e-12).sqrt().flatten(1))
+        return F.normalize(torch.cat(rows, 1), dim=1)
+
+    def seen(self, cells: Any) -> Any:
+        """What the perceptron sees: short words of all cells, mean and maximum of every row."""
+        colours = (cells[..., :COLOURS] + 1e-6).sqrt()
+        words = self.word(torch.cat([colours, cells[..., COLOURS:]], -1))
+        share = cells[..., self.channels : self.channels + 1]
+        words = words * (share > 0)
+        seen = [self.brief(words).flatten(1)]
+        for word, weight in zip(self.grids(words), self.grids(share), strict=True):
+            mean = (word * weight).sum(2) / weight.sum(2).clamp_min(1e-6)  # (N, side, word)
+            seen += [mean.flatten(1), word.amax(2).flatten(1)]
+        return torch.cat(seen, 1)
 
     def forward(self, rows: Any) -> Any:
-        cells = rows.reshape(-1, self.cells, CHANNELS + 2)
-        colours = (cells[..., :COLOURS] + 1e-6).sqrt()
-        mixed = torch.cat([colours, cells[..., COLOURS:]], -1).reshape(-1, rows.shape[1])
-        return F.normalize(self.project(self.histogram(cells)) + self.mix(mixed), dim=1)
+        cells = rows.reshape(-1, self.cells, self.channels + 2)
+        if self.training:  # some cells are hidden
+            cells = cells * (torch.rand_like(cells[..., :1]) > 0.1)
+        return F.normalize(self.project(self.histogram(cells)) + self.mix(self.seen(cells)), dim=1)
 
 
 class Head(nn.Module):
@@ -508,8 +618,10 @@ class Head(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        sides = (int(LAYOUT["foreground_cells"]), int(LAYOUT["background_cells"]))
-        self.parts = nn.ModuleList([PartHead(side) for side in sides])
+        fore, near, wide = (int(LAYOUT[f"{k}_cells"]) for k in ("foreground", "background", "wide"))
+        self.parts = nn.ModuleList(
+            [PartHead([fore], int(LAYOUT["foreground_channels"])), PartHead([near, wide], CHANNELS)]
+        )
 
     def forward(self, fg: Any, bg: Any) -> tuple[Any, Any]:
         return self.parts[0](fg), self.parts[1](bg)
@@ -530,50 +642,61 @@ class Net(nn.Module):
     def cells(self, views: Sequence[View], images: Any) -> list[Any]:
         """What the heads see of all objects of the views."""
         maps = self.backbone(images)
-        flat = maps.reshape(-1, CHANNELS)
-        return [pooled(flat, views, part, maps.shape[1] * maps.shape[2]) for part in (0, 1)]
+        flat, size = maps.reshape(-1, CHANNELS), maps.shape[1] * maps.shape[2]
+        fore, *back = (pooled(flat, views, part, size) for part in range(len(views[0].parts)))
+        own = torch.cat([fore[..., : LAYOUT["foreground_channels"]], fore[..., CHANNELS:]], -1)
+        return [own.flatten(1), torch.cat([cells.flatten(1) for cells in back], 1)]
 
     def start_from_colour(self, views: Sequence[View], device: Any) -> None:
         """Set the heads' linear maps to the principal components of these views' histograms."""
         with torch.no_grad():
             images = torch.from_numpy(np.stack([v.picture for v in views])).to(device)
             for head, cells in zip(self.head.parts, self.cells(views, images), strict=True):
-                rows = head.histogram(cells.reshape(-1, head.cells, CHANNELS + 2))
+                rows = head.histogram(cells.reshape(-1, head.cells, head.channels + 2))
                 axes = torch.linalg.svd(rows.T @ rows)[0].T[:WIDTH]  # (WIDTH, in)
                 head.project.weight[: len(axes)] = axes
 
 
 def pooled(flat: Any, views: Sequence[View], part: int, cells_a_map: int) -> Any:
-    """What the head sees of one part of all N objects (`reobj_track.head_inputs` in torch)."""
+    """Cells (N, cells, C + 2) of one part of all N objects (`reobj_track.head_inputs` in torch)."""
     samples = [v.parts[part] for v in views]
     index = np.concatenate([s.index + i * cells_a_map for i, s in enumerate(samples)])
     weight = np.concatenate([s.weight for s in samples]).astype(np.float32)
     n, side, cells = len(index), index.shape[1], samples[0].cells
     fine = side // cells
-    weight /= (
-        np.maximum(weight.reshape(n, cells, fine, cells, fine).sum((2, 4), keepdims=True), 1)
-        .repeat(fine, 2)
-        .repeat(fine, 4)
-        .reshape(weight.shape)
-    )
-    values = flat[torch.from_numpy(index.ravel()).to(flat.device)].reshape(n, side, side, -1)
-    values = values * torch.from_numpy(weight).to(flat.device)[..., None]
-    mean = values.reshape(n, cells, fine, cells, fine, -1).sum((2, 4))
+
+    def by_cell(values: Any) -> Any:
+        """(N, S, S) to (N * cells * cells, samples of the cell)."""
+        grid = values.reshape(n, cells, fine, cells, fine).swapaxes(2, 3)
+        return grid.reshape(-1, fine * fine)
+
+    weight = by_cell(weight)
+    weight /= np.maximum(weight.sum(1, keepdims=True), 1)
+    rows, weights = (torch.from_numpy(a).to(flat.device) for a in (by_cell(index), weight))
+    mean = F.embedding_bag(rows, flat, mode="sum", per_sample_weights=weights)
     shares = np.concatenate([np.stack([s.share, s.others], -1) for s in samples])
     extra = torch.from_numpy(shares.astype(np.float32)).to(flat.device)
-    return torch.cat([mean, extra], -1).reshape(n, -1)
+    return torch.cat([mean.reshape(n, cells * cells, -1), extra.reshape(n, cells * cells, 2)], -1)
 
 
 # ---- Loss ----------------------------------------------------------------------------------------
 
 
-def triplet_loss(rows: Any, same: Any, different: Any, hard: bool, temperature: float = 0.1) -> Any:
+def triplet_loss(
+    rows: Any,
+    same: Any,
+    different: Any,
+    hard: bool,
+    soft: bool = False,
+    temperature: float = 0.1,
+) -> Any:
     """Soft-margin triplet loss log(1 + exp((s_an - s_ap) / T)) over all anchors and positives.
 
     Args:
         rows: (N, E) unit rows. same, different: (N, N) bool, positives and negatives of each row.
         hard: the negative is the nearest one; else the nearest that is further than the positive
             (if there is none, the nearest one counts a tenth).
+        soft: the negative is the soft maximum of all of them.
     """
     cosine = rows @ rows.T
     anchor, positive = torch.nonzero(same & different.any(1)[:, None], as_tuple=True)
@@ -583,7 +706,9 @@ def triplet_loss(rows: Any, same: Any, different: Any, hard: bool, temperature: 
     others = cosine[anchor].masked_fill(~different[anchor], -2.0)  # (P, N)
     weight = torch.ones_like(near)
     far = others.max(1).values
-    if not hard:
+    if soft:
+        far = temperature * torch.logsumexp(others / temperature, 1)
+    elif not hard:
         semi = others.masked_fill(others > near[:, None].detach(), -2.0).max(1).values
         weight = torch.where(semi > -1.5, 1.0, 0.1)
         far = torch.where(semi > -1.5, semi, far)
@@ -591,7 +716,9 @@ def triplet_loss(rows: Any, same: Any, different: Any, hard: bool, temperature: 
     return (loss * weight).sum() / weight.sum()
 
 
-def batch_loss(foreground: Any, background: Any, scenes: list[list[View]], hard: bool) -> Any:
+def batch_loss(
+    foreground: Any, background: Any, scenes: list[list[View]], hard: bool, soft: bool = False
+) -> Any:
     """Triplet loss of both parts together, and a quarter as much of each alone."""
     views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
     device = foreground.device
@@ -603,9 +730,9 @@ def batch_loss(foreground: Any, background: Any, scenes: list[list[View]], hard:
     near = torch.from_numpy(scene[:, None] == scene).to(device)
     fused = torch.cat([foreground, background], 1) * 0.5**0.5
     same, different = one & apart, ~one & (near if hard else torch.ones_like(near))
-    loss = triplet_loss(fused, same, different, hard)
+    loss = triplet_loss(fused, same, different, hard, soft)
     for alone in (foreground, background):
-        loss = loss + 0.25 * triplet_loss(alone, same, different, hard)
+        loss = loss + 0.25 * triplet_loss(alone, same, different, hard, soft)
     return loss
 
 
@@ -614,10 +741,11 @@ def batch_loss(foreground: Any, background: Any, scenes: list[list[View]], hard:
 
 def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
     """Rank-1 among things of the same scene: `twins`: only those that look alike, where there are
-    two or more; `all`: any. Queries search frames at least 30 % of the clip away from their own.
+    two or more; `single`: as twins, among one random view of each (ten draws); `all`: any. Queries
+    search frames at least 30 % of the clip away from their own.
     """
     net.eval()
-    hits: dict[str, list[float]] = {f"{p}_{g}": [] for p in PARTS for g in ("twins", "all")}
+    hits: dict[str, list[float]] = {f"{p}_{g}": [] for p in PARTS for g in GROUPS}
     for clip in clips:
         rng = np.random.default_rng(0)
         everything = np.unique(np.concatenate(clip.identity))
@@ -632,21 +760,35 @@ def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
         look = np.concatenate([v.look for v in views])
         cosines = (rows[0] @ rows[0].T, rows[1] @ rows[1].T)
         for part, cosine in zip(PARTS, (*cosines, cosines[0] + cosines[1]), strict=True):
-            for group, pool in (("twins", look[:, None] == look), ("all", np.ones_like(cosine))):
-                away = max(1, int(0.3 * len(views)))
-                hits[f"{part}_{group}"] += first_hits(cosine, frame, identity, pool > 0, away)
+            far = np.abs(frame[:, None] - frame) >= max(1, int(0.3 * len(views)))
+            alike = far & (look[:, None] == look)
+            galleries = {"twins": [alike], "single": single_views(alike, identity), "all": [far]}
+            for group, draws in galleries.items():
+                for gallery in draws:
+                    hits[f"{part}_{group}"] += first_hits(cosine, identity, gallery)
     net.train()
     return {name: float(np.mean(found)) if found else float("nan") for name, found in hits.items()}
 
 
-PARTS = ("fg", "bg", "fused")
+PARTS, GROUPS = ("fg", "bg", "fused"), ("twins", "single", "all")
 
 
-def first_hits(
-    cosine: Any, frame: IntArray, identity: IntArray, pool: Any, away: int
-) -> list[float]:
+def single_views(gallery: Any, identity: IntArray, draws: int = 10) -> list[Any]:
+    """Keep one random view of each identity in every query's gallery (N, N)."""
+    rng, kept = np.random.default_rng(0), []
+    for _ in range(draws):
+        order = np.where(gallery, rng.random(len(identity)), -1.0)
+        keep = np.zeros_like(gallery)
+        for one in np.unique(identity):
+            columns = np.flatnonzero(identity == one)
+            best = columns[order[:, columns].argmax(1)]
+            keep[np.arange(len(gallery)), best] = True
+        kept.append(keep & gallery)
+    return kept
+
+
+def first_hits(cosine: Any, identity: IntArray, gallery: Any) -> list[float]:
     """For each query with a positive and a negative in its gallery: is the nearest one right?"""
-    gallery = pool & (np.abs(frame[:, None] - frame) >= away)
     same = identity[:, None] == identity
     asked = (gallery & same).any(1) & (gallery & ~same).any(1)
     best = np.where(gallery, cosine, -9.0).argmax(1)
@@ -657,9 +799,14 @@ def first_hits(
 
 
 def real_clips(args: argparse.Namespace) -> list[Clip]:
-    """Clips of recordings."""
-    clips = [sparse_clip(images, model, args.seed) for images, model in args.sparse]
-    return clips + [tracks_clip(images, tracks) for images, tracks in args.tracks]
+    """Clips of recordings; other pseudo-objects of the same pictures for each of four draws."""
+    clips = [
+        sparse_clip(images, model, 4 * args.seed + draw)
+        for images, model in args.sparse
+        for draw in range(4)
+    ]
+    clips += [tracks_clip(images, tracks) for images, tracks in args.tracks]
+    return clips + [scannet_clip(folder) for folder in args.scannet]
 
 
 class Pool:
@@ -672,7 +819,9 @@ class Pool:
         self.waiting = list(parse_range(args.rooms)) if args.rooms else []
         self.fill()
         if not self.real and not self.rooms:
-            raise SystemExit("error: nothing to train on: give --rooms, --sparse or --tracks")
+            raise SystemExit(
+                "error: nothing to train on: give --rooms, --sparse, --tracks or --scannet"
+            )
 
     def fill(self) -> None:
         """Take in rooms: those of the cache, or render one if there is nothing at all yet."""
@@ -697,6 +846,48 @@ class Pool:
         return scenes
 
 
+class Loader:
+    """Batches made ahead by a second process; where it lags behind, this one makes them."""
+
+    def __init__(self, pool: Pool, first: int) -> None:
+        self.pool, fork = pool, multiprocessing.get_context("fork")
+        self.ready: Any = None
+        self.rooms = len(pool.rooms)
+        if pool.args.ahead:
+            self.ready = fork.Queue(pool.args.ahead)
+            fork.Process(target=self.work, args=(first, os.getpid()), daemon=True).start()
+
+    def work(self, first: int, parent: int) -> None:
+        """Fill the queue until the parent is gone."""
+        os.setsid()  # a scheduling group of its own
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in itertools.count(first):
+            if number % self.pool.args.every == 0:
+                self.pool.fill()
+            rng = np.random.default_rng([self.pool.args.seed, number, 1])
+            batch = self.pool.draw(rng), len(self.pool.rooms)
+            while os.getppid() == parent:
+                try:
+                    self.ready.put(batch, timeout=5)
+                    break
+                except queue.Full:
+                    continue
+            else:
+                return
+
+    def __call__(self, step: int) -> list[list[View]]:
+        """The scenes of the next step."""
+        if self.ready is not None:
+            try:
+                scenes, self.rooms = self.ready.get_nowait()
+                return list(scenes)
+            except queue.Empty:
+                pass
+        else:
+            self.rooms = len(self.pool.rooms)
+        return self.pool.draw(np.random.default_rng([self.pool.args.seed, step]))
+
+
 class Trainer:
     """Network, optimiser and where training stands."""
 
@@ -706,7 +897,7 @@ class Trainer:
         self.args = args
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.net = Net().to(self.device)
-        self.optimizer = torch.optim.AdamW(self.net.parameters(), args.rate, weight_decay=0.02)
+        self.optimizer = torch.optim.AdamW(self.net.parameters(), args.rate, weight_decay=0.05)
         self.step, self.seconds, self.best = 0, 0.0, -1.0
         last = args.out / "last.pt"
         if args.resume and last.exists():
@@ -744,13 +935,15 @@ class Trainer:
 
     def learn(self) -> float:
         """One step; returns the loss."""
-        rng, done = np.random.default_rng([self.args.seed, self.step]), min(self.progress(), 1.0)
+        done = min(self.progress(), 1.0)
         rate = min((self.step + 1) / 40, max(0.02, 0.5 + 0.5 * float(np.cos(np.pi * done))))
         for group in self.optimizer.param_groups:
             group["lr"] = self.args.rate * rate
-        scenes = self.pool.draw(rng)
+        scenes = self.loader(self.step)
         parts = self.net([view for scene in scenes for view in scene], self.device)
-        loss = batch_loss(parts[0], parts[1], scenes, done > self.args.hard_after)
+        loss = batch_loss(
+            parts[0], parts[1], scenes, done > self.args.hard_after, self.args.loss == "soft"
+        )
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
@@ -761,6 +954,7 @@ class Trainer:
     def run(self) -> None:
         """Train to the end; log, validate and save every so many steps."""
         losses: list[float] = []
+        self.loader = Loader(self.pool, self.step)
         while self.progress() < 1:
             began = time.monotonic()
             losses.append(self.learn())
@@ -768,12 +962,13 @@ class Trainer:
             if self.step % self.args.every == 0 or self.progress() >= 1:
                 self.report(float(np.mean(losses)))
                 losses.clear()
-                self.pool.fill()
+                if not self.args.ahead:
+                    self.pool.fill()
 
     def report(self, loss: float) -> None:
         """A row of the log and a checkpoint."""
         row: dict[str, float] = {"step": self.step, "minutes": round(self.seconds / 60, 2)}
-        row |= {"rooms": len(self.pool.rooms), "loss": round(loss, 5)}
+        row |= {"rooms": self.loader.rooms, "loss": round(loss, 5)}
         for name, clips in self.val.items():
             found = rank_one(self.net, clips, self.device)
             row |= {f"{name}_{k}": round(v, 4) for k, v in found.items()}
@@ -785,7 +980,7 @@ class Trainer:
                 writer.writeheader()
             writer.writerow(row)
         print(json.dumps(row), flush=True)
-        score = float(np.nan_to_num(row["room_fused_twins"])) + float(
+        score = float(np.nan_to_num(row["room_fused_single"])) + float(
             np.nan_to_num(row["real_fused_all"])
         )
         names = ["last.pt", "best.pt"] if score >= self.best else ["last.pt"]
@@ -818,7 +1013,7 @@ def draw_curves(log: Path, picture: Path) -> None:
     left.set(xlabel="step", ylabel="triplet loss")
     for name in rows[0]:
         rank = [float(row[name]) for row in rows if name.startswith(("room", "real"))]
-        if name.endswith("_twins" if "room" in name else "_all") and np.isfinite(rank).all():
+        if name.endswith("_single" if "room" in name else "_all") and np.isfinite(rank).all():
             right.plot(step, rank, label=name.replace("_", " "))
     right.set(xlabel="step", ylabel="Rank-1, validation")
     right.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
@@ -834,10 +1029,12 @@ def export(net: Net, out: Path, summary: dict[str, Any]) -> None:
     import onnx
 
     net = net.cpu().eval()
-    cells = [int(LAYOUT[f"{part}_cells"]) ** 2 for part in ("foreground", "background")]
+    with torch.no_grad():
+        net.backbone.stem[0][0].weight /= 64
+    net.backbone.scaled = False
     image = torch.zeros(1, SIZE_WH[1], SIZE_WH[0], 3, dtype=torch.uint8)
     sizes = {0: "n", 1: "h", 2: "w"}
-    rows = tuple(torch.zeros(2, n * (CHANNELS + 2)) for n in cells)
+    rows = tuple(torch.zeros(2, p.cells * (p.channels + 2)) for p in net.head.parts)
     names = ("fg", "bg", "foreground", "background")
     plain: dict[str, Any] = {"dynamo": False, "opset_version": 17}
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
@@ -886,6 +1083,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--no-render", action="store_true", help="use the cache only, as another process fills it")
     for name in ("--sparse", "--val-sparse", "--tracks"):
         add(name, type=pair, action="append", default=[], metavar="IMAGES=PATH")
+    add("--scannet", type=Path, action="append", default=[], metavar="DIR")
     add("--scenes", type=int, default=3, help="scenes a step")
     add("--views", type=int, default=8, help="views of each scene")
     add("--steps", type=int, default=3000)
@@ -895,6 +1093,10 @@ def build_parser() -> argparse.ArgumentParser:
     add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)
+    add("--ahead", type=int, default=0, help="batches that a second process makes ahead (0: none)")
+    add(
+        "--loss", choices=("triplet", "soft"), default="soft", help="semi-hard negative or soft max"
+    )
     add("--start", type=Path, help="take the backbone of this checkpoint (.pt) to begin with")
     add("--resume", action="store_true", help="go on from OUT/last.pt")
     return parser
@@ -903,13 +1105,14 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Train, draw the curves, export."""
     args = build_parser().parse_args(argv)
+    cv2.setNumThreads(0)  # a forked process has no threads of its parent
     trainer = Trainer(args)
     trainer.run()
     trainer.take_best()
     out: Path = args.out
     draw_curves(out / "log.csv", out / "curves.png")
     summary = {"steps": trainer.step, "seed": args.seed, "minutes": round(trainer.seconds / 60, 1)}
-    summary |= {"rooms": len(trainer.pool.rooms), "torch": torch.__version__}
+    summary |= {"rooms": trainer.loader.rooms, "torch": torch.__version__}
     export(trainer.net, out, summary)
     print(f"{out / 'reobj.onnx'}: use it with --embed {out / 'reobj.onnx'}")
     return 0

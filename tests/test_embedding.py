@@ -69,6 +69,32 @@ def test_small_boxes_reach_further() -> None:
     assert np.ptp(near.index % 100) * 4 <= 20 and np.ptp(far.index % 100) * 4 >= 76
 
 
+def test_surroundings_hold_other_objects_but_not_the_own() -> None:
+    masks = np.zeros((2, 200, 400), bool)
+    masks[0, 80:120, 180:220] = masks[1, :, 240:] = True
+    found = boxes((180, 80, 220, 120), (240, 0, 400, 200), masks=masks)
+    layout = rt.EmbedConfig(context=0.5, samples=4, wide=1.5, wide_reach=0.2, wide_cells=5)
+    fore, near, wide = samples(found, layout)
+    column = wide.index[0] % 100
+    assert (column.min() * 4, column.max() * 4) == (104, 292)  # 200 -+ (20 + .2 * 400), 4 px a cell
+    assert (
+        wide.weight[0][column > 60].all() and not (wide.weight[0] & masks_at(masks[0], wide)).any()
+    )
+    assert wide.share.shape == (1 + 1, 5, 5) and wide.share[0, 2, 2] == 0
+    np.testing.assert_allclose(wide.others[0][:, 4], 1.0)
+    inputs = rt.head_inputs(
+        [fore, near, wide], [np.zeros((*p.share.shape, 7)) for p in (fore, near, wide)]
+    )
+    assert [i.shape[1] for i in inputs] == [4 * 9, (16 + 25) * 9]
+
+
+def test_foreground_reads_only_its_channels() -> None:
+    layout = rt.EmbedConfig(wide=1.0, foreground_channels=2)
+    parts = samples(boxes((100, 50, 200, 150)), layout)
+    means = rt.cell_means(np.ones((50, 100, 5), np.float32), parts, layout)
+    assert [m.shape[-1] for m in means] == [2, 5, 5]
+
+
 @pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])
 def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
     for part in samples(boxes(box)):
@@ -190,22 +216,26 @@ def test_colour_channels_are_those_of_the_training_free_descriptor(te) -> None:
 
     image, _ = scene_with_twins()
     image = cv2.GaussianBlur(image, (0, 0), 2)[:, :320]
-    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].float() / 255
+    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].float()
     own = te.ColourMap()(planes)[0].numpy().transpose(1, 2, 0)  # (60, 80, 17)
     other = cv2.resize(rt._colour_features(image), (80, 60), interpolation=cv2.INTER_AREA)
     assert np.corrcoef(own[..., :11].ravel(), other[..., :11].ravel())[0, 1] > 0.98
 
 
-@pytest.mark.parametrize(("hard", "expected"), [(True, 0.9), (False, 0.5)])
-def test_triplet_loss_picks_the_negative(te, hard: bool, expected: float) -> None:
-    """Anchor 0, positive 1 at cosine .6, negatives at .9 (hardest) and .5 (semi-hard)."""
+@pytest.mark.parametrize(
+    ("hard", "soft", "expected"), [(True, False, 0.9), (False, False, 0.5), (False, True, 0.9018)]
+)
+def test_triplet_loss_picks_the_negative(te, hard: bool, soft: bool, expected: float) -> None:
+    """Anchor 0, positive 1 at cosine .6, negatives at .9 (hardest) and .5 (semi-hard); their soft
+    maximum is .1 log(e^9 + e^5).
+    """
     import torch
 
     cosines = (1.0, 0.6, 0.9, 0.5)
     rows = torch.tensor([[c, (1 - c * c) ** 0.5] for c in cosines])
     same, different = torch.zeros(4, 4, dtype=torch.bool), torch.zeros(4, 4, dtype=torch.bool)
     same[0, 1] = different[0, 2] = different[0, 3] = True
-    loss = float(te.triplet_loss(rows, same, different, hard))
+    loss = float(te.triplet_loss(rows, same, different, hard, soft))
     assert loss == pytest.approx(0.1 * np.log1p(np.exp((expected - 0.6) / 0.1)), abs=1e-4)
 
 
@@ -222,8 +252,43 @@ def test_mot_tracks_become_a_clip(te, tmp_path) -> None:
         "1,7,100,100,200,200,.9,-1,-1,-1\n2,7,90,90,200,200,.9,-1,-1,-1\n"
     )
     clip = te.tracks_clip(tmp_path / "images", tmp_path / "tracks.txt")
-    assert [i.tolist() for i in clip.identity] == [[7], [7]]
+    assert [i.tolist() for i in clip.identity] == [[0], [0]] and clip.labels is None
     np.testing.assert_allclose(clip.xyxy[0], [[75, 75, 225, 225]])  # 480 px on the longer side
+
+
+def test_tracks_take_the_masks_of_the_detections(te, tmp_path) -> None:
+    """Of those beside tracks.txt and of the cache of `run`; by box, whatever their order."""
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "0.png"), np.zeros((240, 320, 3), np.uint8))
+    rows = ["1,7,100,100,80,100,.9,-1,-1,-1", "1,9,10,10,40,40,.9,-1,-1,-1"]
+    (tmp_path / "tracks.txt").write_text("\n".join(rows))
+    masks = np.zeros((3, 240, 320), bool)
+    masks[0, 10:50, 10:50] = masks[1, 150:200, 100:180] = masks[2, 210:, 200:] = True
+    found = boxes((10, 10, 50, 50), (100, 100, 180, 200), (200, 210, 320, 240), masks=masks)
+    rt.write_detections_npz(tmp_path / "cache/d/chunk_000000.npz", [(0, found)], [], (320, 240))
+    clip = te.tracks_clip(tmp_path / "images", tmp_path / "tracks.txt")
+    expected = masks[1] * 1 + masks[0] * 2
+    np.testing.assert_array_equal(clip.labels[0], expected)
+    np.testing.assert_array_equal(np.sort(clip.identity[0]), [0, 1])
+
+
+def test_scannet_folders_become_a_clip(te, tmp_path) -> None:
+    for name in ("color", "instance-filt"):
+        (tmp_path / name).mkdir()
+    label = np.zeros((240, 320), np.uint8)
+    label[20:120, 30:100], label[50:200, 150:250] = 3, 5  # objects 2 and 4
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / "color" / f"{i}.jpg"), np.full((480, 640, 3), 90, np.uint8))
+        cv2.imwrite(str(tmp_path / "instance-filt" / f"{i}.png"), label)
+    groups = [{"objectId": 2, "label": "chair"}, {"objectId": 4, "label": "chair"}]
+    (tmp_path / "x.aggregation.json").write_text(json.dumps({"segGroups": groups}))
+    clip = te.scannet_clip(tmp_path)
+    assert len(clip.images) == 2 and clip.images[0].shape == (360, 480, 3)
+    np.testing.assert_allclose(clip.xyxy[1][0], [45, 30, 150, 180])
+    assert len(set(clip.identity[0].tolist())) == 2 and len(set(clip.look[0].tolist())) == 1
+    for box, identity in zip(clip.xyxy[0].astype(int), clip.identity[0], strict=True):
+        inner = clip.labels[0][box[1] + 2 : box[3] - 2, box[0] + 2 : box[2] - 2]
+        assert (inner == identity + 1).all()
 
 
 @pytest.mark.parametrize("command", [["-o", "x"], ["-o", "x", "--sparse", "no=where"]])
