@@ -106,9 +106,7 @@ COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in COCO_CLAS
 
 
 def _opt(default: Any, text: str, flag: str = "") -> Any:
-    """Declare a config field: its default, its help text and, for the few that users need, its
-    flag.
-    """
+    """Declare a config field: default, help text and, for the few that users need, a flag."""
     return field(default=default, metadata={"help": text, "flag": flag})
 
 
@@ -126,28 +124,20 @@ class InputConfig:
 class DetectConfig:
     """Object detection."""
 
-    model: str = _opt(
-        "deimv2-femto", "detector: a name of `models`, or an .onnx file", "--detector"
-    )
+    model: str = _opt("deimv2-femto", "detector: a name of `models`, or a .onnx file", "--detector")
     min_score: float = _opt(0.1, "detections below this score are never used (ByteTrack: .1)")
     nms_iou: float = _opt(0.6, "class-wise NMS overlap for models that need NMS (NanoDet: .6)")
     classes: str = _opt("", "comma-separated class names to keep (default: all)", "--classes")
-    class_names: str = _opt(
-        "", "text file with one class name a line, for models and files that are not COCO"
-    )
+    class_names: str = _opt("", "text file, one class name a line, where they are not COCO's")
     max_detections: int = _opt(100, "detections kept a frame, best scores first")
 
 
 @dataclass(frozen=True, slots=True)
 class PosesConfig:
-    """Camera poses: keyframes, reconstruction, PnP. Numbers measured in pycolmap.md of the design
-    notes.
-    """
+    """Camera poses: keyframes, reconstruction, PnP. How the numbers came about: docs/poses.md."""
 
     mode: str = _opt(
-        "auto",
-        "auto: reconstruct with pycolmap; none: 2D only; or a file or folder of poses",
-        "--poses",
+        "auto", "auto: reconstruct; none: 2D only; or a file or folder of poses", "--poses"
     )
     fmt: str = _opt(
         "auto",
@@ -161,18 +151,14 @@ class PosesConfig:
         "--camera",
     )
     size_px: int = _opt(640, "longer side of the working images")
-    max_flow: float = _opt(
-        0.12, "new keyframe when the median flow since the last passes this share of the width"
-    )
+    max_flow: float = _opt(0.12, "new keyframe at this median flow since the last, over the width")
     min_ratio: float = _opt(0.55, "new keyframe when fewer of the corners than this survive")
     max_keyframes: int = _opt(150, "upper bound on keyframes; max_flow grows until it fits")
     overlap: int = _opt(12, "sequential matching: neighbours at offsets 1, 2, 4 ... 2^(overlap-1)")
     exhaustive_below: int = _opt(30, "match all pairs when there are no more keyframes than this")
     min_registered: float = _opt(0.5, "refuse a model with fewer of the keyframes than this")
     min_points: int = _opt(100, "refuse a model with fewer 3D points")
-    min_tri_angle_deg: float = _opt(
-        1.5, "refuse a model whose median triangulation angle is smaller"
-    )
+    min_tri_angle_deg: float = _opt(1.5, "refuse a model of a smaller median triangulation angle")
     pnp_points: int = _opt(200, "3D points tracked from each keyframe into the frames between")
     pnp_min_inliers: int = _opt(15, "accept a PnP pose with at least this many inliers")
     pnp_min_ratio: float = _opt(0.5, "and at least this share of inliers")
@@ -181,78 +167,52 @@ class PosesConfig:
     corners: int = _opt(300, "corners followed to choose keyframes")
     min_corners: int = _opt(20, "with fewer corners a frame counts as textureless")
     min_keyframes: int = _opt(40, "with fewer keyframes max_flow is halved, down to min_flow")
-    max_interval: int = _opt(
-        60, "new keyframe after this many frames if the camera moved at all (min_flow)"
-    )
+    max_interval: int = _opt(60, "new keyframe after this many frames if the camera moved at all")
     min_flow: float = _opt(0.015, "share of the width that counts as motion")
-    sharp_window: float = _opt(
-        0.7, "the sharpest frame is taken once the flow passed this share of max_flow"
-    )
+    sharp_window: float = _opt(0.7, "from this share of max_flow on the sharpest frame is taken")
     klt_window_px: int = _opt(15, "Lucas-Kanade window on the working image")
     klt_error_px: float = _opt(1.0, "forward-backward error of a followed point")
-    cache_mb: int = _opt(
-        1000, "gray working images kept in memory; beyond it the video is read twice"
-    )
+    cache_mb: int = _opt(1000, "gray images kept in memory; beyond it the video is read twice")
     sift_features: int = _opt(2000, "SIFT features a keyframe (4096: slower, no better)")
     sift_contrast: float = _opt(0.02, "SIFT contrast threshold")
-    sift_contrast_low: float = _opt(
-        0.007, "SIFT contrast threshold where less than sift_few features are found"
-    )
+    sift_contrast_low: float = _opt(0.007, "the same where fewer than sift_few features are found")
     sift_few: int = _opt(500, "see sift_contrast_low")
     loop_pairs: int = _opt(6, "look-alike keyframes matched with each keyframe, to close loops")
     loop_words: int = _opt(64, "visual words that describe the look of a keyframe")
     loop_sample: int = _opt(20000, "descriptors clustered into words")
     focal_guess: float = _opt(0.8, "first focal length over the longer side (phones .72-.85)")
-    good_registered: float = _opt(
-        0.9, "take the first healthy model with this share of the keyframes"
-    )
-    min_points_per_image: int = _opt(
-        30, "refuse a model with fewer 3D points seen in the median image"
-    )
+    good_registered: float = _opt(0.9, "take the first sound model with this share of keyframes")
+    min_points_per_image: int = _opt(30, "refuse a model with fewer 3D points in the median image")
     min_parallax_px: float = _opt(
-        3.0, "refuse a model that pure turns explain to this (turns: < 1.5, walks: > 4)"
+        3.0, "refuse what turns explain to this (turns: < 1.5, walks: > 4)"
     )
     strong_tri_angle_deg: float = _opt(
-        5.0, "trust a self-calibrated focal length from this triangulation angle on"
+        5.0, "trust a self-calibrated focal length from this angle on"
     )
-    strong_spread: float = _opt(
-        0.1, "and from this spread of the cameras over the scene's depth on"
-    )
-    focal_range: tuple[float, float] = _opt(
-        (0.4, 2.0), "and only when focal / longer side lies in here"
-    )
+    strong_spread: float = _opt(0.1, "and from this spread of the cameras over the depth on")
+    focal_range: tuple[float, float] = _opt((0.4, 2.0), "and if focal / longer side lies in here")
     tri_sample: int = _opt(2000, "points used for the median triangulation angle")
     match_chunk: int = _opt(100, "pairs of keyframes matched between two ticks of the progress")
-    refine_px: float = _opt(
-        0.5, "scale of the robust (soft L1) loss of the last adjustment, px of the working image"
-    )
+    refine_px: float = _opt(0.5, "soft L1 loss of the last adjustment, px of the working image")
     min_part: int = _opt(3, "keyframes that make a separate reconstruction worth keeping")
-    join_objects: int = _opt(
-        4, "objects seen in two separate reconstructions that must agree before they are joined"
-    )
+    join_objects: int = _opt(4, "objects that must agree before two reconstructions are joined")
     max_center_shift: float = _opt(
-        0.05, "calibrate the principal point unless it moves by more than this share of the size"
+        0.05, "most that the principal point may move, share of the size"
     )
     smooth: int = _opt(0, "smooth the path over this many frames (odd; 0: leave the hand's shake)")
     pnp_error_px: float = _opt(4.0, "PnP inlier threshold on the working image")
     max_run: int = _opt(1000, "frames held at once between two keyframes")
-    pose_tolerance: float = _opt(
-        5e-3, "how far supplied rotations may be from exact (7-Scenes: 1e-3)"
-    )
-    max_focal_spread: float = _opt(
-        0.02, "supplied cameras of one video may differ in focal length by this share"
-    )
+    pose_tolerance: float = _opt(5e-3, "how far supplied rotations may be off (7-Scenes: 1e-3)")
+    max_focal_spread: float = _opt(0.02, "how far supplied focal lengths may differ, a share")
     lone_frame_s: float = _opt(1 / 60, "half a frame interval when there is only one frame")
     check_tracks: int = _opt(3, "direction check: tracks needed")
     check_views: int = _opt(5, "direction check: frames of a track needed")
     check_most_tracks: int = _opt(200, "direction check: tracks used at most")
     check_most_views: int = _opt(40, "direction check: frames of a track used at most")
-    check_angle_deg: float = _opt(
-        1.0, "direction check: never complain when the tracks meet within this angle"
-    )
+    check_angle_deg: float = _opt(1.0, "direction check: good when the tracks meet within this")
     check_ratio: float = _opt(0.3, "direction check: another reading must be better by this factor")
     max_step_ratio: float = _opt(
-        5.0, "refuse a PnP pose further from its neighbours than this times the median step"
+        5.0, "refuse PnP poses this many median steps off their neighbours"
     )
 
 
@@ -378,50 +338,28 @@ class TrackerConfig:
 class ObjectsConfig:
     """From tracks and cameras to one solid and ellipsoid per object."""
 
-    priors: str = _opt(
-        "", "size priors by category, JSON (default: the priors.json beside this file)", "--priors"
-    )
-    known_size: str = _opt(
-        "", "metric scale from known heights: 'chair=0.82m,door=2.0m'", "--known-size"
-    )
+    priors: str = _opt("", "size priors, JSON (default: priors.json beside this file)", "--priors")
+    known_size: str = _opt("", "known heights for the scale: 'chair=.82m,door=2m'", "--known-size")
     support: str = _opt("auto", "shape of the solids: auto, box, cylinder, ellipsoid", "--support")
-    up: str = _opt(
-        "", "world direction against gravity: x,y,z (default: from the poses or the objects)"
-    )
+    up: str = _opt("", "up in the world: x,y,z (default: from the poses or the objects)")
     link: bool = _opt(True, "join and split tracklets by 3D evidence")
-    look_ratio: float = _opt(
-        1.3, "join by looks only what is this much nearer than any rival (cosine distance)"
-    )
+    look_ratio: float = _opt(1.3, "join by looks what is this much nearer than any rival (cosine)")
     look_gap: int = _opt(30, "views of a tracklet this many frames apart show how looks vary")
     look_prior: tuple[float, float] = _opt(
-        (0.09, 0.18), "1 - cosine of one object and of two before the video has shown any"
+        (0.09, 0.18), "1 - cosine of one object, of two, at first"
     )
     look_prior_weight: float = _opt(10.0, "number of observed pairs that these are worth")
-    double_iou: float = _opt(
-        0.5, "boxes of a frame that overlap more may be two boxes on one object (IoU)"
-    )
-    link_look: float = _opt(
-        -1.0, "never join by place what looks less alike than this (log of the distance ratio)"
-    )
-    link_class: float = _opt(
-        0.1, "join by place only where the detector's classes agree in this share of the scores"
-    )
-    link_place: float = _opt(
-        0.25, "candidates for a join overlap at least this much when cross-projected (IoU)"
-    )
+    double_iou: float = _opt(0.5, "boxes that overlap more may be two boxes on one object (IoU)")
+    link_look: float = _opt(-1.0, "never join by place what looks less alike (log distance ratio)")
+    link_class: float = _opt(0.1, "join by place only where the classes agree in this share")
+    link_place: float = _opt(0.25, "candidates for a join overlap this much cross-projected (IoU)")
     keep_iou: float = _opt(
-        0.4, "a join is kept if the joint solid overlaps the boxes at least this much (IoU)"
+        0.4, "a join is kept if the joint solid overlaps the boxes by this (IoU)"
     )
-    keep_share: float = _opt(
-        0.6, "in at least this share of the frames of either part (OA-SLAM: half)"
-    )
+    keep_share: float = _opt(0.6, "in this share of the frames of either part (OA-SLAM: half)")
     cut_gap: int = _opt(5, "tracklets may be split where this many frames pass without a detection")
-    split_drop: float = _opt(
-        0.7, "a return is doubted if its joint solid overlaps its boxes less than this share"
-    )
-    split_place: float = _opt(
-        0.1, "a return is undone when the two places overlap less than this (IoU)"
-    )
+    split_drop: float = _opt(0.7, "a return is doubted if its joint solid overlaps less, a share")
+    split_place: float = _opt(0.1, "a return is undone where two places overlap less (IoU)")
     min_views: int = _opt(3, "objects with fewer detections in frames with poses get no ellipsoid")
     min_score: float = _opt(0.3, "boxes below this score do not shape the ellipsoid")
     moving: str = _opt(
@@ -525,9 +463,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A COLMAP camera: model name, size in pixels, parameters in COLMAP's order (centre of pixel 0
-    at .5).
-    """
+    """A COLMAP camera: model, size in pixels, parameters in its order (centre of pixel 0 at .5)."""
 
     model: str
     width: int
@@ -537,33 +473,19 @@ class Camera:
     @property
     def K(self) -> Array:
         """(3, 3) pinhole part of the intrinsics."""
-        one_focal = self.model in (
-            "SIMPLE_PINHOLE",
-            "SIMPLE_RADIAL",
-            "RADIAL",
-            "SIMPLE_RADIAL_FISHEYE",
-            "RADIAL_FISHEYE",
-        )
+        one_focal = self.model.startswith("SIMPLE_") or self.model in ("RADIAL", "RADIAL_FISHEYE")
         fx, fy, cx, cy = (self.params[0], *self.params[:3]) if one_focal else self.params[:4]
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def undistort(self, xy: Array) -> Array:
-        """Map (..., 2) image pixels to the pixels of an ideal pinhole camera with the same K; NaN
-        stays.
-        """
-        import pycolmap
-
-        camera = pycolmap.Camera(
-            model=self.model, width=self.width, height=self.height, params=list(self.params)
-        )
+        """Map (..., 2) pixels to those of an ideal pinhole camera with the same K; NaN stays."""
+        camera = _pycolmap_camera(self, (self.width, self.height))
         flat = np.asarray(xy, np.float64).reshape(-1, 2)
         ideal = np.full_like(flat, np.nan)
         good = np.isfinite(flat).all(1)
         if good.any():
-            ideal[good] = (
-                np.asarray(camera.cam_from_img(flat[good]), np.float64) @ self.K[:2, :2].T
-                + self.K[:2, 2]
-            )
+            rays = np.asarray(camera.cam_from_img(flat[good]), np.float64)
+            ideal[good] = rays @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
 
 
@@ -608,18 +530,11 @@ class Poses:
 
 
 class Progress:
-    """One progress line a stage on stderr with rate and time left; silent when stderr is no
-    terminal.
-    """
+    """One line a stage on stderr with rate and time left; silent when stderr is no terminal."""
 
     def __init__(self, stage: str, total: int = 0) -> None:
-        self.stage, self.total, self.done, self.started, self.shown = (
-            stage,
-            total,
-            0,
-            time.monotonic(),
-            0.0,
-        )
+        self.stage, self.total, self.done = stage, total, 0
+        self.started, self.shown = time.monotonic(), 0.0
         self.enabled = sys.stderr.isatty()
 
     def step(self, n: int = 1) -> None:
@@ -3698,8 +3613,7 @@ def similarity(points: Array, target: Array) -> tuple[float, Array, Array]:
 
 
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
-    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; None for an
-    empty text.
+    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; "": None.
 
     >>> parse_camera("500,500,320,240", (640, 480)).model
     'PINHOLE'
@@ -3713,8 +3627,8 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
             camera = Camera("OPENCV" if len(numbers) == 8 else "PINHOLE", *size, tuple(numbers))
             return _checked_camera(camera, f"--camera {text}")
     raise ReobjError(
-        f"--camera {text!r}: expected fx,fy,cx,cy[,k1,k2,p1,p2], pixels of the {size[0]}x{size[1]} "
-        "frames"
+        f"--camera {text!r}: expected fx,fy,cx,cy[,k1,k2,p1,p2], pixels of frames "
+        f"of {size[0]}x{size[1]}"
     )
 
 
@@ -3724,9 +3638,7 @@ def _checked_camera(camera: Camera, where: str) -> Camera:
     if (np.abs(centre - size / 2) > 0.2 * size).any() or not 0.1 < focal / size.max() < 10:
         raise ReobjError(
             f"{where}: focal length {focal:.0f} px and centre ({centre[0]:.0f}, {centre[1]:.0f}) "
-            "do not fit images of "
-            f"{size[0]}x{size[1]}; give the intrinsics of the frames as they are read (rotated? "
-            "resized?)"
+            f"do not fit frames of {size[0]}x{size[1]} as they are read (rotated? resized?)"
         )
     return camera
 
@@ -3753,9 +3665,7 @@ def estimate_poses(
         helps.
     """
     if getattr(video, "is_live", False):
-        raise ReobjError(
-            "poses of a live camera cannot be reconstructed: record a video first, or --poses none"
-        )
+        raise ReobjError("a live camera gives no poses: record a video first, or --poses none")
     size = (int(video.size[0]), int(video.size[1]))
     camera, work = parse_camera(config.camera, size), _WorkVideo(video, config)
     keys = _enough_keyframes(work, config, progress("keyframes", video.expected))
@@ -3846,9 +3756,8 @@ def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
     step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
     text = (
         f"{(~known).sum()} of {len(frame)} frames have no pose (frames "
-        f"{_spans(frame[~known].tolist(), step)}): these "
-        "parts do not connect to the rest; slower turns, fewer blurred frames and more texture "
-        "help, or give --poses"
+        f"{_spans(frame[~known].tolist(), step)}): these parts do not connect to the rest; slower "
+        "turns, fewer blurred frames and more texture help, or give --poses"
     )
     return [] if known.all() else [text]
 
@@ -3858,9 +3767,7 @@ def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class _WorkImage:
-    """One frame at working size: its place in the video, source frame number, time, BGR and gray
-    image.
-    """
+    """One frame at working size: place in the video, source frame number, time, BGR, gray."""
 
     place: int
     frame: int
@@ -3870,9 +3777,7 @@ class _WorkImage:
 
 
 class _WorkVideo:
-    """A video at working size; gray images are kept in memory up to `cache_mb`, beyond it the video
-    is read again.
-    """
+    """A video at working size; gray images are kept up to `cache_mb`, else it is read again."""
 
     def __init__(self, video: Any, config: PosesConfig) -> None:
         self.video, self.config, self.used_mb = video, config, 0.0
@@ -3882,17 +3787,9 @@ class _WorkVideo:
 
     def __iter__(self) -> Iterator[_WorkImage]:
         for place, frame in enumerate(self.video):
-            height, width = frame.image.shape[:2]
-            scale = min(1.0, self.config.size_px / max(height, width))
-            size = (max(1, round(width * scale)), max(1, round(height * scale)))
-            bgr = (
-                frame.image
-                if scale == 1
-                else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-            )
-            yield _WorkImage(
-                place, frame.index, frame.time_s, bgr, cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
-            )
+            bgr = _shrunk(frame.image, self.config.size_px)
+            gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+            yield _WorkImage(place, frame.index, frame.time_s, bgr, gray)
 
     def first_pass(self, line: Progress) -> Iterator[_WorkImage]:
         for work in self:
@@ -3906,27 +3803,18 @@ class _WorkVideo:
         line.close()
 
     def grays(self) -> Iterator[Image]:
-        return (
-            (work.gray for work in self)
-            if self.used_mb > self.config.cache_mb
-            else iter(self.cache)
-        )
+        kept = self.used_mb <= self.config.cache_mb
+        return iter(self.cache) if kept else (work.gray for work in self)
 
 
 def _klt(old: Image, new: Image, xy: Array, config: PosesConfig) -> tuple[Array, BoolArray]:
-    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back to where
-    they began.
-    """
+    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back."""
     if not len(xy):
         return xy, np.zeros(0, bool)
-    start = xy.astype(np.float32).reshape(-1, 1, 2)
-    window = (config.klt_window_px, config.klt_window_px)
-    ahead, found, _ = cv2.calcOpticalFlowPyrLK(
-        old, new, start, np.empty_like(start), winSize=window
-    )
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        new, old, ahead, np.empty_like(start), winSize=window
-    )
+    start, window = xy.astype(np.float32).reshape(-1, 1, 2), (config.klt_window_px,) * 2
+    flow: Any = cv2.calcOpticalFlowPyrLK
+    ahead, found, _ = flow(old, new, start, None, winSize=window)
+    back, found_back, _ = flow(new, old, ahead, None, winSize=window)
     error = np.linalg.norm(back - start, axis=2)[:, 0]  # (N,)
     kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < config.klt_error_px)
     return ahead[:, 0].astype(np.float64), kept
@@ -3945,12 +3833,8 @@ class _FlowSinceKeyframe:
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
     def step(self, gray: Image) -> tuple[float, float]:
-        """Follow into the next frame: median flow since the keyframe over the width, share of
-        corners left.
-        """
-        if (
-            self.count < self.config.min_corners
-        ):  # textureless so far: a keyframe as soon as there is something
+        """Follow into the next frame: median flow since the keyframe over the width, share left."""
+        if self.count < self.config.min_corners:  # textureless: a keyframe as soon as there is more
             return 0.0, float(len(self.corners(gray)) < self.config.min_corners)
         ahead, kept = _klt(self.gray, gray, self.at, self.config)
         self.start, self.at, self.gray = self.start[kept], ahead[kept], gray
@@ -3959,8 +3843,7 @@ class _FlowSinceKeyframe:
 
 
 def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_WorkImage]:
-    """Choose keyframes by optical flow, the sharpest near the threshold; the first and the last
-    frame are among them.
+    """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
     When there are more than `max_keyframes`, every second one is dropped and the spacing doubles:
     one pass, bounded memory, the same choice every time.
@@ -3977,25 +3860,16 @@ def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_Wo
         flow, left = track.step(work.gray)
         if flow >= config.sharp_window * wider * config.max_flow:
             window.append(work)
-        due = flow > wider * config.max_flow or left < config.min_ratio**wider
-        if due or (
-            work.place - track.place >= wider * config.max_interval and flow > config.min_flow
-        ):
-            best = max(
-                window or [work], key=lambda w: float(cv2.Laplacian(w.gray, cv2.CV_32F).var())
-            )
+        late = work.place - track.place >= wider * config.max_interval and flow > config.min_flow
+        if late or flow > wider * config.max_flow or left < config.min_ratio**wider:
+            best = max(window or [work], key=lambda w: cv2.Laplacian(w.gray, cv2.CV_32F).var())
             again.extendleft(w for w in reversed(window) if w.place > best.place)
             keys.append(best)
             if len(keys) > config.max_keyframes:
                 keys, wider = keys[::2], 2 * wider
             window, track = [], _FlowSinceKeyframe(best, config)
-    if (
-        work is not None
-        and work.place > keys[-1].place
-        and (flow > config.min_flow or len(keys) == 1)
-    ):
-        keys.append(work)
-    return keys
+    moved = flow > config.min_flow or len(keys) == 1
+    return [*keys, work] if work is not None and work.place > keys[-1].place and moved else keys
 
 
 # Frames between the keyframes: points followed from both sides, PnP
@@ -4004,8 +3878,7 @@ def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_Wo
 def _locate_between(
     model: _SparseModel, places: IntArray, video: _WorkVideo, config: PosesConfig, line: Progress
 ) -> tuple[Array, npt.NDArray[np.str_], Array]:
-    """Locate every frame by PnP from points followed from the registered keyframes before and after
-    it.
+    """Locate every frame by PnP from points followed from the keyframes before and after it.
 
     Args:
         places: (R,) place in the video of each registered keyframe, ascending.
@@ -4060,21 +3933,16 @@ def _segments(
 def _follow(
     model: _SparseModel, row: int, images: list[Image], config: PosesConfig
 ) -> list[tuple[IntArray, Array]]:
-    """Follow the longest-seen 3D points of a keyframe (row; -1: none) from the first image through
-    the others.
+    """Follow the longest-seen 3D points of a keyframe (row; -1: none) through the images.
 
     Returns:
         per image: rows of `model.points` (n,) and their native pixels (n, 2), COLMAP convention.
     """
     seen = np.flatnonzero(model.obs_image == row)
-    seen = seen[
-        np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")[: config.pnp_points]
-    ]
+    longest = np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")
+    seen = seen[longest[: config.pnp_points]]
     scale = np.array(images[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
-    rows, xy = (
-        model.obs_point[seen],
-        model.obs_xy[seen] * scale - 0.5,
-    )  # OpenCV: pixel centres at whole numbers
+    rows, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5  # OpenCV: centres at 0
     followed = [(rows, model.obs_xy[seen])]
     for old, new in itertools.pairwise(images):
         ahead, kept = _klt(old, new, xy, config)
@@ -4084,26 +3952,22 @@ def _follow(
 
 
 def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
-    """Mark frames whose centre is a detour: much further from both neighbours than these are from
-    each other.
-    """
+    """Mark frames whose centre is a detour: far from both neighbours, which are near each other."""
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     jump = np.zeros(len(cam_from_world), bool)
     if len(known) > 2:
         centre = invert_rigid(cam_from_world[known])[:, :, 3]  # (N, 3)
         step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
         direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
-        jump[known[1:-1]] = step[1:] + step[:-1] - direct > ratio * np.maximum(
-            direct, np.median(step)
-        )
+        usual = np.maximum(direct, np.median(step))
+        jump[known[1:-1]] = step[1:] + step[:-1] - direct > ratio * usual
     return jump
 
 
 def fill_gaps(
     frame: IntArray, cam_from_world: Array, status: npt.NDArray[np.str_], max_gap: int
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line;
-    never beyond.
+    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line.
 
     (Interpolating t of cam_from_world instead would bend the path.)
     """
@@ -4113,9 +3977,8 @@ def fill_gaps(
         if b - a > 1 and frame[b] - frame[a] - 1 <= max_gap:
             share = (frame[a + 1 : b] - frame[a]) / (frame[b] - frame[a])  # (n,)
             ends = invert_rigid(cam_from_world[[a, b]])  # (2, 3, 4) world_from_cam
-            turn = Slerp([0, 1], Rotation.from_matrix(ends[:, :, :3]))(
-                share
-            ).as_matrix()  # (n, 3, 3)
+            between = Slerp([0, 1], Rotation.from_matrix(ends[:, :, :3]))
+            turn = between(share).as_matrix()  # (n, 3, 3)
             centre = ends[0, :, 3] + share[:, None] * (ends[1, :, 3] - ends[0, :, 3])  # (n, 3)
             filled[a + 1 : b] = invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
             status[a + 1 : b] = "interpolated"
@@ -4144,8 +4007,7 @@ def smooth_path(cam_from_world: Array, frames: int) -> Array:
 
 _ADVICE = (
     "move the camera sideways around the objects (turning on the spot gives no depth), keep things "
-    "with texture in "
-    "view, avoid blurred frames, or give --poses; identities in 2D do not need poses"
+    "with texture in view, avoid blurred frames, or give --poses; identities in 2D need none"
 )
 _CHILD_CODE = """
 import importlib.util, sys
@@ -4169,9 +4031,7 @@ def _run_sfm(
     work_dir: Path,
     progress: Callable[[str, int], Progress],
 ) -> list[str]:
-    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why and
-    what helps.
-    """
+    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why."""
     folder = work_dir / "mapping"
     if len(keys) < 3:
         return [f"no camera poses: only {len(keys)} different views; {_ADVICE}"]
@@ -4181,7 +4041,6 @@ def _run_sfm(
     scale = np.tile(np.array(keys[0].gray.shape[::-1]) / size, 2)
     job = {
         "names": names,
-        "frames": [key.frame for key in keys],
         "boxes": [(xyxy * scale).tolist() for xyxy in boxes],
         "camera": None if camera is None else [camera.model, list(camera.params)],
         "size": size,
@@ -4205,19 +4064,9 @@ def _run_sfm(
 
 
 def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Progress]) -> list[str]:
-    """Run `_sfm_child` in a fresh interpreter, so that neither an abort nor chatter of COLMAP
-    reaches the user.
-    """
+    """Run `_sfm_child` in a fresh interpreter: COLMAP's aborts and chatter stay there."""
     here = Path(__file__).resolve()
-    command = [
-        sys.executable,
-        "-c",
-        _CHILD_CODE,
-        here.stem,
-        str(here),
-        str(here.parent),
-        str(folder),
-    ]
+    command = [sys.executable, "-c", _CHILD_CODE, here.stem, *map(str, (here, here.parent, folder))]
     lines: list[Progress] = []
     with (
         open(log_path, "wb") as errors,
@@ -4245,9 +4094,7 @@ def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Prog
 
 
 def _sfm_child(folder_name: str) -> None:
-    """Child process: reconstruct the keyframes of a job folder; writes messages.json and, if it
-    went well, sparse/.
-    """
+    """Child process: reconstruct the keyframes of a job folder into messages.json and sparse/."""
     pc = _pycolmap()
     pc.logging.minloglevel = 0  # stderr is the log file here
     folder = Path(folder_name)
@@ -4262,7 +4109,7 @@ def _sfm_child(folder_name: str) -> None:
     found = []
     for guess in job["guesses"] or [0.0]:  # 0: the intrinsics are given
         tried = dataclasses.replace(config, focal_guess=guess)
-        found.append(_sfm_ladder(database, job["frames"], not guess, tried))
+        found.append(_sfm_ladder(database, len(images), not guess, tried))
         if found[-1][2]:
             break
     models, messages, _ = max(found, key=lambda f: (f[2], len(f[0])))
@@ -4297,14 +4144,10 @@ def _pycolmap() -> Any:
 
 def _pycolmap_camera(camera: Camera, size: tuple[int, int]) -> Any:
     """Make pycolmap's camera, for images of another size."""
-    made = _pycolmap().Camera(
-        camera_id=1,
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
-    )
-    made.rescale(*size)
+    facts = {"model": camera.model, "width": camera.width, "height": camera.height}
+    made = _pycolmap().Camera(camera_id=1, params=list(camera.params), **facts)
+    if (camera.width, camera.height) != size:
+        made.rescale(*size)
     return made
 
 
@@ -4312,7 +4155,6 @@ def _pycolmap_camera(camera: Camera, size: tuple[int, int]) -> Any:
 class _SparseModel:
     """A COLMAP model as arrays; images by ascending id."""
 
-    image_id: list[int]
     names: tuple[str, ...]
     cameras: list[Camera]  # (R,) of each image
     cam_from_world: Array  # (R, 3, 4)
@@ -4339,13 +4181,11 @@ def _read_model(folder: Path) -> _SparseModel:
         i: Camera(c.model.name, c.width, c.height, tuple(c.params.tolist()))
         for i, c in model.cameras.items()
     }
+    poses = [image.cam_from_world().matrix() for image in images]
     return _SparseModel(
-        image_id=[image.image_id for image in images],
         names=tuple(image.name for image in images),
         cameras=[cameras[image.camera_id] for image in images],
-        cam_from_world=np.array([image.cam_from_world().matrix() for image in images]).reshape(
-            -1, 3, 4
-        ),
+        cam_from_world=np.array(poses).reshape(-1, 3, 4),
         points=np.array([point.xyz for _, point in points]).reshape(-1, 3),
         colors=np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
         track_length=np.array([point.track.length() for _, point in points], np.int64),
@@ -4358,8 +4198,8 @@ def _read_model(folder: Path) -> _SparseModel:
 def _absolute_pose(
     xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig
 ) -> tuple[Array, Array] | None:
-    """PnP: cam_from_world (3, 4) and its covariance (6, 6) from native pixels (n, 2) of world
-    points (n, 3); None if it is not to be trusted.
+    """PnP from native pixels (n, 2) of world points (n, 3): cam_from_world (3, 4) and covariance
+    (6, 6); None if it is not to be trusted.
     """
     if len(xy) < config.pnp_min_inliers:
         return None
@@ -4368,9 +4208,8 @@ def _absolute_pose(
     made = _pycolmap_camera(camera, (camera.width, camera.height))
     options = {"estimation_options": {"ransac": ransac}}
     found = _pycolmap().estimate_and_refine_absolute_pose(xy, points, made, **options)
-    if found is None or found["num_inliers"] < max(
-        config.pnp_min_inliers, config.pnp_min_ratio * len(xy)
-    ):
+    least = max(config.pnp_min_inliers, config.pnp_min_ratio * len(xy))
+    if found is None or found["num_inliers"] < least:
         return None
     pose: Array = found["cam_from_world"].matrix()
     xy, points = xy[found["inlier_mask"]], points[found["inlier_mask"]]
@@ -4408,12 +4247,11 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
     pc, size = _pycolmap(), (images.shape[2], images.shape[1])
     if job["camera"] is not None:
         model, params = job["camera"]
-        given = Camera(model, job["size"][0], job["size"][1], tuple(params))
-        camera = _pycolmap_camera(given, size)
+        width, height = job["size"]
+        camera = _pycolmap_camera(Camera(model, width, height, tuple(params)), size)
     else:
-        camera = pc.Camera.create_from_model_name(
-            1, "SIMPLE_RADIAL", config.focal_guess * max(size), *size
-        )
+        focal = config.focal_guess * max(size)
+        camera = pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, *size)
     camera.has_prior_focal_length = job["camera"] is not None
     cv2.setNumThreads(1)
     with contextlib.closing(pc.Database.open(str(database))) as db, ThreadPoolExecutor(2) as pool:
@@ -4421,9 +4259,8 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
         rig = pc.Rig(rig_id=1)
         rig.add_ref_sensor(camera.sensor_id)
         db.write_rig(rig, use_rig_id=True)
-        features = pool.map(
-            lambda k: _sift(images[k], np.array(job["boxes"][k]), config), range(len(images))
-        )
+        boxes = map(np.array, job["boxes"])
+        features = pool.map(_sift, images, boxes, itertools.repeat(config))
         for number, (xy, descriptors) in enumerate(features, 1):
             image = pc.Image(name=f"{number:06d}", camera_id=1, image_id=number)
             db.write_image(image, use_image_id=True)
@@ -4431,16 +4268,13 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
             frame.add_data_id(image.data_id)
             db.write_frame(frame, use_frame_id=True)
             db.write_keypoints(number, xy)
-            db.write_descriptors(
-                number, pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors)
-            )
+            sift = pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors)
+            db.write_descriptors(number, sift)
             _tell("features", number, len(images))
 
 
 def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np.float32], Image]:
-    """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2) and descriptors (N, 128)
-    uint8.
-    """
+    """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2), uint8 (N, 128)."""
     gray = cv2.cvtColor(np.ascontiguousarray(bgr), cv2.COLOR_BGR2GRAY)
     mask = np.full(gray.shape, 255, np.uint8)
     for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
@@ -4452,16 +4286,15 @@ def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np
             break
     if found is None or not len(keypoints):
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
-    xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(
-        0.5
-    )  # COLMAP: centre of pixel 0 at .5
+    xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(0.5)  # COLMAP's pixels
     root = np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-9)) * 512
     return xy, np.minimum(root, 255).astype(np.uint8)
 
 
 def _sfm_match(database: Path, config: PosesConfig) -> None:
-    """Match all pairs of a few keyframes, else each with those at offsets 1, 2, 4, 8 ... and with
-    its look-alikes. (COLMAP skips the pairs that a killed run has matched.)
+    """Match all pairs of a few keyframes, else those at offsets 1, 2, 4, 8 ... and look-alikes.
+
+    (COLMAP skips the pairs that a killed run has matched.)
     """
     pc, listed = _pycolmap(), database.parent / "pairs.txt"
     with contextlib.closing(pc.Database.open(str(database))) as db:
@@ -4486,30 +4319,23 @@ def _sfm_match(database: Path, config: PosesConfig) -> None:
 
 
 def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[int, int]]:
-    """Find the pairs of keyframes that look most alike, for loops. Ref: VLAD, Jegou et al., CVPR
-    2010.
-    """
+    """Find pairs of keyframes that look most alike. Ref: VLAD, Jegou et al., CVPR 2010."""
     features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
     sample = features[:: max(1, len(features) // config.loop_sample)]
     if len(sample) < config.loop_words:
         return []
     cv2.setRNGSeed(config.seed)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
-    _, _, words = cv2.kmeans(
-        sample, config.loop_words, np.empty(0), stop, 1, cv2.KMEANS_PP_CENTERS
-    )  # (W, 128)
-    looks = np.zeros(
-        (len(descriptors), *words.shape), np.float32
-    )  # (K, W, 128) sum of the residuals of each word
+    start = cv2.KMEANS_PP_CENTERS
+    words = cv2.kmeans(sample, config.loop_words, np.empty(0), stop, 1, start)[2]  # (W, 128)
+    looks = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sums of residuals
     for look, found in zip(looks, descriptors, strict=True):
         nearest = (found @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
         np.add.at(look, nearest, found - words[nearest])
     looks /= np.maximum(np.linalg.norm(looks, axis=2, keepdims=True), 1e-9)
     flat = looks.reshape(len(looks), -1)
-    alike = flat @ flat.T  # (K, K)
-    alike[
-        np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike)))) <= 2
-    ] = -np.inf  # matched already
+    alike, at = flat @ flat.T, np.arange(len(flat))  # (K, K)
+    alike[np.abs(at[:, None] - at) <= 2] = -np.inf  # matched already
     best = np.argsort(-alike, axis=1, kind="stable")[:, : config.loop_pairs]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
@@ -4539,21 +4365,19 @@ class _Attempt:
 
     def trusted(self, config: PosesConfig) -> bool:
         """True if the geometry is strong enough to calibrate the focal length."""
-        strong = (
-            self.tri_angle_deg >= config.strong_tri_angle_deg
-            and self.spread >= config.strong_spread
-        )
-        return strong and config.focal_range[0] <= self.focal <= config.focal_range[1]
+        low, high = config.focal_range
+        wide = self.tri_angle_deg >= config.strong_tri_angle_deg
+        return wide and self.spread >= config.strong_spread and low <= self.focal <= high
 
 
 def _sfm_ladder(
-    database: Path, frames: list[int], known_focal: bool, config: PosesConfig
+    database: Path, count: int, known_focal: bool, config: PosesConfig
 ) -> tuple[list[Any], list[str], bool]:
-    """Try mappers from strict to permissive; return the best sound model, followed by those of
-    other keyframes (none if nothing is sound), messages, and whether its focal length is trusted.
+    """Try mappers from strict to permissive.
 
-    Args:
-        frames: frame number of each keyframe.
+    Returns:
+        the best sound model, followed by those of other keyframes (none if nothing is sound),
+        messages, and whether its focal length is trusted.
     """
     tried: list[_Attempt] = []
     if not known_focal:
@@ -4561,18 +4385,17 @@ def _sfm_ladder(
     for rung in ("strict", "relaxed", "global"):
         sound = [a for a in tried if not a.problem]
         turned = [a for a in tried if a.problem and a.parallax_px < config.min_parallax_px]
-        if any(a.registered >= config.good_registered for a in sound + turned) or (
-            sound and rung == "global"
-        ):
+        good = any(a.registered >= config.good_registered for a in sound + turned)
+        if good or (sound and rung == "global"):
             break
-        tried.append(_sfm_attempt(database, rung, known_focal, len(frames), config))
+        tried.append(_sfm_attempt(database, rung, known_focal, count, config))
     best = max(tried, key=lambda a: (not a.problem, a.registered))
     messages = []
     if not best.problem and not known_focal and not best.trusted(config):
         angle = f"{best.tri_angle_deg:.1f} deg"
         weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
         _sfm_guess_focal(database, True, config)
-        best = _sfm_attempt(database, "relaxed", True, len(frames), config)
+        best = _sfm_attempt(database, "relaxed", True, count, config)
         messages = [
             f"{weak} and is taken as {config.focal_guess:.3g} x the longer side; sizes and depths "
             "are rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
@@ -4592,11 +4415,8 @@ def _sfm_guess_focal(database: Path, trusted: bool, config: PosesConfig) -> None
     """Set the camera's focal length to the guess."""
     with contextlib.closing(_pycolmap().Database.open(str(database))) as db:
         camera = db.read_all_cameras()[0]
-        camera.params = [
-            config.focal_guess * max(camera.width, camera.height),
-            *camera.params[1:3],
-            0.0,
-        ]
+        focal = config.focal_guess * max(camera.width, camera.height)
+        camera.params = [focal, *camera.params[1:3], 0.0]
         camera.has_prior_focal_length = trusted
         db.update_camera(camera)
 
@@ -4604,45 +4424,31 @@ def _sfm_guess_focal(database: Path, trusted: bool, config: PosesConfig) -> None
 def _sfm_attempt(
     database: Path, rung: str, fixed: bool, count: int, config: PosesConfig
 ) -> _Attempt:
-    """Run a mapper on `count` keyframes, measure its largest model and name its first problem ("":
-    it is sound).
-    """
+    """Run a mapper on `count` keyframes, measure its largest model and name its first problem."""
     models = _sfm_map(database, rung, fixed, count, config)
     if not models:
         return _Attempt()
-    model = max(
-        models, key=lambda m: (m.num_reg_images(), m.num_points3D())
-    )  # the first is often a stub
+    model = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))  # others: stubs
     camera = next(iter(model.cameras.values()))
     centre = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
-    registered, focal = (
-        len(centre) / count,
-        camera.mean_focal_length() / max(camera.width, camera.height),
-    )
+    registered = len(centre) / count
+    focal = camera.mean_focal_length() / max(camera.width, camera.height)
     seen = [model.image(i).num_points3D for i in centre]
     parallax = _sfm_parallax_px(model)
     angle, depth = _sfm_angle_and_depth(model, centre, config.tri_sample)
     spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
     tests = (
         (registered < config.min_registered, f"only {len(centre)} of {count} keyframes connect"),
-        (
-            model.num_points3D() < config.min_points,
-            f"only {model.num_points3D()} points could be triangulated",
-        ),
+        (model.num_points3D() < config.min_points,
+         f"only {model.num_points3D()} points could be triangulated"),
         (np.median(seen) < config.min_points_per_image, "the images share too few points"),
-        (
-            parallax < config.min_parallax_px,
-            "a mere turn of the camera explains all images, so there is no depth",
-        ),
-        (
-            angle < config.min_tri_angle_deg,
-            f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways",
-        ),
-        (
-            camera.has_bogus_params(*config.focal_range, 1.0),
-            f"the focal length came out as {focal:.2f} x the width",
-        ),
-    )
+        (parallax < config.min_parallax_px,
+         "a mere turn of the camera explains all images, so there is no depth"),
+        (angle < config.min_tri_angle_deg,
+         f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
+        (camera.has_bogus_params(*config.focal_range, 1.0),
+         f"the focal length came out as {focal:.2f} x the width"),
+    )  # fmt: skip
     problem = next((text for bad, text in tests if bad), "")
     others = tuple(m for m in models if m is not model)
     return _Attempt(model, others, registered, angle, parallax, spread, focal, problem)
@@ -4653,24 +4459,17 @@ def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesCo
     pc, out = _pycolmap(), database.parent / rung
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
-    options: dict[str, Any] = {
-        "num_threads": 1,
-        "random_seed": config.seed,
-    }  # one thread: the same result every time
+    options: dict[str, Any] = {"num_threads": 1, "random_seed": config.seed}  # one: reproducible
     if rung == "global":
         if fixed:
-            options["mapper"] = {
-                "bundle_adjustment": {"refine_focal_length": False, "refine_extra_params": False}
-            }
+            kept = {"refine_focal_length": False, "refine_extra_params": False}
+            options["mapper"] = {"bundle_adjustment": kept}
         else:  # with a wrong focal length global mapping is wrong and looks right
             pc.calibrate_view_graph(str(database))
         return list(pc.global_mapping(*paths, options=options).values())
     options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
-    options |= {
-        "ba_global_frames_ratio": 1.4,
-        "ba_global_points_ratio": 1.4,
-        "ba_global_function_tolerance": 1e-5,
-    }
+    options |= {"ba_global_frames_ratio": 1.4, "ba_global_points_ratio": 1.4}
+    options |= {"ba_global_function_tolerance": 1e-5}
     options |= {"ba_refine_focal_length": not fixed, "ba_refine_extra_params": not fixed}
     options |= _RELAXED if rung == "relaxed" else {}
     done = itertools.count(2)
@@ -4682,13 +4481,13 @@ def _sfm_refine(model: Any, fixed: bool, config: PosesConfig) -> None:
     """Adjust cameras and points once more; unless the intrinsics are `fixed`, with a second
     distortion term and the principal point (if that stays near the centre).
     """
-    pc, camera = _pycolmap(), model.camera(1)
-    size = np.array([camera.width, camera.height])
     if fixed:
         _sfm_adjust(model, config.refine_px, False, False)
         return
+    camera = model.camera(1)
+    size = np.array([camera.width, camera.height])
     focal, _, _, distortion = camera.params
-    camera.model = pc.CameraModelId.RADIAL
+    camera.model = _pycolmap().CameraModelId.RADIAL
     for move_center in (True, False):
         camera.params = [focal, *size / 2, distortion, 0]
         _sfm_adjust(model, config.refine_px, True, move_center)
@@ -4714,57 +4513,8 @@ def _sfm_adjust(model: Any, loss_px: float, calibrate: bool, move_center: bool) 
     pc.create_default_bundle_adjuster(options, chosen, model).solve()
 
 
-def refine_together(
-    model: Any, objects: Sequence[dict[str, Array]], loss_px: float = 0.5
-) -> tuple[Any, float, float, int]:
-    """Adjust the cameras of a COLMAP model with the objects as landmarks beside its points: each
-    object is one more point, seen in the centres of its boxes.
-
-    Args:
-        model: pycolmap.Reconstruction with one camera; only its points are adjusted in place.
-        objects: per object image name -> box (4,) xyxy, pixels of the model's camera.
-    Returns:
-        the model adjusted with the objects, or the given one where that would worsen the points'
-        reprojection error; the points' mean reprojection error (px) without and with the objects;
-        number of objects used (0: refused).
-    """
-    pc, joint = _pycolmap(), _pycolmap().Reconstruction()
-    _sfm_adjust(model, loss_px, False, False)
-    joint.add_camera_with_trivial_rig(model.camera(1))
-    seen: list[list[tuple[int, Array]]] = [[] for _ in objects]
-    for i in model.reg_image_ids():
-        old = model.image(i)
-        mine = [(o, boxes[old.name]) for o, boxes in enumerate(objects) if old.name in boxes]
-        centers = [np.asarray((box[:2] + box[2:]) / 2, np.float64) for _, box in mine]
-        for row, ((o, _), xy) in enumerate(zip(mine, centers, strict=True), len(old.points2D)):
-            seen[o].append((i, np.r_[row, xy]))
-        xys = np.array([*(p.xy for p in old.points2D), *centers]).reshape(-1, 2)
-        image = pc.Image(name=old.name, keypoints=xys, camera_id=1, image_id=i)
-        joint.add_image_with_trivial_frame(image, old.cam_from_world())
-    for point in model.points3D.values():
-        joint.add_point3D(point.xyz, point.track, point.color)
-    added = []
-    for views in (v for v in seen if len(v) >= 3):
-        rays = np.array([np.r_[joint.camera(1).cam_from_img(at[1:]), 1] for _, at in views])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        cams = np.array([joint.image(i).cam_from_world().matrix() for i, _ in views])
-        track = pc.Track([pc.TrackElement(i, int(at[0])) for i, at in views])
-        added.append(joint.add_point3D(_meet(cams, rays)[2], track, np.zeros(3, np.uint8)))
-    _sfm_adjust(joint, loss_px, False, False)
-    for object_point in added:
-        joint.delete_point3D(object_point)
-    error = []
-    for one in (model, joint):
-        one.update_point_3d_errors()
-        error.append(float(one.compute_mean_reprojection_error()))
-    better = bool(added) and error[1] <= 1.001 * error[0]
-    return joint if better else model, error[0], error[1], len(added) if better else 0
-
-
 def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> tuple[float, float]:
-    """Median over points of the widest triangulation angle (degrees), and median distance from the
-    cameras.
-    """
+    """Medians over points: widest triangulation angle (degrees), distance from the cameras."""
     ids = sorted(model.point3D_ids())
     angles, depths = [0.0][: not ids], [0.0][: not ids]
     for point_id in ids[:: max(1, len(ids) // sample)]:
@@ -4779,18 +4529,15 @@ def _sfm_angle_and_depth(model: Any, centre: dict[int, Array], sample: int) -> t
 
 def _sfm_parallax_px(model: Any) -> float:
     """Measure what pure turns cannot explain: median residual of the best turn; 95 % of the image
-    pairs are below.
-
-    A model of a camera that only turned looks sound otherwise: a wrong focal length makes up
-    triangulation angles.
+    pairs are below. (A camera that only turned looks sound otherwise: a wrong focal length makes
+    up triangulation angles.)
     """
     rays: dict[int, dict[int, Array]] = {}
     for image_id in sorted(model.reg_image_ids()):
         seen = model.image(image_id).get_observation_points2D()
-        ideal = np.asarray(
-            model.camera(1).cam_from_img(np.array([p.xy for p in seen]).reshape(-1, 2))
-        )
-        unit = np.column_stack([ideal.reshape(-1, 2), np.ones(len(seen))])  # (n, 3)
+        xy = np.array([p.xy for p in seen]).reshape(-1, 2)
+        ideal = np.reshape(model.camera(1).cam_from_img(xy), (-1, 2))
+        unit = np.column_stack([ideal, np.ones(len(seen))])  # (n, 3)
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
         rays[image_id] = dict(zip([p.point3D_id for p in seen], unit, strict=True))
     residuals = []
@@ -4801,27 +4548,21 @@ def _sfm_parallax_px(model: Any) -> float:
                 one, other = (np.array([rays[i][p] for p in both]) for i in (a, b))  # (n, 3)
                 turned = Rotation.align_vectors(other, one)[0].apply(one)
                 residuals.append(np.median(np.linalg.norm(turned - other, axis=1)))
-    return (
-        float(np.percentile(residuals, 95)) * model.camera(1).mean_focal_length()
-        if residuals
-        else 0.0
-    )
+    widest = float(np.percentile(residuals, 95)) if residuals else 0.0
+    return widest * float(model.camera(1).mean_focal_length())
 
 
 def _sfm_write(
     model: Any, images: Any, folder: Path, names: list[str], native: tuple[int, int]
 ) -> None:
-    """Write a COLMAP model in native pixels with the real names; points get the colour of their
-    first observation.
-    """
+    """Write a COLMAP model in native pixels with the real names; points get their first colour."""
     height, width = images.shape[1:3]
     for point_id in model.point3D_ids():
         point = model.point3D(point_id)
         seen = point.track.elements[0]
-        x, y = model.image(seen.image_id).point2D(seen.point2D_idx).xy.astype(int)
-        point.color = images[
-            seen.image_id - 1, np.clip(y, 0, height - 1), np.clip(x, 0, width - 1), ::-1
-        ]
+        xy = model.image(seen.image_id).point2D(seen.point2D_idx).xy.astype(int)
+        x, y = xy.clip(0, (width - 1, height - 1))
+        point.color = images[seen.image_id - 1, y, x, ::-1]
     scale = np.array(native) / (width, height)
     for image_id, image in model.images.items():
         image.name = names[image_id - 1]

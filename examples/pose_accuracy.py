@@ -30,7 +30,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,54 @@ def clips(data: Path, rooms: list[Path]) -> dict[str, Clip]:
         camera = ",".join((room / "camera.txt").read_text().split()[4:])
         found[room.name] = Clip(room / "room.mp4", room / "poses.txt", camera, True)
     return {name: clip for name, clip in found.items() if clip.source.exists()}
+
+
+def refine_together(
+    model: Any, objects: Sequence[dict[str, rt.Array]], loss_px: float = 0.5
+) -> tuple[Any, float, float, int]:
+    """Adjust the cameras of a COLMAP model with the objects as landmarks beside its points: each
+    object is one more point, seen in the centres of its boxes.
+
+    Args:
+        model: pycolmap.Reconstruction with one camera; only its points are adjusted in place.
+        objects: per object image name -> box (4,) xyxy, pixels of the model's camera.
+    Returns:
+        the model adjusted with the objects, or the given one where that would worsen the points'
+        reprojection error; the points' mean reprojection error (px) without and with the objects;
+        number of objects used (0: refused).
+    """
+    pc = rt._pycolmap()
+    joint = pc.Reconstruction()
+    rt._sfm_adjust(model, loss_px, False, False)
+    joint.add_camera_with_trivial_rig(model.camera(1))
+    seen: list[list[tuple[int, rt.Array]]] = [[] for _ in objects]
+    for i in model.reg_image_ids():
+        old = model.image(i)
+        mine = [(o, boxes[old.name]) for o, boxes in enumerate(objects) if old.name in boxes]
+        centers = [np.asarray((box[:2] + box[2:]) / 2, np.float64) for _, box in mine]
+        for row, ((o, _), xy) in enumerate(zip(mine, centers, strict=True), len(old.points2D)):
+            seen[o].append((i, np.r_[row, xy]))
+        xys = np.array([*(p.xy for p in old.points2D), *centers]).reshape(-1, 2)
+        image = pc.Image(name=old.name, keypoints=xys, camera_id=1, image_id=i)
+        joint.add_image_with_trivial_frame(image, old.cam_from_world())
+    for point in model.points3D.values():
+        joint.add_point3D(point.xyz, point.track, point.color)
+    added = []
+    for views in (v for v in seen if len(v) >= 3):
+        rays = np.array([np.r_[joint.camera(1).cam_from_img(at[1:]), 1] for _, at in views])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        cams = np.array([joint.image(i).cam_from_world().matrix() for i, _ in views])
+        track = pc.Track([pc.TrackElement(i, int(at[0])) for i, at in views])
+        added.append(joint.add_point3D(rt._meet(cams, rays)[2], track, np.zeros(3, np.uint8)))
+    rt._sfm_adjust(joint, loss_px, False, False)
+    for object_point in added:
+        joint.delete_point3D(object_point)
+    error = []
+    for one in (model, joint):
+        one.update_point_3d_errors()
+        error.append(float(one.compute_mean_reprojection_error()))
+    better = bool(added) and error[1] <= 1.001 * error[0]
+    return joint if better else model, error[0], error[1], len(added) if better else 0
 
 
 def main() -> int:

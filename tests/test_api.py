@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import four_ways
 import numpy as np
 import pytest
 
@@ -37,14 +38,6 @@ class Duck:
         return replace(self, **{n: p if p is None else p[rows] for n, p in parts.items()})
 
 
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
 def short() -> tuple[rt.Video, rt.RecordedDetections]:
     video = rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=12))
@@ -55,12 +48,11 @@ def test_all_ways_give_the_same_identities(
     short: tuple[rt.Video, rt.RecordedDetections], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Masks steer the appearance, so arrays, which have none, may differ in detail elsewhere."""
-    ways = load("four_ways")
     if importlib.util.find_spec("supervision") is None:
         stand_in = ModuleType("supervision")
         stand_in.Detections = Duck  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, "supervision", stand_in)
-    results = [way(*short) for way in ways.WAYS]
+    results = [way(*short) for way in four_ways.WAYS]
     assert len(results) == 4 and sum(map(len, results[0])) > 30
     for found in results[1:]:
         assert [list(f) for f in found] == [list(f) for f in results[0]]

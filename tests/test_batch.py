@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
 import os
 import re
@@ -12,24 +11,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
 
+import batch
 import pytest
 
 import reobj_track as rt
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOM = ROOT / "examples" / "room"
-
-
-@pytest.fixture(scope="module")
-def batch() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("batch", ROOT / "examples" / "batch.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["batch"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def manifest(folder: Path, *options: str) -> Path:
@@ -42,7 +31,7 @@ def manifest(folder: Path, *options: str) -> Path:
     return folder / "m.csv"
 
 
-def test_manifest_csv_and_jsonl_say_the_same(batch: ModuleType, tmp_path: Path) -> None:
+def test_manifest_csv_and_jsonl_say_the_same(tmp_path: Path) -> None:
     rows = [
         {"path": "a.mp4", "poses": "sparse", "options": "--classes 'tv,dining table'"},
         {"path": "sub/b.mp4", "out": "x", "poses": "none", "command": "track"},
@@ -81,9 +70,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_manifest(
-    case: str, batch: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_manifest(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text, expected = BAD[case]
     (tmp_path / "m.csv").write_text(text)
     assert batch.main([str(tmp_path / "m.csv"), "-o", str(tmp_path / "out")]) == 2
@@ -93,7 +80,6 @@ def test_bad_manifest(
 
 
 def test_without_ray_it_says_what_to_install(
-    batch: ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -104,7 +90,7 @@ def test_without_ray_it_says_what_to_install(
     assert 'pip install "reobj-track[batch]"' in capsys.readouterr().err
 
 
-def test_finished_means_same_files_and_options(batch: ModuleType, tmp_path: Path) -> None:
+def test_finished_means_same_files_and_options(tmp_path: Path) -> None:
     """Run in this process, as a worker does; any change of input or options undoes it."""
     det = tmp_path / "det.npz"
     det.write_bytes((ROOM / "detections.npz").read_bytes())
@@ -138,9 +124,7 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> str:
     return path.read_text()
 
 
-def test_a_killed_worker_loses_nothing_and_doubles_nothing(
-    batch: ModuleType, tmp_path: Path
-) -> None:
+def test_a_killed_worker_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
     """Two workers, four videos; the one at work on b is killed; then the batch is run again."""
     pytest.importorskip("ray")
     path, results = manifest(tmp_path, *(f"--stop {n}" for n in (20, 30, 25, 22))), tmp_path / "out"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
+import importlib
 import json
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -149,15 +148,8 @@ def test_own_weights_say_how_they_were_trained() -> None:
 
 @pytest.fixture(scope="module")
 def te() -> ModuleType:
-    """examples/train_embedding.py, which is in no package."""
     pytest.importorskip("torch", reason="needs pip install torch")
-    path = ROOT / "examples" / "train_embedding.py"
-    spec = importlib.util.spec_from_file_location("train_embedding", path)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["train_embedding"] = module
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module("train_embedding")
 
 
 @pytest.fixture(scope="module")

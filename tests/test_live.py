@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType
 
+import live_ar
 import numpy as np
 import pytest
 
@@ -15,17 +14,7 @@ import reobj_track as rt
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 
-@pytest.fixture(scope="module")
-def live_ar() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("live_ar", EXAMPLES / "live_ar.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_objects_stand_where_they_are(
-    live_ar: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_objects_stand_where_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """60 frames of the example clip: the ellipsoids' centres are those of the true objects."""
     assert live_ar.main(["-o", str(tmp_path), "--frames", "60", "--embed", "none"]) == 0
     objects = json.loads((tmp_path / "live_objects.json").read_text())
@@ -46,7 +35,7 @@ def test_objects_stand_where_they_are(
     assert "ms" in capsys.readouterr().out
 
 
-def test_a_session_goes_on_from_its_state(live_ar: ModuleType, tmp_path: Path) -> None:
+def test_a_session_goes_on_from_its_state(tmp_path: Path) -> None:
     """The second session sees the same frames again: the same objects, no new identities."""
     state = ["--state", str(tmp_path / "state.npz"), "--frames", "40"]
     found = []
@@ -61,7 +50,7 @@ def test_a_session_goes_on_from_its_state(live_ar: ModuleType, tmp_path: Path) -
 
 @pytest.mark.parametrize("option", ["--poses", "--detections"])
 def test_a_missing_file_is_one_line(
-    live_ar: ModuleType, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert live_ar.main(["-o", str(tmp_path), option, str(tmp_path / "none.txt")]) == 2
     assert capsys.readouterr().err.count("\n") == 1

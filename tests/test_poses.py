@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pose_accuracy
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -751,7 +752,7 @@ def test_mapper_on_a_synthetic_dataset(tmp_path):
     with pycolmap.Database.open(str(tmp_path / "database.db")) as database:
         truth = pycolmap.synthesize_dataset(options, database)
     (model,), messages, trusted = rt._sfm_ladder(
-        tmp_path / "database.db", list(range(12)), True, rt.PosesConfig()
+        tmp_path / "database.db", 12, True, rt.PosesConfig()
     )
     assert trusted and not messages and model.num_reg_images() == 12
     names = [image.name for image in truth.images.values()]
@@ -760,9 +761,7 @@ def test_mapper_on_a_synthetic_dataset(tmp_path):
         for m in (model, truth)
     ]
     assert ate_percent(*stack) < 0.1
-    none, messages, _ = rt._sfm_ladder(
-        tmp_path / "database.db", list(range(30)), True, rt.PosesConfig()
-    )
+    none, messages, _ = rt._sfm_ladder(tmp_path / "database.db", 30, True, rt.PosesConfig())
     assert none == [] and "only 12 of 30 keyframes connect" in messages[0]
 
 
@@ -990,11 +989,11 @@ def test_objects_as_landmarks_never_worsen_the_points(walk, noise_px, used):
         }
         for point in longest
     ]
-    adjusted, alone, together, count = rt.refine_together(model, objects)
+    adjusted, alone, together, count = pose_accuracy.refine_together(model, objects)
     assert count == used and (adjusted is model) == (used == 0)
     if used:
         assert together <= 1.001 * alone and adjusted.num_points3D() == model.num_points3D()
-    assert rt.refine_together(model, [])[0] is model
+    assert pose_accuracy.refine_together(model, [])[0] is model
 
 
 def test_import_loads_no_pycolmap():

@@ -9,20 +9,17 @@ from __future__ import annotations
 
 import ast
 import json
-import sys
 import time
 from pathlib import Path
 
+import build_priors
 import numpy as np
 import pytest
+import synthetic_quadrics as syn
+
+import quadrics as q
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "examples")]
-import build_priors  # noqa: E402
-import synthetic_quadrics as syn  # noqa: E402
-
-import quadrics as q  # noqa: E402
-
 DEMO = ROOT.parent / "shared" / "data" / "lfd_aldoma"
 UP = (0.0, 0.0, 1.0)
 COCO_80 = (

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import rank_k as rk
+
+import reobj_track as rt
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "examples"))
-
-import rank_k as rk  # noqa: E402
-
-import reobj_track as rt  # noqa: E402
 
 RNG = np.random.default_rng(0)
 

@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+import render_room as rr
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def load_module() -> ModuleType:
-    """Import examples/render_room.py, which is in no package."""
-    spec = importlib.util.spec_from_file_location(
-        "render_room", ROOT / "examples" / "render_room.py"
-    )
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["render_room"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-rr = load_module()
 SMALL = rr.RoomConfig(seed=3, width=320, height=240, frames=40, texels_per_m=60, light_rays=1)
 
 
