@@ -56,7 +56,7 @@ import threading
 import time
 import urllib.request
 import zipfile
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -4602,39 +4602,32 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
     path, size = Path(path), (int(video.size[0]), int(video.size[1]))
     if not path.exists():
         raise ReobjError(
-            f"{path}: no such file or folder; --poses takes auto, none, or poses in a known format"
+            f"{path}: no such file; --poses takes auto, none, or poses in a known format"
         )
     reader = _POSE_READERS.get(_pose_format(path) if config.fmt == "auto" else config.fmt)
     if reader is None:
-        raise ReobjError(
-            f"--pose-format {config.fmt}: unknown; known are auto, {', '.join(_POSE_READERS)}"
-        )
+        known = ", ".join(_POSE_READERS)
+        raise ReobjError(f"--pose-format {config.fmt}: unknown; known are auto, {known}")
     given = reader(path, size)
     camera = parse_camera(config.camera, size) or given.camera
     if camera is None:
         raise ReobjError(
-            f"{path}: this format has no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2] "
-            "(pixels)"
+            f"{path}: has no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2], pixels"
         )
     camera = _checked_camera(_resized_camera(camera, size, path), str(path))
     numbers = [(frame.index, frame.time_s) for frame in video]
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
-    row, messages = _rows_of_frames(
-        given, path, frame, time_s, [video.names[n] for n in frame if video.names]
-    )
+    names = [video.names[n] for n in frame if video.names]
+    row, messages = _rows_of_frames(given, path, frame, time_s, names)
     poses = np.full((len(frame), 3, 4), np.nan)
     poses[row >= 0] = given.cam_from_world[row[row >= 0]]
     known = np.isfinite(poses).all((1, 2))
     if not known.all():
         lost = _spans(frame[~known].tolist())
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
-    status, extra = (
-        np.where(known, "supplied", "none"),
-        (given.points, given.colors, tuple(messages)),
-    )
-    return Poses(
-        camera, frame, time_s, poses, status, "user", given.metric, given.up_in_world, *extra
-    )
+    status = np.where(known, "supplied", "none")
+    extra = (given.metric, given.up_in_world, given.points, given.colors, tuple(messages))
+    return Poses(camera, frame, time_s, poses, status, "user", *extra)
 
 
 def _pose_format(path: Path) -> str:
@@ -4658,22 +4651,19 @@ def _number_rows(
     """Read a table of numbers (N, C), C in `columns`, and where each row is (for messages)."""
     rows: list[list[float]] = []
     where = []
-    for number, text in enumerate(_lines(path), 1):
+    for number, text in enumerate(_read_text(path).splitlines(), 1):
         if not text.strip() or text.lstrip().startswith("#"):
             continue
         at = f"{path}, line {number}"
         try:
             row = [float(word) for word in text.replace(",", " ").split()]
         except ValueError:
-            raise ReobjError(
-                f"{at}: {text.strip()[:60]!r} is not a row of numbers; expected {expected}"
-            ) from None
+            found = text.strip()[:60]
+            raise ReobjError(f"{at}: {found!r} is no row of numbers; expected {expected}") from None
         if len(row) not in columns or (rows and len(row) != len(rows[0])):
             raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
         if finite and not np.isfinite(row).all():
-            raise ReobjError(
-                f"{at}: a number is not finite; leave out the rows of frames without a pose"
-            )
+            raise ReobjError(f"{at}: a number is not finite; leave out rows of frames without pose")
         rows.append(row)
         where.append(at)
     if not rows:
@@ -4681,67 +4671,44 @@ def _number_rows(
     return np.array(rows), where
 
 
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ReobjError(
-            f"{path}: cannot be read as text ({error}); expected a file of poses"
-        ) from None
-
-
 def _json_object(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads("\n".join(_lines(path)))
-    except json.JSONDecodeError as error:
-        raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from None
+    content = _load_json(path)
     if not isinstance(content, dict):
         raise ReobjError(
-            f"{path}: expected an object with `frames` (nerfstudio, instant-ngp) or `poses` "
-            "(Record3D)"
+            f"{path}: expected `frames` (nerfstudio, instant-ngp) or `poses` (Record3D)"
         )
     return content
 
 
 def _rigid(matrix: Array, where: Sequence[str]) -> Array:
-    """Check rigid transforms (N, 3 or 4, 4) and return (N, 3, 4) with exact rotations; rows of NaN
-    or inf: NaN.
-    """
+    """Check rigid transforms (N, 3 or 4, 4): (N, 3, 4) with exact rotations, NaN where lost."""
     lost = ~np.asarray(np.isfinite(matrix).all((1, 2)), bool)
     matrix = np.where(lost[:, None, None], np.eye(4)[: matrix.shape[1]], matrix)
     rotation = matrix[:, :3, :3]
     tolerance = PosesConfig().pose_tolerance
-    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))
-    off = np.asarray(error.max((1, 2)), np.float64)  # (N,)
     if matrix.shape[1] == 4:
         last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
-        transposed = np.asarray(last_row.max(1) > tolerance, bool)
-        _refuse(
-            transposed,
-            where,
-            "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)",
-        )
+        what = "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)"
+        _refuse(last_row.max(1) > tolerance, where, what)
+    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))  # (N, 3, 3)
     what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular)"
-    scaled = np.asarray(off > tolerance, bool)
-    _refuse(scaled, where, f"{what}; expected a row-major rigid pose without scale")
-    mirrored = np.asarray(np.linalg.det(rotation) < 0, bool)
+    what += "; expected a row-major rigid pose without scale"
+    _refuse(error.max((1, 2)) > tolerance, where, what)
     what = "the rotation is mirrored (determinant -1); turn two axes, not one"
-    _refuse(mirrored, where, what)
+    _refuse(np.linalg.det(rotation) < 0, where, what)
     u, _, vt = np.linalg.svd(rotation)
     exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
     return np.where(lost[:, None, None], np.nan, exact)
 
 
-def _refuse(bad: BoolArray, where: Sequence[str], problem: str) -> None:
-    if bad.any():
+def _refuse(bad: Any, where: Sequence[str], problem: str) -> None:
+    if np.any(bad):
         raise ReobjError(f"{where[int(np.argmax(bad))]}: {problem}")
 
 
 def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
-    """Make (N, 3, 4) from quaternions (N, 4) xyzw, which must be of unit length, and translations
-    (N, 3).
-    """
-    finite = np.asarray(np.isfinite(np.column_stack([xyzw, translation])).all(1), bool)
+    """Make (N, 3, 4) from unit quaternions (N, 4) xyzw and translations (N, 3)."""
+    finite = np.isfinite(np.column_stack([xyzw, translation])).all(1)
     _refuse(~finite, where, "a number is not finite")
     norm = np.linalg.norm(xyzw, axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
@@ -4750,12 +4717,10 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
 
 
 def _given_tum(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam, xyzw; metres unless our own header
-    says otherwise.
-    """
+    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam; metres but for our own header."""
     rows, where = _number_rows(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
-    metric = not any(line.startswith("#") and _NO_SCALE in line for line in _lines(path))
+    metric = re.search(f"^#.*{_NO_SCALE}", _read_text(path), re.MULTILINE) is None
     return _GivenPoses(invert_rigid(world_from_cam), stamps_s=rows[:, 0], metric=metric)
 
 
@@ -4763,12 +4728,9 @@ _NO_SCALE = "units: arbitrary"
 
 
 def _given_kitti(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """KITTI: a row-major 3x4 (or 4x4) world_from_cam a line, one line for each frame of the source;
-    metres.
-    """
-    rows, where = _number_rows(
-        path, (12, 16), "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam"
-    )
+    """KITTI: a row-major 3x4 (or 4x4) world_from_cam for each frame of the source; metres."""
+    expected = "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam"
+    rows, where = _number_rows(path, (12, 16), expected)
     return _GivenPoses(invert_rigid(_rigid(rows.reshape(len(rows), -1, 4), where)), metric=True)
 
 
@@ -4776,18 +4738,15 @@ def _given_arkitscenes(path: Path, size: tuple[int, int]) -> _GivenPoses:
     """ARKitScenes .traj: `t rx ry rz tx ty tz`, axis-angle, cam_from_world, metres."""
     rows, _ = _number_rows(path, (7,), "ARKitScenes rows: t rx ry rz tx ty tz")
     rotation = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
-    return _GivenPoses(
-        np.concatenate([rotation, rows[:, 4:, None]], 2), stamps_s=rows[:, 0], metric=True
-    )
+    poses = np.concatenate([rotation, rows[:, 4:, None]], 2)
+    return _GivenPoses(poses, stamps_s=rows[:, 0], metric=True)
 
 
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 
 
 def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """Record3D metadata: `poses` [qx qy qz qw tx ty tz] world_from_cam in OpenGL axes, `K`
-    column-major; y up.
-    """
+    """Record3D: `poses` [qx qy qz qw tx ty tz] world_from_cam, OpenGL axes, y up; `K`."""
     data = _json_object(path)
     try:
         rows = np.array(data["poses"], np.float64).reshape(-1, 7)
@@ -4804,24 +4763,17 @@ def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
 
 
 def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """ScanNet `pose/<frame>.txt` (also 7-Scenes `*.pose.txt`): 4x4 world_from_cam, metres; inf:
-    lost frame; z up.
+    """ScanNet `pose/<frame>.txt`, z up, or 7-Scenes `*.pose.txt`: 4x4 world_from_cam, metres; inf:
+    lost frame.
     """
     folder = path / "pose" if (path / "pose").is_dir() else path
-    files = sorted(
-        file
-        for file in folder.glob("*.txt")
-        if file.stem[-1:].isdigit() or file.stem.endswith(".pose")
-    )
+    files = sorted(f for f in folder.glob("*.txt") if re.search(r"(\d|\.pose)$", f.stem))
     if not files:
         raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
-    tables = [_number_rows(file, (4,), "4 rows of 4 numbers", finite=False)[0] for file in files]
-    _refuse(
-        np.array([len(t) != 4 for t in tables]),
-        [str(f) for f in files],
-        "expected 4 rows of 4 numbers",
-    )
-    world_from_cam = _rigid(np.array(tables), [str(file) for file in files])
+    where, expected = [str(file) for file in files], "4 rows of 4 numbers"
+    tables = [_number_rows(file, (4,), expected, finite=False)[0] for file in files]
+    _refuse([len(table) != 4 for table in tables], where, f"expected {expected}")
+    world_from_cam = _rigid(np.array(tables), where)
     intrinsic = path / "intrinsic" / "intrinsic_color.txt"
     camera = None
     if intrinsic.exists():
@@ -4843,7 +4795,7 @@ def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise ReobjError(
-            f"{path}: no `frames` in it; expected the transforms.json of nerfstudio or instant-ngp"
+            f"{path}: no `frames`; expected nerfstudio's or instant-ngp's transforms.json"
         )
     where = [f"{path}, frames[{i}]" for i in range(len(frames))]
     try:
@@ -4853,9 +4805,8 @@ def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
         applied = np.eye(4)
         applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise ReobjError(
-            f"{path}: a frame without a 4x4 transform_matrix and file_path ({error!r})"
-        ) from None
+        what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
+        raise ReobjError(f"{path}: {what}") from None
     gl_from_world = invert_rigid(_rigid(matrix, where)) @ applied  # (N, 3, 4)
     return _GivenPoses(_CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
 
@@ -4870,35 +4821,24 @@ def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | 
         return None
     fisheye = data.get("is_fisheye") or "FISHEYE" in str(data.get("camera_model", "")).upper()
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-    pinhole = (
-        focal,
-        data.get("fl_y", focal),
-        data.get("cx", width / 2),
-        data.get("cy", height / 2),
-    )
-    params = tuple(float(v) for v in (*pinhole, *(data.get(key, 0) for key in keys)))
+    centre = (data.get("cx", width / 2), data.get("cy", height / 2))
+    terms = (focal, data.get("fl_y", focal), *centre, *(data.get(key, 0) for key in keys))
+    params = tuple(float(value) for value in terms)
     if not fisheye and not any(params[4:]):
         return Camera("PINHOLE", width, height, params[:4])
     return Camera("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, params)
 
 
 def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
-    """The one camera of all images; slightly different ones (autofocus) are replaced by the median
-    one.
-    """
+    """The one camera of all images: the median of slightly different ones (autofocus)."""
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
     if not found:
         return None
-    middle = found[len(found) // 2]
-    same = all(
-        (c.model, c.width, c.height) == (middle.model, middle.width, middle.height) for c in found
-    )
-    if not same or found[-1].params[0] > (1 + PosesConfig().max_focal_spread) * found[0].params[0]:
-        raise ReobjError(
-            f"{path}: several different cameras; expected one camera for the whole video "
-            "(single_camera)"
-        )
-    return middle
+    kinds = {(c.model, c.width, c.height) for c in found}
+    spread = found[-1].params[0] / found[0].params[0] - 1
+    if len(kinds) > 1 or spread > PosesConfig().max_focal_spread:
+        raise ReobjError(f"{path}: several different cameras; expected one (single_camera)")
+    return found[len(found) // 2]
 
 
 _COLMAP_PARAMS = {
@@ -4909,9 +4849,7 @@ _COLMAP_PARAMS = {
 
 
 def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """COLMAP model, text or binary (preferred), with or without rigs: cam_from_world; scale
-    unknown.
-    """
+    """COLMAP model, text or binary (preferred), with or without rigs; scale unknown."""
     start = path if path.is_dir() else path.parent
     folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
     for suffix, read in ((".bin", _colmap_binary), (".txt", _colmap_text)):
@@ -4919,7 +4857,7 @@ def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
             if (folder / f"images{suffix}").exists():
                 return read(folder)
     raise ReobjError(
-        f"{path}: no images.bin or images.txt in it; expected a COLMAP model, or see --pose-format"
+        f"{path}: no images.bin or .txt; expected a COLMAP model, or see --pose-format"
     )
 
 
@@ -4927,31 +4865,26 @@ def _colmap_binary(folder: Path) -> _GivenPoses:
     try:
         model = _read_model(folder)
     except (ValueError, RuntimeError, IndexError) as error:
-        raise ReobjError(
-            f"{folder}: not a COLMAP model ({str(error).splitlines()[0]}); write it again"
-        ) from None
+        reason = str(error).splitlines()[0]
+        raise ReobjError(f"{folder}: not a COLMAP model ({reason}); write it again") from None
     if not model.names:
         raise ReobjError(f"{folder}: the COLMAP model has no registered image")
-    camera = _one_camera(model.cameras, folder)
-    return _GivenPoses(
-        model.cam_from_world, camera, model.names, points=model.points, colors=model.colors
-    )
+    found = (model.cam_from_world, _one_camera(model.cameras, folder), model.names)
+    return _GivenPoses(*found, points=model.points, colors=model.colors)
 
 
 def _colmap_text(folder: Path) -> _GivenPoses:
     cameras = {}
     for at, words in _word_rows(folder / "cameras.txt"):
         try:
-            cameras[words[0]] = Camera(
-                words[1], int(words[2]), int(words[3]), tuple(float(w) for w in words[4:])
-            )
+            params = tuple(float(word) for word in words[4:])
+            cameras[words[0]] = Camera(words[1], int(words[2]), int(words[3]), params)
+            complete = len(params) == _COLMAP_PARAMS.get(words[1])
         except (ValueError, IndexError):
-            words = []
-        if len(words) != 4 + _COLMAP_PARAMS.get((*words, "", "")[1], -5):
-            raise ReobjError(
-                f"{at}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] with a known model, all "
-                "parameters"
-            )
+            complete = False
+        if not complete:
+            expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] with a known model, all parameters"
+            raise ReobjError(f"{at}: expected {expected}")
     rows, where, names, used, points_next = [], [], [], [], False
     for at, words in _word_rows(folder / "images.txt", blank=True):
         points_line = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
@@ -4963,19 +4896,17 @@ def _colmap_text(folder: Path) -> _GivenPoses:
             used.append(cameras[words[8]])
             names.append(" ".join([words[9], *words[10:]]))
         except (ValueError, IndexError, KeyError):
-            raise ReobjError(
-                f"{at}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            ) from None
+            expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise ReobjError(f"{at}: expected {expected}") from None
         where.append(at)
         points_next = True
     if not rows:
         raise ReobjError(f"{folder / 'images.txt'}: no images in it")
     table = np.array(rows)
     poses = _from_quaternions(table[:, [1, 2, 3, 0]], table[:, 4:], where)
-    points, camera = _colmap_text_points(folder / "points3D.txt"), _one_camera(used, folder)
-    return _GivenPoses(
-        poses, camera, tuple(names), points=points[:, :3], colors=points[:, 3:].astype(np.uint8)
-    )
+    points = _colmap_text_points(folder / "points3D.txt")
+    points, colors = points[:, :3], points[:, 3:].astype(np.uint8)
+    return _GivenPoses(poses, _one_camera(used, folder), tuple(names), points=points, colors=colors)
 
 
 def _colmap_text_points(path: Path) -> Array:
@@ -4992,7 +4923,7 @@ def _colmap_text_points(path: Path) -> Array:
 
 def _word_rows(path: Path, blank: bool = False) -> Iterator[tuple[str, list[str]]]:
     """Yield where and the words of each line that is no comment, blank lines on request."""
-    for number, text in enumerate(_lines(path), 1):
+    for number, text in enumerate(_read_text(path).splitlines(), 1):
         words = text.split()
         if (words or blank) and not text.lstrip().startswith("#"):
             yield f"{path}, line {number}", words
@@ -5013,13 +4944,11 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
     """Bring intrinsics to the frames' size; another shape of image is refused."""
     if (camera.width, camera.height) == size:
         return camera
-    if abs(camera.width * size[1] - camera.height * size[0]) > max(
-        camera.width, camera.height, *size
-    ):
+    own = (camera.width, camera.height)
+    if abs(own[0] * size[1] - own[1] * size[0]) > max(*own, *size):
         raise ReobjError(
-            f"{path}: the poses are of {camera.width}x{camera.height} images, the frames are "
-            f"{size[0]}x{size[1]}; "
-            "expected the same shape (rotated or cropped video?)"
+            f"{path}: the poses are of {own[0]}x{own[1]} images, the frames are "
+            f"{size[0]}x{size[1]}; expected the same shape (rotated or cropped video?)"
         )
     return Camera(camera.model, *size, tuple(_pycolmap_camera(camera, size).params.tolist()))
 
@@ -5049,11 +4978,8 @@ def _rows_of_frames(
 
 
 def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
-    """Match by path, file name or stem; otherwise by the last number in the name (from 0, or from 1
-    without a 0).
-    """
-    keys: list[Callable[[str], str]] = [str, lambda n: Path(n).name, lambda n: Path(n).stem]
-    for key in keys:
+    """Match by path, file name or stem; else by the last number in it (from 1 where none is 0)."""
+    for key in (str, lambda n: Path(n).name, lambda n: Path(n).stem):
         rows = {key(name): r for r, name in enumerate(given)}
         found = np.array([rows.get(key(name), -1) for name in names], np.int64)
         if (found >= 0).any():
@@ -5066,13 +4992,10 @@ def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -
 
 
 def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
-    """Match the nearest stamp within half a frame; stamps of another clock only if there is one for
-    each frame.
-    """
+    """Match the nearest stamp within half a frame; of another clock: if each frame has one."""
     if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
-        return np.arange(len(frame)), [
-            "time stamps are of another clock than the frames: matched in order"
-        ]
+        message = "time stamps are of another clock than the frames: matched in order"
+        return np.arange(len(frame)), [message]
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
     half = 0.5 * float(np.median(steps)) if len(steps) else PosesConfig().lone_frame_s
     nearest = np.abs(stamps_s[None] - time_s[:, None]).argmin(1)  # (F,)
@@ -5121,37 +5044,35 @@ def check_poses(
     likely = " or ".join(text for text, value in angle.items() if value <= 1.5 * best)
     return (
         f"the poses look like {likely}: {len(views)} tracks meet in 3D within {best:.1f} deg when "
-        "read that way, "
-        f"{asis:.1f} deg as they are; check --pose-format and the file's convention"
+        f"read that way, {asis:.1f} deg as they are; check --pose-format and the file's convention"
     )
 
 
 def _track_views(
     poses: Poses, frame: IntArray, xy: Array, config: PosesConfig
 ) -> tuple[IntArray, Array] | None:
-    """Rows of the frames of a track that have a pose, thinned, and unit rays (n, 3) in the camera;
-    None if too few.
+    """Rows of a track's frames with a pose, thinned, and unit rays (n, 3) in the camera; None if
+    too few.
     """
-    place = np.clip(np.searchsorted(poses.frame, frame), 0, len(poses.frame) - 1)
-    use = np.flatnonzero(
-        (poses.frame[place] == frame) & poses.known[place] & np.isfinite(xy).all(1)
-    )
+    place, known = _place_of(poses, frame)
+    use = np.flatnonzero(known & np.isfinite(xy).all(1))
     if len(use) < config.check_views:
         return None
-    use = use[
-        np.unique(
-            np.linspace(0, len(use) - 1, min(len(use), config.check_most_views)).round().astype(int)
-        )
-    ]
+    thin = np.linspace(0, len(use) - 1, min(len(use), config.check_most_views))
+    use = use[np.unique(thin.round().astype(int))]
     ideal = poses.camera.undistort(xy[use])
     rays = np.column_stack([ideal, np.ones(len(use))]) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
     return place[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
+def _place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
+    """Rows (n,) of frames in the poses, and whether these have a pose there."""
+    place = np.searchsorted(poses.frame, frame).clip(0, len(poses.frame) - 1)
+    return place, np.asarray((poses.frame[place] == frame) & poses.known[place], bool)
+
+
 def _meet(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, Array, Array]:
-    """World directions (n, 3) of unit rays, camera centres (n, 3), and the point (3,) nearest to
-    all rays.
-    """
+    """World directions (n, 3) of unit rays, camera centres (n, 3), point (3,) nearest to all."""
     world_from_cam = invert_rigid(cam_from_world)
     ray = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam)
     centre = world_from_cam[:, :, 3]
@@ -5161,9 +5082,7 @@ def _meet(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, Array, Arra
 
 
 def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
-    """Meet rays (n, 3) of n cameras (n, 3, 4) in the nearest point or, if better, at infinity;
-    median angle to it.
-    """
+    """Median angle of rays (n, 3) of n cameras to their nearest point or, if better, infinity."""
     ray, centre, point = _meet(cam_from_world, rays_in_cam)
     toward = np.stack([point - centre, np.broadcast_to(ray.mean(0), ray.shape)])  # (2, n, 3)
     cosine = (ray * toward).sum(2) / np.maximum(np.linalg.norm(toward, axis=2), 1e-12)
@@ -5249,8 +5168,7 @@ def _agree(
             (whole, scale * turn @ in_part + shift),
             (part, turn.T @ (in_whole - shift) / scale),
         ):
-            place = np.clip(np.searchsorted(poses.frame, frame), 0, len(poses.frame) - 1)
-            use = (poses.frame[place] == frame) & poses.known[place]
+            place, use = _place_of(poses, frame)
             in_cam = poses.cam_from_world[place[use]] @ np.r_[point, 1]  # (n, 3)
             xy = in_cam @ poses.camera.K.T
             box = xyxy[use]
@@ -5267,11 +5185,7 @@ def _agree(
 def write_tum(path: Path, poses: Poses) -> None:
     """Write the known poses as TUM rows: world_from_cam, seconds, quaternion xyzw."""
     world_from_cam = invert_rigid(poses.cam_from_world[poses.known])
-    xyzw = (
-        Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat()
-        if len(world_from_cam)
-        else np.empty((0, 4))
-    )
+    xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
     units = "units: metres" if poses.metric else _NO_SCALE
     rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
@@ -5287,19 +5201,16 @@ def write_camera_table(path: Path, poses: Poses) -> None:
     rows = ["frame,time_s,status,position_sigma,rotation_sigma_deg"]
     cov = poses.cov if len(poses.cov) else np.full((len(poses.frame), 6, 6), np.nan)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2).reshape(-1, 2, 3).mean(2))  # (F, 2)
-    for frame, time_s, status, (turn, shift) in zip(
-        poses.frame, poses.time_s, poses.status, sigma, strict=True
-    ):
-        known = np.isfinite(shift)
-        numbers = f"{shift:.6g},{np.degrees(turn):.6g}" if known else ","
+    columns = (poses.frame, poses.time_s, poses.status, sigma)
+    for frame, time_s, status, (turn, shift) in zip(*columns, strict=True):
+        numbers = f"{shift:.6g},{np.degrees(turn):.6g}" if np.isfinite(shift) else ","
         rows.append(f"{frame},{time_s:.6f},{status},{numbers}")
     with atomic(path) as part:
         part.write_text("\n".join(rows) + "\n")
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
-    """Write a COLMAP text model of all known poses and points; pycolmap's own binary model is kept
-    if there is one.
+    """Write a COLMAP text model of all known poses and points, unless pycolmap's own is there.
 
     Args:
         image_names: (F,) name of every frame of `poses`.
@@ -5311,21 +5222,18 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
         old.unlink()
     camera = poses.camera
     numbers = " ".join(repr(float(p)) for p in camera.params)
-    (path / "cameras.txt").write_text(
-        f"1 {camera.model} {camera.width} {camera.height} {numbers}\n"
-    )
-    lines = []
-    for i in np.flatnonzero(poses.known).tolist():
-        xyzw = Rotation.from_matrix(poses.cam_from_world[i, :, :3]).as_quat()
-        values = (*xyzw[[3, 0, 1, 2]], *poses.cam_from_world[i, :, 3])
-        lines.append(f"{i + 1} {' '.join(repr(float(v)) for v in values)} 1 {image_names[i]}\n\n")
+    facts = f"1 {camera.model} {camera.width} {camera.height} {numbers}\n"
+    (path / "cameras.txt").write_text(facts)
+    known = poses.cam_from_world[poses.known]
+    values = np.column_stack([quat_wxyz_from_matrix(known[:, :, :3]), known[:, :, 3]])  # (N, 7)
+    lines = [
+        f"{i + 1} {' '.join(map(repr, row))} 1 {image_names[i]}\n\n"
+        for i, row in zip(np.flatnonzero(poses.known).tolist(), values.tolist(), strict=True)
+    ]
     (path / "images.txt").write_text("".join(lines))
     points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
-    rows = [
-        f"{i} {x!r} {y!r} {z!r} {r} {g} {b} 0\n"
-        for i, ((x, y, z), (r, g, b)) in enumerate(points, 1)
-    ]
-    (path / "points3D.txt").write_text("".join(rows))
+    rows = [" ".join(map(repr, (i, *xyz, *rgb, 0))) for i, (xyz, rgb) in enumerate(points, 1)]
+    (path / "points3D.txt").write_text("".join(f"{row}\n" for row in rows))
 
 
 # ---- Objects: tracklets -> one identity and one solid each -------------------------------------
@@ -5336,10 +5244,8 @@ class TrackTable:
     """All tracked detections of a video, one row each (N rows), ordered by frame.
 
     Attributes:
-        frame: source frame numbers; object_id: identity from 1; tracklet_id: uninterrupted piece of
-            track.
-        xyxy: (N, 4) in the video's native pixels; score; class_id; detection_index: row among the
-            frame's detections.
+        frame: source frame numbers; object_id: identity from 1; tracklet_id: unbroken track.
+        xyxy: (N, 4) native pixels; score; class_id; detection_index: row in the frame.
     """
 
     frame: IntArray
@@ -5365,51 +5271,36 @@ class TrackTable:
 
     @staticmethod
     def from_steps(frames: Sequence[int], steps: Sequence[Tracks], scale: float) -> TrackTable:
-        """Collect the results of `Tracker.step`; tentative rows get the identity that was confirmed
-        later.
-        """
+        """Collect the results of `Tracker.step`; rows get the identity that was confirmed later."""
         frame = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
-        joined = {
-            f.name: np.concatenate([getattr(s, f.name) for s in steps]) if steps else np.empty(0)
-            for f in dataclasses.fields(Tracks)
-        }
-        tracklets, inverse = np.unique(joined["tracklet_id"].astype(np.int64), return_inverse=True)
+        columns = [f.name for f in dataclasses.fields(Tracks)]
+        all_of = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
+        tracklets, inverse = np.unique(all_of["tracklet_id"], return_inverse=True)
         identity = np.zeros(len(tracklets), np.int64)
-        np.maximum.at(identity, inverse, joined["track_id"].astype(np.int64))
-        table = TrackTable(
-            frame,
-            identity[inverse],
-            tracklets[inverse],
-            joined["xyxy"].reshape(-1, 4) / scale,
-            joined["score"],
-            joined["class_id"].astype(np.int64),
-            joined["detection_index"].astype(np.int64),
-        )
+        np.maximum.at(identity, inverse, all_of["track_id"])
+        boxes, ids = all_of["xyxy"] / scale, (identity[inverse], tracklets[inverse])
+        rest = (all_of["score"], all_of["class_id"], all_of["detection_index"])
+        table = TrackTable(frame, *ids, boxes, *rest)
         return table[table.object_id > 0]
 
 
 def object_classes(table: TrackTable) -> dict[int, int]:
     """Class of each object: the one with the largest sum of scores."""
-    votes: dict[int, dict[int, float]] = {}
-    for obj, cls, score in zip(
-        table.object_id.tolist(), table.class_id.tolist(), table.score.tolist(), strict=True
-    ):
-        counts = votes.setdefault(obj, {})
-        counts[cls] = counts.get(cls, 0.0) + score
-    return {
-        obj: max(counts, key=lambda c: (counts[c], -c)) for obj, counts in sorted(votes.items())
-    }
+    objects, row = np.unique(table.object_id, return_inverse=True)
+    classes, column = np.unique(table.class_id, return_inverse=True)
+    votes = np.zeros((len(objects), len(classes)))
+    np.add.at(votes, (row, column), table.score)
+    best = classes[votes.argmax(1)] if len(objects) else classes
+    return dict(zip(objects.tolist(), best.tolist(), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """Boxes of G groups of track rows in the V frames that have a pose: the input of
-    `quadrics.fit_objects`.
+    """Boxes of G groups of track rows in V frames with poses: input of `quadrics.fit_objects`.
 
     Attributes:
-        frame: (V,) source frames; boxes: (V, G, 4) undistorted pixels, NaN where unseen; score: (V,
-            G).
-        img_from_world: (V, 3, 4).
+        frame: (V,) source frames. boxes: (V, G, 4) undistorted pixels, NaN where unseen.
+        score: (V, G). img_from_world: (V, 3, 4).
     """
 
     frame: IntArray
@@ -5441,26 +5332,15 @@ def gather_views(
 
 
 def _undistort_boxes(xyxy: Array, camera: Camera) -> Array:
-    """Boxes in the ideal pinhole image: each edge through the undistorted middle of the edge;
-    border edges stay.
+    """Boxes in the ideal pinhole image: edges through their undistorted middles; at the border they
+    stay.
     """
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
-    x1, y1, x2, y2 = xyxy.T
-    middle_x, middle_y = (x1 + x2) / 2, (y1 + y2) / 2
-    edges = np.stack(
-        [
-            np.stack([x1, middle_y], 1),
-            np.stack([middle_x, y1], 1),
-            np.stack([x2, middle_y], 1),
-            np.stack([middle_x, y2], 1),
-        ],
-        1,
-    )  # (N, 4, 2)
-    ideal = camera.undistort(edges)
-    undistorted = np.stack(
-        [ideal[:, 0, 0], ideal[:, 1, 1], ideal[:, 2, 0], ideal[:, 3, 1]], 1
-    )  # (N, 4)
+    edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) middles
+    side, axis = np.arange(4), np.array([0, 1, 0, 1])
+    edges[:, side, axis] = xyxy
+    undistorted = camera.undistort(edges)[:, side, axis]  # (N, 4)
     limit = np.array([camera.width, camera.height] * 2)
     at_border = (xyxy <= 1) | (xyxy >= limit - 1)
     return np.where(at_border, xyxy, undistorted)
@@ -5534,8 +5414,8 @@ class Linker:
         return np.asarray(self.group[self.atom], np.int64)
 
     def _seen_together(self) -> tuple[BoolArray, BoolArray]:
-        """(L, L): atoms with detections in the same frame; those of them that are surely two
-        objects, that is never so close that they could be two boxes on one object.
+        """(L, L): atoms seen in the same frame; those of them that are never so close that they
+        could be two boxes on one object.
         """
         count = len(self.tracklets)
         together, double = np.zeros((count, count), bool), np.zeros((count, count), bool)
@@ -5616,10 +5496,8 @@ class Linker:
         views = gather_views(self.table, self.poses, rows, count, self.config.min_score)
         classes = _class_shares(self.table, rows, count).argmax(1)
         fits = self.fit(views, classes.tolist())
-        solids = quadrics.solid_boxes(
-            fits.ellipsoids, list(fits.support), views.img_from_world
-        )  # (V, G, 4)
-        solids = quadrics.clip_boxes(solids, views.image_size)
+        solids = quadrics.solid_boxes(fits.ellipsoids, list(fits.support), views.img_from_world)
+        solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
         place = np.zeros((count, count))
         for h in range(count):  # over groups: each is one vectorised comparison
             seen = np.flatnonzero(np.isfinite(views.boxes[:, h, 0]))
@@ -5629,8 +5507,7 @@ class Linker:
         return place, _paired_iou(solids, views.boxes)
 
     def _split(self) -> None:
-        """Undo returns whose places differ: tracklets that the joint solid of their identity does
-        not explain.
+        """Undo returns whose places differ: tracklets that their identity's solid does not explain.
 
         Nothing is split on a poor fit alone: the tracklet's own solid must explain its boxes much
         better, and its place must not overlap those that the joint solid does explain.
@@ -5640,11 +5517,10 @@ class Linker:
             return
         place, own = self._cross_iou(np.arange(count), count)
         _, joint = self._cross_iou(self.group, groups)
-        atoms = range(count)
-        alone = np.array([self._median_iou(own[:, a], self.atom == a) for a in atoms])  # (L,)
-        together = np.array(
-            [self._median_iou(joint[:, self.group[a]], self.atom == a) for a in atoms]
-        )
+        alone, together = (
+            np.array([self._median_iou(iou[:, g], self.atom == a) for a, g in enumerate(column)])
+            for iou, column in ((own, np.arange(count)), (joint, self.group))
+        )  # (L,) each
         worse = together < self.config.split_drop * alone
         length = np.bincount(self.atom, minlength=count)
         for g in np.flatnonzero(np.bincount(self.group) > 1):
@@ -5670,10 +5546,8 @@ class Linker:
         proposal = np.arange(count)
         for a, b, _, _ in pairs:
             proposal[b] = a
-        _, own = self._cross_iou(
-            np.unique(proposal[self.group], return_inverse=True)[1], len(np.unique(proposal))
-        )
-        column = np.unique(proposal, return_inverse=True)[1]
+        kept_labels, column = np.unique(proposal, return_inverse=True)
+        _, own = self._cross_iou(column[self.group], len(kept_labels))
         for a, b, iou, look in pairs:
             kept = self._verify(own[:, column[a]], a, b)
             ids = tuple(sorted(self.tracklets[(self.group == a) | (self.group == b)].tolist()))
@@ -5787,16 +5661,10 @@ def _segments_of(table: TrackTable, cut_gap: int) -> tuple[IntArray, IntArray]:
 
 def _paired_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
     """IoU of boxes paired by broadcasting (..., 4); 0 where one is NaN."""
-    overlap = np.minimum(a_xyxy[..., 2:], b_xyxy[..., 2:]) - np.maximum(
-        a_xyxy[..., :2], b_xyxy[..., :2]
-    )
-    inter = overlap.clip(0).prod(-1)
-    union = (
-        (a_xyxy[..., 2:] - a_xyxy[..., :2]).prod(-1)
-        + (b_xyxy[..., 2:] - b_xyxy[..., :2]).prod(-1)
-        - inter
-    )
-    return np.nan_to_num(np.asarray(inter / np.maximum(union, 1e-9), np.float64))
+    low, high = np.maximum(a_xyxy, b_xyxy)[..., :2], np.minimum(a_xyxy, b_xyxy)[..., 2:]
+    inter = (high - low).clip(0).prod(-1)
+    area_a, area_b = ((b[..., 2:] - b[..., :2]).prod(-1) for b in (a_xyxy, b_xyxy))
+    return np.nan_to_num(np.asarray(inter / np.maximum(area_a + area_b - inter, 1e-9), np.float64))
 
 
 def _class_shares(table: TrackTable, group: IntArray, count: int) -> Array:
@@ -5811,9 +5679,7 @@ def _class_shares(table: TrackTable, group: IntArray, count: int) -> Array:
 
 @contextlib.contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Write a file under a temporary name beside it and move it into place only when it is
-    complete.
-    """
+    """Write a file under a temporary name beside it; it gets its own when it is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".part-{path.name}")
     try:
@@ -5824,125 +5690,73 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def write_mot(path: Path, table: TrackTable) -> None:
-    """Write tracks as MOTChallenge results: frame (1-based), id, left, top, width, height, score,
-    -1, -1, -1.
-    """
-    with atomic(path) as part, part.open("w") as file:
-        for frame, obj, box, score in zip(
-            table.frame, table.object_id, table.xyxy, table.score, strict=True
-        ):
-            left, top, right, bottom = box
-            file.write(
-                f"{frame + 1},{obj},{left:.2f},{top:.2f},{right - left:.2f},{bottom - top:.2f},"
-                f"{score:.4f},-1,-1,-1\n"
-            )
+    """Write MOTChallenge results: frame (from 1), id, left, top, width, height, score, 3 x -1."""
+    ltwh = np.column_stack([table.xyxy[:, :2], table.xyxy[:, 2:] - table.xyxy[:, :2]])
+    rows = np.column_stack([table.frame + 1, table.object_id, ltwh, table.score])  # (N, 7)
+    with atomic(path) as part:
+        np.savetxt(part, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
 
 
 def write_ply(
     path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int], detail: int
 ) -> None:
-    """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world
-    coordinates.
-    """
+    """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world."""
     sphere, faces = _icosphere(detail)  # (P, 3), (T, 3)
     half = ellipsoids.half_axes[:, None] * sphere  # (O, P, 3)
-    points = (
-        np.einsum("oij,opj->opi", ellipsoids.world_from_obj, half)
-        + ellipsoids.center_in_world[:, None]
-    )
+    points = half @ np.swapaxes(ellipsoids.world_from_obj, 1, 2)
+    points += ellipsoids.center_in_world[:, None]
     colors = np.array([object_color(i)[::-1] for i in object_id], np.uint8).reshape(-1, 3)  # RGB
     vertex = np.zeros(points.shape[:2], [("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertex["xyz"], vertex["rgb"] = points, colors[:, None]
     face = np.zeros((len(points), len(faces)), [("n", "u1"), ("i", "<i4", 3)])
     face["n"], face["i"] = 3, faces + (np.arange(len(points)) * len(sphere))[:, None, None]
-    names = "".join(
-        f"property {t} {n}\n"
-        for t, n in [
-            ("float", "x"),
-            ("float", "y"),
-            ("float", "z"),
-            ("uchar", "red"),
-            ("uchar", "green"),
-            ("uchar", "blue"),
-        ]
-    )
+    names = [f"property float {n}\n" for n in "xyz"]
+    names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment reobj_track ellipsoids\n"
-        f"element vertex {vertex.size}\n"
-        f"{names}element face {face.size}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"element vertex {vertex.size}\n{''.join(names)}"
+        f"element face {face.size}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     with atomic(path) as part:
         part.write_bytes(header.encode() + vertex.tobytes() + face.tobytes())
 
 
 def _icosphere(detail: int) -> tuple[Array, IntArray]:
-    """Unit sphere as triangles: points (P, 3) and faces (T, 3); `detail` subdivisions of an
-    octahedron.
+    """Unit sphere as points (P, 3) and triangles (T, 3): an octahedron subdivided `detail` + 1
+    times.
     """
-    points = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-    vertices = [np.array(p, np.float64) for p in points]
-    faces = [(a, b, c) for a, b in ((0, 2), (2, 1), (1, 3), (3, 0)) for c in (4, 5)]
-    faces = [(a, b, c) if c == 4 else (b, a, c) for a, b, c in faces]
+    points = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
+                      [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])  # fmt: skip
     for _ in range(detail + 1):
-        middle: dict[tuple[int, int], int] = {}
-
-        def between(a: int, b: int, middle: dict[tuple[int, int], int] = middle) -> int:
-            key = (min(a, b), max(a, b))
-            if key not in middle:
-                point = vertices[a] + vertices[b]
-                vertices.append(point / np.linalg.norm(point))
-                middle[key] = len(vertices) - 1
-            return middle[key]
-
-        split = [(a, b, c, between(a, b), between(b, c), between(c, a)) for a, b, c in faces]
-        faces = [
-            t
-            for a, b, c, ab, bc, ca in split
-            for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-        ]
-    return np.array(vertices), np.array(faces, np.int64)
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2)
+        edges, edge_of = np.unique(edges, axis=0, return_inverse=True)
+        middle = points[edges].sum(1)  # (E, 3)
+        (a, b, c), (ab, bc, ca) = faces.T, len(points) + edge_of.reshape(-1, 3).T
+        points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
+        faces = np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])  # (4, 3, T)
+        faces = faces.transpose(2, 0, 1).reshape(-1, 3)
+    return points, faces
 
 
+SOLID_FIELDS = ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov")
 OBJECT_FIELDS: dict[str, tuple[type, ...]] = {  # of objects.json: name -> types of its value
-    "id": (int,),
-    "class": (str,),
-    "score": (float, int),
-    "status": (str,),
-    "reason": (str,),
-    "support": (str, type(None)),
-    "center": (list, type(None)),
-    "half_axes": (list, type(None)),
-    "quat_wxyz": (list, type(None)),
-    "size": (list, type(None)),
-    "size_m": (list, type(None)),
-    "size_rel_sigma": (list, type(None)),
-    "cov": (list, type(None)),
-    "views": (int,),
-    "frames_seen": (int,),
-    "parallax_deg": (float, int, type(None)),
-    "dropped_boxes": (int,),
-    "reprojection_iou_median": (float, int, type(None)),
-    "tracks": (list,),
-    "frames": (list,),
-}
+    "id": (int,), "class": (str,), "score": (float, int), "status": (str,), "reason": (str,),
+    "support": (str, type(None)), **dict.fromkeys(SOLID_FIELDS, (list, type(None))),
+    "views": (int,), "frames_seen": (int,), "parallax_deg": (float, int, type(None)),
+    "dropped_boxes": (int,), "reprojection_iou_median": (float, int, type(None)),
+    "tracks": (list,), "frames": (list,),
+}  # fmt: skip
 STATUSES = ("ok", "prior_dominated", "rejected")
 
 
 def validate_objects(path: Path) -> list[str]:
-    """Check an objects.json against the format; returns one line for each fault, none if it is
-    valid.
-    """
-    try:
-        data = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ReobjError(f"{path}: cannot be read as JSON ({error})") from error
+    """Check an objects.json against the format; returns one line for each fault."""
+    data = _load_json(path)
     if not isinstance(data, dict) or data.get("format") != "reobj-objects":
         return [f'{path}: expected a JSON object with "format": "reobj-objects"']
-    faults = [
-        f"{path}: missing key {key!r}"
-        for key in ("version", "video", "world", "conventions", "objects")
-        if key not in data
-    ]
+    wanted = ("version", "video", "world", "conventions", "objects")
+    faults = [f"{path}: missing key {key!r}" for key in wanted if key not in data]
     seen: set[int] = set()
     for i, obj in enumerate(data.get("objects", [])):
         where = f"{path}: objects[{i}]"
@@ -6012,16 +5826,8 @@ def _draw_label(image: Image, text: str, x: int, y: int, color: tuple[int, int, 
     y = max(height + base + 2, y)
     cv2.rectangle(image, (x, y - height - base - 2), (x + width + 4, y), color, -1)
     dark = sum(color) > 380
-    cv2.putText(
-        image,
-        text,
-        (x + 2, y - base),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        0.45,
-        (0,) * 3 if dark else (255,) * 3,
-        1,
-        cv2.LINE_AA,
-    )
+    ink, at = (0,) * 3 if dark else (255,) * 3, (x + 2, y - base)
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, 1, cv2.LINE_AA)
 
 
 def draw_ellipses(
@@ -6041,9 +5847,7 @@ def draw_ellipses(
 def _ellipse_of_dual_conic(
     dual_c: Array,
 ) -> tuple[tuple[float, float], tuple[float, float], float] | None:
-    """Centre, full axes and angle in degrees of an ellipse, or None if it is none: C* = [S - mm',
-    -m; -m', -1].
-    """
+    """Centre, full axes, angle in degrees of an ellipse, else None: C* = [S - mm', -m; -m', -1]."""
     conic = dual_c / -dual_c[2, 2]
     center = -conic[:2, 2]
     values, vectors = np.linalg.eigh(conic[:2, :2] + np.outer(center, center))
@@ -6060,9 +5864,7 @@ class VideoWriter:
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
         self.path, self.part = path, path.with_name(f".part-{path.name}")
-        fourcc = cv2.VideoWriter.fourcc(
-            *"mp4v"
-        )  # MPEG-4 part 2: the one H.264-free codec that ships in the wheel
+        fourcc = cv2.VideoWriter.fourcc(*"mp4v")  # the one H.264-free codec in the wheel
         self.writer = cv2.VideoWriter(str(self.part), fourcc, fps, size)
         if not self.writer.isOpened():
             raise OSError(f"{path}: OpenCV cannot write this video")
@@ -6073,9 +5875,7 @@ class VideoWriter:
         self.count += 1
 
     def close(self, complete: bool) -> None:
-        """Finish the file; keep it only if it is complete (OpenCV does not tell when the disk is
-        full).
-        """
+        """Finish the file; keep it only if complete (OpenCV is silent when the disk is full)."""
         self.writer.release()
         try:
             if complete and self._frames_on_disk() != self.count:
@@ -6087,10 +5887,7 @@ class VideoWriter:
 
     def _frames_on_disk(self) -> int:
         capture = cv2.VideoCapture(str(self.part))
-        try:
-            return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
-        finally:
-            capture.release()
+        return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
 
 
 def write_overlay(
@@ -6122,9 +5919,8 @@ def write_overlay(
         for frame in video:
             low, high = np.searchsorted(result.table.frame, [frame.index, frame.index + 1])
             rows = result.table[slice(low, high)]
-            image = np.asarray(
-                cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8
-            )
+            small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+            image = np.asarray(small, np.uint8)
             if frame.index in projected:
                 dual_c, visible = projected[frame.index]
                 seen = set(rows.object_id.tolist())
@@ -6144,29 +5940,22 @@ def write_overlay(
 def _project_all(
     poses: Poses | None, ellipsoids: quadrics.Ellipsoids | None, scale: float
 ) -> dict[int, tuple[Array, BoolArray]]:
-    """Dual conics (O, 3, 3) and visibility (O,) of all ellipsoids for every frame with a pose, in
-    scaled pixels.
-    """
-    if (
-        poses is None
-        or ellipsoids is None
-        or not len(ellipsoids.half_axes)
-        or not poses.known.any()
-    ):
+    """Dual conics (O, 3, 3), scaled pixels, and visibility (O,) for every frame with a pose."""
+    if poses is None or ellipsoids is None or not len(ellipsoids.half_axes):
         return {}
-    img_from_world = (
-        np.diag([scale, scale, 1.0]) @ poses.camera.K @ poses.cam_from_world[poses.known]
-    )
+    known = poses.cam_from_world[poses.known]
+    img_from_world = np.diag([scale, scale, 1.0]) @ poses.camera.K @ known
     dual_c, visible = quadrics.project(ellipsoids.dual_quadrics(), img_from_world)
-    return {int(f): (dual_c[i], visible[i]) for i, f in enumerate(poses.frame[poses.known])}
+    return dict(
+        zip(poses.frame[poses.known].tolist(), zip(dual_c, visible, strict=True), strict=True)
+    )
 
 
 # ---- Scene page: one self-contained HTML file --------------------------------------------------
 
 
 class Pictures:
-    """Small JPEGs for the scene page, cut while the video is read: crops of every object and
-    frames for the time slider.
+    """Small JPEGs for the scene page, cut while the video is read: objects and whole frames.
 
     Attributes:
         crops: [frame number, base64] of each object's pictures, by identity, by time.
@@ -6278,7 +6067,7 @@ def write_scene(result: RunResult, pictures: Pictures, video: Video, config: Con
         "warnings": result.warnings,
         "world": {k: v for k, v in result.world.items() if k != "links"},
         "links": [
-            link | {"place_iou": _rounded(link["place_iou"], 2), "look": _rounded(link["look"], 2)}
+            link | {key: _rounded(link[key], 2) for key in ("place_iou", "look")}
             for link in result.world["links"]
         ],
         "objects": [_scene_object(o, result.table, steps, pictures) for o in result.objects],
@@ -6362,8 +6151,7 @@ class RunResult:
     """What `run` found; the same is in the files of `out`.
 
     Attributes:
-        table: all track rows; objects: entries of objects.json; poses; fits: quadrics.ObjectFits or
-            None.
+        table: all track rows; objects: entries of objects.json; fits: quadrics.ObjectFits or None;
         seconds: wall time by stage; warnings: what the user should know.
     """
 
@@ -6391,14 +6179,9 @@ class Workspace:
         if out.exists() and not out.is_dir():
             raise ReobjError(f"{out}: is a file; -o wants a folder")
         if foreign and not overwrite:
-            raise ReobjError(
-                f"{out}: is not empty and not made by reobj_track; choose another -o, "
-                "or say --overwrite"
-            )
+            raise ReobjError(f"{out}: not empty, not ours; choose another -o, or say --overwrite")
         if foreign and (out / "sparse").exists():
-            raise ReobjError(
-                f"{out}: has a sparse/ of its own that would be lost; choose another -o"
-            )
+            raise ReobjError(f"{out}: its own sparse/ would be lost; choose another -o")
         self.cache.mkdir(parents=True, exist_ok=True)
 
     def claim(self, video: Video, overwrite: bool) -> None:
@@ -6474,8 +6257,7 @@ def run(
     in_3d: bool = True,
     overwrite: bool = False,
 ) -> RunResult:
-    """Run the chain on a video: detect, track, poses, objects; write the files of the output
-    folder.
+    """Run the chain on a video: detect, track, poses, objects; write the output folder's files.
 
     Args:
         source: video file, folder of images, glob, camera index or URL of a stream. Ctrl-C ends a
@@ -6486,8 +6268,7 @@ def run(
         tracks: file of identities that take the place of detector, tracker and linker.
         in_3d: False for identities only, without cameras and ellipsoids.
     Returns:
-        RunResult, also when the reconstruction fails: then without cameras and ellipsoids, and with
-        a warning.
+        RunResult; if the reconstruction fails, without cameras and ellipsoids, and with a warning.
     Raises:
         ReobjError: for input that cannot be used, with what to do.
     """
@@ -6521,7 +6302,7 @@ def refit(
     out: str | Path, config: Config | None = None, tracks: str | Path | None = None
 ) -> RunResult:
     """Link and fit again from what an output folder holds, with other options of the objects
-    section, or with identities from a file of tracks in place of its own.
+    section, or with identities from a file of tracks.
     """
     if not (Path(out) / "cache").is_dir():
         raise ReobjError(f"{out}: no output folder of reobj_track; make one with `run` or `track`")
@@ -6614,10 +6395,9 @@ def save_poses(path: Path, poses: Poses) -> None:
     arrays = {k: getattr(poses, k) for k in _POSE_ARRAYS}
     for i, other in enumerate(poses.parts):
         save_poses(path.with_suffix(f".{i}.part"), other)
+    text = np.array(json.dumps(facts))
     with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(
-            file, facts=np.array(json.dumps(facts)), parts=len(poses.parts), **arrays
-        )
+        np.savez_compressed(file, facts=text, parts=len(poses.parts), **arrays)
 
 
 _POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors", "cov")
@@ -6695,9 +6475,7 @@ def track(
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """Where detections come from: a key for the cache ("" if not to be cached) and frame ->
-    Detections.
-    """
+    """Where detections come from: key for the cache ("": not cached), and frame -> Detections."""
 
     key: str
     class_names: tuple[str, ...]
@@ -6713,11 +6491,8 @@ def _detection_source(video: Video, config: Config, detections: Any) -> _Source:
         return _Source("", call.class_names, lambda frame: call(frame.image), False)
     if detections:
         recorded = read_detections(detections, video, config.detect)
-        key = source_fingerprint(detections)
-        at = recorded.at
-        return _Source(
-            key, recorded.class_names, lambda frame: at(frame.index), False, recorded.messages
-        )
+        key, names = source_fingerprint(detections), recorded.class_names
+        return _Source(key, names, lambda frame: recorded.at(frame.index), False, recorded.messages)
     path = model_path(config.detect.model, offline=config.offline)
     detector = OnnxDetector(path, config.detect, config.threads)
     key = json.dumps([path.name, path.stat().st_size, dataclasses.asdict(config.detect)])
@@ -6730,9 +6505,7 @@ def _track_frames(
     """One pass over the video: detections (cached if they are dear), tracker, progress."""
     cache = DetectionCache(cache_path, video.working_size) if cache_path and source.slow else None
     tracker = Tracker(config.tracker, _embedder(config))
-    pose_of = (
-        {} if poses is None else dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
-    )
+    pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
     camera = None if poses is None else _scaled_camera(poses.camera, video.scale)
     steps: list[tuple[int, Tracks]] = []
     looks: list[tuple[IntArray, Floats]] = []
@@ -6753,10 +6526,8 @@ def _track_frames(
         if cache is not None:
             cache.flush()
     if not steps:
-        raise ReobjError(
-            f"{video.source}: no frame could be read (--start/--stop/--every leave none, "
-            "or the file is damaged)"
-        )
+        why = "--start/--stop/--every leave none, or the file is damaged"
+        raise ReobjError(f"{video.source}: no frame could be read ({why})")
     table = TrackTable.from_steps([i for i, _ in steps], [s for _, s in steps], video.scale)
     messages = [*source.messages, *_video_messages(video, table)]
     look, look_row = _table_looks(table, [i for i, _ in steps], looks)
@@ -6811,10 +6582,7 @@ def _video_messages(video: Video, table: TrackTable) -> list[str]:
                         "keep up")  # fmt: skip
         messages.append("a live source cannot be read twice: identities only; record it for 3D")
     if not len(table):
-        messages.append(
-            "no object was tracked: no detections, or all below the scores of "
-            "--set tracker.new_score / tracker.high_score"
-        )
+        messages.append("no object was tracked: no detections, or all below tracker.new_score")
     return messages
 
 
@@ -6840,9 +6608,7 @@ def _rows_by(group: IntArray) -> list[IntArray]:
     """Row numbers of each distinct value, in the order of the values."""
     order = np.argsort(group, kind="stable")
     _, starts = np.unique(group[order], return_index=True)
-    return (
-        [np.asarray(rows, np.int64) for rows in np.split(order, starts[1:])] if len(group) else []
-    )
+    return np.split(order, starts[1:]) if len(group) else []
 
 
 def _reconstruct(
@@ -6852,8 +6618,8 @@ def _reconstruct(
     seconds: dict[str, float],
     moving: TrackTable | None = None,
 ) -> tuple[Poses, Path]:
-    """Poses from pycolmap and the folder of their sparse model, both cached; features on moving
-    things (people, animals) are left out.
+    """Poses from pycolmap and the folder of their sparse model, both cached, without features on
+    moving things.
     """
     boxes = np.empty((0, 5)) if moving is None else np.column_stack([moving.frame, moving.xyxy])
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
@@ -6918,17 +6684,9 @@ def _fitter(
     def fit(views: Views, classes: list[int]) -> Any:
         categories = [class_names[c] if c < len(class_names) else "" for c in classes]
         return quadrics.fit_objects(
-            views.boxes,
-            views.img_from_world,
-            views.image_size,
-            categories,
-            priors,
-            up=up,
-            support=support,
-            score=views.score,
-            metric=poses.metric,
-            known_size=known,
-        )
+            views.boxes, views.img_from_world, views.image_size, categories, priors, up=up,
+            support=support, score=views.score, metric=poses.metric, known_size=known,
+        )  # fmt: skip
 
     return fit
 
@@ -6955,9 +6713,8 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     for item in filter(None, (part.strip() for part in text.split(","))):
         found = re.fullmatch(r"(.+?)\s*=\s*([0-9.]+)\s*(m|cm|mm)", item)
         if found is None:
-            raise ReobjError(
-                f"--known-size {item!r}: expected CATEGORY=HEIGHT in m, cm or mm, such as door=2.0m"
-            )
+            expected = "CATEGORY=HEIGHT in m, cm or mm, such as door=2.0m"
+            raise ReobjError(f"--known-size {item!r}: expected {expected}")
         sizes[found[1]] = ("h", float(found[2]) / per_metre[found[3]])
     return sizes
 
@@ -6973,13 +6730,10 @@ def _object_entries(
     config: ObjectsConfig,
 ) -> list[dict[str, Any]]:
     """Entries of objects.json, one an object."""
-    entries = []
-    moving = set(config.moving.split(","))
-    iou = (
-        quadrics.reprojection_iou(fits, views.boxes, views.img_from_world, views.image_size)
-        if views
-        else None
-    )
+    entries, moving, iou = [], set(config.moving.split(",")), np.empty(0)
+    if views is not None:
+        seen = (views.boxes, views.img_from_world, views.image_size)
+        iou = quadrics.reprojection_iou(fits, *seen)  # (V, O)
     for i, (obj, cls) in enumerate(object_classes(table).items()):
         rows = table[table.object_id == obj]
         entry: dict[str, Any] = dict.fromkeys(OBJECT_FIELDS)
@@ -6997,19 +6751,17 @@ def _object_entries(
             "frames": _spans_of(rows),
         }
         if fits is not None and views is not None:
-            _add_fit(entry, fits, i, views, iou[:, i] if iou is not None else None)
+            _add_fit(entry, fits, i, views, iou[:, i])
             if name in moving:
                 _reject(entry, "objects of this class move")
-            elif entry["views"] < config.min_views:
-                frames = "1 frame" if entry["views"] == 1 else f"{entry['views']} frames"
-                _reject(
-                    entry, f"seen in {frames} with a camera pose; {config.min_views} are needed"
-                )
+            elif (count := entry["views"]) < config.min_views:
+                seen_in = f"seen in {count} frame{'s' * (count != 1)} with a camera pose"
+                _reject(entry, f"{seen_in}; {config.min_views} are needed")
         entries.append(entry)
     return entries
 
 
-def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array | None) -> None:
+def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array) -> None:
     """Add the solid, its uncertainty and its evidence to an entry."""
     solid, scale = fits.ellipsoids, fits.scale
     seen = np.isfinite(views.boxes[:, i, 0])
@@ -7020,9 +6772,7 @@ def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array 
         "views": int(seen.sum()),
         "dropped_boxes": int((seen & ~fits.inlier[:, i]).sum()),
         "parallax_deg": _rounded(fits.parallax_deg[i], 2),
-        "reprojection_iou_median": _rounded(np.median(iou[seen]), 3)
-        if iou is not None and seen.any()
-        else None,
+        "reprojection_iou_median": _rounded(np.median(iou[seen]), 3) if seen.any() else None,
     }
     if entry["status"] != "rejected":
         size = fits.size[i]
@@ -7038,9 +6788,7 @@ def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array 
 
 
 def _reject(entry: dict[str, Any], reason: str) -> None:
-    entry |= dict.fromkeys(
-        ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov", "support")
-    )
+    entry |= dict.fromkeys(SOLID_FIELDS) | {"support": None}
     entry |= {"status": "rejected", "reason": reason}
 
 
@@ -7055,22 +6803,22 @@ def _numbers(values: Array) -> list[float]:
 
 def _spans_of(rows: TrackTable) -> list[list[int]]:
     """First and last frame of every tracklet, by time."""
-    spans = [
-        [int(rows.frame[r].min()), int(rows.frame[r].max())] for r in _rows_by(rows.tracklet_id)
-    ]
-    return sorted(spans)
+    frames = [rows.frame[r] for r in _rows_by(rows.tracklet_id)]
+    return sorted([int(f.min()), int(f.max())] for f in frames)
 
 
 def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
     """The "world" of objects.json: units, gravity, scale, registered frames, joins and splits."""
+    links = [dataclasses.asdict(event) for event in events]
     if poses is None:
-        return {
-            "units": None,
-            "source": "none",
-            "registered_frames": 0,
-            "links": [dataclasses.asdict(e) for e in events],
+        return {"units": None, "source": "none", "registered_frames": 0, "links": links}
+    scale = None
+    if fits is not None:
+        scale = {
+            "metres_per_unit": _rounded(fits.scale.value, 6),
+            "rel_sigma": _rounded(fits.scale.rel_sigma, 4),
+            "source": fits.scale.source,
         }
-    scale = fits.scale if fits is not None else None
     up = fits.up if fits is not None and fits.up.any() else poses.up_in_world
     return {
         "units": "m" if poses.metric else "arbitrary",
@@ -7080,14 +6828,8 @@ def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) ->
         "frames": len(poses.frame),
         "up_in_world": None if up is None else _numbers(up),
         "up_source": fits.up_source if fits is not None else "none" if up is None else "poses",
-        "scale": None
-        if scale is None
-        else {
-            "metres_per_unit": _rounded(scale.value, 6),
-            "rel_sigma": _rounded(scale.rel_sigma, 4),
-            "source": scale.source,
-        },
-        "links": [dataclasses.asdict(e) for e in events],
+        "scale": scale,
+        "links": links,
     }
 
 
@@ -7145,9 +6887,7 @@ def _write_objects_json(result: RunResult, video: Video) -> None:
     packages = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "onnxruntime")
     versions = {}
     for name in packages:
-        with contextlib.suppress(
-            Exception
-        ):  # a package installed under another name has no version to tell
+        with contextlib.suppress(Exception):  # installed under another name: no version to tell
             versions[name] = version(name)
     width, height = video.size
     data = {
@@ -7186,43 +6926,26 @@ def summary(result: RunResult) -> str:
         reason = f" ({o['reason']})" if o["reason"] else ""
         lines.append(
             f"{o['id']:>6}  {o['class']:<14} {o['frames_seen']:>6} {len(o['frames']):>6}  "
-            f"{text:<26} {sigma:>6}  "
-            f"{o['status']}{reason}"
+            f"{text:<26} {sigma:>6}  {o['status']}{reason}"
         )
-    counts: dict[str, int] = {}
-    for o in result.objects:
-        counts[o["class"]] = counts.get(o["class"], 0) + 1
-    lines.append(
-        "distinct objects: " + (", ".join(f"{n} {c}" for c, n in sorted(counts.items())) or "none")
-    )
+    counts = sorted(Counter(o["class"] for o in result.objects).items())
+    lines.append("distinct objects: " + (", ".join(f"{n} {c}" for c, n in counts) or "none"))
     return "\n".join(lines + _summary_world(result))
 
 
 def _summary_world(result: RunResult) -> list[str]:
     """Lines on cameras, scale, time and where to look."""
-    lines = []
-    world = result.world
+    lines, world = [], result.world
     if result.poses is not None:
-        lines.append(
-            f"cameras: {world['registered_frames']} of {len(result.poses.frame)} frames "
-            f"({result.poses.source})"
-        )
-        if world.get("scale"):
-            scale = world["scale"]
-            lines.append(
-                f"scale: {scale['metres_per_unit']} m per unit, "
-                f"sigma {100 * (scale['rel_sigma'] or 0):.0f} % "
-                f"(from {scale['source']})"
-            )
+        known, count = world["registered_frames"], len(result.poses.frame)
+        lines.append(f"cameras: {known} of {count} frames ({result.poses.source})")
+    if scale := world.get("scale"):
+        sigma = 100 * (scale["rel_sigma"] or 0)
+        facts = f"{scale['metres_per_unit']} m per unit, sigma {sigma:.0f} %"
+        lines.append(f"scale: {facts} (from {scale['source']})")
     lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in result.seconds.items()))
-    lines.append(
-        "look at: "
-        + ", ".join(
-            str(result.out / name)
-            for name in ("scene.html", "overlay.mp4", "objects.json")
-            if (result.out / name).exists()
-        )
-    )
+    files = [result.out / name for name in ("scene.html", "overlay.mp4", "objects.json")]
+    lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
     return lines
 
 
@@ -7639,8 +7362,7 @@ def evaluate(
     scores = {"all": score_tracks(truth, found)}
     if len(wanted) > 1:
         for name in wanted:
-            part = [x[np.isin(x.name, [name, ""])] for x in (truth, found)]
-            scores[name] = score_tracks(*part)
+            scores[name] = score_tracks(*(x[np.isin(x.name, [name, ""])] for x in (truth, found)))
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
     result["ranks"] = score_looks(out, truth)
     if solids is not None:
@@ -7862,9 +7584,8 @@ def turn_onto(a: Array, b: Array) -> Array:
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:  # parallel, or opposite: then about any axis across
         axis, sine = np.cross(a, np.eye(3)[np.abs(a).argmin()]), 0.0
-    return np.asarray(
-        Rotation.from_rotvec(axis / np.linalg.norm(axis) * math.atan2(sine, cosine)).as_matrix()
-    )
+    turn = axis / np.linalg.norm(axis) * math.atan2(sine, cosine)
+    return np.asarray(Rotation.from_rotvec(turn).as_matrix())
 
 
 def export_glb(saved: Saved, path: Path) -> None:
@@ -8126,24 +7847,13 @@ def _options(parser: argparse.ArgumentParser, *sections: str) -> None:
             if not flag:
                 continue
             dest = f"{section}.{f.name}" if section else f.name
-            if isinstance(f.default, bool):
-                parser.add_argument(
-                    flag, dest=dest, action="store_true", default=None, help=f.metadata["help"]
-                )
-            else:
-                text = (
-                    f"{f.metadata['help']} (default: {f.default})"
-                    if f.default not in ("", 0)
-                    else f.metadata["help"]
-                )
-                parser.add_argument(
-                    flag,
-                    dest=dest,
-                    type=type(f.default),
-                    default=None,
-                    help=text.replace("%", "%%"),
-                    metavar=type(f.default).__name__.upper(),
-                )
+            kind: Any = type(f.default)
+            how = {"type": kind, "metavar": kind.__name__.upper()}
+            if kind is bool:
+                how = {"action": "store_true"}
+            default = f" (default: {f.default})" if f.default else ""
+            text = f"{f.metadata['help']}{default}".replace("%", "%%")
+            parser.add_argument(flag, dest=dest, default=None, help=text, **how)
 
 
 def config_from_args(args: argparse.Namespace) -> Config:
@@ -8156,9 +7866,8 @@ def config_from_args(args: argparse.Namespace) -> Config:
     for item in args.set or []:
         target, equals, text = item.partition("=")
         section, _, name = target.rpartition(".")
-        config = _replaced(
-            config, section, name, _parse_value(config, section, name, text, item if equals else "")
-        )
+        value = _parse_value(config, section, name, text if equals else None)
+        config = _replaced(config, section, name, value)
     return config
 
 
@@ -8169,43 +7878,37 @@ def _replaced(config: Config, section: str, name: str, value: Any) -> Config:
     return dataclasses.replace(config, **{section: changed})
 
 
-def _parse_value(config: Config, section: str, name: str, text: str, item: str) -> Any:
+def _every_option() -> dict[str, dataclasses.Field[Any]]:
+    """All fields that --set takes, by section.field."""
+    sections = {f.name: f.default_factory for f in dataclasses.fields(Config)}
+    made = {name: make() for name, make in sections.items() if callable(make)}
+    return {f"{name}.{f.name}": f for name, own in made.items() for f in dataclasses.fields(own)}
+
+
+def _parse_value(config: Config, section: str, name: str, text: str | None) -> Any:
     """Convert the text of --set to the type of the field."""
-    owner = getattr(config, section, None) if section else config
-    names = [
-        f"{s.name}.{f.name}"
-        for s in dataclasses.fields(Config)
-        if dataclasses.is_dataclass(getattr(config, s.name))
-        for f in dataclasses.fields(getattr(config, s.name))
-    ]
-    if (
-        owner is None
-        or not dataclasses.is_dataclass(owner)
-        or name not in {f.name for f in dataclasses.fields(owner)}
-    ):
+    key, options = f"{section}.{name}", _every_option()
+    if key not in options and not (section == "" and name in ("threads", "offline")):
         import difflib
 
-        close = difflib.get_close_matches(f"{section}.{name}", names, 1) or ["tracker.coast_frames"]
-        raise ReobjError(f"--set {section}.{name}: no such option; did you mean {close[0]}?")
-    kind = type(getattr(owner, name))
+        close = difflib.get_close_matches(key, options, 1) or ["tracker.coast_frames"]
+        raise ReobjError(f"--set {key}: no such option; did you mean {close[0]}?")
+    kind = type(getattr(getattr(config, section) if section else config, name))
     try:
-        if not item:
+        if text is None:
             raise ValueError
         return text.lower() in ("1", "true", "yes", "on") if kind is bool else kind(text)
     except ValueError:
-        raise ReobjError(
-            f"--set {section}.{name}: expected ={kind.__name__.upper()}, found {text!r}"
-        ) from None
+        expected = kind.__name__.upper()
+        raise ReobjError(f"--set {key}: expected ={expected}, found {text!r}") from None
 
 
 class _ListOptions(argparse.Action):
     """--options: print every field of the config with its default and meaning, then stop."""
 
     def __call__(self, parser: argparse.ArgumentParser, *args: Any) -> None:
-        for section in dataclasses.fields(Config):
-            owner = getattr(Config(), section.name)
-            for f in dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ():
-                print(f"{section.name}.{f.name}={f.default}\n        {f.metadata['help']}")
+        for name, f in _every_option().items():
+            print(f"{name}={f.default}\n        {f.metadata['help']}")
         parser.exit()
 
 
@@ -8217,18 +7920,12 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Example: reobj_track.py run room.mp4 -o out; then open out/overlay.mp4.",
     )
     parser.add_argument("--version", action="version", version=f"reobj_track {__version__}")
-    parser.add_argument(
-        "--options",
-        action=_ListOptions,
-        nargs=0,
-        help="list what --set section.field=value can set",
-    )
+    text = "list what --set section.field=value can set"
+    parser.add_argument("--options", action=_ListOptions, nargs=0, help=text)
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_run(
-        sub, "run", "video -> identities -> cameras -> ellipsoids -> files to look at", _cmd_run
-    )
-    _add_run(sub, "track", "identities only (2D)", _cmd_track)
-    _add_run(sub, "poses", "cameras only (pycolmap)", _cmd_poses)
+    _add_run(sub, "run", "video -> identities -> cameras -> ellipsoids -> files to look at")
+    _add_run(sub, "track", "identities only (2D)")
+    _add_run(sub, "poses", "cameras only (pycolmap)")
     _add_objects(sub)
     _add_eval(sub)
     _add_export(sub)
@@ -8240,71 +7937,35 @@ TRACKS_HELP = "identities from a file instead of the tracker: CVAT XML, COCO-VID
 
 
 def _common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--set",
-        action="append",
-        metavar="SECTION.FIELD=VALUE",
-        help="any other option, e.g. tracker.coast_frames=60; --options lists them",
-    )
+    text = "any other option, e.g. tracker.coast_frames=60; --options lists them"
+    parser.add_argument("--set", action="append", metavar="SECTION.FIELD=VALUE", help=text)
     parser.add_argument("-v", "--verbose", action="store_true", help="say what is being done")
     parser.add_argument("--debug", action="store_true", help="say more, and show tracebacks")
 
 
-def _add_run(sub: Any, name: str, text: str, func: Callable[[argparse.Namespace], int]) -> None:
+def _add_run(sub: Any, name: str, text: str) -> None:
     parser = sub.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    parser.add_argument(
-        "video", help="video file, folder of images, glob in quotes, camera index, stream URL"
-    )
-    parser.add_argument("-o", "--out", required=True, help="output folder")
-    parser.add_argument(
-        "--overwrite", action="store_true", help="write into a folder that holds something else"
-    )
+    add = parser.add_argument
+    add("video", help="video file, folder of images, glob in quotes, camera index, stream URL")
+    add("-o", "--out", required=True, help="output folder")
+    add("--overwrite", action="store_true", help="write into a folder that holds something else")
     sections = {
         "run": ("input", "detect", "embed", "tracker", "poses", "objects"),
         "track": ("input", "detect", "embed", "tracker"),
         "poses": ("input", "poses"),
     }[name]
     if name != "poses":
-        parser.add_argument(
-            "--detections",
-            help="recorded detections instead of a detector: MOT txt, CSV, COCO JSON, npz",
-        )
-        parser.add_argument("--tracks", help=TRACKS_HELP)
+        add("--detections", help="recorded detections instead: MOT txt, CSV, COCO JSON, npz")
+        add("--tracks", help=TRACKS_HELP)
     _options(parser, *sections, "")
     _common(parser)
-    parser.set_defaults(func=func)
+    parser.set_defaults(func=_cmd_poses if name == "poses" else _cmd_run)
 
 
 def _cmd_run(args: argparse.Namespace) -> int:
-    return _finish(
-        run(
-            args.video,
-            args.out,
-            config_from_args(args),
-            detections=args.detections,
-            tracks=args.tracks,
-            overwrite=args.overwrite,
-        )
-    )
-
-
-def _cmd_track(args: argparse.Namespace) -> int:
-    return _finish(
-        run(
-            args.video,
-            args.out,
-            config_from_args(args),
-            detections=args.detections,
-            tracks=args.tracks,
-            in_3d=False,
-            overwrite=args.overwrite,
-        )
-    )
-
-
-def _finish(result: RunResult) -> int:
-    """Print the summary on stdout."""
-    print(summary(result))
+    given = {"detections": args.detections, "tracks": args.tracks, "overwrite": args.overwrite}
+    config, in_3d = config_from_args(args), args.command == "run"
+    print(summary(run(args.video, args.out, config, in_3d=in_3d, **given)))
     return 0
 
 
@@ -8319,10 +7980,9 @@ def _cmd_poses(args: argparse.Namespace) -> int:
         poses, model = _reconstruct(video, space, config, seconds)
     space.show_model(model)
     write_cameras(space.out, poses, video)
-    print(
-        f"cameras: {poses.known.sum()} of {len(poses.frame)} frames, {len(poses.points)} points; "
-        f"look at: {space.out / 'poses.txt'}, {space.out / 'sparse'}"
-    )
+    known, count = poses.known.sum(), len(poses.frame)
+    where = f"{space.out / 'poses.txt'}, {space.out / 'sparse'}"
+    print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
     for message in poses.messages:
         log.warning(message)
     return 0
@@ -8332,9 +7992,8 @@ def _add_objects(sub: Any) -> None:
     text = "(re)fit the ellipsoids from what an output folder already holds"
     parser = sub.add_parser("objects", help=text, description=text[0].upper() + text[1:] + ".")
     parser.add_argument("out", help="output folder of an earlier `run`")
-    parser.add_argument(
-        "--validate", action="store_true", help="only check objects.json against its format"
-    )
+    text = "only check objects.json against its format"
+    parser.add_argument("--validate", action="store_true", help=text)
     parser.add_argument("--tracks", help=TRACKS_HELP)
     _options(parser, "objects")
     _common(parser)
@@ -8347,24 +8006,20 @@ def _cmd_objects(args: argparse.Namespace) -> int:
         faults = validate_objects(out / "objects.json" if out.is_dir() else out)
         print("\n".join(faults) or "valid")
         return 2 if faults else 0
-    return _finish(refit(out, config_from_args(args), args.tracks))
+    print(summary(refit(out, config_from_args(args), args.tracks)))
+    return 0
 
 
 def _add_eval(sub: Any) -> None:
     parser = sub.add_parser("eval", help="compare with ground truth: HOTA, IDF1, MOTA, O3D ...")
-    parser.add_argument("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
-    parser.add_argument("--gt", type=Path, required=True, help="true tracks, MOTChallenge gt.txt")
-    parser.add_argument("--gt-objects", type=Path, help="true solids, e.g. a gt_objects.json")
-    parser.add_argument(
-        "--gt-poses",
-        type=Path,
-        help="true cameras, TUM or 4x4 world_from_cam a line "
-        "(default: poses.txt or poses_c2w.txt beside --gt-objects)",
-    )
-    parser.add_argument("--classes", default="", help="score these classes only, comma-separated")
-    parser.add_argument(
-        "--min-visibility", type=float, default=0.0, help="ignore truth that is less visible"
-    )
+    add = parser.add_argument
+    add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
+    add("--gt", type=Path, required=True, help="true tracks, MOTChallenge gt.txt")
+    add("--gt-objects", type=Path, help="true solids, e.g. a gt_objects.json")
+    add("--gt-poses", type=Path, help="true cameras, TUM or 4x4 world_from_cam a line (default: "
+        "poses.txt or poses_c2w.txt beside --gt-objects)")  # fmt: skip
+    add("--classes", default="", help="score these classes only, comma-separated")
+    add("--min-visibility", type=float, default=0.0, help="ignore truth that is less visible")
     _common(parser)
     parser.set_defaults(func=_cmd_eval)
 
@@ -8413,9 +8068,8 @@ def _ranks_line(ranks: dict[str, float]) -> str:
 def _add_models(sub: Any) -> None:
     text = "list, download and verify weights"
     parser = sub.add_parser("models", help=text, description=text[0].upper() + text[1:] + ".")
-    parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="weights to download or verify; none: list all"
-    )
+    names = "weights to download or verify; none: list all"
+    parser.add_argument("names", nargs="*", metavar="NAME", help=names)
     _options(parser, "")
     _common(parser)
     parser.set_defaults(func=_cmd_models)
@@ -8427,10 +8081,8 @@ def _cmd_models(args: argparse.Namespace) -> int:
     if not args.names:
         for row in list_models():
             w = row.weights
-            print(
-                f"{w.name:<20} {w.role:<9} {w.size / 1e6:5.1f} MB  {w.licence:<11} "
-                f"{row.state:<13} {w.note}"
-            )
+            facts = f"{w.name:<20} {w.role:<9} {w.size / 1e6:5.1f} MB  {w.licence:<11}"
+            print(f"{facts} {row.state:<13} {w.note}")
     return 0
 
 
@@ -8447,11 +8099,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return int(args.func(args))
     except KeyboardInterrupt:
-        print(
-            "\ninterrupted: what was computed is kept in the output folder's cache; "
-            "run the same command again to go on from there",
-            file=sys.stderr,
-        )
+        text = "interrupted: the cache keeps what was computed; the same command goes on from there"
+        print(f"\n{text}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output (head, less) has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
