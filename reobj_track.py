@@ -330,7 +330,7 @@ class TrackerConfig:
     place_parallax_deg: float = _opt(2.0, "a place counts from this angle between its views on")
     camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
     flow_size_px: int = _opt(320, "longer side of the image for optical flow")
-    flow_corners: int = _opt(200, "corners followed")
+    flow_corners: int = _opt(100, "corners followed")
     flow_min_corners: int = _opt(8, "with fewer, the camera is taken to stand still")
 
 
@@ -2000,7 +2000,7 @@ class CameraMotion:
         if self._gray is not None and self._corners is not None and self._gray.shape == gray.shape:
             new_from_old = self._flow(gray)
         self._gray = gray
-        self._corners = cv2.goodFeaturesToTrack(gray, self.config.flow_corners, 0.01, 7)
+        self._corners = cv2.goodFeaturesToTrack(gray, self.config.flow_corners, 0.01, 12)
         to_small = np.diag([shrink, shrink, 1.0])
         return np.asarray(np.linalg.inv(to_small) @ new_from_old @ to_small)
 
@@ -3315,7 +3315,9 @@ class Tracker:
         doubtful = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
         known = (live.embedded >= 0)[:, None]
         doubtful |= gate & known & (cost > config.doubt_cost)
-        rows = np.flatnonzero(doubtful.any(0))
+        rows = np.flatnonzero(
+            (doubtful & close).any(0)
+        )  # looks cost time: not for what is no match
         if not len(rows):
             return cost, feasible
         cosine = (live.look @ lazy.get(rows).T).astype(np.float64)  # (T, n)
@@ -5272,6 +5274,9 @@ class TrackTable:
     @staticmethod
     def from_steps(frames: Sequence[int], steps: Sequence[Tracks], scale: float) -> TrackTable:
         """Collect the results of `Tracker.step`; rows get the identity that was confirmed later."""
+        if not steps:
+            none = np.empty(0, np.int64)
+            return TrackTable(none, none, none, np.empty((0, 4)), np.empty(0), none, none)
         frame = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
         columns = [f.name for f in dataclasses.fields(Tracks)]
         all_of = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
@@ -6179,9 +6184,10 @@ class Workspace:
         if out.exists() and not out.is_dir():
             raise ReobjError(f"{out}: is a file; -o wants a folder")
         if foreign and not overwrite:
-            raise ReobjError(f"{out}: not empty, not ours; choose another -o, or say --overwrite")
+            what = "is not empty and not made by reobj_track"
+            raise ReobjError(f"{out}: {what}; choose another -o, or say --overwrite")
         if foreign and (out / "sparse").exists():
-            raise ReobjError(f"{out}: its own sparse/ would be lost; choose another -o")
+            raise ReobjError(f"{out}: a sparse/ of its own would be lost; choose another -o")
         self.cache.mkdir(parents=True, exist_ok=True)
 
     def claim(self, video: Video, overwrite: bool) -> None:
@@ -8099,7 +8105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return int(args.func(args))
     except KeyboardInterrupt:
-        text = "interrupted: the cache keeps what was computed; the same command goes on from there"
+        text = "interrupted: what was computed is kept; run the same command again to go on"
         print(f"\n{text}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output (head, less) has seen enough

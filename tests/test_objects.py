@@ -405,7 +405,7 @@ def test_validate_finds_faults(tmp_path: Path, change: dict[str, object], fault:
 
 def test_validate_refuses_what_is_no_json(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("{")
-    with pytest.raises(rt.ReobjError, match="cannot be read as JSON"):
+    with pytest.raises(rt.ReobjError, match="not valid JSON"):
         rt.validate_objects(tmp_path / "x.json")
 
 
