@@ -258,7 +258,9 @@ class TrackerConfig:
     )
     low_score: float = _opt(0.1, "second round: of at least this score (ByteTrack)")
     new_score: float = _opt(0.5, "a new track needs this score")
-    n_init: int = _opt(3, "detections before a track is confirmed (DeepSORT)")
+    n_init: int = _opt(
+        3, "detections before a new object gets its identity (DeepSORT); a return needs one less"
+    )
     coast_frames: int = _opt(30, "frames a track is predicted without a detection", "--coast")
     remember: bool = _opt(True, "recognise objects that return, however long they were away")
     std_position: float = _opt(
@@ -3430,16 +3432,19 @@ class Tracker:
 
     def _confirm(self, track_of: IntArray) -> IntArray:
         """Give tracks that were seen often enough an identity: a known one that returns, or a new
-        one.
+        one. A return has a look to show for it and needs one detection less. Where nothing is
+        known yet, one detection is enough (as in SORT's first frames).
         """
         live = self._live
-        ready = np.flatnonzero(
-            (live.identity < 0) & (live.hits >= self.config.n_init) & (live.missed == 0)
-        )
+        needed = self.config.n_init if len(self.last_seen) else 1
+        young = (live.identity < 0) & (live.missed == 0)
+        ready = np.flatnonzero(young & (live.hits >= min(needed, self.config.n_init - 1)))
         self.last_seen[live.identity[(live.identity >= 0) & (live.missed == 0)]] = self.frame_number
         returning = self._returns_home(ready)  # (n,) identity or -1
         away = returning < 0
         returning[away] = self._returns(ready[away])
+        sure = (returning >= 0) | (live.hits[ready] >= needed)
+        ready, returning = ready[sure], returning[sure]
         fresh = ready[returning < 0]
         ids = len(self.last_seen) + np.arange(len(fresh))
         self.last_seen = np.append(self.last_seen, np.zeros(len(fresh), np.int64))

@@ -162,17 +162,33 @@ def test_identities_start_at_one_and_belong_to_the_tracker() -> None:
     assert tracker.update(rows((0, 0, 50, 50))).track_id.tolist() == [1]
 
 
-def test_a_track_is_tentative_until_seen_n_init_times() -> None:
+def test_a_newcomer_is_tentative_until_seen_n_init_times() -> None:
+    """The first frame's objects are known at once: nothing is there to be confused with."""
     tracker = rt.Tracker(rt.TrackerConfig(n_init=3))
-    lengths = [len(tracker.update(rows((0, 0, 50, 50)))) for _ in range(4)]
-    assert lengths == [0, 0, 1, 1]
+    known = (0, 0, 50, 50)
+    assert tracker.update(rows(known)).track_id.tolist() == [1]
+    ids = [tracker.update(rows(known, (100, 0, 150, 50))).track_id.tolist() for _ in range(4)]
+    assert ids == [[1], [1], [1, 2], [1, 2]]
+
+
+def test_a_return_is_known_one_detection_earlier_than_a_newcomer() -> None:
+    looks = unit(np.random.default_rng(12), 2)
+    tracker = rt.Tracker()
+    for _ in range(12):
+        tracker.update(rows((0, 0, 50, 50)), embeddings=looks[:1])
+    for _ in range(60):
+        tracker.update(rt.Detections.empty())
+    both = rows((300, 0, 350, 50), (500, 0, 550, 50))
+    ids = [tracker.update(both, embeddings=looks).track_id.tolist() for _ in range(3)]
+    assert ids == [[], [1], [1, 2]]
 
 
 def test_step_tells_tentative_tracks_and_their_tracklet() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=2))
-    first, second = tracker.step(rows((0, 0, 50, 50))), tracker.step(rows((0, 0, 50, 50)))
-    assert first.track_id.tolist() == [0] and second.track_id.tolist() == [1]
-    assert first.tracklet_id.tolist() == second.tracklet_id.tolist()
+    both = rows((0, 0, 50, 50), (100, 0, 150, 50))
+    first, second, third = (tracker.step(part) for part in (both[:1], both, both))
+    assert [t.track_id.tolist() for t in (first, second, third)] == [[1], [1, 0], [1, 2]]
+    assert second.tracklet_id.tolist() == third.tracklet_id.tolist()
 
 
 def test_every_row_names_its_detection() -> None:
@@ -394,7 +410,9 @@ def test_an_unused_tracker_can_be_saved(options: dict[str, int], tmp_path: Path)
     rt.Tracker(rt.TrackerConfig(**options)).save(tmp_path / "state.npz")
     loaded = rt.Tracker.load(tmp_path / "state.npz")
     assert loaded.config == rt.TrackerConfig(**options)
-    assert len(loaded.update(rows((0, 0, 50, 50)))) == (options.get("n_init") == 1)
+    loaded.update(rows((0, 0, 50, 50)))
+    both = rows((0, 0, 50, 50), (90, 0, 140, 50))
+    assert len(loaded.update(both)) == 1 + (options.get("n_init") == 1)
 
 
 def test_what_is_no_saved_tracker_is_refused(tmp_path: Path) -> None:
