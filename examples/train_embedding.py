@@ -366,12 +366,53 @@ def degrade(rng: np.random.Generator, image: Image) -> Image:
     return image
 
 
-def crop_window(rng: np.random.Generator, image: Image, least: float) -> tuple[Array, float]:
+def crop_window(
+    rng: np.random.Generator, image: Image, least: float, size_wh: tuple[int, int]
+) -> tuple[Array, float]:
     """Corner (2,) and factor of a random window with the training picture's shape."""
     height, width = image.shape[:2]
-    fit = min(width / SIZE_WH[0], height / SIZE_WH[1]) * rng.uniform(least, 1.0)
-    extent = np.array(SIZE_WH) * fit
+    fit = min(width / size_wh[0], height / size_wh[1]) * rng.uniform(least, 1.0)
+    extent = np.array(size_wh) * fit
     return rng.uniform(0, 1, 2) * (np.array([width, height]) - extent), float(1 / fit)
+
+
+def augmented(
+    clip: Clip,
+    frame: int,
+    rng: np.random.Generator,
+    change: Callable[[Image], Image] | None,
+    flip: bool,
+    wanted: IntArray,
+    size_wh: tuple[int, int] = SIZE_WH,
+) -> tuple[Image, rt.Detections, IntArray]:
+    """Augment one frame (change None: leave it, for validation).
+
+    Returns a picture of this size, all boxes in it, and the rows (N,) of the wanted identities.
+    """
+    image, augment = clip.images[frame], change is not None
+    corner, factor = crop_window(rng, image, 0.6 if augment else 1.0, size_wh)
+    warp = np.array([[factor, 0, -factor * corner[0]], [0, factor, -factor * corner[1]]])
+    if flip:
+        warp = np.array([[-1.0, 0, size_wh[0]], [0, 1.0, 0]]) @ np.vstack([warp, [0, 0, 1]])
+    pixel = warp.copy()
+    pixel[:, 2] += warp[:, :2] @ [0.5, 0.5] - 0.5  # pixel centres lie at .5
+    flags = cv2.INTER_LINEAR if factor >= 1 else cv2.INTER_AREA
+    picture = np.asarray(cv2.warpAffine(image, pixel, size_wh, flags=flags), np.uint8)
+    xyxy = clip.xyxy[frame] @ np.kron(np.eye(2), warp[:, :2]).T + np.tile(warp[:, 2], 2)
+    xyxy = np.c_[np.minimum(xyxy[:, :2], xyxy[:, 2:]), np.maximum(xyxy[:, :2], xyxy[:, 2:])]
+    if change is not None:
+        picture = degrade(rng, photo_tone(rng, 0.15)(change(picture)))
+    keep, boxes = jittered(rng, xyxy, 0.04 if augment else 0.0, size_wh)
+    keep &= np.isin(clip.identity[frame], wanted)
+    masks = None
+    if clip.labels is not None and (not augment or rng.random() < 0.5):
+        label = cv2.warpAffine(clip.labels[frame], pixel, size_wh, flags=cv2.INTER_NEAREST)
+        masks = label[None] == (clip.identity[frame] + 1)[:, None, None]
+    score = np.full(len(boxes), float(clip.sure))
+    if augment and not clip.sure:
+        score = (rng.random(len(boxes)) < 0.03).astype(float)
+    found = rt.Detections(boxes, score, np.zeros(len(boxes), np.int64), masks)
+    return picture, found, np.flatnonzero(keep)
 
 
 def make_view(
@@ -382,31 +423,9 @@ def make_view(
     flip: bool,
     wanted: IntArray,
 ) -> View:
-    """Augment one frame (change None: leave it, for validation) and sample its boxes."""
-    image, augment = clip.images[frame], change is not None
-    corner, factor = crop_window(rng, image, 0.6 if augment else 1.0)
-    warp = np.array([[factor, 0, -factor * corner[0]], [0, factor, -factor * corner[1]]])
-    if flip:
-        warp = np.array([[-1.0, 0, SIZE_WH[0]], [0, 1.0, 0]]) @ np.vstack([warp, [0, 0, 1]])
-    pixel = warp.copy()
-    pixel[:, 2] += warp[:, :2] @ [0.5, 0.5] - 0.5  # pixel centres lie at .5
-    flags = cv2.INTER_LINEAR if factor >= 1 else cv2.INTER_AREA
-    picture = np.asarray(cv2.warpAffine(image, pixel, SIZE_WH, flags=flags), np.uint8)
-    xyxy = clip.xyxy[frame] @ np.kron(np.eye(2), warp[:, :2]).T + np.tile(warp[:, 2], 2)
-    xyxy = np.c_[np.minimum(xyxy[:, :2], xyxy[:, 2:]), np.maximum(xyxy[:, :2], xyxy[:, 2:])]
-    if change is not None:
-        picture = degrade(rng, photo_tone(rng, 0.15)(change(picture)))
-    keep, boxes = jittered(rng, xyxy, 0.04 if augment else 0.0)
-    keep &= np.isin(clip.identity[frame], wanted)
-    masks = None
-    if clip.labels is not None and (not augment or rng.random() < 0.5):
-        label = cv2.warpAffine(clip.labels[frame], pixel, SIZE_WH, flags=cv2.INTER_NEAREST)
-        masks = label[None] == (clip.identity[frame] + 1)[:, None, None]
-    score = np.full(len(boxes), float(clip.sure))
-    if augment and not clip.sure:
-        score = (rng.random(len(boxes)) < 0.03).astype(float)
-    found = rt.Detections(boxes, score, np.zeros(len(boxes), np.int64), masks)
-    rows, shape = np.flatnonzero(keep), (SIZE_WH[1] // 4, SIZE_WH[0] // 4)
+    """Augment one frame as `augmented` does and sample its boxes."""
+    picture, found, rows = augmented(clip, frame, rng, change, flip, wanted)
+    shape = (SIZE_WH[1] // 4, SIZE_WH[0] // 4)
     parts = rt.part_samples(found, rows, SIZE_WH[::-1], shape, layout())
     return View(picture, clip.identity[frame][rows], clip.look[frame][rows], parts)
 
@@ -417,14 +436,16 @@ def layout() -> rt.EmbedConfig:
 
 
 def jittered(
-    rng: np.random.Generator, xyxy: Array, sigma: float
+    rng: np.random.Generator, xyxy: Array, sigma: float, size_wh: tuple[int, int]
 ) -> tuple[npt.NDArray[np.bool_], Array]:
     """Boxes as a detector would draw them, and which of them are still in view (40 %)."""
     extent = np.tile(xyxy[:, 2:] - xyxy[:, :2], 2)
     moved = xyxy + rng.normal(0, 1, xyxy.shape) * sigma * extent
-    cut = np.clip(moved, 0, [*SIZE_WH, *SIZE_WH])
+    cut = np.clip(moved, 0, [*size_wh, *size_wh])
     sides = cut[:, 2:] - cut[:, :2]
-    keep = (sides.prod(1) > 0.4 * extent[:, :2].prod(1)) & (sides.min(1, initial=np.inf) >= 6)
+    keep = (sides.prod(1) > 0.4 * extent[:, :2].prod(1)) & (
+        sides.min(1, initial=np.inf) >= size_wh[0] / 50
+    )
     return keep, cut
 
 
