@@ -246,7 +246,9 @@ class EmbedConfig:
         0, "the foreground reads only so many channels of the map, the first ones (0: all)"
     )
     crop_px: int = _opt(224, "side of the crops of --embed crops")
-    conv_block: str = _opt("", "trained ConvBlock (.onnx) of --embed crops; none: maps flattened")
+    head: str = _opt(
+        "", "trained head (.onnx) of a backbone; empty: the one that comes along; none: no training"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -2113,6 +2115,16 @@ class Embedder:
             self._last = (frame, self._features(frame))
         return self.pool(self._last[1], frame.shape[:2], detections, rows)
 
+    @property
+    def trained(self) -> bool:
+        """Does the model come with a head?"""
+        return self._net is not None and self._net.head is not None
+
+    @property
+    def frozen(self) -> bool:
+        """Is it a backbone that was trained for something else?"""
+        return self._net is not None and not self._net.own
+
     def pool(
         self,
         features: Floats,
@@ -2218,7 +2230,7 @@ class CropEmbedder(Embedder):
 
     Args:
         model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image
-            input (any batch) and a spatial output.
+            input (any batch) and a spatial output. A ConvBlock for mobilenetv2 comes along.
     Raises:
         ReobjError: the model has no spatial output, or the ConvBlock does not fit it.
     """
@@ -2230,13 +2242,15 @@ class CropEmbedder(Embedder):
         threads: int = 0,
         offline: bool = False,
     ) -> None:
-        super().__init__(model, config, threads, offline)
+        config = config or EmbedConfig()
+        super().__init__(model, dataclasses.replace(config, head="none"), threads, offline)
         self.model = f"crops:{model}"
         self.output = self._deepest_map()
-        block = self.layout.conv_block
-        self.conv_block = (
-            onnx_session(model_path(block, offline=offline), threads) if block else None
-        )
+        head = None if self.trained else trained_head(self.model, config)
+        self.conv_block = onnx_session(head, threads) if head else None
+        if head:
+            layout = _facts(self.conv_block).get("layout", {})
+            self.layout = dataclasses.replace(self.layout, head=str(head), **layout)
 
     def __call__(
         self, frame: Image, detections: Detections, rows: IntArray | None = None
@@ -2254,11 +2268,6 @@ class CropEmbedder(Embedder):
             return Embeddings(_flat_map(fore), _flat_map(back))
         joint = self._joint(np.concatenate([fore, back], 1))
         return Embeddings(_unit_rows(joint), np.empty((len(rows), 0)))
-
-    @property
-    def trained(self) -> bool:
-        """Does the model come with a head of its own?"""
-        return self._net is not None and self._net.head is not None
 
     def cut(self, frame: Image, detections: Detections, rows: IntArray) -> tuple[Image, BoolArray]:
         """Grown boxes, black beyond the frame: crops (N, S, S, 3), object pixels (N, S, S)."""
@@ -2336,7 +2345,7 @@ class CropEmbedder(Embedder):
         """Backbone features (B, C, h, w) of BGR images (B, S, S, 3)."""
         net = self._net
         assert net is not None
-        if net.head is not None:
+        if net.own:
             return np.ascontiguousarray(net.maps(crops).transpose(0, 3, 1, 2))
         rgb = (crops[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         feed = {net.input: np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32)}
@@ -2346,7 +2355,7 @@ class CropEmbedder(Embedder):
         """Name of the backbone's first output at stride 32 (7 x 7 for 224 px), else its first."""
         net, side = self._net, self.layout.crop_px
         assert net is not None
-        if net.head is not None:
+        if net.own:
             return str(net.output)
         names: list[str] = [o.name for o in net.session.get_outputs()]
         maps = net.session.run(names, {net.input: np.zeros((1, 3, side, side), np.float32)})
@@ -2362,7 +2371,7 @@ class CropEmbedder(Embedder):
             isinstance(w, int) and w != n for w, n in zip(wanted, both.shape[1:], strict=True)
         ):
             raise ReobjError(
-                f"{self.layout.conv_block}: takes {entry.shape}, the two maps of the backbone are "
+                f"{self.layout.head}: takes {entry.shape}, the two maps of the backbone are "
                 f"(N, {', '.join(map(str, both.shape[1:]))}): give a ConvBlock trained with this "
                 "backbone and --set embed.crop_px"
             )
@@ -2460,10 +2469,12 @@ class _Backbone:
 
     Files of `examples/train_embedding.py` say in their metadata ("reobj", JSON) how the frame is
     resized, where the map is sampled and which file holds the head; they take BGR bytes and give
-    channels last. Any other backbone: RGB, ImageNet mean and deviation, channels first.
+    channels last. Any other backbone: RGB, ImageNet mean and deviation, channels first; where a
+    head was trained for it, the head's metadata say the same.
 
     Attributes:
         layout: where its maps are sampled. head: session of the trained head, or None.
+        own: does it take BGR bytes and give channels last?
     """
 
     def __init__(self, model: str, config: EmbedConfig, threads: int, offline: bool) -> None:
@@ -2477,14 +2488,15 @@ class _Backbone:
                 "give another --embed model, or --embed colour"
             )
         self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
-        own = self.session.get_modelmeta().custom_metadata_map.get("reobj")
-        self.layout, self.multiple = config, 32
-        self.head: Any = None
-        if own is not None:
-            facts = json.loads(own)
-            self.layout = dataclasses.replace(config, **facts["layout"])
-            self.multiple = int(facts["multiple"])
-            self.head = onnx_session(path.parent / facts["head"], threads)
+        facts = _facts(self.session)
+        self.own = bool(facts)
+        self.layout, self.multiple = config, int(facts.get("multiple", 32))
+        head = path.parent / facts["head"] if self.own else trained_head(model, config)
+        self.head: Any = onnx_session(head, threads) if head else None
+        if head:
+            self.layout = dataclasses.replace(
+                config, **(facts or _facts(self.head)).get("layout", {})
+            )
 
     def __call__(self, frame: Image) -> Floats:
         """Return the features (h, w, C) of a frame (H, W, 3) BGR."""
@@ -2495,7 +2507,7 @@ class _Backbone:
 
     def maps(self, images: Image) -> Floats:
         """Return the features (N, h, w, C) of BGR images (N, H, W, 3) of a fit size."""
-        if self.head is not None:
+        if self.own:
             return self._run(images)
         rgb = images[..., ::-1].astype(np.float32) / 255
         rgb = (rgb - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
@@ -2527,6 +2539,32 @@ def head_inputs(parts: Sequence[PartSamples], means: Sequence[Floats]) -> tuple[
         for part, mean in zip(parts, means, strict=True)
     ]
     return rows[0], np.concatenate(rows[1:], 1)
+
+
+def _facts(session: Any) -> dict[str, Any]:
+    """What `examples/train_embedding.py` wrote into a file's metadata."""
+    text = session.get_modelmeta().custom_metadata_map.get("reobj", "{}")
+    return dict(json.loads(text))
+
+
+def _companion(model: str, suffix: str) -> Path:
+    """A file that belongs to an appearance model: beside its file, else in models/."""
+    kind, _, backbone = model.rpartition(":")
+    path = Path(backbone)
+    folder = path.parent if path.suffix == ".onnx" else own_models()
+    return folder / f"{kind + '_' if kind else ''}{path.stem}{suffix}"
+
+
+def trained_head(model: str, config: EmbedConfig) -> Path | None:
+    """The head of a frozen backbone ("crops:" before its name: the ConvBlock), None: no training.
+
+    Raises:
+        ReobjError: `config.head` is neither a file nor "none".
+    """
+    if config.head:
+        return None if config.head == "none" else model_path(config.head, offline=True)
+    path = _companion(model, "_head.onnx")
+    return path if path.is_file() else None
 
 
 class _LazyEmbeddings:
@@ -2847,10 +2885,7 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
 
 def calibration_file(model: str) -> Path:
     """Where the calibration of an appearance model lies: beside its file, else in models/."""
-    kind, _, backbone = model.rpartition(":")
-    path = Path(backbone)
-    folder = path.parent if path.suffix == ".onnx" else own_models()
-    return folder / f"{kind + '_' if kind else ''}{path.stem}.json"
+    return _companion(model, ".json")
 
 
 class Places:

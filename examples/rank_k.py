@@ -69,6 +69,7 @@ Look = Callable[[rt.Image, rt.Detections, IntArray], rt.Embeddings]
 ANGLES_DEG = (0, 15, 30, 45, 60, 90, 180)
 GAPS = (0, 30, 60, 120, 240, 10**9)  # frames
 RANKS = (1, 5, 20, 50)
+PARTS = ("fg", "bg")
 COLUMNS = (
     ("twins", "any"),
     ("twins", "away"),
@@ -422,15 +423,25 @@ def scannet_sights(folder: Path, stems: Sequence[str], row: IntArray, xyxy: Arra
 # ---- Looks ---------------------------------------------------------------------------------------
 
 
-class FullCrop(rt.CropEmbedder):
-    """The grown crop as it is: the thesis's "full" setup."""
+class OneCrop(rt.CropEmbedder):
+    """One crop of each object: "fg", "bg" (the other part black) or "full" (the grown crop as it
+    is), through the backbone and, if `config.head` names one, a ConvBlock of its own.
+    """
+
+    def __init__(self, model: str, part: str, head: Path | None = None) -> None:
+        config = rt.EmbedConfig(head=str(head) if head else "none")
+        super().__init__(model, config, threads=1)
+        self.part = part
 
     def __call__(
         self, frame: rt.Image, detections: rt.Detections, rows: IntArray | None = None
     ) -> rt.Embeddings:
         rows = np.arange(len(detections)) if rows is None else rows
-        maps = self.maps(self.cut(frame, detections, rows)[0])
-        return rt.Embeddings(flat(maps), np.empty((len(rows), 0)))
+        crops, own = self.cut(frame, detections, rows)
+        shown = {"fg": own, "bg": ~own, "full": np.ones_like(own)}[self.part]
+        maps = self.maps(crops * shown[..., None])
+        found = flat(maps) if self.conv_block is None else self._joint(maps)
+        return rt.Embeddings(found, np.empty((len(rows), 0)))
 
 
 def flat(maps: npt.NDArray[Any]) -> Array:
@@ -463,18 +474,28 @@ def person_look(name: str, threads: int = 1) -> Look:
 
 def looks(args: Any) -> dict[str, tuple[Look, tuple[str, ...]]]:
     """Every method: how to embed, and the names of its one or two parts."""
-    parts, one = ("fg", "bg"), ("full",)
     found: dict[str, tuple[Look, tuple[str, ...]]] = {
-        "colour, frame": (rt.Embedder("colour", threads=1), parts)
+        "colour, frame": (rt.Embedder("colour", threads=1), PARTS)
     }
     for name in args.models:
-        stem = Path(name).stem
-        found[f"{stem}, frame"] = (rt.Embedder(name, threads=1), parts)
-        if not args.no_crops:
-            crops = rt.CropEmbedder(name, threads=1)
-            found[f"{stem}, crops"] = (crops, parts)
-            if not crops.trained:  # a trained head knows two parts only
-                found[f"{stem}, crop"] = (FullCrop(name, threads=1), one)
+        stem, plain = Path(name).stem, rt.EmbedConfig(head="none")
+        frame, crops = rt.Embedder(name, threads=1), rt.CropEmbedder(name, threads=1)
+        found[f"{stem}, frame"] = (frame, PARTS)
+        if frame.frozen and frame.trained:
+            found[f"{stem} no-train, frame"] = (rt.Embedder(name, plain, threads=1), PARTS)
+        if args.no_crops:
+            continue
+        joint = crops.conv_block is not None
+        found[f"{stem}, crops"] = (crops, ("concat",) if joint else PARTS)
+        if crops.frozen:
+            label = f"{stem} no-train" if joint else stem
+            if joint:
+                found[f"{label}, crops"] = (rt.CropEmbedder(name, plain, threads=1), PARTS)
+            found[f"{label}, crop"] = (OneCrop(name, "full"), ("full",))
+        for part in ("fg", "bg", "full"):
+            head = args.blocks / part / f"crops_{stem}_head.onnx" if args.blocks else None
+            if head is not None and head.is_file():
+                found[f"{stem}, crop {part}"] = (OneCrop(name, part, head), (part,))
     for name in args.person:
         found[f"{Path(name).stem}, person"] = (person_look(name), ("box",))
     return found
@@ -1074,6 +1095,8 @@ def build_parser() -> argparse.ArgumentParser:
     add("--person", nargs="*", default=[], help="networks for the plain box (DeepSORT's way)")
     add("--calibrate", type=int, nargs="*", default=[], metavar="SEED",
         help="first fit the probability of the same object on these rooms")  # fmt: skip
+    add("--blocks", type=Path, metavar="DIR",
+        help="ConvBlocks of single crops: DIR of train_embedding.py --crops --setups")  # fmt: skip
     add("--no-crops", action="store_true", help="leave out the slow crop references")
     add("--weight", type=float, default=rt.TrackerConfig().foreground_weight,
         help="share of the foreground in concat (default %(default)s)")  # fmt: skip

@@ -232,10 +232,10 @@ def test_crops_hold_object_or_surroundings(tmp_path: Path) -> None:
     look = crops(image, found)
     assert look.foreground.shape == look.background.shape == (1, 4 * 49)
     assert look.foreground @ look.background.T < 0.9
-    joined = rt.EmbedConfig(conv_block=str(tmp_path / "block.onnx"))
+    joined = rt.EmbedConfig(head=str(tmp_path / "block.onnx"))
     joint = rt.CropEmbedder(str(tmp_path / "net.onnx"), joined, threads=1)(image, found)
     assert joint.foreground.shape == (1, 8) and joint.background.shape == (1, 0)
-    small = rt.EmbedConfig(conv_block=str(tmp_path / "block.onnx"), crop_px=96)
+    small = rt.EmbedConfig(head=str(tmp_path / "block.onnx"), crop_px=96)
     with pytest.raises(rt.ReobjError, match="crop_px"):
         rt.CropEmbedder(str(tmp_path / "net.onnx"), small, threads=1)(image, found)
 
