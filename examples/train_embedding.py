@@ -674,8 +674,13 @@ class Net(nn.Module):
             images = torch.from_numpy(np.stack([v.picture for v in views])).to(device)
             for head, cells in zip(self.head.parts, self.cells(views, images), strict=True):
                 rows = head.histogram(cells.reshape(-1, head.cells, head.channels + 2))
-                axes = torch.linalg.svd(rows.T @ rows)[0].T[:WIDTH]  # (WIDTH, in)
-                head.project.weight[: len(axes)] = axes
+                principal(head.project.weight, rows)
+
+
+def principal(weight: Any, rows: Any) -> None:
+    """Set the first rows of a weight (K, C) to the principal components of rows (N, C)."""
+    axes = torch.linalg.svd(rows.T @ rows)[0].T[: len(weight)]
+    weight[: len(axes)] = axes
 
 
 def pooled(flat: Any, views: Sequence[View], part: int, cells_a_map: int) -> Any:
@@ -742,17 +747,29 @@ def batch_loss(
 ) -> Any:
     """Triplet loss of both parts together, and a quarter as much of each alone."""
     views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
-    device = foreground.device
     scene = np.concatenate([np.full(len(v.identity), s) for s, _, v in views])
-    identity = np.concatenate([v.identity + 10000 * s for s, _, v in views])
+    identity = np.concatenate([v.identity for _, _, v in views])
     frame = np.concatenate([np.full(len(v.identity), f) for _, f, v in views])
+    return parts_loss([foreground, background], (scene, identity, frame), hard, soft)
+
+
+def parts_loss(
+    parts: Sequence[Any], of: tuple[IntArray, IntArray, IntArray], hard: bool, soft: bool
+) -> Any:
+    """Triplet loss of all parts (N, E) together, and a quarter as much of each, if there are two.
+
+    Args:
+        of: (N,) scene, identity within it and frame of each row.
+    """
+    scene, frame, device = of[0], of[2], parts[0].device
+    identity = of[1] + 10000 * scene
     one = torch.from_numpy(identity[:, None] == identity).to(device)
     apart = torch.from_numpy(frame[:, None] != frame).to(device)
     near = torch.from_numpy(scene[:, None] == scene).to(device)
-    fused = torch.cat([foreground, background], 1) * 0.5**0.5
+    fused = torch.cat(list(parts), 1) * len(parts) ** -0.5
     same, different = one & apart, ~one & (near if hard else torch.ones_like(near))
     loss = triplet_loss(fused, same, different, hard, soft)
-    for alone in (foreground, background):
+    for alone in parts if len(parts) > 1 else ():
         loss = loss + 0.25 * triplet_loss(alone, same, different, hard, soft)
     return loss
 
@@ -766,7 +783,7 @@ def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
     search frames at least 30 % of the clip away from their own.
     """
     net.eval()
-    hits: dict[str, list[float]] = {f"{p}_{g}": [] for p in PARTS for g in GROUPS}
+    found = []
     for clip in clips:
         rng = np.random.default_rng(0)
         everything = np.unique(np.concatenate(clip.identity))
@@ -778,16 +795,26 @@ def rank_one(net: Net, clips: Sequence[Clip], device: Any) -> dict[str, float]:
         rows = [torch.cat([d[k] for d in done]).cpu().numpy() for k in (0, 1)]
         frame = np.concatenate([np.full(len(v.identity), f) for f, v in enumerate(views)])
         identity = np.concatenate([v.identity for v in views])
-        look = np.concatenate([v.look for v in views])
-        cosines = (rows[0] @ rows[0].T, rows[1] @ rows[1].T)
-        for part, cosine in zip(PARTS, (*cosines, cosines[0] + cosines[1]), strict=True):
-            far = np.abs(frame[:, None] - frame) >= max(1, int(0.3 * len(views)))
-            alike = far & (look[:, None] == look)
-            galleries = {"twins": [alike], "single": single_views(alike, identity), "all": [far]}
+        found.append((rows, frame, identity, np.concatenate([v.look for v in views])))
+    net.train()
+    return mean_hits(found)
+
+
+def mean_hits(clips: Sequence[Any]) -> dict[str, float]:
+    """Rank-1 of each part and of all together, from (rows of the parts, frame, identity, look) of
+    each clip.
+    """
+    hits: dict[str, list[float]] = {f"{p}_{g}": [] for p in PARTS for g in GROUPS}
+    for rows, frame, identity, look in clips:
+        cosines = [part @ part.T for part in rows]
+        named = dict(zip(PARTS, cosines, strict=False)) if len(rows) > 1 else {}
+        far = np.abs(frame[:, None] - frame) >= max(1, int(0.3 * (frame.max() + 1)))
+        alike = far & (look[:, None] == look)
+        galleries = {"twins": [alike], "single": single_views(alike, identity), "all": [far]}
+        for part, cosine in {**named, "fused": sum(cosines)}.items():
             for group, draws in galleries.items():
                 for gallery in draws:
                     hits[f"{part}_{group}"] += first_hits(cosine, identity, gallery)
-    net.train()
     return {name: float(np.mean(found)) if found else float("nan") for name, found in hits.items()}
 
 
@@ -819,12 +846,12 @@ def first_hits(cosine: Any, identity: IntArray, gallery: Any) -> list[float]:
 # ---- Training ------------------------------------------------------------------------------------
 
 
-def real_clips(args: argparse.Namespace) -> list[Clip]:
-    """Clips of recordings; other pseudo-objects of the same pictures for each of four draws."""
+def real_clips(args: argparse.Namespace, draws: int = 4) -> list[Clip]:
+    """Clips of recordings; other pseudo-objects of the same pictures for each of some draws."""
     clips = [
-        sparse_clip(images, model, 4 * args.seed + draw)
+        sparse_clip(images, model, draws * args.seed + draw)
         for images, model in args.sparse
-        for draw in range(4)
+        for draw in range(draws)
     ]
     clips += [tracks_clip(images, tracks) for images, tracks in args.tracks]
     return clips + [scannet_clip(folder) for folder in args.scannet]
@@ -917,7 +944,8 @@ class Trainer:
         torch.set_num_threads(args.threads)
         self.args = args
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.net = Net().to(self.device)
+        self.pool = self.make_pool()
+        self.net = self.make_net().to(self.device)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), args.rate, weight_decay=0.05)
         self.step, self.seconds, self.best = 0, 0.0, -1.0
         last = args.out / "last.pt"
@@ -928,15 +956,27 @@ class Trainer:
             self.step, self.seconds = state["step"], state["seconds"]
             self.best = state.get("best", -1.0)
         args.out.mkdir(parents=True, exist_ok=True)
-        self.pool = Pool(args)
         if args.start and self.step == 0:
             state = torch.load(args.start, map_location=self.device, weights_only=True)["net"]
             own = {k: v for k, v in state.items() if k.startswith("backbone.")}
             self.net.load_state_dict(own, strict=False)
         if self.step == 0:
             self.start()
+        self.val = self.make_val()
+
+    def make_pool(self) -> Any:
+        """What to learn from."""
+        return Pool(self.args)
+
+    def make_net(self) -> Any:
+        """What learns."""
+        return Net()
+
+    def make_val(self) -> dict[str, Any]:
+        """Clips to validate with."""
+        args = self.args
         rooms = parse_range(args.val_rooms) if args.val_rooms else ()
-        self.val = {
+        return {
             "room": [room_clip(seed, args.cache, args.frames) for seed in rooms],
             "real": [sparse_clip(*source) for source in args.val_sparse],
         }
@@ -960,17 +1000,29 @@ class Trainer:
         rate = min((self.step + 1) / 40, max(0.02, 0.5 + 0.5 * float(np.cos(np.pi * done))))
         for group in self.optimizer.param_groups:
             group["lr"] = self.args.rate * rate
-        scenes = self.loader(self.step)
-        parts = self.net([view for scene in scenes for view in scene], self.device)
-        loss = batch_loss(
-            parts[0], parts[1], scenes, done > self.args.hard_after, self.args.loss == "soft"
-        )
+        loss = self.loss(self.loader(self.step), done > self.args.hard_after)
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimizer.step()
         self.step += 1
         return float(np.asarray(loss.detach().cpu()))
+
+    def loss(self, scenes: Any, hard: bool) -> Any:
+        """Loss of one batch."""
+        parts = self.net([view for scene in scenes for view in scene], self.device)
+        return batch_loss(parts[0], parts[1], scenes, hard, self.args.loss == "soft")
+
+    def score(self, clips: Any) -> dict[str, float]:
+        """Rank-1 on validation clips."""
+        return rank_one(self.net, clips, self.device)
+
+    def summary(self) -> dict[str, Any]:
+        """How it was trained, for the files."""
+        return {
+            "steps": self.step, "seed": self.args.seed, "minutes": round(self.seconds / 60, 1),
+            "rooms": self.loader.rooms, "torch": torch.__version__,
+        }  # fmt: skip
 
     def run(self) -> None:
         """Train to the end; log, validate and save every so many steps."""
@@ -991,7 +1043,7 @@ class Trainer:
         row: dict[str, float] = {"step": self.step, "minutes": round(self.seconds / 60, 2)}
         row |= {"rooms": self.loader.rooms, "loss": round(loss, 5)}
         for name, clips in self.val.items():
-            found = rank_one(self.net, clips, self.device)
+            found = self.score(clips)
             row |= {f"{name}_{k}": round(v, 4) for k, v in found.items()}
         log = self.args.out / "log.csv"
         fresh = not log.exists()
@@ -1042,6 +1094,318 @@ def draw_curves(log: Path, picture: Path) -> None:
     plt.close(figure)
 
 
+# ---- Heads of frozen backbones -------------------------------------------------------------------
+
+FROZEN_WH = (640, 480)  # of a picture for a frozen backbone
+FROZEN = {"size_px": 384, "context": 0.5, "reach": 0.05, "samples": 4, "foreground_cells": 3,
+          "background_cells": 4, "wide": 1.5, "wide_reach": 0.2, "wide_cells": 4}  # fmt: skip
+CROPS = {"context": 0.5, "reach": 0.05, "crop_px": 224}
+CROP_SETUPS = {"concat": ("fg", "bg"), "fg": ("fg",), "bg": ("bg",), "full": ("full",)}
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a frozen backbone shows of the N objects of one augmented scene.
+
+    Attributes:
+        parts: (N, ...) float16 of each part: cells of the frame's map, or maps of crops.
+        identity, look, frame: (N,).
+    """
+
+    parts: dict[str, npt.NDArray[np.float16]]
+    identity: IntArray
+    look: IntArray
+    frame: IntArray
+
+    def views(self, rng: np.random.Generator, count: int) -> Seen:
+        """The rows of so many random frames."""
+        frames = np.unique(self.frame)
+        rows = np.isin(self.frame, rng.permutation(frames)[:count])
+        parts = {name: part[rows] for name, part in self.parts.items()}
+        return Seen(parts, self.identity[rows], self.look[rows], self.frame[rows])
+
+
+class Frozen:
+    """A frozen backbone: what its heads are fed with, cached on disk."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args, self.crops, self.cache = args, bool(args.crops), args.cache / "seen"
+        self.layout: dict[str, Any] = CROPS if self.crops else FROZEN
+        config = rt.EmbedConfig(head="none", **self.layout)
+        kind = rt.CropEmbedder if self.crops else rt.Embedder
+        self.embedder = kind(args.backbone, config, threads=args.threads)
+        self.name = f"{'crops' if self.crops else 'frame'}_{Path(args.backbone).stem}"
+        self.cache.mkdir(parents=True, exist_ok=True)
+
+    def see(self, picture: Image, found: rt.Detections, rows: IntArray) -> dict[str, Any]:
+        """The inputs of the heads for the chosen rows (N,)."""
+        if isinstance(self.embedder, rt.CropEmbedder):
+            crops, own = self.embedder.cut(picture, found, rows)
+            three = np.concatenate([crops * own[..., None], crops * ~own[..., None], crops])
+            parts = np.split(self.embedder.maps(three), 3)
+            return dict(zip(("fg", "bg", "full"), parts, strict=True))
+        features, layout = self.embedder._features(picture), self.embedder.layout
+        samples = rt.part_samples(found, rows, picture.shape[:2], features.shape[:2], layout)
+        cells = rt.head_inputs(samples, rt.cell_means(features, samples, layout))
+        return dict(zip(("fg", "bg"), cells, strict=True))
+
+    def scene(self, name: str, copy: int, parts: Sequence[str], clip: Clip | None = None) -> Seen:
+        """Some frames of a clip (None: a room); copy 0 as they are, others augmented."""
+        path = self.cache / f"{self.name}_{name.replace('/', '_')}_{copy}.npz"
+        if not path.exists():
+            room = int(name.split()[-1]) if clip is None else 0
+            clip = clip or room_clip(room, self.args.cache, self.args.frames)
+            self.keep(path, clip, copy)
+        with np.load(path) as data:
+            return Seen({n: data[n] for n in parts}, data["identity"], data["look"], data["frame"])
+
+    def keep(self, path: Path, clip: Clip, copy: int) -> None:
+        """Augment, look, write."""
+        rng = np.random.default_rng([copy, len(clip.images), sum(map(len, clip.identity))])
+        tone, flip = (photo_tone(rng, 1.0) if copy else None), bool(copy and rng.random() < 0.5)
+        everything, found_rows = np.unique(np.concatenate(clip.identity)), []
+        chosen = np.linspace(0, len(clip.images) - 1, min(self.args.seen, len(clip.images)))
+        for frame in chosen.round().astype(int):
+            picture, found, rows = augmented(clip, frame, rng, tone, flip, everything, FROZEN_WH)
+            rows = rng.permutation(rows)[:24]
+            if len(rows):
+                parts = {k: v.astype(np.float16) for k, v in self.see(picture, found, rows).items()}
+                ids = {"identity": clip.identity[frame][rows], "look": clip.look[frame][rows]}
+                found_rows.append(parts | ids | {"frame": np.full(len(rows), frame)})
+        with rt.atomic(path) as part, part.open("wb") as file:
+            np.savez(file, **{k: np.concatenate([r[k] for r in found_rows]) for k in found_rows[0]})
+
+
+class CellHead(nn.Module):
+    """Cells (N, cells * (C + 2)) of grids of a frozen map to unit rows (N, WIDTH).
+
+    As `PartHead`: a linear map of the training-free descriptor (square roots, part-empty cells
+    count less; starts as principal components) plus a perceptron; features are first narrowed.
+    """
+
+    def __init__(self, grids: Sequence[int], channels: int, narrow: int = 32) -> None:
+        super().__init__()
+        self.grids, self.cells, self.channels = grids, sum(n * n for n in grids), channels
+        self.narrow = nn.Linear(channels, narrow, bias=False)
+        self.project = nn.Linear(self.cells * narrow, WIDTH, bias=False)
+        self.word = nn.Sequential(nn.Linear(narrow + 2, 48), nn.ReLU())
+        rows = sum(grids) * 48
+        self.mix = nn.Sequential(
+            nn.Linear(self.cells * (narrow + 2) + rows, 128, bias=False), nn.BatchNorm1d(128),
+            nn.ReLU(), nn.Linear(128, WIDTH),
+        )  # fmt: skip
+        nn.init.zeros_(self.mix[-1].weight)
+        nn.init.zeros_(self.mix[-1].bias)
+
+    def split(self, rows: Any) -> tuple[Any, Any]:
+        """Unit features (N, cells, narrow) by part-empty cells, and the shares (N, cells, 2)."""
+        cells = rows.reshape(-1, self.cells, self.channels + 2)
+        share = cells[..., self.channels :]
+        trust = [s / s.amax(1, keepdim=True).clamp_min(1e-6)
+                 for s in share[..., :1].split([n * n for n in self.grids], 1)]  # fmt: skip
+        roots = (cells[..., : self.channels].relu() * torch.cat(trust, 1) + 1e-9).sqrt()
+        scale = roots.square().sum((1, 2), keepdim=True).clamp_min(1e-6).rsqrt()
+        return self.narrow(roots * scale), share
+
+    def forward(self, rows: Any) -> Any:
+        plain, share = self.split(rows)
+        seen = torch.cat([plain * 6.0, share], -1)
+        if self.training:  # some cells are hidden
+            seen = seen * (torch.rand_like(seen[..., :1]) > 0.1)
+        words, lines = self.word(seen), []
+        for part, n in zip(words.split([n * n for n in self.grids], 1), self.grids, strict=True):
+            lines.append(part.reshape(-1, n, n, 48).mean(2).flatten(1))  # left and right forgotten
+        mixed = self.mix(torch.cat([seen.flatten(1), *lines], 1))
+        return F.normalize(self.project(plain.flatten(1)) + mixed, dim=1)
+
+    def start(self, rows: Any) -> None:
+        """Begin with the principal components of features, then of cells side by side."""
+        with torch.no_grad():
+            wide, self.narrow = self.narrow, nn.Identity()
+            principal(wide.weight, self.split(rows)[0].flatten(0, 1))
+            self.narrow = wide
+            principal(self.project.weight, self.split(rows)[0].flatten(1))
+
+
+class ConvBlock(nn.Module):
+    """re-OBJ: maps (N, C, 7, 7) of one crop, or of two stacked, to one unit row."""
+
+    def __init__(self, channels: int, width: int = 192, inner: int = 80) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(channels, affine=False)
+        self.squeeze = block(channels, inner, 1)
+        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout2d(0.1))
+        self.out = nn.Linear(64 * 16, width)
+        self.short = nn.Conv2d(channels, 20, 1, bias=False)
+        self.project = nn.Linear(20 * 49, width, bias=False)
+
+    def forward(self, maps: Any) -> Any:
+        maps = self.norm(maps)
+        deep = self.out(self.mix(self.squeeze(maps)).flatten(1))
+        return F.normalize(deep + self.project(self.short(maps).flatten(1)), dim=1)
+
+    def start(self, maps: Any) -> None:
+        """Begin with the principal components of features, then of places side by side."""
+        self.norm.running_mean[:] = maps.mean((0, 2, 3))
+        self.norm.running_var[:] = maps.var((0, 2, 3))
+        maps = self.norm(maps)
+        principal(self.short.weight[..., 0, 0], maps.movedim(1, 3).flatten(0, 2))
+        self.short.weight /= 20
+        principal(self.project.weight, self.short(maps).flatten(1))
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+
+class SeenPool:
+    """Scenes as a frozen backbone sees them, each augmented once or more."""
+
+    def __init__(self, args: argparse.Namespace, frozen: Frozen, names: Sequence[str]) -> None:
+        self.args, self.rooms = args, []
+        for seed in parse_range(args.rooms) if args.rooms else ():
+            if (args.cache / f"room_{seed}.npz").exists() or not args.no_render:
+                for copy in range(1, args.copies + 1):
+                    self.rooms.append(frozen.scene(f"room {seed}", copy, names))
+        for clip in real_clips(args, 1):
+            for copy in range(1, args.copies + 1):
+                self.rooms.append(frozen.scene(clip.name, copy, names, clip))
+        if not self.rooms:
+            raise SystemExit("error: nothing to train on: give --rooms, --sparse or --tracks")
+
+    def fill(self) -> None:
+        """Everything is here from the start."""
+
+    def draw(self, rng: np.random.Generator) -> list[Seen]:
+        """Some views of some scenes."""
+        return [
+            self.rooms[i].views(rng, self.args.views)
+            for i in rng.choice(len(self.rooms), min(self.args.scenes, len(self.rooms)), False)
+        ]
+
+
+class HeadTrainer(Trainer):
+    """Trains heads on what a frozen backbone shows: two of cells, or a ConvBlock of crops."""
+
+    def __init__(self, args: argparse.Namespace, frozen: Frozen, names: Sequence[str]) -> None:
+        self.frozen, self.names = frozen, names
+        super().__init__(args)
+
+    def make_pool(self) -> Any:
+        return SeenPool(self.args, self.frozen, self.names)
+
+    def make_net(self) -> Any:
+        shapes = [self.pool.rooms[0].parts[n].shape[1:] for n in self.names]
+        if self.frozen.crops:
+            return ConvBlock(sum(shape[0] for shape in shapes))
+        fore, *back = (FROZEN[f"{k}_cells"] for k in ("foreground", "background", "wide"))
+        channels = shapes[0][0] // int(fore) ** 2 - 2
+        return nn.ModuleList([CellHead([int(fore)], channels),
+                              CellHead([int(n) for n in back], channels)])  # fmt: skip
+
+    def make_val(self) -> dict[str, Any]:
+        rooms = parse_range(self.args.val_rooms) if self.args.val_rooms else ()
+        clips = [sparse_clip(*source) for source in self.args.val_sparse]
+        return {
+            "room": [self.frozen.scene(f"room {seed}", 0, self.names) for seed in rooms],
+            "real": [self.frozen.scene(clip.name, 0, self.names, clip) for clip in clips],
+        }
+
+    def start(self) -> None:
+        """Start from the principal components of the training-free descriptors."""
+        scenes = self.pool.draw(np.random.default_rng([self.args.seed, 10]))
+        self.net.eval()
+        with torch.no_grad():
+            parts = self.inputs(scenes)
+            heads = [self.net] if self.frozen.crops else self.net
+            for head, rows in zip(heads, parts, strict=True):
+                head.start(rows)
+        self.net.train()
+
+    def inputs(self, scenes: Sequence[Seen]) -> list[Any]:
+        """What each head takes of all objects of the scenes."""
+        parts = [torch.from_numpy(np.concatenate([s.parts[n] for s in scenes])).float()
+                 for n in self.names]  # fmt: skip
+        return [torch.cat(parts, 1)] if self.frozen.crops else parts
+
+    def embed(self, scenes: Sequence[Seen]) -> list[Any]:
+        """Unit rows of each part (of a ConvBlock: one)."""
+        rows = [part.to(self.device) for part in self.inputs(scenes)]
+        if self.frozen.crops:
+            return [self.net(rows[0])]
+        return [head(part) for head, part in zip(self.net, rows, strict=True)]
+
+    def loss(self, scenes: Any, hard: bool) -> Any:
+        parts = self.embed(scenes)
+        scene = np.repeat(np.arange(len(scenes)), [len(s.identity) for s in scenes])
+        identity = np.concatenate([s.identity for s in scenes])
+        frame = np.concatenate([s.frame for s in scenes])
+        return parts_loss(parts, (scene, identity, frame), hard, self.args.loss == "soft")
+
+    def score(self, clips: Sequence[Seen]) -> dict[str, float]:
+        self.net.eval()
+        with torch.no_grad():
+            done = [[p.cpu().numpy() for p in self.embed([clip])] for clip in clips]
+        self.net.train()
+        return mean_hits([(parts, c.frame, c.identity, c.look)
+                          for parts, c in zip(done, clips, strict=True)])  # fmt: skip
+
+
+def train_heads(args: argparse.Namespace) -> None:
+    """Train and export the heads of a frozen backbone."""
+    frozen, out = Frozen(args), args.out
+    setups = CROP_SETUPS if args.crops else {"": ("fg", "bg")}
+    for setup in args.setups if args.crops else setups:
+        args.out = out / setup
+        trainer = HeadTrainer(args, frozen, setups[setup])
+        trainer.run()
+        trainer.take_best()
+        draw_curves(args.out / "log.csv", args.out / "curves.png")
+        export_head(trainer, args.out)
+
+
+def export_head(trainer: HeadTrainer, out: Path) -> None:
+    """Write OUT/[crops_]BACKBONE_head.onnx, large weights as float16."""
+    import onnx
+
+    rows = tuple(part[:2] for part in trainer.inputs(trainer.pool.rooms[:1]))
+    net = trainer.net.cpu().eval()
+    crops = trainer.frozen.crops
+    path = out / f"{'crops_' if crops else ''}{Path(trainer.args.backbone).stem}_head.onnx"
+    fed, given = (["maps"], ["row"]) if crops else (["fg", "bg"], ["foreground", "background"])
+    to_onnx(net if crops else Both(net), rows, path, fed, given)
+    file = halved(onnx.load(path))
+    facts = {"layout": trainer.frozen.layout, "trained": trainer.summary()}
+    onnx.helper.set_model_props(file, {"reobj": json.dumps(facts)})
+    onnx.save(file, path)
+    print(f"{path}: use it with --set embed.head={path}")
+
+
+class Both(nn.Module):
+    """Two heads in one graph."""
+
+    def __init__(self, heads: Any) -> None:
+        super().__init__()
+        self.heads = heads
+
+    def forward(self, fg: Any, bg: Any) -> tuple[Any, Any]:
+        return self.heads[0](fg), self.heads[1](bg)
+
+
+def halved(model: Any) -> Any:
+    """Keep large weights as float16 with a cast behind them: half the file."""
+    import onnx
+
+    casts = []
+    for weight in model.graph.initializer:
+        values = onnx.numpy_helper.to_array(weight)
+        if values.dtype == np.float32 and values.size > 2000:
+            name = weight.name
+            weight.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), name + "_half"))
+            casts.append(onnx.helper.make_node("Cast", [name + "_half"], [name], to=1))
+    for node in reversed(casts):
+        model.graph.node.insert(0, node)
+    return model
+
+
 # ---- Export --------------------------------------------------------------------------------------
 
 
@@ -1056,20 +1420,25 @@ def export(net: Net, out: Path, summary: dict[str, Any]) -> None:
     image = torch.zeros(1, SIZE_WH[1], SIZE_WH[0], 3, dtype=torch.uint8)
     sizes = {0: "n", 1: "h", 2: "w"}
     rows = tuple(torch.zeros(2, p.cells * (p.channels + 2)) for p in net.head.parts)
-    names = ("fg", "bg", "foreground", "background")
-    plain: dict[str, Any] = {"dynamo": False, "opset_version": 17}
-    warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
-    warnings.filterwarnings("ignore", message=".*(legacy|Constant folding|removed).*")
-    torch.onnx.export(net.backbone, (image,), str(out / "reobj.onnx"), input_names=["image"],
-                      output_names=["map"], dynamic_axes={"image": sizes, "map": sizes},
-                      **plain)  # fmt: skip
-    torch.onnx.export(net.head, rows, str(out / "reobj_head.onnx"), input_names=names[:2],
-                      output_names=names[2:], dynamic_axes={name: {0: "n"} for name in names},
-                      **plain)  # fmt: skip
+    names = ["fg", "bg", "foreground", "background"]
+    to_onnx(net.backbone, (image,), out / "reobj.onnx", ["image"], ["map"], sizes)
+    to_onnx(net.head, rows, out / "reobj_head.onnx", names[:2], names[2:])
     facts = {"layout": LAYOUT, "multiple": STRIDE, "head": "reobj_head.onnx", "trained": summary}
     model = onnx.load(out / "reobj.onnx")
     onnx.helper.set_model_props(model, {"reobj": json.dumps(facts)})
     onnx.save(model, out / "reobj.onnx")
+
+
+def to_onnx(
+    net: nn.Module, fed: Any, path: Path, inputs: list[str], outputs: list[str], sizes: Any = None
+) -> None:
+    """Write a network as ONNX; sizes: names of the axes that may vary (default: the first)."""
+    warnings.filterwarnings("ignore", category=DeprecationWarning)
+    warnings.filterwarnings("ignore", message=".*(legacy|Constant folding|removed).*")
+    torch.onnx.export(
+        net, fed, str(path), input_names=inputs, output_names=outputs, dynamo=False,
+        dynamic_axes=dict.fromkeys([*inputs, *outputs], sizes or {0: "n"}), opset_version=17,
+    )  # fmt: skip
 
 
 # ---- Command line --------------------------------------------------------------------------------
@@ -1119,6 +1488,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--loss", choices=("triplet", "soft"), default="soft", help="semi-hard negative or soft max"
     )
     add("--start", type=Path, help="take the backbone of this checkpoint (.pt) to begin with")
+    add("--backbone", help="train a head for this frozen backbone (such as mobilenetv2) instead")
+    add("--crops", action="store_true", help="for two crops an object (re-OBJ's ConvBlock)")
+    add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="of --crops")
+    add("--copies", type=int, default=1, help="augmented copies of each scene for --backbone")
+    add("--seen", type=int, default=20, help="frames of each scene for --backbone")
     add("--resume", action="store_true", help="go on from OUT/last.pt")
     return parser
 
@@ -1127,14 +1501,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Train, draw the curves, export."""
     args = build_parser().parse_args(argv)
     cv2.setNumThreads(0)  # a forked process has no threads of its parent
+    if args.backbone:
+        train_heads(args)
+        return 0
     trainer = Trainer(args)
     trainer.run()
     trainer.take_best()
     out: Path = args.out
     draw_curves(out / "log.csv", out / "curves.png")
-    summary = {"steps": trainer.step, "seed": args.seed, "minutes": round(trainer.seconds / 60, 1)}
-    summary |= {"rooms": trainer.loader.rooms, "torch": torch.__version__}
-    export(trainer.net, out, summary)
+    export(trainer.net, out, trainer.summary())
     print(f"{out / 'reobj.onnx'}: use it with --embed {out / 'reobj.onnx'}")
     return 0
 

@@ -11,6 +11,7 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
+from test_rank_k import backbone
 from test_tracker import scene_with_twins
 
 import reobj_track as rt
@@ -281,6 +282,44 @@ def test_scannet_folders_become_a_clip(te, tmp_path) -> None:
     for box, identity in zip(clip.xyxy[0].astype(int), clip.identity[0], strict=True):
         inner = clip.labels[0][box[1] + 2 : box[3] - 2, box[0] + 2 : box[2] - 2]
         assert (inner == identity + 1).all()
+
+
+@pytest.mark.parametrize("crops", [False, True])
+def test_head_of_a_frozen_backbone_is_found_beside_it(te, trained, tmp_path, crops: bool) -> None:
+    """A step of training; the exported head gives through the tool what it gives in PyTorch."""
+    backbone(tmp_path / "net.onnx", tmp_path / "block.onnx", channels=8)
+    command = ["-o", str(tmp_path), "--backbone", str(tmp_path / "net.onnx"), "--rooms", "3"]
+    command += ["--cache", str(trained / "rooms"), "--val-rooms", "3", "--frames", "6"]
+    assert te.main([*command, *["--crops"] * crops, "--steps", "2", "--every", "1"]) == 0
+    out = tmp_path / "concat" if crops else tmp_path
+    name = "crops_net_head.onnx" if crops else "net_head.onnx"
+    assert cv2.imread(str(out / "curves.png")) is not None
+    (out / name).replace(tmp_path / name)
+    image, detections = scene_with_twins()
+    kind = rt.CropEmbedder if crops else rt.Embedder
+    look = kind(str(tmp_path / "net.onnx"), threads=1)(image, detections)
+    plain = rt.EmbedConfig(head="none")
+    frozen = kind(str(tmp_path / "net.onnx"), plain, threads=1)(image, detections)
+    assert look.foreground.shape != frozen.foreground.shape  # "none": no training
+    assert look.background.shape == ((2, 0) if crops else (2, 128))
+    np.testing.assert_allclose(np.linalg.norm(look.foreground, axis=1), 1, atol=1e-3)
+    args = te.build_parser().parse_args([*command, *["--crops"] * crops])
+    see = te.Frozen(args).see(image, detections, np.arange(2))
+    assert_same_as_in_torch(te, args, see, out / "best.pt", look)
+
+
+def assert_same_as_in_torch(te, args, see, checkpoint: Path, look: rt.Embeddings) -> None:
+    import torch
+
+    names = ["fg", "bg"]
+    trainer = te.HeadTrainer(args, te.Frozen(args), names)
+    trainer.net.load_state_dict(torch.load(checkpoint, weights_only=True)["net"])
+    trainer.net.eval()
+    seen = te.Seen(see, np.arange(2), np.arange(2), np.zeros(2))
+    with torch.no_grad():
+        expected = [part.numpy() for part in trainer.embed([seen])]
+    for mine, theirs in zip((look.foreground, look.background), expected, strict=False):
+        np.testing.assert_allclose(mine, theirs, atol=5e-3)  # weights kept as float16
 
 
 @pytest.mark.parametrize("command", [["-o", "x"], ["-o", "x", "--sparse", "no=where"]])
