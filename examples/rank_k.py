@@ -423,14 +423,34 @@ def scannet_sights(folder: Path, stems: Sequence[str], row: IntArray, xyxy: Arra
 # ---- Looks ---------------------------------------------------------------------------------------
 
 
-class OneCrop(rt.CropEmbedder):
+Memo = dict[int, npt.NDArray[np.float16]]  # map of each crop, by the hash of its pixels
+
+
+class Crops(rt.CropEmbedder):
+    """`CropEmbedder` that shares the maps of a frozen backbone with others, to save time."""
+
+    def __init__(self, model: str, head: str = "", memo: Memo | None = None) -> None:
+        super().__init__(model, rt.EmbedConfig(head=head), threads=1)
+        self.memo = memo if self.frozen else None
+
+    def maps(self, crops: rt.Image) -> npt.NDArray[np.float32]:
+        if self.memo is None:
+            return super().maps(crops)
+        keys = [hash(crop.tobytes()) for crop in crops]
+        new = [i for i, key in enumerate(keys) if key not in self.memo]
+        if new:
+            fresh = super().maps(crops[new]).astype(np.float16)
+            self.memo.update(zip([keys[i] for i in new], fresh, strict=True))
+        return np.stack([self.memo[key] for key in keys]).astype(np.float32)
+
+
+class OneCrop(Crops):
     """One crop of each object: "fg", "bg" (the other part black) or "full" (the grown crop as it
-    is), through the backbone and, if `config.head` names one, a ConvBlock of its own.
+    is), through the backbone and, if `head` names one, a ConvBlock of its own.
     """
 
-    def __init__(self, model: str, part: str, head: Path | None = None) -> None:
-        config = rt.EmbedConfig(head=str(head) if head else "none")
-        super().__init__(model, config, threads=1)
+    def __init__(self, model: str, part: str, head: str = "none", memo: Memo | None = None) -> None:
+        super().__init__(model, head, memo)
         self.part = part
 
     def __call__(
@@ -472,32 +492,38 @@ def person_look(name: str, threads: int = 1) -> Look:
     return look
 
 
-def looks(args: Any) -> dict[str, tuple[Look, tuple[str, ...]]]:
+def looks(args: Any, memo: Memo | None = None) -> dict[str, tuple[Look, tuple[str, ...]]]:
     """Every method: how to embed, and the names of its one or two parts."""
     found: dict[str, tuple[Look, tuple[str, ...]]] = {
         "colour, frame": (rt.Embedder("colour", threads=1), PARTS)
     }
     for name in args.models:
-        stem, plain = Path(name).stem, rt.EmbedConfig(head="none")
-        frame, crops = rt.Embedder(name, threads=1), rt.CropEmbedder(name, threads=1)
+        stem, frame = Path(name).stem, rt.Embedder(name, threads=1)
         found[f"{stem}, frame"] = (frame, PARTS)
         if frame.frozen and frame.trained:
-            found[f"{stem} no-train, frame"] = (rt.Embedder(name, plain, threads=1), PARTS)
-        if args.no_crops:
-            continue
-        joint = crops.conv_block is not None
-        found[f"{stem}, crops"] = (crops, ("concat",) if joint else PARTS)
-        if crops.frozen:
-            label = f"{stem} no-train" if joint else stem
-            if joint:
-                found[f"{label}, crops"] = (rt.CropEmbedder(name, plain, threads=1), PARTS)
-            found[f"{label}, crop"] = (OneCrop(name, "full"), ("full",))
-        for part in ("fg", "bg", "full"):
-            head = args.blocks / part / f"crops_{stem}_head.onnx" if args.blocks else None
-            if head is not None and head.is_file():
-                found[f"{stem}, crop {part}"] = (OneCrop(name, part, head), (part,))
+            plain = rt.Embedder(name, rt.EmbedConfig(head="none"), threads=1)
+            found[f"{stem} no-train, frame"] = (plain, PARTS)
+        if not args.no_crops:
+            found |= crop_looks(name, args.blocks, memo)
     for name in args.person:
         found[f"{Path(name).stem}, person"] = (person_look(name), ("box",))
+    return found
+
+
+def crop_looks(name: str, blocks: Path | None, memo: Memo | None) -> dict[str, Any]:
+    """Methods that send crops of each object through a backbone: trained, then not trained."""
+    stem, crops = Path(name).stem, Crops(name, memo=memo)
+    joint = crops.conv_block is not None
+    found: dict[str, Any] = {f"{stem}, crops": (crops, ("concat",) if joint else PARTS)}
+    for part in ("fg", "bg", "full") if blocks else ():
+        head = Path(str(blocks)) / part / f"crops_{stem}_head.onnx"
+        if head.is_file():
+            found[f"{stem}, crop {part}"] = (OneCrop(name, part, str(head), memo), (part,))
+    if joint:
+        found[f"{stem} no-train, crops"] = (Crops(name, "none", memo), PARTS)
+    if crops.frozen:
+        full = OneCrop(name, "full", memo=memo)
+        found[f"{stem}{' no-train' if joint else ''}, crop"] = (full, ("full",))
     return found
 
 
@@ -936,7 +962,7 @@ def evaluate(
     gap = np.abs(pairs.frame[:, None] - pairs.frame[None]).astype(float)
     kinds = ["open", "class", "twins", "single", *(["same"] if (pairs.model >= 0).any() else [])]
     rows, bins, trust = [], [], []
-    for method, (look, names) in looks(args).items():
+    for method, (look, names) in looks(args, {}).items():
         started = time.time()
         parts = embed(scenes, look)
         calibration = calibration_of(look)

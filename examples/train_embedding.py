@@ -1097,9 +1097,11 @@ def draw_curves(log: Path, picture: Path) -> None:
 # ---- Heads of frozen backbones -------------------------------------------------------------------
 
 FROZEN_WH = (640, 480)  # of a picture for a frozen backbone
-FROZEN = {"size_px": 384, "context": 0.5, "reach": 0.05, "samples": 4, "foreground_cells": 3,
-          "background_cells": 4, "wide": 1.5, "wide_reach": 0.2, "wide_cells": 4}  # fmt: skip
-CROPS = {"context": 0.5, "reach": 0.05, "crop_px": 224}
+FROZEN: dict[str, Any] = {
+    "size_px": 384, "context": 0.5, "reach": 0.05, "samples": 4, "foreground_cells": 3,
+    "background_cells": 4, "wide": 1.5, "wide_reach": 0.2, "wide_cells": 4,
+}  # fmt: skip
+CROPS: dict[str, Any] = {"context": 0.5, "reach": 0.05, "crop_px": 224}
 CROP_SETUPS = {"concat": ("fg", "bg"), "fg": ("fg",), "bg": ("bg",), "full": ("full",)}
 
 
@@ -1170,10 +1172,14 @@ class Frozen:
             rows = rng.permutation(rows)[:24]
             if len(rows):
                 parts = {k: v.astype(np.float16) for k, v in self.see(picture, found, rows).items()}
-                ids = {"identity": clip.identity[frame][rows], "look": clip.look[frame][rows]}
-                found_rows.append(parts | ids | {"frame": np.full(len(rows), frame)})
+                parts |= {"identity": clip.identity[frame][rows], "look": clip.look[frame][rows]}
+                parts["frame"] = np.full(len(rows), frame)
+                found_rows.append(parts)
+        table: dict[str, Any] = {
+            k: np.concatenate([r[k] for r in found_rows]) for k in found_rows[0]
+        }
         with rt.atomic(path) as part, part.open("wb") as file:
-            np.savez(file, **{k: np.concatenate([r[k] for r in found_rows]) for k in found_rows[0]})
+            np.savez(file, **table)
 
 
 class CellHead(nn.Module):
