@@ -846,12 +846,12 @@ def first_hits(cosine: Any, identity: IntArray, gallery: Any) -> list[float]:
 # ---- Training ------------------------------------------------------------------------------------
 
 
-def real_clips(args: argparse.Namespace, draws: int = 4) -> list[Clip]:
-    """Clips of recordings; other pseudo-objects of the same pictures for each of some draws."""
+def real_clips(args: argparse.Namespace) -> list[Clip]:
+    """Clips of recordings; other pseudo-objects of the same pictures for each of four draws."""
     clips = [
-        sparse_clip(images, model, draws * args.seed + draw)
+        sparse_clip(images, model, 4 * args.seed + draw)
         for images, model in args.sparse
-        for draw in range(draws)
+        for draw in range(4)
     ]
     clips += [tracks_clip(images, tracks) for images, tracks in args.tracks]
     return clips + [scannet_clip(folder) for folder in args.scannet]
@@ -1120,11 +1120,14 @@ class Seen:
     frame: IntArray
 
     def views(self, rng: np.random.Generator, count: int) -> Seen:
-        """The rows of so many random frames."""
-        frames = np.unique(self.frame)
-        rows = np.isin(self.frame, rng.permutation(frames)[:count])
-        parts = {name: part[rows] for name, part in self.parts.items()}
+        """The rows of so many random frames; maps (N, C, h, w) in a mirror half of the time."""
+        rows = np.isin(self.frame, rng.permutation(np.unique(self.frame))[:count])
+        turn = rng.choice((1, -1))
+        parts = {k: p[rows][..., ::turn] if p.ndim == 4 else p[rows] for k, p in self.parts.items()}
         return Seen(parts, self.identity[rows], self.look[rows], self.frame[rows])
+
+
+Source = tuple[str, Callable[[], Clip]]  # name of a clip, and how to read it
 
 
 class Frozen:
@@ -1151,13 +1154,12 @@ class Frozen:
         cells = rt.head_inputs(samples, rt.cell_means(features, samples, layout))
         return dict(zip(("fg", "bg"), cells, strict=True))
 
-    def scene(self, name: str, copy: int, parts: Sequence[str], clip: Clip | None = None) -> Seen:
-        """Some frames of a clip (None: a room); copy 0 as they are, others augmented."""
+    def scene(self, source: Source, copy: int, parts: Sequence[str]) -> Seen:
+        """Some frames of a clip, cached; copy 0 as they are, others augmented."""
+        name, load = source
         path = self.cache / f"{self.name}_{name.replace('/', '_')}_{copy}.npz"
         if not path.exists():
-            room = int(name.split()[-1]) if clip is None else 0
-            clip = clip or room_clip(room, self.args.cache, self.args.frames)
-            self.keep(path, clip, copy)
+            self.keep(path, load(), copy)
         with np.load(path) as data:
             return Seen({n: data[n] for n in parts}, data["identity"], data["look"], data["frame"])
 
@@ -1240,13 +1242,15 @@ class ConvBlock(nn.Module):
         super().__init__()
         self.norm = nn.BatchNorm2d(channels, affine=False)
         self.squeeze = block(channels, inner, 1)
-        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout2d(0.1))
+        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout(0.2))
         self.out = nn.Linear(64 * 16, width)
         self.short = nn.Conv2d(channels, 20, 1, bias=False)
         self.project = nn.Linear(20 * 49, width, bias=False)
 
     def forward(self, maps: Any) -> Any:
         maps = self.norm(maps)
+        if self.training:  # some channels, and some places of all of them, are hidden
+            maps = F.dropout2d(maps, 0.1) * (torch.rand_like(maps[:, :1]) > 0.1)
         deep = self.out(self.mix(self.squeeze(maps)).flatten(1))
         return F.normalize(deep + self.project(self.short(maps).flatten(1)), dim=1)
 
@@ -1262,18 +1266,31 @@ class ConvBlock(nn.Module):
         nn.init.zeros_(self.out.bias)
 
 
+def room_sources(args: argparse.Namespace, rooms: str) -> list[Source]:
+    """Rooms A:B, those of the cache if no others shall be rendered."""
+    load = functools.partial(room_clip, cache=args.cache, frames=args.frames)
+    seeds = parse_range(rooms) if rooms else ()
+    there = [s for s in seeds if not args.no_render or (args.cache / f"room_{s}.npz").exists()]
+    return [(f"room {seed}", functools.partial(load, seed)) for seed in there]
+
+
+def sources(args: argparse.Namespace) -> list[Source]:
+    """Names of all training clips, and how to read them."""
+    found = room_sources(args, args.rooms)
+    for kind, given in ((sparse_clip, args.sparse), (tracks_clip, args.tracks)):
+        found += [(f"{a.parent.name}/{a.name}", functools.partial(kind, a, b)) for a, b in given]
+    return found + [(folder.name, functools.partial(scannet_clip, folder))
+                    for folder in args.scannet]  # fmt: skip
+
+
 class SeenPool:
     """Scenes as a frozen backbone sees them, each augmented once or more."""
 
     def __init__(self, args: argparse.Namespace, frozen: Frozen, names: Sequence[str]) -> None:
         self.args, self.rooms = args, []
-        for seed in parse_range(args.rooms) if args.rooms else ():
-            if (args.cache / f"room_{seed}.npz").exists() or not args.no_render:
-                for copy in range(1, args.copies + 1):
-                    self.rooms.append(frozen.scene(f"room {seed}", copy, names))
-        for clip in real_clips(args, 1):
+        for source in sources(args):
             for copy in range(1, args.copies + 1):
-                self.rooms.append(frozen.scene(clip.name, copy, names, clip))
+                self.rooms.append(frozen.scene(source, copy, names))
         if not self.rooms:
             raise SystemExit("error: nothing to train on: give --rooms, --sparse or --tracks")
 
@@ -1308,11 +1325,12 @@ class HeadTrainer(Trainer):
                               CellHead([int(n) for n in back], channels)])  # fmt: skip
 
     def make_val(self) -> dict[str, Any]:
-        rooms = parse_range(self.args.val_rooms) if self.args.val_rooms else ()
-        clips = [sparse_clip(*source) for source in self.args.val_sparse]
+        rooms = room_sources(self.args, self.args.val_rooms)
+        real = [(f"{a.parent.name}/{a.name}", functools.partial(sparse_clip, a, b))
+                for a, b in self.args.val_sparse]  # fmt: skip
         return {
-            "room": [self.frozen.scene(f"room {seed}", 0, self.names) for seed in rooms],
-            "real": [self.frozen.scene(clip.name, 0, self.names, clip) for clip in clips],
+            name: [self.frozen.scene(source, 0, self.names) for source in found]
+            for name, found in (("room", rooms), ("real", real))
         }
 
     def start(self) -> None:
