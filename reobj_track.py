@@ -183,12 +183,8 @@ class PosesConfig:
     focal_guess: float = _opt(0.8, "first focal length over the longer side (phones .72-.85)")
     good_registered: float = _opt(0.9, "take the first sound model with this share of keyframes")
     min_points_per_image: int = _opt(30, "refuse a model with fewer 3D points in the median image")
-    min_parallax_px: float = _opt(
-        3.0, "refuse what turns explain to this (turns: < 1.5, walks: > 4)"
-    )
-    strong_tri_angle_deg: float = _opt(
-        5.0, "trust a self-calibrated focal length from this angle on"
-    )
+    min_parallax_px: float = _opt(3.0, "refuse what turns explain to this (walks: > 4)")
+    strong_tri_angle_deg: float = _opt(5.0, "trust a self-calibrated focal length from this angle")
     strong_spread: float = _opt(0.1, "and from this spread of the cameras over the depth on")
     focal_range: tuple[float, float] = _opt((0.4, 2.0), "and if focal / longer side lies in here")
     tri_sample: int = _opt(2000, "points used for the median triangulation angle")
@@ -196,9 +192,7 @@ class PosesConfig:
     refine_px: float = _opt(0.5, "soft L1 loss of the last adjustment, px of the working image")
     min_part: int = _opt(3, "keyframes that make a separate reconstruction worth keeping")
     join_objects: int = _opt(4, "objects that must agree before two reconstructions are joined")
-    max_center_shift: float = _opt(
-        0.05, "most that the principal point may move, share of the size"
-    )
+    max_center_shift: float = _opt(0.05, "most that the principal point may move, over the size")
     smooth: int = _opt(0, "smooth the path over this many frames (odd; 0: leave the hand's shake)")
     pnp_error_px: float = _opt(4.0, "PnP inlier threshold on the working image")
     max_run: int = _opt(1000, "frames held at once between two keyframes")
@@ -211,9 +205,7 @@ class PosesConfig:
     check_most_views: int = _opt(40, "direction check: frames of a track used at most")
     check_angle_deg: float = _opt(1.0, "direction check: good when the tracks meet within this")
     check_ratio: float = _opt(0.3, "direction check: another reading must be better by this factor")
-    max_step_ratio: float = _opt(
-        5.0, "refuse PnP poses this many median steps off their neighbours"
-    )
+    max_step_ratio: float = _opt(5.0, "refuse PnP poses this many median steps from neighbours")
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,9 +349,7 @@ class ObjectsConfig:
     link_look: float = _opt(-1.0, "never join by place what looks less alike (log distance ratio)")
     link_class: float = _opt(0.1, "join by place only where the classes agree in this share")
     link_place: float = _opt(0.25, "candidates for a join overlap this much cross-projected (IoU)")
-    keep_iou: float = _opt(
-        0.4, "a join is kept if the joint solid overlaps the boxes by this (IoU)"
-    )
+    keep_iou: float = _opt(0.4, "a join is kept if the joint solid overlaps the boxes so (IoU)")
     keep_share: float = _opt(0.6, "in this share of the frames of either part (OA-SLAM: half)")
     cut_gap: int = _opt(5, "tracklets may be split where this many frames pass without a detection")
     split_drop: float = _opt(0.7, "a return is doubted if its joint solid overlaps less, a share")
@@ -654,9 +644,7 @@ def _model_folders() -> list[Path]:
 
 
 def own_models() -> Path:
-    """Return the folder of the weights that come with this module: `models`, installed
-    `reobj_models`.
-    """
+    """Return the folder of our own weights: `models`, where installed `reobj_models`."""
     installed = Path(__file__).resolve().parent / "reobj_models"
     return installed if installed.is_dir() else installed.with_name("models")
 
@@ -4650,9 +4638,7 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
     """
     path, size = Path(path), (int(video.size[0]), int(video.size[1]))
     if not path.exists():
-        raise ReobjError(
-            f"{path}: no such file; --poses takes auto, none, or poses in a known format"
-        )
+        raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
     reader = _POSE_READERS.get(_pose_format(path) if config.fmt == "auto" else config.fmt)
     if reader is None:
         known = ", ".join(_POSE_READERS)
@@ -4660,9 +4646,7 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
     given = reader(path, size)
     camera = parse_camera(config.camera, size) or given.camera
     if camera is None:
-        raise ReobjError(
-            f"{path}: has no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2], pixels"
-        )
+        raise ReobjError(f"{path}: no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2], pixels")
     camera = _checked_camera(_resized_camera(camera, size, path), str(path))
     numbers = [(frame.index, frame.time_s) for frame in video]
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
@@ -4723,9 +4707,7 @@ def _number_rows(
 def _json_object(path: Path) -> dict[str, Any]:
     content = _load_json(path)
     if not isinstance(content, dict):
-        raise ReobjError(
-            f"{path}: expected `frames` (nerfstudio, instant-ngp) or `poses` (Record3D)"
-        )
+        raise ReobjError(f"{path}: expected `frames` (nerfstudio, instant-ngp), `poses` (Record3D)")
     return content
 
 
@@ -4812,9 +4794,7 @@ def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
 
 
 def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """ScanNet `pose/<frame>.txt`, z up, or 7-Scenes `*.pose.txt`: 4x4 world_from_cam, metres; inf:
-    lost frame.
-    """
+    """ScanNet `pose/<frame>.txt`, z up, 7-Scenes `*.pose.txt`: 4x4 world_from_cam, m; inf: lost."""
     folder = path / "pose" if (path / "pose").is_dir() else path
     files = sorted(f for f in folder.glob("*.txt") if re.search(r"(\d|\.pose)$", f.stem))
     if not files:
@@ -4843,9 +4823,7 @@ def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
     data = _json_object(path)
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise ReobjError(
-            f"{path}: no `frames`; expected nerfstudio's or instant-ngp's transforms.json"
-        )
+        raise ReobjError(f"{path}: no `frames`; expected nerfstudio's or ngp's transforms.json")
     where = [f"{path}, frames[{i}]" for i in range(len(frames))]
     try:
         matrix = np.array([f["transform_matrix"] for f in frames], np.float64).reshape(-1, 4, 4)
@@ -5100,9 +5078,7 @@ def check_poses(
 def _track_views(
     poses: Poses, frame: IntArray, xy: Array, config: PosesConfig
 ) -> tuple[IntArray, Array] | None:
-    """Rows of a track's frames with a pose, thinned, and unit rays (n, 3) in the camera; None if
-    too few.
-    """
+    """Rows of a track's frames with a pose, thinned, and unit rays (n, 3); None if too few."""
     place, known = _place_of(poses, frame)
     use = np.flatnonzero(known & np.isfinite(xy).all(1))
     if len(use) < config.check_views:
@@ -5384,9 +5360,7 @@ def gather_views(
 
 
 def _undistort_boxes(xyxy: Array, camera: Camera) -> Array:
-    """Boxes in the ideal pinhole image: edges through their undistorted middles; at the border they
-    stay.
-    """
+    """Boxes (N, 4) whose edges go through their undistorted middles; at the border they stay."""
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
     edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) middles
@@ -5774,9 +5748,7 @@ def write_ply(
 
 
 def _icosphere(detail: int) -> tuple[Array, IntArray]:
-    """Unit sphere as points (P, 3) and triangles (T, 3): an octahedron subdivided `detail` + 1
-    times.
-    """
+    """Unit sphere as points (P, 3) and triangles (T, 3): an octahedron `detail` + 1 times finer."""
     points = np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
                       [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])  # fmt: skip
@@ -5998,9 +5970,8 @@ def _project_all(
     known = poses.cam_from_world[poses.known]
     img_from_world = np.diag([scale, scale, 1.0]) @ poses.camera.K @ known
     dual_c, visible = quadrics.project(ellipsoids.dual_quadrics(), img_from_world)
-    return dict(
-        zip(poses.frame[poses.known].tolist(), zip(dual_c, visible, strict=True), strict=True)
-    )
+    outlines = zip(dual_c, visible, strict=True)
+    return dict(zip(poses.frame[poses.known].tolist(), outlines, strict=True))
 
 
 # ---- Scene page: one self-contained HTML file --------------------------------------------------
@@ -6354,9 +6325,7 @@ def run(
 def refit(
     out: str | Path, config: Config | None = None, tracks: str | Path | None = None
 ) -> RunResult:
-    """Link and fit again from what an output folder holds, with other options of the objects
-    section, or with identities from a file of tracks.
-    """
+    """Link and fit again from what an output folder holds; tracks: identities from this file."""
     if not (Path(out) / "cache").is_dir():
         raise ReobjError(f"{out}: no output folder of reobj_track; make one with `run` or `track`")
     space = Workspace(Path(out))
@@ -6671,9 +6640,7 @@ def _reconstruct(
     seconds: dict[str, float],
     moving: TrackTable | None = None,
 ) -> tuple[Poses, Path]:
-    """Poses from pycolmap and the folder of their sparse model, both cached, without features on
-    moving things.
-    """
+    """Poses from pycolmap, no features on moving things, and their model's folder, both cached."""
     boxes = np.empty((0, 5)) if moving is None else np.column_stack([moving.frame, moving.xyxy])
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
     content = source_fingerprint(video.source)
