@@ -324,6 +324,11 @@ class TrackerConfig:
     place_refit: int = _opt(10, "places are fitted again every so many frames, where views are new")
     place_in_view: float = _opt(0.5, "a detection is expected from this share of a box in view on")
     place_parallax_deg: float = _opt(2.0, "a place counts from this angle between its views on")
+    place_shape: float = _opt(
+        6.0,
+        "and where the longest axis is at most this many middle ones: half-seen things give "
+        "needles (95 % of priors.json: 5.8)",
+    )
     camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
     flow_size_px: int = _opt(320, "longer side of the image for optical flow")
     flow_corners: int = _opt(100, "corners followed")
@@ -2924,6 +2929,8 @@ class Places:
         fast = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
         fits = quadrics.fit_objects(boxes, cameras, image_size, support="ellipsoid", config=fast)
         good = (fits.status != "rejected") & (fits.parallax_deg >= self.config.place_parallax_deg)
+        axes = np.sort(fits.ellipsoids.half_axes, 1)  # (O, 3)
+        good &= axes[:, 2] <= self.config.place_shape * axes[:, 1]
         self.dual_q[due] = np.where(good[:, None, None], fits.ellipsoids.dual_quadrics(), np.nan)
         self.fresh[due] = 0
         return True

@@ -514,6 +514,22 @@ def test_places_hold_few_views_over_the_whole_life() -> None:
     assert kept[0] < 200 and kept[-1] > 800 and np.diff(kept).max() < 300
 
 
+@pytest.mark.parametrize("length", [0.2, 2.0])
+def test_a_needle_is_no_place(length: float) -> None:
+    """Half-seen things give ellipsoids that reach beyond the camera: they tell nothing."""
+    thing = quadrics.Ellipsoids(
+        np.array([[0, 0, 4.0]]), np.array([[length, 0.1, 0.1]]), np.eye(3)[None]
+    )
+    places = rt.Places(rt.TrackerConfig())
+    for i in range(12):
+        view = CAMERA.K @ pose_at(0.2 * i - 1.1)
+        dual_c, _ = quadrics.project(thing.dual_quadrics(), view[None])
+        boxes = quadrics.boxes_from_dual_conics(dual_c[0])
+        places.add(5 * i, np.array([0]), boxes, view)
+    assert places.refit((640, 480))
+    assert bool(places.known[0]) is (length < 1)
+
+
 # ---- Embedder ----
 
 
