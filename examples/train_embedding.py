@@ -573,7 +573,7 @@ class Backbone(nn.Module):
 
 
 class PartHead(nn.Module):
-    """Cells of one part, (N, cells * (C + 2)) of one or more square grids, to unit rows (N, WIDTH).
+    """Cells of one part, (N, cells * (C + 2)) of grids of the same side, to unit rows (N, WIDTH).
 
     A linear map of the colour histogram, which starts as its principal components (so that
     training starts from the training-free descriptor), plus a perceptron that sees the cells as
@@ -581,19 +581,17 @@ class PartHead(nn.Module):
     behind it from the side, but above stays above.
     """
 
-    def __init__(
-        self, sides: Sequence[int], channels: int, word: int = 64, brief: int = 24
-    ) -> None:
+    def __init__(self, grids: int, side: int, channels: int, word: int = 64) -> None:
         super().__init__()
-        self.sides, self.channels = tuple(sides), channels
-        self.cells = sum(side * side for side in sides)
+        self.grids, self.side, self.channels = grids, side, channels
+        self.cells, brief = grids * side * side, 24
         self.project = nn.Linear(self.cells * COLOURS, WIDTH, bias=False)
         self.word = nn.Sequential(
             nn.Linear(channels + 2, word), nn.ReLU(), nn.Linear(word, word), nn.ReLU()
         )
         self.brief = nn.Linear(word, brief, bias=False)
         self.mix = nn.Sequential(
-            nn.Linear(self.cells * brief + sum(sides) * word * 2, 144, bias=False),
+            nn.Linear(self.cells * brief + grids * side * word * 2, 144, bias=False),
             nn.BatchNorm1d(144),
             nn.ReLU(),
             nn.Linear(144, WIDTH),
@@ -601,37 +599,31 @@ class PartHead(nn.Module):
         nn.init.zeros_(self.mix[-1].weight)
         nn.init.zeros_(self.mix[-1].bias)
 
-    def grids(self, cells: Any) -> list[Any]:
-        """(N, cells, C) as (N, side, side, C) of every grid."""
-        split = cells.split([side * side for side in self.sides], 1)
-        return [g.reshape(-1, n, n, g.shape[-1]) for n, g in zip(self.sides, split, strict=True)]
-
     def histogram(self, cells: Any) -> Any:
         """Unit rows (N, cells * COLOURS) of square roots; part-empty cells count less."""
-        rows = []
-        for grid in self.grids(cells):
-            share = grid[..., self.channels : self.channels + 1]
-            trust = share / share.amax((1, 2), keepdim=True).clamp_min(1e-6)
-            rows.append((grid[..., :COLOURS] * trust + 1e-12).sqrt().flatten(1))
-        return F.normalize(torch.cat(rows, 1), dim=1)
+        share = cells[..., self.channels].reshape(-1, self.grids, self.side**2)
+        trust = (share / share.amax(2, keepdim=True).clamp_min(1e-6)).reshape(-1, self.cells, 1)
+        rows = (cells[..., :COLOURS] * trust + 1e-12).sqrt()
+        return F.normalize(rows.flatten(1), dim=1)
 
-    def seen(self, cells: Any) -> Any:
+    def seen(self, words: Any, share: Any) -> Any:
         """What the perceptron sees: short words of all cells, mean and maximum of every row."""
-        colours = (cells[..., :COLOURS] + 1e-6).sqrt()
-        words = self.word(torch.cat([colours, cells[..., COLOURS:]], -1))
-        share = cells[..., self.channels : self.channels + 1]
         words = words * (share > 0)
-        seen = [self.brief(words).flatten(1)]
-        for word, weight in zip(self.grids(words), self.grids(share), strict=True):
-            mean = (word * weight).sum(2) / weight.sum(2).clamp_min(1e-6)  # (N, side, word)
-            seen += [mean.flatten(1), word.amax(2).flatten(1)]
-        return torch.cat(seen, 1)
+        lines = (-1, self.grids * self.side, self.side)
+        word, weight = words.reshape(*lines, words.shape[-1]), share.reshape(*lines, 1)
+        mean = (word * weight).sum(2) / weight.sum(2).clamp_min(1e-6)  # (N, rows, word)
+        seen = [self.brief(words), mean, word.amax(2)]
+        return torch.cat([part.flatten(1) for part in seen], 1)
 
     def forward(self, rows: Any) -> Any:
         cells = rows.reshape(-1, self.cells, self.channels + 2)
         if self.training:  # some cells are hidden
             cells = cells * (torch.rand_like(cells[..., :1]) > 0.1)
-        return F.normalize(self.project(self.histogram(cells)) + self.mix(self.seen(cells)), dim=1)
+        share = cells[..., self.channels : self.channels + 1]
+        colours = (cells[..., :COLOURS] + 1e-6).sqrt()
+        words = self.word(torch.cat([colours, cells[..., COLOURS:]], -1))
+        joint = self.project(self.histogram(cells)) + self.mix(self.seen(words, share))
+        return F.normalize(joint, dim=1)
 
 
 class Head(nn.Module):
@@ -640,8 +632,9 @@ class Head(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         fore, near, wide = (int(LAYOUT[f"{k}_cells"]) for k in ("foreground", "background", "wide"))
+        assert near == wide
         self.parts = nn.ModuleList(
-            [PartHead([fore], int(LAYOUT["foreground_channels"])), PartHead([near, wide], CHANNELS)]
+            [PartHead(1, fore, int(LAYOUT["foreground_channels"])), PartHead(2, near, CHANNELS)]
         )
 
     def forward(self, fg: Any, bg: Any) -> tuple[Any, Any]:
