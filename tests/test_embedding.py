@@ -129,6 +129,23 @@ def test_own_weights_tell_twins_apart_and_know_an_object_again() -> None:
     assert cosine.diagonal().min() > cosine[~np.eye(2, dtype=bool)].max() + 0.2
 
 
+def test_own_foreground_sees_no_context() -> None:
+    """Everything from 10 pixels (of 320) around the object on is changed: its background alone
+    notices.
+    """
+    noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    image, mask = cv2.GaussianBlur(noise, (0, 0), 3), np.zeros((1, 240, 320), bool)
+    mask[0, 100:150, 120:180] = True
+    other, around = 255 - image, (slice(90, 160), slice(110, 190))
+    other[around] = image[around]
+    embedder = rt.Embedder("reobj", threads=1)
+    one, two = (
+        embedder(picture, boxes((120, 100, 180, 150), masks=mask)) for picture in (image, other)
+    )
+    np.testing.assert_allclose(one.foreground, two.foreground, atol=1e-4)
+    assert (one.background * two.background).sum() < 0.95
+
+
 def test_own_weights_embed_some_rows_as_all_rows() -> None:
     image, detections = scene_with_twins()
     embedder = rt.Embedder("reobj", threads=1)
