@@ -287,7 +287,7 @@ class TrackerConfig:
     appearance_weight: float = _opt(0.7, "share of appearance in the cost of doubtful matches")
     foreground_weight: float = _opt(0.5, "share of the foreground in the appearance")
     rival_cost: float = _opt(0.3, "a match is doubtful where a rival costs less than this more")
-    doubt_cost: float = _opt(0.3, "and where it costs more than this: perhaps a new object")
+    doubt_cost: float = _opt(0.5, "and where it costs more than this: perhaps a new object")
     look_odds: float = _opt(
         3.0, "log odds that the look must give a doubtful match of boxes that do not overlap"
     )
@@ -4698,8 +4698,8 @@ def _number_rows(
         try:
             row = [float(word) for word in text.replace(",", " ").split()]
         except ValueError:
-            found = text.strip()[:60]
-            raise ReobjError(f"{at}: {found!r} is no row of numbers; expected {expected}") from None
+            what = f"{text.strip()[:60]!r} is not a row of numbers"
+            raise ReobjError(f"{at}: {what}; expected {expected}") from None
         if len(row) not in columns or (rows and len(row) != len(rows[0])):
             raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
         if finite and not np.isfinite(row).all():
@@ -4714,7 +4714,7 @@ def _number_rows(
 def _json_object(path: Path) -> dict[str, Any]:
     content = _load_json(path)
     if not isinstance(content, dict):
-        raise ReobjError(f"{path}: expected `frames` (nerfstudio, instant-ngp), `poses` (Record3D)")
+        raise ReobjError(f"{path}: expected an object with `frames` (nerfstudio) or `poses`")
     return content
 
 
