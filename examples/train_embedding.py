@@ -1242,8 +1242,6 @@ class ConvBlock(nn.Module):
 
     def forward(self, maps: Any) -> Any:
         maps = self.norm(maps)
-        if self.training:  # some channels, and some places of all of them, are hidden
-            maps = F.dropout2d(maps, 0.1) * (torch.rand_like(maps[:, :1]) > 0.1)
         deep = self.out(self.mix(self.squeeze(maps)).flatten(1))
         return F.normalize(deep + self.project(self.short(maps).flatten(1)), dim=1)
 

@@ -161,6 +161,15 @@ def test_own_weights_say_how_they_were_trained() -> None:
     assert {"steps", "seed", "minutes", "rooms"} <= set(facts["trained"])
 
 
+@pytest.mark.parametrize("name", ["mobilenetv2", "crops:mobilenetv2"])
+def test_heads_of_mobilenetv2_come_along(name: str) -> None:
+    path = rt.trained_head(name, rt.EmbedConfig())
+    assert path is not None and path.parent == rt.own_models()
+    facts = rt._facts(rt.onnx_session(path, 1))
+    assert facts["trained"]["rooms"] > 10 and {"layout", "trained"} <= set(facts)
+    assert rt.trained_head(name, rt.EmbedConfig(head="none")) is None
+
+
 # ---- Training ----
 
 
