@@ -1113,10 +1113,9 @@ class Seen:
     frame: IntArray
 
     def views(self, rng: np.random.Generator, count: int) -> Seen:
-        """The rows of so many random frames; maps (N, C, h, w) in a mirror half of the time."""
+        """The rows of so many random frames."""
         rows = np.isin(self.frame, rng.permutation(np.unique(self.frame))[:count])
-        turn = rng.choice((1, -1))
-        parts = {k: p[rows][..., ::turn] if p.ndim == 4 else p[rows] for k, p in self.parts.items()}
+        parts = {k: part[rows] for k, part in self.parts.items()}
         return Seen(parts, self.identity[rows], self.look[rows], self.frame[rows])
 
 
@@ -1235,7 +1234,7 @@ class ConvBlock(nn.Module):
         super().__init__()
         self.norm = nn.BatchNorm2d(channels, affine=False)
         self.squeeze = block(channels, inner, 1)
-        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout(0.2))
+        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout2d(0.1))
         self.out = nn.Linear(64 * 16, width)
         self.short = nn.Conv2d(channels, 20, 1, bias=False)
         self.project = nn.Linear(20 * 49, width, bias=False)
