@@ -3289,22 +3289,27 @@ class Tracker:
             self._place_boxes = self.places.project(view, self._image_size, share)
 
     def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
-        """Match detections to live tracks: high scores with motion and appearance, then low scores
-        by overlap.
+        """Match detections to live tracks: high scores by motion, and again with the looks of what
+        was matched in doubt, then low scores by overlap.
         """
         config = self.config
         track_of = np.full(len(detections), -1, np.int64)
         box = _cxcywh_from_xyxy(detections.xyxy)
         cost, feasible, iou = self._motion_cost(detections, box, lazy.available)  # (T, D)
-        high = detections.score >= config.high_score
+        high, handicap = detections.score >= config.high_score, self._handicap()[:, None]
+        _assign(cost + handicap, feasible & high & (cost < config.max_cost), track_of)
         if lazy.available and self._live.look.shape[1]:
-            cost, feasible = self._compare_looks(cost, feasible, high, iou, lazy)
-        gate = feasible & high & (cost < config.max_cost)
-        _assign(np.where(gate, cost + self._handicap()[:, None], np.inf), np.inf, track_of)
+            doubtful, close = self._doubtful(cost, feasible & high)
+            asked = np.zeros(len(detections), bool)
+            while len(rows := self._unsure(track_of, doubtful, close, asked)):
+                asked[rows] = True
+                cost, feasible = self._compare_looks(cost, feasible, doubtful, iou, rows, lazy)
+                track_of[:] = -1
+                _assign(cost + handicap, feasible & high & (cost < config.max_cost), track_of)
         free = ~np.isin(np.arange(len(iou)), track_of)
         low = (track_of < 0) & (detections.score >= config.low_score)
         second = feasible & (iou >= config.low_iou) & low & free[:, None]
-        _assign(np.where(second, 1 - iou, np.inf), 1.0, track_of)
+        _assign(1 - iou, second, track_of)
         return track_of
 
     def _motion_cost(
@@ -3336,29 +3341,41 @@ class Tracker:
         waited = ((live.missed - 1) / 10).clip(0, 1)
         return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
 
-    def _compare_looks(
-        self, cost: Array, feasible: BoolArray, high: BoolArray, iou: Array, lazy: _LazyEmbeddings
-    ) -> tuple[Array, BoolArray]:
-        """Blend in appearance where a match is doubtful; forbid what the evidence speaks against.
-
-        Doubtful: a rival costs little more, or the match is so dear that the detection may be of an
-        object without a track. There overlap and look together must speak for the same object.
+    def _doubtful(self, cost: Array, gate: BoolArray) -> tuple[BoolArray, BoolArray]:
+        """Which pairs (T, D) must look alike: a rival costs little more, or the match is so dear
+        that the detection may be of an object without a track. And which cost little more than the
+        best of both.
         """
-        config, live = self.config, self._live
-        gate = feasible & high
+        config = self.config
         open_cost = np.where(gate, cost, np.inf)
         best = np.minimum(
             open_cost.min(0, initial=np.inf)[None], open_cost.min(1, initial=np.inf)[:, None]
         )
         close = gate & (cost <= best + config.rival_cost)
-        doubtful = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
+        rivals = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
+        dear = gate & (self._live.embedded >= 0)[:, None] & (cost > config.doubt_cost)
+        return rivals | dear, close
+
+    @staticmethod
+    def _unsure(
+        track_of: IntArray, doubtful: BoolArray, close: BoolArray, asked: BoolArray
+    ) -> IntArray:
+        """Detections (n,) that were matched in doubt, and their rivals, not looked at yet."""
+        matched = np.flatnonzero(track_of >= 0)
+        matched = matched[doubtful[track_of[matched], matched] & ~asked[matched]]
+        ask: BoolArray = np.asarray((close & doubtful)[track_of[matched]].any(0), bool)
+        ask[matched] = True
+        return np.flatnonzero(ask & ~asked)
+
+    def _compare_looks(
+        self, cost: Array, feasible: BoolArray, doubtful: BoolArray, iou: Array, rows: IntArray,
+        lazy: _LazyEmbeddings,
+    ) -> tuple[Array, BoolArray]:  # fmt: skip
+        """Blend the looks of detections (n,) into the cost; forbid what overlap and look together
+        speak against, among the doubtful pairs.
+        """
+        config, live = self.config, self._live
         known = (live.embedded >= 0)[:, None]
-        doubtful |= gate & known & (cost > config.doubt_cost)
-        rows = np.flatnonzero(
-            (doubtful & close).any(0)
-        )  # looks cost time: not for what is no match
-        if not len(rows):
-            return cost, feasible
         cosine = (live.look @ lazy.get(rows).T).astype(np.float64)  # (T, n)
         logit = _with_outliers(self.look_stats._logit_of_video(cosine))
         weight = config.appearance_weight * known
@@ -3527,7 +3544,7 @@ class Tracker:
         possible = (self.last_seen[identity][None] < live.first[ready][:, None]) & (odds > 0)
         possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
         claimed = np.full(len(identity), -1, np.int64)
-        _assign(np.where(possible & (iou > config.low_iou), 1 - iou, np.inf), np.inf, claimed)
+        _assign(1 - iou, possible & (iou > config.low_iou), claimed)
         column = np.flatnonzero(claimed >= 0)
         result[claimed[column]] = identity[column]
         return result
@@ -3553,7 +3570,7 @@ class Tracker:
         fused = np.where(possible, self.stats.fused(fore, back), -np.inf)  # (n, I)
         claimed = np.full(len(identity), -1, np.int64)
         likely = possible & (self.stats.logit(fore, back, None, gone) >= -1)
-        _assign(np.where(likely, 1 - fused, np.inf).clip(0), np.inf, claimed)
+        _assign((1 - fused).clip(0, 2), likely, claimed)
         column = np.flatnonzero(claimed >= 0)
         row, pick = claimed[column], np.arange(len(column))
         others_of_row, others_of_column = fused[row], fused[:, column].T  # (m, I), (m, n)
@@ -3604,19 +3621,12 @@ def _same_class(votes: Array, class_id: IntArray) -> BoolArray:
     return np.asarray(own[:, None] == class_id[None], bool)
 
 
-def _assign(cost: Array, limit: float, row_of_column: IntArray) -> None:
-    """Minimum-cost assignment of rows to columns where cost < limit; fills row_of_column (C,) in
-    place.
-    """
-    finite = np.isfinite(cost) & (cost < limit)
-    if not finite.any():
-        return
-    worst = (
-        1e3  # dearer than any feasible sum: as many feasible pairs as possible, then the cheapest
-    )
-    rows, columns = linear_sum_assignment(np.where(finite, cost, worst))
-    good = finite[rows, columns]
-    row_of_column[columns[good]] = rows[good]
+def _assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
+    """Match as many rows to columns as possible, then at least cost; fills row_of_column (C,)."""
+    if possible.any():
+        rows, columns = linear_sum_assignment(np.where(possible, cost, 1e3))
+        good = possible[rows, columns]
+        row_of_column[columns[good]] = rows[good]
 
 
 def _as_embeddings(embeddings: Embeddings | npt.ArrayLike | None, count: int) -> Embeddings | None:
