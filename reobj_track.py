@@ -57,7 +57,7 @@ import time
 import urllib.request
 import zipfile
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -289,9 +289,9 @@ class TrackerConfig:
     rival_cost: float = _opt(0.3, "a match is doubtful where a rival costs less than this more")
     doubt_cost: float = _opt(0.5, "and where it costs more than this: perhaps a new object")
     look_odds: float = _opt(
-        3.0, "log odds that the look must give a doubtful match of boxes that do not overlap"
+        6.0, "log odds that the look must give a doubtful match of boxes that do not overlap"
     )
-    iou_odds: float = _opt(10.0, "log odds that full overlap is worth")
+    iou_odds: float = _opt(20.0, "log odds that full overlap is worth")
     embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
     look_momentum: float = _opt(
         0.8, "memory of a track's running mean appearance (StrongSORT: .9 every frame)"
@@ -301,22 +301,14 @@ class TrackerConfig:
         0.95, "a view less similar than this to all kept ones is a new view (cosine)"
     )
     return_probability: float = _opt(
-        0.0,
-        "recognise a return from this calibrated probability (.5: more likely than not); 0, or a "
-        "model without calibration: by what the video shows",
+        0.5, "recognise a return from this probability on, rivals and a new object considered"
     )
-    return_similarity: float = _opt(
-        0.5, "by the video: above this similarity (0: as different objects, 1: as same)"
+    return_odds: float = _opt(
+        1.8, "odds beforehand that a newcomer is a certain known object and not a new one"
     )
-    return_margin: float = _opt(0.15, "and only if no other identity comes closer than this")
-    prior_different: float = _opt(
-        0.55, "cosine of different objects of a class before the video has shown any"
+    prior_weight: float = _opt(
+        10.0, "pairs that the usual looks of one and of two objects are worth (SameObject)"
     )
-    prior_same: float = _opt(
-        0.85, "cosine of two views of one object before the video has shown any"
-    )
-    prior_std: float = _opt(0.1, "spread of both")
-    prior_weight: float = _opt(20.0, "number of observed pairs that these priors are worth")
     place_views: int = _opt(16, "with poses: views kept of every object to tell its place in 3D")
     place_every: int = _opt(
         5, "frames between them; when they are full every other one goes and this doubles"
@@ -344,14 +336,11 @@ class ObjectsConfig:
     support: str = _opt("auto", "shape of the solids: auto, box, cylinder, ellipsoid", "--support")
     up: str = _opt("", "up in the world: x,y,z (default: from the poses or the objects)")
     link: bool = _opt(True, "join and split tracklets by 3D evidence")
-    look_ratio: float = _opt(1.3, "join by looks what is this much nearer than any rival (cosine)")
+    look_probability: float = _opt(0.5, "join by looks from this on, rivals and others considered")
     look_gap: int = _opt(30, "views of a tracklet this many frames apart show how looks vary")
-    look_prior: tuple[float, float] = _opt(
-        (0.09, 0.18), "1 - cosine of one object, of two, at first"
-    )
-    look_prior_weight: float = _opt(10.0, "number of observed pairs that these are worth")
+    look_prior_weight: float = _opt(10.0, "pairs that the usual looks of one and two are worth")
     double_iou: float = _opt(0.5, "boxes that overlap more may be two boxes on one object (IoU)")
-    link_look: float = _opt(-1.0, "never join by place what looks less alike (log distance ratio)")
+    link_look: float = _opt(-4.0, "never join by place what looks less alike (log odds)")
     link_class: float = _opt(0.1, "join by place only where the classes agree in this share")
     link_place: float = _opt(0.25, "candidates for a join overlap this much cross-projected (IoU)")
     keep_iou: float = _opt(0.4, "a join is kept if the joint solid overlaps the boxes so (IoU)")
@@ -2655,17 +2644,6 @@ class Gallery:
         pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -2.0
         return np.asarray(pairs.max(2).argmax(1), np.int64)
 
-    def similarity(self, rows: Floats, identity: IntArray) -> Array:
-        """Best cosine between each row (N, E) and any view of each identity (I,): (N, I)."""
-        if not len(rows) or not len(identity) or self.rows.shape[2] != rows.shape[1]:
-            return np.full((len(rows), len(identity)), -2.0)
-        views = self.rows[identity]  # (I, K, E)
-        cosine = (rows @ views.reshape(-1, views.shape[2]).T).reshape(
-            len(rows), len(identity), -1
-        )  # (N, I, K)
-        empty = np.arange(views.shape[1]) >= self.count[identity][:, None]  # (I, K)
-        return np.asarray(np.where(empty, -2.0, cosine).max(2), np.float64)
-
     def parts(self, rows: Floats, identity: IntArray) -> tuple[Array, Array]:
         """Cosines of foreground and background (N, I) between each row (N, E) and the most
         similar view of each identity (I,); NaN where there is none.
@@ -2699,162 +2677,88 @@ class Gallery:
 class SameObject:
     """Is it the same object? From the cosines of foreground and background to a probability.
 
-    With a calibration (fitted by `examples/rank_k.py --calibrate` and kept beside the model) the
-    log odds are linear in `closeness`, and their slopes change with the angle between the views
-    and the time between them: a background is worth less from another side. How close different
-    objects of the video are (two detections of one frame) shifts the zero of the closeness.
-    Without a calibration, the fused cosine is compared with what the video itself shows: two
-    detections of one frame are different objects, a track's new view and its first one are the
-    same. That adapts to any embedding without labels.
+    No threshold on a cosine serves two videos: the pairs that a video shows without labels say what
+    its cosines mean. Objects of a class side by side in a frame are different, views of a track are
+    of one object. The closeness of both parts is counted from the middle between the two, in
+    standard deviations, and weighs the more the further the two are apart. The weights are fitted
+    (examples/rank_k.py --calibrate) and serve every appearance model.
 
     Args:
-        calibration: coefficients of `terms` for each set of known inputs: "f" the foreground, "b"
-            the background, "a" the angle, "g" the gap, "r" the closest rival; "f", "fb", "fa" ...;
-            and "apart", the mean closeness of both parts of different objects in one frame.
+        weight: number of pairs that the usual mean and spread are worth.
     Attributes:
-        sums: count, sum, sum of squares of the fused cosine of different and of same objects.
-        apart: (3,) count and sums of the closeness of both parts of different objects of a frame.
+        sums: (2, 3, 2) count, sum and sum of squares of the closeness of the foreground and of the
+            background, of different and of same objects.
     """
 
-    KNOWN = "fbagr"
+    WEIGHTS = (0.55, 0.5)  # of foreground and background
+    USUAL = ((1.6, 1.4), (2.2, 1.8))  # mean closeness of both parts: different, same
+    USUAL_STD = 0.45
+    USUAL_ANGLE_DEG = 45.0  # between two views of unknown directions
 
-    def __init__(
-        self, config: TrackerConfig, calibration: Mapping[str, Sequence[float]] | None = None
-    ) -> None:
-        self.config, self.weight = config, config.foreground_weight
-        self.calibration = {k: np.asarray(v, np.float64) for k, v in (calibration or {}).items()}
-        self.usual = self.calibration.pop("apart", np.zeros(2))  # (2,)
-        self.apart = config.prior_weight * np.append(1.0, self.usual)
-        prior = {False: config.prior_different, True: config.prior_same}
-        self.sums = {
-            same: config.prior_weight * np.array([1.0, mean, mean**2 + config.prior_std**2])
-            for same, mean in prior.items()
-        }
-
-    @staticmethod
-    def for_model(config: TrackerConfig, model: str) -> SameObject:
-        """Look for the calibration of an appearance model; without one, learn from the video."""
-        path = calibration_file(model)
-        if not path.is_file():
-            return SameObject(config)
-        try:
-            return SameObject(config, json.loads(path.read_text())["same_object"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ReobjError(
-                f"{path}: no calibration ({error!r}): delete it, or fit one with "
-                "examples/rank_k.py --calibrate"
-            ) from error
+    def __init__(self, weight: float) -> None:
+        mean = np.array(self.USUAL)  # (2, 2)
+        self.sums = weight * np.stack([mean**0, mean, mean**2 + self.USUAL_STD**2], 1)
 
     @staticmethod
     def closeness(cosine: npt.ArrayLike) -> Array:
         """Monotone in the cosine, steep where two views are nearly equal."""
         return np.asarray(-np.log(1.03 - np.minimum(cosine, 1.0)))
 
-    def terms(self, letters: str, inputs: Array) -> Array:
-        """Regressors (N, T) of inputs (N, 5), in the order of KNOWN: 1, the closeness of each part,
-        the lead over the rival, and angle and gap with their products with the parts.
-        """
-        shift = self.apart[1:] / self.apart[0] - self.usual  # (2,) of this video
-        parts = (self.closeness(inputs[:, :2]) - shift)[:, : 1 + ("b" in letters)]  # (N, 1 or 2)
-        columns = [np.ones((len(parts), 1)), parts]
-        if "r" in letters:
-            fused = self.fused(inputs[:, 0], inputs[:, 1])
-            columns.append((self.closeness(fused) - self.closeness(inputs[:, 4]))[:, None])
-        for letter, value in (("a", inputs[:, 2] / 90), ("g", np.log1p(inputs[:, 3]) / 6)):
-            if letter in letters:
-                columns += [value[:, None], value[:, None] * parts]
-        return np.concatenate(columns, 1)
-
-    def fused(self, foreground: Array, background: Array) -> Array:
-        """Weighted mean of the two cosines; of the foreground's alone where the other is NaN."""
-        both = self.weight * foreground + (1 - self.weight) * background
-        return np.where(np.isnan(background), foreground, both)
+    def add(self, foreground: Array, background: Array, same: bool) -> None:
+        """Add cosines of pairs (N,) that the video showed; NaN: unknown."""
+        close = self.closeness(np.stack([foreground.ravel(), background.ravel()], 1))  # (N, 2)
+        powers = np.nan_to_num(np.stack([close**0, close, close**2]))  # NaN**0 == 1
+        self.sums[int(same)] += (powers * np.isfinite(close)).sum(1)
 
     def logit(
         self,
         foreground: npt.ArrayLike,
-        background: npt.ArrayLike | None = None,
-        view_angle_deg: npt.ArrayLike | None = None,
-        gap_frames: npt.ArrayLike | None = None,
-        rival: npt.ArrayLike | None = None,
+        background: npt.ArrayLike = np.nan,
+        view_angle_deg: npt.ArrayLike = np.nan,
     ) -> Array:
         """Log of the odds that it is the same object, where both are equally likely beforehand;
         within about +-7: one case in a thousand is like nothing that was seen.
 
         Args:
-            foreground, background: cosines; any shapes that broadcast, NaN or None: unknown.
-            view_angle_deg: angle between the directions of view; gap_frames: frames between them.
-            rival: fused cosine of the most similar other candidate: then, the odds that the better
-                of the two is right (calibrated models only).
+            foreground, background: cosines; any shapes that broadcast. Without a background the
+                foreground decides; without a foreground nothing speaks for it: -inf.
+            view_angle_deg: between the directions of view. From another side, an object looks less
+                like itself, and what surrounds it soon not at all. NaN: as 45 degrees.
         """
-        given = (foreground, background, view_angle_deg, gap_frames, rival)
-        arrays = [np.asarray(np.nan if x is None else x, np.float64) for x in given]
-        inputs = np.stack([x.ravel() for x in np.broadcast_arrays(*arrays)], 1)  # (N, 5)
-        result = np.full(len(inputs), -np.inf)  # no look: nothing speaks for it
-        if not self.calibration:
-            result = self._logit_of_video(self.fused(inputs[:, 0], inputs[:, 1]))
-        known = np.isfinite(inputs)
-        for letters, weights in sorted(self.calibration.items(), key=lambda item: len(item[0])):
-            rows = known[:, [self.KNOWN.index(c) for c in letters]].all(1)  # the fullest set last
-            result[rows] = self.terms(letters, inputs[rows]) @ weights
-        return _with_outliers(result).reshape(np.broadcast_shapes(*(x.shape for x in arrays)))
+        parts = np.stack(np.broadcast_arrays(foreground, background), -1)  # (..., 2)
+        logit = np.nan_to_num(self.WEIGHTS * self.scores(parts, view_angle_deg)).sum(-1)
+        return _with_outliers(np.where(np.isnan(parts[..., 0]), -np.inf, logit))
 
-    def probability(
-        self,
-        foreground: npt.ArrayLike,
-        background: npt.ArrayLike | None = None,
-        view_angle_deg: npt.ArrayLike | None = None,
-        gap_frames: npt.ArrayLike | None = None,
-        rival: npt.ArrayLike | None = None,
-        prior: float = 0.5,
-    ) -> Array:
-        """Probability of the same object, given how likely it was beforehand; see `logit`."""
-        logit = self.logit(foreground, background, view_angle_deg, gap_frames, rival)
-        return np.asarray(1 / (1 + np.exp(-logit - math.log(prior / (1 - prior)))))
-
-    def returned(
-        self, foreground: Array, background: Array, gap: npt.ArrayLike, rival: Array
-    ) -> BoolArray:
-        """Is the best candidate of a newcomer the same object? (n,) arrays; rival: NaN for none.
-
-        Without a calibration: closer to "same" than to "different", and clearly before the rival.
-        """
-        if self.calibration and self.config.return_probability:
-            chance = self.probability(foreground, background, None, gap, rival)
-            return np.asarray(chance >= self.config.return_probability)
-        alike = self.normalised(self.fused(foreground, background))
-        lead = alike - np.nan_to_num(self.normalised(rival), nan=-1.0)
-        return np.asarray(
-            (alike >= self.config.return_similarity) & (lead >= self.config.return_margin)
-        )
-
-    def add(self, cosine: Array, same: bool) -> None:
-        """Add cosines (N,) of the fused embeddings that the video showed."""
-        cosine = cosine[cosine > -1.5]
-        self.sums[same] += [len(cosine), cosine.sum(), (cosine**2).sum()]
-
-    def add_apart(self, foreground: Array, background: Array) -> None:
-        """Add cosines (N,) of detections of one class in one frame: different objects."""
-        both = self.closeness(np.stack([foreground, background], 1))  # (N, 2)
-        both = both[np.isfinite(both).all(1)]
-        self.apart += np.append(len(both), both.sum(0))
-
-    def mean_std(self, same: bool) -> tuple[float, float]:
-        """Mean and standard deviation of the cosine of pairs of the same / of different objects."""
-        count, total, squares = self.sums[same]
+    def scores(self, cosine: Array, view_angle_deg: npt.ArrayLike = np.nan) -> Array:
+        """What each part (..., 2) says for one object, before it is weighted."""
+        count, total, squares = np.moveaxis(self.sums, 1, 0)  # (2, 2) each: kinds, parts
         mean = total / count
-        return mean, math.sqrt(max(squares / count - mean**2, 1e-6))
+        std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
+        apart = ((mean[1] - mean[0]) / std).clip(0)
+        angle = np.nan_to_num(np.radians(view_angle_deg), nan=math.radians(self.USUAL_ANGLE_DEG))
+        facing = np.stack([(1 + np.cos(angle)) / 2, np.cos(angle).clip(0)], -1)  # (..., 2)
+        return np.asarray(facing * (self.closeness(cosine) - mean.mean(0)) / std * (1 + apart))
 
-    def normalised(self, cosine: Array) -> Array:
-        """Map cosines so that 0 is the mean of different and 1 the mean of same objects."""
-        different, same = self.mean_std(False)[0], self.mean_std(True)[0]
-        return (cosine - different) / max(same - different, 0.05)
+    def probability(self, *known: npt.ArrayLike, prior: float = 0.5) -> Array:
+        """Probability of the same object, given how likely it was beforehand; see `logit`."""
+        return np.asarray(1 / (1 + np.exp(-self.logit(*known) - math.log(prior / (1 - prior)))))
 
-    def _logit_of_video(self, cosine: Array) -> Array:
-        """Linear discriminant of the two normal distributions seen in the video, (N,)."""
-        (low, low_std), (high, high_std) = self.mean_std(False), self.mean_std(True)
-        gap, var = max(high - low, 0.05), max((low_std**2 + high_std**2) / 2, 0.03**2)
-        return np.asarray(np.nan_to_num(gap / var * (cosine - (low + high) / 2), nan=-np.inf))
+
+def match_probability(logit: Array, prior_odds: float = 1.0) -> Array:
+    """Probability (N, M) that row and column are one object, of log odds of the pairs (N, M).
+
+    Against the likeliest other pair of its row or column (the ratio test among look-alikes) and
+    against no pair at all, which beforehand is `prior_odds` times less likely.
+    """
+    odds = prior_odds * np.exp(logit)
+    rival = np.maximum(_best_other(odds), _best_other(odds.T).T)
+    return np.asarray(odds / (odds + 1 + rival))
+
+
+def _best_other(odds: Array) -> Array:
+    """(N, M) largest of the other entries of the row, 0 if there are none."""
+    top = np.sort(np.pad(odds, ((0, 0), (2, 0))), 1)[:, -2:]  # (N, 2) second, best
+    return np.where(odds == top[:, 1:], top[:, :1], top[:, 1:])
 
 
 def _with_outliers(logit: Array, share: float = 1e-3) -> Array:
@@ -2870,15 +2774,16 @@ def part_cosines(a: npt.NDArray[Any], b: npt.NDArray[Any], split: int) -> tuple[
     return _cosine(a[:, :split], b[:, :split]), _cosine(a[:, split:], b[:, split:])
 
 
+def _paired_cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
+    """Cosines (N,) of rows (N, E) with rows (N, E), NaN where one is of zeros."""
+    length = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    return np.asarray(np.where(length > 1e-9, (a * b).sum(1) / np.maximum(length, 1e-9), np.nan))
+
+
 def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
     """Cosines (N, M) of rows (N, E) and (M, E), NaN for rows of zeros."""
     length = np.outer(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
     return np.asarray(np.where(length > 1e-9, (a @ b.T) / np.maximum(length, 1e-9), np.nan))
-
-
-def calibration_file(model: str) -> Path:
-    """Where the calibration of an appearance model lies: beside its file, else in models/."""
-    return _companion(model, ".json")
 
 
 class Places:
@@ -3105,8 +3010,8 @@ class Tracker:
         """Forget everything: the next video starts with identity 1."""
         self.frame_number = -1
         self.gallery = Gallery(self.config)
-        self.stats = SameObject.for_model(self.config, getattr(self.embedder, "model", ""))
-        self.look_stats = SameObject(self.config)  # of a track's look and the next detection
+        self.same = SameObject(self.config.prior_weight)  # of views coast_frames apart
+        self.same_soon = SameObject(self.config.prior_weight)  # of a track and a detection
         self.last_seen = np.zeros(0, np.int64)  # (I,) frame of each identity's last detection
         self.identity_class = np.zeros(0, np.int64)  # (I,)
         self._next_tracklet = 1
@@ -3158,14 +3063,13 @@ class Tracker:
     def _state(self) -> dict[str, tuple[Any, str]]:
         """All that changes from frame to frame: owners and names of their attributes, by name."""
         own = "frame_number last_seen identity_class _next_tracklet _last_pose _place_boxes"
-        stats = ("sums", "apart")
         parts: dict[str, tuple[Any, Sequence[str]]] = {
             "tracker": (self, own.split()),
             "live": (self._live, [f.name for f in dataclasses.fields(_Live)]),
             "gallery": (self.gallery, ("rows", "count", "split")),
             "places": (self.places, Places.ARRAYS),
-            "stats": (self.stats, stats),
-            "look_stats": (self.look_stats, stats),
+            "same": (self.same, ("sums",)),
+            "same_soon": (self.same_soon, ("sums",)),
             "camera": (self._camera_motion, ("_gray", "_corners")),
         }
         return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
@@ -3223,8 +3127,6 @@ class Tracker:
             self.config.foreground_weight,
         )
         self._latest = lazy
-        if embeddings is not None and self.stats.calibration:  # of another model
-            self.stats = SameObject(self.config)
         self._predict(frame, cam_from_world, camera)
         track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
         self._correct(detections, track_of)
@@ -3376,8 +3278,7 @@ class Tracker:
         """
         config, live = self.config, self._live
         known = (live.embedded >= 0)[:, None]
-        cosine = (live.look @ lazy.get(rows).T).astype(np.float64)  # (T, n)
-        logit = _with_outliers(self.look_stats._logit_of_video(cosine))
+        logit = self.same_soon.logit(*part_cosines(live.look, lazy.get(rows), lazy.split))  # (T, n)
         weight = config.appearance_weight * known
         cost, feasible = cost.copy(), feasible.copy()
         cost[:, rows] = (1 - weight) * cost[:, rows] + weight / (1 + np.exp(logit))
@@ -3450,32 +3351,31 @@ class Tracker:
         rows = rows[(live.embedded[track_of[rows]] >= 0) & (live.identity[track_of[rows]] >= 0)]
         if not len(rows):
             return
-        cosine = (live.look[track_of[rows]] @ lazy.get(rows).T).astype(np.float64)  # (n, n)
+        parts = part_cosines(live.look[track_of[rows]], lazy.get(rows), lazy.split)  # (n, n) each
         own = np.eye(len(rows), dtype=bool)
-        class_id = detections.class_id[rows]
-        self.look_stats.add(cosine[own], same=True)
-        self.look_stats.add(cosine[(class_id[:, None] == class_id[None]) & ~own], same=False)
+        self._compare(self.same_soon, parts, own, detections.class_id[rows])
+
+    @staticmethod
+    def _compare(
+        same: SameObject, parts: tuple[Array, Array], own: BoolArray, kind: IntArray
+    ) -> None:
+        """Show all pairs of one class in a frame, (n, n)."""
+        fore, back = parts
+        other = (kind[:, None] == kind) & ~own
+        same.add(fore[own], back[own], True)
+        same.add(fore[other], back[other], False)
 
     def _learn(self, look: Floats, identity: IntArray, class_id: IntArray) -> None:
         """Feed the similarity statistics and the gallery with embeddings (n, E) of one frame."""
-        cosine = (look @ look.T).astype(np.float64)  # (n, n)
-        pair = np.triu(class_id[:, None] == class_id[None], 1)
-        self.stats.add(cosine[pair], same=False)
-        fore, back = part_cosines(look, look, self.gallery.split)
-        self.stats.add_apart(fore[pair], back[pair])
-        old = identity >= 0
-        views = (
-            self.gallery.rows[identity[old]]
-            if len(self.gallery.rows)
-            else np.zeros((0, 0, 0), np.float32)
-        )
-        if views.size:
-            oldest = np.einsum("ne,ne->n", views[:, 0], look[old])
-            self.stats.add(
-                oldest[self.gallery.count[identity[old]] > 1].astype(np.float64), same=True
-            )
-        if old.any():
-            self.gallery.add(identity[old], look[old])
+        old = np.flatnonzero(identity >= 0)
+        look, identity = look[old], identity[old]
+        if not len(old):
+            return
+        if len(self.gallery.count):
+            first = self.gallery.rows[identity, 0] * (self.gallery.count[identity, None] > 1)
+            parts = part_cosines(look, first, self.gallery.split)
+            self._compare(self.same, parts, np.eye(len(old), dtype=bool), class_id[old])
+        self.gallery.add(identity, look)
 
     def _confirm(self, track_of: IntArray) -> IntArray:
         """Give tracks that were seen often enough an identity: a known one that returns, or a new
@@ -3538,9 +3438,8 @@ class Tracker:
         iou = np.nan_to_num(self._home_iou(ready, identity))
         odds = config.iou_odds * iou - config.look_odds
         if live.look.shape[1]:
-            cosine = self.gallery.similarity(live.look[ready], identity)  # (n, I)
-            logit = _with_outliers(self.look_stats._logit_of_video(cosine))
-            odds += np.where(cosine > -2, logit, 0)
+            logit = self.same.logit(*self.gallery.parts(live.look[ready], identity))  # (n, I)
+            odds += np.where(np.isfinite(logit), logit, 0)
         possible = (self.last_seen[identity][None] < live.first[ready][:, None]) & (odds > 0)
         possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
         claimed = np.full(len(identity), -1, np.int64)
@@ -3561,25 +3460,17 @@ class Tracker:
         if not len(ready) or not live.look.shape[1] or not self.config.remember:
             return result
         identity = np.flatnonzero(self.last_seen < live.first[ready].max(initial=0))  # (I,)
-        gone = np.tile(self.frame_number - self.last_seen[identity], (len(ready), 1))
         fore, back = self.gallery.parts(live.look[ready], identity)  # (n, I)
         possible = self.last_seen[identity][None] < live.first[ready][:, None]
         possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
         possible &= ~self._elsewhere(ready, identity)
-        possible &= (live.embedded[ready] >= 0)[:, None] & np.isfinite(fore)
-        fused = np.where(possible, self.stats.fused(fore, back), -np.inf)  # (n, I)
+        possible &= (live.embedded[ready] >= 0)[:, None]
+        logit = np.where(possible, self.same.logit(fore, back), -np.inf)
+        chance = match_probability(logit, self.config.return_odds)
         claimed = np.full(len(identity), -1, np.int64)
-        likely = possible & (self.stats.logit(fore, back, None, gone) >= -1)
-        _assign((1 - fused).clip(0, 2), likely, claimed)
+        _assign(1 - chance, chance >= self.config.return_probability, claimed)
         column = np.flatnonzero(claimed >= 0)
-        row, pick = claimed[column], np.arange(len(column))
-        others_of_row, others_of_column = fused[row], fused[:, column].T  # (m, I), (m, n)
-        others_of_row[pick, column] = others_of_column[pick, row] = -np.inf
-        rival = np.concatenate([others_of_row, others_of_column], 1).max(1, initial=-np.inf)
-        rival[np.isinf(rival)] = np.nan
-        at = (row, column)
-        good = self.stats.returned(fore[at], back[at], gone[at], rival)
-        result[row[good]] = identity[column[good]]
+        result[claimed[column]] = identity[column]
         return result
 
     def _drop(self, rows: BoolArray, track_of: IntArray) -> IntArray:
@@ -5395,8 +5286,7 @@ class LinkEvent:
 
     Attributes:
         place_iou: IoU of cross-projection, None where only looks decided.
-        look: how much nearer (> 0) or further (< 0) the looks are than those that tell one object
-            from two, log of the ratio of cosine distances.
+        look: log odds of the looks that it is one object (`SameObject`).
     """
 
     kind: str
@@ -5411,9 +5301,9 @@ class Linker:
 
     Two tracklets seen in one frame are never the same object, and classes that move stay as the
     tracker has them: neither their place nor what surrounds them lasts.
-    First by looks: tracklets are joined as long as their most alike views are nearer than the
-    video's own middle between one object and two, the most alike first, and only if no rival (seen
-    beside one of the two) is about as near. This replaces what the tracker decided at first sight.
+    First by looks: tracklets are joined as long as their most alike views show one object more
+    likely than any rival (seen beside one of the two) or another object, the most alike first. This
+    replaces what the tracker decided at first sight.
     Then, with poses, by place: tracklets are cut at gaps (where a tracker slips to a twin); a join
     is undone where two well-measured places differ; groups that explain each other's boxes are
     joined, refitted and kept only if the joint solid overlaps the boxes of both in most frames
@@ -5441,7 +5331,7 @@ class Linker:
         names = np.array([*track.class_names, ""])[self.classes.clip(max=len(track.class_names))]
         self.moving = np.isin(names, config.moving.split(","))  # (L,) as the tracker has them
         self.together, self.apart = self._seen_together()
-        self.near = self._nearness(self._look_distance(track.look, track.look_row))
+        self.near = self._nearness(*self._most_alike(track))
         self.group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
         self.events: list[LinkEvent] = []
 
@@ -5468,39 +5358,39 @@ class Linker:
             double[here[:, None], here[None]] |= box_iou(box, box) > self.config.double_iou
         return together, together & ~double
 
-    def _look_distance(self, look: npt.NDArray[Any], look_row: IntArray) -> Array:
-        """(L, L) log(1 - cosine) of the most alike views of two atoms, NaN where there is none;
-        diagonal: of views of one atom at least look_gap frames apart.
+    def _most_alike(self, track: TrackResult) -> Array:
+        """(2, L, L) cosines of foreground and background of the most alike views of two atoms, NaN
+        where there is none; diagonal: of views of one atom at least look_gap frames apart.
         """
-        distance = np.full((len(self.tracklets),) * 2, np.nan)
-        if not look.size:
-            return distance
-        order = np.argsort(self.atom[look_row], kind="stable")
-        rows, unit = look_row[order], _unit_rows(look[order])
-        atoms, starts = np.unique(self.atom[rows], return_index=True)
+        parts = np.full((2, len(self.tracklets), len(self.tracklets)), np.nan)
+        if not track.look.size:
+            return parts
+        order = np.argsort(self.atom[track.look_row], kind="stable")
+        rows, unit = track.look_row[order], _unit_rows(track.look[order])
+        atoms, starts, block = np.unique(self.atom[rows], return_index=True, return_inverse=True)
+        split = track.split or unit.shape[1]
         for atom, mine in zip(atoms, np.split(np.arange(len(rows)), starts[1:]), strict=True):
             cosine = unit[mine] @ unit.T  # (k, n)
             frame = self.table.frame[rows[mine]]
             soon = np.abs(frame[:, None] - frame) < self.config.look_gap
             cosine[:, mine] = np.where(soon, -np.inf, cosine[:, mine])
-            best = np.maximum.reduceat(cosine.max(0), starts)  # (atoms,)
-            distance[atom, atoms] = np.where(np.isinf(best), np.nan, 1 - best)
-        return np.asarray(np.log(distance.clip(1e-3)))
+            view = np.lexsort((-cosine.max(0), block))[starts]  # (atoms,) the best of each
+            own = mine[cosine[:, view].argmax(0)]
+            paired = [_paired_cosine(x[own], x[view]) for x in np.split(unit, [split], 1)]
+            parts[:, atom, atoms] = np.where(np.isinf(cosine[:, view].max(0)), np.nan, paired)
+        return parts
 
-    def _nearness(self, distance: Array) -> Array:
-        """(L, L) how much nearer than the middle between one object and two looks are (log).
+    def _nearness(self, foreground: Array, background: Array) -> Array:
+        """(L, L) log odds that atoms look like one object, NaN: unknown.
 
-        Both are known without labels: atoms of a class seen side by side, and views of one atom
-        some time apart. A few invented pairs stand in while the video has shown none.
+        What that means in this video is known without labels: atoms of a class seen side by side
+        are different, views of one atom some time apart the same.
         """
+        same = SameObject(self.config.look_prior_weight)
         pairs = np.triu(self.apart & (self.classes[:, None] == self.classes), 1)
-        same, different = np.log(self.config.look_prior)
-        middle = 0.0
-        for seen, prior in ((distance[pairs], different), (np.diag(distance), same)):
-            seen = seen[np.isfinite(seen)]
-            weight = self.config.look_prior_weight
-            middle += (seen.sum() + weight * prior) / (len(seen) + weight) / 2
-        return np.asarray(middle - distance)
+        for rows, one in ((pairs, False), (np.eye(len(pairs), dtype=bool), True)):
+            same.add(foreground[rows], background[rows], one)
+        return np.where(np.isnan(foreground), np.nan, same.logit(foreground, background))
 
     def _join_looks(self) -> None:
         """Group the tracklets anew by their looks and list what differs from the tracker."""
@@ -5511,8 +5401,8 @@ class Linker:
         near = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), whole)  # (T, T)
         banned, apart = (_grouped_max(x, whole) for x in (self.together, self.apart))
         banned |= kind[:, None] != kind
-        margin = math.log(self.config.look_ratio)
-        before, self.group = self.group, _most_alike_first(near, banned, apart, margin)[whole]
+        found = _most_alike_first(near, banned, apart, self.config.look_probability)
+        before, self.group = self.group, found[whole]
         self._list_changes(before, self.group, "join")
         self._list_changes(self.group, before, "split")
 
@@ -5617,7 +5507,8 @@ class Linker:
         a, b = np.nonzero(np.triu(good, 1))
         pairs: list[tuple[int, int, float, float]] = []
         used: set[int] = set()
-        for i in np.argsort(-(score[a, b] + 0.2 * look[a, b].clip(-1, 1)), kind="stable"):
+        likely = 0.4 / (1 + np.exp(-look))
+        for i in np.argsort(-(score + likely)[a, b], kind="stable"):
             pair = (int(a[i]), int(b[i]))
             ids = tuple(sorted(self.tracklets[np.isin(self.group, pair)].tolist()))
             if ids not in rejected and not used & set(pair):
@@ -5654,35 +5545,35 @@ def _grouped_max(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArray[Any]:
     return np.asarray(np.maximum.reduceat(by_row, starts, axis=1))
 
 
-def _most_alike_first(near: Array, banned: BoolArray, apart: BoolArray, margin: float) -> IntArray:
-    """Join G things as long as two are alike (near > 0) and no rival is within the margin.
+def _most_alike_first(
+    near: Array, banned: BoolArray, apart: BoolArray, probability: float
+) -> IntArray:
+    """Join G things as long as two are probably one, rivals considered, the most alike first.
 
     Args:
-        near: (G, G) how alike, log; banned: which must never be joined; apart: which are surely
+        near: (G, G) log odds; banned: which must never be joined; apart: which are surely
             different, so that one rivals the other. Between groups the most alike members count.
     Returns:
         group of each, (G,).
     """
-    near, banned, apart = np.where(banned, -np.inf, near), banned.copy(), apart.copy()
-    np.fill_diagonal(near, -np.inf)
+    odds, banned, apart = np.where(banned, 0, np.exp(near)), banned.copy(), apart.copy()
+    np.fill_diagonal(odds, 0)
     np.fill_diagonal(apart, False)
-    i, j = np.nonzero(np.triu(near > 0, 1))
-    order = np.argsort(-near[i, j], kind="stable")
-    pairs = np.column_stack([i, j])[order]
-    group, joined = np.arange(len(near)), True
+    least = probability / (1 - probability)  # odds against all rivals and another object
+    i, j = np.nonzero(np.triu(odds >= least, 1))
+    pairs = np.column_stack([i, j])[np.argsort(-odds[i, j], kind="stable")]
+    group, joined = np.arange(len(odds)), True
     while joined:
         joined = False
         for a, b in group[pairs]:
             a, b = group[a], group[b]
-            rival = near[a, b] - margin
-            if near[a, b] <= 0 or (near[a, apart[b]] > rival).any():
+            rival = max(odds[a, apart[b]].max(initial=0), odds[b, apart[a]].max(initial=0))
+            if odds[a, b] < least * (1 + rival):
                 continue
-            if (near[b, apart[a]] > rival).any():
-                continue
-            near[a] = near[:, a] = np.maximum(near[a], near[b])
+            odds[a] = odds[:, a] = np.maximum(odds[a], odds[b])
             banned[a] = banned[:, a] = banned[a] | banned[b]
             apart[a] = apart[:, a] = apart[a] | apart[b]
-            near[b] = near[:, b] = near[a, a] = near[a, banned[a]] = near[banned[a], a] = -np.inf
+            odds[b] = odds[:, b] = odds[a, a] = odds[a, banned[a]] = odds[banned[a], a] = 0
             apart[b] = apart[:, b] = apart[a, a] = False
             group[group == b], joined = a, True
     return np.unique(group, return_inverse=True)[1]
@@ -6386,7 +6277,7 @@ class TrackResult:
 
     Attributes:
         table: the rows; look: (n, E) fused embeddings of those of them that the tracker embedded,
-            look_row: (n,) which these are.
+            look_row: (n,) which these are; split: width of their foreground (0: all).
         class_names; messages: for the user.
         fixed: identities were given (--tracks): nothing may join, split or renumber them.
     """
@@ -6397,6 +6288,7 @@ class TrackResult:
     fixed: bool = False
     look: npt.NDArray[np.float16] = field(default_factory=lambda: np.empty((0, 0), np.float16))
     look_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    split: int = 0
 
     def save(self, path: Path) -> None:
         """Write as npz, atomically."""
@@ -6405,7 +6297,7 @@ class TrackResult:
         names, messages = np.array(self.class_names, str), np.array(self.messages, str)
         with atomic(path) as part, part.open("wb") as file:
             facts = {"class_names": names, "messages": messages, "fixed": np.array(self.fixed)}
-            np.savez_compressed(file, **columns | facts)
+            np.savez_compressed(file, **columns | facts, split=np.array(self.split))
 
     @staticmethod
     def load(path: Path) -> TrackResult:
@@ -6414,8 +6306,8 @@ class TrackResult:
             with np.load(path, allow_pickle=False) as data:
                 table = TrackTable(*(data[f.name] for f in dataclasses.fields(TrackTable)))
                 names, messages = (tuple(data[k].tolist()) for k in ("class_names", "messages"))
-                fixed, look = bool(data["fixed"]), data["look"]
-                return TrackResult(table, names, messages, fixed, look, data["look_row"])
+                looks = data["look"], data["look_row"], int(data["split"])
+                return TrackResult(table, names, messages, bool(data["fixed"]), *looks)
         except (KeyError, ValueError, OSError) as error:
             raise ReobjError(
                 f"{path}: not readable, or of another version ({error}); delete it and run again"
@@ -6570,7 +6462,8 @@ def _track_frames(
     table = TrackTable.from_steps([i for i, _ in steps], [s for _, s in steps], video.scale)
     messages = [*source.messages, *_video_messages(video, table)]
     look, look_row = _table_looks(table, [i for i, _ in steps], looks)
-    return TrackResult(table, source.class_names, tuple(messages), False, look, look_row)
+    names, split = source.class_names, tracker.gallery.split
+    return TrackResult(table, names, tuple(messages), False, look, look_row, split)
 
 
 def _table_looks(

@@ -693,139 +693,126 @@ def by_bin(
 
 @dataclass(frozen=True, slots=True)
 class Cases:
-    """Decisions as a tracker meets them: a detection against what is remembered of one object.
+    """Pairs as a tracker meets them: a detection and what is remembered of one object of its class.
 
-    Of the remembered views the most similar counts, as in the tracker's gallery.
+    Of the remembered views the most similar counts, as in the tracker's gallery; objects that are
+    in sight beside the detection are no candidates.
 
     Attributes:
-        inputs: (M, 5) of `SameObject.KNOWN`: cosines of foreground and background, view angle,
-            gap, and the fused cosine of the most similar other object, NaN if there is none.
-        same: (M,). best: (M,) most similar of all objects that are remembered.
-        remembered: (M,) is the right object among those that are remembered?
-        apart: cosines of both parts of objects of one class in one frame.
-        returns: share of the newcomers (not seen for 30 frames) that were seen before.
+        cosine: (M, 2) of foreground and background. angle: (M,) between the views, deg.
+        gap: (M,) frames since the object was seen. same: (M,). query: (M,) the detection.
+        newcomer: (M,) was the detection's object out of sight for 30 frames, or never seen?
+        shown: cosines (n, 2) that the video shows without labels: of detections and the first views
+            of others in their frame, and of their own track, if that began 30 frames ago.
     """
 
-    inputs: Array
+    cosine: Array
+    angle: Array
+    gap: Array
     same: BoolArray
-    best: BoolArray
-    remembered: BoolArray
-    apart: tuple[Array, Array]
-    returns: float
+    query: IntArray
+    newcomer: BoolArray
+    shown: tuple[Array, Array]
 
-    def decider(self, calibration: dict[str, list[float]] | None = None) -> rt.SameObject:
-        """`SameObject` that has seen which objects of these scenes are apart, as in a video."""
-        found = rt.SameObject(rt.TrackerConfig(), calibration)
-        found.add_apart(*self.apart)
+    def decider(self) -> rt.SameObject:
+        """`SameObject` that has seen what the video shows."""
+        found = rt.SameObject(rt.TrackerConfig().prior_weight)
+        for same, cosine in enumerate(self.shown):
+            found.add(cosine[:, 0], cosine[:, 1], bool(same))
         return found
 
-    def of(self, letters: str) -> Cases:
-        """Cases that know the inputs named, the other inputs hidden; with a rival only the best."""
-        keep = [c in letters for c in rt.SameObject.KNOWN]
-        inputs = np.where(keep, self.inputs, np.nan)
-        rows = np.isfinite(inputs[:, keep]).all(1) & (self.best | ("r" not in letters))
-        same, best, remembered = self.same[rows], self.best[rows], self.remembered[rows]
-        return Cases(inputs[rows], same, best, remembered, self.apart, self.returns)
-
-    def balance(self) -> Array:
-        """Weights (M,) under which both answers are equally likely at every known angle and gap:
-        how often an object is seen again from near is no look, but the camera's path. Where the
-        rival is known, a whole decision is asked for: as many are remembered as of newcomers.
+    def balance(self, angle: bool = True) -> Array:
+        """Weights (M,) under which both answers are equally likely, at every angle where that is
+        known: how often an object is seen again from near is no look, but the camera's path.
         """
-        if np.isfinite(self.inputs[:, 4]).all():
-            share = float(self.remembered.mean()) if len(self.same) else 1.0
-            odds = self.returns / max(share, 1e-9), (1 - self.returns) / max(1 - share, 1e-9)
-            return np.asarray(np.where(self.remembered, *odds))
-        cell = 100 * np.digitize(self.inputs[:, 2], ANGLES_DEG[1:-1])
-        cell += np.digitize(self.inputs[:, 3], GAPS[1:-1])
-        cell = np.unique(cell, return_inverse=True)[1]
+        cell = np.digitize(self.angle, ANGLES_DEG[1:-1]) * angle
         both = np.stack([np.bincount(cell, self.same == s) for s in (False, True)])  # (2, cells)
-        weight = np.where(both.min(0) >= 5, both.sum(0) / np.maximum(2 * both, 1), 0)
+        weight = np.where(both.min(0) >= 3, both.sum(0) / np.maximum(2 * both, 1), 0)
         return np.asarray(weight[self.same.astype(int), cell])
+
+    def decisions(self, odds: float, angle: bool = False) -> tuple[Array, BoolArray]:
+        """For every newcomer: probability of the likeliest candidate, and is it the right one?"""
+        logit = self.decider().logit(*self.cosine.T, self.angle if angle else np.nan)
+        found = []
+        for q in np.unique(self.query[self.newcomer]):
+            rows = self.query == q
+            chance = rt.match_probability(logit[None, rows], odds)[0]
+            found.append((chance.max(), self.same[rows][chance.argmax()]))
+        table = np.array(found, np.float64).reshape(-1, 2)
+        return table[:, 0], table[:, 1] > 0
 
 
 def cases_of(scene: Scene, parts: Sequence[npt.NDArray[Any]], weight: float, seed: int) -> Cases:
-    """Every detection of a scene against every object of its class that was seen before: some
-    random 1-12 of its views, at least some random time ago. An object seen for the first time is
-    not remembered: then the most similar one is another.
+    """Every detection of a scene against every object of its class seen before: some random 1-12
+    of its views, at least some random time ago.
     """
-    pairs, rng = pairs_of([scene]), np.random.default_rng(seed)
-    cosines = [p @ p.T for p in parts]
-    fused, angle = weight * cosines[0] + (1 - weight) * cosines[1], pairs.angle_deg()
-    allowed, rows = pairs.gallery("class", 0), []
-    for q in range(len(fused)):  # over queries
-        away, views = rng.choice((15, 30, 60, 120)), rng.choice((1, 2, 4, 8, 12))
-        gap = pairs.frame[q] - pairs.frame
-        known = allowed[q] & (gap > away)
-        best = []
-        for k in np.unique(pairs.identity[known]):
-            own = np.flatnonzero(known & (pairs.identity == k))
-            own = rng.choice(own, min(views, len(own)), replace=False)
-            best.append((own[fused[q, own].argmax()], gap[own].min()))
-        order = sorted(best, key=lambda b: -fused[q, b[0]])
-        for i, (j, wait) in enumerate(order):
-            rival = fused[q, order[1 if i == 0 else 0][0]] if len(order) > 1 else np.nan
-            inputs = (cosines[0][q, j], cosines[1][q, j], angle[q, j], wait, rival)
-            known_itself = bool((known & (pairs.identity == pairs.identity[q])).any())
-            rows.append((*inputs, pairs.identity[j] == pairs.identity[q], i == 0, known_itself))
-    table = np.array(rows, np.float64).reshape(-1, 8)
-    apart = ~pairs.same() & (pairs.frame[:, None] == pairs.frame[None])
-    apart &= np.triu(pairs.name[:, None] == pairs.name[None], 1)
-    shown = (cosines[0][apart].astype(np.float64), cosines[1][apart].astype(np.float64))
-    flags = table[:, 5:] > 0
-    known = share_of_returns(pairs)
-    return Cases(table[:, :5], flags[:, 0], flags[:, 1], flags[:, 2], shown, known)
-
-
-def share_of_returns(pairs: Pairs, away: int = 30) -> float:
-    """Share of the newcomers whose class was seen before that are known objects, of one scene."""
-    ago: Any = pairs.frame[:, None] - pairs.frame[None]  # (N, N) frames since row j
+    pairs, rng, away = pairs_of([scene]), np.random.default_rng(seed), 30
+    cosine = np.stack([p @ p.T for p in parts], -1)  # (N, N, 2)
+    fused, angle = cosine @ [weight, 1 - weight], pairs.angle_deg()
     alike, same = pairs.name[:, None] == pairs.name[None], pairs.same()
-    fresh = ~(same & (ago > 0) & (ago <= away)).any(1) & (alike & (ago > away)).any(1)
-    return float((same & (ago > away)).any(1)[fresh].mean()) if fresh.any() else 1.0
+    gap = (pairs.frame[:, None] - pairs.frame[None]).astype(np.int64)  # (N, N) frames since row j
+    begun = np.array([began(pairs.frame[same[q] & (gap[q] >= 0)], away) for q in range(len(gap))])
+    rows, shown = [], ([], [])  # type: ignore[var-annotated]
+    for q in range(len(gap)):  # over queries
+        here = np.flatnonzero(alike[q] & (gap[q] == 0))
+        for k in here:
+            first = np.flatnonzero(same[k] & (pairs.frame == begun[k]))[0]
+            if begun[k] <= pairs.frame[q] - away:
+                shown[int(k == q)].append(cosine[q, first])
+        least, views = rng.choice((15, 30, 60, 120)), rng.choice((1, 2, 4, 8, 12))
+        known = (
+            alike[q] & (gap[q] > least) & ~np.isin(pairs.identity, pairs.identity[here[here != q]])
+        )
+        for i in np.unique(pairs.identity[known]):
+            own = np.flatnonzero(known & (pairs.identity == i))
+            own = rng.choice(own, min(views, len(own)), replace=False)
+            j = own[fused[q, own].argmax()]
+            if not same[q, j] or pairs.frame[own].min() < begun[q]:  # not of the same track
+                rows.append((*cosine[q, j], angle[q, j], gap[q, own].min(), same[q, j], q,
+                             begun[q] == pairs.frame[q]))  # fmt: skip
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    flags, query = table[:, [4, 6]] > 0, table[:, 5].astype(np.int64)
+    both = tuple(np.array(x, np.float64).reshape(-1, 2) for x in shown)
+    return Cases(table[:, :2], table[:, 2], table[:, 3], flags[:, 0], query, flags[:, 1],
+                 (both[0], both[1]))  # fmt: skip
 
 
-def fit_logistic(terms: Array, same: BoolArray, weight: Array, ridge: float = 1e-4) -> Array:
-    """Coefficients (T,) of a logistic regression by Newton's method; ridge on all but the first."""
+def began(frame: IntArray, away: int) -> int:
+    """First frame of the latest stretch of frames, with no gap longer than `away`."""
+    frame = np.sort(frame)
+    return int(frame[np.flatnonzero(np.append(True, np.diff(frame) > away))[-1]])
+
+
+def fit_logistic(terms: Array, same: BoolArray, weight: Array) -> Array:
+    """Coefficients (T,) of a logistic regression without intercept, by Newton's method."""
     coefficients = np.zeros(terms.shape[1])
-    penalty = ridge * weight.sum() * np.diag([1e-6] + [1.0] * (terms.shape[1] - 1))
     for _ in range(50):
         p = 1 / (1 + np.exp(-(terms @ coefficients).clip(-30, 30)))
-        slope = terms.T @ (weight * (same - p)) - penalty @ coefficients
-        curvature = (terms.T * (weight * p * (1 - p))) @ terms + penalty
-        step = np.linalg.solve(curvature, slope)
+        curvature = (terms.T * (weight * p * (1 - p))) @ terms
+        step = np.linalg.solve(curvature, terms.T @ (weight * (same - p)))
         coefficients += step
         if np.abs(step).max() < 1e-6:
             break
     return coefficients
 
 
-def known_inputs() -> list[str]:
-    """All sets of inputs: the foreground is always known."""
-    rest = rt.SameObject.KNOWN[1:]
-    chosen = [itertools.combinations(rest, n) for n in range(len(rest) + 1)]
-    return ["f" + "".join(c) for c in itertools.chain(*chosen)]
+def calibrate(cases: Sequence[Cases]) -> tuple[Array, float]:
+    """`SameObject.WEIGHTS` and `tracker.return_odds`: the likeliest ones."""
+    terms, same, weight = [], [], []
+    for c in cases:
+        for angle in (c.angle, np.full(len(c.same), np.nan)):
+            terms.append(np.nan_to_num(c.decider().scores(c.cosine, angle)))
+            same.append(c.same)
+            weight.append(c.balance(bool(np.isfinite(angle).any())) / max(len(c.same), 1))
+    weights = fit_logistic(*(np.concatenate(x) for x in (terms, same, weight)))
+    odds = np.exp(np.linspace(-2, 3, 26))
+    loss = [sum(log_loss(*c.decisions(o)).sum() for c in cases) for o in odds]
+    return weights, float(odds[int(np.argmin(loss))])
 
 
-def calibrate(scenes: Sequence[Cases]) -> dict[str, list[float]]:
-    """Coefficients of `SameObject` for each set of known inputs, from the cases of each scene."""
-    shown = [rt.SameObject.closeness(np.stack(c.apart)).mean(1) for c in scenes if len(c.apart[0])]
-    usual = [round(float(v), 4) for v in np.mean(shown, 0)]
-    found: dict[str, list[float]] = {"apart": usual}
-    for letters in known_inputs():
-        own = [c.of(letters) for c in scenes]
-        terms = [c.decider({"apart": usual}).terms(letters, c.inputs) for c in own]
-        inputs, same, best, remembered = (
-            np.concatenate([getattr(c, k) for c in own])
-            for k in ("inputs", "same", "best", "remembered")
-        )
-        returns = float(np.mean([c.returns for c in own]))
-        joined = Cases(inputs, same, best, remembered, own[0].apart, returns)
-        if min(joined.same.sum(), (~joined.same).sum()) < 20:  # unknown in these scenes
-            continue
-        weights = fit_logistic(np.concatenate(terms), joined.same, joined.balance())
-        found[letters] = [round(float(w), 4) for w in weights]
-    return found
+def log_loss(probability: Array, same: BoolArray) -> Array:
+    """-log of the probability of what is true."""
+    return np.asarray(-np.log(np.where(same, probability, 1 - probability).clip(1e-3)))
 
 
 def reliability(
@@ -864,40 +851,48 @@ def scene_cases(
     ]  # fmt: skip
 
 
-def write_calibrations(args: Any) -> None:
-    """Fit `SameObject` for every frame method on rooms with and without masks; write it beside
-    the model.
-    """
+def print_calibration(args: Any) -> None:
+    """Fit what `SameObject` and the tracker hold as constants, on rooms with and without masks."""
     plans = [(plan, seed) for plan in args.plan for seed in args.calibrate]
     rooms = [room_scene(seed, args.cache, args.every, plan) for plan, seed in plans]
     rooms += [unmasked(scene) for scene in rooms]
-    for model in args.models or ["colour"]:
-        parts = embed(rooms, rt.Embedder(model, threads=1))
-        found = calibrate(scene_cases(rooms, parts, args.weight))
-        path = rt.calibration_file(str(rt.model_path(model)) if model != "colour" else model)
-        path.parent.mkdir(exist_ok=True)
-        seeds, kinds = (" ".join(map(str, x)) for x in (args.calibrate, args.plan))
-        fitted = f"examples/rank_k.py --calibrate {seeds} --plan {kinds}"
-        text = json.dumps({"fitted_by": fitted, "same_object": found}).replace('], "', '],\n "')
-        with rt.atomic(path) as part:
-            part.write_text(text.replace("{", "{\n ") + "\n")
-        print(f"wrote {path}", file=sys.stderr)
+    cases: list[Cases] = []
+    for model in ["colour", *args.models]:
+        own = scene_cases(rooms, embed(rooms, rt.Embedder(model, threads=1)), args.weight)
+        weights, odds = calibrate(own)
+        print(f"{model}: SameObject.WEIGHTS {weights.round(2)}, tracker.return_odds {odds:.2f}")
+        cases += own
+    weights, odds = calibrate(cases)
+    print(f"together: SameObject.WEIGHTS {weights.round(2)}, tracker.return_odds {odds:.2f}")
 
 
-def reliabilities(cases: Sequence[Cases], calibration: Any) -> list[dict[str, Any]]:
+def reliabilities(cases: Sequence[Cases]) -> list[dict[str, Any]]:
     """Calibration error, log loss and the bins of the reliability diagram, by known inputs."""
     rows: list[dict[str, Any]] = []
-    for letters in ("f", "fb", "fba", "fbg", "fbag", "fbr", "fbgr", "fbagr"):
-        own = [c for c in (c.of(letters) for c in cases) if len(c.same)]
+    for known in ("f", "fb", "fba", "decision", "decision, a"):
+        angle = known.endswith("a")
+        own = [c for c in cases if len(c.same) and not (angle and np.isnan(c.angle).any())]
         if not own:
             continue
-        p = np.concatenate([c.decider(calibration).probability(*c.inputs.T) for c in own])
-        same, weight = (np.concatenate(x) for x in zip(*((c.same, c.balance()) for c in own),
-                                                       strict=True))  # fmt: skip
+        if known.startswith("decision"):
+            odds = rt.TrackerConfig().return_odds
+            both = zip(*(c.decisions(odds, angle) for c in own), strict=True)
+            p, same = (np.concatenate(x) for x in both)
+            weight = np.ones(len(p))
+        else:
+            hidden = np.where([True, known != "f"], 1, np.nan)
+            p = np.concatenate([
+                c.decider().probability(*(c.cosine * hidden).T, c.angle if angle else np.nan)
+                for c in own
+            ])  # fmt: skip
+            same = np.concatenate([c.same for c in own])
+            weight = np.concatenate([c.balance(angle) for c in own])
+        if not weight.sum():
+            continue
         bins = reliability(p, same, weight)
-        loss = -(weight * np.log(np.where(same, p, 1 - p))).sum() / weight.sum()
+        loss = (weight * log_loss(p, same)).sum() / weight.sum()
         right = (weight * ((p > 0.5) == same)).sum() / weight.sum()
-        rows.append({"known": letters, "cases": len(p), "same": float(same.mean()), "right": right,
+        rows.append({"known": known, "cases": len(p), "same": float(same.mean()), "right": right,
                      "ece": expected_error(bins), "log_loss": loss, "bins": bins})  # fmt: skip
     return rows
 
@@ -909,7 +904,7 @@ def plot_reliability(rows: Sequence[dict[str, Any]], out: Path) -> None:
     figure, axes = plt.subplots(1, len(methods), figsize=(4.5 * len(methods), 5.2), squeeze=False)
     for ax, method in zip(axes[0], methods, strict=True):
         ax.plot([0, 1], [0, 1], color="gray", lw=0.8)
-        own = [r for r in rows if r["method"] == method and r["known"] in ("fb", "fbgr")]
+        own = [r for r in rows if r["method"] == method and r["known"] in ("fb", "decision")]
         titles = list(dict.fromkeys(r["set"] for r in own))
         for r in own:
             said, right = ([b[k] for b in r["bins"]] for k in ("said", "right"))
@@ -957,9 +952,8 @@ def evaluate(
     for method, (look, names) in looks(args, {}).items():
         started = time.time()
         parts = embed(scenes, look)
-        calibration = calibration_of(look)
-        if calibration is not None:
-            found = reliabilities(scene_cases(scenes, parts, args.weight), calibration)
+        if len(parts) == 2 and method.endswith("frame"):
+            found = reliabilities(scene_cases(scenes, parts, args.weight))
             trust += [{"set": title, "method": method, **r} for r in found]
         cosines = setups(parts, names, args.weight)
         for setup, cosine in cosines.items():
@@ -973,12 +967,6 @@ def evaluate(
                 bins += [{**head, "by": label, **r} for r in by_bin(cosine, pairs, value, edges)]
         print(f"{title}: {method} {time.time() - started:.0f} s", file=sys.stderr)
     return [{**r, "identity": pairs.identity} for r in rows if "rank1" in r], bins, trust
-
-
-def calibration_of(look: Any) -> Any:
-    """The calibration beside a method's model, or None."""
-    path = rt.calibration_file(getattr(look, "model", ""))
-    return json.loads(path.read_text())["same_object"] if path.is_file() else None
 
 
 def ratio(rows: Sequence[dict[str, Any]], ours: str, protocol: str, gap: str) -> str:
@@ -1103,7 +1091,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--models", nargs="*", default=[], help="backbones beside the colour descriptor")
     add("--person", nargs="*", default=[], help="networks for the plain box (DeepSORT's way)")
     add("--calibrate", type=int, nargs="*", default=[], metavar="SEED",
-        help="first fit the probability of the same object on these rooms")  # fmt: skip
+        help="fit the constants of the probability on these rooms, print them")  # fmt: skip
     add("--blocks", type=Path, metavar="DIR",
         help="ConvBlocks of single crops: DIR of train_embedding.py --crops --setups")  # fmt: skip
     add("--no-crops", action="store_true", help="leave out the slow crop references")
@@ -1118,7 +1106,7 @@ def build_parser() -> argparse.ArgumentParser:
 def measure(args: Any) -> None:
     """Measure all sets, write the files, print the tables."""
     if args.calibrate:
-        write_calibrations(args)
+        print_calibration(args)
     sets = scene_sets(args)
     if not sets:
         raise rt.ReobjError("nothing to measure: give --rooms, --recording, --depth or --scannet")

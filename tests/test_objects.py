@@ -176,10 +176,10 @@ def test_only_classes_that_the_detector_confuses_are_joined(every: int, classes:
     ("near", "banned", "apart", "group"),
     [
         ([(0, 1, 3.0)], [], [], [0, 0, 1]),  # alike
-        ([(0, 1, 0.9)], [], [], [0, 1, 2]),  # further apart than the middle
+        ([(0, 1, 0.9)], [], [], [0, 1, 2]),  # rather another object
         ([(0, 1, 3.0)], [(0, 1)], [(0, 1)], [0, 1, 2]),  # seen together
         ([(0, 1, 3.0), (1, 2, 3.0)], [], [], [0, 0, 0]),  # through a third
-        ([(0, 1, 3.0), (1, 2, 2.0)], [(0, 2)], [(0, 2)], [0, 0, 1]),  # the better one of two twins
+        ([(0, 1, 4.0), (1, 2, 2.0)], [(0, 2)], [(0, 2)], [0, 0, 1]),  # the better one of two twins
         ([(0, 1, 3.0), (1, 2, 2.9)], [(0, 2)], [(0, 2)], [0, 1, 2]),  # twins about as near: apart
         ([(0, 1, 3.0), (1, 2, 2.9)], [(0, 2)], [], [0, 0, 1]),  # two boxes on one are no rivals
     ],
@@ -196,7 +196,7 @@ def test_most_alike_are_joined_first(
     for k, pairs in enumerate((banned, apart)):
         for i, j in pairs:
             no[k, i, j] = no[k, j, i] = True
-    assert rt._most_alike_first(matrix, no[0], no[1], np.log(1.3)).tolist() == group
+    assert rt._most_alike_first(matrix, no[0], no[1], 0.5).tolist() == group
 
 
 def looks_of(table: rt.TrackTable, chair: np.ndarray, twins: float) -> np.ndarray:

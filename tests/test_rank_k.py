@@ -247,86 +247,70 @@ def test_crops_are_an_embedder_of_the_tool(tmp_path: Path) -> None:
     assert isinstance(rt._embedder(config), rt.CropEmbedder)
 
 
-def logistic_cases(n: int = 4000) -> rk.Cases:
-    """Cosines whose true log odds are known: 4 * closeness of the foreground - 6, at even prior."""
-    closeness = RNG.uniform(0, 3, n)
-    same = RNG.random(n) < 1 / (1 + np.exp(6 - 4 * closeness))
-    inputs = np.full((n, 5), np.nan)
-    inputs[:, 0] = 1.03 - np.exp(-closeness)
-    inputs[:, 1] = RNG.uniform(0, 1, n)  # says nothing
-    inputs[:, 2], inputs[:, 3] = RNG.uniform(0, 90, n), RNG.uniform(0, 300, n)
-    inputs[:, 4] = RNG.uniform(0, 1, n)
-    yes = np.ones(n, bool)
-    return rk.Cases(inputs, same, yes, yes, (np.array([0.5]), np.array([0.5])), 1.0)
+def normal_cases(n: int = 4000, objects: int = 3) -> rk.Cases:
+    """Newcomers against some objects of which at most one is right; both parts are normal."""
+    close = {True: (2.0, 1.9), False: (1.2, 1.4)}
+
+    def cosine(same: rk.BoolArray) -> rk.Array:
+        mean = np.where(same[:, None], close[True], close[False])
+        return np.asarray(1.03 - np.exp(-np.minimum(RNG.normal(mean, 0.4), 3.4)))
+
+    query = np.repeat(np.arange(n // objects), objects)
+    right = RNG.integers(0, objects + 1, n // objects)  # `objects`: a new one
+    same = np.tile(np.arange(objects), n // objects) == right[query]
+    shown = (cosine(np.zeros(500, bool)), cosine(np.ones(500, bool)))
+    angle, yes = np.full(len(same), np.nan), np.ones(len(same), bool)
+    return rk.Cases(cosine(same), angle, 40 + 0 * angle, same, query, yes, shown)
 
 
-def test_calibration_finds_the_true_odds() -> None:
-    cases = logistic_cases()
-    found = rk.calibrate([cases])
-    assert set(found) == {"apart", *rk.known_inputs()}
-    own = cases.of("fb")
-    p = own.decider(found).probability(*own.inputs.T)
-    assert rk.expected_error(rk.reliability(p, own.same, own.balance())) < 0.03
-    assert found["fb"][1] == pytest.approx(4, rel=0.15) and abs(found["fb"][2]) < 0.3
-    always_sure = np.where(p > 0.5, 0.999, 0.001)
-    assert rk.expected_error(rk.reliability(always_sure, own.same, own.balance())) > 0.05
+def test_calibration_finds_the_true_odds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the constants fitted to them, normal pairs and decisions come out calibrated."""
+    cases = normal_cases()
+    weights, odds = rk.calibrate([cases])
+    monkeypatch.setattr(rt.SameObject, "WEIGHTS", tuple(weights))
+    p = cases.decider().probability(*cases.cosine.T)
+    bins = rk.reliability(p, cases.same, cases.balance(False))
+    assert rk.expected_error(bins) < 0.03
+    said, right = cases.decisions(odds)
+    bins = rk.reliability(said, right, np.ones(len(said)))
+    assert rk.expected_error(bins) < 0.05 and right.mean() > 0.5
+    always_sure = rk.reliability(np.where(p > 0.5, 0.999, 0.001), cases.same, cases.balance(False))
+    assert rk.expected_error(always_sure) > 0.05
 
 
-def test_calibrated_probability_follows_its_evidence() -> None:
+def test_constants_are_those_of_normal_pairs() -> None:
+    """Not fitted to them, the constants still say about the right probability."""
+    cases = normal_cases()
+    rows = {r["known"]: r for r in rk.reliabilities([cases])}
+    assert set(rows) == {"f", "fb", "decision"}
+    assert rows["fb"]["ece"] < 0.1 and rows["fb"]["right"] > rows["f"]["right"] > 0.7
+    assert rows["decision"]["log_loss"] < np.log(2)  # of guessing
+
+
+def test_probability_follows_its_evidence() -> None:
     """Monotone in both cosines; a background from another side counts less; bounded."""
-    inputs = np.array([1.0, 2.0])
-    weights = {"fb": [-4, *inputs], "fba": [-4, *inputs, 0, 0, -2], "f": [-3, 1], "apart": [0, 0]}
-    same = rt.SameObject(rt.TrackerConfig(), weights)
+    same = rt.SameObject(10)
     high, low = same.logit(0.9, 0.9), same.logit(0.9, 0.2)
     assert high > low and same.logit(0.95, 0.9) > high
     near = same.logit(0.9, [0.2, 0.9], 0.0)
-    side = same.logit(0.9, [0.2, 0.9], 90.0)
-    assert np.ptp(near) > 5 * np.ptp(side)
-    assert same.logit(0.9, np.nan) == same.logit(0.9)  # no background: another set of weights
+    side = same.logit(0.9, [0.2, 0.9], 80.0)
+    assert np.ptp(near) > 3 * np.ptp(side)
+    assert np.ptp(same.logit(0.9, [0.2, 0.9], 90.0)) == pytest.approx(0)
+    assert np.isfinite(same.logit(0.9, np.nan))
     assert np.abs(same.logit([1.0, -1.0], [1.0, -1.0])).max() < 7
     assert same.probability(0.9, 0.9, prior=0.1) < same.probability(0.9, 0.9)
     assert same.logit(np.full((2, 3), 0.5), 0.4).shape == (2, 3)
     assert same.logit(np.nan, 0.5) == -np.inf and same.probability(np.nan) == 0
 
 
-def test_calibrated_decision_only_where_asked() -> None:
-    """A lead over the rival decides by the calibration from return_probability on, else by the
-    video.
-    """
-    weights = {"fb": [-4, 1, 2], "fbr": [-9, 0, 0, 30]}
-    one = np.full(1, 0.9)
-    by_video, asked = (
-        rt.SameObject(rt.TrackerConfig(return_probability=p), weights) for p in (0.0, 0.5)
-    )
-    for rival, lead in ((0.5, True), (0.89, False)):
-        assert asked.returned(one, one, 40, np.full(1, rival)) == lead
-        assert by_video.returned(one, one, 40, np.full(1, rival)) == (rival < 0.85)
-    closer = rt.SameObject(rt.TrackerConfig(return_probability=0.999), weights)
-    assert not closer.returned(one, one, 40, np.full(1, 0.85))
-
-
 def test_probability_adapts_to_the_video() -> None:
-    """Where all objects look alike, the same cosine says less; with and without calibration."""
-    weights = {"fb": [-4, 1, 2], "apart": [0.5, 0.5]}
-    for calibration in (weights, None):
-        plain, alike = (rt.SameObject(rt.TrackerConfig(), calibration) for _ in range(2))
-        alike.add_apart(np.full(200, 0.9), np.full(200, 0.9))
-        alike.add(np.full(200, 0.9), same=False)
-        assert alike.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
-
-
-def test_calibration_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    net = tmp_path / "net.onnx"
-    net.write_bytes(b"")
-    file = rt.calibration_file(str(net))
-    assert file == tmp_path / "net.json"
-    assert rt.calibration_file(f"crops:{net}") == tmp_path / "crops_net.json"
-    assert not rt.SameObject.for_model(rt.TrackerConfig(), str(net)).calibration
-    file.write_text(json.dumps({"same_object": {"apart": [1, 1], "fb": [0, 1, 1]}}))
-    assert set(rt.SameObject.for_model(rt.TrackerConfig(), str(net)).calibration) == {"fb"}
-    file.write_text("{}")
-    with pytest.raises(rt.ReobjError, match=r"net\.json.*--calibrate"):
-        rt.SameObject.for_model(rt.TrackerConfig(), str(net))
+    """Where all objects look alike the same cosine says less; unknown parts teach nothing."""
+    plain, alike = rt.SameObject(10), rt.SameObject(10)
+    alike.add(np.full(200, 0.95), np.full(200, np.nan), False)
+    assert alike.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
+    assert np.array_equal(alike.sums[:, :, 1], plain.sums[:, :, 1])
+    alike.add(np.full(200, 0.99), np.full(200, 0.99), True)
+    assert alike.logit(0.99, 0.99) > 0 > alike.logit(0.93, 0.9)
 
 
 def test_part_cosines_of_fused_rows() -> None:
