@@ -732,7 +732,8 @@ class Cases:
 
     def decisions(self, odds: float, angle: bool = False) -> tuple[Array, BoolArray]:
         """For every newcomer: probability of the likeliest candidate, and is it the right one?"""
-        logit = self.decider().logit(*self.cosine.T, self.angle if angle else np.nan)
+        fore, back = self.cosine.T
+        logit = self.decider().logit(fore, back, self.angle if angle else np.nan)
         found = []
         for q in np.unique(self.query[self.newcomer]):
             rows = self.query == q
@@ -798,13 +799,14 @@ def fit_logistic(terms: Array, same: BoolArray, weight: Array) -> Array:
 
 def calibrate(cases: Sequence[Cases]) -> tuple[Array, float]:
     """`SameObject.WEIGHTS` and `tracker.return_odds`: the likeliest ones."""
-    terms, same, weight = [], [], []
+    fitted: list[tuple[Array, BoolArray, Array]] = []
     for c in cases:
         for angle in (c.angle, np.full(len(c.same), np.nan)):
-            terms.append(np.nan_to_num(c.decider().scores(c.cosine, angle)))
-            same.append(c.same)
-            weight.append(c.balance(bool(np.isfinite(angle).any())) / max(len(c.same), 1))
-    weights = fit_logistic(*(np.concatenate(x) for x in (terms, same, weight)))
+            weight = c.balance(bool(np.isfinite(angle).any())) / max(len(c.same), 1)
+            terms = np.nan_to_num(c.decider().scores(c.cosine, angle))
+            fitted.append((terms, c.same, weight))
+    terms, same, weight = (np.concatenate(x) for x in zip(*fitted, strict=True))
+    weights = fit_logistic(terms, same, weight)
     odds = np.exp(np.linspace(-2, 3, 26))
     loss = [sum(log_loss(*c.decisions(o)).sum() for c in cases) for o in odds]
     return weights, float(odds[int(np.argmin(loss))])
