@@ -1113,9 +1113,10 @@ class Seen:
     frame: IntArray
 
     def views(self, rng: np.random.Generator, count: int) -> Seen:
-        """The rows of so many random frames."""
+        """The rows of so many random frames; maps (N, C, h, w) in a mirror half of the time."""
         rows = np.isin(self.frame, rng.permutation(np.unique(self.frame))[:count])
-        parts = {k: part[rows] for k, part in self.parts.items()}
+        turn = rng.choice((1, -1))
+        parts = {k: p[rows][..., ::turn] if p.ndim == 4 else p[rows] for k, p in self.parts.items()}
         return Seen(parts, self.identity[rows], self.look[rows], self.frame[rows])
 
 
@@ -1234,13 +1235,15 @@ class ConvBlock(nn.Module):
         super().__init__()
         self.norm = nn.BatchNorm2d(channels, affine=False)
         self.squeeze = block(channels, inner, 1)
-        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout2d(0.1))
+        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout(0.2))
         self.out = nn.Linear(64 * 16, width)
         self.short = nn.Conv2d(channels, 20, 1, bias=False)
         self.project = nn.Linear(20 * 49, width, bias=False)
 
     def forward(self, maps: Any) -> Any:
         maps = self.norm(maps)
+        if self.training:  # some channels, and some places of all of them, are hidden
+            maps = F.dropout2d(maps, 0.1) * (torch.rand_like(maps[:, :1]) > 0.1)
         deep = self.out(self.mix(self.squeeze(maps)).flatten(1))
         return F.normalize(deep + self.project(self.short(maps).flatten(1)), dim=1)
 
@@ -1515,6 +1518,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Train, draw the curves, export."""
     args = build_parser().parse_args(argv)
     cv2.setNumThreads(0)  # a forked process has no threads of its parent
+    if args.rooms and args.val_rooms:
+        both = set(parse_range(args.rooms)) & set(parse_range(args.val_rooms))
+        if both:
+            print(f"warning: rooms {sorted(both)} both train and validate", file=sys.stderr)
     if args.backbone:
         train_heads(args)
         return 0
