@@ -3201,7 +3201,7 @@ class Tracker:
         high, handicap = detections.score >= config.high_score, self._handicap()[:, None]
         _assign(cost + handicap, feasible & high & (cost < config.max_cost), track_of)
         if lazy.available and self._live.look.shape[1]:
-            doubtful, close = self._doubtful(cost, feasible & high)
+            doubtful, close = self._doubtful(cost, handicap, feasible & high)
             asked = np.zeros(len(detections), bool)
             while len(rows := self._unsure(track_of, doubtful, close, asked)):
                 asked[rows] = True
@@ -3243,7 +3243,9 @@ class Tracker:
         waited = ((live.missed - 1) / 10).clip(0, 1)
         return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
 
-    def _doubtful(self, cost: Array, gate: BoolArray) -> tuple[BoolArray, BoolArray]:
+    def _doubtful(
+        self, cost: Array, handicap: Array, gate: BoolArray
+    ) -> tuple[BoolArray, BoolArray]:
         """Which pairs (T, D) must look alike: a rival costs little more, or the match is so dear
         that the detection may be of an object without a track. And which cost little more than the
         best of both.
@@ -3255,7 +3257,7 @@ class Tracker:
         )
         close = gate & (cost <= best + config.rival_cost)
         rivals = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
-        dear = gate & (self._live.embedded >= 0)[:, None] & (cost > config.doubt_cost)
+        dear = gate & (self._live.embedded >= 0)[:, None] & (cost + handicap > config.doubt_cost)
         return rivals | dear, close
 
     @staticmethod
