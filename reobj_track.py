@@ -3201,7 +3201,8 @@ class Tracker:
         high, handicap = detections.score >= config.high_score, self._handicap()[:, None]
         _assign(cost + handicap, feasible & high & (cost < config.max_cost), track_of)
         if lazy.available and self._live.look.shape[1]:
-            doubtful, close = self._doubtful(cost, handicap, feasible & high)
+            same_class = _same_class(self._live.votes, detections.class_id)
+            doubtful, close = self._doubtful(cost, handicap, feasible & high, same_class)
             asked = np.zeros(len(detections), bool)
             while len(rows := self._unsure(track_of, doubtful, close, asked)):
                 asked[rows] = True
@@ -3244,18 +3245,18 @@ class Tracker:
         return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
 
     def _doubtful(
-        self, cost: Array, handicap: Array, gate: BoolArray
+        self, cost: Array, handicap: Array, gate: BoolArray, same_class: BoolArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Which pairs (T, D) must look alike: a rival costs little more, or the match is so dear
-        that the detection may be of an object without a track. And which cost little more than the
-        best of both.
+        """Which pairs (T, D) must look alike: a rival of the class costs little more (two boxes of
+        two classes around one thing look alike), or the match is so dear that the detection may be
+        of an object without a track. And which cost little more than the best of both.
         """
         config = self.config
         open_cost = np.where(gate, cost, np.inf)
         best = np.minimum(
             open_cost.min(0, initial=np.inf)[None], open_cost.min(1, initial=np.inf)[:, None]
         )
-        close = gate & (cost <= best + config.rival_cost)
+        close = gate & same_class & (cost <= best + config.rival_cost)
         rivals = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
         dear = gate & (self._live.embedded >= 0)[:, None] & (cost + handicap > config.doubt_cost)
         return rivals | dear, close
