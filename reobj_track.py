@@ -3390,9 +3390,7 @@ class Tracker:
         young = (live.identity < 0) & (live.missed == 0)
         ready = np.flatnonzero(young & (live.hits >= min(needed, self.config.n_init - 1)))
         self.last_seen[live.identity[(live.identity >= 0) & (live.missed == 0)]] = self.frame_number
-        returning = self._returns_home(ready)  # (n,) identity or -1
-        away = returning < 0
-        returning[away] = self._returns(ready[away])
+        returning = self._returns(ready)  # (n,) identity or -1
         sure = (returning >= 0) | (live.hits[ready] >= needed)
         ready, returning = ready[sure], returning[sure]
         fresh = ready[returning < 0]
@@ -3413,7 +3411,7 @@ class Tracker:
         return self._drop(stale, track_of)
 
     def _home_iou(self, ready: IntArray, identity: IntArray) -> Array:
-        """Overlap (n, I) of tracks with the places of identities in this frame; NaN: unknown."""
+        """Overlap (n, I) of tracks with the places of identities in this frame, NaN: unknown."""
         iou = np.full((len(ready), len(identity)), np.nan)
         if self._view is not None and len(identity):
             places = self.places.project(self._view, self._image_size, 0.0)
@@ -3423,55 +3421,31 @@ class Tracker:
             iou[:, ~_rows_of(self.places.known, identity, False)] = np.nan
         return iou
 
-    def _elsewhere(self, ready: IntArray, identity: IntArray) -> BoolArray:
-        """(n, I): is the track nowhere near where the identity stands? Things that move stand
-        nowhere: no ellipsoid fits their views.
-        """
-        return np.asarray(self._home_iou(ready, identity) == 0, bool)
+    def _returns(self, ready: IntArray) -> IntArray:
+        """Recognise known identities in newly confirmed tracks: look and place, where known, must
+        make it probable, also in view of the other candidates.
 
-    def _returns_home(self, ready: IntArray) -> IntArray:
-        """Recognise newly confirmed tracks where a lost identity has its place, unless their look
-        speaks against it.
+        Never gated by overlap, aspect ratio or pixel distance: the camera may return from anywhere.
+        An identity that was seen while the newcomer was already in view is another object, and so
+        is one whose place in 3D is not here. Things that move have no place: no ellipsoid fits.
         """
         live, config = self._live, self.config
         result = np.full(len(ready), -1, np.int64)
-        if self._view is None or not len(ready) or not config.remember:
-            return result
-        identity = np.flatnonzero(self.last_seen < live.first[ready].max())
-        iou = np.nan_to_num(self._home_iou(ready, identity))
-        odds = config.iou_odds * iou - config.look_odds
-        if live.look.shape[1]:
-            logit = self.same.logit(*self.gallery.parts(live.look[ready], identity))  # (n, I)
-            odds += np.where(np.isfinite(logit), logit, 0)
-        possible = (self.last_seen[identity][None] < live.first[ready][:, None]) & (odds > 0)
-        possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
-        claimed = np.full(len(identity), -1, np.int64)
-        _assign(1 - iou, possible & (iou > config.low_iou), claimed)
-        column = np.flatnonzero(claimed >= 0)
-        result[claimed[column]] = identity[column]
-        return result
-
-    def _returns(self, ready: IntArray) -> IntArray:
-        """Recognise known identities in newly confirmed tracks: the look must be probably the same,
-        also in view of the next best candidate.
-
-        Never gated by overlap, aspect ratio or pixel distance: the camera may return from anywhere.
-        An identity that was seen while the newcomer was already in view is another object.
-        """
-        live = self._live
-        result = np.full(len(ready), -1, np.int64)
-        if not len(ready) or not live.look.shape[1] or not self.config.remember:
-            return result
         identity = np.flatnonzero(self.last_seen < live.first[ready].max(initial=0))  # (I,)
-        fore, back = self.gallery.parts(live.look[ready], identity)  # (n, I)
-        possible = self.last_seen[identity][None] < live.first[ready][:, None]
-        possible &= self.identity_class[identity][None] == live.votes[ready].argmax(1)[:, None]
-        possible &= ~self._elsewhere(ready, identity)
-        possible &= (live.embedded[ready] >= 0)[:, None]
-        logit = np.where(possible, self.same.logit(fore, back), -np.inf)
-        chance = match_probability(logit, self.config.return_odds)
+        if not len(identity) or not config.remember:
+            return result
+        iou = self._home_iou(ready, identity)  # (n, I)
+        home = iou > config.low_iou
+        logit = self.same.logit(*self.gallery.parts(live.look[ready], identity))
+        logit[home & np.isinf(logit)] = 0  # no look: the place decides
+        logit += np.where(home, config.iou_odds * iou - config.look_odds, 0)
+        possible = self.last_seen[identity] < live.first[ready][:, None]
+        possible &= self.identity_class[identity] == live.votes[ready].argmax(1)[:, None]
+        logit[~possible | (iou == 0)] = -np.inf
+        chance = match_probability(logit, config.return_odds)
         claimed = np.full(len(identity), -1, np.int64)
-        _assign(1 - chance, chance >= self.config.return_probability, claimed)
+        good = (chance >= config.return_probability) | (home & (logit > 0))
+        _assign(1 - chance, good, claimed)
         column = np.flatnonzero(claimed >= 0)
         result[claimed[column]] = identity[column]
         return result
