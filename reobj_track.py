@@ -2691,7 +2691,7 @@ class SameObject:
     """
 
     WEIGHTS = (0.55, 0.5)  # of foreground and background
-    USUAL = ((1.6, 1.4), (2.2, 1.8))  # mean closeness of both parts: different, same
+    USUAL = ((1.3, 0.65), (1.8, 1.2))  # mean closeness of both parts: different, same
     USUAL_STD = 0.45
     USUAL_ANGLE_DEG = 45.0  # between two views of unknown directions
 

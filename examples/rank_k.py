@@ -863,6 +863,9 @@ def print_calibration(args: Any) -> None:
         own = scene_cases(rooms, embed(rooms, rt.Embedder(model, threads=1)), args.weight)
         weights, odds = calibrate(own)
         print(f"{model}: SameObject.WEIGHTS {weights.round(2)}, tracker.return_odds {odds:.2f}")
+        close = [[rt.SameObject.closeness(c.shown[k]).mean(0) for c in own if len(c.shown[k])]
+                 for k in (0, 1)]  # fmt: skip
+        print(f"  SameObject.USUAL {np.array([np.mean(x, 0) for x in close]).round(2).tolist()}")
         cases += own
     weights, odds = calibrate(cases)
     print(f"together: SameObject.WEIGHTS {weights.round(2)}, tracker.return_odds {odds:.2f}")
