@@ -228,6 +228,21 @@ def test_crossing_objects_keep_their_identity_by_appearance() -> None:
     assert tracks.track_id.tolist() == [2, 1]
 
 
+@pytest.mark.parametrize("left", [130, 140, 145])
+def test_a_coasting_track_does_not_take_a_newcomer_that_looks_different(left: int) -> None:
+    """The newcomer lies nearer to a third object, which has a detection of its own."""
+    seen, gone, new = unit(np.random.default_rng(13), 3)
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
+    both = rows((100, 100, 150, 150), (left, 100, left + 50, 150))
+    for _ in range(12):
+        tracker.update(both, embeddings=np.stack([seen, gone]))
+    for _ in range(5):
+        tracker.update(both[:1], embeddings=seen[None])
+    found = rows((100, 100, 150, 150), (109, 100, 159, 150))
+    tracks = tracker.update(found, embeddings=np.stack([seen, new]))
+    assert tracks.track_id.tolist() == [1, 3]
+
+
 def away_and_back(
     tracker: rt.Tracker, looks: np.ndarray, back: np.ndarray, gap: int = 200
 ) -> list[int]:
