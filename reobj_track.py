@@ -2706,9 +2706,10 @@ class SameObject:
 
     def add(self, foreground: Array, background: Array, same: bool) -> None:
         """Add cosines of pairs (N,) that the video showed; NaN: unknown."""
-        close = self.closeness(np.stack([foreground.ravel(), background.ravel()], 1))  # (N, 2)
-        powers = np.nan_to_num(np.stack([close**0, close, close**2]))  # NaN**0 == 1
-        self.sums[int(same)] += (powers * np.isfinite(close)).sum(1)
+        close = self.closeness(np.stack([foreground.ravel(), background.ravel()]))  # (2, N)
+        known = np.isfinite(close)
+        close = np.where(known, close, 0.0)
+        self.sums[int(same)] += [known.sum(1), close.sum(1), (close * close).sum(1)]
 
     def logit(
         self,
@@ -2726,7 +2727,8 @@ class SameObject:
                 like itself, and what surrounds it soon not at all. NaN: as 45 degrees.
         """
         parts = np.stack(np.broadcast_arrays(foreground, background), -1)  # (..., 2)
-        logit = np.nan_to_num(self.WEIGHTS * self.scores(parts, view_angle_deg)).sum(-1)
+        evidence = self.WEIGHTS * self.scores(parts, view_angle_deg)
+        logit = np.where(np.isnan(evidence), 0, evidence).sum(-1)
         return _with_outliers(np.where(np.isnan(parts[..., 0]), -np.inf, logit))
 
     def scores(self, cosine: Array, view_angle_deg: npt.ArrayLike = np.nan) -> Array:
@@ -2735,7 +2737,7 @@ class SameObject:
         mean = total / count
         std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
         apart = ((mean[1] - mean[0]) / std).clip(0)
-        angle = np.nan_to_num(np.radians(view_angle_deg), nan=math.radians(self.USUAL_ANGLE_DEG))
+        angle = np.radians(np.where(np.isnan(view_angle_deg), self.USUAL_ANGLE_DEG, view_angle_deg))
         facing = np.stack([(1 + np.cos(angle)) / 2, np.cos(angle).clip(0)], -1)  # (..., 2)
         return np.asarray(facing * (self.closeness(cosine) - mean.mean(0)) / std * (1 + apart))
 
@@ -2782,8 +2784,11 @@ def _paired_cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
 
 def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
     """Cosines (N, M) of rows (N, E) and (M, E), NaN for rows of zeros."""
-    length = np.outer(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
-    return np.asarray(np.where(length > 1e-9, (a @ b.T) / np.maximum(length, 1e-9), np.nan))
+    if not a.shape[1]:
+        return np.full((len(a), len(b)), np.nan)
+    lengths = (np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    a, b = (x / np.where(n > 1e-9, n, np.nan) for x, n in zip((a, b), lengths, strict=True))
+    return np.asarray(a @ b.T)
 
 
 class Places:
@@ -3209,9 +3214,10 @@ class Tracker:
                 cost, feasible = self._compare_looks(cost, feasible, doubtful, iou, rows, lazy)
                 track_of[:] = -1
                 _assign(cost + handicap, feasible & high & (cost < config.max_cost), track_of)
-        free = ~np.isin(np.arange(len(iou)), track_of)
+        free = np.ones(len(iou) + 1, bool)
+        free[track_of] = False  # -1: the one too many
         low = (track_of < 0) & (detections.score >= config.low_score)
-        second = feasible & (iou >= config.low_iou) & low & free[:, None]
+        second = feasible & (iou >= config.low_iou) & low & free[:-1, None]
         _assign(1 - iou, second, track_of)
         return track_of
 
@@ -3311,6 +3317,8 @@ class Tracker:
     def _begin(self, detections: Detections, track_of: IntArray) -> IntArray:
         """Start a tentative track at every unmatched detection of sufficient score."""
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
+        if not len(rows):
+            return track_of
         ids = self._next_tracklet + np.arange(len(rows))
         self._next_tracklet += len(rows)
         born = _Live.born(
@@ -3400,9 +3408,9 @@ class Tracker:
             self.identity_class, live.votes[fresh].argmax(1) if len(fresh) else []
         )
         self.identity_class = self.identity_class.astype(np.int64)
-        stale = np.isin(
-            live.identity, returning[returning >= 0]
-        )  # coasting tracks of those who came back
+        back = np.zeros(len(self.last_seen) + 1, bool)  # the one too many: of no identity
+        back[returning[returning >= 0]] = True
+        stale = back[live.identity]  # coasting tracks of those who came back
         live.identity[ready[returning >= 0]], live.identity[fresh] = returning[returning >= 0], ids
         self.last_seen[live.identity[ready]] = self.frame_number
         seen = ready[live.embedded[ready] >= 0]
@@ -3452,6 +3460,8 @@ class Tracker:
 
     def _drop(self, rows: BoolArray, track_of: IntArray) -> IntArray:
         """Remove live tracks; returns the detections' rows renumbered."""
+        if not rows.any():
+            return track_of
         renumber = np.append(np.where(rows, -1, np.cumsum(~rows) - 1), -1)
         self._live = self._live.select(~rows)
         return np.asarray(renumber[track_of], np.int64)
@@ -3474,7 +3484,8 @@ class Tracker:
         patience = np.where(
             live.identity < 0, np.minimum(live.hits, self.config.n_init), self.config.coast_frames
         )
-        self._live = live.select(live.missed <= patience)
+        if (live.missed > patience).any():
+            self._live = live.select(live.missed <= patience)
 
 
 def _rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
