@@ -2680,8 +2680,8 @@ class SameObject:
     No threshold on a cosine serves two videos: the pairs that a video shows without labels say what
     its cosines mean. Objects of a class side by side in a frame are different, views of a track are
     of one object. The closeness of both parts is counted from the middle between the two, in
-    standard deviations, and weighs the more the further the two are apart. The weights are fitted
-    (examples/rank_k.py --calibrate) and serve every appearance model.
+    standard deviations, and weighs the more the further the two are apart. The weights are near
+    the fit of examples/rank_k.py --calibrate (docs/reid.md) and serve every appearance model.
 
     Args:
         weight: number of pairs that the usual mean and spread are worth.
