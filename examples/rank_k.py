@@ -1098,7 +1098,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--calibrate", type=int, nargs="*", default=[], metavar="SEED",
         help="fit the constants of the probability on these rooms, print them")  # fmt: skip
     add("--blocks", type=Path, metavar="DIR",
-        help="ConvBlocks of single crops: DIR of train_embedding.py --crops --setups")  # fmt: skip
+        help="ConvBlocks of single crops: DIR of train_head.py --crops --setups")  # fmt: skip
     add("--no-crops", action="store_true", help="leave out the slow crop references")
     add("--weight", type=float, default=rt.TrackerConfig().foreground_weight,
         help="share of the foreground in concat (default %(default)s)")  # fmt: skip

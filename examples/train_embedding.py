@@ -949,10 +949,6 @@ class Trainer:
             self.step, self.seconds = state["step"], state["seconds"]
             self.best = state.get("best", -1.0)
         args.out.mkdir(parents=True, exist_ok=True)
-        if args.start and self.step == 0:
-            state = torch.load(args.start, map_location=self.device, weights_only=True)["net"]
-            own = {k: v for k, v in state.items() if k.startswith("backbone.")}
-            self.net.load_state_dict(own, strict=False)
         if self.step == 0:
             self.start()
         self.val = self.make_val()
@@ -975,7 +971,11 @@ class Trainer:
         }
 
     def start(self) -> None:
-        """Start the heads from the training-free descriptor."""
+        """Start the heads from the training-free descriptor, the backbone from --start."""
+        if self.args.start:
+            state = torch.load(self.args.start, map_location=self.device, weights_only=True)["net"]
+            own = {k: v for k, v in state.items() if k.startswith("backbone.")}
+            self.net.load_state_dict(own, strict=False)
         rng = np.random.default_rng([self.args.seed, 10])
         views = [view for _ in range(12) for scene in self.pool.draw(rng) for view in scene]
         self.net.eval()
@@ -1087,342 +1087,6 @@ def draw_curves(log: Path, picture: Path) -> None:
     plt.close(figure)
 
 
-# ---- Heads of frozen backbones -------------------------------------------------------------------
-
-FROZEN_WH = (640, 480)  # of a picture for a frozen backbone
-FROZEN: dict[str, Any] = {
-    "size_px": 384, "context": 0.5, "reach": 0.05, "samples": 4, "foreground_cells": 3,
-    "background_cells": 4, "wide": 1.5, "wide_reach": 0.2, "wide_cells": 4,
-}  # fmt: skip
-CROPS: dict[str, Any] = {"context": 0.5, "reach": 0.05, "crop_px": 224}
-CROP_SETUPS = {"concat": ("fg", "bg"), "fg": ("fg",), "bg": ("bg",), "full": ("full",)}
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """What a frozen backbone shows of the N objects of one augmented scene.
-
-    Attributes:
-        parts: (N, ...) float16 of each part: cells of the frame's map, or maps of crops.
-        identity, look, frame: (N,).
-    """
-
-    parts: dict[str, npt.NDArray[np.float16]]
-    identity: IntArray
-    look: IntArray
-    frame: IntArray
-
-    def views(self, rng: np.random.Generator, count: int) -> Seen:
-        """The rows of so many random frames; maps (N, C, h, w) in a mirror half of the time."""
-        rows = np.isin(self.frame, rng.permutation(np.unique(self.frame))[:count])
-        turn = rng.choice((1, -1))
-        parts = {k: p[rows][..., ::turn] if p.ndim == 4 else p[rows] for k, p in self.parts.items()}
-        return Seen(parts, self.identity[rows], self.look[rows], self.frame[rows])
-
-
-Source = tuple[str, Callable[[], Clip]]  # name of a clip, and how to read it
-
-
-class Frozen:
-    """A frozen backbone: what its heads are fed with, cached on disk."""
-
-    def __init__(self, args: argparse.Namespace) -> None:
-        self.args, self.crops, self.cache = args, bool(args.crops), args.cache / "seen"
-        self.layout: dict[str, Any] = CROPS if self.crops else FROZEN
-        config = rt.EmbedConfig(head="none", **self.layout)
-        kind = rt.CropEmbedder if self.crops else rt.Embedder
-        self.embedder = kind(args.backbone, config, threads=args.threads)
-        self.name = f"{'crops' if self.crops else 'frame'}_{Path(args.backbone).stem}"
-        self.cache.mkdir(parents=True, exist_ok=True)
-
-    def see(self, picture: Image, found: rt.Detections, rows: IntArray) -> dict[str, Any]:
-        """The inputs of the heads for the chosen rows (N,)."""
-        if isinstance(self.embedder, rt.CropEmbedder):
-            crops, own = self.embedder.cut(picture, found, rows)
-            three = np.concatenate([crops * own[..., None], crops * ~own[..., None], crops])
-            parts = np.split(self.embedder.maps(three), 3)
-            return dict(zip(("fg", "bg", "full"), parts, strict=True))
-        features, layout = self.embedder._features(picture), self.embedder.layout
-        samples = rt.part_samples(found, rows, picture.shape[:2], features.shape[:2], layout)
-        cells = rt.head_inputs(samples, rt.cell_means(features, samples, layout))
-        return dict(zip(("fg", "bg"), cells, strict=True))
-
-    def scene(self, source: Source, copy: int, parts: Sequence[str]) -> Seen:
-        """Some frames of a clip, cached; copy 0 as they are, others augmented."""
-        name, load = source
-        path = self.cache / f"{self.name}_{name.replace('/', '_')}_{copy}.npz"
-        if not path.exists():
-            self.keep(path, load(), copy)
-        with np.load(path) as data:
-            return Seen({n: data[n] for n in parts}, data["identity"], data["look"], data["frame"])
-
-    def keep(self, path: Path, clip: Clip, copy: int) -> None:
-        """Augment, look, write."""
-        rng = np.random.default_rng([copy, len(clip.images), sum(map(len, clip.identity))])
-        tone, flip = (photo_tone(rng, 1.0) if copy else None), bool(copy and rng.random() < 0.5)
-        everything, found_rows = np.unique(np.concatenate(clip.identity)), []
-        chosen = np.linspace(0, len(clip.images) - 1, min(self.args.seen, len(clip.images)))
-        for frame in chosen.round().astype(int):
-            picture, found, rows = augmented(clip, frame, rng, tone, flip, everything, FROZEN_WH)
-            rows = rng.permutation(rows)[:24]
-            if len(rows):
-                parts = {k: v.astype(np.float16) for k, v in self.see(picture, found, rows).items()}
-                parts |= {"identity": clip.identity[frame][rows], "look": clip.look[frame][rows]}
-                parts["frame"] = np.full(len(rows), frame)
-                found_rows.append(parts)
-        table: dict[str, Any] = {
-            k: np.concatenate([r[k] for r in found_rows]) for k in found_rows[0]
-        }
-        with rt.atomic(path) as part, part.open("wb") as file:
-            np.savez(file, **table)
-
-
-class CellHead(nn.Module):
-    """Cells (N, cells * (C + 2)) of grids of a frozen map to unit rows (N, WIDTH).
-
-    As `PartHead`: a linear map of the training-free descriptor (square roots, part-empty cells
-    count less; starts as principal components) plus a perceptron; features are first narrowed.
-    """
-
-    def __init__(self, grids: Sequence[int], channels: int, narrow: int = 32) -> None:
-        super().__init__()
-        self.grids, self.cells, self.channels = grids, sum(n * n for n in grids), channels
-        self.narrow = nn.Linear(channels, narrow, bias=False)
-        self.project = nn.Linear(self.cells * narrow, WIDTH, bias=False)
-        self.word = nn.Sequential(nn.Linear(narrow + 2, 48), nn.ReLU())
-        rows = sum(grids) * 48
-        self.mix = nn.Sequential(
-            nn.Linear(self.cells * (narrow + 2) + rows, 128, bias=False), nn.BatchNorm1d(128),
-            nn.ReLU(), nn.Linear(128, WIDTH),
-        )  # fmt: skip
-        nn.init.zeros_(self.mix[-1].weight)
-        nn.init.zeros_(self.mix[-1].bias)
-
-    def split(self, rows: Any) -> tuple[Any, Any]:
-        """Unit features (N, cells, narrow) by part-empty cells, and the shares (N, cells, 2)."""
-        cells = rows.reshape(-1, self.cells, self.channels + 2)
-        share = cells[..., self.channels :]
-        trust = [s / s.amax(1, keepdim=True).clamp_min(1e-6)
-                 for s in share[..., :1].split([n * n for n in self.grids], 1)]  # fmt: skip
-        roots = (cells[..., : self.channels].relu() * torch.cat(trust, 1) + 1e-9).sqrt()
-        scale = roots.square().sum((1, 2), keepdim=True).clamp_min(1e-6).rsqrt()
-        return self.narrow(roots * scale), share
-
-    def forward(self, rows: Any) -> Any:
-        plain, share = self.split(rows)
-        seen = torch.cat([plain * 6.0, share], -1)
-        if self.training:  # some cells are hidden
-            seen = seen * (torch.rand_like(seen[..., :1]) > 0.1)
-        words, lines = self.word(seen), []
-        for part, n in zip(words.split([n * n for n in self.grids], 1), self.grids, strict=True):
-            lines.append(part.reshape(-1, n, n, 48).mean(2).flatten(1))  # left and right forgotten
-        mixed = self.mix(torch.cat([seen.flatten(1), *lines], 1))
-        return F.normalize(self.project(plain.flatten(1)) + mixed, dim=1)
-
-    def start(self, rows: Any) -> None:
-        """Begin with the principal components of features, then of cells side by side."""
-        with torch.no_grad():
-            wide, self.narrow = self.narrow, nn.Identity()
-            principal(wide.weight, self.split(rows)[0].flatten(0, 1))
-            self.narrow = wide
-            principal(self.project.weight, self.split(rows)[0].flatten(1))
-
-
-class ConvBlock(nn.Module):
-    """re-OBJ: maps (N, C, 7, 7) of one crop, or of two stacked, to one unit row."""
-
-    def __init__(self, channels: int, width: int = 192, inner: int = 80) -> None:
-        super().__init__()
-        self.norm = nn.BatchNorm2d(channels, affine=False)
-        self.squeeze = block(channels, inner, 1)
-        self.mix = nn.Sequential(block(inner, inner), block(inner, 64, 3, 2), nn.Dropout(0.2))
-        self.out = nn.Linear(64 * 16, width)
-        self.short = nn.Conv2d(channels, 20, 1, bias=False)
-        self.project = nn.Linear(20 * 49, width, bias=False)
-
-    def forward(self, maps: Any) -> Any:
-        maps = self.norm(maps)
-        if self.training:  # some channels, and some places of all of them, are hidden
-            maps = F.dropout2d(maps, 0.1) * (torch.rand_like(maps[:, :1]) > 0.1)
-        deep = self.out(self.mix(self.squeeze(maps)).flatten(1))
-        return F.normalize(deep + self.project(self.short(maps).flatten(1)), dim=1)
-
-    def start(self, maps: Any) -> None:
-        """Begin with the principal components of features, then of places side by side."""
-        self.norm.running_mean[:] = maps.mean((0, 2, 3))
-        self.norm.running_var[:] = maps.var((0, 2, 3))
-        maps = self.norm(maps)
-        principal(self.short.weight[..., 0, 0], maps.movedim(1, 3).flatten(0, 2))
-        self.short.weight /= 20
-        principal(self.project.weight, self.short(maps).flatten(1))
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-
-
-def room_sources(args: argparse.Namespace, rooms: str) -> list[Source]:
-    """Rooms A:B, those of the cache if no others shall be rendered."""
-    load = functools.partial(room_clip, cache=args.cache, frames=args.frames)
-    seeds = parse_range(rooms) if rooms else ()
-    there = [s for s in seeds if not args.no_render or (args.cache / f"room_{s}.npz").exists()]
-    return [(f"room {seed}", functools.partial(load, seed)) for seed in there]
-
-
-def sources(args: argparse.Namespace) -> list[Source]:
-    """Names of all training clips, and how to read them."""
-    found = room_sources(args, args.rooms)
-    for kind, given in ((sparse_clip, args.sparse), (tracks_clip, args.tracks)):
-        found += [(f"{a.parent.name}/{a.name}", functools.partial(kind, a, b)) for a, b in given]
-    return found + [(folder.name, functools.partial(scannet_clip, folder))
-                    for folder in args.scannet]  # fmt: skip
-
-
-class SeenPool:
-    """Scenes as a frozen backbone sees them, each augmented once or more."""
-
-    def __init__(self, args: argparse.Namespace, frozen: Frozen, names: Sequence[str]) -> None:
-        self.args, self.rooms = args, []
-        for source in sources(args):
-            for copy in range(1, args.copies + 1):
-                self.rooms.append(frozen.scene(source, copy, names))
-        if not self.rooms:
-            raise SystemExit("error: nothing to train on: give --rooms, --sparse or --tracks")
-
-    def fill(self) -> None:
-        """Everything is here from the start."""
-
-    def draw(self, rng: np.random.Generator) -> list[Seen]:
-        """Some views of some scenes."""
-        return [
-            self.rooms[i].views(rng, self.args.views)
-            for i in rng.choice(len(self.rooms), min(self.args.scenes, len(self.rooms)), False)
-        ]
-
-
-class HeadTrainer(Trainer):
-    """Trains heads on what a frozen backbone shows: two of cells, or a ConvBlock of crops."""
-
-    def __init__(self, args: argparse.Namespace, frozen: Frozen, names: Sequence[str]) -> None:
-        self.frozen, self.names = frozen, names
-        super().__init__(args)
-
-    def make_pool(self) -> Any:
-        return SeenPool(self.args, self.frozen, self.names)
-
-    def make_net(self) -> Any:
-        shapes = [self.pool.rooms[0].parts[n].shape[1:] for n in self.names]
-        if self.frozen.crops:
-            return ConvBlock(sum(shape[0] for shape in shapes))
-        fore, *back = (FROZEN[f"{k}_cells"] for k in ("foreground", "background", "wide"))
-        channels = shapes[0][0] // int(fore) ** 2 - 2
-        return nn.ModuleList([CellHead([int(fore)], channels),
-                              CellHead([int(n) for n in back], channels)])  # fmt: skip
-
-    def make_val(self) -> dict[str, Any]:
-        rooms = room_sources(self.args, self.args.val_rooms)
-        real = [(f"{a.parent.name}/{a.name}", functools.partial(sparse_clip, a, b))
-                for a, b in self.args.val_sparse]  # fmt: skip
-        return {
-            name: [self.frozen.scene(source, 0, self.names) for source in found]
-            for name, found in (("room", rooms), ("real", real))
-        }
-
-    def start(self) -> None:
-        """Start from the principal components of the training-free descriptors."""
-        scenes = self.pool.draw(np.random.default_rng([self.args.seed, 10]))
-        self.net.eval()
-        with torch.no_grad():
-            parts = self.inputs(scenes)
-            heads = [self.net] if self.frozen.crops else self.net
-            for head, rows in zip(heads, parts, strict=True):
-                head.start(rows)
-        self.net.train()
-
-    def inputs(self, scenes: Sequence[Seen]) -> list[Any]:
-        """What each head takes of all objects of the scenes."""
-        parts = [torch.from_numpy(np.concatenate([s.parts[n] for s in scenes])).float()
-                 for n in self.names]  # fmt: skip
-        return [torch.cat(parts, 1)] if self.frozen.crops else parts
-
-    def embed(self, scenes: Sequence[Seen]) -> list[Any]:
-        """Unit rows of each part (of a ConvBlock: one)."""
-        rows = [part.to(self.device) for part in self.inputs(scenes)]
-        if self.frozen.crops:
-            return [self.net(rows[0])]
-        return [head(part) for head, part in zip(self.net, rows, strict=True)]
-
-    def loss(self, scenes: Any, hard: bool) -> Any:
-        parts = self.embed(scenes)
-        scene = np.repeat(np.arange(len(scenes)), [len(s.identity) for s in scenes])
-        identity = np.concatenate([s.identity for s in scenes])
-        frame = np.concatenate([s.frame for s in scenes])
-        return parts_loss(parts, (scene, identity, frame), hard, self.args.loss == "soft")
-
-    def score(self, clips: Sequence[Seen]) -> dict[str, float]:
-        self.net.eval()
-        with torch.no_grad():
-            done = [[p.cpu().numpy() for p in self.embed([clip])] for clip in clips]
-        self.net.train()
-        return mean_hits([(parts, c.frame, c.identity, c.look)
-                          for parts, c in zip(done, clips, strict=True)])  # fmt: skip
-
-
-def train_heads(args: argparse.Namespace) -> None:
-    """Train and export the heads of a frozen backbone."""
-    frozen, out = Frozen(args), args.out
-    setups = CROP_SETUPS if args.crops else {"": ("fg", "bg")}
-    for setup in args.setups if args.crops else setups:
-        args.out = out / setup
-        trainer = HeadTrainer(args, frozen, setups[setup])
-        trainer.run()
-        trainer.take_best()
-        draw_curves(args.out / "log.csv", args.out / "curves.png")
-        export_head(trainer, args.out)
-
-
-def export_head(trainer: HeadTrainer, out: Path) -> None:
-    """Write OUT/[crops_]BACKBONE_head.onnx, large weights as float16."""
-    import onnx
-
-    rows = tuple(part[:2] for part in trainer.inputs(trainer.pool.rooms[:1]))
-    net = trainer.net.cpu().eval()
-    crops = trainer.frozen.crops
-    path = out / f"{'crops_' if crops else ''}{Path(trainer.args.backbone).stem}_head.onnx"
-    fed, given = (["maps"], ["row"]) if crops else (["fg", "bg"], ["foreground", "background"])
-    to_onnx(net if crops else Both(net), rows, path, fed, given)
-    file = halved(onnx.load(path))
-    facts = {"layout": trainer.frozen.layout, "trained": trainer.summary()}
-    onnx.helper.set_model_props(file, {"reobj": json.dumps(facts)})
-    onnx.save(file, path)
-    print(f"{path}: use it with --set embed.head={path}")
-
-
-class Both(nn.Module):
-    """Two heads in one graph."""
-
-    def __init__(self, heads: Any) -> None:
-        super().__init__()
-        self.heads = heads
-
-    def forward(self, fg: Any, bg: Any) -> tuple[Any, Any]:
-        return self.heads[0](fg), self.heads[1](bg)
-
-
-def halved(model: Any) -> Any:
-    """Keep large weights as float16 with a cast behind them: half the file."""
-    import onnx
-
-    casts = []
-    for weight in model.graph.initializer:
-        values = onnx.numpy_helper.to_array(weight)
-        if values.dtype == np.float32 and values.size > 2000:
-            name = weight.name
-            weight.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), name + "_half"))
-            casts.append(onnx.helper.make_node("Cast", [name + "_half"], [name], to=1))
-    for node in reversed(casts):
-        model.graph.node.insert(0, node)
-    return model
-
-
 # ---- Export --------------------------------------------------------------------------------------
 
 
@@ -1476,10 +1140,10 @@ def pair(text: str) -> tuple[Path, Path]:
     return Path(left), Path(right)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Options."""
+def common_options(description: str | None) -> argparse.ArgumentParser:
+    """Options of every training."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add: Callable[..., Any] = parser.add_argument
     add("-o", "--out", type=Path, required=True, help="folder for models, checkpoint, log")
@@ -1504,27 +1168,27 @@ def build_parser() -> argparse.ArgumentParser:
     add(
         "--loss", choices=("triplet", "soft"), default="soft", help="semi-hard negative or soft max"
     )
-    add("--start", type=Path, help="take the backbone of this checkpoint (.pt) to begin with")
-    add("--backbone", help="train a head for this frozen backbone (such as mobilenetv2) instead")
-    add("--crops", action="store_true", help="for two crops an object (re-OBJ's ConvBlock)")
-    add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="of --crops")
-    add("--copies", type=int, default=1, help="augmented copies of each scene for --backbone")
-    add("--seen", type=int, default=20, help="frames of each scene for --backbone")
     add("--resume", action="store_true", help="go on from OUT/last.pt")
     return parser
 
 
+def parsed(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read the options; warns of rooms that both train and validate."""
+    args = parser.parse_args(argv)
+    cv2.setNumThreads(0)  # a forked process has no threads of its parent
+    both = set(parse_range(args.rooms or "0:0")) & set(parse_range(args.val_rooms or "0:0"))
+    if both:
+        print(f"warning: rooms {sorted(both)} both train and validate", file=sys.stderr)
+    return args
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Train, draw the curves, export."""
-    args = build_parser().parse_args(argv)
-    cv2.setNumThreads(0)  # a forked process has no threads of its parent
-    if args.rooms and args.val_rooms:
-        both = set(parse_range(args.rooms)) & set(parse_range(args.val_rooms))
-        if both:
-            print(f"warning: rooms {sorted(both)} both train and validate", file=sys.stderr)
-    if args.backbone:
-        train_heads(args)
-        return 0
+    parser = common_options(__doc__)
+    parser.add_argument(
+        "--start", type=Path, help="take the backbone of this checkpoint (.pt) to begin with"
+    )
+    args = parsed(parser, argv)
     trainer = Trainer(args)
     trainer.run()
     trainer.take_best()

@@ -180,6 +180,11 @@ def te() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
+def th(te) -> ModuleType:
+    return importlib.import_module("train_head")
+
+
+@pytest.fixture(scope="module")
 def trained(te, tmp_path_factory) -> Path:
     """Two steps on one small room, then two more from the checkpoint."""
     folder = tmp_path_factory.mktemp("train")
@@ -311,12 +316,12 @@ def test_scannet_folders_become_a_clip(te, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("crops", [False, True])
-def test_head_of_a_frozen_backbone_is_found_beside_it(te, trained, tmp_path, crops: bool) -> None:
+def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, crops: bool) -> None:
     """A step of training; the exported head gives through the tool what it gives in PyTorch."""
     backbone(tmp_path / "net.onnx", tmp_path / "block.onnx", channels=8)
     command = ["-o", str(tmp_path), "--backbone", str(tmp_path / "net.onnx"), "--rooms", "3"]
     command += ["--cache", str(trained / "rooms"), "--val-rooms", "3", "--frames", "6"]
-    assert te.main([*command, *["--crops"] * crops, "--steps", "2", "--every", "1"]) == 0
+    assert th.main([*command, *["--crops"] * crops, "--steps", "2", "--every", "1"]) == 0
     out = tmp_path / "concat" if crops else tmp_path
     name = "crops_net_head.onnx" if crops else "net_head.onnx"
     assert cv2.imread(str(out / "curves.png")) is not None
@@ -329,16 +334,16 @@ def test_head_of_a_frozen_backbone_is_found_beside_it(te, trained, tmp_path, cro
     assert look.foreground.shape != frozen.foreground.shape  # "none": no training
     assert look.background.shape == ((2, 0) if crops else (2, 128))
     np.testing.assert_allclose(np.linalg.norm(look.foreground, axis=1), 1, atol=1e-3)
-    args = te.build_parser().parse_args([*command, *["--crops"] * crops])
-    see = te.Frozen(args).see(image, detections, np.arange(2))
-    assert_same_as_in_torch(te, args, see, out / "best.pt", look)
+    args = th.build_parser().parse_args([*command, *["--crops"] * crops])
+    see = th.Frozen(args).see(image, detections, np.arange(2))
+    assert_same_as_in_torch(th, args, see, out / "best.pt", look)
 
 
-def assert_same_as_in_torch(te, args, see, checkpoint: Path, look: rt.Embeddings) -> None:
+def assert_same_as_in_torch(th, args, see, checkpoint: Path, look: rt.Embeddings) -> None:
     import torch
 
     names = ["fg", "bg"]
-    trainer = te.HeadTrainer(args, te.Frozen(args), names)
+    trainer = th.HeadTrainer(args, th.Frozen(args), names)
     trainer.net.load_state_dict(torch.load(checkpoint, weights_only=True)["net"])
     trainer.net.eval()
     seen = te.Seen(see, np.arange(2), np.arange(2), np.zeros(2))
