@@ -346,7 +346,7 @@ def assert_same_as_in_torch(th, args, see, checkpoint: Path, look: rt.Embeddings
     trainer = th.HeadTrainer(args, th.Frozen(args), names)
     trainer.net.load_state_dict(torch.load(checkpoint, weights_only=True)["net"])
     trainer.net.eval()
-    seen = te.Seen(see, np.arange(2), np.arange(2), np.zeros(2))
+    seen = th.Seen(see, np.arange(2), np.arange(2), np.zeros(2))
     with torch.no_grad():
         expected = [part.numpy() for part in trainer.embed([seen])]
     for mine, theirs in zip((look.foreground, look.background), expected, strict=False):
