@@ -2010,7 +2010,7 @@ class CameraMotion:
             affine, inliers = cv2.estimateAffinePartial2D(
                 self._corners[good], moved[good], ransacReprojThreshold=2.0
             )
-            if affine is not None and inliers.mean() > 0.3:
+            if affine is not None and inliers.sum() >= self.config.flow_min_corners:
                 result[:2] = affine
         return result
 
