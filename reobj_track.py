@@ -3196,30 +3196,50 @@ class Tracker:
             self._place_boxes = self.places.project(view, self._image_size, share)
 
     def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
-        """Match detections to live tracks: high scores by motion, and again with the looks of what
-        was matched in doubt, then low scores by overlap.
+        """Match detections to live tracks: high scores by motion, then what is left, low scores
+        too, by overlap. Both times what is matched in doubt must look alike.
         """
         config = self.config
-        track_of = np.full(len(detections), -1, np.int64)
         box = _cxcywh_from_xyxy(detections.xyxy)
         cost, feasible, iou = self._motion_cost(detections, box, lazy.available)  # (T, D)
-        high, handicap = detections.score >= config.high_score, self._handicap()[:, None]
-        _assign(cost + handicap, feasible & high & (cost < config.max_cost), track_of)
-        if lazy.available and self._live.look.shape[1]:
-            same_class = _same_class(self._live.votes, detections.class_id)
-            doubtful, close = self._doubtful(cost, handicap, feasible & high, same_class)
-            asked = np.zeros(len(detections), bool)
-            while len(rows := self._unsure(track_of, doubtful, close, asked)):
-                asked[rows] = True
-                cost, feasible = self._compare_looks(cost, feasible, doubtful, iou, rows, lazy)
-                track_of[:] = -1
-                _assign(cost + handicap, feasible & high & (cost < config.max_cost), track_of)
+        same_class = _same_class(self._live.votes, detections.class_id)
+        evidence = config.iou_odds * (iou - config.class_cost * ~same_class) - config.look_odds
+        handicap = self._handicap()[:, None]
+        first = feasible & (detections.score >= config.high_score)
+        doubt = self._doubtful(cost, handicap, first, same_class)
+        track_of, refused = self._matched(cost, handicap, first, doubt, evidence, lazy)
         free = np.ones(len(iou) + 1, bool)
         free[track_of] = False  # -1: the one too many
         low = (track_of < 0) & (detections.score >= config.low_score)
-        second = feasible & (iou >= config.low_iou) & low & free[:-1, None]
-        _assign(1 - iou, second, track_of)
-        return track_of
+        second = feasible & ~refused & (iou >= config.low_iou) & low & free[:-1, None]
+        doubt = self._doubtful(cost, handicap, second, np.zeros_like(same_class))
+        late, _ = self._matched(1 - iou, 0 * handicap, second, doubt, evidence, lazy)
+        return np.maximum(track_of, late)
+
+    def _matched(
+        self, cost: Array, handicap: Array, possible: BoolArray, doubt: tuple[BoolArray, BoolArray],
+        evidence: Array, lazy: _LazyEmbeddings,
+    ) -> tuple[IntArray, BoolArray]:  # fmt: skip
+        """Match at least cost; look at what was matched in doubt and at its rivals; match again.
+
+        Args:
+            doubt: of `_doubtful`. evidence: log odds of the boxes (T, D).
+        Returns:
+            row of the live track of each detection (D,), or -1; pairs refused by their looks.
+        """
+        track_of = np.full(cost.shape[1], -1, np.int64)
+        refused = np.zeros(cost.shape, bool)
+        asked = np.full(cost.shape[1], not (lazy.available and self._live.look.shape[1]))
+        while True:
+            track_of[:] = -1
+            good = possible & ~refused & (cost < self.config.max_cost)
+            _assign(cost + handicap, good, track_of)
+            rows = self._unsure(track_of, *doubt, asked)
+            if not len(rows):
+                return track_of, refused
+            asked[rows] = True
+            cost, against = self._compare_looks(cost, evidence, rows, lazy)
+            refused[:, rows] |= against & doubt[0][:, rows]
 
     def _motion_cost(
         self, detections: Detections, box: Array, looks: bool
@@ -3279,21 +3299,18 @@ class Tracker:
         return np.flatnonzero(ask & ~asked)
 
     def _compare_looks(
-        self, cost: Array, feasible: BoolArray, doubtful: BoolArray, iou: Array, rows: IntArray,
-        lazy: _LazyEmbeddings,
-    ) -> tuple[Array, BoolArray]:  # fmt: skip
-        """Blend the looks of detections (n,) into the cost; forbid what overlap and look together
-        speak against, among the doubtful pairs.
+        self, cost: Array, evidence: Array, rows: IntArray, lazy: _LazyEmbeddings
+    ) -> tuple[Array, BoolArray]:
+        """Blend the looks of detections (n,) into the cost (T, D); and what boxes and look together
+        speak against, (T, n).
         """
-        config, live = self.config, self._live
-        known = (live.embedded >= 0)[:, None]
-        logit = self.same_soon.logit(*part_cosines(live.look, lazy.get(rows), lazy.split))  # (T, n)
-        weight = config.appearance_weight * known
-        cost, feasible = cost.copy(), feasible.copy()
+        known = (self._live.embedded >= 0)[:, None]
+        cosines = part_cosines(self._live.look, lazy.get(rows), lazy.split)
+        logit = self.same_soon.logit(*cosines)  # (T, n)
+        weight = self.config.appearance_weight * known
+        cost = cost.copy()
         cost[:, rows] = (1 - weight) * cost[:, rows] + weight / (1 + np.exp(logit))
-        against = logit + config.iou_odds * iou[:, rows] < config.look_odds
-        feasible[:, rows] &= ~(known & doubtful[:, rows] & against)
-        return cost, feasible
+        return cost, known & (logit + evidence[:, rows] < 0)
 
     def _correct(self, detections: Detections, track_of: IntArray) -> None:
         """Kalman update of the matched tracks."""
