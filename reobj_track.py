@@ -283,7 +283,9 @@ class TrackerConfig:
     distance_weight: float = _opt(0.2, "share of the distance in the cost, the rest is overlap")
     missed_cost: float = _opt(0.2, "added for tracks not seen for 10 frames, in proportion before")
     tentative_cost: float = _opt(0.2, "added for tracks that are not confirmed yet")
-    class_cost: float = _opt(0.2, "added to the cost when the class differs")
+    class_cost: float = _opt(
+        0.2, "added to the cost, and taken off the overlap in doubt, when the class differs"
+    )
     appearance_weight: float = _opt(0.7, "share of appearance in the cost of doubtful matches")
     foreground_weight: float = _opt(0.5, "share of the foreground in the appearance")
     rival_cost: float = _opt(0.3, "a match is doubtful where a rival costs less than this more")
@@ -324,7 +326,7 @@ class TrackerConfig:
     camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
     flow_size_px: int = _opt(320, "longer side of the image for optical flow")
     flow_corners: int = _opt(100, "corners followed")
-    flow_min_corners: int = _opt(8, "with fewer, the camera is taken to stand still")
+    flow_min_corners: int = _opt(8, "with fewer that agree, the camera is taken to stand still")
 
 
 @dataclass(frozen=True, slots=True)
@@ -1976,8 +1978,10 @@ def _resized(image: Image, size: Sequence[int]) -> Image:
 class CameraMotion:
     """Global image motion between consecutive frames from sparse optical flow, as a 3x3 matrix.
 
-    A similarity transform is fitted by RANSAC to corner tracks (as BoT-SORT does); with too few
-    corners the identity is returned, so a textureless frame never stops the tracker.
+    A similarity transform is fitted by RANSAC to corner tracks (as BoT-SORT does). What counts is
+    how many corners agree, not their share: in wide steps most are lost, and eight of a hundred
+    hardly agree by chance. With fewer the identity is returned, so a textureless frame never stops
+    the tracker.
     """
 
     def __init__(self, config: TrackerConfig) -> None:

@@ -110,6 +110,17 @@ def test_camera_motion_recovers_a_known_shift() -> None:
     np.testing.assert_allclose(new_from_old[:2, :2], np.eye(2), atol=0.01)
 
 
+def test_camera_motion_of_a_wide_step_needs_no_majority() -> None:
+    """A quarter of the corners is enough: the rest left the view or changed."""
+    rng = np.random.default_rng(5)
+    old, new = textured(rng), textured(rng)
+    new[:240, :320] = old[18:258, 24:344]
+    motion = rt.CameraMotion(rt.TrackerConfig())
+    motion(old)
+    new_from_old = motion(new)
+    np.testing.assert_allclose((new_from_old @ [184, 138, 1])[:2], [160, 120], atol=2)
+
+
 def test_camera_motion_survives_a_textureless_frame() -> None:
     motion = rt.CameraMotion(rt.TrackerConfig())
     blank = np.full((100, 100, 3), 128, np.uint8)
@@ -241,6 +252,18 @@ def test_a_coasting_track_does_not_take_a_newcomer_that_looks_different(left: in
     found = rows((100, 100, 150, 150), (109, 100, 159, 150))
     tracks = tracker.update(found, embeddings=np.stack([seen, new]))
     assert tracks.track_id.tolist() == [1, 3]
+
+
+@pytest.mark.parametrize(("left", "score", "kind"), [(120, 0.2, CHAIR), (112, 0.9, CUP)])
+def test_a_doubtful_match_must_look_alike(left: int, score: float, kind: int) -> None:
+    """Low scores and changes of class may go on with a track, but not with another thing."""
+    seen, other = unit(np.random.default_rng(13), 2)
+    for look, expected in ((seen, [1]), (other, [])):
+        tracker = rt.Tracker()
+        for _ in range(12):
+            tracker.update(rows((100, 100, 150, 150)), embeddings=seen[None])
+        found = rows((left, 100, left + 50, 150), score=score, class_id=kind)
+        assert tracker.update(found, embeddings=look[None]).track_id.tolist() == expected
 
 
 def away_and_back(
