@@ -344,12 +344,14 @@ class ObjectsConfig:
     double_iou: float = _opt(0.5, "boxes that overlap more may be two boxes on one object (IoU)")
     link_look: float = _opt(-4.0, "never join by place what looks less alike (log odds)")
     link_class: float = _opt(0.1, "join by place only where the classes agree in this share")
-    link_place: float = _opt(0.25, "candidates for a join overlap this much cross-projected (IoU)")
+    link_place: float = _opt(
+        0.25, "one place from this overlap cross-projected on (IoU): may be joined, is not split"
+    )
     keep_iou: float = _opt(0.4, "a join is kept if the joint solid overlaps the boxes so (IoU)")
     keep_share: float = _opt(0.6, "in this share of the frames of either part (OA-SLAM: half)")
     cut_gap: int = _opt(5, "tracklets may be split where this many frames pass without a detection")
     split_drop: float = _opt(0.7, "a return is doubted if its joint solid overlaps less, a share")
-    split_place: float = _opt(0.1, "a return is undone where two places overlap less (IoU)")
+    split_place: float = _opt(0.25, "a return is undone where two places overlap less (IoU)")
     min_views: int = _opt(3, "objects with fewer detections in frames with poses get no ellipsoid")
     min_score: float = _opt(0.3, "boxes below this score do not shape the ellipsoid")
     moving: str = _opt(
@@ -2795,6 +2797,14 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
     return np.asarray(a @ b.T)
 
 
+def quick_fit(boxes: Array, img_from_world: Array, image_size: tuple[int, int]) -> Any:
+    """Ellipsoids of any size from boxes (V, G, 4), in a few steps (`quadrics.fit_objects`)."""
+    config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
+    return quadrics.fit_objects(
+        boxes, img_from_world, image_size, support="ellipsoid", config=config
+    )
+
+
 class Places:
     """Where every identity is in 3D, for a tracker that is told the camera's poses.
 
@@ -2840,8 +2850,7 @@ class Places:
         boxes = np.full((len(frames), len(due), 4), np.nan)
         boxes[row, at] = self.boxes[due][at, slot]
         cameras = self.img_from_world[due][at, slot][first]  # (F, 3, 4)
-        fast = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
-        fits = quadrics.fit_objects(boxes, cameras, image_size, support="ellipsoid", config=fast)
+        fits = quick_fit(boxes, cameras, image_size)
         good = (fits.status != "rejected") & (fits.parallax_deg >= self.config.place_parallax_deg)
         axes = np.sort(fits.ellipsoids.half_axes, 1)  # (O, 3)
         good &= axes[:, 2] <= self.config.place_shape * axes[:, 1]
@@ -5313,10 +5322,11 @@ class Linker:
     First by looks: tracklets are joined as long as their most alike views show one object more
     likely than any rival (seen beside one of the two) or another object, the most alike first. This
     replaces what the tracker decided at first sight.
-    Then, with poses, by place: tracklets are cut at gaps (where a tracker slips to a twin); a join
-    is undone where two well-measured places differ; groups that explain each other's boxes are
-    joined, refitted and kept only if the joint solid overlaps the boxes of both in most frames
-    (merge, re-project, undo: the idea of OA-SLAM).
+    Then, with poses, by place: tracklets are cut at gaps (where a tracker slips to a twin) and
+    where two solids explain boxes that one does not (where it slips to a neighbour); a join is
+    undone where two well-measured places differ; groups that explain each other's boxes are joined,
+    refitted and kept only if the joint solid overlaps the boxes of both in most frames (merge,
+    re-project, undo: the idea of OA-SLAM).
 
     Args:
         track: rows with the tracker's identities, and their looks.
@@ -5333,12 +5343,11 @@ class Linker:
         table = track.table
         self.table, self.poses, self.fit, self.config = table, poses, fit, config
         self.located = np.empty(0) if poses is None else poses.frame[poses.known]  # (V,)
-        self.atom, first = _segments_of(table, config.cut_gap)  # (N,), (L,)
-        self.tracklets = table.tracklet_id[first]  # (L,)
-        self.identity = table.object_id[first]  # (L,)
-        self.classes = _class_shares(table, self.atom, len(first)).argmax(1)  # (L,)
-        names = np.array([*track.class_names, ""])[self.classes.clip(max=len(track.class_names))]
-        self.moving = np.isin(names, config.moving.split(","))  # (L,) as the tracker has them
+        self.atom = _segments_of(table, config.cut_gap)  # (N,)
+        self._describe(track.class_names)
+        if poses is not None:
+            self._cut()
+            self._describe(track.class_names)
         self.together, self.apart = self._seen_together()
         self.near = self._nearness(*self._most_alike(track))
         self.group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
@@ -5354,6 +5363,15 @@ class Linker:
             while self._join_round(rejected):
                 pass
         return np.asarray(self.group[self.atom], np.int64)
+
+    def _describe(self, class_names: Sequence[str]) -> None:
+        """What the atoms are: tracklet, identity, class, whether that moves, (L,) each."""
+        first = np.unique(self.atom, return_index=True)[1]  # (L,)
+        self.tracklets = self.table.tracklet_id[first]
+        self.identity = self.table.object_id[first]
+        self.classes = _class_shares(self.table, self.atom, len(first)).argmax(1)
+        names = np.array([*class_names, ""])[self.classes.clip(max=len(class_names))]
+        self.moving = np.isin(names, self.config.moving.split(","))  # as the tracker has them
 
     def _seen_together(self) -> tuple[BoolArray, BoolArray]:
         """(L, L): atoms seen in the same frame; those of them that are never so close that they
@@ -5426,6 +5444,58 @@ class Linker:
                 ids = tuple(np.unique(self.tracklets[atoms if kind == "join" else piece]).tolist())
                 self.events.append(LinkEvent(kind, ids, None, float(max(look, -9.0)), True))
 
+    def _cut(self) -> None:
+        """Cut atoms where the tracker slipped to another thing without missing a frame, until no
+        cut helps. `_split` takes back those with both sides in one place.
+        """
+        todo = np.flatnonzero(~self.moving)
+        while len(todo):
+            cuts = self._cuts(todo)
+            fresh = self.atom.max() + 1 + np.arange(len(cuts))
+            for name, (atom, frame) in zip(fresh, cuts, strict=True):
+                self.atom[(self.atom == atom) & (self.table.frame >= frame)] = name
+            todo = np.concatenate([[atom for atom, _ in cuts], fresh]).astype(np.int64)
+
+    def _cuts(self, atoms: IntArray) -> list[tuple[int, int]]:
+        """Atoms to cut, and the frame from which on: the best of 8 cuts, if the solid of a half
+        explains its boxes much better than that of the whole does, as in `_split`.
+        """
+        least, drop, frame = 2 * self.config.min_views, self.config.split_drop, self.table.frame
+        usable = np.isin(frame, self.located) & (self.table.score >= self.config.min_score)
+        rows = [np.flatnonzero(usable & (self.atom == atom)) for atom in atoms]
+        tries: list[tuple[int, int, Array]] = []
+        for i, joint in enumerate(self._own_iou(rows)):
+            span = np.linspace(least, len(joint) - least, 8 * (len(joint) >= 2 * least))
+            for at in np.unique(span.round().astype(np.int64)):
+                together = np.array([np.median(joint[:at]), np.median(joint[at:])])
+                if together.min() < drop:  # no overlap is above 1
+                    tries.append((i, int(at), together))
+        halves = [half for i, at, _ in tries for half in (rows[i][:at], rows[i][at:])]
+        alone = self._own_iou(halves)
+        best: dict[int, tuple[float, int]] = {}
+        for (i, at, together), a, b in zip(tries, alone[::2], alone[1::2], strict=True):
+            total = float(a.sum() + b.sum())
+            worse = together < drop * np.array([np.median(a), np.median(b)])
+            if worse.any() and total > best.get(i, (0.0, 0))[0]:
+                best[i] = total, at
+        return [(int(atoms[i]), int(frame[rows[i][at]])) for i, (_, at) in best.items()]
+
+    def _own_iou(self, groups: Sequence[IntArray]) -> list[Array]:
+        """How well one ellipsoid of any size explains the boxes of each group of rows (IoU)."""
+        if not groups:
+            return []
+        assert self.poses is not None
+        size = [len(rows) for rows in groups]
+        rows, label = np.concatenate(groups), np.repeat(np.arange(len(groups)), size)
+        views = gather_views(self.table[rows], self.poses, label, len(size), self.config.min_score)
+        ellipsoids = quick_fit(views.boxes, views.img_from_world, views.image_size).ellipsoids
+        solids = quadrics.solid_boxes(ellipsoids, "ellipsoid", views.img_from_world)
+        solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
+        at = np.searchsorted(self.located, self.table.frame[rows])
+        return np.split(
+            _paired_iou(solids[at, label], views.boxes[at, label]), np.cumsum(size)[:-1]
+        )
+
     def _cross_iou(self, labels: IntArray, count: int) -> tuple[Array, Array]:
         """Fit all groups of atoms; how well does each solid explain the boxes of each other group?
 
@@ -5472,7 +5542,7 @@ class Linker:
             for atom in np.setdiff1d(members[~self.moving[members]], anchors):
                 iou = float(max(place[anchors, atom].max(), place[atom, anchors].max()))
                 look = float(np.nan_to_num(self.near[anchors, atom], nan=-np.inf).max(initial=-9))
-                if iou < self.config.split_place:
+                if iou < self.config.link_place:
                     self.group[atom] = self.group.max() + 1
                     ids = (int(self.tracklets[anchors[0]]), int(self.tracklets[atom]))
                     self.events.append(LinkEvent("split", ids, iou, look, True))
@@ -5588,18 +5658,18 @@ def _most_alike_first(
     return np.unique(group, return_inverse=True)[1]
 
 
-def _segments_of(table: TrackTable, cut_gap: int) -> tuple[IntArray, IntArray]:
+def _segments_of(table: TrackTable, cut_gap: int) -> IntArray:
     """Cut tracklets where more than cut_gap frames pass without a detection.
 
     Returns:
-        segment of each row (N,), numbered from 0, and the first row of each segment (L,).
+        segment of each row (N,), numbered from 0.
     """
     order = np.lexsort((table.frame, table.tracklet_id))
     tracklet, frame = table.tracklet_id[order], table.frame[order]
     begins = np.append(True, (np.diff(tracklet) != 0) | (np.diff(frame) > cut_gap))[: len(order)]
     segment = np.empty(len(order), np.int64)
     segment[order] = np.cumsum(begins) - 1
-    return segment, order[begins]
+    return segment
 
 
 def _paired_iou(a_xyxy: Array, b_xyxy: Array) -> Array:

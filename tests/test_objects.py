@@ -127,6 +127,21 @@ def test_a_wrong_return_is_split_by_its_place() -> None:
     assert [e["kind"] for e in result.world["links"]] == ["split"]
 
 
+@pytest.mark.parametrize("slips", [[60], [40, 80], []])
+def test_a_tracklet_that_slipped_is_cut_by_place(slips: list[int]) -> None:
+    """The tracker goes on with another chair without missing a frame; else nothing is cut."""
+    poses = walk()
+    table = table_of(poses)
+    chair = np.array([0, 1, 2])[np.searchsorted(slips, table.frame, "right")]
+    table = table[table.detection_index == chair]
+    one = np.ones(len(table), np.int64)
+    result = linked(dataclasses.replace(table, object_id=one, tracklet_id=one), poses)
+    assert len(result.objects) == len(slips) + 1
+    truth = np.searchsorted(slips, table.frame, "right") + 1
+    assert (result.table.object_id == truth).mean() > 0.9
+    assert ("split" in {e["kind"] for e in result.world["links"]}) == bool(slips)
+
+
 def test_objects_seen_together_are_never_joined() -> None:
     """Two tracks of one chair in the same frames (a double detection) stay two: the evidence says
     so.
