@@ -2620,12 +2620,13 @@ class Gallery:
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
         self.rows = np.zeros((0, config.views, 0), np.float32)  # (I, K, E)
+        self.sight = np.zeros((0, config.views, 3))  # (I, K, 3) directions they were seen in
         self.count = np.zeros(0, np.int64)  # (I,) views held
         self.split = 0  # width of the foreground in the rows
 
-    def add(self, identity: IntArray, rows: Floats) -> None:
-        """Store one new view (E,) for each of N different identities: a new one if it is novel,
-        else blended.
+    def add(self, identity: IntArray, rows: Floats, sight: Array) -> None:
+        """Store one new view (E,) for each of N different identities, seen in a direction (N, 3)
+        of the world, NaN: unknown. A new one if it is novel, else blended.
         """
         self._grow(int(identity.max(initial=-1)) + 1, rows.shape[1])
         own = self.rows[identity]  # (N, K, E)
@@ -2641,6 +2642,7 @@ class Gallery:
         blend = np.where(novel, 0.0, 0.9)[:, None]
         picked = own[np.arange(len(identity)), target]  # (N, E)
         self.rows[identity, target] = _unit_rows(blend * picked + (1 - blend) * rows)
+        self.sight[identity[novel], target[novel]] = sight[novel]
         self.count[identity] += novel & room
 
     @staticmethod
@@ -2650,22 +2652,26 @@ class Gallery:
         pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -2.0
         return np.asarray(pairs.max(2).argmax(1), np.int64)
 
-    def parts(self, rows: Floats, identity: IntArray) -> tuple[Array, Array]:
+    def parts(
+        self, rows: Floats, identity: IntArray, sight: Array
+    ) -> tuple[Array, Array, Array]:
         """Cosines of foreground and background (N, I) between each row (N, E) and the most
-        similar view of each identity (I,); NaN where there is none.
+        similar view of each identity (I,), and the degrees between the directions in which both
+        were seen, (N, 3) of the rows; NaN where unknown.
         """
         shape = (len(rows), len(identity), self.config.views)
         if not rows.size or not len(identity) or self.rows.shape[2] != rows.shape[1]:
-            return np.full(shape[:2], np.nan), np.full(shape[:2], np.nan)
+            return np.full(shape[:2], np.nan), np.full(shape[:2], np.nan), np.full(shape[:2], np.nan)
         views = self.rows[identity].reshape(-1, rows.shape[1])  # (I * K, E)
         empty = np.arange(self.config.views) >= self.count[identity][:, None]  # (I, K)
         fused = np.where(empty, -2.0, (rows @ views.T).reshape(shape))  # (N, I, K)
         best = fused.argmax(2)[..., None]
-        fore, back = (
-            np.where(empty, np.nan, part.reshape(shape))
-            for part in part_cosines(rows, views, self.split)
+        angle = angle_deg(sight[:, None], self.sight[identity].reshape(-1, 3))
+        fore, back, angle = (
+            np.take_along_axis(np.where(empty, np.nan, part.reshape(shape)), best, 2)[..., 0]
+            for part in (*part_cosines(rows, views, self.split), angle)
         )
-        return np.take_along_axis(fore, best, 2)[..., 0], np.take_along_axis(back, best, 2)[..., 0]
+        return fore, back, angle
 
     def _grow(self, identities: int, width: int) -> None:
         if self.rows.shape[2] == 0:
@@ -2674,10 +2680,24 @@ class Gallery:
             extra = max(
                 identities - len(self.count), len(self.count), 16
             )  # doubling: amortised O(1)
-            self.rows = np.concatenate(
-                [self.rows, np.zeros((extra, *self.rows.shape[1:]), np.float32)]
+            self.rows, self.sight, self.count = (
+                np.concatenate([old, np.zeros((extra, *old.shape[1:]), old.dtype)])
+                for old in (self.rows, self.sight, self.count)
             )
-            self.count = np.concatenate([self.count, np.zeros(extra, np.int64)])
+
+
+def sight_lines(xyxy: Array, img_from_world: Array) -> Array:
+    """Unit vectors (N, 3) in world axes from the camera to the centres of boxes (N, 4); one
+    (3, 4) matrix for all or one each, NaN: unknown.
+    """
+    center = np.column_stack([(xyxy[:, :2] + xyxy[:, 2:]) / 2, np.ones(len(xyxy))])  # (N, 3)
+    ray = (np.linalg.inv(img_from_world[..., :3]) @ center[..., None])[..., 0]
+    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+def angle_deg(a: Array, b: Array) -> Array:
+    """Degrees between unit vectors (..., 3)."""
+    return np.asarray(np.degrees(np.arccos((a * b).sum(-1).clip(-1, 1))))
 
 
 class SameObject:
@@ -2934,7 +2954,7 @@ class Tracks:
         return found
 
 
-STATE_VERSION = 1  # of the files of Tracker.save
+STATE_VERSION = 2  # of the files of Tracker.save
 
 
 @dataclass(slots=True)
@@ -3084,7 +3104,7 @@ class Tracker:
         parts: dict[str, tuple[Any, Sequence[str]]] = {
             "tracker": (self, own.split()),
             "live": (self._live, [f.name for f in dataclasses.fields(_Live)]),
-            "gallery": (self.gallery, ("rows", "count", "split")),
+            "gallery": (self.gallery, ("rows", "sight", "count", "split")),
             "places": (self.places, Places.ARRAYS),
             "same": (self.same, ("sums",)),
             "same_soon": (self.same_soon, ("sums",)),
@@ -3382,7 +3402,7 @@ class Tracker:
         keep = np.where(known, self.config.look_momentum, 0.0)[:, None]
         live.look[t] = _unit_rows(keep * live.look[t] + (1 - keep) * look)
         live.embedded[t] = self.frame_number
-        self._learn(look, live.identity[t], detections.class_id[rows])
+        self._learn(look, live.identity[t], detections.class_id[rows], self._sight(t))
 
     def _learn_looks(
         self, detections: Detections, track_of: IntArray, rows: IntArray, lazy: _LazyEmbeddings
@@ -3406,7 +3426,13 @@ class Tracker:
         same.add(fore[own], back[own], True)
         same.add(fore[other], back[other], False)
 
-    def _learn(self, look: Floats, identity: IntArray, class_id: IntArray) -> None:
+    def _sight(self, t: IntArray) -> Array:
+        """Directions (n, 3) in which tracks are seen in this frame, NaN without a pose."""
+        if self._view is None:
+            return np.full((len(t), 3), np.nan)
+        return sight_lines(_xyxy_from_cxcywh(self._live.mean[t, :, 0]), self._view)
+
+    def _learn(self, look: Floats, identity: IntArray, class_id: IntArray, sight: Array) -> None:
         """Feed the similarity statistics and the gallery with embeddings (n, E) of one frame."""
         old = np.flatnonzero(identity >= 0)
         look, identity = look[old], identity[old]
@@ -3416,7 +3442,7 @@ class Tracker:
             first = self.gallery.rows[identity, 0] * (self.gallery.count[identity, None] > 1)
             parts = part_cosines(look, first, self.gallery.split)
             self._compare(self.same, parts, np.eye(len(old), dtype=bool), class_id[old])
-        self.gallery.add(identity, look)
+        self.gallery.add(identity, look, sight[old])
 
     def _confirm(self, track_of: IntArray) -> IntArray:
         """Give tracks that were seen often enough an identity: a known one that returns, or a new
@@ -3445,7 +3471,7 @@ class Tracker:
         self.last_seen[live.identity[ready]] = self.frame_number
         seen = ready[live.embedded[ready] >= 0]
         if len(seen):
-            self.gallery.add(live.identity[seen], live.look[seen])
+            self.gallery.add(live.identity[seen], live.look[seen], self._sight(seen))
         return self._drop(stale, track_of)
 
     def _home_iou(self, ready: IntArray, identity: IntArray) -> Array:
@@ -3474,7 +3500,9 @@ class Tracker:
             return result
         iou = self._home_iou(ready, identity)  # (n, I)
         home = iou > config.low_iou
-        logit = self.same.logit(*self.gallery.parts(live.look[ready], identity))
+        logit = self.same.logit(
+            *self.gallery.parts(live.look[ready], identity, self._sight(ready))
+        )
         logit[home & np.isinf(logit)] = 0  # no look: the place decides
         logit += np.where(home, config.iou_odds * iou - config.look_odds, 0)
         possible = self.last_seen[identity] < live.first[ready][:, None]
@@ -5386,16 +5414,17 @@ class Linker:
         return together, together & ~double
 
     def _most_alike(self, track: TrackResult) -> Array:
-        """(2, L, L) cosines of foreground and background of the most alike views of two atoms, NaN
-        where there is none; diagonal: of views of one atom at least look_gap frames apart.
+        """(3, L, L) cosines of foreground and background of the most alike views of two atoms, and
+        the degrees between their directions; NaN where unknown. Diagonal: of views of one atom at
+        least look_gap frames apart.
         """
-        parts = np.full((2, len(self.tracklets), len(self.tracklets)), np.nan)
+        parts = np.full((3, len(self.tracklets), len(self.tracklets)), np.nan)
         if not track.look.size:
             return parts
         order = np.argsort(self.atom[track.look_row], kind="stable")
         rows, unit = track.look_row[order], _unit_rows(track.look[order])
         atoms, starts, block = np.unique(self.atom[rows], return_index=True, return_inverse=True)
-        split = track.split or unit.shape[1]
+        split, sight = track.split or unit.shape[1], self._sight(rows)
         for atom, mine in zip(atoms, np.split(np.arange(len(rows)), starts[1:]), strict=True):
             cosine = unit[mine] @ unit.T  # (k, n)
             frame = self.table.frame[rows[mine]]
@@ -5404,10 +5433,20 @@ class Linker:
             view = np.lexsort((-cosine.max(0), block))[starts]  # (atoms,) the best of each
             own = mine[cosine[:, view].argmax(0)]
             paired = [_paired_cosine(x[own], x[view]) for x in np.split(unit, [split], 1)]
+            paired.append(angle_deg(sight[own], sight[view]))
             parts[:, atom, atoms] = np.where(np.isinf(cosine[:, view].max(0)), np.nan, paired)
         return parts
 
-    def _nearness(self, foreground: Array, background: Array) -> Array:
+    def _sight(self, rows: IntArray) -> Array:
+        """Directions (n, 3) in which rows of the table were seen, NaN without a pose."""
+        if self.poses is None:
+            return np.full((len(rows), 3), np.nan)
+        place, known = _place_of(self.poses, self.table.frame[rows])
+        camera = self.poses.camera
+        cams = np.where(known[:, None, None], self.poses.cam_from_world[place], np.nan)
+        return sight_lines(_undistort_boxes(self.table.xyxy[rows], camera), camera.K @ cams)
+
+    def _nearness(self, foreground: Array, background: Array, angle: Array) -> Array:
         """(L, L) log odds that atoms look like one object, NaN: unknown.
 
         What that means in this video is known without labels: atoms of a class seen side by side
@@ -5417,7 +5456,7 @@ class Linker:
         pairs = np.triu(self.apart & (self.classes[:, None] == self.classes), 1)
         for rows, one in ((pairs, False), (np.eye(len(pairs), dtype=bool), True)):
             same.add(foreground[rows], background[rows], one)
-        return np.where(np.isnan(foreground), np.nan, same.logit(foreground, background))
+        return np.where(np.isnan(foreground), np.nan, same.logit(foreground, background, angle))
 
     def _join_looks(self) -> None:
         """Group the tracklets anew by their looks and list what differs from the tracker."""
