@@ -2652,16 +2652,15 @@ class Gallery:
         pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -2.0
         return np.asarray(pairs.max(2).argmax(1), np.int64)
 
-    def parts(
-        self, rows: Floats, identity: IntArray, sight: Array
-    ) -> tuple[Array, Array, Array]:
+    def parts(self, rows: Floats, identity: IntArray, sight: Array) -> tuple[Array, Array, Array]:
         """Cosines of foreground and background (N, I) between each row (N, E) and the most
         similar view of each identity (I,), and the degrees between the directions in which both
         were seen, (N, 3) of the rows; NaN where unknown.
         """
         shape = (len(rows), len(identity), self.config.views)
         if not rows.size or not len(identity) or self.rows.shape[2] != rows.shape[1]:
-            return np.full(shape[:2], np.nan), np.full(shape[:2], np.nan), np.full(shape[:2], np.nan)
+            unknown = np.full(shape[:2], np.nan)
+            return unknown, unknown, unknown
         views = self.rows[identity].reshape(-1, rows.shape[1])  # (I * K, E)
         empty = np.arange(self.config.views) >= self.count[identity][:, None]  # (I, K)
         fused = np.where(empty, -2.0, (rows @ views.T).reshape(shape))  # (N, I, K)
@@ -3500,9 +3499,7 @@ class Tracker:
             return result
         iou = self._home_iou(ready, identity)  # (n, I)
         home = iou > config.low_iou
-        logit = self.same.logit(
-            *self.gallery.parts(live.look[ready], identity, self._sight(ready))
-        )
+        logit = self.same.logit(*self.gallery.parts(live.look[ready], identity, self._sight(ready)))
         logit[home & np.isinf(logit)] = 0  # no look: the place decides
         logit += np.where(home, config.iou_odds * iou - config.look_odds, 0)
         possible = self.last_seen[identity] < live.first[ready][:, None]

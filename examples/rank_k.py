@@ -140,14 +140,6 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any]:
     return np.asarray(image)
 
 
-def sight_of(xyxy: Array, world_from_cam: Array, K: Array) -> Array:
-    """Unit vectors (N, 3) in world axes from a camera (3, 4) to the centres of boxes (N, 4)."""
-    center = (xyxy[:, :2] + xyxy[:, 2:]) / 2
-    ray = np.column_stack([center, np.ones(len(center))]) @ np.linalg.inv(K).T  # (N, 3)
-    ray = ray @ world_from_cam[:3, :3].T
-    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-
-
 # ---- Rendered rooms ------------------------------------------------------------------------------
 
 
@@ -195,7 +187,7 @@ def render_scene(config: Any, folder: Path, every: int) -> None:
         found = rr.simulate_detections(
             room, frame.truth, frame.instance, rr.DetectorConfig(false_positives=0), rng
         )
-        sight = sight_of(found.xyxy, np.linalg.inv([*poses[number], [0, 0, 0, 1]]), K)
+        sight = rt.sight_lines(found.xyxy, K @ poses[number])
         for i, k in enumerate(found.truth_index):
             item = room.objects[k]
             rows.append({
@@ -255,10 +247,10 @@ def sights(folder: Path, row: IntArray, xyxy: Array) -> Array:
     files = (folder / "poses_c2w.txt", folder / "intrinsics.json")
     if not all(p.is_file() for p in files):
         return sight
-    poses = np.loadtxt(files[0]).reshape(-1, 4, 4)  # (F, 4, 4) world_from_cam
+    cams = np.linalg.inv(np.loadtxt(files[0]).reshape(-1, 4, 4))[:, :3]  # (F, 3, 4)
     K = pinhole(json.loads(files[1].read_text()))
     for f in np.unique(row):
-        sight[row == f] = sight_of(xyxy[row == f], poses[f], K)
+        sight[row == f] = rt.sight_lines(xyxy[row == f], K @ cams[f])
     return sight
 
 
@@ -408,7 +400,9 @@ def scannet_sights(folder: Path, stems: Sequence[str], row: IntArray, xyxy: Arra
         pose = folder / "pose" / f"{stem}.txt"
         if intrinsic.is_file() and pose.is_file():
             K = np.loadtxt(intrinsic)[:3, :3]
-            sight[row == f] = sight_of(xyxy[row == f], np.loadtxt(pose)[:3], K)
+            sight[row == f] = rt.sight_lines(
+                xyxy[row == f], K @ np.linalg.inv(np.loadtxt(pose))[:3]
+            )
     return sight
 
 
@@ -891,7 +885,7 @@ def reliabilities(cases: Sequence[Cases]) -> list[dict[str, Any]]:
                 for c in own
             ])  # fmt: skip
             same = np.concatenate([c.same for c in own])
-            weight = np.concatenate([c.balance(angle) for c in own])
+            weight = np.concatenate([c.balance() for c in own])
         if not weight.sum():
             continue
         bins = reliability(p, same, weight)

@@ -249,6 +249,19 @@ def test_looks_alone_decide_without_poses(
     assert all(len({*chair[found == o].tolist()}) == 1 for o in np.unique(found))
 
 
+def test_looks_from_another_side_say_less() -> None:
+    """The first and the last views of the chairs, on an arc of 120 degrees around them."""
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.frame < 15) | (table.frame >= 105)]
+    table = dataclasses.replace(table, tracklet_id=table.tracklet_id + 3 * (table.frame > 60))
+    look = looks_of(table, table.detection_index, 0.3)
+    track = rt.TrackResult(table, NAMES, look=look, look_row=np.arange(len(table)))
+    near, posed = (rt.Linker(track, p, None, rt.ObjectsConfig()).near for p in (None, poses))
+    assert (np.abs(posed)[:3, 3:] < np.abs(near)[:3, 3:]).all()
+    assert (np.diag(posed[:3, 3:]) < 0.7 * np.diag(near[:3, 3:])).all()
+
+
 def test_a_misnamed_piece_does_not_ban_the_return_of_its_tracklet() -> None:
     """A gap within the second tracklet of a chair, before it the detector says cup."""
     table = table_of(walk())

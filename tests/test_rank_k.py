@@ -325,11 +325,15 @@ def test_gallery_parts_are_of_the_most_similar_view() -> None:
     gallery = rt.Gallery(rt.TrackerConfig())
     gallery.split = 2
     views = np.array([[1, 0, 1, 0], [0, 1, 0, 1.0]], np.float32) / np.sqrt(2)
-    for view in views:
-        gallery.add(np.array([0]), view[None])
-    fore, back = gallery.parts(views[1:], np.array([0]))
-    assert (fore, back) == (pytest.approx(1), pytest.approx(1))
-    assert np.isnan(gallery.parts(views, np.array([], int))[0]).size == 0
+    ahead, left, unknown = np.array([[[0, 0, 1.0]], [[-1, 0, 0]], np.full((1, 3), np.nan)])
+    for view, sight in zip(views, (ahead, left), strict=True):
+        gallery.add(np.array([0]), view[None], sight)
+    fore, back, angle = gallery.parts(views[1:], np.array([0]), ahead)
+    assert (fore, back, angle) == (pytest.approx(1), pytest.approx(1), pytest.approx(90))
+    gallery.add(np.array([0]), views[1:], ahead)  # nothing new: the kept view stays as it was
+    assert gallery.parts(views[1:], np.array([0]), left)[2] == pytest.approx(0)
+    assert np.isnan(gallery.parts(views[1:], np.array([0]), unknown)[2])
+    assert np.isnan(gallery.parts(views, np.array([], int), views[:, :3])[0]).size == 0
 
 
 def test_trained_crops_see_only_their_part() -> None:

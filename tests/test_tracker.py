@@ -533,6 +533,28 @@ def test_with_poses_a_twin_elsewhere_is_another_object() -> None:
     assert len(set.union(*ids.values())) == 3
 
 
+@pytest.mark.parametrize(("turn_deg", "known"), [(0, False), (90, True)])
+def test_from_another_side_other_surroundings_say_nothing(turn_deg: int, known: bool) -> None:
+    """Its place unknown (no parallax), an object comes back with what is now behind it."""
+    tracker, box = rt.Tracker(), rows((300, 200, 340, 260))
+    thing, wall = (
+        np.array([[1, 0], [0.9, 0.436]]),
+        np.eye(2),
+    )  # before, after: much, not at all alike
+    seen = []
+    for step in range(60):
+        back = step >= 55
+        found = box if step < 15 or back else rt.Detections.empty()
+        look = (part[[int(back)]][: len(found)] for part in (thing, wall))
+        tracks = tracker.update(
+            found, embeddings=rt.Embeddings(*look),
+            cam_from_world=pose_at(0, turn_deg * (step >= 50)), camera=CAMERA,
+        )  # fmt: skip
+        seen.append(tracks.track_id.tolist())
+    assert seen[14] == [1]
+    assert seen[-1] == [1 if known else 2]
+
+
 def test_a_frame_without_pose_changes_no_place() -> None:
     tracker = rt.Tracker()
     walk(tracker, PAST)
