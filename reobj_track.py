@@ -3333,15 +3333,15 @@ class Tracker:
     def _compare_looks(
         self, cost: Array, evidence: Array, rows: IntArray, lazy: _LazyEmbeddings
     ) -> tuple[Array, BoolArray]:
-        """Blend the looks of detections (n,) into the cost (T, D); and what boxes and look together
-        speak against, (T, n).
+        """Blend the looks of detections (n,) into the cost (T, D), half alike where unknown; and
+        what boxes and look together speak against, (T, n).
         """
         known = (self._live.embedded >= 0)[:, None]
         cosines = part_cosines(self._live.look, lazy.get(rows), lazy.split)
         logit = self.same_soon.logit(*cosines)  # (T, n)
-        weight = self.config.appearance_weight * known
-        cost = cost.copy()
-        cost[:, rows] = (1 - weight) * cost[:, rows] + weight / (1 + np.exp(logit))
+        weight, cost = self.config.appearance_weight, cost.copy()
+        unlike = 1 / (1 + np.exp(np.where(known, logit, 0)))
+        cost[:, rows] = (1 - weight) * cost[:, rows] + weight * unlike
         return cost, known & (logit + evidence[:, rows] < 0)
 
     def _correct(self, detections: Detections, track_of: IntArray) -> None:

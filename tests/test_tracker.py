@@ -266,6 +266,20 @@ def test_a_doubtful_match_must_look_alike(left: int, score: float, kind: int) ->
         assert tracker.update(found, embeddings=look[None]).track_id.tolist() == expected
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_second_box_for_one_frame_does_not_take_the_identity(seed: int) -> None:
+    """The track of the second box has no look yet: that speaks neither for nor against it."""
+    rng, tracker = np.random.default_rng(seed), rt.Tracker()
+    own, beside, second = (100, 100, 140, 200), (300, 100, 340, 200), (105, 100, 145, 200)
+    common, seen = unit(rng, 2), []
+    for step in range(30):
+        boxes = [own if step <= 24 else second, beside] + [second] * (step == 24)
+        look = common[[0, 1, 0][: len(boxes)]] + 0.9 * unit(rng, len(boxes))  # views .55 alike
+        seen.append(tracker.update(rows(*boxes), embeddings=look).track_id.tolist())
+    assert seen[23] == [1, 2]
+    assert seen[25:] == [[1, 2]] * 5
+
+
 def away_and_back(
     tracker: rt.Tracker, looks: np.ndarray, back: np.ndarray, gap: int = 200
 ) -> list[int]:
