@@ -326,6 +326,7 @@ class TrackerConfig:
     camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
     flow_size_px: int = _opt(320, "longer side of the image for optical flow")
     flow_corners: int = _opt(100, "corners followed")
+    flow_near: int = _opt(5, "of these the nearest tell how a track moves besides, in a deep scene")
     flow_min_corners: int = _opt(8, "with fewer that agree, the camera is taken to stand still")
 
 
@@ -1990,34 +1991,49 @@ class CameraMotion:
         self.config = config
         self._gray: Image | None = None
         self._corners: Any = None
+        self.flow = np.empty((0, 4))  # (K, 4) corners of the old image and what they moved besides
 
     def __call__(self, image: Image) -> Array:
         """Return new_from_old (3, 3) in pixels of `image`."""
         shrink = min(1.0, self.config.flow_size_px / max(image.shape[:2]))
         small = _resized(image, [round(side * shrink) for side in image.shape[1::-1]])
         gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
-        new_from_old = np.eye(3)
+        new_from_old, self.flow = np.eye(3), np.empty((0, 4))
         if self._gray is not None and self._corners is not None and self._gray.shape == gray.shape:
             new_from_old = self._flow(gray)
         self._gray = gray
         self._corners = cv2.goodFeaturesToTrack(gray, self.config.flow_corners, 0.01, 12)
+        self.flow /= shrink
         to_small = np.diag([shrink, shrink, 1.0])
         return np.asarray(np.linalg.inv(to_small) @ new_from_old @ to_small)
 
+    def parallax(self, xy: Array) -> Array:
+        """What things at xy (N, 2) of the old image moved besides, (N, 2), in a deep scene: as the
+        corners near them (median of the nearest).
+        """
+        if not len(self.flow):
+            return np.zeros_like(xy)
+        apart = ((xy[:, None] - self.flow[:, :2]) ** 2).sum(-1)  # (N, K)
+        near = apart.argsort(1)[:, : self.config.flow_near]
+        return np.asarray(np.median(self.flow[near, 2:], 1))
+
     def _flow(self, gray: Image) -> Array:
-        """Fit the similarity small_new_from_small_old (3, 3)."""
+        """Fit the similarity small_new_from_small_old (3, 3). Where it holds for most corners, the
+        others move by themselves; where not, the scene is deep, and `flow` says how they move.
+        """
         assert self._gray is not None and self._corners is not None
         guess = np.empty_like(self._corners)
         moved, ok, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, self._corners, guess)
         good = ok.ravel() == 1
         result = np.eye(3)
         if good.sum() >= self.config.flow_min_corners:
+            old, new = self._corners[good, 0], moved[good, 0]  # (K, 2) each
             cv2.setRNGSeed(0)
-            affine, inliers = cv2.estimateAffinePartial2D(
-                self._corners[good], moved[good], ransacReprojThreshold=2.0
-            )
+            affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=2.0)
             if affine is not None and inliers.sum() >= self.config.flow_min_corners:
                 result[:2] = affine
+                if inliers.mean() < 0.5:
+                    self.flow = np.c_[old, new - old @ affine[:, :2].T - affine[:, 2]]
         return result
 
 
@@ -3187,7 +3203,9 @@ class Tracker:
         if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
             in_view = self._move_with_pose(np.asarray(cam_from_world, np.float64), camera)
         elif frame is not None and self.config.camera_motion:
+            at = live.mean[:, :2, 0]
             live.mean, live.cov = _warp_state(live.mean, live.cov, self._camera_motion(frame))
+            live.mean[:, :2, 0] += self._camera_motion.parallax(at)
         live.missed += in_view | (live.missed == 0)
 
     def _move_with_pose(self, cam_from_world: Array, camera: Camera) -> BoolArray:

@@ -121,6 +121,23 @@ def test_camera_motion_of_a_wide_step_needs_no_majority() -> None:
     np.testing.assert_allclose((new_from_old @ [184, 138, 1])[:2], [160, 120], atol=2)
 
 
+@pytest.mark.parametrize(
+    ("shifts", "expected"),
+    [((4, 22, 10, 16), 16), ((10, 10, 10, 22), 10)],
+    ids=["a deep scene: as the corners near by", "a thing that moves by itself: as the rest"],
+)
+def test_motion_of_a_scene_with_depth(shifts: tuple[int, ...], expected: int) -> None:
+    """Four bands of the image move sideways; where does a point of the last band go?"""
+    image = textured(np.random.default_rng(6))
+    motion = rt.CameraMotion(rt.TrackerConfig())
+    motion(image)
+    bands = zip(np.split(image, 4), shifts, strict=True)
+    new_from_old = motion(np.concatenate([np.roll(band, shift, 1) for band, shift in bands]))
+    at = np.array([[320.0, 440.0]])
+    moved = (np.c_[at, 1] @ new_from_old.T)[:, :2] + motion.parallax(at)
+    np.testing.assert_allclose(moved - at, [[expected, 0]], atol=1)
+
+
 def test_camera_motion_survives_a_textureless_frame() -> None:
     motion = rt.CameraMotion(rt.TrackerConfig())
     blank = np.full((100, 100, 3), 128, np.uint8)
