@@ -3143,8 +3143,8 @@ class Tracker:
                 object with xyxy, confidence, class_id and mask (supervision).
             frame: (H, W, 3) BGR image: camera motion, and the input of the embedder.
             embeddings: of all detections: an (D, E) array or `Embeddings`.
-            cam_from_world: (3, 4) pose of this frame, with `camera`: replaces the image's own
-                motion estimate.
+            cam_from_world: (3, 4) pose of this frame, with `camera`: objects are known by their
+                place in 3D.
         Returns:
             The detections that belong to a confirmed track; decided once.
         """
@@ -3195,33 +3195,35 @@ class Tracker:
     def _predict(
         self, frame: Image | None, cam_from_world: Array | None, camera: Camera | None
     ) -> None:
-        """Kalman prediction, then the camera's own motion."""
+        """Kalman prediction, then the camera's own motion: as the image shows it, without an image
+        by the known rotation; with a pose, what has a place in 3D goes where that is seen.
+        """
         live = self._live
         live.mean, live.cov = kalman_predict(live.mean, live.cov, self.config)
         live.mean[:, 2:, 0] = live.mean[:, 2:, 0].clip(1.0)  # a size stays positive
-        self._view, in_view = None, np.ones(len(live.mean), bool)
+        self._view, before, pose = None, live.mean[..., 0].copy(), None
         if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
-            in_view = self._move_with_pose(np.asarray(cam_from_world, np.float64), camera)
-        elif frame is not None and self.config.camera_motion:
-            at = live.mean[:, :2, 0]
+            pose = np.asarray(cam_from_world, np.float64)
+        if frame is not None and self.config.camera_motion:
             live.mean, live.cov = _warp_state(live.mean, live.cov, self._camera_motion(frame))
-            live.mean[:, :2, 0] += self._camera_motion.parallax(at)
+            live.mean[:, :2, 0] += self._camera_motion.parallax(before[:, :2])
+        elif pose is not None and camera is not None and self._last_pose is not None:
+            rotation = pose[:, :3] @ self._last_pose[:, :3].T
+            turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for what is far
+            live.mean, live.cov = _warp_state(live.mean, live.cov, turn)
+        in_view = np.ones(len(live.mean), bool)
+        if pose is not None and camera is not None:
+            in_view = self._place_tracks(pose, camera, before)
         live.missed += in_view | (live.missed == 0)
 
-    def _move_with_pose(self, cam_from_world: Array, camera: Camera) -> BoolArray:
-        """Move tracks with the known camera: those of known place as their ellipsoid's image does,
-        others by its rotation. Returns (T,): should a detection be expected?
+    def _place_tracks(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
+        """Move tracks of known place as their ellipsoid's image does, from where they were
+        predicted for a camera at rest (T, 4). Returns (T,): should a detection be expected?
         """
         live = self._live
         self._image_size = size = (camera.width, camera.height)
         self._view = view = camera.K @ cam_from_world  # (3, 4)
-        turn = np.eye(3)
-        if self._last_pose is not None:
-            rotation = cam_from_world[:, :3] @ self._last_pose[:, :3].T
-            turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for what is far
         self._last_pose = cam_from_world
-        predicted = live.mean[..., 0]
-        live.mean, live.cov = _warp_state(live.mean, live.cov, turn)
         now, before = self.places.project(view, size, self.config.place_in_view), self._place_boxes
         self._place_boxes = now
         known = _rows_of(self.places.known, live.identity, False)
