@@ -2225,8 +2225,8 @@ def _by_cell(values: npt.NDArray[Any], cells: int) -> npt.NDArray[Any]:
 class CropEmbedder(Embedder):
     """Foreground and background embeddings as in re-OBJ: two masked crops of every object.
 
-    The grown box is cut out twice, once with all but the object black and once with the object
-    black. A backbone turns each into a map (7 x 7 x C for 224 px), and a trained ConvBlock turns
+    The grown box is cut out twice, once with all but the object hidden and once with the object
+    hidden. A backbone turns each into a map (7 x 7 x C for 224 px), and a trained ConvBlock turns
     the two maps, one behind the other in the channels, into one embedding. Without a ConvBlock the
     maps are flattened: the thesis's "no-train". A model of `train_embedding.py` has its own head:
     its cells are pooled from the crops' maps as `Embedder` does from the frame's. This is the
@@ -2264,7 +2264,7 @@ class CropEmbedder(Embedder):
         if not len(rows):
             return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
         crops, on_object = self.cut(frame, detections, rows)
-        masked = np.concatenate([crops * on_object[..., None], crops * ~on_object[..., None]])
+        masked = self.masked(crops, on_object)
         if self.trained:
             return self._trained(masked, detections, rows, frame.shape[:2], on_object)
         fore, back = np.split(self.maps(masked), 2)  # (N, C, h, w) each
@@ -2288,6 +2288,22 @@ class CropEmbedder(Embedder):
         x = grid[:, 0, None, :].repeat(side, 1)  # (N, S, S)
         y = grid[:, 1, :, None].repeat(side, 2)
         return np.stack(crops), _on_object(detections, rows, x, y)
+
+    def masked(self, crops: Image, on_object: BoolArray) -> Image:
+        """Objects alone, then surroundings alone: (2N, S, S, 3) of crops (N, S, S, 3).
+
+        A pre-trained backbone gets a mean grey with a soft edge (sigma S / 28): a hard edge is the
+        strongest thing in the crop, and another mask of the same object would look different.
+        """
+        own = on_object[..., None]
+        if self.trained:
+            return np.concatenate([crops * own, crops * ~own])
+        edge = self.layout.crop_px / 28
+        soft = [cv2.GaussianBlur(o.astype(np.float32), (0, 0), edge) for o in on_object]
+        grey = np.array(IMAGENET_MEAN[::-1], np.float32)
+        fore = (crops - grey) * np.stack(soft)[..., None]
+        both = np.concatenate([grey + fore, crops - fore])
+        return np.asarray(both.round(), np.uint8)
 
     def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
         """Corners (N, 2) of the grown boxes, whole pixels; may lie beyond the frame."""

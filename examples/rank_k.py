@@ -431,7 +431,7 @@ class Crops(rt.CropEmbedder):
 
 
 class OneCrop(Crops):
-    """One crop of each object: "fg", "bg" (the other part black) or "full" (the grown crop as it
+    """One crop of each object: "fg", "bg" (the other part hidden) or "full" (the grown crop as it
     is), through the backbone and, if `head` names one, a ConvBlock of its own.
     """
 
@@ -444,8 +444,9 @@ class OneCrop(Crops):
     ) -> rt.Embeddings:
         rows = np.arange(len(detections)) if rows is None else rows
         crops, own = self.cut(frame, detections, rows)
-        shown = {"fg": own, "bg": ~own, "full": np.ones_like(own)}[self.part]
-        maps = self.maps(crops * shown[..., None])
+        if self.part != "full":
+            crops = np.split(self.masked(crops, own), 2)[PARTS.index(self.part)]
+        maps = self.maps(crops)
         found = flat(maps) if self.conv_block is None else self._joint(maps)
         return rt.Embeddings(found, np.empty((len(rows), 0)))
 

@@ -384,8 +384,9 @@ def augmented(
     flip: bool,
     wanted: IntArray,
     size_wh: tuple[int, int] = SIZE_WH,
+    masked: float = 0.5,
 ) -> tuple[Image, rt.Detections, IntArray]:
-    """Augment one frame (change None: leave it, for validation).
+    """Augment one frame (change None: leave it, for validation). masked: share that keeps masks.
 
     Returns a picture of this size, all boxes in it, and the rows (N,) of the wanted identities.
     """
@@ -405,7 +406,7 @@ def augmented(
     keep, boxes = jittered(rng, xyxy, 0.04 if augment else 0.0, size_wh)
     keep &= np.isin(clip.identity[frame], wanted)
     masks = None
-    if clip.labels is not None and (not augment or rng.random() < 0.5):
+    if clip.labels is not None and (not augment or rng.random() < masked):
         label = cv2.warpAffine(clip.labels[frame], pixel, size_wh, flags=cv2.INTER_NEAREST)
         masks = label[None] == (clip.identity[frame] + 1)[:, None, None]
     score = np.full(len(boxes), float(clip.sure))

@@ -88,7 +88,7 @@ class Frozen:
         """The inputs of the heads for the chosen rows (N,)."""
         if isinstance(self.embedder, rt.CropEmbedder):
             crops, own = self.embedder.cut(picture, found, rows)
-            three = np.concatenate([crops * own[..., None], crops * ~own[..., None], crops])
+            three = np.concatenate([self.embedder.masked(crops, own), crops])
             parts = np.split(self.embedder.maps(three), 3)
             return dict(zip(("fg", "bg", "full"), parts, strict=True))
         features, layout = self.embedder._features(picture), self.embedder.layout
@@ -97,7 +97,7 @@ class Frozen:
         return dict(zip(("fg", "bg"), cells, strict=True))
 
     def scene(self, source: Source, copy: int, parts: Sequence[str]) -> Seen:
-        """Some frames of a clip, cached; copy 0 as they are, others te.augmented."""
+        """Some frames of a clip, cached; copy 0 as they are, others augmented."""
         name, load = source
         path = self.cache / f"{self.name}_{name.replace('/', '_')}_{copy}.npz"
         if not path.exists():
@@ -106,13 +106,16 @@ class Frozen:
             return Seen({n: data[n] for n in parts}, data["identity"], data["look"], data["frame"])
 
     def keep(self, path: Path, clip: te.Clip, copy: int) -> None:
-        """Augment, look, write."""
+        """Augment, look, write. Odd copies have masks, even ones ellipses, as a video has."""
         rng = np.random.default_rng([copy, len(clip.images), sum(map(len, clip.identity))])
         tone, flip = (te.photo_tone(rng, 1.0) if copy else None), bool(copy and rng.random() < 0.5)
         everything, found_rows = np.unique(np.concatenate(clip.identity)), []
-        chosen = np.linspace(0, len(clip.images) - 1, min(self.args.seen, len(clip.images)))
-        for frame in chosen.round().astype(int):
-            picture, found, rows = te.augmented(clip, frame, rng, tone, flip, everything, FROZEN_WH)
+        count = min(self.args.seen, len(clip.images))
+        shift = rng.uniform(0, 1) if copy else 0.5
+        for frame in ((np.arange(count) + shift) * len(clip.images) / count).astype(int):
+            picture, found, rows = te.augmented(
+                clip, frame, rng, tone, flip, everything, FROZEN_WH, masked=copy % 2
+            )
             rows = rng.permutation(rows)[:24]
             if len(rows):
                 parts = {k: v.astype(np.float16) for k, v in self.see(picture, found, rows).items()}
@@ -130,7 +133,7 @@ class CellHead(nn.Module):
     """Cells (N, cells * (C + 2)) of grids of a frozen map to unit rows (N, te.WIDTH).
 
     As `PartHead`: a linear map of the training-free descriptor (square roots, part-empty cells
-    count less; starts as te.principal components) plus a perceptron; features are first narrowed.
+    count less; starts as principal components) plus a perceptron; features are first narrowed.
     """
 
     def __init__(self, grids: Sequence[int], channels: int, narrow: int = 32) -> None:
@@ -169,7 +172,7 @@ class CellHead(nn.Module):
         return F.normalize(self.project(plain.flatten(1)) + mixed, dim=1)
 
     def start(self, rows: Any) -> None:
-        """Begin with the te.principal components of features, then of cells side by side."""
+        """Begin with the principal components of features, then of cells side by side."""
         with torch.no_grad():
             wide, self.narrow = self.narrow, nn.Identity()
             te.principal(wide.weight, self.split(rows)[0].flatten(0, 1))
@@ -197,7 +200,7 @@ class ConvBlock(nn.Module):
         return F.normalize(deep + self.project(self.short(maps).flatten(1)), dim=1)
 
     def start(self, maps: Any) -> None:
-        """Begin with the te.principal components of features, then of places side by side."""
+        """Begin with the principal components of features, then of places side by side."""
         self.norm.running_mean[:] = maps.mean((0, 2, 3))
         self.norm.running_var[:] = maps.var((0, 2, 3))
         maps = self.norm(maps)
@@ -276,7 +279,7 @@ class HeadTrainer(te.Trainer):
         }
 
     def start(self) -> None:
-        """Start from the te.principal components of the training-free descriptors."""
+        """Start from the principal components of the training-free descriptors."""
         scenes = self.pool.draw(np.random.default_rng([self.args.seed, 10]))
         self.net.eval()
         with torch.no_grad():

@@ -229,6 +229,12 @@ def test_crops_hold_object_or_surroundings(tmp_path: Path) -> None:
     pixels, on_object = crops.cut(image, found, np.arange(1))
     assert on_object.mean() == pytest.approx(0.25, abs=0.01)  # grown by half on every side
     assert (pixels[on_object] == (0, 0, 200)).mean() > 0.97
+    (fore,), (back,) = np.split(crops.masked(pixels, on_object).astype(int), 2)  # (S, S, 3) each
+    grey = np.array(rt.IMAGENET_MEAN[::-1]).round()
+    assert (fore[:20, :20] == grey).all() and (back[102:122, 102:122] == grey).all()
+    np.testing.assert_allclose(fore + back, pixels[0] + grey, atol=2)  # also along the soft edge
+    plain = crops.masked(np.full_like(pixels, 220), on_object).astype(int)
+    assert 0 < np.abs(np.diff(plain, axis=2)).max() < 8  # of 100 grey values: no hard edge
     look = crops(image, found)
     assert look.foreground.shape == look.background.shape == (1, 4 * 49)
     assert look.foreground @ look.background.T < 0.9
