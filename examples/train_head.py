@@ -181,9 +181,13 @@ class CellHead(nn.Module):
 
 
 class ConvBlock(nn.Module):
-    """re-OBJ: maps (N, C, 7, 7) of one crop, or of two stacked, to one unit row."""
+    """re-OBJ: maps (N, C, 7, 7) of one crop to unit rows.
 
-    def __init__(self, channels: int, width: int = 192, inner: int = 80) -> None:
+    Two crops have one each, and their rows make one: stacked maps in a common block were worse by
+    3 points of Rank-1 on the validation rooms (docs/reidentification.md).
+    """
+
+    def __init__(self, channels: int, width: int, inner: int = 64) -> None:
         super().__init__()
         self.norm = nn.BatchNorm2d(channels, affine=False)
         self.squeeze = te.block(channels, inner, 1)
@@ -251,7 +255,7 @@ class SeenPool:
 
 
 class HeadTrainer(te.Trainer):
-    """Trains heads on what a frozen backbone shows: two of cells, or a ConvBlock of crops."""
+    """Trains heads on what a frozen backbone shows: of cells, or ConvBlocks of crops."""
 
     def __init__(self, args: argparse.Namespace, frozen: Frozen, names: Sequence[str]) -> None:
         self.frozen, self.names = frozen, names
@@ -263,7 +267,7 @@ class HeadTrainer(te.Trainer):
     def make_net(self) -> Any:
         shapes = [self.pool.rooms[0].parts[n].shape[1:] for n in self.names]
         if self.frozen.crops:
-            return ConvBlock(sum(shape[0] for shape in shapes))
+            return nn.ModuleList(ConvBlock(shape[0], 192 // len(shapes)) for shape in shapes)
         fore, *back = (FROZEN[f"{k}_cells"] for k in ("foreground", "background", "wide"))
         channels = shapes[0][0] // int(fore) ** 2 - 2
         return nn.ModuleList([CellHead([int(fore)], channels),
@@ -280,27 +284,23 @@ class HeadTrainer(te.Trainer):
 
     def start(self) -> None:
         """Start from the principal components of the training-free descriptors."""
-        scenes = self.pool.draw(np.random.default_rng([self.args.seed, 10]))
+        rng = np.random.default_rng([self.args.seed, 10])
+        scenes = [scene for _ in range(5) for scene in self.pool.draw(rng)]
         self.net.eval()
         with torch.no_grad():
-            parts = self.inputs(scenes)
-            heads = [self.net] if self.frozen.crops else self.net
-            for head, rows in zip(heads, parts, strict=True):
+            for head, rows in zip(self.net, self.inputs(scenes), strict=True):
                 head.start(rows)
         self.net.train()
 
     def inputs(self, scenes: Sequence[Seen]) -> list[Any]:
         """What each head takes of all objects of the scenes."""
-        parts = [torch.from_numpy(np.concatenate([s.parts[n] for s in scenes])).float()
-                 for n in self.names]  # fmt: skip
-        return [torch.cat(parts, 1)] if self.frozen.crops else parts
+        return [torch.from_numpy(np.concatenate([s.parts[n] for s in scenes])).float()
+                for n in self.names]  # fmt: skip
 
     def embed(self, scenes: Sequence[Seen]) -> list[Any]:
-        """Unit rows of each part (of a ConvBlock: one)."""
-        rows = [part.to(self.device) for part in self.inputs(scenes)]
-        if self.frozen.crops:
-            return [self.net(rows[0])]
-        return [head(part) for head, part in zip(self.net, rows, strict=True)]
+        """Unit rows of each part."""
+        parts = self.inputs(scenes)
+        return [head(part.to(self.device)) for head, part in zip(self.net, parts, strict=True)]
 
     def loss(self, scenes: Any, hard: bool) -> Any:
         parts = self.embed(scenes)
@@ -335,12 +335,14 @@ def export_head(trainer: HeadTrainer, out: Path) -> None:
     """Write OUT/[crops_]BACKBONE_head.onnx, large weights as float16."""
     import onnx
 
-    rows = tuple(part[:2] for part in trainer.inputs(trainer.pool.rooms[:1]))
-    net = trainer.net.cpu().eval()
-    crops = trainer.frozen.crops
+    fed = tuple(part[:2] for part in trainer.inputs(trainer.pool.rooms[:1]))
+    net, crops = trainer.net.cpu().eval(), trainer.frozen.crops
     path = out / f"{'crops_' if crops else ''}{Path(trainer.args.backbone).stem}_head.onnx"
-    fed, given = (["maps"], ["row"]) if crops else (["fg", "bg"], ["foreground", "background"])
-    te.to_onnx(net if crops else Both(net), rows, path, fed, given)
+    if crops:
+        whole = Heads(net, fed[0].shape[1])
+        te.to_onnx(whole, (torch.cat(fed, 1),), path, ["maps"], ["row"])
+    else:
+        te.to_onnx(Heads(net), fed, path, ["fg", "bg"], ["foreground", "background"])
     file = halved(onnx.load(path))
     facts = {"layout": trainer.frozen.layout, "trained": trainer.summary()}
     onnx.helper.set_model_props(file, {"reobj": json.dumps(facts)})
@@ -348,15 +350,19 @@ def export_head(trainer: HeadTrainer, out: Path) -> None:
     print(f"{path}: use it with --set embed.head={path}")
 
 
-class Both(nn.Module):
-    """Two heads in one graph."""
+class Heads(nn.Module):
+    """All heads in one graph, each with its own input; of crops: stacked maps (N, n * C, 7, 7) to
+    one unit row. channels: C of crops, else 0.
+    """
 
-    def __init__(self, heads: Any) -> None:
+    def __init__(self, heads: Any, channels: int = 0) -> None:
         super().__init__()
-        self.heads = heads
+        self.heads, self.channels = heads, channels
 
-    def forward(self, fg: Any, bg: Any) -> tuple[Any, Any]:
-        return self.heads[0](fg), self.heads[1](bg)
+    def forward(self, *parts: Any) -> Any:
+        fed = parts[0].split(self.channels, 1) if self.channels else parts
+        rows = tuple(head(part) for head, part in zip(self.heads, fed, strict=True))
+        return torch.cat(rows, 1) * len(rows) ** -0.5 if self.channels else rows
 
 
 def halved(model: Any) -> Any:
