@@ -73,13 +73,21 @@ EMBEDDER = digest(  # what the own look depends on
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """One video: detections of all frames, truth, and where its images are (None: no images)."""
+    """One video: detections of all frames, truth, and where its images are (None: no images);
+    of the images only every n-th counts.
+    """
 
     name: str
     group: str
     detections: list[rt.Detections]
     truth: rt.LabelledBoxes
     images: Path | None
+    every: int = 1
+
+    def video(self) -> rt.Video:
+        """The images that count."""
+        assert self.images is not None
+        return rt.Video(self.images, rt.InputConfig(every=self.every))
 
 
 # ---- Sequences ---------------------------------------------------------------------------------
@@ -134,6 +142,16 @@ def room_sequence(folder: Path) -> Sequence:
     return Sequence(folder.name, "rooms", found, truth, folder / "room.mp4")
 
 
+def thinned(seq: Sequence, every: int) -> Sequence:
+    """Only every n-th frame: wide steps."""
+    if every == 1:
+        return seq
+    truth = seq.truth[(seq.truth.frame - 1) % every == 0]
+    truth = replace(truth, frame=(truth.frame - 1) // every + 1)
+    name, group = (f"{x}, every {every}th frame" for x in (seq.name, seq.group))
+    return Sequence(name, group, seq.detections[::every], truth, seq.images, every)
+
+
 # ---- Appearance --------------------------------------------------------------------------------
 
 
@@ -173,11 +191,10 @@ def own_look(image: rt.Image, found: rt.Detections, embedder: rt.Embedder) -> Ar
 
 def embed_all(seq: Sequence, net: Any) -> tuple[list[Array], float]:
     """Embeddings of every frame's detections, and CPU seconds."""
-    assert seq.images is not None
     looks, seconds = [], 0.0
-    for frame in rt.Video(seq.images):
+    for frame, found in zip(seq.video(), seq.detections, strict=True):
         started = time.process_time()
-        looks.append(net(frame.image, seq.detections[frame.index]))
+        looks.append(net(frame.image, found))
         seconds += time.process_time() - started
     width = max((x.shape[1] for x in looks if x.ndim == 2), default=0)
     return [x if len(x) else np.empty((0, width)) for x in looks], seconds
@@ -218,7 +235,7 @@ def ours(
     embedder = rt.Embedder() if seq.images is not None and looks is None else None
     tracker = rt.Tracker(config, embedder)
     identity, seconds = [], 0.0
-    frames = iter(rt.Video(seq.images)) if seq.images is not None else None
+    frames = iter(seq.video()) if seq.images is not None else None
     for f, found in enumerate(seq.detections):
         image = None if frames is None else next(frames).image
         started = time.process_time()
@@ -234,13 +251,18 @@ def whole_chain(seq: Sequence, out: Path, poses: str) -> Run:
     """`run`, identities decided over the whole video; seconds of tracking and linking, no poses."""
     assert seq.images is not None
     at = iter(seq.detections)
-    config = rt.Config(poses=rt.PosesConfig(mode=poses), output=rt.OutputConfig(overlay=False))
+    config = rt.Config(
+        input=rt.InputConfig(every=seq.every),
+        poses=rt.PosesConfig(mode=poses),
+        output=rt.OutputConfig(overlay=False),
+    )
     result = rt.run(
         seq.images, out / seq.name, config, detections=lambda image: next(at), overwrite=True
     )
     first = np.cumsum([0, *(len(d) for d in seq.detections)])
     identity = np.zeros(first[-1], np.int64)
-    identity[first[result.table.frame] + result.table.detection_index] = result.table.object_id
+    row = first[result.table.frame // seq.every] + result.table.detection_index
+    identity[row] = result.table.object_id
     return identity, result.seconds["track"] + result.seconds["objects"]
 
 
@@ -253,7 +275,9 @@ def result_boxes(
     ids, row = np.unique(identity[kept], return_inverse=True)
     votes = np.zeros((len(ids), len(rt.COCO_NAMES)), np.float32)
     np.add.at(votes, (row, stream.class_id[kept]), stream.score[kept])
-    names = "" if seq.group == "pedestrians" else np.array(rt.COCO_NAMES)[votes.argmax(1)][row]
+    names = (
+        "" if seq.group.startswith("pedestrians") else np.array(rt.COCO_NAMES)[votes.argmax(1)][row]
+    )
     xyxy = stream.xyxy[kept]
     rows = np.c_[stream.frame[kept] + 1, identity[kept], xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
     return rt.labelled(rows, names)
@@ -282,7 +306,7 @@ def networks(seq: Sequence) -> dict[str, Any]:
     """Appearance by name for a sequence: (image, detections) -> rows."""
     if seq.images is None:
         return {}
-    person = seq.group == "pedestrians"
+    person = seq.group.startswith("pedestrians")
     file = "osnet_x0_25_msmt17.onnx" if person else "mobilenetv2_feat.onnx"
     path = Path(os.environ.get("REOBJ_MODELS", "models")) / file
     own = functools.partial(own_look, embedder=rt.Embedder())
@@ -324,7 +348,7 @@ def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], Run]]]:
         if peer.startswith("rf-") or (peer in deepsorts and not nets):
             label = f"{peer}, no look" if peer in deepsorts else peer
             result[label] = (str(TUNED), part(peer_run, peer, seq, args.peers, None))
-    if seq.images is not None and seq.group == "rooms":
+    if seq.images is not None and seq.group.startswith("rooms"):
         chain = args.out / "chain"
         result["ours, whole video, no poses"] = (source, part(whole_chain, seq, chain, "none"))
         result["ours, whole chain"] = (source, part(whole_chain, seq, chain, "auto"))
@@ -501,6 +525,7 @@ def main() -> int:
     parser.add_argument("--render", default="", metavar="SEEDS", help="more rooms: 1,2,v900")
     parser.add_argument("--kitchen", type=Path, nargs="*", default=[], help="recordings")
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
+    parser.add_argument("--every", type=int, default=1, help="use every n-th frame: wide steps")
     parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args()
@@ -508,6 +533,7 @@ def main() -> int:
     rooms = [*args.rooms, *rendered(args.render, args.out / "rooms")]
     seqs = [room_sequence(p) for p in rooms] + [kitchen_sequence(p) for p in args.kitchen]
     seqs += mot_sequences(args.mot) if args.mot else []
+    seqs = [thinned(seq, args.every) for seq in seqs]
     found = {s.name: variants(s, args) for s in seqs}
     rows = report(found, seqs)
     with rt.atomic(args.out / "compare.csv") as part, part.open("w", newline="") as file:
