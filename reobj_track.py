@@ -2018,23 +2018,44 @@ class CameraMotion:
         return np.asarray(np.median(self.flow[near, 2:], 1))
 
     def _flow(self, gray: Image) -> Array:
-        """Fit the similarity small_new_from_small_old (3, 3). Where it holds for most corners, the
-        others move by themselves; where not, the scene is deep, and `flow` says how they move.
+        """Fit the similarity small_new_from_small_old (3, 3): to the corners followed, or, where
+        the step was too wide for that, to points that look alike.
         """
         assert self._gray is not None and self._corners is not None
         guess = np.empty_like(self._corners)
         moved, ok, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, self._corners, guess)
         good = ok.ravel() == 1
-        result = np.eye(3)
-        if good.sum() >= self.config.flow_min_corners:
-            old, new = self._corners[good, 0], moved[good, 0]  # (K, 2) each
-            cv2.setRNGSeed(0)
-            affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=2.0)
-            if affine is not None and inliers.sum() >= self.config.flow_min_corners:
-                result[:2] = affine
-                if inliers.mean() < 0.5:
-                    self.flow = np.c_[old, new - old @ affine[:, :2].T - affine[:, 2]]
-        return result
+        found = self._similarity(self._corners[good, 0], moved[good, 0])
+        if found is None:
+            found = self._similarity(*_alike_points(self._gray, gray))
+        return np.eye(3) if found is None else found
+
+    def _similarity(self, old: Floats, new: Floats) -> Array | None:
+        """Fit (3, 3) to points (K, 2), None: too few agree. Where it holds for most of them, the
+        others move by themselves; where not, the scene is deep, and `flow` says how they move.
+        """
+        if len(old) < self.config.flow_min_corners:
+            return None
+        cv2.setRNGSeed(0)
+        affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=2.0)
+        if affine is None or inliers.sum() < self.config.flow_min_corners:
+            return None
+        if inliers.mean() < 0.5:
+            self.flow = np.c_[old, new - old @ affine[:, :2].T - affine[:, 2]]
+        return np.vstack([affine, [0, 0, 1]])
+
+
+def _alike_points(old: Image, new: Image) -> tuple[Floats, Floats]:
+    """Points (K, 2) of two gray images that look alike, wherever they are (ORB)."""
+    orb = cv2.ORB.create(300, fastThreshold=7)
+    (a, look_a), (b, look_b) = (orb.detectAndCompute(image, None) for image in (old, new))
+    if look_a is None or look_b is None:
+        return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(look_a, look_b)
+    index = np.array([(m.queryIdx, m.trainIdx) for m in pairs], np.int64).reshape(-1, 2)
+    points = (np.array(cv2.KeyPoint.convert(found), np.float32) for found in (a, b))
+    at_old, at_new = (xy[rows] for xy, rows in zip(points, index.T, strict=True))
+    return at_old, at_new
 
 
 def _warp_state(mean: Array, cov: Array, new_from_old: Array) -> tuple[Array, Array]:

@@ -145,6 +145,16 @@ def test_camera_motion_survives_a_textureless_frame() -> None:
     np.testing.assert_array_equal(motion(blank), np.eye(3))
 
 
+def test_camera_motion_of_a_step_over_half_the_image() -> None:
+    """Too far for optical flow: 300 by 150 px."""
+    noise = np.random.default_rng(8).integers(0, 256, (720, 960, 3), dtype=np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 3)
+    motion = rt.CameraMotion(rt.TrackerConfig())
+    motion(image[:480, :640])
+    new_from_old = motion(image[150:630, 300:940])
+    np.testing.assert_allclose((new_from_old @ [400, 300, 1])[:2], [100, 150], atol=3)
+
+
 def test_identity_survives_a_jerk_of_the_camera() -> None:
     """The view jumps by 100 px: without motion compensation the gate loses the object."""
     image = textured(np.random.default_rng(2))
