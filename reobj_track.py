@@ -237,6 +237,9 @@ class EmbedConfig:
     foreground_channels: int = _opt(
         0, "the foreground reads only so many channels of the map, the first ones (0: all)"
     )
+    neighbours: float = _opt(
+        0.2, "trained: share of the objects around in the background part (0: none)"
+    )
     crop_px: int = _opt(224, "side of the crops of --embed crops")
     head: str = _opt(
         "", "trained head (.onnx) of a backbone; empty: the one that comes along; none: no training"
@@ -2158,12 +2161,39 @@ class Embedder:
         rows: IntArray,
     ) -> Embeddings:
         """Embed the chosen rows from a (h, w, C) feature map of a frame of this size."""
-        parts = part_samples(detections, rows, size_hw, features.shape[:2], self.layout)
+        if not len(rows):
+            return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
+        sure = detections.score >= self.layout.object_score
+        share = self.layout.neighbours if self.trained else 0.0
+        seen = np.union1d(rows, np.flatnonzero(sure)) if share else rows
+        parts = part_samples(detections, rows, size_hw, features.shape[:2], self.layout, seen)
         means = cell_means(features, parts, self.layout)
         if self._net is not None and self._net.head is not None:
-            return self._net.embed(parts, means)
+            fore, back = self._net.embed(parts, means)
+            if share:
+                own = np.searchsorted(seen, rows)
+                around = look_around(detections.xyxy[seen], fore, sure[seen])[own]
+                back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
+                fore, back = fore[own], _unit_rows(back)
+            return Embeddings(fore, back)
         foreground, *background = map(_unit_histogram, means, (part.share for part in parts))
         return Embeddings(foreground, _unit_rows(np.concatenate(background, 1)))
+
+
+def look_around(xyxy: Array, foreground: npt.NDArray[Any], sure: BoolArray) -> Array:
+    """What stands around each object of a frame: unit rows (D, E), 0 where nothing does.
+
+    The sum of the looks of the others, each weighted by exp(-distance / own size). Seen from behind
+    an object has another background, but the same neighbours.
+
+    Args:
+        xyxy: (D, 4). foreground: (D, E). sure: (D,) which of them count as neighbours.
+    """
+    box = _cxcywh_from_xyxy(xyxy)
+    distance = np.linalg.norm(box[:, None, :2] - box[:, :2], axis=-1)  # (D, D)
+    size = np.sqrt(box[:, 2:].clip(1.0).prod(1))
+    weight = np.exp(-distance / size[:, None]) * (sure & ~np.eye(len(box), dtype=bool))
+    return _unit_rows(weight @ foreground)
 
 
 @dataclass(frozen=True, slots=True)
@@ -2189,14 +2219,15 @@ def part_samples(
     size_hw: tuple[int, ...],
     shape: tuple[int, int],
     layout: EmbedConfig,
+    seen: IntArray | None = None,
 ) -> list[PartSamples]:
     """Sample boxes (foreground), grown boxes (background, no other object) and, if the layout has
     them, wider boxes (everything but the object) of the chosen rows (N,).
 
     Args:
         detections: of one frame of size_hw. shape: (h, w) of the feature map of that frame.
+        seen: (M,) rows of the foreground; default those of the background.
     """
-    box = _cxcywh_from_xyxy(detections.xyxy[rows])[..., None]  # (N, 4, 1)
     grow = [(0.0, 0.0, layout.foreground_cells)]
     grow += [(layout.context, layout.reach, layout.background_cells)]
     grow += [(layout.wide, layout.wide_reach, layout.wide_cells)] * (layout.wide > 0)
@@ -2204,6 +2235,8 @@ def part_samples(
     size, cells_wh = (np.array(v[1::-1])[:, None] for v in (size_hw, shape))  # (2, 1) x, y
     parts: list[PartSamples] = []
     for share_of_box, share_of_image, cells in grow:
+        chosen = rows if parts or seen is None else seen
+        box = _cxcywh_from_xyxy(detections.xyxy[chosen])[..., None]  # (N, 4, 1)
         least = share_of_image * max(size_hw[:2])
         half = box[:, 2:] / 2 + np.maximum(box[:, 2:] * share_of_box, least)  # (N, 2, 1)
         side = cells * layout.samples
@@ -2212,7 +2245,7 @@ def part_samples(
         cell = np.minimum((at / size * cells_wh).astype(int).clip(0), cells_wh - 1)
         inside = within[:, 0, None] & within[:, 1, :, None]  # (N, S, S)
         index = cell[:, 1, :, None] * shape[1] + cell[:, 0, None]
-        own = _on_object(detections, rows, at[:, 0, None], at[:, 1, :, None]) & inside
+        own = _on_object(detections, chosen, at[:, 0, None], at[:, 1, :, None]) & inside
         free = inside & ~own
         others = objects.take(index) & free
         weight = (own, free & ~others, free)[len(parts)]
@@ -2558,20 +2591,18 @@ class _Backbone:
     def _run(self, images: npt.NDArray[Any]) -> Floats:
         return np.asarray(self.session.run([self.output], {self.input: images})[0], np.float32)
 
-    def embed(self, parts: Sequence[PartSamples], means: Sequence[Floats]) -> Embeddings:
-        """Both parts' cells through the head, all objects at once."""
-        if not len(means[0]):
-            return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
+    def embed(self, parts: Sequence[PartSamples], means: Sequence[Floats]) -> tuple[Array, Array]:
+        """Both parts' cells through the head, all objects at once: unit rows (M, E1), (N, E2)."""
         fed = head_inputs(parts, means)
         foreground, background = self.head.run(None, dict(zip(("fg", "bg"), fed, strict=True)))
-        return Embeddings(np.asarray(foreground, np.float64), np.asarray(background, np.float64))
+        return np.asarray(foreground, np.float64), np.asarray(background, np.float64)
 
 
 def head_inputs(parts: Sequence[PartSamples], means: Sequence[Floats]) -> tuple[Floats, Floats]:
     """What a head sees of each cell: mean feature, share that counts, share on other objects.
 
-    Returns (N, cells * cells * (C + 2)) for the foreground and for the background, where the
-    grown box's cells come before the wider box's.
+    Returns (M, cells * cells * (C + 2)) for the foreground and (N, ...) for the background, where
+    the grown box's cells come before the wider box's.
     """
     rows = [
         np.concatenate([mean, part.share[..., None], part.others[..., None]], -1)

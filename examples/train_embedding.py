@@ -1114,12 +1114,15 @@ def export(net: Net, out: Path, summary: dict[str, Any]) -> None:
 def to_onnx(
     net: nn.Module, fed: Any, path: Path, inputs: list[str], outputs: list[str], sizes: Any = None
 ) -> None:
-    """Write a network as ONNX; sizes: names of the axes that may vary (default: the first)."""
+    """Write a network as ONNX; sizes: names of the axes that may vary (default: the first, one
+    name for each input and its output).
+    """
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     warnings.filterwarnings("ignore", message=".*(legacy|Constant folding|removed).*")
     torch.onnx.export(
         net, fed, str(path), input_names=inputs, output_names=outputs, dynamo=False,
-        dynamic_axes=dict.fromkeys([*inputs, *outputs], sizes or {0: "n"}), opset_version=17,
+        dynamic_axes={name: sizes or {0: f"n{k % len(inputs)}"}
+                      for k, name in enumerate([*inputs, *outputs])}, opset_version=17,
     )  # fmt: skip
 
 

@@ -122,7 +122,7 @@ def test_own_weights_tell_twins_apart_and_know_an_object_again() -> None:
     embedder, looks = rt.Embedder("reobj", threads=1), []
     for picture, found in ((image, detections), (moved.clip(0, 255).astype(np.uint8), later)):
         look = embedder(picture, found)
-        assert look.foreground.shape == look.background.shape == (2, 128)
+        assert look.foreground.shape == (2, 128) and look.background.shape == (2, 256)
         np.testing.assert_allclose(np.linalg.norm(look.foreground, axis=1), 1, atol=1e-5)
         looks.append(np.concatenate([look.foreground, look.background], 1))
     cosine = looks[0] @ looks[1].T / 2  # rows: before, columns: after
@@ -146,11 +146,45 @@ def test_own_foreground_sees_no_context() -> None:
     assert (one.background * two.background).sum() < 0.95
 
 
+def test_what_stands_around_is_the_look_of_near_neighbours() -> None:
+    """The near one of two others counts more, unsure ones and oneself do not; alone: nothing."""
+    xyxy = np.array([(0, 0, 40, 40), (50, 0, 90, 40), (300, 0, 340, 40), (0, 0, 40, 40)], float)
+    sure, look = np.array([True, True, True, False]), np.eye(4)
+    around = rt.look_around(xyxy, look, sure)
+    np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1)
+    assert around[0, 1] > 0.99 > around[2, 1] > around[2, 0] > 0 and not around[:, 3].any()
+    assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # the unsure one has some
+    np.testing.assert_allclose(around, rt.look_around(3 * xyxy + 7, look, sure))
+    assert not rt.look_around(xyxy[:1], look[:1], sure[:1]).any()
+    assert rt.look_around(xyxy[:0], look[:0], sure[:0]).shape == (0, 4)
+
+
+def test_neighbours_tell_places_apart_that_look_the_same() -> None:
+    """Twins on a plain wall; a red and a green thing stand near, but out of their background."""
+    image, grey = np.full((480, 640, 3), 160, np.uint8), (40, 40, 40)
+    things = {20: grey, 440: grey, 200: (0, 0, 220), 620: (0, 220, 0)}
+    for x, colour in things.items():
+        image[220:260, x - 20 : x + 20] = colour
+    found = boxes(*[(x - 20, 220, x + 20, 260) for x in things])
+    plain, told = (
+        rt.Embedder("reobj", rt.EmbedConfig(neighbours=share), threads=1)(image, found).background
+        for share in (0.0, 0.2)
+    )
+    assert (plain.shape[1], told.shape[1]) == (128, 256)
+    np.testing.assert_allclose(np.linalg.norm(told, axis=1), 1, atol=1e-5)
+    assert told[0] @ told[1] < plain[0] @ plain[1] - 0.02
+    alone = rt.Embedder("reobj", threads=1)(image, found[:1]).background
+    assert not alone[:, 128:].any() and np.linalg.norm(alone) == pytest.approx(1, abs=1e-5)
+
+
 def test_own_weights_embed_some_rows_as_all_rows() -> None:
     image, detections = scene_with_twins()
     embedder = rt.Embedder("reobj", threads=1)
     whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
     np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-5)
+    np.testing.assert_allclose(whole.background[1:], part.background, atol=1e-5)
+    turned = embedder(image, detections, np.array([1, 0]))
+    np.testing.assert_allclose(whole.background[::-1], turned.background, atol=1e-5)
     assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
 
 
@@ -229,7 +263,9 @@ def test_exported_model_equals_the_trained_network(te, trained) -> None:
     masks = clip.labels[frame][None] == (clip.identity[frame] + 1)[:, None, None]
     n = len(masks)
     detections = rt.Detections(clip.xyxy[frame], np.ones(n), np.zeros(n, np.int64), masks)
-    found = rt.Embedder(str(trained / "reobj.onnx"), threads=1)(view.picture, detections)
+    found = rt.Embedder(str(trained / "reobj.onnx"), rt.EmbedConfig(neighbours=0), threads=1)(
+        view.picture, detections
+    )
     assert n == len(view.identity) >= 3
     for mine, theirs in zip((found.foreground, found.background), expected, strict=True):
         np.testing.assert_allclose(mine, theirs.numpy(), atol=2e-4)
@@ -328,7 +364,8 @@ def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, cro
     (out / name).replace(tmp_path / name)
     image, detections = scene_with_twins()
     kind = rt.CropEmbedder if crops else rt.Embedder
-    look = kind(str(tmp_path / "net.onnx"), threads=1)(image, detections)
+    alone = rt.EmbedConfig(neighbours=0)
+    look = kind(str(tmp_path / "net.onnx"), alone, threads=1)(image, detections)
     plain = rt.EmbedConfig(head="none")
     frozen = kind(str(tmp_path / "net.onnx"), plain, threads=1)(image, detections)
     assert look.foreground.shape != frozen.foreground.shape  # "none": no training
