@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Show the worst identity errors of a run beside the truth, each with its likely cause.
+"""Show the worst identity errors of runs beside the truth, each with its likely cause.
 
-    python examples/failure_gallery.py OUT --gt gt.txt -o gallery.png [--classes chair,cup]
+    python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg [--classes chair,cup]
 
 An error is a true object that carries, for some frames, an identity that does not stand for it
 (`rt.identity_map`): either a second identity of its own (split), or the identity of another object
@@ -189,50 +189,53 @@ def put(image: rt.Image, text: str, at: tuple[int, int], bgr: tuple[int, int, in
     cv2.putText(image, text, at, font, 0.38, bgr, 1, cv2.LINE_AA)
 
 
-def montage(case: Case, errors: list[Error], video: rt.Video) -> tuple[rt.Image, list[str]]:
-    """One row of stills for each error, and the lines of the table."""
-    plans = [panels(case, e) for e in errors]
-    wanted = {f for plan in plans for f, _, _ in plan}
+def strip(name: str, case: Case, error: Error, video: rt.Video) -> tuple[rt.Image, str]:
+    """A row of stills, and the line of the table; name: of the run."""
+    plan = panels(case, error)
+    wanted = {f for f, _, _ in plan}
     images = {f.index + 1: f.image for f in video if f.index + 1 in wanted}
-    rows, lines = [], []
-    for error, plan in zip(errors, plans, strict=True):
-        stills = [still(case, images[f], f, true, text) for f, true, text in plan if f in images]
-        height, width = images[plan[0][0]].shape[:2]
-        why = causes(case, error, (width, height))
-        lines.append(f"| {title(case, error)} | {why} |")
-        blank = np.full_like(stills[0], 40)
-        strip = np.hstack([*stills, *[blank] * (3 - len(stills))])
-        caption = np.full((CAPTION_PX, strip.shape[1], 3), 40, np.uint8)
-        put(caption, f"{title(case, error)}: {why}", (4, 15), (255, 255, 255))
-        rows += [caption, strip]
-    return np.vstack(rows), lines
+    stills = [still(case, images[f], f, true, text) for f, true, text in plan if f in images]
+    height, width = images[plan[0][0]].shape[:2]
+    why = causes(case, error, (width, height))
+    blank = np.full_like(stills[0], 40)
+    row = np.hstack([*stills, *[blank] * (3 - len(stills))])
+    caption = np.full((CAPTION_PX, row.shape[1], 3), 40, np.uint8)
+    put(caption, f"{name}, {title(case, error)}: {why}", (4, 15), (255, 255, 255))
+    return np.vstack([caption, row]), f"| {name} | {title(case, error)} | {why} |"
 
 
 def main() -> int:
-    """Write the montage and print the table."""
+    """Write the picture and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("out", type=Path, metavar="OUT", help="output folder of run or track")
-    parser.add_argument("--gt", type=Path, required=True, help="MOTChallenge truth")
+    parser.add_argument("out", type=Path, nargs="+", help="output folders of run or track")
+    parser.add_argument("--gt", type=Path, nargs="+", required=True, help="their truths (MOT)")
     parser.add_argument("-o", "--image", type=Path, required=True, help="picture to write")
     parser.add_argument("--classes", default="", help="only these")
     parser.add_argument("--limit", type=int, default=8, help="errors shown")
     args = parser.parse_args()
+    classes, found = [c for c in args.classes.split(",") if c], []
     try:
-        case = read_case(args.out, args.gt, [c for c in args.classes.split(",") if c])
-        errors = find_errors(case)[: args.limit]
-        if not errors:
-            print("no identity errors")
-            return 0
-        source = json.loads((args.out / "cache" / "source.json").read_text())
-        video = rt.Video(source["source"], rt.InputConfig(**source["input"]))
-        picture, lines = montage(case, errors, video)
-    except rt.ReobjError as error:
+        for out, gt in zip(args.out, args.gt, strict=True):
+            case = read_case(out, gt, classes)
+            source = json.loads((out / "cache" / "source.json").read_text())
+            video = rt.Video(source["source"], rt.InputConfig(**source["input"]))
+            found += [(out.name, case, error, video) for error in find_errors(case)]
+        found.sort(key=lambda item: -len(item[2].pairs))
+        strips = [strip(*item) for item in found[: args.limit]]
+    except (rt.ReobjError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    cv2.imwrite(str(args.image), picture)
-    print("\n".join(["| error | cause |", "|---|---|", *lines]))
+    if not strips:
+        print("no identity errors")
+        return 0
+    width = max(picture.shape[1] for picture, _ in strips)
+    wide = [
+        cv2.copyMakeBorder(p, 0, 0, 0, width - p.shape[1], cv2.BORDER_CONSTANT) for p, _ in strips
+    ]
+    cv2.imwrite(str(args.image), np.vstack(wide), [cv2.IMWRITE_JPEG_QUALITY, 75])
+    print("\n".join(["| video | error | cause |", "|---|---|---|", *(line for _, line in strips)]))
     return 0
 
 
