@@ -311,6 +311,9 @@ class TrackerConfig:
     return_odds: float = _opt(
         1.8, "odds beforehand that a newcomer is a certain known object and not a new one"
     )
+    jump_odds: float = _opt(
+        2.0, "log odds against a return far from where the object's own track still coasts"
+    )
     prior_weight: float = _opt(
         10.0, "pairs that the usual looks of one and of two objects are worth (SameObject)"
     )
@@ -3572,11 +3575,26 @@ class Tracker:
             iou[:, ~_rows_of(self.places.known, identity, False)] = np.nan
         return iou
 
+    def _jumps(self, ready: IntArray, identity: IntArray) -> BoolArray:
+        """(n, I): does the identity's own track still coast, and is it predicted far from the
+        newcomer (three times the gate)? With poses the places in 3D tell.
+        """
+        live, config = self._live, self.config
+        row = np.full(len(self.last_seen), -1)
+        coasting = np.flatnonzero((live.identity >= 0) & (live.missed > 0))
+        row[live.identity[coasting]] = coasting
+        row = row[identity]  # (I,)
+        var = live.cov[row, :2, 0] + (config.std_measure * _noise_scale(live.mean[row])[:, :2]) ** 2
+        offset = live.mean[ready, None, :2, 0] - live.mean[row, :2, 0]  # (n, I, 2)
+        far = (offset**2 / var).sum(-1) > 9 * config.gate_chi2
+        return np.asarray(far & (row >= 0) & (self._view is None), bool)
+
     def _returns(self, ready: IntArray) -> IntArray:
         """Recognise known identities in newly confirmed tracks: look and place, where known, must
         make it probable, also in view of the other candidates.
 
-        Never gated by overlap, aspect ratio or pixel distance: the camera may return from anywhere.
+        Never gated by overlap, aspect ratio or pixel distance: the camera may return from anywhere;
+        but a track that still coasts says where its object should be.
         An identity that was seen while the newcomer was already in view is another object, and so
         is one whose place in 3D is not here. Things that move have no place: no ellipsoid fits.
         """
@@ -3590,6 +3608,7 @@ class Tracker:
         logit = self.same.logit(*self.gallery.parts(live.look[ready], identity, self._sight(ready)))
         logit[home & np.isinf(logit)] = 0  # no look: the place decides
         logit += np.where(home, config.iou_odds * iou - config.look_odds, 0)
+        logit -= config.jump_odds * self._jumps(ready, identity)
         possible = self.last_seen[identity] < live.first[ready][:, None]
         possible &= self.identity_class[identity] == live.votes[ready].argmax(1)[:, None]
         logit[~possible | (iou == 0)] = -np.inf

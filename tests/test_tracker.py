@@ -335,6 +335,22 @@ def test_objects_that_return_elsewhere_get_their_identity_back() -> None:
     assert away_and_back(rt.Tracker(), looks, back) == [4, 3, 2, 1]
 
 
+@pytest.mark.parametrize(("gone", "expected"), [(3, 2), (100, 1)])
+def test_a_newcomer_is_not_who_should_be_elsewhere(gone: int, expected: int) -> None:
+    """It looks rather like an object that was seen far off a moment ago, or long ago."""
+    rng = np.random.default_rng(4)
+    look = unit(rng, 1)
+    alike = look + 0.09 * rng.normal(size=look.shape)
+    tracker = rt.Tracker()
+    for _ in range(12):
+        tracker.update(rows((0, 0, 50, 50)), embeddings=look)
+    for _ in range(gone):
+        tracker.update(rt.Detections.empty())
+    for _ in range(4):
+        tracks = tracker.update(rows((600, 400, 650, 450)), embeddings=alike)
+    assert tracks.track_id.tolist() == [expected]
+
+
 def test_a_newcomer_does_not_steal_an_identity() -> None:
     rng = np.random.default_rng(5)
     assert away_and_back(rt.Tracker(), unit(rng, 3), unit(rng, 3)) == [4, 5, 6]
