@@ -109,30 +109,38 @@ class Clip:
         return np.asarray(seen @ seen.T, np.float32)
 
 
-def room_config(seed: int, frames: int = 40) -> rr.RoomConfig:
-    """One training room: small pictures, coarse light, its own lens and eye height."""
+def room_config(seed: int, frames: int = 40, fine: bool = False) -> rr.RoomConfig:
+    """One training room: small pictures (fine: of twice the width), coarse light, its own lens and
+    eye height.
+    """
     rng = np.random.default_rng([seed, 8])
     lens, eye = float(rng.uniform(52, 76)), float(rng.uniform(1.15, 1.75))
-    return rr.RoomConfig(seed=seed, frames=frames, width=SIZE_WH[0], height=SIZE_WH[1],
-                         texels_per_m=200.0, light_rays=4, shutter=0.0, noise=0.0, exposure=0.1,
+    return rr.RoomConfig(seed=seed, frames=frames, width=SIZE_WH[0] * (1 + fine),
+                         height=SIZE_WH[1] * (1 + fine), texels_per_m=300.0 if fine else 200.0,
+                         light_rays=4, shutter=0.1 * fine, noise=0.0, exposure=0.1,
                          plan="varied", path="tour", hfov_deg=lens, eye_m=eye)  # fmt: skip
 
 
-def room_clip(seed: int, cache: Path, frames: int = 40) -> Clip:
+def room_clip(seed: int, cache: Path, frames: int = 40, fine: bool = False) -> Clip:
     """Render a room, or read it from the cache."""
-    path = cache / f"room_{seed}.npz"
+    path = room_path(seed, cache, fine)
     if not path.exists():
-        render_to(path, room_config(seed, frames))
+        render_to(path, room_config(seed, frames, fine))
     data = np.load(path)
     boxes, visibility, labels = data["xyxy"], data["visibility"], data["instance"]
     sides = (boxes[..., 2:] - boxes[..., :2]).min(2)  # (F, O), NaN where not in view
     seen = (visibility > 0.3) & (np.nan_to_num(sides) >= 7)
     rows = [np.flatnonzero(row) for row in seen]
     return Clip(
-        f"room {seed}", list(data["image"]), [label + np.uint8(1) for label in labels],
+        path.stem.replace("_", " "), list(data["image"]), [label + np.uint8(1) for label in labels],
         [box[row].astype(float) for box, row in zip(boxes, rows, strict=True)],
         rows, [data["look"][row] for row in rows], True,
     )  # fmt: skip
+
+
+def room_path(seed: int, cache: Path, fine: bool = False) -> Path:
+    """Where a rendered room is kept."""
+    return cache / f"{'fine' if fine else 'room'}_{seed}.npz"
 
 
 def render_to(path: Path, config: rr.RoomConfig) -> None:
@@ -868,7 +876,7 @@ class Pool:
     def fill(self) -> None:
         """Take in rooms: those of the cache, or render one if there is nothing at all yet."""
         for seed in list(self.waiting):
-            there = (self.args.cache / f"room_{seed}.npz").exists()
+            there = room_path(seed, self.args.cache).exists()
             if there or not self.args.no_render:
                 clip = room_clip(seed, self.args.cache, self.args.frames)
                 self.rooms.append((clip, clip.shared()))

@@ -215,17 +215,18 @@ class ConvBlock(nn.Module):
         nn.init.zeros_(self.out.bias)
 
 
-def room_sources(args: argparse.Namespace, rooms: str) -> list[Source]:
-    """Rooms A:B, those of the cache if no others shall be rendered."""
-    load = functools.partial(te.room_clip, cache=args.cache, frames=args.frames)
-    seeds = te.parse_range(rooms) if rooms else ()
-    there = [s for s in seeds if not args.no_render or (args.cache / f"room_{s}.npz").exists()]
-    return [(f"room {seed}", functools.partial(load, seed)) for seed in there]
+def room_sources(args: argparse.Namespace, rooms: str, fine: bool = False) -> list[Source]:
+    """Rooms A:B, those of the cache if no others shall be rendered. fine: half as many views."""
+    frames = args.frames // 2 if fine else args.frames
+    load = functools.partial(te.room_clip, cache=args.cache, frames=frames, fine=fine)
+    paths = {s: te.room_path(s, args.cache, fine) for s in te.parse_range(rooms or "0:0")}
+    return [(path.stem.replace("_", " "), functools.partial(load, seed))
+            for seed, path in paths.items() if not args.no_render or path.exists()]  # fmt: skip
 
 
 def sources(args: argparse.Namespace) -> list[Source]:
     """Names of all training clips, and how to read them."""
-    found = room_sources(args, args.rooms)
+    found = room_sources(args, args.rooms) + room_sources(args, args.fine_rooms, True)
     for kind, given in ((te.sparse_clip, args.sparse), (te.tracks_clip, args.tracks)):
         found += [(f"{a.parent.name}/{a.name}", functools.partial(kind, a, b)) for a, b in given]
     return found + [(folder.name, functools.partial(te.scannet_clip, folder))
@@ -389,6 +390,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = te.common_options(__doc__)
     add: Callable[..., Any] = parser.add_argument
     add("--backbone", required=True, help="name or ONNX file of the frozen backbone")
+    add("--fine-rooms", default="", help="A:B, seeds of rooms in 640 x 480")
     add("--crops", action="store_true", help="for two crops an object (re-OBJ's ConvBlock)")
     add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="of --crops")
     add("--copies", type=int, default=1, help="augmented copies of each scene")

@@ -376,6 +376,16 @@ def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, cro
     assert_same_as_in_torch(th, args, see, out / "best.pt", look)
 
 
+def test_fine_rooms_have_pictures_and_a_cache_of_their_own(th, te, tmp_path) -> None:
+    for name in ("fine_7.npz", "room_8.npz"):
+        (tmp_path / name).touch()
+    command = ["-o", "x", "--backbone", "x", "--cache", str(tmp_path), "--no-render"]
+    args = th.build_parser().parse_args([*command, "--rooms", "7:9", "--fine-rooms", "7:9"])
+    assert [name for name, _ in th.sources(args)] == ["room 8", "fine 7"]
+    small, fine = te.room_config(7), te.room_config(7, fine=True)
+    assert fine.width == 2 * small.width and fine.hfov_deg == small.hfov_deg
+
+
 def assert_same_as_in_torch(th, args, see, checkpoint: Path, look: rt.Embeddings) -> None:
     import torch
 
