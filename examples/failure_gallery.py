@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 
 IntArray = npt.NDArray[np.int64]
-WIDTH_PX, CAPTION_PX = 400, 22
+WIDTH_PX, CAPTION_PX = 300, 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +234,7 @@ def main() -> int:
     wide = [
         cv2.copyMakeBorder(p, 0, 0, 0, width - p.shape[1], cv2.BORDER_CONSTANT) for p, _ in strips
     ]
-    cv2.imwrite(str(args.image), np.vstack(wide), [cv2.IMWRITE_JPEG_QUALITY, 75])
+    cv2.imwrite(str(args.image), np.vstack(wide), [cv2.IMWRITE_JPEG_QUALITY, 60])
     print("\n".join(["| video | error | cause |", "|---|---|---|", *(line for _, line in strips)]))
     return 0
 
