@@ -297,7 +297,7 @@ def test_failure_gallery_names_the_error_and_its_cause(tmp_path: Path) -> None:
     error = "object 1: a second identity (id 2, right 1), 4 frames from 16"
     assert f"| {error} | out of view for 5 frames; cut by the border |" in done.stdout
     picture = cv2.imread(str(tmp_path / "gallery.png"))
-    assert picture is not None and picture.shape[1] == 1200
+    assert picture is not None and picture.shape[1] == 900
 
 
 # ---- Objects in 3D ----
