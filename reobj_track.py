@@ -3320,24 +3320,28 @@ class Tracker:
 
     def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
         """Match detections to live tracks: high scores by motion, then what is left, low scores
-        too, by overlap. Both times what is matched in doubt must look alike.
+        too, by overlap. Both times what is matched in doubt must look alike: where a rival costs
+        little more, or the match is so dear that the detection may be of an object without a track.
         """
         config = self.config
-        box = _cxcywh_from_xyxy(detections.xyxy)
-        cost, feasible, iou = self._motion_cost(detections, box, lazy.available)  # (T, D)
-        same_class = _same_class(self._live.votes, detections.class_id)
+        same_class = _same_class(self._live.votes, detections.class_id)  # (T, D), as all below
+        cost, feasible, iou = self._motion_cost(detections.xyxy, same_class, lazy.available)
         evidence = config.iou_odds * (iou - config.class_cost * ~same_class) - config.look_odds
         handicap = self._handicap()[:, None]
         first = feasible & (detections.score >= config.high_score)
-        doubt = self._doubtful(cost, handicap, first, same_class)
+        dear = (cost + handicap > config.doubt_cost) & (self._live.embedded >= 0)[:, None]
+        rivals, close = self._rivals(cost, first, same_class)
+        doubt = rivals | dear, close
         track_of, refused = self._matched(cost, handicap, first, doubt, evidence, lazy)
         free = np.ones(len(iou) + 1, bool)
         free[track_of] = False  # -1: the one too many
         low = (track_of < 0) & (detections.score >= config.low_score)
         second = feasible & ~refused & (iou >= config.low_iou) & low & free[:-1, None]
-        doubt = self._doubtful(cost, handicap, second, np.zeros_like(same_class))
-        late, _ = self._matched(1 - iou, 0 * handicap, second, doubt, evidence, lazy)
-        return np.maximum(track_of, late)
+        if second.any():
+            doubt = dear, np.zeros_like(dear)
+            late, _ = self._matched(1 - iou, 0 * handicap, second, doubt, evidence, lazy)
+            track_of = np.maximum(track_of, late)
+        return track_of
 
     def _matched(
         self, cost: Array, handicap: Array, possible: BoolArray, doubt: tuple[BoolArray, BoolArray],
@@ -3346,7 +3350,8 @@ class Tracker:
         """Match at least cost; look at what was matched in doubt and at its rivals; match again.
 
         Args:
-            doubt: of `_doubtful`. evidence: log odds of the boxes (T, D).
+            doubt: which pairs must look alike, and which compete, (T, D) each.
+            evidence: log odds of the boxes (T, D).
         Returns:
             row of the live track of each detection (D,), or -1; pairs refused by their looks.
         """
@@ -3365,18 +3370,17 @@ class Tracker:
             refused[:, rows] |= against & doubt[0][:, rows]
 
     def _motion_cost(
-        self, detections: Detections, box: Array, looks: bool
+        self, xyxy: Array, same_class: BoolArray, looks: bool
     ) -> tuple[Array, BoolArray, Array]:
         """Cost in [0, 1] from overlap and gated distance, feasibility and IoU, (T, D) each."""
-        live, config = self._live, self.config
-        iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), detections.xyxy)
+        live, config, box = self._live, self.config, _cxcywh_from_xyxy(xyxy)
+        iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), xyxy)
         var = (
             live.cov[:, :2, 0] + (config.std_measure * _noise_scale(live.mean)[:, :2]) ** 2
         )  # (T, 2) S
         offset = live.mean[:, None, :2, 0] - box[None, :, :2]  # (T, D, 2)
         distance = (offset**2 / var[:, None]).sum(-1)  # (T, D) squared Mahalanobis, 2 dof
         distance = distance / config.gate_chi2
-        same_class = _same_class(live.votes, detections.class_id)
         feasible = (distance < 1) | (iou > config.gate_iou)
         if not looks:
             growth = np.log(live.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
@@ -3393,22 +3397,18 @@ class Tracker:
         waited = ((live.missed - 1) / 10).clip(0, 1)
         return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
 
-    def _doubtful(
-        self, cost: Array, handicap: Array, gate: BoolArray, same_class: BoolArray
+    def _rivals(
+        self, cost: Array, gate: BoolArray, same_class: BoolArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Which pairs (T, D) must look alike: a rival of the class costs little more (two boxes of
-        two classes around one thing look alike), or the match is so dear that the detection may be
-        of an object without a track. And which cost little more than the best of both.
+        """Which pairs (T, D) have a rival of the class that costs little more (two boxes of two
+        classes around one thing look alike), and which cost little more than the best of both.
         """
-        config = self.config
         open_cost = np.where(gate, cost, np.inf)
         best = np.minimum(
             open_cost.min(0, initial=np.inf)[None], open_cost.min(1, initial=np.inf)[:, None]
         )
-        close = gate & same_class & (cost <= best + config.rival_cost)
-        rivals = close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None])
-        dear = gate & (self._live.embedded >= 0)[:, None] & (cost + handicap > config.doubt_cost)
-        return rivals | dear, close
+        close = gate & same_class & (cost <= best + self.config.rival_cost)
+        return close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None]), close
 
     @staticmethod
     def _unsure(
