@@ -358,7 +358,6 @@ class ObjectsConfig:
     keep_share: float = _opt(0.6, "in this share of the frames of either part (OA-SLAM: half)")
     cut_gap: int = _opt(5, "tracklets may be split where this many frames pass without a detection")
     split_drop: float = _opt(0.7, "a return is doubted if its joint solid overlaps less, a share")
-    split_place: float = _opt(0.25, "a return is undone where two places overlap less (IoU)")
     min_views: int = _opt(3, "objects with fewer detections in frames with poses get no ellipsoid")
     min_score: float = _opt(0.3, "boxes below this score do not shape the ellipsoid")
     moving: str = _opt(
@@ -2103,7 +2102,8 @@ class Embedder:
     the frame serves all objects. The box and the expanded box are sampled on grids; samples under
     the object's mask (or the ellipse inscribed in its box) make the foreground, samples under no
     mask at all the background; both keep a coarse spatial layout (cells). A trained model brings a
-    head that turns the cells into two short embeddings.
+    head that turns the cells into two short embeddings; its background also holds what the objects
+    around look like (`look_around`).
 
     Args:
         model: "reobj" for the weights that come along, "colour" for the training-free descriptor

@@ -215,6 +215,8 @@ def main() -> int:
     parser.add_argument("--classes", default="", help="only these")
     parser.add_argument("--limit", type=int, default=8, help="errors shown")
     args = parser.parse_args()
+    if len(args.gt) != len(args.out):
+        parser.error(f"{len(args.out)} runs, {len(args.gt)} truths: give one --gt file for each")
     classes, found = [c for c in args.classes.split(",") if c], []
     try:
         for out, gt in zip(args.out, args.gt, strict=True):
@@ -224,7 +226,7 @@ def main() -> int:
             found += [(out.name, case, error, video) for error in find_errors(case)]
         found.sort(key=lambda item: -len(item[2].pairs))
         strips = [strip(*item) for item in found[: args.limit]]
-    except (rt.ReobjError, ValueError) as error:
+    except rt.ReobjError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if not strips:

@@ -5,10 +5,14 @@ import.
 from __future__ import annotations
 
 import ast
+import dataclasses
+import re
 import statistics
 from pathlib import Path
 
 import pytest
+
+import reobj_track as rt
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = ("reobj_track.py", "quadrics.py", "examples/render_room.py")
@@ -60,3 +64,13 @@ def test_nothing_runs_at_import(module: str) -> None:
     tree = ast.parse((ROOT / module).read_text())
     others = [ast.unparse(n)[:60] for n in tree.body[1:] if not isinstance(n, allowed)]
     assert others == []
+
+
+def test_every_option_is_used() -> None:
+    """What a user can set must be read somewhere."""
+    source = (ROOT / "reobj_track.py").read_text()
+    sections = [s for s in vars(rt).values() if dataclasses.is_dataclass(s)]
+    names = {
+        f.name for s in sections if s.__name__.endswith("Config") for f in dataclasses.fields(s)
+    }
+    assert {name for name in names if not re.search(rf"\.{name}\b", source)} == set()
