@@ -37,6 +37,7 @@ import base64
 import contextlib
 import csv
 import dataclasses
+import functools
 import glob
 import hashlib
 import http.client
@@ -2129,7 +2130,7 @@ class Embedder:
         if model != "colour":
             self._net = _Backbone(model, self.layout, threads, offline)
             self.layout, self._features = self._net.layout, self._net
-        self._last: tuple[Image, Floats] | None = None
+        self._last: _Seen | None = None
 
     def __call__(
         self, frame: Image, detections: Detections, rows: IntArray | None = None
@@ -2139,12 +2140,25 @@ class Embedder:
         Args:
             frame: (H, W, 3) BGR.
             detections: all detections of the frame (their masks also say what is no background).
-            rows: (N,) the detections to embed; default all.
+            rows: (N,) the detections to embed; default all. Asked again about the same frame and
+                detections, only what is new is computed.
         """
         rows = np.arange(len(detections)) if rows is None else rows
-        if self._last is None or self._last[0] is not frame:
-            self._last = (frame, self._features(frame))
-        return self.pool(self._last[1], frame.shape[:2], detections, rows)
+        if not len(rows):
+            return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
+        seen, share = self._last, self.layout.neighbours if self.trained else 0.0
+        if seen is None or seen.frame is not frame or seen.detections is not detections:
+            seen = self._last = _Seen(frame, detections, self._features(frame), self.layout)
+        wanted = seen.sure & (share > 0)
+        wanted[rows] = True
+        new = np.flatnonzero(wanted & ~seen.known)
+        fore, back = self._parts(seen, new, rows)
+        seen.foreground = _widen(seen.foreground, fore)
+        seen.foreground[new], seen.known[new] = fore, True
+        if share:
+            around = look_around(detections.xyxy, seen.foreground, seen.sure, rows)
+            back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
+        return Embeddings(seen.foreground[rows], _unit_rows(back))
 
     @property
     def trained(self) -> bool:
@@ -2156,127 +2170,143 @@ class Embedder:
         """Is it a backbone that was trained for something else?"""
         return self._net is not None and not self._net.own
 
-    def pool(
-        self,
-        features: Floats,
-        size_hw: tuple[int, ...],
-        detections: Detections,
-        rows: IntArray,
-    ) -> Embeddings:
-        """Embed the chosen rows from a (h, w, C) feature map of a frame of this size."""
-        if not len(rows):
-            return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
-        sure = detections.score >= self.layout.object_score
-        share = self.layout.neighbours if self.trained else 0.0
-        seen = np.union1d(rows, np.flatnonzero(sure)) if share else rows
-        parts = part_samples(detections, rows, size_hw, features.shape[:2], self.layout, seen)
-        means = cell_means(features, parts, self.layout)
+    def _parts(self, seen: _Seen, new: IntArray, rows: IntArray) -> tuple[Array, Array]:
+        """Foreground (M, E1) of the new rows and background (N, E2) of the chosen ones."""
+        size_hw, chosen = seen.frame.shape[:2], (new, rows)
+        samples = part_samples(seen.detections, chosen, size_hw, seen.objects, self.layout)
+        fore, back = part_cells(seen.features, samples, self.layout)
         if self._net is not None and self._net.head is not None:
-            fore, back = self._net.embed(parts, means)
-            if share:
-                own = np.searchsorted(seen, rows)
-                around = look_around(detections.xyxy[seen], fore, sure[seen])[own]
-                back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
-                fore, back = fore[own], _unit_rows(back)
-            return Embeddings(fore, back)
-        foreground, *background = map(_unit_histogram, means, (part.share for part in parts))
-        return Embeddings(foreground, _unit_rows(np.concatenate(background, 1)))
+            return self._net.embed(fore, back)
+        near = self.layout.background_cells**2
+        around = (back[:, :near], back[:, near:])[: 1 + (self.layout.wide > 0)]
+        return _unit_histogram(fore), np.concatenate([_unit_histogram(b) for b in around], 1)
 
 
-def look_around(xyxy: Array, foreground: npt.NDArray[Any], sure: BoolArray) -> Array:
-    """What stands around each object of a frame: unit rows (D, E), 0 where nothing does.
+class _Seen:
+    """A frame, its feature map (h, w, C), the cells (h, w) that show objects, and the foreground
+    (D, E) of those of its detections that are known.
+    """
+
+    def __init__(
+        self, frame: Image, detections: Detections, features: Floats, layout: EmbedConfig
+    ) -> None:
+        self.frame, self.detections, self.features = frame, detections, features
+        self.sure = detections.score >= layout.object_score
+        self.objects = object_map(detections, frame.shape, features.shape[:2], layout.object_score)
+        self.known = np.zeros(len(detections), bool)
+        self.foreground = np.zeros((len(detections), 0))
+
+
+def look_around(
+    xyxy: Array, foreground: npt.NDArray[Any], sure: BoolArray, rows: IntArray
+) -> Array:
+    """What stands around the chosen objects of a frame: unit rows (N, E), 0 where nothing does.
 
     The sum of the looks of the others, each weighted by exp(-distance / own size). Seen from behind
     an object has another background, but the same neighbours.
 
     Args:
         xyxy: (D, 4). foreground: (D, E). sure: (D,) which of them count as neighbours.
+        rows: (N,) the chosen ones.
     """
-    box = _cxcywh_from_xyxy(xyxy)
-    distance = np.linalg.norm(box[:, None, :2] - box[:, :2], axis=-1)  # (D, D)
-    size = np.sqrt(box[:, 2:].clip(1.0).prod(1))
-    weight = np.exp(-distance / size[:, None]) * (sure & ~np.eye(len(box), dtype=bool))
-    return _unit_rows(weight @ foreground)
+    others, (x, y, w, h) = np.flatnonzero(sure), _cxcywh_from_xyxy(xyxy).T  # (O,), (D,) each
+    centre, size = x + 1j * y, np.sqrt(np.maximum(w, 1) * np.maximum(h, 1))
+    distance = np.abs(centre[rows, None] - centre[others])  # (N, O)
+    weight = np.exp(-distance / size[rows, None]) * (rows[:, None] != others)
+    return _unit_rows(weight @ foreground[others])
 
 
 @dataclass(frozen=True, slots=True)
 class PartSamples:
-    """Where N objects look at a feature map for their foreground or their background.
+    """Where objects look at a feature map: S samples in each of C cells, first those of M
+    foregrounds, then those of N backgrounds (of each the grown box, then the wider one).
 
     Attributes:
-        index: (N, S, S) flat index into the map's cells. weight: (N, S, S) bool, samples that
-            count. cells: parts a side; S is a multiple of it.
-        share: (N, cells, cells) of the samples that count. others: same, of those on other objects.
+        index: (C, S) flat index into the map's cells. weight: (C, S) bool, samples that count.
+        share: (C, 2) of the samples that count, and of those on other objects.
+        shape: (M, cells of each), (N, cells of each).
     """
 
     index: IntArray
     weight: BoolArray
-    cells: int
-    share: Array
-    others: Array
+    share: Floats
+    shape: tuple[tuple[int, int], tuple[int, int]]
+
+    def split(self, values: Any) -> tuple[Any, Any]:
+        """Give foreground (M, cells, ...) and background (N, cells, ...) of values (C, ...)."""
+        fore, back = self.shape
+        first, rest = values[: math.prod(fore)], values[math.prod(fore) :]
+        return first.reshape(*fore, *values.shape[1:]), rest.reshape(*back, *values.shape[1:])
 
 
 def part_samples(
     detections: Detections,
-    rows: IntArray,
+    rows: Sequence[IntArray],
     size_hw: tuple[int, ...],
-    shape: tuple[int, int],
+    objects: BoolArray,
     layout: EmbedConfig,
-    seen: IntArray | None = None,
-) -> list[PartSamples]:
-    """Sample boxes (foreground), grown boxes (background, no other object) and, if the layout has
-    them, wider boxes (everything but the object) of the chosen rows (N,).
+) -> PartSamples:
+    """Sample boxes (foreground), and for the background grown boxes (no other object) and, if the
+    layout has them, wider boxes (everything but the object).
 
     Args:
-        detections: of one frame of size_hw. shape: (h, w) of the feature map of that frame.
-        seen: (M,) rows of the foreground; default those of the background.
+        detections: of one frame of size_hw. rows: (M,) those for the foreground, (N,) those for the
+            background. objects: (h, w) cells of the feature map that show any (`object_map`).
     """
-    grow = [(0.0, 0.0, layout.foreground_cells)]
-    grow += [(layout.context, layout.reach, layout.background_cells)]
-    grow += [(layout.wide, layout.wide_reach, layout.wide_cells)] * (layout.wide > 0)
-    objects = _object_map(detections, size_hw, shape, layout.object_score)  # (h, w)
-    size, cells_wh = (np.array(v[1::-1])[:, None] for v in (size_hw, shape))  # (2, 1) x, y
-    parts: list[PartSamples] = []
-    for share_of_box, share_of_image, cells in grow:
-        chosen = rows if parts or seen is None else seen
-        box = _cxcywh_from_xyxy(detections.xyxy[chosen])[..., None]  # (N, 4, 1)
-        least = share_of_image * max(size_hw[:2])
-        half = box[:, 2:] / 2 + np.maximum(box[:, 2:] * share_of_box, least)  # (N, 2, 1)
+    size, cells_wh = (np.array(v[1::-1])[:, None] for v in (size_hw, objects.shape))
+    window, grid, near, shape = _grids(layout, len(rows[0]), len(rows[1]))
+    row = np.concatenate(rows).take(window)  # (L,)
+    low, high = detections.xyxy.T.take(row, 1).reshape(2, 2, -1)  # (2, L) x, y, as all below
+    centre, own_half = (low + high) / 2, (high - low) / 2
+    half = own_half + np.maximum((high - low) * grid[2], grid[3] * max(size_hw))
+    at = centre + half * grid[:2]
+    inside = ((at >= 0) & (at < size)).all(0)  # (L,)
+    cell = (at / size * cells_wh).astype(int)
+    index = (cell[1] * objects.shape[1] + cell[0]) * inside
+    own = _on_object(detections, row, at, centre, own_half) & inside
+    others = objects.take(index) & (inside > own)
+    weight, fine = inside > (own | others & near), layout.samples**2
+    weight[: fine * math.prod(shape[0])] = own[: fine * math.prod(shape[0])]
+    counts = np.concatenate([weight, others]).reshape(2, -1, fine).sum(-1, dtype=np.float32)
+    return PartSamples(index.reshape(-1, fine), weight.reshape(-1, fine), counts.T / fine, shape)
+
+
+@functools.lru_cache(64)
+def _grids(layout: EmbedConfig, fore: int, back: int) -> tuple[IntArray, Array, BoolArray, Any]:
+    """The L samples of so many foregrounds and backgrounds: the number of the one each is of (L,);
+    x and y in the box, -1 to 1, and by what share of itself and at least of the image that is grown
+    (4, L); do other objects not count (L,)? Last `PartSamples.shape`.
+    """
+    own = (0.0, 0.0, 0, layout.foreground_cells)
+    near = (layout.context, layout.reach, 1, layout.background_cells)
+    wide = (layout.wide, layout.wide_reach, 0, layout.wide_cells)
+    grids = []
+    for *kind, cells in (own, near, wide)[: 2 + (layout.wide > 0)]:
         side = cells * layout.samples
-        at = box[:, :2] + half * ((np.arange(side) + 0.5) / side * 2 - 1)  # (N, 2, S) x, y
-        within = (at >= 0) & (at < size)
-        cell = np.minimum((at / size * cells_wh).astype(int).clip(0), cells_wh - 1)
-        inside = within[:, 0, None] & within[:, 1, :, None]  # (N, S, S)
-        index = cell[:, 1, :, None] * shape[1] + cell[:, 0, None]
-        own = _on_object(detections, chosen, at[:, 0, None], at[:, 1, :, None]) & inside
-        free = inside & ~own
-        others = objects.take(index) & free
-        weight = (own, free & ~others, free)[len(parts)]
-        share = [_by_cell(w, cells).mean(-1, dtype=np.float32) for w in (weight, others)]
-        parts.append(PartSamples(index, weight, cells, *share))
-    return parts
+        line = ((np.arange(side) + 0.5) / side * 2 - 1).reshape(cells, -1)
+        x, y = line[:, None], line[:, None, :, None]
+        grids.append(np.stack(np.broadcast_arrays(x, y, *kind)).reshape(5, -1))
+    one, other = grids[0], np.concatenate(grids[1:], 1)
+    grid = np.concatenate([one[:, :0], *[one] * fore, *[other] * back], 1)
+    sizes = np.array([one.shape[1], other.shape[1]])
+    of = np.arange(fore + back).repeat(sizes.repeat([fore, back]))
+    cells = (sizes // layout.samples**2).tolist()
+    return of, grid[:4], grid[4] > 0, ((fore, cells[0]), (back, cells[1]))
 
 
-def cell_means(features: Floats, parts: Sequence[PartSamples], layout: EmbedConfig) -> list[Floats]:
-    """Mean (N, cells, cells, C) of the samples that count in every cell of the parts, 0 where none
-    does, on a map (h, w, C).
+def part_cells(
+    features: Floats, samples: PartSamples, layout: EmbedConfig
+) -> tuple[Floats, Floats]:
+    """What foregrounds and backgrounds see in each cell, (M, cells, C + 2) and (N, cells, C + 2):
+    mean of the samples that count on a map (h, w, C), 0 where none does; `PartSamples.share`.
     """
-    flat, means = features.reshape(-1, features.shape[-1]), []
-    for part, channels in zip(
-        parts, (layout.foreground_channels or None, None, None), strict=False
-    ):
-        sampled = flat.take(_by_cell(part.index, part.cells), 0)[..., :channels]  # (N, k, k, s, C)
-        share = _by_cell(part.weight, part.cells).astype(np.float32)[..., None, :]
-        share /= np.maximum(share.sum(-1, keepdims=True), 1)
-        means.append(np.asarray((share @ sampled)[..., 0, :], np.float32))
-    return means
-
-
-def _by_cell(values: npt.NDArray[Any], cells: int) -> npt.NDArray[Any]:
-    """Regroup (N, S, S) as (N, cells, cells, samples of the cell)."""
-    n, fine = len(values), values.shape[1] // cells
-    grid = values.reshape(n, cells, fine, cells, fine).swapaxes(2, 3)
-    return grid.reshape(n, cells, cells, fine * fine)
+    sampled = features.reshape(-1, features.shape[-1]).take(samples.index, 0)  # (cells, S, C)
+    total = (samples.weight.astype(np.float32)[:, None] @ sampled)[:, 0]  # (cells, C)
+    mean = total / np.maximum(samples.share[:, :1] * samples.index.shape[1], 1)
+    fore, back = samples.split(np.concatenate([mean, samples.share], 1))
+    if channels := layout.foreground_channels:
+        fore = np.concatenate([fore[..., :channels], fore[..., -2:]], -1)
+    return fore, back
 
 
 class CropEmbedder(Embedder):
@@ -2342,9 +2372,10 @@ class CropEmbedder(Embedder):
         ]
         unit = (np.arange(side) + 0.5) / side  # (S,)
         grid = low[:, :, None] + (high - low)[:, :, None] * unit  # (N, 2, S)
-        x = grid[:, 0, None, :].repeat(side, 1)  # (N, S, S)
-        y = grid[:, 1, :, None].repeat(side, 2)
-        return np.stack(crops), _on_object(detections, rows, x, y)
+        at = np.stack(np.broadcast_arrays(grid[:, 0, None, :], grid[:, 1, :, None]))  # (2, N, S, S)
+        box = _cxcywh_from_xyxy(detections.xyxy[rows]).T[..., None, None]  # (4, N, 1, 1)
+        own = _on_object(detections, rows[:, None, None], at, box[:2], box[2:] / 2)
+        return np.stack(crops), own
 
     def masked(self, crops: Image, on_object: BoolArray) -> Image:
         """Objects alone, then surroundings alone: (2N, S, S, 3) of crops (N, S, S, 3).
@@ -2386,8 +2417,7 @@ class CropEmbedder(Embedder):
         assert net is not None
         low, high = self._windows(detections.xyxy[rows], size_hw)
         own = (detections.xyxy[rows] - np.tile(low, 2)) * np.tile(side / (high - low), 2)  # (N, 4)
-        sure = detections[detections.score >= self.layout.object_score]
-        others = self._crop_objects(sure, size_hw, low, high) & ~on_object  # (N, S, S)
+        others = self._crop_objects(detections, size_hw, low, high) & ~on_object  # (N, S, S)
         maps = net.maps(masked)  # (2N, h, w, C)
         fed = []
         for i in range(2 * count):  # over crops: each has a map of its own
@@ -2399,18 +2429,18 @@ class CropEmbedder(Embedder):
                 np.zeros(sum(some), np.int64),
                 np.stack([on_object[k], others[k]])[some],
             )
-            parts = part_samples(found, np.arange(1), (side, side), maps.shape[1:3], self.layout)
-            fed.append(head_inputs(parts, cell_means(maps[i], parts, self.layout))[i // count])
-        fore, back = np.concatenate(fed[:count]), np.concatenate(fed[count:])
-        found_rows = net.head.run(None, {"fg": fore, "bg": back})
-        return Embeddings(*(np.asarray(part, np.float64) for part in found_rows))
+            objects = object_map(found, (side, side), maps.shape[1:3])
+            samples = part_samples(found, [np.arange(1)] * 2, (side, side), objects, self.layout)
+            fed.append(part_cells(maps[i], samples, self.layout)[i // count])
+        return Embeddings(*net.embed(np.concatenate(fed[:count]), np.concatenate(fed[count:])))
 
     def _crop_objects(
         self, detections: Detections, size_hw: tuple[int, ...], low: IntArray, high: IntArray
     ) -> BoolArray:
         """(N, S, S): which pixels of the crops show any object."""
         height, width = size_hw
-        objects = _object_map(detections, size_hw, (height, width))  # (H, W)
+        score = self.layout.object_score
+        objects = object_map(detections, size_hw, (height, width), score)  # (H, W)
         side = self.layout.crop_px
         unit = (np.arange(side) + 0.5) / side
         at = (low[:, :, None] + (high - low)[:, :, None] * unit).astype(int)  # (N, 2, S)
@@ -2462,52 +2492,58 @@ def _flat_map(maps: Floats) -> Array:
     return _unit_rows(np.sign(flat) * np.sqrt(np.abs(flat)))
 
 
-def _on_object(detections: Detections, rows: IntArray, x: Array, y: Array) -> BoolArray:
-    """For samples (N, S, S), or x (N, 1, S) and y (N, S, 1): on the row's own object (its mask,
-    else the inscribed ellipse)?
+def _on_object(
+    detections: Detections, rows: IntArray, at: Array, centre: Array, half: Array
+) -> BoolArray:
+    """Are samples at (2, ...) of detections rows (...) on their own object? Its mask, else the
+    ellipse inscribed in its box, centre and half size (2, ...).
     """
-    box = _cxcywh_from_xyxy(detections.xyxy[rows])[:, :, None, None]  # (N, 4, 1, 1)
-    half = np.maximum(box[:, 2:] / 2, 0.5)
-    on = ((x - box[:, 0]) / half[:, 0]) ** 2 + ((y - box[:, 1]) / half[:, 1]) ** 2 <= 1
+    on = (((at - centre) / np.maximum(half, 0.5)) ** 2).sum(0) <= 1
     if detections.masks is not None:
         height, width = detections.masks.shape[1:]
-        row, column = y.astype(int).clip(0, height - 1), x.astype(int).clip(0, width - 1)
-        under = detections.masks[rows[:, None, None], row, column]  # (N, S, S)
-        masked = np.array([detections.masks[i].any() for i in rows], bool)  # no copies of masks
-        on = np.where(masked[:, None, None], under, on)
+        column, row = at[0].astype(int).clip(0, width - 1), at[1].astype(int).clip(0, height - 1)
+        masked = np.zeros(len(detections), bool)
+        masked[[i for i in np.unique(rows) if detections.masks[i].any()]] = True
+        on = np.where(masked[rows], detections.masks[rows, row, column], on)
     return np.asarray(on, bool)
 
 
-def _object_map(
+def object_map(
     detections: Detections,
     size_hw: tuple[int, ...],
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
     min_score: float = 0.0,
 ) -> BoolArray:
     """Which cells of a feature map (h, w) show any object of the frame? size_hw: of the frame."""
+    sure = np.flatnonzero(detections.score >= min_score)
     canvas = np.zeros(shape, np.uint8)
     scale = np.array([shape[1] / size_hw[1], shape[0] / size_hw[0]] * 2)
-    boxes = (_cxcywh_from_xyxy(detections.xyxy) * scale).round().clip(-9999, 9999)
-    for i in np.flatnonzero(detections.score >= min_score):
+    boxes = (_cxcywh_from_xyxy(detections.xyxy[sure]) * scale).round().clip(-9999, 9999)
+    for i, (x, y, w, h) in zip(sure, boxes.astype(int).tolist(), strict=True):
         mask = None if detections.masks is None else detections.masks[i].view(np.uint8)
         if mask is not None and mask.any():
             canvas |= cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST)
         else:
-            x, y, w, h = boxes[i].astype(int).tolist()
             axes = (max(w // 2, 1), max(h // 2, 1))
             cv2.ellipse(canvas, (x, y), axes, 0, 0, 360, (1,), -1)
     return canvas.view(bool)
 
 
-def _unit_histogram(mean: Floats, share: Array) -> Array:
-    """Cells (N, k, k, C) side by side as unit rows (N, k * k * C).
+def _unit_histogram(cells: Floats) -> Array:
+    """Cells (N, K, C + 2) of `part_cells` side by side as unit rows (N, K * C).
 
     The signed square root makes a cosine of histograms a Hellinger kernel and tames strong
     channels; part-empty cells count less.
     """
-    trust = np.sqrt(share / np.maximum(share.max((1, 2), keepdims=True), 1e-9))
+    mean, share = cells[..., :-2], cells[..., -2]
+    trust = np.sqrt(share / np.maximum(share.max(1, keepdims=True), 1e-9))
     rows = np.sign(mean) * np.sqrt(np.abs(mean)) * trust[..., None]
-    return _unit_rows(rows.reshape(len(mean), -1))
+    return _unit_rows(_side_by_side(rows))
+
+
+def _side_by_side(cells: Floats) -> Floats:
+    """Cells (N, K, C) as rows (N, K * C); N may be 0."""
+    return cells.reshape(len(cells), cells.shape[1] * cells.shape[2])
 
 
 def _colour_features(frame: Image) -> Floats:
@@ -2594,26 +2630,11 @@ class _Backbone:
     def _run(self, images: npt.NDArray[Any]) -> Floats:
         return np.asarray(self.session.run([self.output], {self.input: images})[0], np.float32)
 
-    def embed(self, parts: Sequence[PartSamples], means: Sequence[Floats]) -> tuple[Array, Array]:
+    def embed(self, fore: Floats, back: Floats) -> tuple[Array, Array]:
         """Both parts' cells through the head, all objects at once: unit rows (M, E1), (N, E2)."""
-        fed = head_inputs(parts, means)
-        foreground, background = self.head.run(None, dict(zip(("fg", "bg"), fed, strict=True)))
+        fed = {"fg": _side_by_side(fore), "bg": _side_by_side(back)}
+        foreground, background = self.head.run(None, fed)
         return np.asarray(foreground, np.float64), np.asarray(background, np.float64)
-
-
-def head_inputs(parts: Sequence[PartSamples], means: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """What a head sees of each cell: mean feature, share that counts, share on other objects.
-
-    Returns (M, cells * cells * (C + 2)) for the foreground and (N, ...) for the background, where
-    the grown box's cells come before the wider box's.
-    """
-    rows = [
-        np.concatenate([mean, part.share[..., None], part.others[..., None]], -1)
-        .reshape(len(mean), -1)
-        .astype(np.float32)
-        for part, mean in zip(parts, means, strict=True)
-    ]
-    return rows[0], np.concatenate(rows[1:], 1)
 
 
 def _facts(session: Any) -> dict[str, Any]:

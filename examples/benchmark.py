@@ -363,7 +363,7 @@ def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
     tracker, clock = rt.Tracker(embedder=embedder), Clock()
     clock.wrap(embedder, "_features", "map", lambda *_: 1)
     clock.wrap(embedder._net, "embed", "head", lambda *_: 1)
-    clock.wrap(embedder, "pool", "pool", lambda *args: len(args[3]))
+    clock.wrap(rt.Embedder, "__call__", "all", lambda *args: len(args[3]))
     rows, embedded = [], []
     for frame in rt.Video(source, rt.InputConfig(stop=frames)):
         clock.spent.clear()
@@ -373,10 +373,9 @@ def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
         detected = time.thread_time()
         tracker.update(found, frame.image)
         done = time.thread_time()
-        part = {name: clock.spent.get(name, 0.0) for name in ("map", "pool", "head")}
-        times = (detected - started, done - detected, part["map"] + part["pool"])
-        rows.append((*times, part["map"], part["head"]))
-        embedded.append(clock.calls.get("pool", 0))
+        parts = [clock.spent.get(name, 0.0) for name in ("all", "map", "head")]
+        rows.append((detected - started, done - detected, *parts))
+        embedded.append(clock.calls.get("all", 0))
     return 1e3 * np.array(rows), np.array(embedded)
 
 

@@ -332,7 +332,7 @@ class View:
     picture: Image  # (H, W, 3)
     identity: IntArray  # (D,)
     look: IntArray  # (D,)
-    parts: list[rt.PartSamples]
+    samples: rt.PartSamples
 
 
 def photo_tone(rng: np.random.Generator, strength: float) -> Callable[[Image], Image]:
@@ -435,8 +435,9 @@ def make_view(
     """Augment one frame as `augmented` does and sample its boxes."""
     picture, found, rows = augmented(clip, frame, rng, change, flip, wanted)
     shape = (SIZE_WH[1] // 4, SIZE_WH[0] // 4)
-    parts = rt.part_samples(found, rows, SIZE_WH[::-1], shape, layout())
-    return View(picture, clip.identity[frame][rows], clip.look[frame][rows], parts)
+    objects = rt.object_map(found, SIZE_WH[::-1], shape, layout().object_score)
+    samples = rt.part_samples(found, [rows, rows], SIZE_WH[::-1], objects, layout())
+    return View(picture, clip.identity[frame][rows], clip.look[frame][rows], samples)
 
 
 def layout() -> rt.EmbedConfig:
@@ -651,7 +652,7 @@ class Head(nn.Module):
 
 
 class Net(nn.Module):
-    """Backbone, pooling as in `reobj_track.Embedder.pool`, head."""
+    """Backbone, pooling as in `reobj_track.Embedder`, head."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -666,9 +667,9 @@ class Net(nn.Module):
         """What the heads see of all objects of the views."""
         maps = self.backbone(images)
         flat, size = maps.reshape(-1, CHANNELS), maps.shape[1] * maps.shape[2]
-        fore, *back = (pooled(flat, views, part, size) for part in range(len(views[0].parts)))
+        fore, back = pooled(flat, [v.samples for v in views], size)
         own = torch.cat([fore[..., : LAYOUT["foreground_channels"]], fore[..., CHANNELS:]], -1)
-        return [own.flatten(1), torch.cat([cells.flatten(1) for cells in back], 1)]
+        return [own.flatten(1), back.flatten(1)]
 
     def start_from_colour(self, views: Sequence[View], device: Any) -> None:
         """Set the heads' linear maps to the principal components of these views' histograms."""
@@ -685,26 +686,19 @@ def principal(weight: Any, rows: Any) -> None:
     weight[: len(axes)] = axes
 
 
-def pooled(flat: Any, views: Sequence[View], part: int, cells_a_map: int) -> Any:
-    """Cells (N, cells, C + 2) of one part of all N objects (`reobj_track.head_inputs` in torch)."""
-    samples = [v.parts[part] for v in views]
+def pooled(flat: Any, samples: Sequence[rt.PartSamples], cells_a_map: int) -> list[Any]:
+    """Cells (N, cells, C + 2) of all foregrounds and backgrounds (`reobj_track.part_cells` in
+    torch); flat: all maps' cells, one map after the other.
+    """
     index = np.concatenate([s.index + i * cells_a_map for i, s in enumerate(samples)])
-    weight = np.concatenate([s.weight for s in samples]).astype(np.float32)
-    n, side, cells = len(index), index.shape[1], samples[0].cells
-    fine = side // cells
-
-    def by_cell(values: Any) -> Any:
-        """(N, S, S) to (N * cells * cells, samples of the cell)."""
-        grid = values.reshape(n, cells, fine, cells, fine).swapaxes(2, 3)
-        return grid.reshape(-1, fine * fine)
-
-    weight = by_cell(weight)
+    weight = np.concatenate([s.weight for s in samples]).astype(np.float32)  # (cells, S)
     weight /= np.maximum(weight.sum(1, keepdims=True), 1)
-    rows, weights = (torch.from_numpy(a).to(flat.device) for a in (by_cell(index), weight))
+    share = np.concatenate([s.share for s in samples])
+    rows, weights, shares = (torch.from_numpy(a).to(flat.device) for a in (index, weight, share))
     mean = F.embedding_bag(rows, flat, mode="sum", per_sample_weights=weights)
-    shares = np.concatenate([np.stack([s.share, s.others], -1) for s in samples])
-    extra = torch.from_numpy(shares.astype(np.float32)).to(flat.device)
-    return torch.cat([mean.reshape(n, cells * cells, -1), extra.reshape(n, cells * cells, 2)], -1)
+    views = torch.cat([mean, shares], 1).split([len(s.index) for s in samples])
+    parts = [s.split(cells) for s, cells in zip(samples, views, strict=True)]
+    return [torch.cat(part) for part in zip(*parts, strict=True)]
 
 
 # ---- Loss ----------------------------------------------------------------------------------------

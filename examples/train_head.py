@@ -92,9 +92,11 @@ class Frozen:
             parts = np.split(self.embedder.maps(three), 3)
             return dict(zip(("fg", "bg", "full"), parts, strict=True))
         features, layout = self.embedder._features(picture), self.embedder.layout
-        samples = rt.part_samples(found, rows, picture.shape[:2], features.shape[:2], layout)
-        cells = rt.head_inputs(samples, rt.cell_means(features, samples, layout))
-        return dict(zip(("fg", "bg"), cells, strict=True))
+        size_hw, shape = picture.shape[:2], features.shape[:2]
+        objects = rt.object_map(found, size_hw, shape, layout.object_score)
+        samples = rt.part_samples(found, [rows, rows], size_hw, objects, layout)
+        fore, back = rt.part_cells(features, samples, layout)
+        return {"fg": fore.reshape(len(rows), -1), "bg": back.reshape(len(rows), -1)}
 
     def scene(self, source: Source, copy: int, parts: Sequence[str]) -> Seen:
         """Some frames of a clip, cached; copy 0 as they are, others augmented."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import importlib
 import json
+import math
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import cv2
 import numpy as np
@@ -25,9 +26,20 @@ def boxes(*xyxy: tuple[float, float, float, float], masks: np.ndarray | None = N
     return rt.Detections(np.array(xyxy, float), np.full(n, 0.9), np.zeros(n, np.int64), masks)
 
 
-def samples(detections: rt.Detections, layout: rt.EmbedConfig = LAYOUT):
+def samples(detections: rt.Detections, layout: rt.EmbedConfig = LAYOUT) -> list[SimpleNamespace]:
+    """Of foreground, grown and wider boxes: index, weight (N, k, k, S), share, others (N, k, k)."""
     rows = np.arange(len(detections))
-    return rt.part_samples(detections, rows, (200, 400), (50, 100), layout)
+    objects = rt.object_map(detections, (200, 400), (50, 100))
+    both = rt.part_samples(detections, [rows, rows], (200, 400), objects, layout)
+    values = {"index": both.index, "weight": both.weight}
+    values |= {"share": both.share[:, 0], "others": both.share[:, 1]}
+    near, parts = layout.background_cells**2, []
+    for part, some in ((0, slice(None)), (1, slice(near)), (1, slice(near, None))):
+        cut = {name: both.split(value)[part][:, some] for name, value in values.items()}
+        side = math.isqrt(cut["share"].shape[1])
+        cut = {n: v.reshape(len(rows), side, side, *v.shape[2:]) for n, v in cut.items()}
+        parts.append(SimpleNamespace(**cut))
+    return parts[: 2 + (layout.wide > 0)]
 
 
 # ---- Sampling ----
@@ -57,7 +69,7 @@ def test_masks_of_all_objects_are_no_background() -> None:
     np.testing.assert_allclose(back.others[0][:, 3], 1.0)
 
 
-def masks_at(mask: np.ndarray, part: rt.PartSamples) -> np.ndarray:
+def masks_at(mask: np.ndarray, part: SimpleNamespace) -> np.ndarray:
     row, column = np.divmod(part.index[0], 100)
     return np.asarray(mask[row * 4 + 2, column * 4 + 2])
 
@@ -74,7 +86,7 @@ def test_surroundings_hold_other_objects_but_not_the_own() -> None:
     masks[0, 80:120, 180:220] = masks[1, :, 240:] = True
     found = boxes((180, 80, 220, 120), (240, 0, 400, 200), masks=masks)
     layout = rt.EmbedConfig(context=0.5, samples=4, wide=1.5, wide_reach=0.2, wide_cells=5)
-    fore, near, wide = samples(found, layout)
+    _, _, wide = samples(found, layout)
     column = wide.index[0] % 100
     assert (column.min() * 4, column.max() * 4) == (104, 292)  # 200 -+ (20 + .2 * 400), 4 px a cell
     assert (
@@ -82,17 +94,23 @@ def test_surroundings_hold_other_objects_but_not_the_own() -> None:
     )
     assert wide.share.shape == (1 + 1, 5, 5) and wide.share[0, 2, 2] == 0
     np.testing.assert_allclose(wide.others[0][:, 4], 1.0)
-    inputs = rt.head_inputs(
-        [fore, near, wide], [np.zeros((*p.share.shape, 7)) for p in (fore, near, wide)]
+
+
+def test_cells_are_means_of_the_samples_that_count() -> None:
+    """On a map that holds its own columns and rows; the foreground reads only the first channel."""
+    layout = rt.EmbedConfig(context=0.5, samples=4, wide=1.0, wide_cells=5, foreground_channels=1)
+    found = boxes((100, 50, 200, 150), (120, 60, 150, 90))
+    rows, objects = [np.array([1]), np.array([0, 1])], np.zeros((50, 100), bool)
+    both = rt.part_samples(found, rows, (200, 400), objects, layout)
+    y, x = np.mgrid[:50, :100].astype(np.float32)
+    fore, back = rt.part_cells(np.stack([x, y], -1), both, layout)
+    assert fore.shape == (1, 4, 3) and back.shape == (2, 16 + 25, 4)
+    np.testing.assert_allclose(fore[0, :, 0].reshape(2, 2).mean(0), [32, 35.5], atol=0.6)
+    first = np.where(both.weight[4], np.divmod(both.index[4], 100), np.nan)  # of the grown box
+    np.testing.assert_allclose(back[0, 0, 1::-1], np.nanmean(first, 1), rtol=1e-5)
+    assert (
+        fore[0, 0, 1] == both.weight[0].mean() and back[1, 20, 2] == both.weight[4 + 41 + 20].mean()
     )
-    assert [i.shape[1] for i in inputs] == [4 * 9, (16 + 25) * 9]
-
-
-def test_foreground_reads_only_its_channels() -> None:
-    layout = rt.EmbedConfig(wide=1.0, foreground_channels=2)
-    parts = samples(boxes((100, 50, 200, 150)), layout)
-    means = rt.cell_means(np.ones((50, 100, 5), np.float32), parts, layout)
-    assert [m.shape[-1] for m in means] == [2, 5, 5]
 
 
 @pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])
@@ -150,13 +168,13 @@ def test_what_stands_around_is_the_look_of_near_neighbours() -> None:
     """The near one of two others counts more, unsure ones and oneself do not; alone: nothing."""
     xyxy = np.array([(0, 0, 40, 40), (50, 0, 90, 40), (300, 0, 340, 40), (0, 0, 40, 40)], float)
     sure, look = np.array([True, True, True, False]), np.eye(4)
-    around = rt.look_around(xyxy, look, sure)
+    around = rt.look_around(xyxy, look, sure, np.arange(4))
     np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1)
     assert around[0, 1] > 0.99 > around[2, 1] > around[2, 0] > 0 and not around[:, 3].any()
     assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # the unsure one has some
-    np.testing.assert_allclose(around, rt.look_around(3 * xyxy + 7, look, sure))
-    assert not rt.look_around(xyxy[:1], look[:1], sure[:1]).any()
-    assert rt.look_around(xyxy[:0], look[:0], sure[:0]).shape == (0, 4)
+    np.testing.assert_allclose(around, rt.look_around(3 * xyxy + 7, look, sure, np.arange(4)))
+    assert not rt.look_around(xyxy[:1], look[:1], sure[:1], np.arange(1)).any()
+    np.testing.assert_allclose(around[2:], rt.look_around(xyxy, look, sure, np.array([2, 3])))
 
 
 def test_neighbours_tell_places_apart_that_look_the_same() -> None:
@@ -177,13 +195,20 @@ def test_neighbours_tell_places_apart_that_look_the_same() -> None:
     assert not alone[:, 128:].any() and np.linalg.norm(alone) == pytest.approx(1, abs=1e-5)
 
 
-def test_own_weights_embed_some_rows_as_all_rows() -> None:
+@pytest.mark.parametrize("model", ["reobj", "colour"])
+def test_some_rows_are_embedded_as_all_rows(model: str) -> None:
+    """In whatever order they are asked for, also by and by: then the map is made once."""
     image, detections = scene_with_twins()
-    embedder = rt.Embedder("reobj", threads=1)
+    embedder = rt.Embedder(model, threads=1)
     whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
     np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-5)
     np.testing.assert_allclose(whole.background[1:], part.background, atol=1e-5)
-    turned = embedder(image, detections, np.array([1, 0]))
+    later = rt.Embedder(model, threads=1)
+    later(image, detections, np.array([1]))
+    later._features = None  # type: ignore[assignment]
+    later(image, detections, np.array([1]))
+    turned = later(image, detections, np.array([1, 0]))
+    np.testing.assert_allclose(whole.foreground[::-1], turned.foreground, atol=1e-5)
     np.testing.assert_allclose(whole.background[::-1], turned.background, atol=1e-5)
     assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
 
