@@ -612,7 +612,7 @@ WEIGHTS: tuple[Weights, ...] = (
             "f75628d5ebbbb652f34adc33fcb163fe3a123e5a8bddc70125cb76b6f3c79005", 11560385,
             "AGPL-3.0", "COCO with masks, AP 39.5, 154 ms; strong copyleft"),
     Weights("reobj", "backbone", "reobj.onnx", "",
-            "fa51969745e5bd4dee9b04898fbd8967df69fc019d03f9c4c4741ff7426d08ea", 394054,
+            "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 394054,
             "MIT", "ours, comes along: foreground and background, trained with its head"),
     Weights("mobilenetv2", "backbone", "mobilenetv2_feat.onnx", "",
             "2e2d63ad6239eb67ad4e132a0858da4ecbaf3022560007a659d05a1afd8fbc7f", 8849494,

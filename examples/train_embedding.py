@@ -25,7 +25,7 @@ alone; for every anchor and positive the negative is the soft maximum of all (mo
 twin elsewhere in the room), or with --loss triplet semi-hard (the nearest of those further than the
 positive) and with --hard-after, the nearest of all of the same scene from then on.
 Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
-al., MobileNetV2, CVPR 2018 (inverted residual).
+al., MobileNetV2, CVPR 2018 (inverted residual); Izmailov et al., UAI 2018 (--average).
 
 Axes: B frames of a batch, D detections of a frame, N of a batch, C channels of the map.
 """
@@ -62,6 +62,7 @@ try:
     import torch
     from torch import nn
     from torch.nn import functional as F
+    from torch.optim import swa_utils
 except ImportError:
     sys.exit("train_embedding.py needs PyTorch: pip install torch matplotlib onnx")
 
@@ -163,7 +164,7 @@ def render_to(path: Path, config: rr.RoomConfig) -> None:
 
 @functools.lru_cache
 def read_pictures(folder: Path) -> dict[str, tuple[Image, float]]:
-    """All images of a folder with a longer side of 1.5 times the network's, and their scale."""
+    """All images of a folder with a longer side of twice the network's, and their scale."""
     pictures = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in (".jpg", ".jpeg", ".png"):
@@ -171,7 +172,7 @@ def read_pictures(folder: Path) -> dict[str, tuple[Image, float]]:
         image = cv2.imread(str(path))
         if image is None:
             raise SystemExit(f"error: {path}: not an image that OpenCV reads")
-        scale = min(1.0, 1.5 * SIZE_WH[0] / max(image.shape[:2]))
+        scale = min(1.0, 2.0 * SIZE_WH[0] / max(image.shape[:2]))
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         pictures[path.name] = np.asarray(small, np.uint8), scale
     if not pictures:
@@ -288,7 +289,7 @@ def scannet_clip(folder: Path) -> Clip:
     for f in range(len(scene.images)):
         rows = np.flatnonzero((scene.row == f) & (scene.identity > 0))
         image, found, scored = scene.at(f)
-        scale = min(1.0, 1.5 * SIZE_WH[0] / max(image.shape[:2]))
+        scale = min(1.0, 2.0 * SIZE_WH[0] / max(image.shape[:2]))
         picture = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         corners = scene.xyxy[rows] * (picture.shape[1] / scene.size[0])
         label = np.zeros(picture.shape[:2], np.uint8)
@@ -379,7 +380,7 @@ def crop_window(
 ) -> tuple[Array, float]:
     """Corner (2,) and factor of a random window with the training picture's shape."""
     height, width = image.shape[:2]
-    fit = min(width / size_wh[0], height / size_wh[1]) * rng.uniform(least, 1.0)
+    fit = min(width / size_wh[0], height / size_wh[1]) * least ** rng.uniform(0, 1)
     extent = np.array(size_wh) * fit
     return rng.uniform(0, 1, 2) * (np.array([width, height]) - extent), float(1 / fit)
 
@@ -399,7 +400,8 @@ def augmented(
     Returns a picture of this size, all boxes in it, and the rows (N,) of the wanted identities.
     """
     image, augment = clip.images[frame], change is not None
-    corner, factor = crop_window(rng, image, 0.6 if augment else 1.0, size_wh)
+    least = np.clip(0.6 * size_wh[0] / image.shape[1], 0.3, 0.6) if augment else 1.0
+    corner, factor = crop_window(rng, image, least, size_wh)
     warp = np.array([[factor, 0, -factor * corner[0]], [0, factor, -factor * corner[1]]])
     if flip:
         warp = np.array([[-1.0, 0, size_wh[0]], [0, 1.0, 0]]) @ np.vstack([warp, [0, 0, 1]])
@@ -527,23 +529,42 @@ class ColourMap(nn.Module):
         self.register_buffer("xyz", torch.tensor(xyz)[..., None, None])  # sRGB, D65, BGR order
         sobel = torch.tensor([[-1.0, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 2
         self.register_buffer("sobel", torch.stack([sobel, sobel.T])[:, None])
-        self.register_buffer("levels", torch.arange(5.0)[None, :, None, None])
+        self.fuse()
+
+    def fuse(self) -> None:
+        """Put in one convolution each what is linear: mean and range of the pixels; of the roots of
+        X, Y, Z: chroma, its length in every direction, four times the lightness; its edges.
+        """
+        turns, sobel = self.turns[:, :, 0, 0], 1.16 * self.sobel[:, 0]  # (6, 2), (2, 3, 3)
+        chroma = torch.tensor([[12.5, -12.5, 0], [0, 5, -5]])
+        level = torch.tensor([[0, 4.64, 0]]).repeat(5, 1)
+        parts = {
+            "mean": torch.eye(3)[..., None, None].repeat(1, 1, 4, 4) / (16 * 255),
+            "linear": torch.cat([chroma, turns @ chroma, level])[..., None, None],
+            "offset": torch.cat([torch.zeros(8), -0.64 - torch.arange(5.0)]),
+            "edges": torch.cat([sobel, torch.einsum("kc,cij->kij", turns, sobel)])[:, None],
+        }
+        for name, value in parts.items():
+            self.register_buffer(name, value, persistent=False)
 
     def forward(self, x: Any) -> Any:
-        x = F.avg_pool2d(x, 4) / 255
+        x = F.conv2d(x, self.mean, stride=4)
         x = x * (x * (x * 0.305306011 + 0.682171111) + 0.012522878)  # sRGB to linear light
         f = (F.conv2d(x, self.xyz).clamp_min(0.001).log() / 3).exp()  # cube root, vectorised
-        lightness = 1.16 * f[:, 1:2] - 0.16  # L / 100
-        chroma = torch.cat([5.0 * (f[:, :1] - f[:, 1:2]), 2.0 * (f[:, 1:2] - f[:, 2:])], 1) * 2.5
-        levels = F.relu(1 - (lightness * 4 - self.levels).abs()) * 0.5
-        edges = F.conv2d(F.pad(lightness, (1, 1, 1, 1), mode="replicate"), self.sobel)
-        return torch.cat([self.directions(chroma), levels, self.directions(edges)], 1)
+        chroma, ahead, levels = F.conv2d(f, self.linear, self.offset).split([2, 6, 5], 1)
+        lightness = F.pad(f[:, 1:2], (1, 1, 1, 1), mode="replicate")  # but for factor and offset
+        edges, across = F.conv2d(lightness, self.edges).split([2, 6], 1)
+        levels = F.relu(1 - levels.abs()) * 0.5
+        return torch.cat(
+            [self.directions(chroma, ahead), levels, self.directions(edges, across)], 1
+        )
 
-    def directions(self, vector: Any) -> Any:
-        length = ((vector * vector).sum(1, keepdim=True) + 1e-8).sqrt()
-        aligned = F.relu(F.conv2d(vector, self.turns) / length)
-        aligned = aligned * aligned
-        return aligned * aligned * length.clamp_max(1.0)
+    def directions(self, vector: Any, ahead: Any) -> Any:
+        """Cosine^4 with every direction, times the length up to 1; ahead: length along each."""
+        square = (vector * vector).sum(1, keepdim=True) + 1e-8
+        ahead = F.relu(ahead)
+        ahead = ahead * ahead
+        return ahead * ahead * (square.sqrt().clamp_max(1.0) / (square * square))
 
 
 class Backbone(nn.Module):
@@ -579,7 +600,9 @@ class Backbone(nn.Module):
         x16 = self.side16(self.down16(x8))
         y8 = self.mix8(self.side8(x8) + F.interpolate(x16, scale_factor=2.0, mode="nearest"))
         y4 = self.mix4(self.side4(x4) + F.interpolate(y8, scale_factor=2.0, mode="nearest"))
-        return torch.cat([self.colour(x), self.near(x4), y4], 1).permute(0, 2, 3, 1)
+        with torch.no_grad():
+            fixed = self.colour(x)
+        return torch.cat([fixed, self.near(x4), y4], 1).permute(0, 2, 3, 1)
 
 
 class PartHead(nn.Module):
@@ -609,31 +632,35 @@ class PartHead(nn.Module):
         nn.init.zeros_(self.mix[-1].weight)
         nn.init.zeros_(self.mix[-1].bias)
 
-    def histogram(self, cells: Any) -> Any:
+    def histogram(self, colours: Any, share: Any) -> Any:
         """Unit rows (N, cells * COLOURS) of square roots; part-empty cells count less."""
-        share = cells[..., self.channels].reshape(-1, self.grids, self.side**2)
-        trust = (share / share.amax(2, keepdim=True).clamp_min(1e-6)).reshape(-1, self.cells, 1)
-        rows = (cells[..., :COLOURS] * trust + 1e-12).sqrt()
-        return F.normalize(rows.flatten(1), dim=1)
+        share = share.reshape(-1, self.grids, self.side**2)
+        trust = (share / share.amax(2, keepdim=True).clamp_min(1e-6)).reshape(-1, 1)
+        return unit((colours * trust + 1e-12).sqrt().reshape(-1, self.cells * COLOURS))
 
     def seen(self, words: Any, share: Any) -> Any:
         """What the perceptron sees: short words of all cells, mean and maximum of every row."""
-        words = words * (share > 0)
-        lines = (-1, self.grids * self.side, self.side)
-        word, weight = words.reshape(*lines, words.shape[-1]), share.reshape(*lines, 1)
-        mean = (word * weight).sum(2) / weight.sum(2).clamp_min(1e-6)  # (N, rows, word)
-        seen = [self.brief(words), mean, word.amax(2)]
-        return torch.cat([part.flatten(1) for part in seen], 1)
+        words = words * share.sign()
+        wide = self.brief.in_features
+        word, weight = words.reshape(-1, self.side, wide), share.reshape(-1, 1, self.side)
+        mean = weight @ word / weight.sum(2, keepdim=True).clamp_min(1e-6)  # (rows, 1, word)
+        brief = self.brief(words).reshape(-1, self.cells * self.brief.out_features)
+        lines = [part.reshape(-1, self.grids * self.side * wide) for part in (mean, word.amax(1))]
+        return torch.cat([brief, *lines], 1)
 
     def forward(self, rows: Any) -> Any:
-        cells = rows.reshape(-1, self.cells, self.channels + 2)
+        cells = rows.reshape(-1, self.channels + 2)  # of all objects: exports as few, plain nodes
         if self.training:  # some cells are hidden
-            cells = cells * (torch.rand_like(cells[..., :1]) > 0.1)
-        share = cells[..., self.channels : self.channels + 1]
-        colours = (cells[..., :COLOURS] + 1e-6).sqrt()
-        words = self.word(torch.cat([colours, cells[..., COLOURS:]], -1))
-        joint = self.project(self.histogram(cells)) + self.mix(self.seen(words, share))
-        return F.normalize(joint, dim=1)
+            cells = cells * (torch.rand_like(cells[:, :1]) > 0.1)
+        colours, rest, share, others = cells.split([COLOURS, self.channels - COLOURS, 1, 1], 1)
+        words = self.word(torch.cat([(colours + 1e-6).sqrt(), rest, share, others], 1))
+        joint = self.project(self.histogram(colours, share)) + self.mix(self.seen(words, share))
+        return unit(joint)
+
+
+def unit(rows: Any) -> Any:
+    """Rows (N, E) of unit length."""
+    return rows / rows.norm(dim=1, keepdim=True)
 
 
 class Head(nn.Module):
@@ -676,7 +703,8 @@ class Net(nn.Module):
         with torch.no_grad():
             images = torch.from_numpy(np.stack([v.picture for v in views])).to(device)
             for head, cells in zip(self.head.parts, self.cells(views, images), strict=True):
-                rows = head.histogram(cells.reshape(-1, head.cells, head.channels + 2))
+                cells = cells.reshape(-1, head.channels + 2)
+                rows = head.histogram(cells[:, :COLOURS], cells[:, head.channels])
                 principal(head.project.weight, rows)
 
 
@@ -860,7 +888,8 @@ class Pool:
         self.args = args
         self.real = [(clip, clip.shared()) for clip in real_clips(args)]
         self.rooms: list[tuple[Clip, Any]] = []
-        self.waiting = list(parse_range(args.rooms)) if args.rooms else []
+        wanted = ((args.rooms, False), (args.fine_rooms, True))
+        self.waiting = [(s, fine) for rooms, fine in wanted for s in parse_range(rooms or "0:0")]
         self.fill()
         if not self.real and not self.rooms:
             raise SystemExit(
@@ -869,12 +898,12 @@ class Pool:
 
     def fill(self) -> None:
         """Take in rooms: those of the cache, or render one if there is nothing at all yet."""
-        for seed in list(self.waiting):
-            there = room_path(seed, self.args.cache).exists()
+        for seed, fine in list(self.waiting):
+            there = room_path(seed, self.args.cache, fine).exists()
             if there or not self.args.no_render:
-                clip = room_clip(seed, self.args.cache, self.args.frames)
+                clip = room_clip(seed, self.args.cache, self.args.frames, fine)
                 self.rooms.append((clip, clip.shared()))
-                self.waiting.remove(seed)
+                self.waiting.remove((seed, fine))
 
     def draw(self, rng: np.random.Generator) -> list[list[View]]:
         """Scenes of one batch: recordings for a third of them, if there are any."""
@@ -944,6 +973,7 @@ class Trainer:
         self.net = self.make_net().to(self.device)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), args.rate, weight_decay=0.05)
         self.step, self.seconds, self.best = 0, 0.0, -1.0
+        self.mean: Any = None  # the network with the mean of the weights of the last steps
         last = args.out / "last.pt"
         if args.resume and last.exists():
             state = torch.load(last, map_location=self.device, weights_only=True)
@@ -954,6 +984,12 @@ class Trainer:
         args.out.mkdir(parents=True, exist_ok=True)
         if self.step == 0:
             self.start()
+        if args.average:
+            rule = swa_utils.get_ema_multi_avg_fn(args.average)
+            self.mean = swa_utils.AveragedModel(self.net, multi_avg_fn=rule, use_buffers=True)
+            self.mean.update_parameters(self.net)
+            if self.step:
+                self.mean.load_state_dict(state["mean"])
         self.val = self.make_val()
 
     def make_pool(self) -> Any:
@@ -974,11 +1010,11 @@ class Trainer:
         }
 
     def start(self) -> None:
-        """Start the heads from the training-free descriptor, the backbone from --start."""
+        """Start from a checkpoint (--start), or the heads from the training-free descriptor."""
         if self.args.start:
-            state = torch.load(self.args.start, map_location=self.device, weights_only=True)["net"]
-            own = {k: v for k, v in state.items() if k.startswith("backbone.")}
-            self.net.load_state_dict(own, strict=False)
+            state = torch.load(self.args.start, map_location=self.device, weights_only=True)
+            self.net.load_state_dict(state["net"])
+            return
         rng = np.random.default_rng([self.args.seed, 10])
         views = [view for _ in range(12) for scene in self.pool.draw(rng) for view in scene]
         self.net.eval()
@@ -1001,6 +1037,8 @@ class Trainer:
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), 5.0)
         self.optimizer.step()
+        if self.mean is not None:
+            self.mean.update_parameters(self.net)
         self.step += 1
         return float(np.asarray(loss.detach().cpu()))
 
@@ -1011,7 +1049,11 @@ class Trainer:
 
     def score(self, clips: Any) -> dict[str, float]:
         """Rank-1 on validation clips."""
-        return rank_one(self.net, clips, self.device)
+        return rank_one(self.taken(), clips, self.device)
+
+    def taken(self) -> Any:
+        """The network that is validated and exported."""
+        return self.net if self.mean is None else self.mean.module
 
     def summary(self) -> dict[str, Any]:
         """How it was trained, for the files."""
@@ -1056,6 +1098,8 @@ class Trainer:
         self.best = max(self.best, score)
         state = {"net": self.net.state_dict(), "optimizer": self.optimizer.state_dict()}
         state |= {"step": self.step, "seconds": self.seconds, "best": self.best}
+        if self.mean is not None:
+            state["mean"] = self.mean.state_dict()
         for name in names:
             torch.save(state, self.args.out / "part")
             (self.args.out / "part").replace(self.args.out / name)
@@ -1064,6 +1108,8 @@ class Trainer:
         """Go back to the checkpoint with the best validation (the last one of equals)."""
         state = torch.load(self.args.out / "best.pt", map_location=self.device, weights_only=True)
         self.net.load_state_dict(state["net"])
+        if self.mean is not None:
+            self.mean.load_state_dict(state["mean"])
         self.step = state["step"]
 
 
@@ -1154,6 +1200,7 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
     add: Callable[..., Any] = parser.add_argument
     add("-o", "--out", type=Path, required=True, help="folder for models, checkpoint, log")
     add("--rooms", default="", help="A:B, seeds of rendered rooms to train on")
+    add("--fine-rooms", default="", help="A:B, seeds of rooms in 640 x 480")
     add("--val-rooms", default="", help="A:B, seeds to validate with")
     add("--cache", type=Path, default=Path("rooms_cache"), help="folder of rendered rooms")
     add("--frames", type=int, default=40, help="views of each room")
@@ -1166,6 +1213,10 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
     add("--steps", type=int, default=3000)
     add("--minutes", type=float, default=0.0, help="stop after so many minutes of steps (0: never)")
     add("--rate", type=float, default=1e-3, help="peak learning rate (AdamW, cosine)")
+    add(
+        "--average", type=float, default=0.0, metavar="DECAY",
+        help="take the moving average of the weights (.9995; 0: the last weights)",
+    )  # fmt: skip
     add("--hard-after", type=float, default=1.0, help="hardest negatives from this share on")
     add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
@@ -1192,7 +1243,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Train, draw the curves, export."""
     parser = common_options(__doc__)
     parser.add_argument(
-        "--start", type=Path, help="take the backbone of this checkpoint (.pt) to begin with"
+        "--start", type=Path, help="begin with the weights of this checkpoint (.pt)"
     )
     args = parsed(parser, argv)
     trainer = Trainer(args)
@@ -1200,7 +1251,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     trainer.take_best()
     out: Path = args.out
     draw_curves(out / "log.csv", out / "curves.png")
-    export(trainer.net, out, trainer.summary())
+    export(trainer.taken(), out, trainer.summary())
     print(f"{out / 'reobj.onnx'}: use it with --embed {out / 'reobj.onnx'}")
     return 0
 

@@ -300,23 +300,23 @@ class HeadTrainer(te.Trainer):
         return [torch.from_numpy(np.concatenate([s.parts[n] for s in scenes])).float()
                 for n in self.names]  # fmt: skip
 
-    def embed(self, scenes: Sequence[Seen]) -> list[Any]:
-        """Unit rows of each part."""
+    def embed(self, net: Any, scenes: Sequence[Seen]) -> list[Any]:
+        """Unit rows of each part by these heads."""
         parts = self.inputs(scenes)
-        return [head(part.to(self.device)) for head, part in zip(self.net, parts, strict=True)]
+        return [head(part.to(self.device)) for head, part in zip(net, parts, strict=True)]
 
     def loss(self, scenes: Any, hard: bool) -> Any:
-        parts = self.embed(scenes)
+        parts = self.embed(self.net, scenes)
         scene = np.repeat(np.arange(len(scenes)), [len(s.identity) for s in scenes])
         identity = np.concatenate([s.identity for s in scenes])
         frame = np.concatenate([s.frame for s in scenes])
         return te.parts_loss(parts, (scene, identity, frame), hard, self.args.loss == "soft")
 
     def score(self, clips: Sequence[Seen]) -> dict[str, float]:
-        self.net.eval()
+        net = self.taken().eval()
         with torch.no_grad():
-            done = [[p.cpu().numpy() for p in self.embed([clip])] for clip in clips]
-        self.net.train()
+            done = [[p.cpu().numpy() for p in self.embed(net, [clip])] for clip in clips]
+        net.train()
         return te.mean_hits([(parts, c.frame, c.identity, c.look)
                           for parts, c in zip(done, clips, strict=True)])  # fmt: skip
 
@@ -339,7 +339,7 @@ def export_head(trainer: HeadTrainer, out: Path) -> None:
     import onnx
 
     fed = tuple(part[:2] for part in trainer.inputs(trainer.pool.rooms[:1]))
-    net, crops = trainer.net.cpu().eval(), trainer.frozen.crops
+    net, crops = trainer.taken().cpu().eval(), trainer.frozen.crops
     path = out / f"{'crops_' if crops else ''}{Path(trainer.args.backbone).stem}_head.onnx"
     if crops:
         whole = Heads(net, fed[0].shape[1])
@@ -392,7 +392,6 @@ def build_parser() -> argparse.ArgumentParser:
     parser = te.common_options(__doc__)
     add: Callable[..., Any] = parser.add_argument
     add("--backbone", required=True, help="name or ONNX file of the frozen backbone")
-    add("--fine-rooms", default="", help="A:B, seeds of rooms in 640 x 480")
     add("--crops", action="store_true", help="for two crops an object (re-OBJ's ConvBlock)")
     add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="of --crops")
     add("--copies", type=int, default=1, help="augmented copies of each scene")

@@ -260,6 +260,7 @@ def trained(te, tmp_path_factory) -> Path:
         "--every",
         "1",
     ]
+    command += ["--average", "0.5"]
     assert te.main([*command, "--steps", "2"]) == 0
     assert te.main([*command, "--steps", "3", "--resume"]) == 0
     return folder
@@ -279,7 +280,10 @@ def test_exported_model_equals_the_trained_network(te, trained) -> None:
 
     clip = te.room_clip(3, trained / "rooms")
     net = te.Net()
-    net.load_state_dict(torch.load(trained / "best.pt", weights_only=True)["net"])
+    state = torch.load(trained / "best.pt", weights_only=True)
+    mean = {k[7:]: v for k, v in state["mean"].items() if k.startswith("module.")}
+    assert any((mean[k] != v).any() for k, v in state["net"].items())
+    net.load_state_dict(mean)
     net.eval()
     frame, rng = int(np.argmax([len(i) for i in clip.identity])), np.random.default_rng(0)
     view = te.make_view(clip, frame, rng, None, False, clip.identity[frame])
@@ -324,6 +328,21 @@ def test_triplet_loss_picks_the_negative(te, hard: bool, soft: bool, expected: f
     assert loss == pytest.approx(0.1 * np.log1p(np.exp((expected - 0.6) / 0.1)), abs=1e-4)
 
 
+def test_windows_of_large_pictures_are_narrower(te) -> None:
+    """Sizes differ by up to 1 : 3 where the picture holds the detail."""
+    rng = np.random.default_rng(0)
+    number = np.arange(1)
+    widths = []
+    for scale in (1, 2):
+        image = np.zeros((240 * scale, 320 * scale, 3), np.uint8)
+        box = np.array([[150.0, 110, 170, 130]]) * scale
+        clip = te.Clip("x", [image], None, [box], [number], [number], True)
+        found = [te.augmented(clip, 0, rng, lambda image: image, False, number) for _ in range(200)]
+        boxes = np.concatenate([d.xyxy[rows] for _, d, rows in found])
+        widths.append(boxes[:, 2] - boxes[:, 0])
+    assert widths[0].max() < 45 < 55 < widths[1].max() and widths[1].min() < 24
+
+
 def test_overlapping_pseudo_objects_are_dropped(te) -> None:
     center = np.array([[0.0, 0, 0], [0.1, 0, 0], [2.0, 0, 0], [5.0, 0, 0]])
     assert te.apart(center, np.array([1.0, 1.0, 1.0, 0.0])).tolist() == [0, 2]
@@ -338,7 +357,7 @@ def test_mot_tracks_become_a_clip(te, tmp_path) -> None:
     )
     clip = te.tracks_clip(tmp_path / "images", tmp_path / "tracks.txt")
     assert [i.tolist() for i in clip.identity] == [[0], [0]] and clip.labels is None
-    np.testing.assert_allclose(clip.xyxy[0], [[75, 75, 225, 225]])  # 480 px on the longer side
+    np.testing.assert_allclose(clip.xyxy[0], [[100, 100, 300, 300]])  # 640 px on the longer side
 
 
 def test_tracks_take_the_masks_of_the_detections(te, tmp_path) -> None:
@@ -368,8 +387,8 @@ def test_scannet_folders_become_a_clip(te, tmp_path) -> None:
     groups = [{"objectId": 2, "label": "chair"}, {"objectId": 4, "label": "chair"}]
     (tmp_path / "x.aggregation.json").write_text(json.dumps({"segGroups": groups}))
     clip = te.scannet_clip(tmp_path)
-    assert len(clip.images) == 2 and clip.images[0].shape == (360, 480, 3)
-    np.testing.assert_allclose(clip.xyxy[1][0], [45, 30, 150, 180])
+    assert len(clip.images) == 2 and clip.images[0].shape == (480, 640, 3)
+    np.testing.assert_allclose(clip.xyxy[1][0], [60, 40, 200, 240])
     assert len(set(clip.identity[0].tolist())) == 2 and len(set(clip.look[0].tolist())) == 1
     for box, identity in zip(clip.xyxy[0].astype(int), clip.identity[0], strict=True):
         inner = clip.labels[0][box[1] + 2 : box[3] - 2, box[0] + 2 : box[2] - 2]
@@ -420,7 +439,7 @@ def assert_same_as_in_torch(th, args, see, checkpoint: Path, look: rt.Embeddings
     trainer.net.eval()
     seen = th.Seen(see, np.arange(2), np.arange(2), np.zeros(2))
     with torch.no_grad():
-        expected = [part.numpy() for part in trainer.embed([seen])]
+        expected = [part.numpy() for part in trainer.embed(trainer.net, [seen])]
     if args.crops:  # one row of both
         expected = [np.concatenate(expected, 1) / 2**0.5]
     for mine, theirs in zip((look.foreground, look.background), expected, strict=False):
