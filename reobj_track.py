@@ -299,6 +299,10 @@ class TrackerConfig:
     )
     iou_odds: float = _opt(20.0, "log odds that full overlap is worth")
     embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
+    map_frames: int = _opt(2, "a feature map serves this many more frames (0: its own alone) ...")
+    map_move: float = _opt(
+        0.02, "... while the image has moved by less than this share of its longer side"
+    )
     look_momentum: float = _opt(
         0.8, "memory of a track's running mean appearance (StrongSORT: .9 every frame)"
     )
@@ -2148,7 +2152,8 @@ class Embedder:
             return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
         seen, share = self._last, self.layout.neighbours if self.trained else 0.0
         if seen is None or seen.frame is not frame or seen.detections is not detections:
-            seen = self._last = _Seen(frame, detections, self._features(frame), self.layout)
+            features = self._features(frame)
+            seen = self._last = _Seen(frame, detections, detections, features, self.layout)
         wanted = seen.sure & (share > 0)
         wanted[rows] = True
         new = np.flatnonzero(wanted & ~seen.known)
@@ -2159,6 +2164,17 @@ class Embedder:
             around = look_around(detections.xyxy, seen.foreground, seen.sure, rows)
             back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
         return Embeddings(seen.foreground[rows], _unit_rows(back))
+
+    def keep_map(self, frame: Image, detections: Detections, new_from_old: Array) -> None:
+        """Let the map computed last serve this frame too: its boxes are looked up where they were.
+
+        Args:
+            detections: of this frame, without masks. new_from_old: (3, 3) its pixels from those of
+                the frame of the map, a similarity.
+        """
+        if self._last is not None:
+            there, features = _warped(detections, np.linalg.inv(new_from_old)), self._last.features
+            self._last = _Seen(frame, detections, there, features, self.layout)
 
     @property
     def trained(self) -> bool:
@@ -2173,7 +2189,7 @@ class Embedder:
     def _parts(self, seen: _Seen, new: IntArray, rows: IntArray) -> tuple[Array, Array]:
         """Foreground (M, E1) of the new rows and background (N, E2) of the chosen ones."""
         size_hw, chosen = seen.frame.shape[:2], (new, rows)
-        samples = part_samples(seen.detections, chosen, size_hw, seen.objects, self.layout)
+        samples = part_samples(seen.there, chosen, size_hw, seen.objects, self.layout)
         fore, back = part_cells(seen.features, samples, self.layout)
         if self._net is not None and self._net.head is not None:
             return self._net.embed(fore, back)
@@ -2182,17 +2198,30 @@ class Embedder:
         return _unit_histogram(fore), np.concatenate([_unit_histogram(b) for b in around], 1)
 
 
+def _warped(detections: Detections, matrix: npt.NDArray[Any]) -> Detections:
+    """Move boxes by a similarity (3, 3); centres turn, boxes stay upright."""
+    box = _cxcywh_from_xyxy(detections.xyxy)
+    box[:, :2] = box[:, :2] @ matrix[:2, :2].T + matrix[:2, 2]
+    box[:, 2:] *= math.sqrt(abs(np.linalg.det(matrix[:2, :2])))
+    return dataclasses.replace(detections, xyxy=_xyxy_from_cxcywh(box))
+
+
 class _Seen:
-    """A frame, its feature map (h, w, C), the cells (h, w) that show objects, and the foreground
-    (D, E) of those of its detections that are known.
+    """A frame, its detections and where they lie on a feature map (h, w, C), the cells (h, w) that
+    show objects, and the foreground (D, E) of those of the detections that are known.
     """
 
     def __init__(
-        self, frame: Image, detections: Detections, features: Floats, layout: EmbedConfig
+        self,
+        frame: Image,
+        detections: Detections,
+        there: Detections,
+        features: Floats,
+        layout: EmbedConfig,
     ) -> None:
-        self.frame, self.detections, self.features = frame, detections, features
+        self.frame, self.detections, self.there, self.features = frame, detections, there, features
         self.sure = detections.score >= layout.object_score
-        self.objects = object_map(detections, frame.shape, features.shape[:2], layout.object_score)
+        self.objects = object_map(there, frame.shape, features.shape[:2], layout.object_score)
         self.known = np.zeros(len(detections), bool)
         self.foreground = np.zeros((len(detections), 0))
 
@@ -2676,6 +2705,7 @@ class _LazyEmbeddings:
     ) -> None:
         self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
         self.weight = weight
+        self.new_from_old: Array | None = None  # (3, 3) where the map of a frame before serves
         self.rows: Floats | None = None  # (D, E)
         self.split = 0  # width of the foreground in the rows
         self.done = np.zeros(len(detections), bool)
@@ -2700,6 +2730,8 @@ class _LazyEmbeddings:
             parts = (self.given.foreground[rows], self.given.background[rows])
         else:
             assert self.embedder is not None and self.frame is not None
+            if self.new_from_old is not None and self.rows is None:
+                self.embedder.keep_map(self.frame, self.detections, self.new_from_old)
             embeddings = self.embedder(self.frame, self.detections, rows)
             parts = (embeddings.foreground, embeddings.background)
         weight, self.split = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
@@ -3165,6 +3197,7 @@ class Tracker:
         self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
         self._last_pose: Array | None = None
         self._latest: _LazyEmbeddings | None = None  # of the latest frame
+        self._forget_map()
         self._view: Array | None = None  # (3, 4) img_from_world of the frame
         self._image_size = (0, 0)
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
@@ -3173,6 +3206,7 @@ class Tracker:
         """Write the whole state, without the embedder, as an .npz file: what `load` reads goes on
         as if it had never stopped.
         """
+        self._forget_map()  # as the one that is loaded has none
         state: dict[str, Any] = {}
         for key, (owner, name) in self._state().items():
             value = getattr(owner, name)
@@ -3273,10 +3307,13 @@ class Tracker:
         )
         self._latest = lazy
         self._predict(frame, cam_from_world, camera)
+        lazy.new_from_old = self._older_map(detections, frame)
         track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
         self._correct(detections, track_of)
         track_of = self._begin(detections, track_of)
         self._look(detections, track_of, lazy)
+        if lazy.rows is not None and lazy.new_from_old is None:
+            self._map_age, self._map_motion = 0, np.eye(3)
         track_of = self._confirm(track_of)
         result = self._report(detections, track_of)
         self._retire()
@@ -3293,11 +3330,12 @@ class Tracker:
         live = self._live
         live.mean, live.cov = kalman_predict(live.mean, live.cov, self.config)
         live.mean[:, 2:, 0] = live.mean[:, 2:, 0].clip(1.0)  # a size stays positive
-        self._view, before, pose = None, live.mean[..., 0].copy(), None
+        self._view, before, pose, self._motion = None, live.mean[..., 0].copy(), None, np.eye(3)
         if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
             pose = np.asarray(cam_from_world, np.float64)
         if frame is not None and self.config.camera_motion:
-            live.mean, live.cov = _warp_state(live.mean, live.cov, self._camera_motion(frame))
+            self._motion = self._camera_motion(frame)
+            live.mean, live.cov = _warp_state(live.mean, live.cov, self._motion)
             live.mean[:, :2, 0] += self._camera_motion.parallax(before[:, :2])
         elif pose is not None and camera is not None and self._last_pose is not None:
             rotation = pose[:, :3] @ self._last_pose[:, :3].T
@@ -3307,6 +3345,26 @@ class Tracker:
         if pose is not None and camera is not None:
             in_view = self._place_tracks(pose, camera, before)
         live.missed += in_view | (live.missed == 0)
+
+    def _forget_map(self) -> None:
+        """The next look needs a feature map of its own frame."""
+        self._map_age, self._map_motion = 10**6, np.eye(3)
+
+    def _older_map(self, detections: Detections, frame: Image | None) -> Array | None:
+        """new_from_old (3, 3) if the feature map of a frame shortly before serves this one too:
+        the image has moved little since. Masks lie at this frame's pixels: they need its own map.
+        """
+        self._map_age, self._map_motion = self._map_age + 1, self._motion @ self._map_motion
+        if frame is None or np.array_equal(self._motion, np.eye(3)):  # not known
+            self._forget_map()
+        fresh = self._map_age > self.config.map_frames or detections.masks is not None
+        fresh |= self.frame_number % self.config.embed_every == 0  # all tracks are refreshed
+        if fresh or frame is None or not hasattr(self.embedder, "keep_map"):
+            return None
+        height, width = frame.shape[:2]
+        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1.0]])
+        moved = np.abs(corners @ self._map_motion.T - corners).max()
+        return self._map_motion if moved < self.config.map_move * max(height, width) else None
 
     def _place_tracks(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
         """Move tracks of known place as their ellipsoid's image does, from where they were
