@@ -213,6 +213,30 @@ def test_some_rows_are_embedded_as_all_rows(model: str) -> None:
     assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
 
 
+def test_a_map_serves_the_next_frame() -> None:
+    """The look of boxes that moved with the image: nearly that of a map of their own, far from that
+    of another place; no map is computed.
+    """
+    rng = np.random.default_rng(5)
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (520, 700, 3), dtype=np.uint8), (0, 0), 6)
+    old, new = wide[:480, :640], wide[3:483, 6:646]  # things move by (-6, -3)
+    there = boxes((100, 100, 180, 220), (300, 200, 380, 300))
+    here = boxes((94, 97, 174, 217), (294, 197, 374, 297))
+    embedder, computed = rt.Embedder(threads=1), []
+    own = rt.Embedder(threads=1)(new, here)
+    plain = embedder._features
+    embedder._features = lambda frame: (computed.append(1), plain(frame))[1]
+    embedder(old, there)
+    embedder.keep_map(new, here, np.array([[1, 0, -6], [0, 1, -3], [0, 0, 1.0]]))
+    kept = embedder(new, here)
+    assert len(computed) == 1
+    for mine, theirs in ((kept.foreground, own.foreground), (kept.background, own.background)):
+        cosine = mine @ theirs.T
+        assert cosine.diagonal().min() > 0.95 > cosine[0, 1]
+    embedder(new, there)  # other detections: a map of its own again
+    assert len(computed) == 2
+
+
 def test_own_weights_say_how_they_were_trained() -> None:
     session = rt.onnx_session(rt.model_path("reobj"), 1)
     facts = json.loads(session.get_modelmeta().custom_metadata_map["reobj"])

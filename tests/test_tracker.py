@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -470,6 +471,78 @@ def test_a_newcomer_does_not_take_over_a_missed_track() -> None:
         assert found.track_id.tolist() == expected
     both = tracker.update(rows(here, beside), embeddings=looks[[0, 2]])
     assert both.track_id.tolist() == [1, 2]
+
+
+# ---- Maps that serve the next frames ----
+
+
+def mapped_tracker(age: int = 0) -> rt.Tracker:
+    """A tracker in frame 1 that had a feature map computed so many frames before the last one."""
+    tracker = rt.Tracker(embedder=rt.Embedder())
+    tracker.frame_number, tracker._map_age = 1, age
+    return tracker
+
+
+def shift(x: float) -> np.ndarray:
+    return np.array([[1, 0, x], [0, 1, 0], [0, 0, 1.0]])
+
+
+def test_a_map_serves_while_the_image_moves_little() -> None:
+    """2 % of 640 pixels in all, two frames more."""
+    frame, found = np.zeros((480, 640, 3), np.uint8), rows((0, 0, 50, 50))
+    tracker = mapped_tracker()
+    tracker._motion = shift(5)
+    np.testing.assert_allclose(tracker._older_map(found, frame), shift(5))
+    np.testing.assert_allclose(tracker._older_map(found, frame), shift(10))
+    tracker._motion = shift(0.5)
+    assert tracker._older_map(found, frame) is None  # the third frame
+    tracker = mapped_tracker()
+    tracker._motion = shift(7)
+    assert tracker._older_map(found, frame) is not None
+    assert tracker._older_map(found, frame) is None  # 14 pixels
+
+
+def test_a_map_of_its_own_for_masks_refreshes_and_unknown_motion() -> None:
+    frame, found = np.zeros((480, 640, 3), np.uint8), rows((0, 0, 50, 50))
+    masked = dataclasses.replace(found, masks=np.ones((1, 480, 640), bool))
+    for detections, number, motion in ((masked, 1, 5), (found, 20, 5), (found, 1, 0)):
+        tracker = mapped_tracker()
+        tracker.frame_number, tracker._motion = number, shift(motion)
+        assert tracker._older_map(detections, frame) is None
+    tracker = mapped_tracker()
+    tracker.embedder = lambda frame, detections, rows: None  # the user's own
+    tracker._motion = shift(5)
+    assert tracker._older_map(found, frame) is None
+
+
+def test_identities_without_masks_with_fewer_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the example clip, masks left out: maps are saved, identities stay."""
+    recorded = rt.read_detections(ROOM / "detections.npz", rt.Video(ROOM / "room.mp4"))
+    frames = list(itertools.islice(rt.Video(ROOM / "room.mp4"), 60))
+    told, computed = [], []
+    for share in (0.0, 0.02):
+        tracker, count = rt.Tracker(rt.TrackerConfig(map_move=share), rt.Embedder()), [0]
+        plain = tracker.embedder._features
+        monkeypatch.setattr(
+            tracker.embedder,
+            "_features",
+            lambda f: (count.append(1), plain(f))[1],  # noqa: B023
+        )
+        found = [dataclasses.replace(recorded.at(f.index), masks=None) for f in frames]
+        steps = [tracker.update(d, f.image) for d, f in zip(found, frames, strict=True)]
+        told.append(steps)
+        computed.append(sum(count))
+    assert computed[1] < 0.97 * computed[0]
+    same = [a.track_id.tolist() == b.track_id.tolist() for a, b in zip(*told, strict=True)]
+    assert np.mean(same) > 0.95
+
+
+def test_saving_ends_the_life_of_a_map(tmp_path: Path) -> None:
+    """The tracker that goes on and the one that is loaded look at the same pixels."""
+    tracker = mapped_tracker()
+    tracker.save(tmp_path / "state.npz")
+    tracker._motion = shift(5)
+    assert tracker._older_map(rows((0, 0, 50, 50)), np.zeros((480, 640, 3), np.uint8)) is None
 
 
 # ---- Saved state ----
