@@ -2165,16 +2165,13 @@ class Embedder:
             back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
         return Embeddings(seen.foreground[rows], _unit_rows(back))
 
-    def keep_map(self, frame: Image, detections: Detections, new_from_old: Array) -> None:
-        """Let the map computed last serve this frame too: its boxes are looked up where they were.
-
-        Args:
-            detections: of this frame, without masks. new_from_old: (3, 3) its pixels from those of
-                the frame of the map, a similarity.
+    def keep_map(self, frame: Image, detections: Detections, there: Array) -> None:
+        """Let the map computed last serve this frame too: its detections (without masks) are looked
+        up where they were in the frame of the map, boxes (D, 4) `there`.
         """
         if self._last is not None:
-            there, features = _warped(detections, np.linalg.inv(new_from_old)), self._last.features
-            self._last = _Seen(frame, detections, there, features, self.layout)
+            older = dataclasses.replace(detections, xyxy=there)
+            self._last = _Seen(frame, detections, older, self._last.features, self.layout)
 
     @property
     def trained(self) -> bool:
@@ -2196,14 +2193,6 @@ class Embedder:
         near = self.layout.background_cells**2
         around = (back[:, :near], back[:, near:])[: 1 + (self.layout.wide > 0)]
         return _unit_histogram(fore), np.concatenate([_unit_histogram(b) for b in around], 1)
-
-
-def _warped(detections: Detections, matrix: npt.NDArray[Any]) -> Detections:
-    """Move boxes by a similarity (3, 3); centres turn, boxes stay upright."""
-    box = _cxcywh_from_xyxy(detections.xyxy)
-    box[:, :2] = box[:, :2] @ matrix[:2, :2].T + matrix[:2, 2]
-    box[:, 2:] *= math.sqrt(abs(np.linalg.det(matrix[:2, :2])))
-    return dataclasses.replace(detections, xyxy=_xyxy_from_cxcywh(box))
 
 
 class _Seen:
@@ -2705,7 +2694,7 @@ class _LazyEmbeddings:
     ) -> None:
         self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
         self.weight = weight
-        self.new_from_old: Array | None = None  # (3, 3) where the map of a frame before serves
+        self.there: Array | None = None  # (D, 4) in a frame before whose map serves this one too
         self.rows: Floats | None = None  # (D, E)
         self.split = 0  # width of the foreground in the rows
         self.done = np.zeros(len(detections), bool)
@@ -2730,8 +2719,8 @@ class _LazyEmbeddings:
             parts = (self.given.foreground[rows], self.given.background[rows])
         else:
             assert self.embedder is not None and self.frame is not None
-            if self.new_from_old is not None and self.rows is None:
-                self.embedder.keep_map(self.frame, self.detections, self.new_from_old)
+            if self.there is not None and self.rows is None:
+                self.embedder.keep_map(self.frame, self.detections, self.there)
             embeddings = self.embedder(self.frame, self.detections, rows)
             parts = (embeddings.foreground, embeddings.background)
         weight, self.split = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
@@ -3307,12 +3296,12 @@ class Tracker:
         )
         self._latest = lazy
         self._predict(frame, cam_from_world, camera)
-        lazy.new_from_old = self._older_map(detections, frame)
+        lazy.there = self._on_older_map(detections, frame)
         track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
         self._correct(detections, track_of)
         track_of = self._begin(detections, track_of)
         self._look(detections, track_of, lazy)
-        if lazy.rows is not None and lazy.new_from_old is None:
+        if lazy.rows is not None and lazy.there is None:
             self._map_age, self._map_motion = 0, np.eye(3)
         track_of = self._confirm(track_of)
         result = self._report(detections, track_of)
@@ -3350,9 +3339,9 @@ class Tracker:
         """The next look needs a feature map of its own frame."""
         self._map_age, self._map_motion = 10**6, np.eye(3)
 
-    def _older_map(self, detections: Detections, frame: Image | None) -> Array | None:
-        """new_from_old (3, 3) if the feature map of a frame shortly before serves this one too:
-        the image has moved little since. Masks lie at this frame's pixels: they need its own map.
+    def _on_older_map(self, detections: Detections, frame: Image | None) -> Array | None:
+        """Boxes (D, 4) in a frame shortly before whose feature map serves this one too: the image
+        has moved little since. Masks lie at this frame's pixels: they need its own map.
         """
         self._map_age, self._map_motion = self._map_age + 1, self._motion @ self._map_motion
         if frame is None or np.array_equal(self._motion, np.eye(3)):  # not known
@@ -3364,7 +3353,22 @@ class Tracker:
         height, width = frame.shape[:2]
         corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1.0]])
         moved = np.abs(corners @ self._map_motion.T - corners).max()
-        return self._map_motion if moved < self.config.map_move * max(height, width) else None
+        if moved > self.config.map_move * max(height, width):
+            return None
+        return self._where_they_were(detections.xyxy)
+
+    def _where_they_were(self, xyxy: Array) -> Array:
+        """Boxes (D, 4) in the frame of the map: back by the motion of the track that is expected
+        there (things that move, depth), then by that of the camera.
+        """
+        live, box, older = self._live, _cxcywh_from_xyxy(xyxy), np.linalg.inv(self._map_motion)
+        if len(live.mean) and len(box):
+            iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), xyxy)
+            speed = live.mean[iou.argmax(0), :2, 1] * (iou.max(0) > 0)[:, None]  # (D, 2) a frame
+            box[:, :2] -= self._map_age * speed
+        box[:, :2] = box[:, :2] @ older[:2, :2].T + older[:2, 2]
+        box[:, 2:] *= math.sqrt(abs(np.linalg.det(older[:2, :2])))
+        return _xyxy_from_cxcywh(box)
 
     def _place_tracks(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
         """Move tracks of known place as their ellipsoid's image does, from where they were

@@ -227,7 +227,7 @@ def test_a_map_serves_the_next_frame() -> None:
     plain = embedder._features
     embedder._features = lambda frame: (computed.append(1), plain(frame))[1]
     embedder(old, there)
-    embedder.keep_map(new, here, np.array([[1, 0, -6], [0, 1, -3], [0, 0, 1.0]]))
+    embedder.keep_map(new, here, there.xyxy)
     kept = embedder(new, here)
     assert len(computed) == 1
     for mine, theirs in ((kept.foreground, own.foreground), (kept.background, own.background)):

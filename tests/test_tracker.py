@@ -492,14 +492,14 @@ def test_a_map_serves_while_the_image_moves_little() -> None:
     frame, found = np.zeros((480, 640, 3), np.uint8), rows((0, 0, 50, 50))
     tracker = mapped_tracker()
     tracker._motion = shift(5)
-    np.testing.assert_allclose(tracker._older_map(found, frame), shift(5))
-    np.testing.assert_allclose(tracker._older_map(found, frame), shift(10))
+    np.testing.assert_allclose(tracker._on_older_map(found, frame), [[-5, 0, 45, 50]])
+    np.testing.assert_allclose(tracker._on_older_map(found, frame), [[-10, 0, 40, 50]])
     tracker._motion = shift(0.5)
-    assert tracker._older_map(found, frame) is None  # the third frame
+    assert tracker._on_older_map(found, frame) is None  # the third frame
     tracker = mapped_tracker()
     tracker._motion = shift(7)
-    assert tracker._older_map(found, frame) is not None
-    assert tracker._older_map(found, frame) is None  # 14 pixels
+    assert tracker._on_older_map(found, frame) is not None
+    assert tracker._on_older_map(found, frame) is None  # 14 pixels
 
 
 def test_a_map_of_its_own_for_masks_refreshes_and_unknown_motion() -> None:
@@ -508,11 +508,11 @@ def test_a_map_of_its_own_for_masks_refreshes_and_unknown_motion() -> None:
     for detections, number, motion in ((masked, 1, 5), (found, 20, 5), (found, 1, 0)):
         tracker = mapped_tracker()
         tracker.frame_number, tracker._motion = number, shift(motion)
-        assert tracker._older_map(detections, frame) is None
+        assert tracker._on_older_map(detections, frame) is None
     tracker = mapped_tracker()
     tracker.embedder = lambda frame, detections, rows: None  # the user's own
     tracker._motion = shift(5)
-    assert tracker._older_map(found, frame) is None
+    assert tracker._on_older_map(found, frame) is None
 
 
 def test_identities_without_masks_with_fewer_maps(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -542,7 +542,7 @@ def test_saving_ends_the_life_of_a_map(tmp_path: Path) -> None:
     tracker = mapped_tracker()
     tracker.save(tmp_path / "state.npz")
     tracker._motion = shift(5)
-    assert tracker._older_map(rows((0, 0, 50, 50)), np.zeros((480, 640, 3), np.uint8)) is None
+    assert tracker._on_older_map(rows((0, 0, 50, 50)), np.zeros((480, 640, 3), np.uint8)) is None
 
 
 # ---- Saved state ----
