@@ -301,7 +301,7 @@ class TrackerConfig:
     embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
     map_frames: int = _opt(2, "a feature map serves this many more frames (0: its own alone) ...")
     map_move: float = _opt(
-        0.02, "... while the image has moved by less than this share of its longer side"
+        0.025, "... while the image has moved by less than this share of its longer side"
     )
     look_momentum: float = _opt(
         0.8, "memory of a track's running mean appearance (StrongSORT: .9 every frame)"

@@ -488,7 +488,7 @@ def shift(x: float) -> np.ndarray:
 
 
 def test_a_map_serves_while_the_image_moves_little() -> None:
-    """2 % of 640 pixels in all, two frames more."""
+    """2.5 % of 640 pixels in all, two frames more."""
     frame, found = np.zeros((480, 640, 3), np.uint8), rows((0, 0, 50, 50))
     tracker = mapped_tracker()
     tracker._motion = shift(5)
@@ -497,9 +497,23 @@ def test_a_map_serves_while_the_image_moves_little() -> None:
     tracker._motion = shift(0.5)
     assert tracker._on_older_map(found, frame) is None  # the third frame
     tracker = mapped_tracker()
-    tracker._motion = shift(7)
+    tracker._motion = shift(9)
     assert tracker._on_older_map(found, frame) is not None
-    assert tracker._on_older_map(found, frame) is None  # 14 pixels
+    assert tracker._on_older_map(found, frame) is None  # 18 pixels
+
+
+def test_things_that_move_are_looked_up_where_they_were() -> None:
+    """A walker at 3 pixels a frame before a still camera that trembles by half a pixel."""
+    tracker = mapped_tracker()
+    tracker._live = rt._Live.born(
+        np.array([[125.0, 200, 50, 100]]), np.array([1]), 0, tracker.config
+    )
+    tracker._live.mean[0, 0, 1] = 3.0
+    tracker._motion = shift(0.5)
+    walker, other = (100, 150, 150, 250), (400, 150, 450, 250)
+    frame = np.zeros((480, 640, 3), np.uint8)
+    expected = [[96.5, 150, 146.5, 250], [399.5, 150, 449.5, 250]]
+    np.testing.assert_allclose(tracker._on_older_map(rows(walker, other), frame), expected)
 
 
 def test_a_map_of_its_own_for_masks_refreshes_and_unknown_motion() -> None:
@@ -520,7 +534,7 @@ def test_identities_without_masks_with_fewer_maps(monkeypatch: pytest.MonkeyPatc
     recorded = rt.read_detections(ROOM / "detections.npz", rt.Video(ROOM / "room.mp4"))
     frames = list(itertools.islice(rt.Video(ROOM / "room.mp4"), 60))
     told, computed = [], []
-    for share in (0.0, 0.02):
+    for share in (0.0, 0.025):
         tracker, count = rt.Tracker(rt.TrackerConfig(map_move=share), rt.Embedder()), [0]
         plain = tracker.embedder._features
         monkeypatch.setattr(
