@@ -616,7 +616,7 @@ WEIGHTS: tuple[Weights, ...] = (
             "f75628d5ebbbb652f34adc33fcb163fe3a123e5a8bddc70125cb76b6f3c79005", 11560385,
             "AGPL-3.0", "COCO with masks, AP 39.5, 154 ms; strong copyleft"),
     Weights("reobj", "backbone", "reobj.onnx", "",
-            "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 394054,
+            "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 392965,
             "MIT", "ours, comes along: foreground and background, trained with its head"),
     Weights("mobilenetv2", "backbone", "mobilenetv2_feat.onnx", "",
             "2e2d63ad6239eb67ad4e132a0858da4ecbaf3022560007a659d05a1afd8fbc7f", 8849494,
@@ -2165,13 +2165,21 @@ class Embedder:
             back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
         return Embeddings(seen.foreground[rows], _unit_rows(back))
 
-    def keep_map(self, frame: Image, detections: Detections, there: Array) -> None:
+    def keep_map(
+        self, frame: Image, detections: Detections, there: Array, after: Image | None
+    ) -> bool:
         """Let the map computed last serve this frame too: its detections (without masks) are looked
         up where they were in the frame of the map, boxes (D, 4) `there`.
+
+        Args:
+            after: the frame that was asked about last. If it was another one (of another video),
+                nothing is kept, and the answer is False.
         """
-        if self._last is not None:
+        kept = self._last is not None and self._last.frame is after
+        if self._last is not None and kept:
             older = dataclasses.replace(detections, xyxy=there)
             self._last = _Seen(frame, detections, older, self._last.features, self.layout)
+        return kept
 
     @property
     def trained(self) -> bool:
@@ -2695,6 +2703,7 @@ class _LazyEmbeddings:
         self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
         self.weight = weight
         self.there: Array | None = None  # (D, 4) in a frame before whose map serves this one too
+        self.after: Image | None = None  # the frame that was asked about last
         self.rows: Floats | None = None  # (D, E)
         self.split = 0  # width of the foreground in the rows
         self.done = np.zeros(len(detections), bool)
@@ -2720,7 +2729,8 @@ class _LazyEmbeddings:
         else:
             assert self.embedder is not None and self.frame is not None
             if self.there is not None and self.rows is None:
-                self.embedder.keep_map(self.frame, self.detections, self.there)
+                now = (self.frame, self.detections, self.there, self.after)
+                self.there = self.there if self.embedder.keep_map(*now) else None
             embeddings = self.embedder(self.frame, self.detections, rows)
             parts = (embeddings.foreground, embeddings.background)
         weight, self.split = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
@@ -3186,6 +3196,7 @@ class Tracker:
         self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
         self._last_pose: Array | None = None
         self._latest: _LazyEmbeddings | None = None  # of the latest frame
+        self._asked: Image | None = None  # the frame that was asked about last
         self._forget_map()
         self._view: Array | None = None  # (3, 4) img_from_world of the frame
         self._image_size = (0, 0)
@@ -3296,13 +3307,15 @@ class Tracker:
         )
         self._latest = lazy
         self._predict(frame, cam_from_world, camera)
-        lazy.there = self._on_older_map(detections, frame)
+        lazy.there, lazy.after = self._on_older_map(detections, frame), self._asked
         track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
         self._correct(detections, track_of)
         track_of = self._begin(detections, track_of)
         self._look(detections, track_of, lazy)
-        if lazy.rows is not None and lazy.there is None:
-            self._map_age, self._map_motion = 0, np.eye(3)
+        if lazy.rows is not None:
+            self._asked = frame
+            if lazy.there is None:
+                self._map_age, self._map_motion = 0, np.eye(3)
         track_of = self._confirm(track_of)
         result = self._report(detections, track_of)
         self._retire()
@@ -3338,6 +3351,7 @@ class Tracker:
     def _forget_map(self) -> None:
         """The next look needs a feature map of its own frame."""
         self._map_age, self._map_motion = 10**6, np.eye(3)
+        self._asked = None
 
     def _on_older_map(self, detections: Detections, frame: Image | None) -> Array | None:
         """Boxes (D, 4) in a frame shortly before whose feature map serves this one too: the image

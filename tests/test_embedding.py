@@ -227,7 +227,8 @@ def test_a_map_serves_the_next_frame() -> None:
     plain = embedder._features
     embedder._features = lambda frame: (computed.append(1), plain(frame))[1]
     embedder(old, there)
-    embedder.keep_map(new, here, there.xyxy)
+    assert not embedder.keep_map(new, here, there.xyxy, new)  # another video came between
+    assert embedder.keep_map(new, here, there.xyxy, old)
     kept = embedder(new, here)
     assert len(computed) == 1
     for mine, theirs in ((kept.foreground, own.foreground), (kept.background, own.background)):
