@@ -3204,9 +3204,9 @@ class Tracker:
 
     def save(self, path: str | Path) -> None:
         """Write the whole state, without the embedder, as an .npz file: what `load` reads goes on
-        as if it had never stopped.
+        exactly as this tracker does. Both compute the next feature map anew (`map_frames`).
         """
-        self._forget_map()  # as the one that is loaded has none
+        self._forget_map()
         state: dict[str, Any] = {}
         for key, (owner, name) in self._state().items():
             value = getattr(owner, name)
