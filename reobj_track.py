@@ -50,15 +50,15 @@ import queue
 import re
 import shutil
 import signal
-import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.request
 import zipfile
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,7 +69,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
-from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, Slerp
 
 import quadrics
@@ -142,8 +141,7 @@ class PosesConfig:
     )
     fmt: str = _opt(
         "auto",
-        "format of supplied poses: auto, colmap, tum, kitti, transforms, scannet, record3d, "
-        "arkitscenes",
+        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d",
         "--pose-format",
     )
     camera: str = _opt(
@@ -191,10 +189,7 @@ class PosesConfig:
     tri_sample: int = _opt(2000, "points used for the median triangulation angle")
     match_chunk: int = _opt(100, "pairs of keyframes matched between two ticks of the progress")
     refine_px: float = _opt(0.5, "soft L1 loss of the last adjustment, px of the working image")
-    min_part: int = _opt(3, "keyframes that make a separate reconstruction worth keeping")
-    join_objects: int = _opt(4, "objects that must agree before two reconstructions are joined")
     max_center_shift: float = _opt(0.05, "most that the principal point may move, over the size")
-    smooth: int = _opt(0, "smooth the path over this many frames (odd; 0: leave the hand's shake)")
     pnp_error_px: float = _opt(4.0, "PnP inlier threshold on the working image")
     max_run: int = _opt(1000, "frames held at once between two keyframes")
     pose_tolerance: float = _opt(5e-3, "how far supplied rotations may be off (7-Scenes: 1e-3)")
@@ -215,8 +210,8 @@ class EmbedConfig:
 
     model: str = _opt(
         "reobj",
-        "appearance: reobj (comes along), colour (training-free), none, a backbone name / .onnx "
-        "file, or crops[:BACKBONE] (re-OBJ as published: two crops an object)",
+        "appearance: reobj (comes along), none, a backbone name / .onnx file, or "
+        "crops[:BACKBONE] (re-OBJ as published: two crops an object)",
         "--embed",
     )
     size_px: int = _opt(480, "longer side of the backbone's input")
@@ -299,10 +294,6 @@ class TrackerConfig:
     )
     iou_odds: float = _opt(20.0, "log odds that full overlap is worth")
     embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
-    map_frames: int = _opt(2, "a feature map serves this many more frames (0: its own alone) ...")
-    map_move: float = _opt(
-        0.025, "... while the image has moved by less than this share of its longer side"
-    )
     look_momentum: float = _opt(
         0.8, "memory of a track's running mean appearance (StrongSORT: .9 every frame)"
     )
@@ -507,9 +498,6 @@ class Poses:
         up_in_world: (3,) unit vector against gravity, or None if unknown.
         points: (N, 3) sparse points in world; colors (N, 3) uint8 RGB.
         messages: what the user should know (spans without poses and what helps).
-        cov: (F, 6, 6) covariance of the error of each pose in camera axes: rotation vector (rad),
-            then camera centre (world units); NaN where unknown, (0, 6, 6) for supplied poses.
-        parts: reconstructions of other frames that do not connect, each in a world of its own.
     """
 
     camera: Camera
@@ -523,8 +511,6 @@ class Poses:
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
     messages: tuple[str, ...] = ()
-    cov: Array = field(default_factory=lambda: np.empty((0, 6, 6)))
-    parts: tuple[Poses, ...] = ()
 
     @property
     def known(self) -> BoolArray:
@@ -572,7 +558,7 @@ DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """A file of pre-trained weights; without `url` it is used if it lies in REOBJ_MODELS."""
+    """A file of pre-trained weights; without `url` it comes along in `models`."""
 
     name: str
     role: str  # detector, backbone or reid (appearance of persons)
@@ -606,33 +592,15 @@ WEIGHTS: tuple[Weights, ...] = (
             _PICODET + "picodet_s_416_coco.onnx",
             "cdab77bdde16e4f76bec734c4e5791801d1739e4c7ec1995e0e110e04300d0c2", 4040573,
             "Apache-2.0", "COCO, AP 33.5, 46 ms"),
-    Weights("picodet-s-640", "detector", "picodet_s_640_coco.onnx", "",
-            "708f33b6bc54cd7a0a31f4111a9a60672e5d9401a51d4442f7800f6aa24b0d18", 4014103,
-            "Apache-2.0", "COCO, AP 34.3, 100 ms; picodet-s-416 with a larger input"),
-    Weights("nanodet-plus-m-512", "detector", "nanodet-plus-m_512.onnx", "",
-            "5fc8c64d50783f7b17e62b27f42576b59a5627a51e179b9feba06a6fb36f4a3c", 4793247,
-            "Apache-2.0", "COCO, AP 33.6, 53 ms; converted from ncnn"),
-    Weights("yolo11n-seg", "detector", "yolo11n-seg_dyn.onnx", "",
-            "f75628d5ebbbb652f34adc33fcb163fe3a123e5a8bddc70125cb76b6f3c79005", 11560385,
-            "AGPL-3.0", "COCO with masks, AP 39.5, 154 ms; strong copyleft"),
     Weights("reobj", "backbone", "reobj.onnx", "",
             "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 392965,
             "MIT", "ours, comes along: foreground and background, trained with its head"),
-    Weights("mobilenetv2", "backbone", "mobilenetv2_feat.onnx", "",
-            "2e2d63ad6239eb67ad4e132a0858da4ecbaf3022560007a659d05a1afd8fbc7f", 8849494,
-            "Apache-2.0", "ImageNet, convolution layers only"),
-    Weights("squeezenet1.1", "backbone", "squeezenet1.1.onnx", "",
-            "06e303cf8798e53991befff5189cca2f00c97835d9aad8922d854b7c6aca9dc0", 4952376,
-            "Apache-2.0", "ImageNet"),
-    Weights("resnet50v2-s3", "backbone", "resnet50v2_gluon_s3.onnx", "",
-            "b70356f9326e334ba092ee786cb7935c454f29da5888ba09815b2a11541bf086", 36281640,
-            "Apache-2.0", "ImageNet, stages 1-3"),
 )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class ModelRow:
-    """A known file: "verified", "wrong sha256", "missing" or "not offered" (no download)."""
+    """A known file: "verified", "wrong sha256" or "missing"."""
 
     weights: Weights
     state: str
@@ -673,8 +641,7 @@ def list_models() -> list[ModelRow]:
     """Return every known file of weights with its state on this machine."""
     rows = []
     for weights in WEIGHTS:
-        path = _find_model(weights.file)
-        state = "missing" if weights.url else "not offered"
+        path, state = _find_model(weights.file), "missing"
         if path is not None:
             state = "verified" if _sha256(path) == weights.sha256 else "wrong sha256"
         rows.append(ModelRow(weights, state, path))
@@ -704,8 +671,6 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
 def _fetch(weights: Weights, offline: bool) -> Path:
     """Download weights into the first writable folder and return the verified file."""
     by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
-    if not weights.url:
-        raise ReobjError(f"model {weights.name} is not offered for download: {by_hand}")
     if offline:
         raise ReobjError(f"model {weights.name} is not here and --offline forbids the download: "
                          f"fetch {weights.url} elsewhere and {by_hand}")  # fmt: skip
@@ -713,49 +678,46 @@ def _fetch(weights: Weights, offline: bool) -> Path:
         "fetching %s: %.1f MB, licence %s, from %s, sha256 %s",
         weights.name, weights.size / 1e6, weights.licence, weights.url, weights.sha256,
     )  # fmt: skip
-    part = _part_file(weights.file)
+    target = _writable_folder() / weights.file
     try:
-        _download(weights, part)
+        with atomic(target) as part:
+            _download(weights, part)
+            if (digest := _sha256(part)) != weights.sha256:
+                raise ReobjError(
+                    f"{weights.url}: sha256 is {digest}, expected {weights.sha256}: not kept; run "
+                    "again; if it happens again the source has changed: do not use it"
+                )
     except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
         raise ReobjError(
-            f"{weights.url}: download failed ({error}): run again to go on from there, or get a "
-            f"file with sha256 {weights.sha256} on another machine and {by_hand}"
+            f"{weights.url}: download failed ({error}): run again, or get a file with sha256 "
+            f"{weights.sha256} on another machine and {by_hand}"
         ) from error
-    if (digest := _sha256(part)) != weights.sha256:
-        part.unlink()
-        raise ReobjError(
-            f"{weights.url}: sha256 is {digest}, expected {weights.sha256}: file deleted; "
-            "run again; if it happens again the source has changed: do not use it"
-        )
-    return part.replace(part.with_suffix(""))
+    return target
 
 
-def _part_file(name: str) -> Path:
-    """Return where an unfinished download lies: in the first folder that can be written."""
+def _writable_folder() -> Path:
+    """Return the first folder for weights that can be written."""
     for folder in _model_folders():
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
-            return folder / (name + ".part")
+            return folder
     tried = " nor ".join(map(str, _model_folders()))
     raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
 
 
 def _download(weights: Weights, part: Path) -> None:
-    """Append what is missing to the unfinished file, or start over if the server cannot resume."""
-    done = part.stat().st_size if part.exists() else 0
-    if done == weights.size:
-        return
-    asked = {"Range": f"bytes={done}-"} if 0 < done < weights.size else {}  # longer: not ours
-    request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"} | asked)
-    progress = Progress("fetch kB", weights.size // 1000)
-    with urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response:
-        done = done if response.status == 206 else 0
-        with part.open("ab" if done else "wb") as file:
-            while done < weights.size and (chunk := response.read(DOWNLOAD_CHUNK)):
-                file.write(chunk)
-                done += len(chunk)
-                progress.step(len(chunk) // 1000)
+    """Write the file behind the URL to `part`, with progress; a short answer is an error."""
+    request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
+    progress, done = Progress("fetch kB", weights.size // 1000), 0
+    with (
+        urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response,
+        part.open("wb") as file,
+    ):
+        while done < weights.size and (chunk := response.read(DOWNLOAD_CHUNK)):
+            file.write(chunk)
+            done += len(chunk)
+            progress.step(len(chunk) // 1000)
     progress.close()
     if done < weights.size:
         raise ConnectionError(f"connection cut after {done} of {weights.size} bytes")
@@ -1121,9 +1083,19 @@ def _read_text(path: Path) -> str:
         raise ReobjError(f"{path}: cannot be read as text ({error})") from error
 
 
+def read_mot_rows(path: Path) -> Array:
+    """Read a MOTChallenge file: rows (N, 6 to 10) of numbers; (0, 10) of an empty file."""
+    columns, cells, lines, is_mot = _table_cells(path)
+    if not is_mot:
+        raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
+    numbers = [_column([row[i] for row in cells], lines, path) for i in range(len(columns))]
+    return np.stack(numbers, 1)
+
+
 def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
     """Read MOT rows (frame from 1, id, left, top, w, h[, score[, class]]), or CSV with a header."""
-    texts, lines, is_mot = _table_texts(path)
+    columns, cells, lines, is_mot = _table_cells(path)
+    texts = {role: [row[i] for row in cells] for i, role in enumerate(columns)}
     column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
     if is_mot and (column["id"] % 1 != 0).any():
         raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
@@ -1145,8 +1117,10 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
     )  # fmt: skip
 
 
-def _table_texts(path: Path) -> tuple[dict[str, list[str]], IntArray, bool]:
-    """Return the cells by column, the lines they stand on, and whether it is MOT (no header)."""
+def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray, bool]:
+    """Return the columns' roles, the rows of cells, the lines they stand on (N,), and whether it
+    is MOT (no header).
+    """
     reader = csv.reader(_read_text(path).splitlines())
     rows = [(reader.line_num, cells) for cells in reader if cells]
     is_mot = not rows or rows[0][1][0].strip()[:1] in "+-.0123456789"
@@ -1157,9 +1131,8 @@ def _table_texts(path: Path) -> tuple[dict[str, list[str]], IntArray, bool]:
     for line, cells in rows:
         if str(len(cells)) != expected:
             raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {expected}")
-    texts = {role: [cells[i].strip() for _, cells in rows]
-             for i, role in enumerate(columns[:width])}  # fmt: skip
-    return texts, np.array([line for line, _ in rows], np.int64), is_mot
+    cells = [[cell.strip() for cell in row] for _, row in rows]
+    return tuple(columns[:width]), cells, np.array([line for line, _ in rows], np.int64), is_mot
 
 
 def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
@@ -1177,6 +1150,10 @@ def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
 
 def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
     """Convert a column to finite numbers."""
+    with contextlib.suppress(ValueError):
+        values = np.array(cells, np.float64)
+        if np.isfinite(values).all():
+            return values
     values = np.full(len(cells), np.nan)
     for i, cell in enumerate(cells):
         with contextlib.suppress(ValueError):
@@ -1295,11 +1272,7 @@ def _read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int]
 ) -> tuple[RecordedDetections, IntArray]:
     """Read our own format, as `_pack` makes it; also the frames that were `done`, if it says so."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data: dict[str, Any] = dict(file)
-    except Exception as error:  # zip, zlib and numpy each have their own for damaged files
-        raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
+    data, _ = load_npz(path)
     count = len(data.get("frame", ()))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
@@ -1421,17 +1394,25 @@ def _pack(
     }
 
 
-def _save_npz(path: Path, arrays: dict[str, Any]) -> None:
-    """Write an npz file so that it is there whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
+def save_npz(path: Path, arrays: Mapping[str, Any], **facts: Any) -> None:
+    """Write arrays, and facts as JSON, to an npz file that is there whole or not at all."""
+    with atomic(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **arrays, facts=np.array(json.dumps(facts)))
+
+
+def load_npz(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read the arrays and the facts that `save_npz` wrote.
+
+    Raises:
+        ReobjError: damaged, or no npz file.
+    """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise ReobjError(f"{path}: cannot be written ({error.strerror})") from error
+        with np.load(path, allow_pickle=False) as file:
+            arrays: dict[str, Any] = dict(file)
+        facts: dict[str, Any] = json.loads(str(arrays.pop("facts", "{}")))
+    except Exception as error:  # zip, zlib and numpy each have their own for damaged files
+        raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
+    return arrays, facts
 
 
 def write_detections_npz(
@@ -1441,7 +1422,7 @@ def write_detections_npz(
     image_size: tuple[int, int],
 ) -> None:
     """Write (frame number, Detections) pairs, masks as run lengths, for `read_detections`."""
-    _save_npz(Path(path), _pack(list(frames), class_names, image_size))
+    save_npz(Path(path), _pack(list(frames), class_names, image_size))
 
 
 class DetectionCache:
@@ -1486,7 +1467,7 @@ class DetectionCache:
         frames = sorted(self._fresh.items())
         path = self.folder / f"chunk_{self._next:06d}.npz"
         done = {"done": np.array([index for index, _ in frames])}
-        _save_npz(path, _pack(frames, [], self.image_size) | done)
+        save_npz(path, _pack(frames, [], self.image_size) | done)
         self._next += 1
         self._fresh.clear()
         self._load(path)
@@ -1595,12 +1576,6 @@ def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[Array, Array]:
     return np.concatenate(cells), np.concatenate(stride)
 
 
-def _box_corners(centers: Array) -> Array:
-    """Convert (N, 4+) centre x, y, width, height to (N, 4) corners."""
-    half = centers[:, 2:4] / 2
-    return np.hstack([centers[:, :2] - half, centers[:, :2] + half])
-
-
 def _best_class(scores: Array) -> tuple[Array, IntArray]:
     """Return the best score of each row of (N, C), and its class."""
     return scores.max(1).astype(np.float64), scores.argmax(1).astype(np.int64)
@@ -1623,7 +1598,7 @@ def _decode_yolox(outs: list[Any], geometry: _Geometry) -> _Found:
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
     score, label = _best_class(rows[:, 5:])
-    return _Found(geometry.to_image(_box_corners(rows)), score * rows[:, 4], label)
+    return _Found(geometry.to_image(_xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
 
 
 def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Found:
@@ -1632,7 +1607,7 @@ def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Found:
     proto = next((o[0] for o in outs[1:]), np.empty((0, 1, 1)))  # (32, h, w)
     end = rows.shape[1] - len(proto)
     score, label = _best_class(rows[:, 4:end])
-    boxes = geometry.to_image(_box_corners(rows))
+    boxes = geometry.to_image(_xyxy_from_cxcywh(rows))
     ratio = np.divide(proto.shape[:0:-1], geometry.input_size)  # (2,) map / input
 
     def masks(chosen: IntArray) -> BoolArray:
@@ -1923,8 +1898,9 @@ def _cxcywh_from_xyxy(xyxy: Array) -> Array:
 
 
 def _xyxy_from_cxcywh(box: Array) -> Array:
-    """Corners of boxes given by centre and size (N, 4)."""
-    return np.concatenate([box[:, :2] - box[:, 2:] / 2, box[:, :2] + box[:, 2:] / 2], 1)
+    """Corners (N, 4) of boxes given by centre and size (N, 4+)."""
+    half = box[:, 2:4] / 2
+    return np.concatenate([box[:, :2] - half, box[:, :2] + half], 1)
 
 
 # ---- Motion: Kalman filter and camera motion ---------------------------------------------------
@@ -1980,12 +1956,18 @@ def _noise_scale(mean: Array) -> Array:
     return np.concatenate([side, side, size], 1)
 
 
-def _resized(image: Image, size: Sequence[int]) -> Image:
+def resized(image: Image, size: Sequence[int]) -> Image:
     """Resize to (w, h) by averaging; by halves first, which is 4 times as fast on large frames."""
     while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
         half = (image.shape[1] // 2, image.shape[0] // 2)
         image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def shrunk(image: Image, size_px: int) -> Image:
+    """A copy whose longer side is at most size_px."""
+    ratio = min(1.0, size_px / max(image.shape[:2]))
+    return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
 
 
 class CameraMotion:
@@ -2006,7 +1988,7 @@ class CameraMotion:
     def __call__(self, image: Image) -> Array:
         """Return new_from_old (3, 3) in pixels of `image`."""
         shrink = min(1.0, self.config.flow_size_px / max(image.shape[:2]))
-        small = _resized(image, [round(side * shrink) for side in image.shape[1::-1]])
+        small = resized(image, [round(side * shrink) for side in image.shape[1::-1]])
         gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         new_from_old, self.flow = np.eye(3), np.empty((0, 4))
         if self._gray is not None and self._corners is not None and self._gray.shape == gray.shape:
@@ -2111,8 +2093,7 @@ class Embedder:
     around look like (`look_around`).
 
     Args:
-        model: "reobj" for the weights that come along, "colour" for the training-free descriptor
-            (soft colour histogram and gradient orientations), or a backbone: a name listed by
+        model: "reobj" for the weights that come along, or a backbone: a name listed by
             `reobj_track.py models` or a path to an ONNX file with an image input and a spatial
             output (of `train_embedding.py`: its head and its layout are found through the file).
 
@@ -2127,13 +2108,9 @@ class Embedder:
         threads: int = 0,
         offline: bool = False,
     ) -> None:
-        self.layout = config or EmbedConfig()
         self.model = model
-        self._net: _Backbone | None = None
-        self._features: Callable[[Image], Floats] = _colour_features
-        if model != "colour":
-            self._net = _Backbone(model, self.layout, threads, offline)
-            self.layout, self._features = self._net.layout, self._net
+        self._net = _Backbone(model, config or EmbedConfig(), threads, offline)
+        self.layout = self._net.layout
         self._last: _Seen | None = None
 
     def __call__(
@@ -2152,8 +2129,7 @@ class Embedder:
             return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
         seen, share = self._last, self.layout.neighbours if self.trained else 0.0
         if seen is None or seen.frame is not frame or seen.detections is not detections:
-            features = self._features(frame)
-            seen = self._last = _Seen(frame, detections, detections, features, self.layout)
+            seen = self._last = _Seen(frame, detections, self._net(frame), self.layout)
         wanted = seen.sure & (share > 0)
         wanted[rows] = True
         new = np.flatnonzero(wanted & ~seen.known)
@@ -2165,38 +2141,22 @@ class Embedder:
             back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
         return Embeddings(seen.foreground[rows], _unit_rows(back))
 
-    def keep_map(
-        self, frame: Image, detections: Detections, there: Array, after: Image | None
-    ) -> bool:
-        """Let the map computed last serve this frame too: its detections (without masks) are looked
-        up where they were in the frame of the map, boxes (D, 4) `there`.
-
-        Args:
-            after: the frame that was asked about last. If it was another one (of another video),
-                nothing is kept, and the answer is False.
-        """
-        kept = self._last is not None and self._last.frame is after
-        if self._last is not None and kept:
-            older = dataclasses.replace(detections, xyxy=there)
-            self._last = _Seen(frame, detections, older, self._last.features, self.layout)
-        return kept
-
     @property
     def trained(self) -> bool:
         """Does the model come with a head?"""
-        return self._net is not None and self._net.head is not None
+        return self._net.head is not None
 
     @property
     def frozen(self) -> bool:
         """Is it a backbone that was trained for something else?"""
-        return self._net is not None and not self._net.own
+        return not self._net.own
 
     def _parts(self, seen: _Seen, new: IntArray, rows: IntArray) -> tuple[Array, Array]:
         """Foreground (M, E1) of the new rows and background (N, E2) of the chosen ones."""
         size_hw, chosen = seen.frame.shape[:2], (new, rows)
-        samples = part_samples(seen.there, chosen, size_hw, seen.objects, self.layout)
+        samples = part_samples(seen.detections, chosen, size_hw, seen.objects, self.layout)
         fore, back = part_cells(seen.features, samples, self.layout)
-        if self._net is not None and self._net.head is not None:
+        if self.trained:
             return self._net.embed(fore, back)
         near = self.layout.background_cells**2
         around = (back[:, :near], back[:, near:])[: 1 + (self.layout.wide > 0)]
@@ -2204,21 +2164,16 @@ class Embedder:
 
 
 class _Seen:
-    """A frame, its detections and where they lie on a feature map (h, w, C), the cells (h, w) that
-    show objects, and the foreground (D, E) of those of the detections that are known.
+    """A frame, its detections, its feature map (h, w, C), the cells (h, w) that show objects, and
+    the foreground (D, E) of those of the detections that are known.
     """
 
     def __init__(
-        self,
-        frame: Image,
-        detections: Detections,
-        there: Detections,
-        features: Floats,
-        layout: EmbedConfig,
+        self, frame: Image, detections: Detections, features: Floats, layout: EmbedConfig
     ) -> None:
-        self.frame, self.detections, self.there, self.features = frame, detections, there, features
+        self.frame, self.detections, self.features = frame, detections, features
         self.sure = detections.score >= layout.object_score
-        self.objects = object_map(there, frame.shape, features.shape[:2], layout.object_score)
+        self.objects = object_map(detections, frame.shape, features.shape[:2], layout.object_score)
         self.known = np.zeros(len(detections), bool)
         self.foreground = np.zeros((len(detections), 0))
 
@@ -2347,14 +2302,14 @@ class CropEmbedder(Embedder):
 
     Args:
         model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image
-            input (any batch) and a spatial output. A ConvBlock for mobilenetv2 comes along.
+            input (any batch) and a spatial output. A ConvBlock for mobilenetv2_feat comes along.
     Raises:
         ReobjError: the model has no spatial output, or the ConvBlock does not fit it.
     """
 
     def __init__(
         self,
-        model: str = "mobilenetv2",
+        model: str = "mobilenetv2_feat",
         config: EmbedConfig | None = None,
         threads: int = 0,
         offline: bool = False,
@@ -2440,7 +2395,6 @@ class CropEmbedder(Embedder):
     ) -> Embeddings:
         """Pool the maps of foreground and background crops (2N, S, S, 3) for a trained head."""
         net, side, count = self._net, self.layout.crop_px, len(rows)
-        assert net is not None
         low, high = self._windows(detections.xyxy[rows], size_hw)
         own = (detections.xyxy[rows] - np.tile(low, 2)) * np.tile(side / (high - low), 2)  # (N, 4)
         others = self._crop_objects(detections, size_hw, low, high) & ~on_object  # (N, S, S)
@@ -2477,7 +2431,6 @@ class CropEmbedder(Embedder):
     def maps(self, crops: Image) -> Floats:
         """Backbone features (B, C, h, w) of BGR images (B, S, S, 3)."""
         net = self._net
-        assert net is not None
         if net.own:
             return np.ascontiguousarray(net.maps(crops).transpose(0, 3, 1, 2))
         rgb = (crops[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
@@ -2487,7 +2440,6 @@ class CropEmbedder(Embedder):
     def _deepest_map(self) -> str:
         """Name of the backbone's first output at stride 32 (7 x 7 for 224 px), else its first."""
         net, side = self._net, self.layout.crop_px
-        assert net is not None
         if net.own:
             return str(net.output)
         names: list[str] = [o.name for o in net.session.get_outputs()]
@@ -2572,37 +2524,6 @@ def _side_by_side(cells: Floats) -> Floats:
     return cells.reshape(len(cells), cells.shape[1] * cells.shape[2])
 
 
-def _colour_features(frame: Image) -> Floats:
-    """Training-free feature map (h, w, 17): soft histograms of Lab colour and of gradient
-    orientation.
-    """
-    shrink = min(1.0, 320 / max(frame.shape[:2]))
-    small = _resized(frame, [round(side * shrink) for side in frame.shape[1::-1]])
-    lab = cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_BGR2Lab)
-    lightness = lab[..., :1] / 100  # (h, w, 1)
-    levels = (1 - np.abs(lightness * 4 - np.arange(5, dtype=np.float32))).clip(0) * 0.5  # (h, w, 5)
-    gray = cv2.GaussianBlur(lab[..., 0] / 100, (0, 0), 1)
-    gradient = cv2.merge(
-        [cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)]
-    )  # (h, w, 2)
-    stacked = np.concatenate(
-        [_direction_bins(lab[..., 1:] / 40), levels, _direction_bins(gradient)], -1
-    )
-    return np.asarray(cv2.blur(stacked, (5, 5)), np.float32)
-
-
-def _direction_bins(vector: Any, bins: int = 6) -> Floats:
-    """Soft histogram (h, w, bins) of the directions of (h, w, 2) vectors, by their length."""
-    length = cv2.magnitude(vector[..., 0], vector[..., 1])[..., None] + 1e-6  # (h, w, 1)
-    turn = np.arange(bins) * 2 * np.pi / bins
-    aligned = (vector / length) @ np.stack([np.cos(turn), np.sin(turn)]).astype(
-        np.float32
-    )  # cosines (h, w, bins)
-    aligned = aligned.clip(0)
-    aligned *= aligned
-    return np.asarray(aligned * aligned * np.minimum(length, 1), np.float32)
-
-
 class _Backbone:
     """Feature map of a frame from an ONNX backbone with an image input and a spatial output.
 
@@ -2624,7 +2545,7 @@ class _Backbone:
             raise ReobjError(
                 f"{model}: expected a backbone with one image input and a spatial output "
                 f"(N, C, h, w), found outputs {[o.name for o in self.session.get_outputs()]}; "
-                "give another --embed model, or --embed colour"
+                "give another --embed model"
             )
         self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
         facts = _facts(self.session)
@@ -2642,14 +2563,13 @@ class _Backbone:
         shrink = min(1.0, self.layout.size_px / max(frame.shape[:2]))
         side = self.multiple
         size = [max(side, round(n * shrink / side) * side) for n in frame.shape[1::-1]]
-        return np.asarray(self.maps(_resized(frame, size)[None])[0])
+        return np.asarray(self.maps(resized(frame, size)[None])[0])
 
     def maps(self, images: Image) -> Floats:
         """Return the features (N, h, w, C) of BGR images (N, H, W, 3) of a fit size."""
         if self.own:
             return self._run(images)
-        rgb = images[..., ::-1].astype(np.float32) / 255
-        rgb = (rgb - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
+        rgb = (images[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         maps = self._run(np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32))
         return np.ascontiguousarray(maps.transpose(0, 2, 3, 1))
 
@@ -2702,8 +2622,6 @@ class _LazyEmbeddings:
     ) -> None:
         self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
         self.weight = weight
-        self.there: Array | None = None  # (D, 4) in a frame before whose map serves this one too
-        self.after: Image | None = None  # the frame that was asked about last
         self.rows: Floats | None = None  # (D, E)
         self.split = 0  # width of the foreground in the rows
         self.done = np.zeros(len(detections), bool)
@@ -2728,9 +2646,6 @@ class _LazyEmbeddings:
             parts = (self.given.foreground[rows], self.given.background[rows])
         else:
             assert self.embedder is not None and self.frame is not None
-            if self.there is not None and self.rows is None:
-                now = (self.frame, self.detections, self.there, self.after)
-                self.there = self.there if self.embedder.keep_map(*now) else None
             embeddings = self.embedder(self.frame, self.detections, rows)
             parts = (embeddings.foreground, embeddings.background)
         weight, self.split = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
@@ -3196,32 +3111,28 @@ class Tracker:
         self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
         self._last_pose: Array | None = None
         self._latest: _LazyEmbeddings | None = None  # of the latest frame
-        self._asked: Image | None = None  # the frame that was asked about last
-        self._forget_map()
         self._view: Array | None = None  # (3, 4) img_from_world of the frame
         self._image_size = (0, 0)
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
 
     def save(self, path: str | Path) -> None:
         """Write the whole state, without the embedder, as an .npz file: what `load` reads goes on
-        exactly as this tracker does. Both compute the next feature map anew (`map_frames`).
+        exactly as this tracker does.
         """
-        self._forget_map()
         state: dict[str, Any] = {}
         for key, (owner, name) in self._state().items():
             value = getattr(owner, name)
             if value is not None:
                 state[key] = list(value.values()) if isinstance(value, dict) else value
-        facts = {"version": STATE_VERSION, "config": dataclasses.asdict(self.config)}
-        _save_npz(Path(path), state | {"facts": json.dumps(facts)})
+        save_npz(
+            Path(path), state, version=STATE_VERSION, config=dataclasses.asdict(self.config)
+        )
 
     @classmethod
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
         """Read a tracker that `save` wrote; embedder: as the saved one had."""
         try:
-            with np.load(path, allow_pickle=False) as data:
-                state = dict(data)
-            facts = json.loads(str(state.pop("facts")))
+            state, facts = load_npz(Path(path))
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
             tracker = cls(TrackerConfig(**facts["config"]), embedder)
@@ -3232,7 +3143,7 @@ class Tracker:
                 value: Any = state[key]
                 value = dict(zip(old, value, strict=True)) if isinstance(old, dict) else value
                 setattr(owner, name, int(value) if isinstance(old, int) else value)
-        except (OSError, EOFError, zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise ReobjError(
                 f"{path}: not the state of a tracker of this version ({error}); "
                 "expected a file written by Tracker.save"
@@ -3307,15 +3218,10 @@ class Tracker:
         )
         self._latest = lazy
         self._predict(frame, cam_from_world, camera)
-        lazy.there, lazy.after = self._on_older_map(detections, frame), self._asked
         track_of = self._associate(detections, lazy)  # (D,) row of the live track, or -1
         self._correct(detections, track_of)
         track_of = self._begin(detections, track_of)
         self._look(detections, track_of, lazy)
-        if lazy.rows is not None:
-            self._asked = frame
-            if lazy.there is None:
-                self._map_age, self._map_motion = 0, np.eye(3)
         track_of = self._confirm(track_of)
         result = self._report(detections, track_of)
         self._retire()
@@ -3332,12 +3238,12 @@ class Tracker:
         live = self._live
         live.mean, live.cov = kalman_predict(live.mean, live.cov, self.config)
         live.mean[:, 2:, 0] = live.mean[:, 2:, 0].clip(1.0)  # a size stays positive
-        self._view, before, pose, self._motion = None, live.mean[..., 0].copy(), None, np.eye(3)
+        self._view, before, pose = None, live.mean[..., 0].copy(), None
         if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
             pose = np.asarray(cam_from_world, np.float64)
         if frame is not None and self.config.camera_motion:
-            self._motion = self._camera_motion(frame)
-            live.mean, live.cov = _warp_state(live.mean, live.cov, self._motion)
+            motion = self._camera_motion(frame)
+            live.mean, live.cov = _warp_state(live.mean, live.cov, motion)
             live.mean[:, :2, 0] += self._camera_motion.parallax(before[:, :2])
         elif pose is not None and camera is not None and self._last_pose is not None:
             rotation = pose[:, :3] @ self._last_pose[:, :3].T
@@ -3347,42 +3253,6 @@ class Tracker:
         if pose is not None and camera is not None:
             in_view = self._place_tracks(pose, camera, before)
         live.missed += in_view | (live.missed == 0)
-
-    def _forget_map(self) -> None:
-        """The next look needs a feature map of its own frame."""
-        self._map_age, self._map_motion = 10**6, np.eye(3)
-        self._asked = None
-
-    def _on_older_map(self, detections: Detections, frame: Image | None) -> Array | None:
-        """Boxes (D, 4) in a frame shortly before whose feature map serves this one too: the image
-        has moved little since. Masks lie at this frame's pixels: they need its own map.
-        """
-        self._map_age, self._map_motion = self._map_age + 1, self._motion @ self._map_motion
-        if frame is None or np.array_equal(self._motion, np.eye(3)):  # not known
-            self._forget_map()
-        fresh = self._map_age > self.config.map_frames or detections.masks is not None
-        fresh |= self.frame_number % self.config.embed_every == 0  # all tracks are refreshed
-        if fresh or frame is None or not hasattr(self.embedder, "keep_map"):
-            return None
-        height, width = frame.shape[:2]
-        corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1.0]])
-        moved = np.abs(corners @ self._map_motion.T - corners).max()
-        if moved > self.config.map_move * max(height, width):
-            return None
-        return self._where_they_were(detections.xyxy)
-
-    def _where_they_were(self, xyxy: Array) -> Array:
-        """Boxes (D, 4) in the frame of the map: back by the motion of the track that is expected
-        there (things that move, depth), then by that of the camera.
-        """
-        live, box, older = self._live, _cxcywh_from_xyxy(xyxy), np.linalg.inv(self._map_motion)
-        if len(live.mean) and len(box):
-            iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), xyxy)
-            speed = live.mean[iou.argmax(0), :2, 1] * (iou.max(0) > 0)[:, None]  # (D, 2) a frame
-            box[:, :2] -= self._map_age * speed
-        box[:, :2] = box[:, :2] @ older[:2, :2].T + older[:2, 2]
-        box[:, 2:] *= math.sqrt(abs(np.linalg.det(older[:2, :2])))
-        return _xyxy_from_cxcywh(box)
 
     def _place_tracks(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
         """Move tracks of known place as their ellipsoid's image does, from where they were
@@ -3791,19 +3661,6 @@ def invert_rigid(b_from_a: Array) -> Array:
     return np.concatenate([rotation, -rotation @ b_from_a[..., 3:]], -1)
 
 
-def similarity(points: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation (3, 3) and shift (3,) that bring points (N, 3) closest to target (N, 3).
-
-    Ref: Umeyama, PAMI 1991.
-    """
-    a, b = points - points.mean(0), target - target.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    turn = (u * flip) @ vt
-    scale = float((s * flip).sum() / (a**2).sum())
-    return scale, turn, target.mean(0) - scale * turn @ points.mean(0)
-
-
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; "": None.
 
@@ -3875,16 +3732,10 @@ def estimate_poses(
         camera = camera or Camera("SIMPLE_PINHOLE", *size, guess)
         nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
         return Poses(camera, frame, time_s, nothing, none, "none", messages=tuple(messages))
-    poses, *parts = (
-        _located(folder, video, work, config, progress("pnp", len(frame)))
-        for folder in [work_dir / "sparse", *sorted((work_dir / "mapping").glob("part-*"))]
-    )
-    for part in parts:
-        span = f"frames {frame[part.known][0]}-{frame[part.known][-1]}"
-        messages.append(f"{span}: a separate reconstruction, left out as it does not connect")
+    poses = _located(work_dir / "sparse", video, work, config, progress("pnp", len(frame)))
     shutil.rmtree(work_dir / "mapping")
     messages += _lost_frames(frame, poses.known)
-    return dataclasses.replace(poses, messages=tuple(messages), parts=tuple(parts))
+    return dataclasses.replace(poses, messages=tuple(messages))
 
 
 def _enough_keyframes(work: _WorkVideo, config: PosesConfig, line: Progress) -> list[_WorkImage]:
@@ -3907,11 +3758,10 @@ def _located(
     frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
     place_of = {_frame_name(video, number): place for place, number in enumerate(work.frames)}
     places = np.array([place_of[name] for name in model.names])
-    cam_from_world, status, cov = _locate_between(model, places, work, config, line)
+    cam_from_world, status = _locate_between(model, places, work, config, line)
     cam_from_world, status = fill_gaps(frame, cam_from_world, status, config.max_gap)
-    cam_from_world = smooth_path(cam_from_world, config.smooth) if config.smooth else cam_from_world
     found = (model.cameras[0], frame, time_s, cam_from_world, status, "pycolmap")
-    return Poses(*found, points=model.points, colors=model.colors, cov=cov)
+    return Poses(*found, points=model.points, colors=model.colors)
 
 
 def _frame_name(video: Any, number: int) -> str:
@@ -3979,7 +3829,7 @@ class _WorkVideo:
 
     def __iter__(self) -> Iterator[_WorkImage]:
         for place, frame in enumerate(self.video):
-            bgr = _shrunk(frame.image, self.config.size_px)
+            bgr = shrunk(frame.image, self.config.size_px)
             gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
             yield _WorkImage(place, frame.index, frame.time_s, bgr, gray)
 
@@ -4069,22 +3919,17 @@ def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_Wo
 
 def _locate_between(
     model: _SparseModel, places: IntArray, video: _WorkVideo, config: PosesConfig, line: Progress
-) -> tuple[Array, npt.NDArray[np.str_], Array]:
+) -> tuple[Array, npt.NDArray[np.str_]]:
     """Locate every frame by PnP from points followed from the keyframes before and after it.
 
     Args:
         places: (R,) place in the video of each registered keyframe, ascending.
     Returns:
-        cam_from_world (F, 3, 4), NaN where PnP was refused, status (F,), and cov (F, 6, 6), NaN
-        where there is no pose; see `Poses`.
+        cam_from_world (F, 3, 4), NaN where PnP was refused, and status (F,); see `Poses`.
     """
     count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
-    cov = np.full((count, 6, 6), np.nan)
     cam_from_world[places], status[places] = model.cam_from_world, "keyframe"
-    for row, (place, pose) in enumerate(zip(places, model.cam_from_world, strict=True)):
-        seen = model.obs_image == row
-        cov[place] = pose_cov(model.obs_xy[seen], model.points[model.obs_point[seen]], pose, camera)
     for before, after, run in _segments(places, video.grays(), config.max_run):
         images = [gray for _, gray in run]
         ahead = _follow(model, before, images, config)
@@ -4094,12 +3939,12 @@ def _locate_between(
                 points, xy = model.points[np.r_[rows_a, rows_b]], np.r_[xy_a, xy_b]
                 found = _absolute_pose(xy, points, camera, gray.shape[1], config)
                 if found is not None:
-                    (cam_from_world[place], cov[place]), status[place] = found, "pnp"
+                    cam_from_world[place], status[place] = found, "pnp"
         line.step(len(run) - 1)
     line.close()
     jump = _jumps(cam_from_world, config.max_step_ratio) & (status == "pnp")
-    cam_from_world[jump], status[jump], cov[jump] = np.nan, "none", np.nan
-    return cam_from_world, status, cov
+    cam_from_world[jump], status[jump] = np.nan, "none"
+    return cam_from_world, status
 
 
 def _segments(
@@ -4175,24 +4020,6 @@ def fill_gaps(
             filled[a + 1 : b] = invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
             status[a + 1 : b] = "interpolated"
     return filled, status
-
-
-def smooth_path(cam_from_world: Array, frames: int) -> Array:
-    """Smooth poses (F, 3, 4) over a window of this many frames (odd, >= 5): a parabola fitted to
-    centres and quaternions (Savitzky-Golay). Runs shorter than the window stay.
-    """
-    window, smoothed = max(frames | 1, 5), cam_from_world.copy()
-    known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
-    for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
-        if len(run) >= window:
-            world_from_cam = invert_rigid(cam_from_world[run])
-            quat = Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat()
-            turns = np.cumprod(np.r_[1, np.where((quat[1:] * quat[:-1]).sum(1) < 0, -1, 1)])
-            table = np.column_stack([quat * turns[:, None], world_from_cam[:, :, 3]])  # (n, 7)
-            table = savgol_filter(table, window, 2, axis=0)
-            turn = Rotation.from_quat(table[:, :4]).as_matrix()
-            smoothed[run] = invert_rigid(np.concatenate([turn, table[:, 4:, None]], 2))
-    return smoothed
 
 
 # Reconstruction of the keyframes in a child process
@@ -4304,11 +4131,10 @@ def _sfm_child(folder_name: str) -> None:
         found.append(_sfm_ladder(database, len(images), not guess, tried))
         if found[-1][2]:
             break
-    models, messages, _ = max(found, key=lambda f: (f[2], len(f[0])))
-    for i, model in enumerate(models):
-        folder_of = folder / ("sparse" if i == 0 else f"part-{i}")
-        shutil.rmtree(folder_of, ignore_errors=True)
-        _sfm_write(model, images, folder_of, job["names"], tuple(job["size"]))
+    model, messages, _ = max(found, key=lambda f: (f[2], f[0] is not None))
+    shutil.rmtree(folder / "sparse", ignore_errors=True)
+    if model is not None:
+        _sfm_write(model, images, folder / "sparse", job["names"], tuple(job["size"]))
     (folder / "messages.json").write_text(json.dumps(messages))
 
 
@@ -4389,9 +4215,9 @@ def _read_model(folder: Path) -> _SparseModel:
 
 def _absolute_pose(
     xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig
-) -> tuple[Array, Array] | None:
-    """PnP from native pixels (n, 2) of world points (n, 3): cam_from_world (3, 4) and covariance
-    (6, 6); None if it is not to be trusted.
+) -> Array | None:
+    """PnP from native pixels (n, 2) of world points (n, 3): cam_from_world (3, 4); None if it is
+    not to be trusted.
     """
     if len(xy) < config.pnp_min_inliers:
         return None
@@ -4404,34 +4230,8 @@ def _absolute_pose(
     if found is None or found["num_inliers"] < least:
         return None
     pose: Array = found["cam_from_world"].matrix()
-    xy, points = xy[found["inlier_mask"]], points[found["inlier_mask"]]
-    if not np.isfinite(pose).all() or (points @ pose[2, :3] + pose[2, 3] <= 0).any():
-        return None
-    return pose, pose_cov(xy, points, pose, camera)
-
-
-def pose_cov(xy: Array, points: Array, cam_from_world: Array, camera: Camera) -> Array:
-    """Covariance (6, 6) of a pose fitted to pixels (n, 2) of world points (n, 3): rotation vector
-    (rad), then camera centre (units of the points), both in camera axes.
-
-    From the Jacobian of the ideal pixels and the robust spread of the residuals; the points count
-    as exact. NaN when they do not fix the pose.
-    """
-    in_cam = points @ cam_from_world[:, :3].T + cam_from_world[:, 3]  # (n, 3)
-    depth, focal = in_cam[:, 2:], camera.K[[0, 1], [0, 1]]
-    ray = in_cam[:, :2] / depth
-    residual = camera.undistort(xy) - camera.K[:2, 2] - ray * focal  # (n, 2)
-    by_point = np.zeros((len(xy), 2, 3))
-    by_point[:, [0, 1], [0, 1]] = focal / depth
-    by_point[:, :, 2] = -ray * focal / depth
-    turn = np.cross(np.eye(3)[None], in_cam[:, None])  # (n, 3, 3) rows: e_i x p
-    moved = np.concatenate([np.swapaxes(turn, 1, 2), np.tile(-np.eye(3), (len(xy), 1, 1))], 2)
-    jacobian = (by_point @ moved).reshape(-1, 6)  # (2n, 6)
-    free = 2 * len(xy) - 6
-    if free <= 0 or np.linalg.matrix_rank(jacobian) < 6:
-        return np.full((6, 6), np.nan)
-    sigma2 = (1.4826 * np.median(np.abs(residual))) ** 2 * 2 * len(xy) / free  # MAD of a normal
-    return np.asarray(sigma2 * np.linalg.inv(jacobian.T @ jacobian))
+    depth = points[found["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
+    return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
 def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: PosesConfig) -> None:
@@ -4541,13 +4341,12 @@ _RELAXED = {
 
 @dataclass(frozen=True, slots=True)
 class _Attempt:
-    """One mapper's largest model, its other models, and what tells a sound model from a wrong one.
+    """One mapper's largest model, and what tells a sound model from a wrong one.
 
     (The reprojection error does not: wrong models had the smallest.)
     """
 
     model: Any = None
-    others: tuple[Any, ...] = ()
     registered: float = 0.0  # share of the keyframes
     tri_angle_deg: float = 0.0  # median over points of the widest angle between two rays
     parallax_px: float = 0.0  # what turns of the camera alone cannot explain
@@ -4564,12 +4363,12 @@ class _Attempt:
 
 def _sfm_ladder(
     database: Path, count: int, known_focal: bool, config: PosesConfig
-) -> tuple[list[Any], list[str], bool]:
+) -> tuple[Any, list[str], bool]:
     """Try mappers from strict to permissive.
 
     Returns:
-        the best sound model, followed by those of other keyframes (none if nothing is sound),
-        messages, and whether its focal length is trusted.
+        the best sound model (None if nothing is sound), messages, and whether its focal length is
+        trusted.
     """
     tried: list[_Attempt] = []
     if not known_focal:
@@ -4593,14 +4392,9 @@ def _sfm_ladder(
             "are rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
         ]
     if best.problem:
-        return [], [f"no camera poses: {best.problem}; {_ADVICE}"], known_focal
+        return None, [f"no camera poses: {best.problem}; {_ADVICE}"], known_focal
     _sfm_refine(best.model, bool(known_focal or messages), config)
-    models, seen = [best.model], set(best.model.reg_image_ids())
-    for other in best.others:
-        if len(set(other.reg_image_ids()) - seen) >= config.min_part:
-            seen |= set(other.reg_image_ids())
-            models.append(other)
-    return models, messages, known_focal or not messages
+    return best.model, messages, known_focal or not messages
 
 
 def _sfm_guess_focal(database: Path, trusted: bool, config: PosesConfig) -> None:
@@ -4642,8 +4436,7 @@ def _sfm_attempt(
          f"the focal length came out as {focal:.2f} x the width"),
     )  # fmt: skip
     problem = next((text for bad, text in tests if bad), "")
-    others = tuple(m for m in models if m is not model)
-    return _Attempt(model, others, registered, angle, parallax, spread, focal, problem)
+    return _Attempt(model, registered, angle, parallax, spread, focal, problem)
 
 
 def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
@@ -4819,7 +4612,7 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
 
 
 def _pose_format(path: Path) -> str:
-    """Recognise a format from the names in a folder, or from a file's name and its first row."""
+    """Recognise a format from the names in a folder, or from a file's name."""
     if path.is_dir():
         if (path / "transforms.json").exists():
             return "transforms"
@@ -4828,9 +4621,7 @@ def _pose_format(path: Path) -> str:
         return "colmap"
     if path.suffix == ".json" or path.name == "metadata":
         return "record3d" if "poses" in _json_object(path) else "transforms"
-    counts = {7: "arkitscenes", 8: "tum", 12: "kitti", 16: "kitti"}
-    rows, _ = _number_rows(path, tuple(counts), "a pose a line (TUM: 8 numbers, KITTI: 12 or 16)")
-    return counts[rows.shape[1]]
+    return "tum"
 
 
 def _number_rows(
@@ -4911,21 +4702,6 @@ def _given_tum(path: Path, size: tuple[int, int]) -> _GivenPoses:
 
 
 _NO_SCALE = "units: arbitrary"
-
-
-def _given_kitti(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """KITTI: a row-major 3x4 (or 4x4) world_from_cam for each frame of the source; metres."""
-    expected = "KITTI rows: 12 (3x4) or 16 (4x4) numbers, row-major world_from_cam"
-    rows, where = _number_rows(path, (12, 16), expected)
-    return _GivenPoses(invert_rigid(_rigid(rows.reshape(len(rows), -1, 4), where)), metric=True)
-
-
-def _given_arkitscenes(path: Path, size: tuple[int, int]) -> _GivenPoses:
-    """ARKitScenes .traj: `t rx ry rz tx ty tz`, axis-angle, cam_from_world, metres."""
-    rows, _ = _number_rows(path, (7,), "ARKitScenes rows: t rx ry rz tx ty tz")
-    rotation = Rotation.from_rotvec(rows[:, 1:4]).as_matrix()
-    poses = np.concatenate([rotation, rows[:, 4:, None]], 2)
-    return _GivenPoses(poses, stamps_s=rows[:, 0], metric=True)
 
 
 _CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
@@ -5023,102 +4799,68 @@ def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
     return found[len(found) // 2]
 
 
-_COLMAP_PARAMS = {
-    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
-    "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4,
-    "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
-}  # fmt: skip
-
-
 def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
     """COLMAP model, text or binary (preferred), with or without rigs; scale unknown."""
     start = path if path.is_dir() else path.parent
     folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
-    for suffix, read in ((".bin", _colmap_binary), (".txt", _colmap_text)):
-        for folder in folders:
-            if (folder / f"images{suffix}").exists():
-                return read(folder)
-    raise ReobjError(
-        f"{path}: no images.bin or .txt; expected a COLMAP model, or see --pose-format"
-    )
-
-
-def _colmap_binary(folder: Path) -> _GivenPoses:
+    found = [f for suffix in (".bin", ".txt") for f in folders if (f / f"images{suffix}").exists()]
+    if not found:
+        raise ReobjError(
+            f"{path}: no images.bin or .txt; expected a COLMAP model, or see --pose-format"
+        )
+    folder = found[0]
     try:
-        model = _read_model(folder)
+        if (folder / "images.bin").exists():
+            model = _read_model(folder)
+        else:
+            with tempfile.TemporaryDirectory() as copy:
+                _copy_text_model(folder, Path(copy))
+                model = _read_model(Path(copy))
     except (ValueError, RuntimeError, IndexError) as error:
         reason = str(error).splitlines()[0]
         raise ReobjError(f"{folder}: not a COLMAP model ({reason}); write it again") from None
     if not model.names:
         raise ReobjError(f"{folder}: the COLMAP model has no registered image")
-    found = (model.cam_from_world, _one_camera(model.cameras, folder), model.names)
-    return _GivenPoses(*found, points=model.points, colors=model.colors)
+    facts = (model.cam_from_world, _one_camera(model.cameras, folder), model.names)
+    return _GivenPoses(*facts, points=model.points, colors=model.colors)
 
 
-def _colmap_text(folder: Path) -> _GivenPoses:
-    cameras = {}
-    for at, words in _word_rows(folder / "cameras.txt"):
-        try:
-            params = tuple(float(word) for word in words[4:])
-            cameras[words[0]] = Camera(words[1], int(words[2]), int(words[3]), params)
-            complete = len(params) == _COLMAP_PARAMS.get(words[1])
-        except (ValueError, IndexError):
-            complete = False
-        if not complete:
-            expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] with a known model, all parameters"
-            raise ReobjError(f"{at}: expected {expected}")
-    rows, where, names, used, points_next = [], [], [], [], False
-    for at, words in _word_rows(folder / "images.txt", blank=True):
-        points_line = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
-        if points_line and (points_next or not words):  # models of poses only may lack this line
+def _copy_text_model(folder: Path, copy: Path) -> None:
+    """Copy a COLMAP text model so that pycolmap reads all of it.
+
+    Models of poses alone often lack points3D.txt and the blank line of points after each image:
+    pycolmap refuses the first, and with the second takes every other image for points.
+    """
+    images = [
+        (number, text.split())
+        for number, text in enumerate(_read_text(folder / "images.txt").splitlines(), 1)
+        if not text.startswith("#")
+    ]
+    rows, points_next = [], False
+    for number, words in images:
+        is_points = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
+        if is_points and (points_next or not words):
+            rows[-1:] = [(rows[-1][0], words)] if rows else []
             points_next = False
             continue
-        try:
-            rows.append([float(w) for w in words[1:8]])
-            used.append(cameras[words[8]])
-            names.append(" ".join([words[9], *words[10:]]))
-        except (ValueError, IndexError, KeyError):
+        if len(words) < 10:
             expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            raise ReobjError(f"{at}: expected {expected}") from None
-        where.append(at)
+            raise ReobjError(f"{folder / 'images.txt'}, line {number}: expected {expected}")
+        rows.append((words, []))
         points_next = True
-    if not rows:
-        raise ReobjError(f"{folder / 'images.txt'}: no images in it")
-    table = np.array(rows)
-    poses = _from_quaternions(table[:, [1, 2, 3, 0]], table[:, 4:], where)
-    points = _colmap_text_points(folder / "points3D.txt")
-    points, colors = points[:, :3], points[:, 3:].astype(np.uint8)
-    return _GivenPoses(poses, _one_camera(used, folder), tuple(names), points=points, colors=colors)
-
-
-def _colmap_text_points(path: Path) -> Array:
-    """Position and colour (N, 6) of the points of a COLMAP text model."""
-    rows = []
-    for at, words in _word_rows(path) if path.exists() else ():
-        try:
-            x, y, z, red, green, blue, _ = (float(word) for word in words[1:8])
-        except ValueError:
-            raise ReobjError(f"{at}: expected POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
-        rows.append((x, y, z, red, green, blue))
-    return np.array(rows, np.float64).reshape(-1, 6)
-
-
-def _word_rows(path: Path, blank: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Yield where and the words of each line that is no comment, blank lines on request."""
-    for number, text in enumerate(_read_text(path).splitlines(), 1):
-        words = text.split()
-        if (words or blank) and not text.lstrip().startswith("#"):
-            yield f"{path}, line {number}", words
+    lines = [f"{' '.join(image)}\n{' '.join(points)}\n" for image, points in rows]
+    (copy / "images.txt").write_text("".join(lines))
+    shutil.copyfile(folder / "cameras.txt", copy / "cameras.txt")
+    points = folder / "points3D.txt"
+    (copy / "points3D.txt").write_text(_read_text(points) if points.exists() else "")
 
 
 _POSE_READERS: dict[str, Callable[[Path, tuple[int, int]], _GivenPoses]] = {
     "colmap": _given_colmap,
     "tum": _given_tum,
-    "kitti": _given_kitti,
     "transforms": _given_transforms,
     "scannet": _given_scannet,
     "record3d": _given_record3d,
-    "arkitscenes": _given_arkitscenes,
 }
 
 
@@ -5272,93 +5014,6 @@ def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
 # Separate reconstructions, joined by the objects that both see
 
 
-def join_parts(
-    poses: Poses, tracks: Sequence[tuple[IntArray, Array]], config: PosesConfig | None = None
-) -> Poses:
-    """Bring the separate reconstructions into the world of the largest one where the same objects,
-    by their identities, are seen in both and agree on how; the others stay left out.
-
-    Args:
-        tracks: per identity frame numbers (n,) and boxes (n, 4) xyxy, native pixels.
-    """
-    config, left = config or PosesConfig(), []
-    for part in poses.parts:
-        found = align_by_objects(part, poses, tracks, config)
-        new = part.known & ~poses.known
-        if found is None or not new.any():
-            left.append(part)
-            continue
-        (scale, turn, shift), count = found
-        moved = poses.cam_from_world.copy()
-        moved[new, :, :3] = part.cam_from_world[new, :, :3] @ turn.T
-        moved[new, :, 3] = scale * part.cam_from_world[new, :, 3] - moved[new, :, :3] @ shift
-        cov = poses.cov.copy()
-        unit = np.repeat([1, scale], 3)
-        cov[new] = part.cov[new] * np.outer(unit, unit)
-        span = f"frames {part.frame[part.known][0]}-{part.frame[part.known][-1]}: a separate "
-        text = f"{span}reconstruction, joined to the rest by {count} objects seen in both"
-        kept = [m for m in poses.messages if not m.startswith(span)]
-        status = np.where(new, part.status, poses.status)
-        poses = dataclasses.replace(poses, cam_from_world=moved, cov=cov, status=status)
-        poses = dataclasses.replace(poses, messages=(*kept, text))
-    return dataclasses.replace(poses, parts=tuple(left))
-
-
-def align_by_objects(
-    part: Poses, whole: Poses, tracks: Sequence[tuple[IntArray, Array]], config: PosesConfig
-) -> tuple[tuple[float, Array, Array], int] | None:
-    """Find the similarity (scale, rotation, shift) whole_from_part from objects seen in both, and
-    how many agree; None unless `join_objects` of them, and most of all, do.
-
-    Every three objects propose one; an object agrees if its centre from either reconstruction
-    projects into its boxes of the other (median over the frames).
-    """
-    shared = []  # per object: box centre in both worlds
-    for frame, xyxy in tracks:
-        centre = (xyxy[:, :2] + xyxy[:, 2:]) / 2
-        a, b = (_track_views(poses, frame, centre, config) for poses in (part, whole))
-        if a is not None and b is not None:
-            in_part = _meet(part.cam_from_world[a[0]], a[1])[2]
-            in_whole = _meet(whole.cam_from_world[b[0]], b[1])[2]
-            shared.append((frame, xyxy, in_part, in_whole))
-    if len(shared) < config.join_objects:
-        return None
-    here, there = (np.array([s[i] for s in shared]) for i in (2, 3))  # (O, 3)
-    best: tuple[int, BoolArray] = (0, np.zeros(len(shared), bool))
-    for triple in itertools.islice(itertools.combinations(range(len(shared)), 3), 2000):
-        agree = _agree(similarity(here[list(triple)], there[list(triple)]), shared, part, whole)
-        best = max(best, (int(agree.sum()), agree), key=lambda b: b[0])
-    if best[0] < max(config.join_objects, 0.6 * len(shared)):
-        return None
-    found = similarity(here[best[1]], there[best[1]])
-    count = int(_agree(found, shared, part, whole).sum())
-    return (found, count) if count >= config.join_objects else None
-
-
-def _agree(
-    whole_from_part: tuple[float, Array, Array], shared: list[Any], part: Poses, whole: Poses
-) -> BoolArray:
-    """(O,) True for objects whose centre from one world lies in its boxes in the other, both ways;
-    their distance from the box centres is at most a quarter of the box in the median frame.
-    """
-    scale, turn, shift = whole_from_part
-    agree = []
-    for frame, xyxy, in_part, in_whole in shared:
-        for poses, point in (
-            (whole, scale * turn @ in_part + shift),
-            (part, turn.T @ (in_whole - shift) / scale),
-        ):
-            place, use = _place_of(poses, frame)
-            in_cam = poses.cam_from_world[place[use]] @ np.r_[point, 1]  # (n, 3)
-            xy = in_cam @ poses.camera.K.T
-            box = xyxy[use]
-            off = np.abs(xy[:, :2] / xy[:, 2:] - (box[:, :2] + box[:, 2:]) / 2)
-            off = np.where(in_cam[:, 2:] > 0, off, np.inf) / (box[:, 2:] - box[:, :2])
-            agree.append(float(np.median(off.max(1))) <= 0.25)
-    both = np.array(agree, bool).reshape(-1, 2)
-    return np.asarray(both.all(1), bool)
-
-
 # Writers
 
 
@@ -5372,21 +5027,6 @@ def write_tum(path: Path, poses: Poses) -> None:
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:
         part.write_text("\n".join([header, *rows]) + "\n")
-
-
-def write_camera_table(path: Path, poses: Poses) -> None:
-    """Write a CSV row for every frame: status, and standard deviations of position (world units)
-    and rotation (degrees), root mean square over the axes, empty where unknown.
-    """
-    rows = ["frame,time_s,status,position_sigma,rotation_sigma_deg"]
-    cov = poses.cov if len(poses.cov) else np.full((len(poses.frame), 6, 6), np.nan)
-    sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2).reshape(-1, 2, 3).mean(2))  # (F, 2)
-    columns = (poses.frame, poses.time_s, poses.status, sigma)
-    for frame, time_s, status, (turn, shift) in zip(*columns, strict=True):
-        numbers = f"{shift:.6g},{np.degrees(turn):.6g}" if np.isfinite(shift) else ","
-        rows.append(f"{frame},{time_s:.6f},{status},{numbers}")
-    with atomic(path) as part:
-        part.write_text("\n".join(rows) + "\n")
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
@@ -5733,7 +5373,7 @@ class Linker:
         solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
         at = np.searchsorted(self.located, self.table.frame[rows])
         return np.split(
-            _paired_iou(solids[at, label], views.boxes[at, label]), np.cumsum(size)[:-1]
+            quadrics.box_iou(solids[at, label], views.boxes[at, label]), np.cumsum(size)[:-1]
         )
 
     def _cross_iou(self, labels: IntArray, count: int) -> tuple[Array, Array]:
@@ -5754,9 +5394,9 @@ class Linker:
         for h in range(count):  # over groups: each is one vectorised comparison
             seen = np.flatnonzero(np.isfinite(views.boxes[:, h, 0]))
             if len(seen):
-                iou = _paired_iou(solids[seen], views.boxes[seen, h][:, None])  # (n, G)
+                iou = quadrics.box_iou(solids[seen], views.boxes[seen, h][:, None])  # (n, G)
                 place[:, h] = np.median(iou, 0)
-        return place, _paired_iou(solids, views.boxes)
+        return place, quadrics.box_iou(solids, views.boxes)
 
     def _split(self) -> None:
         """Undo returns whose places differ: tracklets that their identity's solid does not explain.
@@ -5912,14 +5552,6 @@ def _segments_of(table: TrackTable, cut_gap: int) -> IntArray:
     return segment
 
 
-def _paired_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
-    """IoU of boxes paired by broadcasting (..., 4); 0 where one is NaN."""
-    low, high = np.maximum(a_xyxy, b_xyxy)[..., :2], np.minimum(a_xyxy, b_xyxy)[..., 2:]
-    inter = (high - low).clip(0).prod(-1)
-    area_a, area_b = ((b[..., 2:] - b[..., :2]).prod(-1) for b in (a_xyxy, b_xyxy))
-    return np.nan_to_num(np.asarray(inter / np.maximum(area_a + area_b - inter, 1e-9), np.float64))
-
-
 def _class_shares(table: TrackTable, group: IntArray, count: int) -> Array:
     """Share of every class in the scores of each group of rows, (count, C)."""
     votes = np.zeros((count, int(table.class_id.max(initial=0)) + 1))
@@ -5991,50 +5623,21 @@ def _icosphere(detail: int) -> tuple[Array, IntArray]:
 
 
 SOLID_FIELDS = ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov")
-OBJECT_FIELDS: dict[str, tuple[type, ...]] = {  # of objects.json: name -> types of its value
-    "id": (int,), "class": (str,), "score": (float, int), "status": (str,), "reason": (str,),
-    "support": (str, type(None)), **dict.fromkeys(SOLID_FIELDS, (list, type(None))),
-    "views": (int,), "frames_seen": (int,), "parallax_deg": (float, int, type(None)),
-    "dropped_boxes": (int,), "reprojection_iou_median": (float, int, type(None)),
-    "tracks": (list,), "frames": (list,),
-}  # fmt: skip
-STATUSES = ("ok", "prior_dominated", "rejected")
+OBJECT_FIELDS = (
+    "id", "class", "score", "status", "reason", "support", *SOLID_FIELDS, "views", "frames_seen",
+    "parallax_deg", "dropped_boxes", "reprojection_iou_median", "tracks", "frames",
+)  # fmt: skip
 
 
 def validate_objects(path: Path) -> list[str]:
-    """Check an objects.json against the format; returns one line for each fault."""
-    data = _load_json(path)
-    if not isinstance(data, dict) or data.get("format") != "reobj-objects":
-        return [f'{path}: expected a JSON object with "format": "reobj-objects"']
-    wanted = ("version", "video", "world", "conventions", "objects")
-    faults = [f"{path}: missing key {key!r}" for key in wanted if key not in data]
-    seen: set[int] = set()
-    for i, obj in enumerate(data.get("objects", [])):
-        where = f"{path}: objects[{i}]"
-        faults += [f"{where}: {fault}" for fault in _object_faults(obj)]
-        if obj.get("id") in seen:
-            faults.append(f"{where}: id {obj.get('id')} occurs twice")
-        seen.add(obj.get("id"))
-    return faults
-
-
-def _object_faults(obj: dict[str, Any]) -> list[str]:
-    """Faults of one entry of objects.json."""
-    faults = [f"missing key {key!r}" for key in OBJECT_FIELDS if key not in obj]
-    faults += [
-        f"{key}: expected {' or '.join(t.__name__ for t in types)}, found {type(obj[key]).__name__}"
-        for key, types in OBJECT_FIELDS.items()
-        if key in obj and not isinstance(obj[key], types)
-    ]
-    if obj.get("status") not in STATUSES:
-        faults.append(f"status: expected one of {', '.join(STATUSES)}, found {obj.get('status')!r}")
-    for key, length in (("center", 3), ("half_axes", 3), ("size", 3), ("quat_wxyz", 4), ("cov", 9)):
-        value = obj.get(key)
-        if isinstance(value, list) and len(value) != length:
-            faults.append(f"{key}: expected {length} entries, found {len(value)}")
-    if obj.get("status") != "rejected" and obj.get("center") is None:
-        faults.append("center: missing although the object is not rejected")
-    return faults
+    """Check an objects.json against objects.schema.json; returns one line for each fault."""
+    try:
+        import jsonschema
+    except ImportError as error:
+        raise ReobjError("jsonschema is not installed: pip install jsonschema") from error
+    schema = json.loads(Path(__file__).with_name("objects.schema.json").read_text())
+    faults = jsonschema.Draft202012Validator(schema).iter_errors(_load_json(path))
+    return sorted(f"{path}: {fault.json_path}: {fault.message[:200]}" for fault in faults)
 
 
 def quat_wxyz_from_matrix(rotation: Array) -> Array:
@@ -6239,23 +5842,16 @@ class Pictures:
                 crop = _jpeg(frame.image[y1:y2, x1:x2], self.config.scene_crop_px)
                 self.crops[int(obj)].append((frame.index, crop))
         if frame.index in self.whole:
-            image = _shrunk(frame.image, self.config.scene_frame_px)
+            image = shrunk(frame.image, self.config.scene_frame_px)
             low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
             scale = self.scale * image.shape[1] / width
             draw_tracks(image, self.table[slice(low, high)], {}, scale)
             self.frames.append((frame.index, _jpeg(image, self.config.scene_frame_px)))
 
 
-def _shrunk(image: Image, size_px: int) -> Image:
-    """A copy whose longer side is at most size_px."""
-    ratio = min(1.0, size_px / max(image.shape[:2]))
-    size = [max(1, round(side * ratio)) for side in image.shape[1::-1]]
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def _jpeg(image: Image, size_px: int) -> str:
     """Base64 of a small JPEG."""
-    data = cv2.imencode(".jpg", _shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    data = cv2.imencode(".jpg", shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return base64.b64encode(data.tobytes()).decode()
 
 
@@ -6289,17 +5885,6 @@ def diverse_rows(
 def scene_frames(result: RunResult) -> IntArray:
     """Frame numbers that the time slider of the scene page goes through, before thinning."""
     return np.unique(result.table.frame) if result.poses is None else result.poses.frame
-
-
-def guessed_up(cam_from_world: Array) -> Array:
-    """Direction against gravity (3,) when nobody knows it: people hold the horizon level, so it is
-    the one most at right angles to all cameras' x axes (F, 3, 4); else the mean of their -y axes.
-    """
-    upward = -cam_from_world[:, 1, :3].mean(0)
-    _, strength, axes = np.linalg.svd(cam_from_world[:, 0, :3])
-    if len(strength) > 2 and strength[1] > 0.2 * strength[0]:  # the cameras turned, not only moved
-        upward = axes[2] * (1 if axes[2] @ upward >= 0 else -1)
-    return np.asarray(upward / (np.linalg.norm(upward) or 1))
 
 
 def write_scene(result: RunResult, pictures: Pictures, video: Video, config: Config) -> None:
@@ -6344,7 +5929,9 @@ def _scene_cameras(
         return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
     thin = slice(None, None, math.ceil(len(poses.points) / limits.scene_points) or 1)
     K = poses.camera.K
-    up = guessed_up(poses.cam_from_world[poses.known]) if up_in_world is None else up_in_world
+    up = up_in_world
+    if up is None:
+        up = quadrics.camera_up(K @ poses.cam_from_world[poses.known])[0]
     size = {"width": poses.camera.width, "height": poses.camera.height}
     return {
         "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
@@ -6539,9 +6126,6 @@ def run(
     if in_3d and poses is None and not video.is_live:
         moving = _moving_rows(track, config.objects)
         poses, model = _reconstruct(video, space, config, seconds, moving)
-        rows = _rows_by(track.table.object_id)
-        boxes = [(track.table.frame[r], track.table.xyxy[r]) for r in rows]
-        poses = join_parts(poses, boxes, config.poses)
     if poses is not None:
         _check_supplied(poses, track.table)
     space.remember(track, poses)
@@ -6613,21 +6197,19 @@ class TrackResult:
         """Write as npz, atomically."""
         columns = {f.name: getattr(self.table, f.name) for f in dataclasses.fields(TrackTable)}
         columns |= {"look": self.look, "look_row": self.look_row}
-        names, messages = np.array(self.class_names, str), np.array(self.messages, str)
-        with atomic(path) as part, part.open("wb") as file:
-            facts = {"class_names": names, "messages": messages, "fixed": np.array(self.fixed)}
-            np.savez_compressed(file, **columns | facts, split=np.array(self.split))
+        facts = {k: getattr(self, k) for k in ("class_names", "messages", "fixed", "split")}
+        save_npz(path, columns, **facts)
 
     @staticmethod
     def load(path: Path) -> TrackResult:
         """Read what `save` wrote."""
         try:
-            with np.load(path, allow_pickle=False) as data:
-                table = TrackTable(*(data[f.name] for f in dataclasses.fields(TrackTable)))
-                names, messages = (tuple(data[k].tolist()) for k in ("class_names", "messages"))
-                looks = data["look"], data["look_row"], int(data["split"])
-                return TrackResult(table, names, messages, bool(data["fixed"]), *looks)
-        except (KeyError, ValueError, OSError) as error:
+            data, facts = load_npz(path)
+            table = TrackTable(*(data[f.name] for f in dataclasses.fields(TrackTable)))
+            names, messages = tuple(facts["class_names"]), tuple(facts["messages"])
+            looks = data["look"], data["look_row"], int(facts["split"])
+            return TrackResult(table, names, messages, bool(facts["fixed"]), *looks)
+        except (KeyError, ValueError) as error:
             raise ReobjError(
                 f"{path}: not readable, or of another version ({error}); delete it and run again"
             ) from error
@@ -6642,23 +6224,16 @@ def save_poses(path: Path, poses: Poses) -> None:
         "up": None if poses.up_in_world is None else poses.up_in_world.tolist(),
         "messages": poses.messages,
     }
-    arrays = {k: getattr(poses, k) for k in _POSE_ARRAYS}
-    for i, other in enumerate(poses.parts):
-        save_poses(path.with_suffix(f".{i}.part"), other)
-    text = np.array(json.dumps(facts))
-    with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, facts=text, parts=len(poses.parts), **arrays)
+    save_npz(path, {k: getattr(poses, k) for k in _POSE_ARRAYS}, **facts)
 
 
-_POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors", "cov")
+_POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors")
 
 
 def load_poses(path: Path) -> Poses:
     """Read what `save_poses` wrote."""
-    with np.load(path, allow_pickle=False) as data:
-        facts = json.loads(str(data["facts"]))
-        arrays = {k: data[k] for k in _POSE_ARRAYS if k in data}
-        parts = range(int(data["parts"]) if "parts" in data else 0)
+    data, facts = load_npz(path)
+    arrays = {k: data[k] for k in _POSE_ARRAYS}
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
     return Poses(
@@ -6667,7 +6242,6 @@ def load_poses(path: Path) -> Poses:
         metric=facts["metric"],
         up_in_world=up,
         messages=tuple(facts["messages"]),
-        parts=tuple(load_poses(path.with_suffix(f".{i}.part")) for i in parts),
         **arrays,
     )
 
@@ -6813,7 +6387,7 @@ def _embedder(config: Config) -> Embedder | None:
         return None
     kind, _, backbone = config.embed.model.partition(":")
     if kind == "crops":
-        backbone = backbone or "mobilenetv2"
+        backbone = backbone or "mobilenetv2_feat"
         return CropEmbedder(backbone, config.embed, config.threads, config.offline)
     return Embedder(config.embed.model, config.embed, config.threads, config.offline)
 
@@ -7098,7 +6672,6 @@ def write_cameras(out: Path, poses: Poses, video: Video) -> None:
     """Write poses.txt, and sparse/ for supplied poses (pycolmap's own model has its points too)."""
     if poses.known.any():
         write_tum(out / "poses.txt", poses)
-        write_camera_table(out / "cameras.csv", poses)
         if poses.source == "user":
             names = [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
             write_colmap(out / "sparse", poses, names)
@@ -7108,7 +6681,7 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
     """Write the files of the output folder; each appears only when it is complete."""
     out, started = result.out, time.monotonic()
     old = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html")
-    for name in old:  # of an earlier run
+    for name in old:  # of an earlier run; cameras.csv: of an earlier version
         (out / name).unlink(missing_ok=True)
     write_mot(out / "tracks.txt", result.table)
     _write_objects_json(result, video)
@@ -7224,17 +6797,6 @@ class LabelledBoxes:
 
     def __getitem__(self, keep: Any) -> LabelledBoxes:
         return LabelledBoxes(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
-
-
-def read_mot_rows(path: Path) -> Array:
-    """Rows of a MOTChallenge file, (N, columns)."""
-    try:
-        rows = np.loadtxt(path, delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise ReobjError(f"{path}: no MOTChallenge file: {error}") from None
-    if rows.size and rows.shape[1] < 6:
-        raise ReobjError(f"{path}: {rows.shape[1]} columns; wanted frame,id,left,top,width,height")
-    return np.asarray(rows if rows.size else np.empty((0, 10)), np.float64)
 
 
 def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
@@ -7516,7 +7078,9 @@ def true_from_found(out: Path, truth_poses: Path | None) -> tuple[float, Array, 
     use = poses.known & np.isfinite(centers).all(1)
     pose, goal = poses.cam_from_world[use], centers[use]
     ours = -np.einsum("fji,fj->fi", pose[:, :, :3], pose[:, :, 3])  # (f, 3)
-    return similarity(ours, goal)
+    true_from_ours = _pycolmap().estimate_sim3d(ours, goal)
+    turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
+    return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
 
 
 def _true_centers(path: Path, poses: Poses) -> Array:
@@ -7649,14 +7213,7 @@ def _was_read(frame: IntArray, out: Path) -> BoolArray:
 # ---- Export: other tools' files from an output folder ------------------------------------------
 
 CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
-MANY_CAMERAS = 200  # in a GLB; of longer videos every n-th
 SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
-BOXER_COLUMNS = (
-    "time_ns,tx_world_object,ty_world_object,tz_world_object,qw_world_object,qx_world_object,"
-    "qy_world_object,qz_world_object,scale_x,scale_y,scale_z,name,instance,sem_id,prob"
-)
-
-
 @dataclass(frozen=True, slots=True)
 class Saved:
     """What an output folder of `run` holds, read back for the exports.
@@ -7684,7 +7241,7 @@ class Saved:
         names = tuple(dict.fromkeys(o["class"] for o in data["objects"]))
         class_of = {o["id"]: names.index(o["class"]) for o in data["objects"]}
         tracks = out / "tracks.txt"
-        rows = read_mot_rows(tracks) if tracks.stat().st_size else np.empty((0, 10))
+        rows = read_mot_rows(tracks)
         found = labelled(rows)
         classes = np.array([class_of[i] for i in found.identity.tolist()], np.int64)
         unknown = np.full(len(found), -1, np.int64)
@@ -7783,28 +7340,6 @@ def _cvat_boxes(track: ET.Element, rows: TrackTable, following: dict[int, int]) 
             ET.SubElement(track, "box", facts | corners | {"z_order": "0"})
 
 
-def export_boxer(saved: Saved, path: Path) -> None:
-    """Write Boxer's CSV of 3D boxes: centre, quaternion wxyz and full extents, in metres, z up.
-
-    One row an object at the time of the first frame, since the scene stands still. Left out:
-    rejected objects, the shape (all are boxes here), the uncertainty, the sightings.
-    Source: facebookresearch/boxer, utils/file_io.py, `read_obb_csv`.
-    """
-    rows = []
-    kept = [o for o in saved.data["objects"] if o["status"] != "rejected"]
-    scale, turn = _upright(saved, path, [0.0, 0, 1])
-    time_ns = 0 if saved.poses is None else round(1e9 * float(saved.poses.time_s[0]))
-    for o in kept:
-        center = turn @ np.array(o["center"]) * scale
-        own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
-        numbers = [*center, *quat_wxyz_from_matrix(turn[None] @ own)[0],
-                   *np.array(o["size"]) * scale]  # fmt: skip
-        rows.append([time_ns, *(f"{v:.6f}" for v in numbers), o["class"].replace(",", " "),
-                     o["id"], saved.class_names.index(o["class"]), o["score"]])  # fmt: skip
-    with atomic(path) as part, part.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([BOXER_COLUMNS.split(","), *rows])
-
-
 def _upright(saved: Saved, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
     """Metres per unit (1 if unknown) and the rotation (3, 3) that brings the world's up onto this
     axis; what is unknown is said.
@@ -7817,104 +7352,41 @@ def _upright(saved: Saved, path: Path, up_axis: Sequence[float]) -> tuple[float,
             log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
         if up is None:
             log.warning("up is unknown: %s keeps the world's axes", path)
-    turn = turn_onto(np.array(up or up_axis), np.array(up_axis))
-    return metres or 1.0, turn
-
-
-def _xyzw(rotation: Array) -> list[float]:
-    """Unit quaternion of a rotation matrix (3, 3), w last."""
-    return [float(v) for v in np.roll(quat_wxyz_from_matrix(rotation[None])[0], -1)]
-
-
-def turn_onto(a: Array, b: Array) -> Array:
-    """Return the smallest rotation (3, 3) that takes the direction of a (3,) to that of b (3,)."""
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    axis, cosine = np.cross(a, b), float(a @ b)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:  # parallel, or opposite: then about any axis across
-        axis, sine = np.cross(a, np.eye(3)[np.abs(a).argmin()]), 0.0
-    turn = axis / np.linalg.norm(axis) * math.atan2(sine, cosine)
-    return np.asarray(Rotation.from_rotvec(turn).as_matrix())
+    turn = Rotation.align_vectors([up_axis], [up or up_axis])[0].as_matrix()
+    return metres or 1.0, np.asarray(turn)
 
 
 def export_glb(saved: Saved, path: Path) -> None:
-    """Write binary glTF 2.0: y up, in metres if the scale is known; a named node an object (a unit
-    sphere scaled to the ellipsoid; its facts in `extras`), up to MANY_CAMERAS cameras, the points.
-
-    Source: the glTF 2.0 specification of Khronos.
+    """Write binary glTF 2.0: y up, in metres if the scale is known; a named mesh an object, its
+    facts in `extras`; the sparse points and the camera's path. Needs trimesh.
     """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ReobjError("trimesh is not installed: pip install 'reobj-track[viewer]'") from error
     scale, turn = _upright(saved, path, [0.0, 1, 0])
-    kept = [o for o in saved.data["objects"] if o["status"] != "rejected"]
-    sphere, faces = _icosphere(OutputConfig().ply_detail)  # (P, 3), (T, 3)
-    arrays = [sphere.astype("<f4"), faces.reshape(-1, 1).astype("<u4")]  # accessors 0 and 1
-    ball = {"attributes": {"POSITION": 0, "NORMAL": 0}, "indices": 1}
-    meshes = [{"primitives": [ball | {"material": i}]} for i in range(len(kept))]
-    nodes = [
-        {"name": f"{o['class']} {o['id']}", "mesh": i, "translation": o["center"],
-         "rotation": np.roll(o["quat_wxyz"], -1).tolist(), "scale": o["half_axes"],
-         "extras": {k: o[k] for k in ("id", "class", "status", "support", "size_m")}}
-        for i, o in enumerate(kept)
-    ]  # fmt: skip
-    extra: dict[str, Any] = {}
+    world = np.eye(4)
+    world[:3, :3] = scale * turn
+    scene = trimesh.Scene()
+    for o in saved.data["objects"]:
+        if o["status"] == "rejected":
+            continue
+        mesh, name = trimesh.creation.icosphere(subdivisions=3), f"{o['class']} {o['id']}"
+        mesh.visual.face_colors = [*object_color(o["id"])[::-1], 255]
+        mesh.metadata = {k: o[k] for k in ("id", "class", "status", "support", "size_m")}
+        world_from_obj = np.eye(4)
+        own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
+        world_from_obj[:3, :3] = own * o["half_axes"]
+        world_from_obj[:3, 3] = o["center"]
+        scene.add_geometry(mesh, name, name, transform=world @ world_from_obj)
     if saved.poses is not None and len(saved.poses.points):
-        opaque = np.insert(saved.poses.colors, 3, 255, axis=1)  # (N, 4)
-        arrays += [saved.poses.points.astype("<f4"), opaque]
-        dots = {"attributes": {"POSITION": 2, "COLOR_0": 3}, "mode": 0}
-        nodes.append({"name": "points", "mesh": len(meshes)})
-        meshes.append({"primitives": [dots]})
-    if saved.poses is not None and saved.poses.known.any():
-        extra["cameras"], cameras = _glb_cameras(saved.poses)
-        nodes += cameras
-    root = {"name": "world", "scale": [scale] * 3, "rotation": _xyzw(turn)}
-    nodes.append(root | {"children": list(range(len(nodes)))} if nodes else root)
-    materials = [
-        {"name": f"object {o['id']}", "pbrMetallicRoughness": {"metallicFactor": 0.0,
-         "baseColorFactor": [(c / 255) ** 2.2 for c in object_color(o["id"])[::-1]] + [1.0]}}
-        for o in kept
-    ]  # fmt: skip
-    extra |= {"scenes": [{"nodes": [len(nodes) - 1]}], "nodes": nodes}
-    extra |= {"meshes": meshes, "materials": materials}
-    _write_glb(path, arrays, {key: value for key, value in extra.items() if value})
-
-
-def _glb_cameras(poses: Poses) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The camera of a glTF scene and a node for each pose; glTF cameras look along -z, y up."""
-    camera, known = poses.camera, np.flatnonzero(poses.known)
-    known = known[:: math.ceil(len(known) / MANY_CAMERAS)]
-    yfov = 2 * math.atan(camera.height / 2 / camera.K[1, 1])
-    lens = {"yfov": yfov, "aspectRatio": camera.width / camera.height, "znear": 0.01}
-    world_from_cam = invert_rigid(poses.cam_from_world[known]) @ np.diag([1.0, -1, -1, 1])
-    nodes = [
-        {"name": f"camera {frame}", "camera": 0, "rotation": _xyzw(m[:, :3]),
-         "translation": m[:, 3].tolist()}
-        for frame, m in zip(poses.frame[known], world_from_cam, strict=True)
-    ]  # fmt: skip
-    return [{"type": "perspective", "perspective": lens}], nodes
-
-
-def _write_glb(path: Path, arrays: Sequence[npt.NDArray[Any]], scene: dict[str, Any]) -> None:
-    """Write a .glb: the arrays (N, k) become its accessors, in their order; all of 4-byte rows."""
-    types, components = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}, {"f": 5126, "I": 5125, "B": 5121}
-    offsets = np.cumsum([0] + [a.nbytes for a in arrays]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": at, "byteLength": a.nbytes}
-        for at, a in zip(offsets, arrays, strict=False)
-    ]
-    accessors = [
-        {"bufferView": i, "componentType": components[a.dtype.char], "count": len(a),
-         "type": types[a.shape[1]], "min": a.min(0).tolist(), "max": a.max(0).tolist(),
-         "normalized": a.dtype.char == "B"}
-        for i, a in enumerate(arrays)
-    ]  # fmt: skip
-    head = {"asset": {"version": "2.0", "generator": f"reobj_track {__version__}"}, "scene": 0}
-    head |= {"buffers": [{"byteLength": offsets[-1]}], "bufferViews": views, "accessors": accessors}
-    text = json.dumps(head | scene, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    blob = b"".join(a.tobytes() for a in arrays)
-    with atomic(path) as part, part.open("wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob)))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", len(blob), b"BIN\0") + blob)
+        cloud = trimesh.PointCloud(saved.poses.points, colors=saved.poses.colors)
+        scene.add_geometry(cloud, "points", "points", transform=world)
+    if saved.poses is not None and saved.poses.known.sum() > 1:
+        path_of = invert_rigid(saved.poses.cam_from_world[saved.poses.known])[:, :, 3]
+        scene.add_geometry(trimesh.load_path(path_of), "cameras", "cameras", transform=world)
+    with atomic(path) as part:
+        part.write_bytes(scene.export(file_type="glb"))
 
 
 def export_rrd(saved: Saved, path: Path) -> None:
@@ -7980,7 +7452,6 @@ def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str], scale: f
 EXPORTS: dict[str, tuple[str, Callable[[Saved, Path], None]]] = {  # name: file in OUT, writer
     "coco-vid": ("coco_vid.json", export_coco_vid),
     "cvat": ("cvat.xml", export_cvat),
-    "boxer": ("boxer_3dbbs.csv", export_boxer),
     "glb": ("objects.glb", export_glb),
     "rrd": ("scene.rrd", export_rrd),
 }
