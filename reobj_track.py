@@ -58,7 +58,7 @@ import time
 import urllib.request
 import zipfile
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -150,58 +150,9 @@ class PosesConfig:
         "--camera",
     )
     size_px: int = _opt(640, "longer side of the working images")
-    max_flow: float = _opt(0.12, "new keyframe at this median flow since the last, over the width")
-    min_ratio: float = _opt(0.55, "new keyframe when fewer of the corners than this survive")
     max_keyframes: int = _opt(150, "upper bound on keyframes; max_flow grows until it fits")
-    overlap: int = _opt(12, "sequential matching: neighbours at offsets 1, 2, 4 ... 2^(overlap-1)")
-    exhaustive_below: int = _opt(30, "match all pairs when there are no more keyframes than this")
-    min_registered: float = _opt(0.5, "refuse a model with fewer of the keyframes than this")
-    min_points: int = _opt(100, "refuse a model with fewer 3D points")
-    min_tri_angle_deg: float = _opt(1.5, "refuse a model of a smaller median triangulation angle")
-    pnp_points: int = _opt(200, "3D points tracked from each keyframe into the frames between")
-    pnp_min_inliers: int = _opt(15, "accept a PnP pose with at least this many inliers")
-    pnp_min_ratio: float = _opt(0.5, "and at least this share of inliers")
     max_gap: int = _opt(15, "interpolate over at most this many frames (marked `interpolated`)")
     seed: int = _opt(0, "random seed of the reconstruction")
-    corners: int = _opt(300, "corners followed to choose keyframes")
-    min_corners: int = _opt(20, "with fewer corners a frame counts as textureless")
-    min_keyframes: int = _opt(40, "with fewer keyframes max_flow is halved, down to min_flow")
-    max_interval: int = _opt(60, "new keyframe after this many frames if the camera moved at all")
-    min_flow: float = _opt(0.015, "share of the width that counts as motion")
-    sharp_window: float = _opt(0.7, "from this share of max_flow on the sharpest frame is taken")
-    klt_window_px: int = _opt(15, "Lucas-Kanade window on the working image")
-    klt_error_px: float = _opt(1.0, "forward-backward error of a followed point")
-    cache_mb: int = _opt(1000, "gray images kept in memory; beyond it the video is read twice")
-    sift_features: int = _opt(2000, "SIFT features a keyframe (4096: slower, no better)")
-    sift_contrast: float = _opt(0.02, "SIFT contrast threshold")
-    sift_contrast_low: float = _opt(0.007, "the same where fewer than sift_few features are found")
-    sift_few: int = _opt(500, "see sift_contrast_low")
-    loop_pairs: int = _opt(6, "look-alike keyframes matched with each keyframe, to close loops")
-    loop_words: int = _opt(64, "visual words that describe the look of a keyframe")
-    loop_sample: int = _opt(20000, "descriptors clustered into words")
-    focal_guess: float = _opt(0.8, "first focal length over the longer side (phones .72-.85)")
-    good_registered: float = _opt(0.9, "take the first sound model with this share of keyframes")
-    min_points_per_image: int = _opt(30, "refuse a model with fewer 3D points in the median image")
-    min_parallax_px: float = _opt(3.0, "refuse what turns explain to this (walks: > 4)")
-    strong_tri_angle_deg: float = _opt(5.0, "trust a self-calibrated focal length from this angle")
-    strong_spread: float = _opt(0.1, "and from this spread of the cameras over the depth on")
-    focal_range: tuple[float, float] = _opt((0.4, 2.0), "and if focal / longer side lies in here")
-    tri_sample: int = _opt(2000, "points used for the median triangulation angle")
-    match_chunk: int = _opt(100, "pairs of keyframes matched between two ticks of the progress")
-    refine_px: float = _opt(0.5, "soft L1 loss of the last adjustment, px of the working image")
-    max_center_shift: float = _opt(0.05, "most that the principal point may move, over the size")
-    pnp_error_px: float = _opt(4.0, "PnP inlier threshold on the working image")
-    max_run: int = _opt(1000, "frames held at once between two keyframes")
-    pose_tolerance: float = _opt(5e-3, "how far supplied rotations may be off (7-Scenes: 1e-3)")
-    max_focal_spread: float = _opt(0.02, "how far supplied focal lengths may differ, a share")
-    lone_frame_s: float = _opt(1 / 60, "half a frame interval when there is only one frame")
-    check_tracks: int = _opt(3, "direction check: tracks needed")
-    check_views: int = _opt(5, "direction check: frames of a track needed")
-    check_most_tracks: int = _opt(200, "direction check: tracks used at most")
-    check_most_views: int = _opt(40, "direction check: frames of a track used at most")
-    check_angle_deg: float = _opt(1.0, "direction check: good when the tracks meet within this")
-    check_ratio: float = _opt(0.3, "direction check: another reading must be better by this factor")
-    max_step_ratio: float = _opt(5.0, "refuse PnP poses this many median steps from neighbours")
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,74 +213,16 @@ class TrackerConfig:
     std_velocity: float = _opt(
         1 / 80, "process noise of a velocity over the box size (DeepSORT: 1/160)"
     )
-    std_start: float = _opt(
-        0.2, "spread of a new track's velocity over the box size (DeepSORT: 1/16; SORT: wide)"
-    )
-    std_measure: float = _opt(
-        0.05, "measurement noise over the box size at score .8 (DeepSORT: 1/20)"
-    )
-    score_noise: float = _opt(
-        0.25, "and how it grows with doubt, (1 - score) to this power (StrongSORT: 1)"
-    )
-    gate_chi2: float = _opt(
-        9.2103, "gate on the centre's squared Mahalanobis distance (chi2 .99, 2 dof)"
-    )
-    gate_iou: float = _opt(0.2, "overlap that passes the gate by itself")
-    blind_iou: float = _opt(0.1, "overlap needed by all where there is no look to compare")
-    blind_size: float = _opt(2.0, "and most that width or height may differ then, as a factor")
-    low_iou: float = _opt(0.3, "overlap needed for low scores and for a change of class")
-    max_cost: float = _opt(0.9, "most that an accepted match may cost (0: perfect, 1: at the gate)")
-    distance_weight: float = _opt(0.2, "share of the distance in the cost, the rest is overlap")
-    missed_cost: float = _opt(0.2, "added for tracks not seen for 10 frames, in proportion before")
-    tentative_cost: float = _opt(0.2, "added for tracks that are not confirmed yet")
     class_cost: float = _opt(
         0.2, "added to the cost, and taken off the overlap in doubt, when the class differs"
     )
     appearance_weight: float = _opt(0.7, "share of appearance in the cost of doubtful matches")
     foreground_weight: float = _opt(0.5, "share of the foreground in the appearance")
-    rival_cost: float = _opt(0.3, "a match is doubtful where a rival costs less than this more")
-    doubt_cost: float = _opt(0.5, "and where it costs more than this: perhaps a new object")
-    look_odds: float = _opt(
-        6.0, "log odds that the look must give a doubtful match of boxes that do not overlap"
-    )
-    iou_odds: float = _opt(20.0, "log odds that full overlap is worth")
     embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
-    look_momentum: float = _opt(
-        0.8, "memory of a track's running mean appearance (StrongSORT: .9 every frame)"
-    )
-    views: int = _opt(12, "views kept of every identity")
-    novelty: float = _opt(
-        0.95, "a view less similar than this to all kept ones is a new view (cosine)"
-    )
     return_probability: float = _opt(
         0.5, "recognise a return from this probability on, rivals and a new object considered"
     )
-    return_odds: float = _opt(
-        1.8, "odds beforehand that a newcomer is a certain known object and not a new one"
-    )
-    jump_odds: float = _opt(
-        2.0, "log odds against a return far from where the object's own track still coasts"
-    )
-    prior_weight: float = _opt(
-        10.0, "pairs that the usual looks of one and of two objects are worth (SameObject)"
-    )
-    place_views: int = _opt(16, "with poses: views kept of every object to tell its place in 3D")
-    place_every: int = _opt(
-        5, "frames between them; when they are full every other one goes and this doubles"
-    )
-    place_refit: int = _opt(10, "places are fitted again every so many frames, where views are new")
-    place_in_view: float = _opt(0.5, "a detection is expected from this share of a box in view on")
-    place_parallax_deg: float = _opt(2.0, "a place counts from this angle between its views on")
-    place_shape: float = _opt(
-        6.0,
-        "and where the longest axis is at most this many middle ones: half-seen things give "
-        "needles (95 % of priors.json: 5.8)",
-    )
     camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
-    flow_size_px: int = _opt(320, "longer side of the image for optical flow")
-    flow_corners: int = _opt(100, "corners followed")
-    flow_near: int = _opt(5, "of these the nearest tell how a track moves besides, in a deep scene")
-    flow_min_corners: int = _opt(8, "with fewer that agree, the camera is taken to stand still")
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,19 +234,6 @@ class ObjectsConfig:
     support: str = _opt("auto", "shape of the solids: auto, box, cylinder, ellipsoid", "--support")
     up: str = _opt("", "up in the world: x,y,z (default: from the poses or the objects)")
     link: bool = _opt(True, "join and split tracklets by 3D evidence")
-    look_probability: float = _opt(0.5, "join by looks from this on, rivals and others considered")
-    look_gap: int = _opt(30, "views of a tracklet this many frames apart show how looks vary")
-    look_prior_weight: float = _opt(10.0, "pairs that the usual looks of one and two are worth")
-    double_iou: float = _opt(0.5, "boxes that overlap more may be two boxes on one object (IoU)")
-    link_look: float = _opt(-4.0, "never join by place what looks less alike (log odds)")
-    link_class: float = _opt(0.1, "join by place only where the classes agree in this share")
-    link_place: float = _opt(
-        0.25, "one place from this overlap cross-projected on (IoU): may be joined, is not split"
-    )
-    keep_iou: float = _opt(0.4, "a join is kept if the joint solid overlaps the boxes so (IoU)")
-    keep_share: float = _opt(0.6, "in this share of the frames of either part (OA-SLAM: half)")
-    cut_gap: int = _opt(5, "tracklets may be split where this many frames pass without a detection")
-    split_drop: float = _opt(0.7, "a return is doubted if its joint solid overlaps less, a share")
     min_views: int = _opt(3, "objects with fewer detections in frames with poses get no ellipsoid")
     min_score: float = _opt(0.3, "boxes below this score do not shape the ellipsoid")
     moving: str = _opt(
@@ -367,16 +247,7 @@ class OutputConfig:
     """Files written."""
 
     overlay: bool = _opt(True, "write overlay.mp4")
-    overlay_size_px: int = _opt(1280, "longer side of the overlay")
-    ply_detail: int = _opt(2, "subdivisions of the ellipsoids in objects.ply")
     scene: bool = _opt(True, "write scene.html")
-    scene_crops: int = _opt(8, "pictures of each object in scene.html")
-    scene_max_crops: int = _opt(480, "and of all objects together")
-    scene_crop_px: int = _opt(112, "longer side of these pictures")
-    scene_frames: int = _opt(60, "video frames in scene.html, shown beside the time slider")
-    scene_frame_px: int = _opt(320, "longer side of these frames")
-    scene_steps: int = _opt(1500, "steps of the time slider (longer videos: every n-th camera)")
-    scene_points: int = _opt(20000, "sparse points in scene.html (more: every n-th)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -473,7 +344,7 @@ class Camera:
 
     def undistort(self, xy: Array) -> Array:
         """Map (..., 2) pixels to those of an ideal pinhole camera with the same K; NaN stays."""
-        camera = _pycolmap_camera(self, (self.width, self.height))
+        camera = pycolmap_camera(self, (self.width, self.height))
         flat = np.asarray(xy, np.float64).reshape(-1, 2)
         ideal = np.full_like(flat, np.nan)
         good = np.isfinite(flat).all(1)
@@ -1970,6 +1841,12 @@ def shrunk(image: Image, size_px: int) -> Image:
     return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
 
 
+FLOW_SIZE_PX = 320  # longer side of the image for optical flow
+FLOW_CORNERS = 100  # corners followed
+FLOW_NEIGHBOURS = 5  # of these the nearest tell how a track moves besides, in a deep scene
+FLOW_MIN_CORNERS = 8  # with fewer that agree, the camera is taken to stand still
+
+
 class CameraMotion:
     """Global image motion between consecutive frames from sparse optical flow, as a 3x3 matrix.
 
@@ -1979,22 +1856,21 @@ class CameraMotion:
     a textureless frame never stops the tracker.
     """
 
-    def __init__(self, config: TrackerConfig) -> None:
-        self.config = config
+    def __init__(self) -> None:
         self._gray: Image | None = None
         self._corners: Any = None
         self.flow = np.empty((0, 4))  # (K, 4) corners of the old image and what they moved besides
 
     def __call__(self, image: Image) -> Array:
         """Return new_from_old (3, 3) in pixels of `image`."""
-        shrink = min(1.0, self.config.flow_size_px / max(image.shape[:2]))
+        shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
         small = resized(image, [round(side * shrink) for side in image.shape[1::-1]])
         gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         new_from_old, self.flow = np.eye(3), np.empty((0, 4))
         if self._gray is not None and self._corners is not None and self._gray.shape == gray.shape:
             new_from_old = self._flow(gray)
         self._gray = gray
-        self._corners = cv2.goodFeaturesToTrack(gray, self.config.flow_corners, 0.01, 12)
+        self._corners = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, 0.01, 12)
         self.flow /= shrink
         to_small = np.diag([shrink, shrink, 1.0])
         return np.asarray(np.linalg.inv(to_small) @ new_from_old @ to_small)
@@ -2006,7 +1882,7 @@ class CameraMotion:
         if not len(self.flow):
             return np.zeros_like(xy)
         apart = ((xy[:, None] - self.flow[:, :2]) ** 2).sum(-1)  # (N, K)
-        near = apart.argsort(1)[:, : self.config.flow_near]
+        near = apart.argsort(1)[:, : FLOW_NEIGHBOURS]
         return np.asarray(np.median(self.flow[near, 2:], 1))
 
     def _flow(self, gray: Image) -> Array:
@@ -2026,11 +1902,11 @@ class CameraMotion:
         """Fit (3, 3) to points (K, 2), None: too few agree. Where it holds for most of them, the
         others move by themselves; where not, the scene is deep, and `flow` says how they move.
         """
-        if len(old) < self.config.flow_min_corners:
+        if len(old) < FLOW_MIN_CORNERS:
             return None
         cv2.setRNGSeed(0)
         affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=2.0)
-        if affine is None or inliers.sum() < self.config.flow_min_corners:
+        if affine is None or inliers.sum() < FLOW_MIN_CORNERS:
             return None
         if inliers.mean() < 0.5:
             self.flow = np.c_[old, new - old @ affine[:, :2].T - affine[:, 2]]
@@ -2665,16 +2541,19 @@ def _unit_rows(rows: npt.NDArray[Any]) -> Array:
     return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
 
 
+GALLERY_VIEWS = 12  # views kept of every identity
+GALLERY_NOVELTY = 0.95  # a view less similar than this to all kept ones is a new view (cosine)
+
+
 class Gallery:
     """What every identity of the video looked like: a few diverse views each, never forgotten.
 
     Arrays grow with the number of identities, not with time: `views` per identity at most.
     """
 
-    def __init__(self, config: TrackerConfig) -> None:
-        self.config = config
-        self.rows = np.zeros((0, config.views, 0), np.float32)  # (I, K, E)
-        self.sight = np.zeros((0, config.views, 3))  # (I, K, 3) directions they were seen in
+    def __init__(self) -> None:
+        self.rows = np.zeros((0, GALLERY_VIEWS, 0), np.float32)  # (I, K, E)
+        self.sight = np.zeros((0, GALLERY_VIEWS, 3))  # (I, K, 3) directions they were seen in
         self.count = np.zeros(0, np.int64)  # (I,) views held
         self.split = 0  # width of the foreground in the rows
 
@@ -2688,8 +2567,8 @@ class Gallery:
         similarity = np.einsum("nke,ne->nk", own, rows)  # (N, K)
         similarity[slot >= self.count[identity][:, None]] = -2.0
         nearest = similarity.argmax(1)  # (N,)
-        novel = similarity.max(1) < self.config.novelty  # (N,)
-        room = self.count[identity] < self.config.views
+        novel = similarity.max(1) < GALLERY_NOVELTY  # (N,)
+        room = self.count[identity] < GALLERY_VIEWS
         crowded = self._most_redundant(own[novel & ~room])
         target = np.where(novel & room, self.count[identity], nearest)  # (N,)
         target[novel & ~room] = crowded
@@ -2711,12 +2590,12 @@ class Gallery:
         similar view of each identity (I,), and the degrees between the directions in which both
         were seen, (N, 3) of the rows; NaN where unknown.
         """
-        shape = (len(rows), len(identity), self.config.views)
+        shape = (len(rows), len(identity), GALLERY_VIEWS)
         if not rows.size or not len(identity) or self.rows.shape[2] != rows.shape[1]:
             unknown = np.full(shape[:2], np.nan)
             return unknown, unknown, unknown
         views = self.rows[identity].reshape(-1, rows.shape[1])  # (I * K, E)
-        empty = np.arange(self.config.views) >= self.count[identity][:, None]  # (I, K)
+        empty = np.arange(GALLERY_VIEWS) >= self.count[identity][:, None]  # (I, K)
         fused = np.where(empty, -2.0, (rows @ views.T).reshape(shape))  # (N, I, K)
         best = fused.argmax(2)[..., None]
         angle = angle_deg(sight[:, None], self.sight[identity].reshape(-1, 3))
@@ -2728,7 +2607,7 @@ class Gallery:
 
     def _grow(self, identities: int, width: int) -> None:
         if self.rows.shape[2] == 0:
-            self.rows = np.zeros((len(self.count), self.config.views, width), np.float32)
+            self.rows = np.zeros((len(self.count), GALLERY_VIEWS, width), np.float32)
         if identities > len(self.count):
             extra = max(
                 identities - len(self.count), len(self.count), 16
@@ -2878,6 +2757,14 @@ def quick_fit(boxes: Array, img_from_world: Array, image_size: tuple[int, int]) 
     )
 
 
+PLACE_VIEWS = 16  # with poses: views kept of every object to tell its place in 3D
+PLACE_EVERY = 5  # frames between them; when they are full every other one goes and this doubles
+PLACE_PARALLAX_DEG = 2.0  # a place counts from this angle between its views on
+# and where the longest axis is at most this many middle ones: half-seen things give needles (95 %
+# of priors.json: 5.8)
+PLACE_SHAPE = 6.0
+
+
 class Places:
     """Where every identity is in 3D, for a tracker that is told the camera's poses.
 
@@ -2887,9 +2774,8 @@ class Places:
 
     ARRAYS = ("frame", "boxes", "img_from_world", "every", "fresh", "dual_q")
 
-    def __init__(self, config: TrackerConfig) -> None:
-        self.config = config
-        views = config.place_views
+    def __init__(self) -> None:
+        views = PLACE_VIEWS
         self.frame = np.zeros((0, views), np.int64)  # (I, V), < 0: free
         self.boxes = np.zeros((0, views, 4))  # (I, V, 4)
         self.img_from_world = np.zeros((0, views, 3, 4))  # (I, V, 3, 4)
@@ -2924,9 +2810,9 @@ class Places:
         boxes[row, at] = self.boxes[due][at, slot]
         cameras = self.img_from_world[due][at, slot][first]  # (F, 3, 4)
         fits = quick_fit(boxes, cameras, image_size)
-        good = (fits.status != "rejected") & (fits.parallax_deg >= self.config.place_parallax_deg)
+        good = (fits.status != "rejected") & (fits.parallax_deg >= PLACE_PARALLAX_DEG)
         axes = np.sort(fits.ellipsoids.half_axes, 1)  # (O, 3)
-        good &= axes[:, 2] <= self.config.place_shape * axes[:, 1]
+        good &= axes[:, 2] <= PLACE_SHAPE * axes[:, 1]
         self.dual_q[due] = np.where(good[:, None, None], fits.ellipsoids.dual_quadrics(), np.nan)
         self.fresh[due] = 0
         return True
@@ -2951,7 +2837,7 @@ class Places:
         extra = identities - len(self.frame)
         if extra > 0:
             extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
-            fills = {"frame": -1000, "dual_q": np.nan, "every": self.config.place_every}
+            fills = {"frame": -1000, "dual_q": np.nan, "every": PLACE_EVERY}
             for name in self.ARRAYS:
                 old = getattr(self, name)
                 new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
@@ -3010,6 +2896,9 @@ class Tracks:
 STATE_VERSION = 2  # of the files of Tracker.save
 
 
+STD_START = 0.2  # spread of a new track's velocity over the box size (DeepSORT: 1/16; SORT: wide)
+
+
 @dataclass(slots=True)
 class _Live:
     """State of the live tracks, one row a track (T rows)."""
@@ -3044,7 +2933,7 @@ class _Live:
             [
                 (2 * config.std_position * scale) ** 2,
                 0 * scale,
-                (config.std_start * scale) ** 2,
+                (STD_START * scale) ** 2,
             ],
             -1,
         )
@@ -3070,6 +2959,30 @@ def _widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
     if a.ndim != 2 or a.shape[1] >= b.shape[1]:
         return a
     return np.concatenate([a, np.zeros((len(a), b.shape[1] - a.shape[1]), a.dtype)], 1)
+
+
+STD_MEASURE = 0.05  # measurement noise over the box size at score .8 (DeepSORT: 1/20)
+SCORE_NOISE = 0.25  # and how it grows with doubt, (1 - score) to this power (StrongSORT: 1)
+GATE_CHI2 = 9.2103  # gate on the centre's squared Mahalanobis distance (chi2 .99, 2 dof)
+GATE_IOU = 0.2  # overlap that passes the gate by itself
+MOTION_ONLY_IOU = 0.1  # overlap needed by all where there is no look to compare
+MOTION_ONLY_SIZE = 2.0  # and most that width or height may differ then, as a factor
+LOW_IOU = 0.3  # overlap needed for low scores and for a change of class
+MAX_COST = 0.9  # most that an accepted match may cost (0: perfect, 1: at the gate)
+DISTANCE_WEIGHT = 0.2  # share of the distance in the cost, the rest is overlap
+AGE_COST = 0.2  # added for tracks not seen for 10 frames, in proportion before
+UNCONFIRMED_COST = 0.2  # added for tracks that are not confirmed yet
+AMBIGUITY_MARGIN = 0.3  # a match is doubtful where a rival costs less than this more
+WEAK_MATCH_COST = 0.5  # and where it costs more than this: perhaps a new object
+# log odds that the look must give a doubtful match of boxes that do not overlap
+NO_OVERLAP_ODDS = 6.0
+IOU_ODDS = 20.0  # log odds that full overlap is worth
+EMBEDDING_MOMENTUM = 0.8  # memory of a track's running mean appearance (StrongSORT: .9 every frame)
+RETURN_ODDS = 1.8  # odds beforehand that a newcomer is a certain known object and not a new one
+JUMP_ODDS = 2.0  # log odds against a return far from where the object's own track still coasts
+PRIOR_PAIRS = 10.0  # pairs that the usual looks of one and of two objects are worth (SameObject)
+PLACE_REFIT = 10  # places are fitted again every so many frames, where views are new
+PLACE_IN_VIEW = 0.5  # a detection is expected from this share of a box in view on
 
 
 class Tracker:
@@ -3100,14 +3013,14 @@ class Tracker:
     def reset(self) -> None:
         """Forget everything: the next video starts with identity 1."""
         self.frame_number = -1
-        self.gallery = Gallery(self.config)
-        self.same = SameObject(self.config.prior_weight)  # of views coast_frames apart
-        self.same_soon = SameObject(self.config.prior_weight)  # of a track and a detection
+        self.gallery = Gallery()
+        self.same = SameObject(PRIOR_PAIRS)  # of views coast_frames apart
+        self.same_soon = SameObject(PRIOR_PAIRS)  # of a track and a detection
         self.last_seen = np.zeros(0, np.int64)  # (I,) frame of each identity's last detection
         self.identity_class = np.zeros(0, np.int64)  # (I,)
         self._next_tracklet = 1
-        self._camera_motion = CameraMotion(self.config)
-        self.places = Places(self.config)
+        self._camera_motion = CameraMotion()
+        self.places = Places()
         self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
         self._last_pose: Array | None = None
         self._latest: _LazyEmbeddings | None = None  # of the latest frame
@@ -3262,7 +3175,7 @@ class Tracker:
         self._image_size = size = (camera.width, camera.height)
         self._view = view = camera.K @ cam_from_world  # (3, 4)
         self._last_pose = cam_from_world
-        now, before = self.places.project(view, size, self.config.place_in_view), self._place_boxes
+        now, before = self.places.project(view, size, PLACE_IN_VIEW), self._place_boxes
         self._place_boxes = now
         known = _rows_of(self.places.known, live.identity, False)
         now, before = (_rows_of(boxes, live.identity, np.nan) for boxes in (now, before))
@@ -3281,8 +3194,8 @@ class Tracker:
         """Keep the boxes of this frame as views of their objects, and fit places now and then."""
         own = tracks[tracks.track_id > 0]
         self.places.add(self.frame_number, own.track_id - 1, own.xyxy, view)
-        if self.frame_number % self.config.place_refit == 0 and self.places.refit(self._image_size):
-            share = self.config.place_in_view
+        if self.frame_number % PLACE_REFIT == 0 and self.places.refit(self._image_size):
+            share = PLACE_IN_VIEW
             self._place_boxes = self.places.project(view, self._image_size, share)
 
     def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
@@ -3293,17 +3206,17 @@ class Tracker:
         config = self.config
         same_class = _same_class(self._live.votes, detections.class_id)  # (T, D), as all below
         cost, feasible, iou = self._motion_cost(detections.xyxy, same_class, lazy.available)
-        evidence = config.iou_odds * (iou - config.class_cost * ~same_class) - config.look_odds
+        evidence = IOU_ODDS * (iou - config.class_cost * ~same_class) - NO_OVERLAP_ODDS
         handicap = self._handicap()[:, None]
         first = feasible & (detections.score >= config.high_score)
-        dear = (cost + handicap > config.doubt_cost) & (self._live.embedded >= 0)[:, None]
+        dear = (cost + handicap > WEAK_MATCH_COST) & (self._live.embedded >= 0)[:, None]
         rivals, close = self._rivals(cost, first, same_class)
         doubt = rivals | dear, close
         track_of, refused = self._matched(cost, handicap, first, doubt, evidence, lazy)
         free = np.ones(len(iou) + 1, bool)
         free[track_of] = False  # -1: the one too many
         low = (track_of < 0) & (detections.score >= config.low_score)
-        second = feasible & ~refused & (iou >= config.low_iou) & low & free[:-1, None]
+        second = feasible & ~refused & (iou >= LOW_IOU) & low & free[:-1, None]
         if second.any():
             doubt = dear, np.zeros_like(dear)
             late, _ = self._matched(1 - iou, 0 * handicap, second, doubt, evidence, lazy)
@@ -3327,7 +3240,7 @@ class Tracker:
         asked = np.full(cost.shape[1], not (lazy.available and self._live.look.shape[1]))
         while True:
             track_of[:] = -1
-            good = possible & ~refused & (cost < self.config.max_cost)
+            good = possible & ~refused & (cost < MAX_COST)
             _assign(cost + handicap, good, track_of)
             rows = self._unsure(track_of, *doubt, asked)
             if not len(rows):
@@ -3343,26 +3256,26 @@ class Tracker:
         live, config, box = self._live, self.config, _cxcywh_from_xyxy(xyxy)
         iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), xyxy)
         var = (
-            live.cov[:, :2, 0] + (config.std_measure * _noise_scale(live.mean)[:, :2]) ** 2
+            live.cov[:, :2, 0] + (STD_MEASURE * _noise_scale(live.mean)[:, :2]) ** 2
         )  # (T, 2) S
         offset = live.mean[:, None, :2, 0] - box[None, :, :2]  # (T, D, 2)
         distance = (offset**2 / var[:, None]).sum(-1)  # (T, D) squared Mahalanobis, 2 dof
-        distance = distance / config.gate_chi2
-        feasible = (distance < 1) | (iou > config.gate_iou)
+        distance = distance / GATE_CHI2
+        feasible = (distance < 1) | (iou > GATE_IOU)
         if not looks:
             growth = np.log(live.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
-            feasible &= (np.abs(growth) < math.log(config.blind_size)).all(-1)
-            feasible &= iou >= config.blind_iou
-        share = config.distance_weight
+            feasible &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(-1)
+            feasible &= iou >= MOTION_ONLY_IOU
+        share = DISTANCE_WEIGHT
         cost = (1 - share) * (1 - iou) + share * distance.clip(0, 1)
         cost = cost + config.class_cost * ~same_class
-        return cost, feasible & (same_class | (iou > config.low_iou)), iou
+        return cost, feasible & (same_class | (iou > LOW_IOU)), iou
 
     def _handicap(self) -> Array:
         """What a match costs extra (T,): tracks just seen and confirmed ones choose first."""
-        live, config = self._live, self.config
+        live = self._live
         waited = ((live.missed - 1) / 10).clip(0, 1)
-        return np.asarray(config.missed_cost * waited + config.tentative_cost * (live.identity < 0))
+        return np.asarray(AGE_COST * waited + UNCONFIRMED_COST * (live.identity < 0))
 
     def _rivals(
         self, cost: Array, gate: BoolArray, same_class: BoolArray
@@ -3374,7 +3287,7 @@ class Tracker:
         best = np.minimum(
             open_cost.min(0, initial=np.inf)[None], open_cost.min(1, initial=np.inf)[:, None]
         )
-        close = gate & same_class & (cost <= best + self.config.rival_cost)
+        close = gate & same_class & (cost <= best + AMBIGUITY_MARGIN)
         return close & ((close.sum(0) > 1)[None] | (close.sum(1) > 1)[:, None]), close
 
     @staticmethod
@@ -3407,8 +3320,8 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t, live = track_of[rows], self._live
         box = _cxcywh_from_xyxy(detections.xyxy[rows])
-        doubt = ((1 - detections.score[rows]).clip(0.05) / 0.2) ** self.config.score_noise  # (n,)
-        noise = self.config.std_measure * _noise_scale(live.mean[t]) * doubt[:, None]
+        doubt = ((1 - detections.score[rows]).clip(0.05) / 0.2) ** SCORE_NOISE  # (n,)
+        noise = STD_MEASURE * _noise_scale(live.mean[t]) * doubt[:, None]
         live.mean[t], live.cov[t] = kalman_update(live.mean[t], live.cov[t], box, noise)
         self._count(detections, rows, t)
 
@@ -3456,7 +3369,7 @@ class Tracker:
         self.gallery.split = lazy.split
         live.look = _widen(live.look, look)
         known = live.embedded[t] >= 0
-        keep = np.where(known, self.config.look_momentum, 0.0)[:, None]
+        keep = np.where(known, EMBEDDING_MOMENTUM, 0.0)[:, None]
         live.look[t] = _unit_rows(keep * live.look[t] + (1 - keep) * look)
         live.embedded[t] = self.frame_number
         self._learn(look, live.identity[t], detections.class_id[rows], self._sight(t))
@@ -3546,14 +3459,14 @@ class Tracker:
         """(n, I): does the identity's own track still coast, and is it predicted far from the
         newcomer (three times the gate)? With poses the places in 3D tell.
         """
-        live, config = self._live, self.config
+        live = self._live
         row = np.full(len(self.last_seen), -1)
         coasting = np.flatnonzero((live.identity >= 0) & (live.missed > 0))
         row[live.identity[coasting]] = coasting
         row = row[identity]  # (I,)
-        var = live.cov[row, :2, 0] + (config.std_measure * _noise_scale(live.mean[row])[:, :2]) ** 2
+        var = live.cov[row, :2, 0] + (STD_MEASURE * _noise_scale(live.mean[row])[:, :2]) ** 2
         offset = live.mean[ready, None, :2, 0] - live.mean[row, :2, 0]  # (n, I, 2)
-        far = (offset**2 / var).sum(-1) > 9 * config.gate_chi2
+        far = (offset**2 / var).sum(-1) > 9 * GATE_CHI2
         return np.asarray(far & (row >= 0) & (self._view is None), bool)
 
     def _returns(self, ready: IntArray) -> IntArray:
@@ -3571,15 +3484,15 @@ class Tracker:
         if not len(identity) or not config.remember:
             return result
         iou = self._home_iou(ready, identity)  # (n, I)
-        home = iou > config.low_iou
+        home = iou > LOW_IOU
         logit = self.same.logit(*self.gallery.parts(live.look[ready], identity, self._sight(ready)))
         logit[home & np.isinf(logit)] = 0  # no look: the place decides
-        logit += np.where(home, config.iou_odds * iou - config.look_odds, 0)
-        logit -= config.jump_odds * self._jumps(ready, identity)
+        logit += np.where(home, IOU_ODDS * iou - NO_OVERLAP_ODDS, 0)
+        logit -= JUMP_ODDS * self._jumps(ready, identity)
         possible = self.last_seen[identity] < live.first[ready][:, None]
         possible &= self.identity_class[identity] == live.votes[ready].argmax(1)[:, None]
         logit[~possible | (iou == 0)] = -np.inf
-        chance = match_probability(logit, config.return_odds)
+        chance = match_probability(logit, RETURN_ODDS)
         claimed = np.full(len(identity), -1, np.int64)
         good = (chance >= config.return_probability) | (home & (logit > 0))
         _assign(1 - chance, good, claimed)
@@ -3692,6 +3605,9 @@ def _checked_camera(camera: Camera, where: str) -> Camera:
     return camera
 
 
+FOCAL_GUESS = 0.8  # first focal length over the longer side (phones .72-.85)
+
+
 def estimate_poses(
     video: Any,
     config: PosesConfig,
@@ -3716,19 +3632,22 @@ def estimate_poses(
     if getattr(video, "is_live", False):
         raise ReobjError("a live camera gives no poses: record a video first, or --poses none")
     size = (int(video.size[0]), int(video.size[1]))
-    camera, work = parse_camera(config.camera, size), _WorkVideo(video, config)
-    keys = _enough_keyframes(work, config, progress("keyframes", video.expected))
+    camera, work = parse_camera(config.camera, size), WorkVideo(video, config.size_px)
+    keys = _enough_keyframes(work, config.max_keyframes, progress("keyframes", video.expected))
     boxes = [
         np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4))
         for k in keys
     ]
     names = [_frame_name(video, key.frame) for key in keys]
-    guesses = [] if camera else [*filter(None, [_exif_focal(video)]), config.focal_guess]
-    messages = _run_sfm(keys, names, boxes, camera, size, guesses, config, work_dir, progress)
+    guesses = [] if camera else [*filter(None, [_exif_focal(video)]), FOCAL_GUESS]
+    images = [key.bgr for key in keys]
+    messages = reconstruct(
+        images, names, boxes, camera, size, guesses, config.seed, work_dir, progress
+    )
     frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
     if not (work_dir / "sparse").exists():
         shutil.rmtree(work_dir / "mapping", ignore_errors=True)
-        guess = (config.focal_guess * max(size), size[0] / 2, size[1] / 2)
+        guess = (FOCAL_GUESS * max(size), size[0] / 2, size[1] / 2)
         camera = camera or Camera("SIMPLE_PINHOLE", *size, guess)
         nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
         return Poses(camera, frame, time_s, nothing, none, "none", messages=tuple(messages))
@@ -3738,27 +3657,32 @@ def estimate_poses(
     return dataclasses.replace(poses, messages=tuple(messages))
 
 
-def _enough_keyframes(work: _WorkVideo, config: PosesConfig, line: Progress) -> list[_WorkImage]:
+MAX_FLOW = 0.12  # new keyframe at this median flow since the last, over the width
+MIN_KEYFRAMES = 40  # with fewer keyframes max_flow is halved, down to min_flow
+MIN_FLOW = 0.015  # share of the width that counts as motion
+
+
+def _enough_keyframes(work: WorkVideo, most: int, line: Progress) -> list[WorkImage]:
     """Pick keyframes, twice as dense as long as they are fewer than `min_keyframes`."""
-    keys = pick_keyframes(work.first_pass(line), config)
-    wanted, finer = min(config.min_keyframes, len(work.frames)), config
-    while len(keys) < wanted and finer.max_flow > 2 * config.min_flow:
-        finer = dataclasses.replace(finer, max_flow=finer.max_flow / 2)
-        keys = pick_keyframes(work, finer)
+    keys, max_flow = pick_keyframes(work.first_pass(line), most), MAX_FLOW
+    wanted = min(MIN_KEYFRAMES, len(work.frames))
+    while len(keys) < wanted and max_flow > 2 * MIN_FLOW:
+        max_flow /= 2
+        keys = pick_keyframes(work, most, max_flow)
     if not keys:
         raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
     return keys
 
 
 def _located(
-    folder: Path, video: Any, work: _WorkVideo, config: PosesConfig, line: Progress
+    folder: Path, video: Any, work: WorkVideo, config: PosesConfig, line: Progress
 ) -> Poses:
     """Poses of all frames that a COLMAP model of keyframes locates."""
-    model = _read_model(folder)
+    model = read_model(folder)
     frame, time_s = np.array(work.frames, np.int64), np.array(work.times, np.float64)
     place_of = {_frame_name(video, number): place for place, number in enumerate(work.frames)}
     places = np.array([place_of[name] for name in model.names])
-    cam_from_world, status = _locate_between(model, places, work, config, line)
+    cam_from_world, status = locate_between(model, places, work, config.seed, line)
     cam_from_world, status = fill_gaps(frame, cam_from_world, status, config.max_gap)
     found = (model.cameras[0], frame, time_s, cam_from_world, status, "pycolmap")
     return Poses(*found, points=model.points, colors=model.colors)
@@ -3772,7 +3696,7 @@ def _exif_focal(video: Any) -> float:
     """Focal length over the longer side from the EXIF of the first photo; 0 if there is none."""
     for path in getattr(video, "_files", [])[:1]:
         with contextlib.suppress(ValueError, RuntimeError):  # formats that pycolmap cannot read
-            camera = _pycolmap().infer_camera_from_image(str(path))
+            camera = import_pycolmap().infer_camera_from_image(str(path))
             if camera.has_prior_focal_length:
                 return float(camera.mean_focal_length() / max(camera.width, camera.height))
     return 0.0
@@ -3808,7 +3732,7 @@ def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class _WorkImage:
+class WorkImage:
     """One frame at working size: place in the video, source frame number, time, BGR, gray."""
 
     place: int
@@ -3818,107 +3742,129 @@ class _WorkImage:
     gray: Image
 
 
-class _WorkVideo:
+CACHE_MB = 1000  # gray images kept in memory; beyond it the video is read twice
+
+
+class WorkVideo:
     """A video at working size; gray images are kept up to `cache_mb`, else it is read again."""
 
-    def __init__(self, video: Any, config: PosesConfig) -> None:
-        self.video, self.config, self.used_mb = video, config, 0.0
+    def __init__(self, video: Any, size_px: int) -> None:
+        self.video, self.size_px, self.used_mb = video, size_px, 0.0
         self.frames: list[int] = []
         self.times: list[float] = []
         self.cache: list[Image] = []
 
-    def __iter__(self) -> Iterator[_WorkImage]:
+    def __iter__(self) -> Iterator[WorkImage]:
         for place, frame in enumerate(self.video):
-            bgr = shrunk(frame.image, self.config.size_px)
+            bgr = shrunk(frame.image, self.size_px)
             gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-            yield _WorkImage(place, frame.index, frame.time_s, bgr, gray)
+            yield WorkImage(place, frame.index, frame.time_s, bgr, gray)
 
-    def first_pass(self, line: Progress) -> Iterator[_WorkImage]:
+    def first_pass(self, line: Progress) -> Iterator[WorkImage]:
         for work in self:
             self.frames.append(work.frame)
             self.times.append(work.time_s)
             self.used_mb += work.gray.nbytes / 1e6
-            self.cache = [] if self.used_mb > self.config.cache_mb else self.cache
+            self.cache = [] if self.used_mb > CACHE_MB else self.cache
             self.cache.append(work.gray)
             line.step()
             yield work
         line.close()
 
     def grays(self) -> Iterator[Image]:
-        kept = self.used_mb <= self.config.cache_mb
+        kept = self.used_mb <= CACHE_MB
         return iter(self.cache) if kept else (work.gray for work in self)
 
 
-def _klt(old: Image, new: Image, xy: Array, config: PosesConfig) -> tuple[Array, BoolArray]:
+KLT_WINDOW_PX = 15  # Lucas-Kanade window on the working image
+KLT_ERROR_PX = 1.0  # forward-backward error of a followed point
+
+
+def follow_points(old: Image, new: Image, xy: Array) -> tuple[Array, BoolArray]:
     """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back."""
     if not len(xy):
         return xy, np.zeros(0, bool)
-    start, window = xy.astype(np.float32).reshape(-1, 1, 2), (config.klt_window_px,) * 2
+    start, window = xy.astype(np.float32).reshape(-1, 1, 2), (KLT_WINDOW_PX,) * 2
     flow: Any = cv2.calcOpticalFlowPyrLK
     ahead, found, _ = flow(old, new, start, None, winSize=window)
     back, found_back, _ = flow(new, old, ahead, None, winSize=window)
     error = np.linalg.norm(back - start, axis=2)[:, 0]  # (N,)
-    kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < config.klt_error_px)
+    kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < KLT_ERROR_PX)
     return ahead[:, 0].astype(np.float64), kept
+
+
+CORNERS = 300  # corners followed to choose keyframes
+MIN_CORNERS = 20  # with fewer corners a frame counts as textureless
 
 
 class _FlowSinceKeyframe:
     """Corners of a keyframe followed from frame to frame."""
 
-    def __init__(self, key: _WorkImage, config: PosesConfig) -> None:
-        self.place, self.config, self.gray = key.place, config, key.gray
+    def __init__(self, key: WorkImage) -> None:
+        self.place, self.gray = key.place, key.gray
         self.start = self.at = self.corners(key.gray)
         self.count = len(self.start)
 
     def corners(self, gray: Image) -> Array:
-        found = cv2.goodFeaturesToTrack(gray, self.config.corners, 0.01, max(gray.shape) / 80)
+        found = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(gray.shape) / 80)
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
     def step(self, gray: Image) -> tuple[float, float]:
         """Follow into the next frame: median flow since the keyframe over the width, share left."""
-        if self.count < self.config.min_corners:  # textureless: a keyframe as soon as there is more
-            return 0.0, float(len(self.corners(gray)) < self.config.min_corners)
-        ahead, kept = _klt(self.gray, gray, self.at, self.config)
+        if self.count < MIN_CORNERS:  # textureless: a keyframe as soon as there is more
+            return 0.0, float(len(self.corners(gray)) < MIN_CORNERS)
+        ahead, kept = follow_points(self.gray, gray, self.at)
         self.start, self.at, self.gray = self.start[kept], ahead[kept], gray
         flow = np.linalg.norm(self.at - self.start, axis=1)
         return float(np.median(flow)) / gray.shape[1] if kept.any() else 0.0, len(flow) / self.count
 
 
-def pick_keyframes(works: Iterable[_WorkImage], config: PosesConfig) -> list[_WorkImage]:
+MIN_RATIO = 0.55  # new keyframe when fewer of the corners than this survive
+MAX_INTERVAL = 60  # new keyframe after this many frames if the camera moved at all
+SHARP_WINDOW = 0.7  # from this share of max_flow on the sharpest frame is taken
+
+
+def pick_keyframes(
+    works: Iterable[WorkImage], max_keyframes: int, max_flow: float = MAX_FLOW
+) -> list[WorkImage]:
     """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
     When there are more than `max_keyframes`, every second one is dropped and the spacing doubles:
     one pass, bounded memory, the same choice every time.
     """
-    keys: list[_WorkImage] = []
-    again: deque[_WorkImage] = deque()  # frames behind a chosen one, to be looked at again
-    window: list[_WorkImage] = []
+    keys: list[WorkImage] = []
+    again: deque[WorkImage] = deque()  # frames behind a chosen one, to be looked at again
+    window: list[WorkImage] = []
     stream, work, track, wider, flow = iter(works), None, None, 1, 0.0
     while (following := again.popleft() if again else next(stream, None)) is not None:
         work = following
         if track is None:
-            keys, track = [work], _FlowSinceKeyframe(work, config)
+            keys, track = [work], _FlowSinceKeyframe(work)
             continue
         flow, left = track.step(work.gray)
-        if flow >= config.sharp_window * wider * config.max_flow:
+        if flow >= SHARP_WINDOW * wider * max_flow:
             window.append(work)
-        late = work.place - track.place >= wider * config.max_interval and flow > config.min_flow
-        if late or flow > wider * config.max_flow or left < config.min_ratio**wider:
+        late = work.place - track.place >= wider * MAX_INTERVAL and flow > MIN_FLOW
+        if late or flow > wider * max_flow or left < MIN_RATIO**wider:
             best = max(window or [work], key=lambda w: cv2.Laplacian(w.gray, cv2.CV_32F).var())
             again.extendleft(w for w in reversed(window) if w.place > best.place)
             keys.append(best)
-            if len(keys) > config.max_keyframes:
+            if len(keys) > max_keyframes:
                 keys, wider = keys[::2], 2 * wider
-            window, track = [], _FlowSinceKeyframe(best, config)
-    moved = flow > config.min_flow or len(keys) == 1
+            window, track = [], _FlowSinceKeyframe(best)
+    moved = flow > MIN_FLOW or len(keys) == 1
     return [*keys, work] if work is not None and work.place > keys[-1].place and moved else keys
 
 
 # Frames between the keyframes: points followed from both sides, PnP
 
 
-def _locate_between(
-    model: _SparseModel, places: IntArray, video: _WorkVideo, config: PosesConfig, line: Progress
+MAX_RUN = 1000  # frames held at once between two keyframes
+MAX_STEP_RATIO = 5.0  # refuse PnP poses this many median steps from neighbours
+
+
+def locate_between(
+    model: SparseModel, places: IntArray, video: WorkVideo, seed: int, line: Progress
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Locate every frame by PnP from points followed from the keyframes before and after it.
 
@@ -3930,19 +3876,19 @@ def _locate_between(
     count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
     cam_from_world[places], status[places] = model.cam_from_world, "keyframe"
-    for before, after, run in _segments(places, video.grays(), config.max_run):
+    for before, after, run in _segments(places, video.grays(), MAX_RUN):
         images = [gray for _, gray in run]
-        ahead = _follow(model, before, images, config)
-        back = _follow(model, after, images[::-1], config)[::-1]
+        ahead = _follow(model, before, images)
+        back = _follow(model, after, images[::-1])[::-1]
         for (place, gray), (rows_a, xy_a), (rows_b, xy_b) in zip(run, ahead, back, strict=True):
             if status[place] == "none":
                 points, xy = model.points[np.r_[rows_a, rows_b]], np.r_[xy_a, xy_b]
-                found = _absolute_pose(xy, points, camera, gray.shape[1], config)
+                found = absolute_pose(xy, points, camera, gray.shape[1], seed)
                 if found is not None:
                     cam_from_world[place], status[place] = found, "pnp"
         line.step(len(run) - 1)
     line.close()
-    jump = _jumps(cam_from_world, config.max_step_ratio) & (status == "pnp")
+    jump = _jumps(cam_from_world, MAX_STEP_RATIO) & (status == "pnp")
     cam_from_world[jump], status[jump] = np.nan, "none"
     return cam_from_world, status
 
@@ -3967,8 +3913,11 @@ def _segments(
         yield before, -1, list(run)
 
 
+PNP_POINTS = 200  # 3D points tracked from each keyframe into the frames between
+
+
 def _follow(
-    model: _SparseModel, row: int, images: list[Image], config: PosesConfig
+    model: SparseModel, row: int, images: list[Image]
 ) -> list[tuple[IntArray, Array]]:
     """Follow the longest-seen 3D points of a keyframe (row; -1: none) through the images.
 
@@ -3977,12 +3926,12 @@ def _follow(
     """
     seen = np.flatnonzero(model.obs_image == row)
     longest = np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")
-    seen = seen[longest[: config.pnp_points]]
+    seen = seen[longest[: PNP_POINTS]]
     scale = np.array(images[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
     rows, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5  # OpenCV: centres at 0
     followed = [(rows, model.obs_xy[seen])]
     for old, new in itertools.pairwise(images):
-        ahead, kept = _klt(old, new, xy, config)
+        ahead, kept = follow_points(old, new, xy)
         rows, xy = rows[kept], ahead[kept]
         followed.append((rows, (xy + 0.5) / scale))
     return followed
@@ -4028,43 +3977,39 @@ _ADVICE = (
     "move the camera sideways around the objects (turning on the spot gives no depth), keep things "
     "with texture in view, avoid blurred frames, or give --poses; identities in 2D need none"
 )
-_CHILD_CODE = """
-import importlib.util, sys
-name, path, home, folder = sys.argv[1:]
-sys.path.append(home)
-spec = importlib.util.spec_from_file_location(name, path)
-sys.modules[name] = module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
-module._sfm_child(folder)
-"""
 
-
-def _run_sfm(
-    keys: list[_WorkImage],
+def reconstruct(
+    images: Sequence[Image],
     names: list[str],
     boxes: list[Array],
     camera: Camera | None,
     size: tuple[int, int],
     guesses: list[float],
-    config: PosesConfig,
+    seed: int,
     work_dir: Path,
     progress: Callable[[str, int], Progress],
 ) -> list[str]:
-    """Reconstruct the keyframes into `work_dir/sparse`; without a model the messages say why."""
+    """Reconstruct keyframes into `work_dir/sparse`; without a model the messages say why.
+
+    Args:
+        images: (h, w, 3) BGR at working size; names: of their frames; size: (w, h) native pixels.
+        boxes: (N, 4) xyxy of moving things in each, native pixels: no features there.
+        camera: None: self-calibrated, from each of the guesses (focal length / longer side).
+    """
     folder = work_dir / "mapping"
-    if len(keys) < 3:
-        return [f"no camera poses: only {len(keys)} different views; {_ADVICE}"]
+    if len(images) < 3:
+        return [f"no camera poses: only {len(images)} different views; {_ADVICE}"]
     digest = hashlib.sha256()
-    for key in keys:
-        digest.update(key.bgr.tobytes())
-    scale = np.tile(np.array(keys[0].gray.shape[::-1]) / size, 2)
+    for image in images:
+        digest.update(image.tobytes())
+    scale = np.tile(np.array(images[0].shape[1::-1]) / size, 2)
     job = {
         "names": names,
         "boxes": [(xyxy * scale).tolist() for xyxy in boxes],
         "camera": None if camera is None else [camera.model, list(camera.params)],
         "size": size,
         "guesses": guesses,
-        "config": dataclasses.asdict(config),
+        "seed": seed,
         "images": digest.hexdigest(),
     }
     text, path = json.dumps(job), folder / "job.json"
@@ -4072,7 +4017,7 @@ def _run_sfm(
         for old in (work_dir / "sparse", folder):
             shutil.rmtree(old, ignore_errors=True)
         folder.mkdir(parents=True)
-        np.save(folder / "keyframes.npy", np.stack([key.bgr for key in keys]))
+        np.save(folder / "keyframes.npy", np.stack(images))
         with atomic(path) as part:
             part.write_text(text)
     (folder / "messages.json").unlink(missing_ok=True)
@@ -4084,12 +4029,16 @@ def _run_sfm(
 
 def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Progress]) -> list[str]:
     """Run `_sfm_child` in a fresh interpreter: COLMAP's aborts and chatter stay there."""
-    here = Path(__file__).resolve()
-    command = [sys.executable, "-c", _CHILD_CODE, here.stem, *map(str, (here, here.parent, folder))]
+    command = [sys.executable, "-m", "reobj.poses.mapping", str(folder)]
+    package = Path(__file__).resolve().parents[2]
+    paths = [str(package), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     lines: list[Progress] = []
     with (
         open(log_path, "wb") as errors,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors) as child,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=errors, env=environment
+        ) as child,
     ):
         try:
             for text in child.stdout or ():
@@ -4114,21 +4063,20 @@ def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Prog
 
 def _sfm_child(folder_name: str) -> None:
     """Child process: reconstruct the keyframes of a job folder into messages.json and sparse/."""
-    pc = _pycolmap()
+    pc = import_pycolmap()
     pc.logging.minloglevel = 0  # stderr is the log file here
     folder = Path(folder_name)
     job = json.loads((folder / "job.json").read_text())
-    config, database = PosesConfig(**job["config"]), folder / "database.db"
+    database, seed = folder / "database.db", int(job["seed"])
     images = np.load(folder / "keyframes.npy", mmap_mode="r")  # (K, h, w, 3) BGR
     if not (folder / "features").exists():
         database.unlink(missing_ok=True)
-        _sfm_features(database, images, job, config)
+        _sfm_features(database, images, job)
         (folder / "features").touch()
-    _sfm_match(database, config)
+    _sfm_match(database, seed)
     found = []
     for guess in job["guesses"] or [0.0]:  # 0: the intrinsics are given
-        tried = dataclasses.replace(config, focal_guess=guess)
-        found.append(_sfm_ladder(database, len(images), not guess, tried))
+        found.append(_sfm_ladder(database, len(images), guess, seed))
         if found[-1][2]:
             break
     model, messages, _ = max(found, key=lambda f: (f[2], f[0] is not None))
@@ -4147,7 +4095,7 @@ def _tell(stage: str, done: int, total: int) -> None:
 # All calls of pycolmap
 
 
-def _pycolmap() -> Any:
+def import_pycolmap() -> Any:
     """Import pycolmap without its log on stderr and without its handler of SIGTERM."""
     if "pycolmap" in sys.modules:
         return sys.modules["pycolmap"]
@@ -4160,17 +4108,17 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-def _pycolmap_camera(camera: Camera, size: tuple[int, int]) -> Any:
+def pycolmap_camera(camera: Camera, size: tuple[int, int]) -> Any:
     """Make pycolmap's camera, for images of another size."""
     facts = {"model": camera.model, "width": camera.width, "height": camera.height}
-    made = _pycolmap().Camera(camera_id=1, params=list(camera.params), **facts)
+    made = import_pycolmap().Camera(camera_id=1, params=list(camera.params), **facts)
     if (camera.width, camera.height) != size:
         made.rescale(*size)
     return made
 
 
 @dataclass(frozen=True, slots=True)
-class _SparseModel:
+class SparseModel:
     """A COLMAP model as arrays; images by ascending id."""
 
     names: tuple[str, ...]
@@ -4184,8 +4132,8 @@ class _SparseModel:
     obs_xy: Array  # (M, 2) COLMAP pixels
 
 
-def _read_model(folder: Path) -> _SparseModel:
-    model = _pycolmap().Reconstruction(str(folder))
+def read_model(folder: Path) -> SparseModel:
+    model = import_pycolmap().Reconstruction(str(folder))
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     points = sorted(model.points3D.items())
     row = {point_id: r for r, (point_id, _) in enumerate(points)}
@@ -4200,7 +4148,7 @@ def _read_model(folder: Path) -> _SparseModel:
         for i, c in model.cameras.items()
     }
     poses = [image.cam_from_world().matrix() for image in images]
-    return _SparseModel(
+    return SparseModel(
         names=tuple(image.name for image in images),
         cameras=[cameras[image.camera_id] for image in images],
         cam_from_world=np.array(poses).reshape(-1, 3, 4),
@@ -4213,20 +4161,25 @@ def _read_model(folder: Path) -> _SparseModel:
     )
 
 
-def _absolute_pose(
-    xy: Array, points: Array, camera: Camera, work_width: int, config: PosesConfig
+PNP_MIN_INLIERS = 15  # accept a PnP pose with at least this many inliers
+PNP_MIN_RATIO = 0.5  # and at least this share of inliers
+PNP_ERROR_PX = 4.0  # PnP inlier threshold on the working image
+
+
+def absolute_pose(
+    xy: Array, points: Array, camera: Camera, work_width: int, seed: int
 ) -> Array | None:
     """PnP from native pixels (n, 2) of world points (n, 3): cam_from_world (3, 4); None if it is
     not to be trusted.
     """
-    if len(xy) < config.pnp_min_inliers:
+    if len(xy) < PNP_MIN_INLIERS:
         return None
-    error_px = config.pnp_error_px * camera.width / work_width
-    ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": config.seed}
-    made = _pycolmap_camera(camera, (camera.width, camera.height))
+    error_px = PNP_ERROR_PX * camera.width / work_width
+    ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
+    made = pycolmap_camera(camera, (camera.width, camera.height))
     options = {"estimation_options": {"ransac": ransac}}
-    found = _pycolmap().estimate_and_refine_absolute_pose(xy, points, made, **options)
-    least = max(config.pnp_min_inliers, config.pnp_min_ratio * len(xy))
+    found = import_pycolmap().estimate_and_refine_absolute_pose(xy, points, made, **options)
+    least = max(PNP_MIN_INLIERS, PNP_MIN_RATIO * len(xy))
     if found is None or found["num_inliers"] < least:
         return None
     pose: Array = found["cam_from_world"].matrix()
@@ -4234,15 +4187,15 @@ def _absolute_pose(
     return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
-def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: PosesConfig) -> None:
+def _sfm_features(database: Path, images: Any, job: dict[str, Any]) -> None:
     """Write one camera, the keyframes (ids from 1) and their RootSIFT features into a database."""
-    pc, size = _pycolmap(), (images.shape[2], images.shape[1])
+    pc, size = import_pycolmap(), (images.shape[2], images.shape[1])
     if job["camera"] is not None:
         model, params = job["camera"]
         width, height = job["size"]
-        camera = _pycolmap_camera(Camera(model, width, height, tuple(params)), size)
+        camera = pycolmap_camera(Camera(model, width, height, tuple(params)), size)
     else:
-        focal = config.focal_guess * max(size)
+        focal = FOCAL_GUESS * max(size)
         camera = pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, *size)
     camera.has_prior_focal_length = job["camera"] is not None
     cv2.setNumThreads(1)
@@ -4252,7 +4205,7 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
         rig.add_ref_sensor(camera.sensor_id)
         db.write_rig(rig, use_rig_id=True)
         boxes = map(np.array, job["boxes"])
-        features = pool.map(_sift, images, boxes, itertools.repeat(config))
+        features = pool.map(_sift, images, boxes)
         for number, (xy, descriptors) in enumerate(features, 1):
             image = pc.Image(name=f"{number:06d}", camera_id=1, image_id=number)
             db.write_image(image, use_image_id=True)
@@ -4265,16 +4218,22 @@ def _sfm_features(database: Path, images: Any, job: dict[str, Any], config: Pose
             _tell("features", number, len(images))
 
 
-def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np.float32], Image]:
+SIFT_FEATURES = 2000  # SIFT features a keyframe (4096: slower, no better)
+SIFT_CONTRAST = 0.02  # SIFT contrast threshold
+SIFT_CONTRAST_LOW = 0.007  # the same where fewer than sift_few features are found
+SIFT_FEW = 500  # see sift_contrast_low
+
+
+def _sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]:
     """Detect RootSIFT features outside the boxes: COLMAP pixels (N, 2), uint8 (N, 128)."""
     gray = cv2.cvtColor(np.ascontiguousarray(bgr), cv2.COLOR_BGR2GRAY)
     mask = np.full(gray.shape, 255, np.uint8)
     for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
         mask[math.floor(y1) : math.ceil(y2), math.floor(x1) : math.ceil(x2)] = 0
-    for contrast in (config.sift_contrast, config.sift_contrast_low):
-        sift: Any = cv2.SIFT.create(nfeatures=config.sift_features, contrastThreshold=contrast)
+    for contrast in (SIFT_CONTRAST, SIFT_CONTRAST_LOW):
+        sift: Any = cv2.SIFT.create(nfeatures=SIFT_FEATURES, contrastThreshold=contrast)
         keypoints, found = sift.detectAndCompute(gray, mask)
-        if len(keypoints) >= config.sift_few:
+        if len(keypoints) >= SIFT_FEW:
             break
     if found is None or not len(keypoints):
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
@@ -4283,43 +4242,53 @@ def _sift(bgr: Image, boxes: Array, config: PosesConfig) -> tuple[npt.NDArray[np
     return xy, np.minimum(root, 255).astype(np.uint8)
 
 
-def _sfm_match(database: Path, config: PosesConfig) -> None:
+OVERLAP = 12  # sequential matching: neighbours at offsets 1, 2, 4 ... 2^(overlap-1)
+EXHAUSTIVE_BELOW = 30  # match all pairs when there are no more keyframes than this
+MATCH_CHUNK = 100  # pairs of keyframes matched between two ticks of the progress
+
+
+def _sfm_match(database: Path, seed: int) -> None:
     """Match all pairs of a few keyframes, else those at offsets 1, 2, 4, 8 ... and look-alikes.
 
     (COLMAP skips the pairs that a killed run has matched.)
     """
-    pc, listed = _pycolmap(), database.parent / "pairs.txt"
+    pc, listed = import_pycolmap(), database.parent / "pairs.txt"
     with contextlib.closing(pc.Database.open(str(database))) as db:
         count = db.num_images()
         descriptors = [np.asarray(db.read_descriptors(i + 1).data) for i in range(count)]
     pairs = set(itertools.combinations(range(count), 2))
-    if count > config.exhaustive_below:
-        steps = [1 << k for k in range(config.overlap)]
+    if count > EXHAUSTIVE_BELOW:
+        steps = [1 << k for k in range(OVERLAP)]
         pairs = {(i, i + step) for step in steps for i in range(count - step)}
-        pairs |= set(_look_alikes(descriptors, config))
+        pairs |= set(_look_alikes(descriptors, seed))
     ordered = sorted(pairs)
-    for start in range(0, len(ordered), config.match_chunk):
-        chunk = ordered[start : start + config.match_chunk]
+    for start in range(0, len(ordered), MATCH_CHUNK):
+        chunk = ordered[start : start + MATCH_CHUNK]
         listed.write_text("".join(f"{i + 1:06d} {j + 1:06d}\n" for i, j in chunk))
         pc.match_image_pairs(
             str(database),
             pairing_options={"match_list_path": str(listed)},
-            verification_options={"ransac": {"random_seed": config.seed}},  # else two runs differ
+            verification_options={"ransac": {"random_seed": seed}},  # else two runs differ
             device=pc.Device.cpu,
         )
         _tell("match", start + len(chunk), len(ordered))
 
 
-def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[int, int]]:
+LOOP_PAIRS = 6  # look-alike keyframes matched with each keyframe, to close loops
+LOOP_WORDS = 64  # visual words that describe the look of a keyframe
+LOOP_SAMPLE = 20000  # descriptors clustered into words
+
+
+def _look_alikes(descriptors: list[Image], seed: int) -> list[tuple[int, int]]:
     """Find pairs of keyframes that look most alike. Ref: VLAD, Jegou et al., CVPR 2010."""
     features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
-    sample = features[:: max(1, len(features) // config.loop_sample)]
-    if len(sample) < config.loop_words:
+    sample = features[:: max(1, len(features) // LOOP_SAMPLE)]
+    if len(sample) < LOOP_WORDS:
         return []
-    cv2.setRNGSeed(config.seed)
+    cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
     start = cv2.KMEANS_PP_CENTERS
-    words = cv2.kmeans(sample, config.loop_words, np.empty(0), stop, 1, start)[2]  # (W, 128)
+    words = cv2.kmeans(sample, LOOP_WORDS, np.empty(0), stop, 1, start)[2]  # (W, 128)
     looks = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sums of residuals
     for look, found in zip(looks, descriptors, strict=True):
         nearest = (found @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
@@ -4328,7 +4297,7 @@ def _look_alikes(descriptors: list[Image], config: PosesConfig) -> list[tuple[in
     flat = looks.reshape(len(looks), -1)
     alike, at = flat @ flat.T, np.arange(len(flat))  # (K, K)
     alike[np.abs(at[:, None] - at) <= 2] = -np.inf  # matched already
-    best = np.argsort(-alike, axis=1, kind="stable")[:, : config.loop_pairs]
+    best = np.argsort(-alike, axis=1, kind="stable")[:, : LOOP_PAIRS]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
 
@@ -4337,6 +4306,11 @@ _RELAXED = {
                "abs_pose_min_inlier_ratio": 0.15, "filter_min_tri_angle": 0.5},
     "triangulation": {"min_angle": 0.5, "ignore_two_view_tracks": False},
 }  # fmt: skip
+
+
+STRONG_TRI_ANGLE_DEG = 5.0  # trust a self-calibrated focal length from this angle
+STRONG_SPREAD = 0.1  # and from this spread of the cameras over the depth on
+FOCAL_RANGE = (0.4, 2.0)  # and if focal / longer side lies in here
 
 
 @dataclass(frozen=True, slots=True)
@@ -4354,15 +4328,19 @@ class _Attempt:
     focal: float = 0.0  # over the longer side
     problem: str = "no two keyframes show the same points from clearly different places"
 
-    def trusted(self, config: PosesConfig) -> bool:
+    def trusted(self) -> bool:
         """True if the geometry is strong enough to calibrate the focal length."""
-        low, high = config.focal_range
-        wide = self.tri_angle_deg >= config.strong_tri_angle_deg
-        return wide and self.spread >= config.strong_spread and low <= self.focal <= high
+        low, high = FOCAL_RANGE
+        wide = self.tri_angle_deg >= STRONG_TRI_ANGLE_DEG
+        return wide and self.spread >= STRONG_SPREAD and low <= self.focal <= high
+
+
+GOOD_REGISTERED = 0.9  # take the first sound model with this share of keyframes
+MIN_PARALLAX_PX = 3.0  # refuse what turns explain to this (walks: > 4)
 
 
 def _sfm_ladder(
-    database: Path, count: int, known_focal: bool, config: PosesConfig
+    database: Path, count: int, guess: float, seed: int
 ) -> tuple[Any, list[str], bool]:
     """Try mappers from strict to permissive.
 
@@ -4371,47 +4349,55 @@ def _sfm_ladder(
         trusted.
     """
     tried: list[_Attempt] = []
+    known_focal = not guess
     if not known_focal:
-        _sfm_guess_focal(database, False, config)
+        _sfm_guess_focal(database, guess, False)
     for rung in ("strict", "relaxed", "global"):
         sound = [a for a in tried if not a.problem]
-        turned = [a for a in tried if a.problem and a.parallax_px < config.min_parallax_px]
-        good = any(a.registered >= config.good_registered for a in sound + turned)
+        turned = [a for a in tried if a.problem and a.parallax_px < MIN_PARALLAX_PX]
+        good = any(a.registered >= GOOD_REGISTERED for a in sound + turned)
         if good or (sound and rung == "global"):
             break
-        tried.append(_sfm_attempt(database, rung, known_focal, count, config))
+        tried.append(_sfm_attempt(database, rung, known_focal, count, seed))
     best = max(tried, key=lambda a: (not a.problem, a.registered))
     messages = []
-    if not best.problem and not known_focal and not best.trusted(config):
+    if not best.problem and not known_focal and not best.trusted():
         angle = f"{best.tri_angle_deg:.1f} deg"
         weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
-        _sfm_guess_focal(database, True, config)
-        best = _sfm_attempt(database, "relaxed", True, count, config)
+        _sfm_guess_focal(database, guess, True)
+        best = _sfm_attempt(database, "relaxed", True, count, seed)
         messages = [
-            f"{weak} and is taken as {config.focal_guess:.3g} x the longer side; sizes and depths "
+            f"{weak} and is taken as {guess:.3g} x the longer side; sizes and depths "
             "are rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
         ]
     if best.problem:
         return None, [f"no camera poses: {best.problem}; {_ADVICE}"], known_focal
-    _sfm_refine(best.model, bool(known_focal or messages), config)
+    _sfm_refine(best.model, bool(known_focal or messages))
     return best.model, messages, known_focal or not messages
 
 
-def _sfm_guess_focal(database: Path, trusted: bool, config: PosesConfig) -> None:
-    """Set the camera's focal length to the guess."""
-    with contextlib.closing(_pycolmap().Database.open(str(database))) as db:
+def _sfm_guess_focal(database: Path, guess: float, trusted: bool) -> None:
+    """Set the camera's focal length to a guess, a share of the longer side."""
+    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
         camera = db.read_all_cameras()[0]
-        focal = config.focal_guess * max(camera.width, camera.height)
+        focal = guess * max(camera.width, camera.height)
         camera.params = [focal, *camera.params[1:3], 0.0]
         camera.has_prior_focal_length = trusted
         db.update_camera(camera)
 
 
+MIN_REGISTERED = 0.5  # refuse a model with fewer of the keyframes than this
+MIN_POINTS = 100  # refuse a model with fewer 3D points
+MIN_TRI_ANGLE_DEG = 1.5  # refuse a model of a smaller median triangulation angle
+MIN_POINTS_PER_IMAGE = 30  # refuse a model with fewer 3D points in the median image
+TRI_SAMPLE = 2000  # points used for the median triangulation angle
+
+
 def _sfm_attempt(
-    database: Path, rung: str, fixed: bool, count: int, config: PosesConfig
+    database: Path, rung: str, fixed: bool, count: int, seed: int
 ) -> _Attempt:
     """Run a mapper on `count` keyframes, measure its largest model and name its first problem."""
-    models = _sfm_map(database, rung, fixed, count, config)
+    models = _sfm_map(database, rung, fixed, count, seed)
     if not models:
         return _Attempt()
     model = max(models, key=lambda m: (m.num_reg_images(), m.num_points3D()))  # others: stubs
@@ -4421,30 +4407,30 @@ def _sfm_attempt(
     focal = camera.mean_focal_length() / max(camera.width, camera.height)
     seen = [model.image(i).num_points3D for i in centre]
     parallax = _sfm_parallax_px(model)
-    angle, depth = _sfm_angle_and_depth(model, centre, config.tri_sample)
+    angle, depth = _sfm_angle_and_depth(model, centre, TRI_SAMPLE)
     spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
     tests = (
-        (registered < config.min_registered, f"only {len(centre)} of {count} keyframes connect"),
-        (model.num_points3D() < config.min_points,
+        (registered < MIN_REGISTERED, f"only {len(centre)} of {count} keyframes connect"),
+        (model.num_points3D() < MIN_POINTS,
          f"only {model.num_points3D()} points could be triangulated"),
-        (np.median(seen) < config.min_points_per_image, "the images share too few points"),
-        (parallax < config.min_parallax_px,
+        (np.median(seen) < MIN_POINTS_PER_IMAGE, "the images share too few points"),
+        (parallax < MIN_PARALLAX_PX,
          "a mere turn of the camera explains all images, so there is no depth"),
-        (angle < config.min_tri_angle_deg,
+        (angle < MIN_TRI_ANGLE_DEG,
          f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
-        (camera.has_bogus_params(*config.focal_range, 1.0),
+        (camera.has_bogus_params(*FOCAL_RANGE, 1.0),
          f"the focal length came out as {focal:.2f} x the width"),
     )  # fmt: skip
     problem = next((text for bad, text in tests if bad), "")
     return _Attempt(model, registered, angle, parallax, spread, focal, problem)
 
 
-def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesConfig) -> list[Any]:
+def _sfm_map(database: Path, rung: str, fixed: bool, count: int, seed: int) -> list[Any]:
     """Run a mapper: "strict" or "relaxed" incremental, "global"; `fixed` keeps the intrinsics."""
-    pc, out = _pycolmap(), database.parent / rung
+    pc, out = import_pycolmap(), database.parent / rung
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
-    options: dict[str, Any] = {"num_threads": 1, "random_seed": config.seed}  # one: reproducible
+    options: dict[str, Any] = {"num_threads": 1, "random_seed": seed}  # one: reproducible
     if rung == "global":
         if fixed:
             kept = {"refine_focal_length": False, "refine_extra_params": False}
@@ -4462,28 +4448,32 @@ def _sfm_map(database: Path, rung: str, fixed: bool, count: int, config: PosesCo
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
 
 
-def _sfm_refine(model: Any, fixed: bool, config: PosesConfig) -> None:
+REFINE_PX = 0.5  # soft L1 loss of the last adjustment, px of the working image
+MAX_CENTER_SHIFT = 0.05  # most that the principal point may move, over the size
+
+
+def _sfm_refine(model: Any, fixed: bool) -> None:
     """Adjust cameras and points once more; unless the intrinsics are `fixed`, with a second
     distortion term and the principal point (if that stays near the centre).
     """
     if fixed:
-        _sfm_adjust(model, config.refine_px, False, False)
+        _sfm_adjust(model, REFINE_PX, False, False)
         return
     camera = model.camera(1)
     size = np.array([camera.width, camera.height])
     focal, _, _, distortion = camera.params
-    camera.model = _pycolmap().CameraModelId.RADIAL
+    camera.model = import_pycolmap().CameraModelId.RADIAL
     for move_center in (True, False):
         camera.params = [focal, *size / 2, distortion, 0]
-        _sfm_adjust(model, config.refine_px, True, move_center)
+        _sfm_adjust(model, REFINE_PX, True, move_center)
         shift = np.abs(np.array([camera.principal_point_x, camera.principal_point_y]) - size / 2)
-        if (shift <= config.max_center_shift * size).all():
+        if (shift <= MAX_CENTER_SHIFT * size).all():
             break
 
 
 def _sfm_adjust(model: Any, loss_px: float, calibrate: bool, move_center: bool) -> None:
     """Bundle adjustment of all images with a robust loss, first and second camera as gauge."""
-    pc = _pycolmap()
+    pc = import_pycolmap()
     options, chosen = pc.BundleAdjustmentOptions(), pc.BundleAdjustmentConfig()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = calibrate
@@ -4575,27 +4565,28 @@ class _GivenPoses:
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
 
 
-def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
-    """Read poses made elsewhere, in the format `config.fmt` (auto: recognised).
+def read_poses(path: str | Path, video: Any, fmt: str = "auto", camera: str = "") -> Poses:
+    """Read poses made elsewhere.
 
     Args:
-        path: file or folder; video: the frames they belong to; config: its `camera` overrides the
-            file's intrinsics.
+        path: file or folder. video: the frames they belong to.
+        fmt: auto (recognised), colmap, tum, transforms, scannet or record3d.
+        camera: intrinsics fx,fy,cx,cy[,k1,k2,p1,p2] in place of the file's.
     Returns:
         poses of the frames that the file knows, NaN for the others (counted in `messages`).
     """
     path, size = Path(path), (int(video.size[0]), int(video.size[1]))
     if not path.exists():
         raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
-    reader = _POSE_READERS.get(_pose_format(path) if config.fmt == "auto" else config.fmt)
+    reader = _POSE_READERS.get(_pose_format(path) if fmt == "auto" else fmt)
     if reader is None:
         known = ", ".join(_POSE_READERS)
-        raise ReobjError(f"--pose-format {config.fmt}: unknown; known are auto, {known}")
+        raise ReobjError(f"--pose-format {fmt}: unknown; known are auto, {known}")
     given = reader(path, size)
-    camera = parse_camera(config.camera, size) or given.camera
-    if camera is None:
+    own = parse_camera(camera, size) or given.camera
+    if own is None:
         raise ReobjError(f"{path}: no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2], pixels")
-    camera = _checked_camera(_resized_camera(camera, size, path), str(path))
+    own = _checked_camera(_resized_camera(own, size, path), str(path))
     numbers = [(frame.index, frame.time_s) for frame in video]
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
     names = [video.names[n] for n in frame if video.names]
@@ -4608,7 +4599,7 @@ def read_poses(path: str | Path, video: Any, config: PosesConfig) -> Poses:
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
     status = np.where(known, "supplied", "none")
     extra = (given.metric, given.up_in_world, given.points, given.colors, tuple(messages))
-    return Poses(camera, frame, time_s, poses, status, "user", *extra)
+    return Poses(own, frame, time_s, poses, status, "user", *extra)
 
 
 def _pose_format(path: Path) -> str:
@@ -4657,12 +4648,15 @@ def _json_object(path: Path) -> dict[str, Any]:
     return content
 
 
+POSE_TOLERANCE = 0.005  # how far supplied rotations may be off (7-Scenes: 1e-3)
+
+
 def _rigid(matrix: Array, where: Sequence[str]) -> Array:
     """Check rigid transforms (N, 3 or 4, 4): (N, 3, 4) with exact rotations, NaN where lost."""
     lost = ~np.asarray(np.isfinite(matrix).all((1, 2)), bool)
     matrix = np.where(lost[:, None, None], np.eye(4)[: matrix.shape[1]], matrix)
     rotation = matrix[:, :3, :3]
-    tolerance = PosesConfig().pose_tolerance
+    tolerance = POSE_TOLERANCE
     if matrix.shape[1] == 4:
         last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
         what = "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)"
@@ -4689,7 +4683,7 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
     _refuse(~finite, where, "a number is not finite")
     norm = np.linalg.norm(xyzw, axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
-    _refuse(np.abs(norm - 1) > PosesConfig().pose_tolerance, where, what)
+    _refuse(np.abs(norm - 1) > POSE_TOLERANCE, where, what)
     return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
 
 
@@ -4787,6 +4781,9 @@ def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | 
     return Camera("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, params)
 
 
+MAX_FOCAL_SPREAD = 0.02  # how far supplied focal lengths may differ, a share
+
+
 def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
     """The one camera of all images: the median of slightly different ones (autofocus)."""
     found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
@@ -4794,7 +4791,7 @@ def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
         return None
     kinds = {(c.model, c.width, c.height) for c in found}
     spread = found[-1].params[0] / found[0].params[0] - 1
-    if len(kinds) > 1 or spread > PosesConfig().max_focal_spread:
+    if len(kinds) > 1 or spread > MAX_FOCAL_SPREAD:
         raise ReobjError(f"{path}: several different cameras; expected one (single_camera)")
     return found[len(found) // 2]
 
@@ -4811,11 +4808,11 @@ def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
     folder = found[0]
     try:
         if (folder / "images.bin").exists():
-            model = _read_model(folder)
+            model = read_model(folder)
         else:
             with tempfile.TemporaryDirectory() as copy:
                 _copy_text_model(folder, Path(copy))
-                model = _read_model(Path(copy))
+                model = read_model(Path(copy))
     except (ValueError, RuntimeError, IndexError) as error:
         reason = str(error).splitlines()[0]
         raise ReobjError(f"{folder}: not a COLMAP model ({reason}); write it again") from None
@@ -4874,7 +4871,7 @@ def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera
             f"{path}: the poses are of {own[0]}x{own[1]} images, the frames are "
             f"{size[0]}x{size[1]}; expected the same shape (rotated or cropped video?)"
         )
-    return Camera(camera.model, *size, tuple(_pycolmap_camera(camera, size).params.tolist()))
+    return Camera(camera.model, *size, tuple(pycolmap_camera(camera, size).params.tolist()))
 
 
 def _rows_of_frames(
@@ -4915,13 +4912,16 @@ def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -
     return np.array([row_of.get(n, -1) for n in frame.tolist()], np.int64)
 
 
+LONE_FRAME_S = 1 / 60  # half a frame interval when there is only one frame
+
+
 def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
     """Match the nearest stamp within half a frame; of another clock: if each frame has one."""
     if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
         message = "time stamps are of another clock than the frames: matched in order"
         return np.arange(len(frame)), [message]
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
-    half = 0.5 * float(np.median(steps)) if len(steps) else PosesConfig().lone_frame_s
+    half = 0.5 * float(np.median(steps)) if len(steps) else LONE_FRAME_S
     nearest = np.abs(stamps_s[None] - time_s[:, None]).argmin(1)  # (F,)
     return np.where(np.abs(stamps_s[nearest] - time_s) <= half * (1 + 1e-6), nearest, -1), []
 
@@ -4929,8 +4929,14 @@ def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntA
 # Check of direction and axes
 
 
+CHECK_TRACKS = 3  # direction check: tracks needed
+CHECK_MOST_TRACKS = 200  # direction check: tracks used at most
+CHECK_ANGLE_DEG = 1.0  # direction check: good when the tracks meet within this
+CHECK_RATIO = 0.3  # direction check: another reading must be better by this factor
+
+
 def check_poses(
-    poses: Poses, tracks: Sequence[tuple[IntArray, Array]], config: PosesConfig | None = None
+    poses: Poses, tracks: Sequence[tuple[IntArray, Array]]
 ) -> str | None:
     """Find out whether poses are given in the wrong direction or with the wrong axes.
 
@@ -4944,7 +4950,6 @@ def check_poses(
         a message that names the likely mistake if another reading explains the tracks clearly
         better, else None.
     """
-    config = config or PosesConfig()
     usual = poses.cam_from_world
     readings = {
         "as they are": usual,
@@ -4953,9 +4958,9 @@ def check_poses(
             _CV_FROM_GL @ usual,
         "inverted and with OpenGL axes": _CV_FROM_GL @ invert_rigid(usual),
     }  # fmt: skip
-    views = [view for track in tracks if (view := _track_views(poses, *track, config)) is not None]
-    views = sorted(views, key=lambda v: -len(v[0]))[: config.check_most_tracks]
-    if len(views) < config.check_tracks:
+    views = [view for track in tracks if (view := _track_views(poses, *track)) is not None]
+    views = sorted(views, key=lambda v: -len(v[0]))[: CHECK_MOST_TRACKS]
+    if len(views) < CHECK_TRACKS:
         return None
     angle = {
         text: float(np.median([_ray_error_deg(reading[at], rays) for at, rays in views]))
@@ -4963,7 +4968,7 @@ def check_poses(
     }
     asis = angle.pop("as they are")
     best = min(angle.values())
-    if asis < config.check_angle_deg or best > config.check_ratio * asis:
+    if asis < CHECK_ANGLE_DEG or best > CHECK_RATIO * asis:
         return None
     likely = " or ".join(text for text, value in angle.items() if value <= 1.5 * best)
     return (
@@ -4972,15 +4977,19 @@ def check_poses(
     )
 
 
+CHECK_VIEWS = 5  # direction check: frames of a track needed
+CHECK_MOST_VIEWS = 40  # direction check: frames of a track used at most
+
+
 def _track_views(
-    poses: Poses, frame: IntArray, xy: Array, config: PosesConfig
+    poses: Poses, frame: IntArray, xy: Array
 ) -> tuple[IntArray, Array] | None:
     """Rows of a track's frames with a pose, thinned, and unit rays (n, 3); None if too few."""
     place, known = _place_of(poses, frame)
     use = np.flatnonzero(known & np.isfinite(xy).all(1))
-    if len(use) < config.check_views:
+    if len(use) < CHECK_VIEWS:
         return None
-    thin = np.linspace(0, len(use) - 1, min(len(use), config.check_most_views))
+    thin = np.linspace(0, len(use) - 1, min(len(use), CHECK_MOST_VIEWS))
     use = use[np.unique(thin.round().astype(int))]
     ideal = poses.camera.undistort(xy[use])
     rays = np.column_stack([ideal, np.ones(len(use))]) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
@@ -4993,7 +5002,7 @@ def _place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
     return place, np.asarray((poses.frame[place] == frame) & poses.known[place], bool)
 
 
-def _meet(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, Array, Array]:
+def triangulate_rays(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, Array, Array]:
     """World directions (n, 3) of unit rays, camera centres (n, 3), point (3,) nearest to all."""
     world_from_cam = invert_rigid(cam_from_world)
     ray = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam)
@@ -5005,7 +5014,7 @@ def _meet(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, Array, Arra
 
 def _ray_error_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
     """Median angle of rays (n, 3) of n cameras to their nearest point or, if better, infinity."""
-    ray, centre, point = _meet(cam_from_world, rays_in_cam)
+    ray, centre, point = triangulate_rays(cam_from_world, rays_in_cam)
     toward = np.stack([point - centre, np.broadcast_to(ray.mean(0), ray.shape)])  # (2, n, 3)
     cosine = (ray * toward).sum(2) / np.maximum(np.linalg.norm(toward, axis=2), 1e-12)
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)), axis=1).min()))
@@ -5183,6 +5192,20 @@ class LinkEvent:
     kept: bool
 
 
+LINK_PROBABILITY = 0.5  # join by looks from this on, rivals and others considered
+VIEW_GAP = 30  # views of a tracklet this many frames apart show how looks vary
+LINK_PRIOR_PAIRS = 10.0  # pairs that the usual looks of one and two are worth
+DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes on one object (IoU)
+MIN_LINK_LOG_ODDS = -4.0  # never join by place what looks less alike (log odds)
+LINK_CLASS = 0.1  # join by place only where the classes agree in this share
+# one place from this overlap cross-projected on (IoU): may be joined, is not split
+LINK_PLACE = 0.25
+KEEP_IOU = 0.4  # a join is kept if the joint solid overlaps the boxes so (IoU)
+KEEP_SHARE = 0.6  # in this share of the frames of either part (OA-SLAM: half)
+CUT_GAP = 5  # tracklets may be split where this many frames pass without a detection
+SPLIT_DROP = 0.7  # a return is doubted if its joint solid overlaps less, a share
+
+
 class Linker:
     """Decide over the whole video which tracklets are one object.
 
@@ -5207,12 +5230,15 @@ class Linker:
         track: TrackResult,
         poses: Poses | None,
         fit: Callable[[Views, list[int]], Any] | None,
-        config: ObjectsConfig,
+        moving: Collection[str],
+        min_score: float,
+        min_views: int,
     ) -> None:
         table = track.table
-        self.table, self.poses, self.fit, self.config = table, poses, fit, config
+        self.table, self.poses, self.fit = table, poses, fit
+        self.moving_classes, self.min_score, self.min_views = moving, min_score, min_views
         self.located = np.empty(0) if poses is None else poses.frame[poses.known]  # (V,)
-        self.atom = _segments_of(table, config.cut_gap)  # (N,)
+        self.atom = _segments_of(table, CUT_GAP)  # (N,)
         self._describe(track.class_names)
         if poses is not None:
             self._cut()
@@ -5240,7 +5266,7 @@ class Linker:
         self.identity = self.table.object_id[first]
         self.classes = _class_shares(self.table, self.atom, len(first)).argmax(1)
         names = np.array([*class_names, ""])[self.classes.clip(max=len(class_names))]
-        self.moving = np.isin(names, self.config.moving.split(","))  # as the tracker has them
+        self.moving = np.isin(names, list(self.moving_classes))  # as the tracker has them
 
     def _seen_together(self) -> tuple[BoolArray, BoolArray]:
         """(L, L): atoms seen in the same frame; those of them that are never so close that they
@@ -5251,7 +5277,7 @@ class Linker:
         for rows in _rows_by(self.table.frame):
             here, box = self.atom[rows], self.table.xyxy[rows]
             together[here[:, None], here[None]] = True
-            double[here[:, None], here[None]] |= box_iou(box, box) > self.config.double_iou
+            double[here[:, None], here[None]] |= box_iou(box, box) > DUPLICATE_IOU
         return together, together & ~double
 
     def _most_alike(self, track: TrackResult) -> Array:
@@ -5269,7 +5295,7 @@ class Linker:
         for atom, mine in zip(atoms, np.split(np.arange(len(rows)), starts[1:]), strict=True):
             cosine = unit[mine] @ unit.T  # (k, n)
             frame = self.table.frame[rows[mine]]
-            soon = np.abs(frame[:, None] - frame) < self.config.look_gap
+            soon = np.abs(frame[:, None] - frame) < VIEW_GAP
             cosine[:, mine] = np.where(soon, -np.inf, cosine[:, mine])
             view = np.lexsort((-cosine.max(0), block))[starts]  # (atoms,) the best of each
             own = mine[cosine[:, view].argmax(0)]
@@ -5293,7 +5319,7 @@ class Linker:
         What that means in this video is known without labels: atoms of a class seen side by side
         are different, views of one atom some time apart the same.
         """
-        same = SameObject(self.config.look_prior_weight)
+        same = SameObject(LINK_PRIOR_PAIRS)
         pairs = np.triu(self.apart & (self.classes[:, None] == self.classes), 1)
         for rows, one in ((pairs, False), (np.eye(len(pairs), dtype=bool), True)):
             same.add(foreground[rows], background[rows], one)
@@ -5308,7 +5334,7 @@ class Linker:
         near = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), whole)  # (T, T)
         banned, apart = (_grouped_max(x, whole) for x in (self.together, self.apart))
         banned |= kind[:, None] != kind
-        found = _most_alike_first(near, banned, apart, self.config.look_probability)
+        found = _most_alike_first(near, banned, apart, LINK_PROBABILITY)
         before, self.group = self.group, found[whole]
         self._list_changes(before, self.group, "join")
         self._list_changes(self.group, before, "split")
@@ -5340,8 +5366,8 @@ class Linker:
         """Atoms to cut, and the frame from which on: the best of 8 cuts, if the solid of a half
         explains its boxes much better than that of the whole does, as in `_split`.
         """
-        least, drop, frame = 2 * self.config.min_views, self.config.split_drop, self.table.frame
-        usable = np.isin(frame, self.located) & (self.table.score >= self.config.min_score)
+        least, drop, frame = 2 * self.min_views, SPLIT_DROP, self.table.frame
+        usable = np.isin(frame, self.located) & (self.table.score >= self.min_score)
         rows = [np.flatnonzero(usable & (self.atom == atom)) for atom in atoms]
         tries: list[tuple[int, int, Array]] = []
         for i, joint in enumerate(self._own_iou(rows)):
@@ -5367,7 +5393,7 @@ class Linker:
         assert self.poses is not None
         size = [len(rows) for rows in groups]
         rows, label = np.concatenate(groups), np.repeat(np.arange(len(groups)), size)
-        views = gather_views(self.table[rows], self.poses, label, len(size), self.config.min_score)
+        views = gather_views(self.table[rows], self.poses, label, len(size), self.min_score)
         ellipsoids = quick_fit(views.boxes, views.img_from_world, views.image_size).ellipsoids
         solids = quadrics.solid_boxes(ellipsoids, "ellipsoid", views.img_from_world)
         solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
@@ -5385,7 +5411,7 @@ class Linker:
         """
         assert self.poses is not None and self.fit is not None
         rows = labels[self.atom]  # (N,)
-        views = gather_views(self.table, self.poses, rows, count, self.config.min_score)
+        views = gather_views(self.table, self.poses, rows, count, self.min_score)
         classes = _class_shares(self.table, rows, count).argmax(1)
         fits = self.fit(views, classes.tolist())
         solids = quadrics.solid_boxes(fits.ellipsoids, list(fits.support), views.img_from_world)
@@ -5413,7 +5439,7 @@ class Linker:
             np.array([self._median_iou(iou[:, g], self.atom == a) for a, g in enumerate(column)])
             for iou, column in ((own, np.arange(count)), (joint, self.group))
         )  # (L,) each
-        worse = together < self.config.split_drop * alone
+        worse = together < SPLIT_DROP * alone
         length = np.bincount(self.atom, minlength=count)
         for g in np.flatnonzero(np.bincount(self.group) > 1):
             members = np.flatnonzero(self.group == g)
@@ -5422,7 +5448,7 @@ class Linker:
             for atom in np.setdiff1d(members[~self.moving[members]], anchors):
                 iou = float(max(place[anchors, atom].max(), place[atom, anchors].max()))
                 look = float(np.nan_to_num(self.near[anchors, atom], nan=-np.inf).max(initial=-9))
-                if iou < self.config.link_place:
+                if iou < LINK_PLACE:
                     self.group[atom] = self.group.max() + 1
                     ids = (int(self.tracklets[anchors[0]]), int(self.tracklets[atom]))
                     self.events.append(LinkEvent("split", ids, iou, look, True))
@@ -5455,12 +5481,12 @@ class Linker:
         """Disjoint pairs of groups worth a joint fit: (a, b, cross IoU, look), best first."""
         apart = _grouped_max(self.together, self.group)  # (G, G) cannot be one
         share = _class_shares(self.table, self.group[self.atom], count)  # (G, C)
-        confused = np.minimum(share[:, None], share).sum(-1) >= self.config.link_class  # (G, G)
+        confused = np.minimum(share[:, None], share).sum(-1) >= LINK_CLASS  # (G, G)
         look = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), self.group)  # (G, G)
         look = np.where(np.isfinite(look), look, 0.0)  # nothing known speaks for nothing
         score = np.maximum(place, place.T)
-        good = ~apart & confused & (score >= self.config.link_place)
-        good &= look >= self.config.link_look
+        good = ~apart & confused & (score >= LINK_PLACE)
+        good &= look >= MIN_LINK_LOG_ODDS
         still = ~np.isin(np.arange(count), self.group[self.moving])
         good &= still[:, None] & still
         a, b = np.nonzero(np.triu(good, 1))
@@ -5483,7 +5509,7 @@ class Linker:
     def _explains(self, own_iou: Array, rows: BoolArray) -> bool:
         """Does a solid overlap the boxes of these rows in most of their frames? own_iou: (V,)."""
         iou = own_iou[self._views_of(rows)]
-        return bool(len(iou) and np.mean(iou >= self.config.keep_iou) >= self.config.keep_share)
+        return bool(len(iou) and np.mean(iou >= KEEP_IOU) >= KEEP_SHARE)
 
     def _median_iou(self, own_iou: Array, rows: BoolArray) -> float:
         """Median overlap of a solid with the boxes of these rows; 0 if none has a pose."""
@@ -5492,7 +5518,7 @@ class Linker:
 
     def _views_of(self, rows: BoolArray) -> BoolArray:
         """(V,) frames with a pose in which one of the rows is seen."""
-        seen = self.table.frame[rows & (self.table.score >= self.config.min_score)]
+        seen = self.table.frame[rows & (self.table.score >= self.min_score)]
         return np.isin(self.located, seen)
 
 
@@ -5582,11 +5608,14 @@ def write_mot(path: Path, table: TrackTable) -> None:
         np.savetxt(part, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
 
 
+PLY_DETAIL = 2  # subdivisions of the sphere: 512 triangles an object
+
+
 def write_ply(
-    path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int], detail: int
+    path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int]
 ) -> None:
     """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world."""
-    sphere, faces = _icosphere(detail)  # (P, 3), (T, 3)
+    sphere, faces = _icosphere(PLY_DETAIL)  # (P, 3), (T, 3)
     half = ellipsoids.half_axes[:, None] * sphere  # (O, P, 3)
     points = half @ np.swapaxes(ellipsoids.world_from_obj, 1, 2)
     points += ellipsoids.center_in_world[:, None]
@@ -5744,11 +5773,13 @@ class VideoWriter:
         return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
 
 
+OVERLAY_SIZE_PX = 1280  # longer side of the overlay
+
+
 def write_overlay(
     result: RunResult,
     solids: quadrics.Ellipsoids | None,
     video: Video,
-    config: OutputConfig,
     pictures: Pictures | None = None,
 ) -> None:
     """Write overlay.mp4: boxes, identities and back-projected ellipsoids of every frame.
@@ -5759,7 +5790,7 @@ def write_overlay(
         pictures: takes its own from every frame, so that the video is read once for both.
     """
     width, height = video.size
-    shrink = min(1.0, config.overlay_size_px / max(width, height))
+    shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
     size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
     scale = size[0] / width
     projected = _project_all(result.poses, solids, scale)
@@ -5807,6 +5838,13 @@ def _project_all(
 # ---- Scene page: one self-contained HTML file --------------------------------------------------
 
 
+SCENE_CROPS = 8  # pictures of each object in scene.html
+SCENE_MAX_CROPS = 480  # and of all objects together
+SCENE_CROP_PX = 112  # longer side of these pictures
+SCENE_FRAMES = 60  # video frames in scene.html, shown beside the time slider
+SCENE_FRAME_PX = 320  # longer side of these frames
+
+
 class Pictures:
     """Small JPEGs for the scene page, cut while the video is read: objects and whole frames.
 
@@ -5815,20 +5853,20 @@ class Pictures:
         frames: [frame number, base64] of whole frames with their boxes.
     """
 
-    def __init__(self, result: RunResult, video: Video, config: OutputConfig) -> None:
-        self.table, self.config, self.scale = result.table, config, video.scale
+    def __init__(self, result: RunResult, video: Video) -> None:
+        self.table, self.scale = result.table, video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o["id"]: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
-        count = config.scene_max_crops // max(len(result.objects), 1)
-        count = min(max(count, 1), config.scene_crops)
+        count = SCENE_MAX_CROPS // max(len(result.objects), 1)
+        count = min(max(count, 1), SCENE_CROPS)
         ranked = sorted(result.objects, key=lambda o: -o["frames_seen"])
         chosen = {
             o["id"]: diverse_rows(result.table, o, result.poses, count)
-            for o in ranked[: config.scene_max_crops]
+            for o in ranked[: SCENE_MAX_CROPS]
         }
         self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
         shown = scene_frames(result)
-        self.whole = set(shown[:: math.ceil(len(shown) / config.scene_frames) or 1].tolist())
+        self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
 
     def take(self, frame: Frame) -> None:
         """Cut what is wanted from this frame."""
@@ -5839,14 +5877,14 @@ class Pictures:
             x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
             x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
             if x1 < x2 and y1 < y2:
-                crop = _jpeg(frame.image[y1:y2, x1:x2], self.config.scene_crop_px)
+                crop = _jpeg(frame.image[y1:y2, x1:x2], SCENE_CROP_PX)
                 self.crops[int(obj)].append((frame.index, crop))
         if frame.index in self.whole:
-            image = shrunk(frame.image, self.config.scene_frame_px)
+            image = shrunk(frame.image, SCENE_FRAME_PX)
             low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
             scale = self.scale * image.shape[1] / width
             draw_tracks(image, self.table[slice(low, high)], {}, scale)
-            self.frames.append((frame.index, _jpeg(image, self.config.scene_frame_px)))
+            self.frames.append((frame.index, _jpeg(image, SCENE_FRAME_PX)))
 
 
 def _jpeg(image: Image, size_px: int) -> str:
@@ -5887,15 +5925,18 @@ def scene_frames(result: RunResult) -> IntArray:
     return np.unique(result.table.frame) if result.poses is None else result.poses.frame
 
 
-def write_scene(result: RunResult, pictures: Pictures, video: Video, config: Config) -> None:
+SCENE_STEPS = 1500  # steps of the time slider (longer videos: every n-th camera)
+
+
+def write_scene(result: RunResult, pictures: Pictures, video: Video) -> None:
     """Write scene.html: ellipsoids, cameras, points and pictures in one page that needs no network.
 
     The page is `scene_template.html`; its data are objects.json's entries without covariance, and
     base64 of little-endian float32 / uint8 arrays.
     """
-    limits, frames = config.output, scene_frames(result)
-    steps = frames[:: math.ceil(len(frames) / limits.scene_steps) or 1]  # (S,)
-    seconds = config.input.every / (video.fps or 30.0) * len(frames) / max(1, len(steps))
+    frames = scene_frames(result)
+    steps = frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]  # (S,)
+    seconds = video.config.every / (video.fps or 30.0) * len(frames) / max(1, len(steps))
     data = {
         "title": Path(str(video.source)).name,
         "facts": _scene_facts(result.world),
@@ -5909,7 +5950,7 @@ def write_scene(result: RunResult, pictures: Pictures, video: Video, config: Con
         "thumbs": pictures.frames,
         "why_flat": _why_flat(result),
         "steps": {"frame": steps.tolist(), "seconds": seconds},
-        **_scene_cameras(result.poses, result.world.get("up_in_world"), steps, limits),
+        **_scene_cameras(result.poses, result.world.get("up_in_world"), steps),
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = Path(__file__).with_name("scene_template.html").read_text().split("@DATA@")
@@ -5921,13 +5962,16 @@ def _base64(values: npt.NDArray[Any], kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
 
 
+SCENE_POINTS = 20000  # sparse points in scene.html (more: every n-th)
+
+
 def _scene_cameras(
-    poses: Poses | None, up_in_world: Sequence[float] | None, steps: IntArray, limits: OutputConfig
+    poses: Poses | None, up_in_world: Sequence[float] | None, steps: IntArray
 ) -> dict[str, Any]:
     """Cameras of the steps, sparse points and the upward direction, for the page."""
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
-    thin = slice(None, None, math.ceil(len(poses.points) / limits.scene_points) or 1)
+    thin = slice(None, None, math.ceil(len(poses.points) / SCENE_POINTS) or 1)
     K = poses.camera.K
     up = up_in_world
     if up is None:
@@ -6415,7 +6459,7 @@ def _supplied_poses(video: Video, config: Config) -> Poses | None:
     """Poses given by the user, or None if they are to be reconstructed."""
     if config.poses.mode in ("auto", "none"):
         return None
-    return read_poses(config.poses.mode, video, config.poses)
+    return read_poses(config.poses.mode, video, config.poses.fmt, config.poses.camera)
 
 
 def _check_supplied(poses: Poses, table: TrackTable) -> None:
@@ -6479,7 +6523,11 @@ def make_objects(
     if located and poses is not None:
         fit = _fitter(config.objects, poses, track.class_names)
     if len(table) and config.objects.link and not track.fixed:
-        linker = Linker(track, poses if located else None, fit, config.objects)
+        own = config.objects
+        linker = Linker(
+            track, poses if located else None, fit, own.moving.split(","), own.min_score,
+            own.min_views,
+        )  # fmt: skip
         table, events = table.with_objects(linker.run()), linker.events
     elif len(table) and not track.fixed:
         table = table.with_objects(table.object_id)
@@ -6691,15 +6739,15 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
     solids = None if result.fits is None else result.fits.ellipsoids[kept]
     if solids is not None:
         ids = [o["id"] for o in result.objects if o["status"] != "rejected"]
-        write_ply(out / "objects.ply", solids, ids, config.output.ply_detail)
-    pictures = Pictures(result, video, config.output) if config.output.scene else None
+        write_ply(out / "objects.ply", solids, ids)
+    pictures = Pictures(result, video) if config.output.scene else None
     if config.output.overlay and not video.is_live:
-        write_overlay(result, solids, video, config.output, pictures)
+        write_overlay(result, solids, video, pictures)
     elif pictures is not None and not video.is_live:
         for frame in video:
             pictures.take(frame)
     if pictures is not None:
-        write_scene(result, pictures, video, config)
+        write_scene(result, pictures, video)
     result.seconds["write"] = time.monotonic() - started
 
 
@@ -7078,7 +7126,7 @@ def true_from_found(out: Path, truth_poses: Path | None) -> tuple[float, Array, 
     use = poses.known & np.isfinite(centers).all(1)
     pose, goal = poses.cam_from_world[use], centers[use]
     ours = -np.einsum("fji,fj->fi", pose[:, :, :3], pose[:, :, 3])  # (f, 3)
-    true_from_ours = _pycolmap().estimate_sim3d(ours, goal)
+    true_from_ours = import_pycolmap().estimate_sim3d(ours, goal)
     turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
     return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
 
