@@ -165,29 +165,6 @@ class EmbedConfig:
         "crops[:BACKBONE] (re-OBJ as published: two crops an object)",
         "--embed",
     )
-    size_px: int = _opt(480, "longer side of the backbone's input")
-    context: float = _opt(0.5, "background: the box grown by this share of its size on every side")
-    reach: float = _opt(0.0, "and at least by this share of the image's longer side")
-    samples: int = _opt(4, "samples a side of every cell")
-    object_score: float = _opt(
-        0.3, "detections from this score on are no background for the others"
-    )
-    foreground_cells: int = _opt(2, "cells a side that the foreground is divided into")
-    background_cells: int = _opt(
-        4, "cells a side that the grown box is divided into for the background"
-    )
-    wide: float = _opt(
-        0.0, "surroundings with other objects in them: the box grown by this share (0: none)"
-    )
-    wide_reach: float = _opt(0.2, "and at least by this share of the image's longer side")
-    wide_cells: int = _opt(4, "cells a side of the surroundings")
-    foreground_channels: int = _opt(
-        0, "the foreground reads only so many channels of the map, the first ones (0: all)"
-    )
-    neighbours: float = _opt(
-        0.2, "trained: share of the objects around in the background part (0: none)"
-    )
-    crop_px: int = _opt(224, "side of the crops of --embed crops")
     head: str = _opt(
         "", "trained head (.onnx) of a backbone; empty: the one that comes along; none: no training"
     )
@@ -1002,8 +979,8 @@ def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray
     for line, cells in rows:
         if str(len(cells)) != expected:
             raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {expected}")
-    cells = [[cell.strip() for cell in row] for _, row in rows]
-    return tuple(columns[:width]), cells, np.array([line for line, _ in rows], np.int64), is_mot
+    stripped = [[cell.strip() for cell in row] for _, row in rows]
+    return tuple(columns[:width]), stripped, np.array([line for line, _ in rows], np.int64), is_mot
 
 
 def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
@@ -1958,6 +1935,47 @@ class Embeddings:
     background: Array
 
 
+@dataclass(frozen=True, slots=True)
+class SamplingLayout:
+    """Where a feature map is sampled for foreground and background; trained models bring their own.
+
+    Attributes:
+        size_px: longer side of the backbone's input. samples: a side of every cell.
+        context, min_margin: the box grows by this share of its size on every side, and by at least
+            this share of the image's longer side.
+        object_score: detections from this score on are no background for the others.
+        foreground_cells, background_cells: a side, of the box and of the grown box.
+        surround_scale, surround_min_margin, surround_cells: the same for a wider box that shows
+            other objects too (scale 0: none).
+        foreground_channels: the foreground reads only the first so many channels (0: all).
+        neighbours: share of the objects around in the background part of trained models.
+        crop_px: side of the crops of re-OBJ (`CropEmbedder`).
+    """
+
+    size_px: int = 480
+    samples: int = 4
+    context: float = 0.5
+    min_margin: float = 0.0
+    object_score: float = 0.3
+    foreground_cells: int = 2
+    background_cells: int = 4
+    surround_scale: float = 0.0
+    surround_min_margin: float = 0.2
+    surround_cells: int = 4
+    foreground_channels: int = 0
+    neighbours: float = 0.2
+    crop_px: int = 224
+
+    def updated(self, metadata: dict[str, Any]) -> SamplingLayout:
+        """Take what a model's metadata say in `layout`, also by the names of earlier versions."""
+        given = metadata.get("layout", {})
+        return dataclasses.replace(self, **{_EARLIER_NAMES.get(k, k): v for k, v in given.items()})
+
+
+_EARLIER_NAMES = {"reach": "min_margin", "wide": "surround_scale",
+                  "wide_reach": "surround_min_margin", "wide_cells": "surround_cells"}  # fmt: skip
+
+
 class Embedder:
     """Foreground and background embeddings from one feature map a frame, pooled under masks.
 
@@ -1972,20 +1990,23 @@ class Embedder:
         model: "reobj" for the weights that come along, or a backbone: a name listed by
             `reobj_track.py models` or a path to an ONNX file with an image input and a spatial
             output (of `train_embedding.py`: its head and its layout are found through the file).
+        head: trained head (.onnx) of a backbone; "": the one that comes along; "none": no training.
+        layout: where the map of an untrained backbone is sampled.
 
     Attributes:
-        layout: where the map is sampled; that of the model if it was trained, else the config's.
+        layout: where the map is sampled; that of the model if it was trained.
     """
 
     def __init__(
         self,
         model: str = "reobj",
-        config: EmbedConfig | None = None,
+        head: str = "",
+        layout: SamplingLayout | None = None,
         threads: int = 0,
         offline: bool = False,
     ) -> None:
         self.model = model
-        self._net = _Backbone(model, config or EmbedConfig(), threads, offline)
+        self._net = _Backbone(model, head, layout or SamplingLayout(), threads, offline)
         self.layout = self._net.layout
         self._last: _Seen | None = None
 
@@ -2025,7 +2046,7 @@ class Embedder:
     @property
     def frozen(self) -> bool:
         """Is it a backbone that was trained for something else?"""
-        return not self._net.own
+        return not self._net.channels_last
 
     def _parts(self, seen: _Seen, new: IntArray, rows: IntArray) -> tuple[Array, Array]:
         """Foreground (M, E1) of the new rows and background (N, E2) of the chosen ones."""
@@ -2035,7 +2056,7 @@ class Embedder:
         if self.trained:
             return self._net.embed(fore, back)
         near = self.layout.background_cells**2
-        around = (back[:, :near], back[:, near:])[: 1 + (self.layout.wide > 0)]
+        around = (back[:, :near], back[:, near:])[: 1 + (self.layout.surround_scale > 0)]
         return _unit_histogram(fore), np.concatenate([_unit_histogram(b) for b in around], 1)
 
 
@@ -2045,7 +2066,7 @@ class _Seen:
     """
 
     def __init__(
-        self, frame: Image, detections: Detections, features: Floats, layout: EmbedConfig
+        self, frame: Image, detections: Detections, features: Floats, layout: SamplingLayout
     ) -> None:
         self.frame, self.detections, self.features = frame, detections, features
         self.sure = detections.score >= layout.object_score
@@ -2101,7 +2122,7 @@ def part_samples(
     rows: Sequence[IntArray],
     size_hw: tuple[int, ...],
     objects: BoolArray,
-    layout: EmbedConfig,
+    layout: SamplingLayout,
 ) -> PartSamples:
     """Sample boxes (foreground), and for the background grown boxes (no other object) and, if the
     layout has them, wider boxes (everything but the object).
@@ -2129,16 +2150,16 @@ def part_samples(
 
 
 @functools.lru_cache(64)
-def _grids(layout: EmbedConfig, fore: int, back: int) -> tuple[IntArray, Array, BoolArray, Any]:
+def _grids(layout: SamplingLayout, fore: int, back: int) -> tuple[IntArray, Array, BoolArray, Any]:
     """The L samples of so many foregrounds and backgrounds: the number of the one each is of (L,);
     x and y in the box, -1 to 1, and by what share of itself and at least of the image that is grown
     (4, L); do other objects not count (L,)? Last `PartSamples.shape`.
     """
     own = (0.0, 0.0, 0, layout.foreground_cells)
-    near = (layout.context, layout.reach, 1, layout.background_cells)
-    wide = (layout.wide, layout.wide_reach, 0, layout.wide_cells)
+    near = (layout.context, layout.min_margin, 1, layout.background_cells)
+    wide = (layout.surround_scale, layout.surround_min_margin, 0, layout.surround_cells)
     grids = []
-    for *kind, cells in (own, near, wide)[: 2 + (layout.wide > 0)]:
+    for *kind, cells in (own, near, wide)[: 2 + (layout.surround_scale > 0)]:
         side = cells * layout.samples
         line = ((np.arange(side) + 0.5) / side * 2 - 1).reshape(cells, -1)
         x, y = line[:, None], line[:, None, :, None]
@@ -2152,7 +2173,7 @@ def _grids(layout: EmbedConfig, fore: int, back: int) -> tuple[IntArray, Array, 
 
 
 def part_cells(
-    features: Floats, samples: PartSamples, layout: EmbedConfig
+    features: Floats, samples: PartSamples, layout: SamplingLayout
 ) -> tuple[Floats, Floats]:
     """What foregrounds and backgrounds see in each cell, (M, cells, C + 2) and (N, cells, C + 2):
     mean of the samples that count on a map (h, w, C), 0 where none does; `PartSamples.share`.
@@ -2186,19 +2207,18 @@ class CropEmbedder(Embedder):
     def __init__(
         self,
         model: str = "mobilenetv2_feat",
-        config: EmbedConfig | None = None,
+        head: str = "",
+        layout: SamplingLayout | None = None,
         threads: int = 0,
         offline: bool = False,
     ) -> None:
-        config = config or EmbedConfig()
-        super().__init__(model, dataclasses.replace(config, head="none"), threads, offline)
+        super().__init__(model, "none", layout, threads, offline)
         self.model = f"crops:{model}"
         self.output = self._deepest_map()
-        head = None if self.trained else trained_head(self.model, config)
-        self.conv_block = onnx_session(head, threads) if head else None
-        if head:
-            layout = _facts(self.conv_block).get("layout", {})
-            self.layout = dataclasses.replace(self.layout, head=str(head), **layout)
+        self.head = None if self.trained else trained_head(self.model, head)
+        self.conv_block = onnx_session(self.head, threads) if self.head else None
+        if self.conv_block is not None:
+            self.layout = self.layout.updated(onnx_metadata(self.conv_block))
 
     def __call__(
         self, frame: Image, detections: Detections, rows: IntArray | None = None
@@ -2253,10 +2273,10 @@ class CropEmbedder(Embedder):
     def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
         """Corners (N, 2) of the grown boxes, whole pixels; may lie beyond the frame."""
         box = _cxcywh_from_xyxy(xyxy)  # (N, 4)
-        grow, reach = self.layout.context, self.layout.reach
-        if self.layout.wide:
-            grow, reach = max(grow, self.layout.wide), max(reach, self.layout.wide_reach)
-        least = max(1.0, reach * max(size_hw))
+        layout, surround = self.layout, self.layout.surround_scale > 0
+        grow = max(layout.context, layout.surround_scale)
+        least = max(layout.min_margin, layout.surround_min_margin * surround)
+        least = max(1.0, least * max(size_hw))
         half = box[:, 2:] / 2 + np.maximum(box[:, 2:] * grow, least)  # (N, 2)
         low, high = np.floor(box[:, :2] - half), np.ceil(box[:, :2] + half)
         return low.astype(np.int64), high.astype(np.int64)
@@ -2307,7 +2327,7 @@ class CropEmbedder(Embedder):
     def maps(self, crops: Image) -> Floats:
         """Backbone features (B, C, h, w) of BGR images (B, S, S, 3)."""
         net = self._net
-        if net.own:
+        if net.channels_last:
             return np.ascontiguousarray(net.maps(crops).transpose(0, 3, 1, 2))
         rgb = (crops[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         feed = {net.input: np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32)}
@@ -2316,7 +2336,7 @@ class CropEmbedder(Embedder):
     def _deepest_map(self) -> str:
         """Name of the backbone's first output at stride 32 (7 x 7 for 224 px), else its first."""
         net, side = self._net, self.layout.crop_px
-        if net.own:
+        if net.channels_last:
             return str(net.output)
         names: list[str] = [o.name for o in net.session.get_outputs()]
         maps = net.session.run(names, {net.input: np.zeros((1, 3, side, side), np.float32)})
@@ -2332,9 +2352,9 @@ class CropEmbedder(Embedder):
             isinstance(w, int) and w != n for w, n in zip(wanted, both.shape[1:], strict=True)
         ):
             raise ReobjError(
-                f"{self.layout.head}: takes {entry.shape}, the two maps of the backbone are "
+                f"{self.head}: takes {entry.shape}, the two maps of the backbone are "
                 f"(N, {', '.join(map(str, both.shape[1:]))}): give a ConvBlock trained with this "
-                "backbone and --set embed.crop_px"
+                "backbone"
             )
         joint = self.conv_block.run(None, {entry.name: both})[0]
         return np.asarray(joint.reshape(len(both), -1), np.float64)
@@ -2410,10 +2430,12 @@ class _Backbone:
 
     Attributes:
         layout: where its maps are sampled. head: session of the trained head, or None.
-        own: does it take BGR bytes and give channels last?
+        channels_last: of the maps that the network itself gives; such networks take BGR bytes.
     """
 
-    def __init__(self, model: str, config: EmbedConfig, threads: int, offline: bool) -> None:
+    def __init__(
+        self, model: str, head: str, layout: SamplingLayout, threads: int, offline: bool
+    ) -> None:
         path = model_path(model, offline=offline)
         self.session = onnx_session(path, threads)
         spatial = [o.name for o in self.session.get_outputs() if len(o.shape) == 4]
@@ -2424,15 +2446,14 @@ class _Backbone:
                 "give another --embed model"
             )
         self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
-        facts = _facts(self.session)
-        self.own = bool(facts)
-        self.layout, self.multiple = config, int(facts.get("multiple", 32))
-        head = path.parent / facts["head"] if self.own else trained_head(model, config)
-        self.head: Any = onnx_session(head, threads) if head else None
-        if head:
-            self.layout = dataclasses.replace(
-                config, **(facts or _facts(self.head)).get("layout", {})
-            )
+        metadata = onnx_metadata(self.session)
+        self.channels_last = bool(metadata)
+        self.multiple = int(metadata.get("multiple", 32))
+        file = path.parent / metadata["head"] if metadata else trained_head(model, head)
+        self.head: Any = onnx_session(file, threads) if file else None
+        self.layout = layout
+        if self.head is not None:
+            self.layout = layout.updated(metadata or onnx_metadata(self.head))
 
     def __call__(self, frame: Image) -> Floats:
         """Return the features (h, w, C) of a frame (H, W, 3) BGR."""
@@ -2443,7 +2464,7 @@ class _Backbone:
 
     def maps(self, images: Image) -> Floats:
         """Return the features (N, h, w, C) of BGR images (N, H, W, 3) of a fit size."""
-        if self.own:
+        if self.channels_last:
             return self._run(images)
         rgb = (images[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         maps = self._run(np.ascontiguousarray(rgb.transpose(0, 3, 1, 2), np.float32))
@@ -2459,29 +2480,29 @@ class _Backbone:
         return np.asarray(foreground, np.float64), np.asarray(background, np.float64)
 
 
-def _facts(session: Any) -> dict[str, Any]:
-    """What `examples/train_embedding.py` wrote into a file's metadata."""
+def onnx_metadata(session: Any) -> dict[str, Any]:
+    """Read what `examples/train_embedding.py` wrote into a model file's metadata."""
     text = session.get_modelmeta().custom_metadata_map.get("reobj", "{}")
     return dict(json.loads(text))
 
 
-def _companion(model: str, suffix: str) -> Path:
-    """A file that belongs to an appearance model: beside its file, else in models/."""
+def trained_head(model: str, head: str = "") -> Path | None:
+    """Find the head of a frozen backbone ("crops:" before its name: the ConvBlock).
+
+    Args:
+        head: its file, "none", or "" for BACKBONE_head.onnx beside the backbone's file, else among
+            the weights that come along.
+    Returns:
+        None: no head, the backbone's own features serve.
+    Raises:
+        ReobjError: `head` is neither a file nor "none".
+    """
+    if head:
+        return None if head == "none" else model_path(head, offline=True)
     kind, _, backbone = model.rpartition(":")
     path = Path(backbone)
     folder = path.parent if path.suffix == ".onnx" else own_models()
-    return folder / f"{kind + '_' if kind else ''}{path.stem}{suffix}"
-
-
-def trained_head(model: str, config: EmbedConfig) -> Path | None:
-    """The head of a frozen backbone ("crops:" before its name: the ConvBlock), None: no training.
-
-    Raises:
-        ReobjError: `config.head` is neither a file nor "none".
-    """
-    if config.head:
-        return None if config.head == "none" else model_path(config.head, offline=True)
-    path = _companion(model, "_head.onnx")
+    path = folder / f"{kind + '_' if kind else ''}{path.stem}_head.onnx"
     return path if path.is_file() else None
 
 
@@ -2849,21 +2870,24 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """The detections of one frame that belong to a track, as a struct of arrays of length M.
+    """Tracked detections as a struct of arrays of length M: of a frame, or of a whole video.
 
     Attributes:
+        frame: number of the frame: what a `Tracker` returns counts its updates, from 0; a table of
+            a video has the source's numbers, in ascending order.
         track_id: identity, from 1; 0 while a track is still tentative.
-        xyxy, score, class_id: of the detection.
-        detection_index: row of the detection in what was handed to the tracker.
         tracklet_id: uninterrupted piece of track, from 1; an identity that returns has several.
+        xyxy, score, class_id: of the detection; in the table of a video in native pixels.
+        detection_index: row of the detection in what was handed to the tracker; -1: unknown.
     """
 
+    frame: IntArray
     track_id: IntArray
+    tracklet_id: IntArray
     xyxy: Array
     score: Array
     class_id: IntArray
     detection_index: IntArray
-    tracklet_id: IntArray
 
     def __len__(self) -> int:
         return len(self.track_id)
@@ -2871,18 +2895,42 @@ class Tracks:
     def __getitem__(self, keep: Any) -> Tracks:
         return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
-    def to_array(self) -> Array:
-        """(M, 8) rows x1, y1, x2, y2, id, score, class, detection index.
+    @staticmethod
+    def concatenate(frames: Sequence[int], steps: Sequence[Tracks], scale: float = 1.0) -> Tracks:
+        """Make the table of a video from a tracker's results, frame by frame.
 
-        >>> tracker = Tracker(TrackerConfig(n_init=1))
-        >>> tracker.update(np.array([[10, 10, 50, 90, 0.9, 56]])).to_array().astype(int)
-        array([[10, 10, 50, 90,  1,  0, 56,  0]])
+        Rows of a tracklet get the identity that was confirmed later; what never was is left out.
+
+        Args:
+            frames: source number of each. scale: pixels of the frames per native pixel.
         """
+        if not steps:
+            none = np.empty(0, np.int64)
+            return Tracks(none, none, none, np.empty((0, 4)), np.empty(0), none, none)
+        columns = [f.name for f in dataclasses.fields(Tracks)]
+        all_of = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
+        all_of["frame"] = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
+        tracklets, inverse = np.unique(all_of["tracklet_id"], return_inverse=True)
+        identity = np.zeros(len(tracklets), np.int64)
+        np.maximum.at(identity, inverse, all_of["track_id"])
+        all_of |= {"track_id": identity[inverse], "xyxy": all_of["xyxy"] / scale}
+        table = Tracks(**all_of)
+        return table[table.track_id > 0]
+
+    def with_identities(self, track_id: IntArray) -> Tracks:
+        """The same rows with other identities, renumbered 1, 2, ... by first appearance."""
+        _, first, inverse = np.unique(track_id, return_index=True, return_inverse=True)
+        rank = np.empty(len(first), np.int64)
+        rank[np.argsort(first)] = np.arange(1, len(first) + 1)
+        return dataclasses.replace(self, track_id=rank[inverse.ravel()])
+
+    def to_array(self) -> Array:
+        """Return (M, 8) rows x1, y1, x2, y2, id, score, class, detection index."""
         columns = (self.xyxy, self.track_id, self.score, self.class_id, self.detection_index)
         return np.column_stack(columns).astype(np.float64).reshape(-1, 8)
 
     def to_supervision(self, detections: Any) -> Any:
-        """The rows of supervision's `Detections` that are tracked, with `tracker_id` set.
+        """Return the rows of supervision's `Detections` that are tracked, with `tracker_id` set.
 
         Args:
             detections: what was handed to `update` (anything that has `tracker_id` and can be
@@ -3512,12 +3560,13 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
         return Tracks(
+            np.full(len(rows), self.frame_number),
             self._live.identity[t] + 1,
+            self._live.tracklet[t],
             detections.xyxy[rows],
             detections.score[rows],
             detections.class_id[rows],
             rows,
-            self._live.tracklet[t],
         )
 
     def _retire(self) -> None:
@@ -4833,7 +4882,8 @@ def _copy_text_model(folder: Path, copy: Path) -> None:
         for number, text in enumerate(_read_text(folder / "images.txt").splitlines(), 1)
         if not text.startswith("#")
     ]
-    rows, points_next = [], False
+    rows: list[tuple[list[str], list[str]]] = []
+    points_next = False
     for number, words in images:
         is_points = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
         if is_points and (points_next or not words):
@@ -5068,57 +5118,9 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
 # ---- Objects: tracklets -> one identity and one solid each -------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class TrackTable:
-    """All tracked detections of a video, one row each (N rows), ordered by frame.
-
-    Attributes:
-        frame: source frame numbers; object_id: identity from 1; tracklet_id: unbroken track.
-        xyxy: (N, 4) native pixels; score; class_id; detection_index: row in the frame.
-    """
-
-    frame: IntArray
-    object_id: IntArray
-    tracklet_id: IntArray
-    xyxy: Array
-    score: Array
-    class_id: IntArray
-    detection_index: IntArray
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def __getitem__(self, keep: Any) -> TrackTable:
-        return TrackTable(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
-
-    def with_objects(self, object_id: IntArray) -> TrackTable:
-        """The same rows with other identities, renumbered 1, 2, ... by first appearance."""
-        _, first, inverse = np.unique(object_id, return_index=True, return_inverse=True)
-        rank = np.empty(len(first), np.int64)
-        rank[np.argsort(first)] = np.arange(1, len(first) + 1)
-        return dataclasses.replace(self, object_id=rank[inverse.ravel()])
-
-    @staticmethod
-    def from_steps(frames: Sequence[int], steps: Sequence[Tracks], scale: float) -> TrackTable:
-        """Collect the results of `Tracker.step`; rows get the identity that was confirmed later."""
-        if not steps:
-            none = np.empty(0, np.int64)
-            return TrackTable(none, none, none, np.empty((0, 4)), np.empty(0), none, none)
-        frame = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
-        columns = [f.name for f in dataclasses.fields(Tracks)]
-        all_of = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
-        tracklets, inverse = np.unique(all_of["tracklet_id"], return_inverse=True)
-        identity = np.zeros(len(tracklets), np.int64)
-        np.maximum.at(identity, inverse, all_of["track_id"])
-        boxes, ids = all_of["xyxy"] / scale, (identity[inverse], tracklets[inverse])
-        rest = (all_of["score"], all_of["class_id"], all_of["detection_index"])
-        table = TrackTable(frame, *ids, boxes, *rest)
-        return table[table.object_id > 0]
-
-
-def object_classes(table: TrackTable) -> dict[int, int]:
+def object_classes(table: Tracks) -> dict[int, int]:
     """Class of each object: the one with the largest sum of scores."""
-    objects, row = np.unique(table.object_id, return_inverse=True)
+    objects, row = np.unique(table.track_id, return_inverse=True)
     classes, column = np.unique(table.class_id, return_inverse=True)
     votes = np.zeros((len(objects), len(classes)))
     np.add.at(votes, (row, column), table.score)
@@ -5143,7 +5145,7 @@ class Views:
 
 
 def gather_views(
-    table: TrackTable, poses: Poses, groups: IntArray, count: int, min_score: float
+    table: Tracks, poses: Poses, groups: IntArray, count: int, min_score: float
 ) -> Views:
     """Spread the track rows over frames and groups.
 
@@ -5263,7 +5265,7 @@ class Linker:
         """What the atoms are: tracklet, identity, class, whether that moves, (L,) each."""
         first = np.unique(self.atom, return_index=True)[1]  # (L,)
         self.tracklets = self.table.tracklet_id[first]
-        self.identity = self.table.object_id[first]
+        self.identity = self.table.track_id[first]
         self.classes = _class_shares(self.table, self.atom, len(first)).argmax(1)
         names = np.array([*class_names, ""])[self.classes.clip(max=len(class_names))]
         self.moving = np.isin(names, list(self.moving_classes))  # as the tracker has them
@@ -5564,7 +5566,7 @@ def _most_alike_first(
     return np.unique(group, return_inverse=True)[1]
 
 
-def _segments_of(table: TrackTable, cut_gap: int) -> IntArray:
+def _segments_of(table: Tracks, cut_gap: int) -> IntArray:
     """Cut tracklets where more than cut_gap frames pass without a detection.
 
     Returns:
@@ -5578,7 +5580,7 @@ def _segments_of(table: TrackTable, cut_gap: int) -> IntArray:
     return segment
 
 
-def _class_shares(table: TrackTable, group: IntArray, count: int) -> Array:
+def _class_shares(table: Tracks, group: IntArray, count: int) -> Array:
     """Share of every class in the scores of each group of rows, (count, C)."""
     votes = np.zeros((count, int(table.class_id.max(initial=0)) + 1))
     np.add.at(votes, (group, table.class_id.clip(0)), table.score)
@@ -5600,10 +5602,10 @@ def atomic(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def write_mot(path: Path, table: TrackTable) -> None:
+def write_mot(path: Path, table: Tracks) -> None:
     """Write MOTChallenge results: frame (from 1), id, left, top, width, height, score, 3 x -1."""
     ltwh = np.column_stack([table.xyxy[:, :2], table.xyxy[:, 2:] - table.xyxy[:, :2]])
-    rows = np.column_stack([table.frame + 1, table.object_id, ltwh, table.score])  # (N, 7)
+    rows = np.column_stack([table.frame + 1, table.track_id, ltwh, table.score])  # (N, 7)
     with atomic(path) as part:
         np.savetxt(part, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
 
@@ -5689,13 +5691,13 @@ def object_color(object_id: int) -> tuple[int, int, int]:
     return blue, green, red
 
 
-def draw_tracks(image: Image, table: TrackTable, labels: dict[int, str], scale: float) -> None:
+def draw_tracks(image: Image, table: Tracks, labels: dict[int, str], scale: float) -> None:
     """Draw the boxes and identities of one frame's rows, in place.
 
     Args:
         labels: text of each identity; scale: image pixels per pixel of the table.
     """
-    for obj, box in zip(table.object_id.tolist(), table.xyxy * scale, strict=True):
+    for obj, box in zip(table.track_id.tolist(), table.xyxy * scale, strict=True):
         x1, y1, x2, y2 = box.round().astype(int).tolist()
         color = object_color(obj)
         cv2.rectangle(image, (x1, y1), (x2, y2), color, 2, cv2.LINE_AA)
@@ -5808,7 +5810,7 @@ def write_overlay(
             image = np.asarray(small, np.uint8)
             if frame.index in projected:
                 dual_c, visible = projected[frame.index]
-                seen = set(rows.object_id.tolist())
+                seen = set(rows.track_id.tolist())
                 drawn = visible & np.array([i in seen or i in sure for i in ids], bool)
                 draw_ellipses(image, dual_c, drawn, ids, seen)
             draw_tracks(image, rows, labels, scale)
@@ -5872,7 +5874,7 @@ class Pictures:
         """Cut what is wanted from this frame."""
         rows = self.wanted[self.table.frame[self.wanted] == frame.index]
         height, width = frame.image.shape[:2]
-        for obj, box in zip(self.table.object_id[rows], self.table.xyxy[rows], strict=True):
+        for obj, box in zip(self.table.track_id[rows], self.table.xyxy[rows], strict=True):
             margin = 0.1 * (box[2:] - box[:2])
             x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
             x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
@@ -5894,12 +5896,12 @@ def _jpeg(image: Image, size_px: int) -> str:
 
 
 def diverse_rows(
-    table: TrackTable, entry: dict[str, Any], poses: Poses | None, count: int
+    table: Tracks, entry: dict[str, Any], poses: Poses | None, count: int
 ) -> IntArray:
     """Row numbers (<= count,) of the views of one object that differ most: in time and, where there
     are cameras, in viewing direction; large boxes with good scores first.
     """
-    rows = np.flatnonzero(table.object_id == entry["id"])
+    rows = np.flatnonzero(table.track_id == entry["id"])
     frame, box = table.frame[rows], table.xyxy[rows]
     quality = table.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
     place = 2 * (frame / max(int(table.frame.max(initial=0)), 1))[:, None]  # (N, 1)
@@ -5973,26 +5975,26 @@ def _scene_cameras(
         return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
     thin = slice(None, None, math.ceil(len(poses.points) / SCENE_POINTS) or 1)
     K = poses.camera.K
-    up = up_in_world
-    if up is None:
-        up = quadrics.camera_up(K @ poses.cam_from_world[poses.known])[0]
+    up = quadrics.camera_up(K @ poses.cam_from_world[poses.known])[0]
+    if up_in_world is not None:
+        up = np.array(up_in_world)
     size = {"width": poses.camera.width, "height": poses.camera.height}
     return {
         "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
         "poses": _base64(invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)]), "<f4"),
         "points": _base64(poses.points[thin], "<f4"),
         "colors": _base64(poses.colors[thin], "u1"),
-        "up": _numbers(np.asarray(up)),
+        "up": _numbers(up),
     }
 
 
 def _scene_object(
-    entry: dict[str, Any], table: TrackTable, steps: IntArray, pictures: Pictures
+    entry: dict[str, Any], table: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
     """An object for the page: its entry of objects.json, colour, steps in which it is seen (first,
     last, first, last ...) and pictures.
     """
-    seen = np.isin(steps, table.frame[table.object_id == entry["id"]])
+    seen = np.isin(steps, table.frame[table.track_id == entry["id"]])
     runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
     runs[1::2] -= 1
     return {k: v for k, v in entry.items() if k != "cov"} | {
@@ -6037,7 +6039,7 @@ class RunResult:
     """
 
     out: Path
-    table: TrackTable
+    table: Tracks
     class_names: tuple[str, ...]
     objects: list[dict[str, Any]]
     poses: Poses | None
@@ -6087,7 +6089,7 @@ class Workspace:
 
     def path(self, stage: str, *key: Any) -> Path:
         """File of a stage's result for this key (configs and strings)."""
-        columns = [f.name for x in (TrackTable, TrackResult) for f in dataclasses.fields(x)]
+        columns = [f.name for x in (Tracks, TrackResult) for f in dataclasses.fields(x)]
         text = json.dumps([__version__, columns, key], sort_keys=True, default=dataclasses.asdict)
         return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
@@ -6229,7 +6231,7 @@ class TrackResult:
         fixed: identities were given (--tracks): nothing may join, split or renumber them.
     """
 
-    table: TrackTable
+    table: Tracks
     class_names: tuple[str, ...]
     messages: tuple[str, ...] = ()
     fixed: bool = False
@@ -6239,7 +6241,7 @@ class TrackResult:
 
     def save(self, path: Path) -> None:
         """Write as npz, atomically."""
-        columns = {f.name: getattr(self.table, f.name) for f in dataclasses.fields(TrackTable)}
+        columns = {f.name: getattr(self.table, f.name) for f in dataclasses.fields(Tracks)}
         columns |= {"look": self.look, "look_row": self.look_row}
         facts = {k: getattr(self, k) for k in ("class_names", "messages", "fixed", "split")}
         save_npz(path, columns, **facts)
@@ -6249,7 +6251,7 @@ class TrackResult:
         """Read what `save` wrote."""
         try:
             data, facts = load_npz(path)
-            table = TrackTable(*(data[f.name] for f in dataclasses.fields(TrackTable)))
+            table = Tracks(*(data[f.name] for f in dataclasses.fields(Tracks)))
             names, messages = tuple(facts["class_names"]), tuple(facts["messages"])
             looks = data["look"], data["look_row"], int(facts["split"])
             return TrackResult(table, names, messages, bool(facts["fixed"]), *looks)
@@ -6396,7 +6398,7 @@ def _track_frames(
     if not steps:
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
-    table = TrackTable.from_steps([i for i, _ in steps], [s for _, s in steps], video.scale)
+    table = Tracks.concatenate([i for i, _ in steps], [s for _, s in steps], video.scale)
     messages = [*source.messages, *_video_messages(video, table)]
     look, look_row = _table_looks(table, [i for i, _ in steps], looks)
     names, split = source.class_names, tracker.gallery.split
@@ -6404,7 +6406,7 @@ def _track_frames(
 
 
 def _table_looks(
-    table: TrackTable, frames: Sequence[int], looks: Sequence[tuple[IntArray, Floats]]
+    table: Tracks, frames: Sequence[int], looks: Sequence[tuple[IntArray, Floats]]
 ) -> tuple[npt.NDArray[np.float16], IntArray]:
     """Embeddings that the tracker computed, (n, E), and the table rows they belong to, (n,)."""
     keys = zip(table.frame.tolist(), table.detection_index.tolist(), strict=True)
@@ -6432,8 +6434,9 @@ def _embedder(config: Config) -> Embedder | None:
     kind, _, backbone = config.embed.model.partition(":")
     if kind == "crops":
         backbone = backbone or "mobilenetv2_feat"
-        return CropEmbedder(backbone, config.embed, config.threads, config.offline)
-    return Embedder(config.embed.model, config.embed, config.threads, config.offline)
+        made = CropEmbedder(backbone, config.embed.head, None, config.threads, config.offline)
+        return made
+    return Embedder(config.embed.model, config.embed.head, None, config.threads, config.offline)
 
 
 def _scaled_camera(camera: Camera, scale: float) -> Camera:
@@ -6443,7 +6446,7 @@ def _scaled_camera(camera: Camera, scale: float) -> Camera:
     return Camera("PINHOLE", round(camera.width * scale), round(camera.height * scale), params)
 
 
-def _video_messages(video: Video, table: TrackTable) -> list[str]:
+def _video_messages(video: Video, table: Tracks) -> list[str]:
     """What the user should know about the input."""
     messages = list(video.messages)
     if video.is_live:
@@ -6462,7 +6465,7 @@ def _supplied_poses(video: Video, config: Config) -> Poses | None:
     return read_poses(config.poses.mode, video, config.poses.fmt, config.poses.camera)
 
 
-def _check_supplied(poses: Poses, table: TrackTable) -> None:
+def _check_supplied(poses: Poses, table: Tracks) -> None:
     """Refuse supplied poses whose direction or axes contradict the tracks."""
     if poses.source != "user":
         return
@@ -6485,7 +6488,7 @@ def _reconstruct(
     space: Workspace,
     config: Config,
     seconds: dict[str, float],
-    moving: TrackTable | None = None,
+    moving: Tracks | None = None,
 ) -> tuple[Poses, Path]:
     """Poses from pycolmap, no features on moving things, and their model's folder, both cached."""
     boxes = np.empty((0, 5)) if moving is None else np.column_stack([moving.frame, moving.xyxy])
@@ -6507,7 +6510,7 @@ def _reconstruct(
     return poses, model
 
 
-def _moving_rows(track: TrackResult, config: ObjectsConfig) -> TrackTable:
+def _moving_rows(track: TrackResult, config: ObjectsConfig) -> Tracks:
     """Rows of the classes that move."""
     moving = [i for i, n in enumerate(track.class_names) if n in config.moving.split(",")]
     return track.table[np.isin(track.table.class_id, moving)]
@@ -6528,12 +6531,12 @@ def make_objects(
             track, poses if located else None, fit, own.moving.split(","), own.min_score,
             own.min_views,
         )  # fmt: skip
-        table, events = table.with_objects(linker.run()), linker.events
+        table, events = table.with_identities(linker.run()), linker.events
     elif len(table) and not track.fixed:
-        table = table.with_objects(table.object_id)
+        table = table.with_identities(table.track_id)
     if len(table) and poses is not None and fit is not None:
         classes = object_classes(table)
-        group = np.searchsorted(list(classes), table.object_id)
+        group = np.searchsorted(list(classes), table.track_id)
         views = gather_views(table, poses, group, len(classes), config.objects.min_score)
         fits = fit(views, list(classes.values()))
     objects = _object_entries(table, track.class_names, fits, views, config.objects)
@@ -6594,7 +6597,7 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
 
 
 def _object_entries(
-    table: TrackTable,
+    table: Tracks,
     class_names: Sequence[str],
     fits: Any,
     views: Views | None,
@@ -6606,7 +6609,7 @@ def _object_entries(
         seen = (views.boxes, views.img_from_world, views.image_size)
         iou = quadrics.reprojection_iou(fits, *seen)  # (V, O)
     for i, (obj, cls) in enumerate(object_classes(table).items()):
-        rows = table[table.object_id == obj]
+        rows = table[table.track_id == obj]
         entry: dict[str, Any] = dict.fromkeys(OBJECT_FIELDS)
         name = class_names[cls] if 0 <= cls < len(class_names) else "object"
         entry |= {
@@ -6672,7 +6675,7 @@ def _numbers(values: Array) -> list[float]:
     return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
 
 
-def _spans_of(rows: TrackTable) -> list[list[int]]:
+def _spans_of(rows: Tracks) -> list[list[int]]:
     """First and last frame of every tracklet, by time."""
     frames = [rows.frame[r] for r in _rows_by(rows.tracklet_id)]
     return sorted([int(f.min()), int(f.max())] for f in frames)
@@ -7274,7 +7277,7 @@ class Saved:
 
     out: Path
     data: dict[str, Any]
-    table: TrackTable
+    table: Tracks
     class_names: tuple[str, ...]
     poses: Poses | None
     video: Video | None
@@ -7294,7 +7297,7 @@ class Saved:
         classes = np.array([class_of[i] for i in found.identity.tolist()], np.int64)
         unknown = np.full(len(found), -1, np.int64)
         ids, score = found.identity, rows[:, 6]
-        table = TrackTable(found.frame - 1, ids, ids, found.xyxy, score, classes, unknown)
+        table = Tracks(found.frame - 1, ids, ids, found.xyxy, score, classes, unknown)
         poses, source = (out / "cache" / n for n in ("last-poses.npz", "source.json"))
         video = None
         if source.is_file():
@@ -7333,8 +7336,8 @@ def export_coco_vid(saved: Saved, path: Path) -> None:
     boxes = np.hstack([corners[:, :2], corners[:, 2:] - corners[:, :2]]).round(2).tolist()
     annotations = [
         {"id": i + 1, "image_id": image_id[int(table.frame[i])], "video_id": 1,
-         "category_id": int(table.class_id[i]) + 1, "instance_id": int(table.object_id[i]),
-         "track_id": int(table.object_id[i]), "bbox": box, "area": round(box[2] * box[3], 2),
+         "category_id": int(table.class_id[i]) + 1, "instance_id": int(table.track_id[i]),
+         "track_id": int(table.track_id[i]), "bbox": box, "area": round(box[2] * box[3], 2),
          "iscrowd": 0, "score": float(table.score[i])}
         for i, box in enumerate(boxes)
     ]  # fmt: skip
@@ -7371,13 +7374,13 @@ def export_cvat(saved: Saved, path: Path) -> None:
     following = dict(itertools.pairwise(frames))
     for obj, cls in object_classes(table).items():
         track = {"id": str(obj - 1), "label": saved.class_names[cls], "source": "auto"}
-        _cvat_boxes(ET.SubElement(root, "track", track), table[table.object_id == obj], following)
+        _cvat_boxes(ET.SubElement(root, "track", track), table[table.track_id == obj], following)
     ET.indent(root)
     with atomic(path) as part:
         ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
 
 
-def _cvat_boxes(track: ET.Element, rows: TrackTable, following: dict[int, int]) -> None:
+def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> None:
     """Add the boxes of a track, and one `outside` in the frame that follows the end of a visit."""
     seen = set(rows.frame.tolist())
     for frame, box in zip(rows.frame.tolist(), rows.xyxy, strict=True):
@@ -7415,7 +7418,7 @@ def export_glb(saved: Saved, path: Path) -> None:
     scale, turn = _upright(saved, path, [0.0, 1, 0])
     world = np.eye(4)
     world[:3, :3] = scale * turn
-    scene = trimesh.Scene()
+    scene: Any = trimesh.Scene()
     for o in saved.data["objects"]:
         if o["status"] == "rejected":
             continue
@@ -7428,7 +7431,7 @@ def export_glb(saved: Saved, path: Path) -> None:
         world_from_obj[:3, 3] = o["center"]
         scene.add_geometry(mesh, name, name, transform=world @ world_from_obj)
     if saved.poses is not None and len(saved.poses.points):
-        cloud = trimesh.PointCloud(saved.poses.points, colors=saved.poses.colors)
+        cloud: Any = trimesh.points.PointCloud(saved.poses.points, colors=saved.poses.colors)
         scene.add_geometry(cloud, "points", "points", transform=world)
     if saved.poses is not None and saved.poses.known.sum() > 1:
         path_of = invert_rigid(saved.poses.cam_from_world[saved.poses.known])[:, :, 3]
@@ -7491,8 +7494,8 @@ def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str], scale: f
         rows = table[table.frame == frame]
         boxes = rr.Boxes2D(
             array=rows.xyxy, array_format=rr.Box2DFormat.XYXY,
-            labels=[names[i] for i in rows.object_id.tolist()],
-            colors=[object_color(i)[::-1] for i in rows.object_id.tolist()],
+            labels=[names[i] for i in rows.track_id.tolist()],
+            colors=[object_color(i)[::-1] for i in rows.track_id.tolist()],
         )  # fmt: skip
         rec.log("world/camera/boxes", boxes)
 
@@ -7540,7 +7543,7 @@ def read_tracks(
                          "(0-based); an object is in one place at a time")  # fmt: skip
     rows = np.flatnonzero(use)[first]
     ids, unknown = found.identity[rows], np.full(len(rows), -1, np.int64)
-    table = TrackTable(found.frame[rows], ids, ids, found.xyxy[rows], found.score[rows],
+    table = Tracks(found.frame[rows], ids, ids, found.xyxy[rows], found.score[rows],
                        found.class_id[rows], unknown)  # fmt: skip
     names = found.class_names
     if like is not None:
@@ -7550,7 +7553,7 @@ def read_tracks(
     return TrackResult(table, names, tuple(found.messages), fixed=True)
 
 
-def _as_known(known: TrackTable, table: TrackTable, unnamed: bool) -> TrackTable:
+def _as_known(known: Tracks, table: Tracks, unnamed: bool) -> Tracks:
     """Give unmoved boxes their earlier scores, and unnamed ones the class that overlaps most."""
     class_id, score = table.class_id.copy(), table.score.copy()
     for rows in _rows_by(table.frame):
