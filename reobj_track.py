@@ -1859,7 +1859,7 @@ class CameraMotion:
         if not len(self.flow):
             return np.zeros_like(xy)
         apart = ((xy[:, None] - self.flow[:, :2]) ** 2).sum(-1)  # (N, K)
-        near = apart.argsort(1)[:, : FLOW_NEIGHBOURS]
+        near = apart.argsort(1)[:, :FLOW_NEIGHBOURS]
         return np.asarray(np.median(self.flow[near, 2:], 1))
 
     def _flow(self, gray: Image) -> Array:
@@ -3085,9 +3085,7 @@ class Tracker:
             value = getattr(owner, name)
             if value is not None:
                 state[key] = list(value.values()) if isinstance(value, dict) else value
-        save_npz(
-            Path(path), state, version=STATE_VERSION, config=dataclasses.asdict(self.config)
-        )
+        save_npz(Path(path), state, version=STATE_VERSION, config=dataclasses.asdict(self.config))
 
     @classmethod
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
@@ -3303,9 +3301,7 @@ class Tracker:
         """Cost in [0, 1] from overlap and gated distance, feasibility and IoU, (T, D) each."""
         live, config, box = self._live, self.config, _cxcywh_from_xyxy(xyxy)
         iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), xyxy)
-        var = (
-            live.cov[:, :2, 0] + (STD_MEASURE * _noise_scale(live.mean)[:, :2]) ** 2
-        )  # (T, 2) S
+        var = live.cov[:, :2, 0] + (STD_MEASURE * _noise_scale(live.mean)[:, :2]) ** 2  # (T, 2) S
         offset = live.mean[:, None, :2, 0] - box[None, :, :2]  # (T, D, 2)
         distance = (offset**2 / var[:, None]).sum(-1)  # (T, D) squared Mahalanobis, 2 dof
         distance = distance / GATE_CHI2
@@ -3965,9 +3961,7 @@ def _segments(
 PNP_POINTS = 200  # 3D points tracked from each keyframe into the frames between
 
 
-def _follow(
-    model: SparseModel, row: int, images: list[Image]
-) -> list[tuple[IntArray, Array]]:
+def _follow(model: SparseModel, row: int, images: list[Image]) -> list[tuple[IntArray, Array]]:
     """Follow the longest-seen 3D points of a keyframe (row; -1: none) through the images.
 
     Returns:
@@ -3975,7 +3969,7 @@ def _follow(
     """
     seen = np.flatnonzero(model.obs_image == row)
     longest = np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")
-    seen = seen[longest[: PNP_POINTS]]
+    seen = seen[longest[:PNP_POINTS]]
     scale = np.array(images[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
     rows, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5  # OpenCV: centres at 0
     followed = [(rows, model.obs_xy[seen])]
@@ -4026,6 +4020,7 @@ _ADVICE = (
     "move the camera sideways around the objects (turning on the spot gives no depth), keep things "
     "with texture in view, avoid blurred frames, or give --poses; identities in 2D need none"
 )
+
 
 def reconstruct(
     images: Sequence[Image],
@@ -4085,9 +4080,7 @@ def _run_child(folder: Path, log_path: Path, progress: Callable[[str, int], Prog
     lines: list[Progress] = []
     with (
         open(log_path, "wb") as errors,
-        subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=errors, env=environment
-        ) as child,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, env=environment) as child,
     ):
         try:
             for text in child.stdout or ():
@@ -4346,7 +4339,7 @@ def _look_alikes(descriptors: list[Image], seed: int) -> list[tuple[int, int]]:
     flat = looks.reshape(len(looks), -1)
     alike, at = flat @ flat.T, np.arange(len(flat))  # (K, K)
     alike[np.abs(at[:, None] - at) <= 2] = -np.inf  # matched already
-    best = np.argsort(-alike, axis=1, kind="stable")[:, : LOOP_PAIRS]
+    best = np.argsort(-alike, axis=1, kind="stable")[:, :LOOP_PAIRS]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
 
@@ -4388,9 +4381,7 @@ GOOD_REGISTERED = 0.9  # take the first sound model with this share of keyframes
 MIN_PARALLAX_PX = 3.0  # refuse what turns explain to this (walks: > 4)
 
 
-def _sfm_ladder(
-    database: Path, count: int, guess: float, seed: int
-) -> tuple[Any, list[str], bool]:
+def _sfm_ladder(database: Path, count: int, guess: float, seed: int) -> tuple[Any, list[str], bool]:
     """Try mappers from strict to permissive.
 
     Returns:
@@ -4442,9 +4433,7 @@ MIN_POINTS_PER_IMAGE = 30  # refuse a model with fewer 3D points in the median i
 TRI_SAMPLE = 2000  # points used for the median triangulation angle
 
 
-def _sfm_attempt(
-    database: Path, rung: str, fixed: bool, count: int, seed: int
-) -> _Attempt:
+def _sfm_attempt(database: Path, rung: str, fixed: bool, count: int, seed: int) -> _Attempt:
     """Run a mapper on `count` keyframes, measure its largest model and name its first problem."""
     models = _sfm_map(database, rung, fixed, count, seed)
     if not models:
@@ -4985,9 +4974,7 @@ CHECK_ANGLE_DEG = 1.0  # direction check: good when the tracks meet within this
 CHECK_RATIO = 0.3  # direction check: another reading must be better by this factor
 
 
-def check_poses(
-    poses: Poses, tracks: Sequence[tuple[IntArray, Array]]
-) -> str | None:
+def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str | None:
     """Find out whether poses are given in the wrong direction or with the wrong axes.
 
     Triangulates the box centres of tracks with the poses as they are, inverted, and with OpenGL
@@ -5009,7 +4996,7 @@ def check_poses(
         "inverted and with OpenGL axes": _CV_FROM_GL @ invert_rigid(usual),
     }  # fmt: skip
     views = [view for track in tracks if (view := _track_views(poses, *track)) is not None]
-    views = sorted(views, key=lambda v: -len(v[0]))[: CHECK_MOST_TRACKS]
+    views = sorted(views, key=lambda v: -len(v[0]))[:CHECK_MOST_TRACKS]
     if len(views) < CHECK_TRACKS:
         return None
     angle = {
@@ -5031,9 +5018,7 @@ CHECK_VIEWS = 5  # direction check: frames of a track needed
 CHECK_MOST_VIEWS = 40  # direction check: frames of a track used at most
 
 
-def _track_views(
-    poses: Poses, frame: IntArray, xy: Array
-) -> tuple[IntArray, Array] | None:
+def _track_views(poses: Poses, frame: IntArray, xy: Array) -> tuple[IntArray, Array] | None:
     """Rows of a track's frames with a pose, thinned, and unit rays (n, 3); None if too few."""
     place, known = _place_of(poses, frame)
     use = np.flatnonzero(known & np.isfinite(xy).all(1))
@@ -5613,9 +5598,7 @@ def write_mot(path: Path, table: Tracks) -> None:
 PLY_DETAIL = 2  # subdivisions of the sphere: 512 triangles an object
 
 
-def write_ply(
-    path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int]
-) -> None:
+def write_ply(path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int]) -> None:
     """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world."""
     sphere, faces = _icosphere(PLY_DETAIL)  # (P, 3), (T, 3)
     half = ellipsoids.half_axes[:, None] * sphere  # (O, P, 3)
@@ -5864,7 +5847,7 @@ class Pictures:
         ranked = sorted(result.objects, key=lambda o: -o["frames_seen"])
         chosen = {
             o["id"]: diverse_rows(result.table, o, result.poses, count)
-            for o in ranked[: SCENE_MAX_CROPS]
+            for o in ranked[:SCENE_MAX_CROPS]
         }
         self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
         shown = scene_frames(result)
@@ -5895,9 +5878,7 @@ def _jpeg(image: Image, size_px: int) -> str:
     return base64.b64encode(data.tobytes()).decode()
 
 
-def diverse_rows(
-    table: Tracks, entry: dict[str, Any], poses: Poses | None, count: int
-) -> IntArray:
+def diverse_rows(table: Tracks, entry: dict[str, Any], poses: Poses | None, count: int) -> IntArray:
     """Row numbers (<= count,) of the views of one object that differ most: in time and, where there
     are cameras, in viewing direction; large boxes with good scores first.
     """
@@ -7265,6 +7246,8 @@ def _was_read(frame: IntArray, out: Path) -> BoolArray:
 
 CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
 SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
+
+
 @dataclass(frozen=True, slots=True)
 class Saved:
     """What an output folder of `run` holds, read back for the exports.
