@@ -5761,50 +5761,46 @@ class VideoWriter:
 OVERLAY_SIZE_PX = 1280  # longer side of the overlay
 
 
-def write_overlay(
-    result: RunResult,
-    solids: quadrics.Ellipsoids | None,
-    video: Video,
-    pictures: Pictures | None = None,
-) -> None:
-    """Write overlay.mp4: boxes, identities and back-projected ellipsoids of every frame.
+class Overlay:
+    """overlay.mp4: boxes, identities and back-projected ellipsoids, frame by frame.
 
     Args:
         solids: ellipsoids of the objects that are not rejected, in their order. Those that rest on
             a prior are drawn only while they are detected.
-        pictures: takes its own from every frame, so that the video is read once for both.
     """
-    width, height = video.size
-    shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
-    size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
-    scale = size[0] / width
-    projected = _project_all(result.poses, solids, scale)
-    kept = [o for o in result.objects if o["status"] != "rejected"]
-    ids, sure = [o["id"] for o in kept], {o["id"] for o in kept if o["status"] == "ok"}
-    labels = {o["id"]: f"{o['id']} {o['class']}" for o in result.objects}
-    fps = max(1.0, (video.fps or 30.0) / video.config.every)
-    writer = VideoWriter(result.out / "overlay.mp4", fps, size)
-    progress, complete = Progress("overlay", video.expected), False
-    try:
-        for frame in video:
-            low, high = np.searchsorted(result.table.frame, [frame.index, frame.index + 1])
-            rows = result.table[slice(low, high)]
-            small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-            image = np.asarray(small, np.uint8)
-            if frame.index in projected:
-                dual_c, visible = projected[frame.index]
-                seen = set(rows.track_id.tolist())
-                drawn = visible & np.array([i in seen or i in sure for i in ids], bool)
-                draw_ellipses(image, dual_c, drawn, ids, seen)
-            draw_tracks(image, rows, labels, scale)
-            writer.write(image)
-            if pictures is not None:
-                pictures.take(frame)
-            progress.step()
-        complete = True
-    finally:
-        writer.close(complete)
-        progress.close()
+
+    def __init__(self, result: RunResult, solids: quadrics.Ellipsoids | None, video: Video) -> None:
+        width, height = video.size
+        shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
+        self.size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
+        self.scale, self.table = self.size[0] / width, result.table
+        self.projected = _project_all(result.poses, solids, self.scale)
+        kept = [o for o in result.objects if o["status"] != "rejected"]
+        self.ids, self.sure = (
+            [o["id"] for o in kept],
+            {o["id"] for o in kept if o["status"] == "ok"},
+        )
+        self.labels = {o["id"]: f"{o['id']} {o['class']}" for o in result.objects}
+        fps = max(1.0, (video.fps or 30.0) / video.config.every)
+        self.writer = VideoWriter(result.out / "overlay.mp4", fps, self.size)
+
+    def take(self, frame: Frame) -> None:
+        """Draw and append one frame."""
+        low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
+        rows = self.table[slice(low, high)]
+        small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
+        image = np.asarray(small, np.uint8)
+        if frame.index in self.projected:
+            dual_c, visible = self.projected[frame.index]
+            seen = set(rows.track_id.tolist())
+            drawn = visible & np.array([i in seen or i in self.sure for i in self.ids], bool)
+            draw_ellipses(image, dual_c, drawn, self.ids, seen)
+        draw_tracks(image, rows, self.labels, self.scale)
+        self.writer.write(image)
+
+    def close(self, complete: bool) -> None:
+        """Finish the file; it appears only if it is complete."""
+        self.writer.close(complete)
 
 
 def _project_all(
@@ -6725,11 +6721,21 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
         ids = [o["id"] for o in result.objects if o["status"] != "rejected"]
         write_ply(out / "objects.ply", solids, ids)
     pictures = Pictures(result, video) if config.output.scene else None
+    overlay = None
     if config.output.overlay and not video.is_live:
-        write_overlay(result, solids, video, pictures)
-    elif pictures is not None and not video.is_live:
-        for frame in video:
-            pictures.take(frame)
+        overlay = Overlay(result, solids, video)
+    sinks = [sink for sink in (overlay, pictures) if sink is not None and not video.is_live]
+    progress, complete = Progress("pictures", video.expected), False
+    try:
+        for frame in video if sinks else ():
+            for sink in sinks:
+                sink.take(frame)
+            progress.step()
+        complete = True
+    finally:
+        progress.close()
+        if overlay is not None:
+            overlay.close(complete)
     if pictures is not None:
         write_scene(result, pictures, video)
     result.seconds["write"] = time.monotonic() - started
