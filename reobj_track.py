@@ -72,100 +72,94 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation, Slerp
 
 import quadrics
-
-__version__ = "0.1.0"
-
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-Image = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float32]
-
-log = logging.getLogger("reobj_track")
-
-
-class ReobjError(ValueError):
-    """A mistake in the input: says what, where, what was expected and what to do (exit code 2)."""
-
-
-# ---- Constants ---------------------------------------------------------------------------------
-
-COCO_CLASSES = (
-    "person bicycle car motorcycle airplane bus train truck boat traffic_light fire_hydrant "
-    "stop_sign parking_meter bench bird cat dog horse sheep cow elephant bear zebra giraffe "
-    "backpack umbrella handbag tie suitcase frisbee skis snowboard sports_ball kite "
-    "baseball_bat baseball_glove skateboard surfboard tennis_racket bottle wine_glass cup fork "
-    "knife spoon bowl banana apple sandwich orange broccoli carrot hot_dog pizza donut cake "
-    "chair couch potted_plant bed dining_table toilet tv laptop mouse remote keyboard "
-    "cell_phone microwave oven toaster sink refrigerator book clock vase scissors teddy_bear "
-    "hair_drier toothbrush"
+from reobj import __version__
+from reobj.types import (
+    COCO_NAMES,
+    Array,
+    BoolArray,
+    Detections,
+    Embeddings,
+    Floats,
+    Frame,
+    Image,
+    IntArray,
+    ReobjError,
+    Tracks,
+    as_detections,
+    box_iou,
+    class_shares,
+    cxcywh_from_xyxy,
+    log,
+    object_classes,
+    object_color,
+    option,
+    rows_by,
+    unit_rows,
+    widen,
+    xyxy_from_cxcywh,
 )
-COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in COCO_CLASSES.split())
 
 # ---- Configuration: the only home of numbers ---------------------------------------------------
-
-
-def _opt(default: Any, text: str, flag: str = "") -> Any:
-    """Declare a config field: default, help text and, for the few that users need, a flag."""
-    return field(default=default, metadata={"help": text, "flag": flag})
 
 
 @dataclass(frozen=True, slots=True)
 class InputConfig:
     """Which frames are read. Frame numbers are those of the source, whatever `every` is."""
 
-    every: int = _opt(1, "use every N-th frame", "--every")
-    start: int = _opt(0, "first frame (0-based)", "--start")
-    stop: int = _opt(0, "frame to stop before (0: the end)", "--stop")
-    max_size: int = _opt(0, "shrink frames to this longer side, px (0: native)", "--max-size")
+    every: int = option(1, "use every N-th frame", "--every")
+    start: int = option(0, "first frame (0-based)", "--start")
+    stop: int = option(0, "frame to stop before (0: the end)", "--stop")
+    max_size: int = option(0, "shrink frames to this longer side, px (0: native)", "--max-size")
 
 
 @dataclass(frozen=True, slots=True)
 class DetectConfig:
     """Object detection."""
 
-    model: str = _opt("deimv2-femto", "detector: a name of `models`, or a .onnx file", "--detector")
-    min_score: float = _opt(0.1, "detections below this score are never used (ByteTrack: .1)")
-    nms_iou: float = _opt(0.6, "class-wise NMS overlap for models that need NMS (NanoDet: .6)")
-    classes: str = _opt("", "comma-separated class names to keep (default: all)", "--classes")
-    class_names: str = _opt("", "text file, one class name a line, where they are not COCO's")
-    max_detections: int = _opt(100, "detections kept a frame, best scores first")
+    model: str = option(
+        "deimv2-femto", "detector: a name of `models`, or a .onnx file", "--detector"
+    )
+    min_score: float = option(0.1, "detections below this score are never used (ByteTrack: .1)")
+    nms_iou: float = option(0.6, "class-wise NMS overlap for models that need NMS (NanoDet: .6)")
+    classes: str = option("", "comma-separated class names to keep (default: all)", "--classes")
+    class_names: str = option("", "text file, one class name a line, where they are not COCO's")
+    max_detections: int = option(100, "detections kept a frame, best scores first")
 
 
 @dataclass(frozen=True, slots=True)
 class PosesConfig:
     """Camera poses: keyframes, reconstruction, PnP. How the numbers came about: docs/poses.md."""
 
-    mode: str = _opt(
+    mode: str = option(
         "auto", "auto: reconstruct; none: 2D only; or a file or folder of poses", "--poses"
     )
-    fmt: str = _opt(
+    fmt: str = option(
         "auto",
         "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d",
         "--pose-format",
     )
-    camera: str = _opt(
+    camera: str = option(
         "",
         "intrinsics: fx,fy,cx,cy[,k1,k2,p1,p2] in native pixels (COLMAP: centre + .5)",
         "--camera",
     )
-    size_px: int = _opt(640, "longer side of the working images")
-    max_keyframes: int = _opt(150, "upper bound on keyframes; max_flow grows until it fits")
-    max_gap: int = _opt(15, "interpolate over at most this many frames (marked `interpolated`)")
-    seed: int = _opt(0, "random seed of the reconstruction")
+    size_px: int = option(640, "longer side of the working images")
+    max_keyframes: int = option(150, "upper bound on keyframes; max_flow grows until it fits")
+    max_gap: int = option(15, "interpolate over at most this many frames (marked `interpolated`)")
+    seed: int = option(0, "random seed of the reconstruction")
 
 
 @dataclass(frozen=True, slots=True)
 class EmbedConfig:
     """Appearance."""
 
-    model: str = _opt(
+    model: str = option(
         "reobj",
         "appearance: reobj (comes along), none, a backbone name / .onnx file, or "
         "crops[:BACKBONE] (re-OBJ as published: two crops an object)",
         "--embed",
     )
-    head: str = _opt(
+    head: str = option(
         "", "trained head (.onnx) of a backbone; empty: the one that comes along; none: no training"
     )
 
@@ -174,46 +168,54 @@ class EmbedConfig:
 class TrackerConfig:
     """Tracking and re-identification."""
 
-    high_score: float = _opt(
+    high_score: float = option(
         0.4, "first association round: detections of at least this score", "--high-score"
     )
-    low_score: float = _opt(0.1, "second round: of at least this score (ByteTrack)")
-    new_score: float = _opt(0.5, "a new track needs this score")
-    n_init: int = _opt(
+    low_score: float = option(0.1, "second round: of at least this score (ByteTrack)")
+    new_score: float = option(0.5, "a new track needs this score")
+    n_init: int = option(
         3, "detections before a new object gets its identity (DeepSORT); a return needs one less"
     )
-    coast_frames: int = _opt(30, "frames a track is predicted without a detection", "--coast")
-    remember: bool = _opt(True, "recognise objects that return, however long they were away")
-    std_position: float = _opt(
+    coast_frames: int = option(30, "frames a track is predicted without a detection", "--coast")
+    remember: bool = option(True, "recognise objects that return, however long they were away")
+    std_position: float = option(
         0.05, "process noise of a position over the box size (DeepSORT: 1/20)"
     )
-    std_velocity: float = _opt(
+    std_velocity: float = option(
         1 / 80, "process noise of a velocity over the box size (DeepSORT: 1/160)"
     )
-    class_cost: float = _opt(
+    class_cost: float = option(
         0.2, "added to the cost, and taken off the overlap in doubt, when the class differs"
     )
-    appearance_weight: float = _opt(0.7, "share of appearance in the cost of doubtful matches")
-    foreground_weight: float = _opt(0.5, "share of the foreground in the appearance")
-    embed_every: int = _opt(10, "refresh the appearance of a track after this many frames")
-    return_probability: float = _opt(
+    appearance_weight: float = option(0.7, "share of appearance in the cost of doubtful matches")
+    foreground_weight: float = option(0.5, "share of the foreground in the appearance")
+    embed_every: int = option(10, "refresh the appearance of a track after this many frames")
+    return_probability: float = option(
         0.5, "recognise a return from this probability on, rivals and a new object considered"
     )
-    camera_motion: bool = _opt(True, "compensate the camera's motion from sparse optical flow")
+    camera_motion: bool = option(True, "compensate the camera's motion from sparse optical flow")
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectsConfig:
     """From tracks and cameras to one solid and ellipsoid per object."""
 
-    priors: str = _opt("", "size priors, JSON (default: priors.json beside this file)", "--priors")
-    known_size: str = _opt("", "known heights for the scale: 'chair=.82m,door=2m'", "--known-size")
-    support: str = _opt("auto", "shape of the solids: auto, box, cylinder, ellipsoid", "--support")
-    up: str = _opt("", "up in the world: x,y,z (default: from the poses or the objects)")
-    link: bool = _opt(True, "join and split tracklets by 3D evidence")
-    min_views: int = _opt(3, "objects with fewer detections in frames with poses get no ellipsoid")
-    min_score: float = _opt(0.3, "boxes below this score do not shape the ellipsoid")
-    moving: str = _opt(
+    priors: str = option(
+        "", "size priors, JSON (default: priors.json beside this file)", "--priors"
+    )
+    known_size: str = option(
+        "", "known heights for the scale: 'chair=.82m,door=2m'", "--known-size"
+    )
+    support: str = option(
+        "auto", "shape of the solids: auto, box, cylinder, ellipsoid", "--support"
+    )
+    up: str = option("", "up in the world: x,y,z (default: from the poses or the objects)")
+    link: bool = option(True, "join and split tracklets by 3D evidence")
+    min_views: int = option(
+        3, "objects with fewer detections in frames with poses get no ellipsoid"
+    )
+    min_score: float = option(0.3, "boxes below this score do not shape the ellipsoid")
+    moving: str = option(
         "person,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe",
         "classes that move: tracked, but without ellipsoid",
     )
@@ -223,8 +225,8 @@ class ObjectsConfig:
 class OutputConfig:
     """Files written."""
 
-    overlay: bool = _opt(True, "write overlay.mp4")
-    scene: bool = _opt(True, "write scene.html")
+    overlay: bool = option(True, "write overlay.mp4")
+    scene: bool = option(True, "write scene.html")
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,69 +240,11 @@ class Config:
     poses: PosesConfig = field(default_factory=PosesConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
-    threads: int = _opt(0, "threads of onnxruntime, OpenCV and numpy (0: all cores)", "--threads")
-    offline: bool = _opt(False, "never download weights", "--offline")
+    threads: int = option(0, "threads of onnxruntime, OpenCV and numpy (0: all cores)", "--threads")
+    offline: bool = option(False, "never download weights", "--offline")
 
 
 # ---- Data types --------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Detections:
-    """Detections of one frame as a struct of arrays.
-
-    Attributes:
-        xyxy: (D, 4) boxes x1, y1, x2, y2, pixels, corner convention.
-        score: (D,) in [0, 1].
-        class_id: (D,) index into the class names.
-        masks: (D, H, W) bool at the frame's size, or None. A mask without any pixel means "no
-            mask".
-    """
-
-    xyxy: Array
-    score: Array
-    class_id: IntArray
-    masks: BoolArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.xyxy)
-
-    def __getitem__(self, keep: Any) -> Detections:
-        """Select by index array, boolean mask or slice."""
-        masks = None if self.masks is None else self.masks[keep]
-        return Detections(self.xyxy[keep], self.score[keep], self.class_id[keep], masks)
-
-    @staticmethod
-    def empty() -> Detections:
-        return Detections(np.empty((0, 4)), np.empty(0), np.empty(0, np.int64))
-
-    @staticmethod
-    def from_array(rows: npt.ArrayLike) -> Detections:
-        """Make from (N, 6) rows x1, y1, x2, y2, confidence, class.
-
-        >>> Detections.from_array([[0, 0, 10, 20, 0.9, 56]]).class_id
-        array([56])
-        """
-        rows = np.asarray(rows, np.float64).reshape(-1, 6) if np.size(rows) else np.empty((0, 6))
-        return Detections(rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64))
-
-    @staticmethod
-    def from_supervision(found: Any) -> Detections:
-        """Make from an object with xyxy (N, 4), confidence, class_id and mask, as supervision's.
-
-        What is None there counts as score 1, class 0, no mask. `Tracker.update` takes such objects
-        as they are; `Tracks.to_supervision` goes back.
-        """
-        return as_detections(found)
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """One video frame: source number (0-based), time in seconds, BGR image (H, W, 3) uint8."""
-
-    index: int
-    time_s: float
-    image: Image
 
 
 @dataclass(frozen=True, slots=True)
@@ -648,7 +592,7 @@ class Video:
             yield Frame(index, time_s, image)
         if self.skipped:
             self._warn(f"{len(self.skipped)} frames skipped (unreadable or of another size): "
-                       f"{_shortened(self.skipped)}")  # fmt: skip
+                       f"{shortened(self.skipped)}")  # fmt: skip
 
     def _warn(self, text: str) -> None:
         if (text := f"{self.source}: {text}") not in self.messages:
@@ -774,7 +718,7 @@ def without_password(text: str) -> str:
     return re.sub(r"(?<=://)[^/@\s]*@", "", text)
 
 
-def _shortened(items: Sequence[Any]) -> str:
+def shortened(items: Sequence[Any]) -> str:
     """Return the first five of a list, for messages."""
     return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
 
@@ -894,10 +838,10 @@ class RecordedDetections:
 
 def load_class_names(path: str | Path) -> tuple[str, ...]:
     """Read one class name a line."""
-    return tuple(line.strip() for line in _read_text(Path(path)).splitlines() if line.strip())
+    return tuple(line.strip() for line in read_text(Path(path)).splitlines() if line.strip())
 
 
-def _unnamed_class(class_id: int, count: int) -> str:
+def unnamed_class(class_id: int, count: int) -> str:
     return (f"class {class_id}, but there are only {count} class names: give a file of names with "
             "--set detect.class_names=FILE")  # fmt: skip
 
@@ -912,7 +856,7 @@ def read_detections(
     names = load_class_names(config.class_names) if config.class_names else ()
     try:
         if path.suffix.lower() == ".npz":
-            found, _ = _read_npz(path, video.size, video.working_size)
+            found, _ = read_npz(path, video.size, video.working_size)
         else:
             read = _read_coco if path.suffix.lower() == ".json" else _read_table
             found = read(path, names, video)
@@ -924,7 +868,7 @@ def read_detections(
     return found
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -953,7 +897,7 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
     xyxy = np.stack([column[role] for role in ("x1", "y1", "x2", "y2")], 1)  # (N, 4)
     count = len(lines)
     class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
-    messages = [f"{len(new)} class names not in the list: {_shortened(new)}"] if new else []
+    messages = [f"{len(new)} class names not in the list: {shortened(new)}"] if new else []
     frame = column["frame"].astype(np.int64) - is_mot
     if frame.min(initial=0) == -1 and is_mot:
         frame += 1
@@ -969,7 +913,7 @@ def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray
     """Return the columns' roles, the rows of cells, the lines they stand on (N,), and whether it
     is MOT (no header).
     """
-    reader = csv.reader(_read_text(path).splitlines())
+    reader = csv.reader(read_text(path).splitlines())
     rows = [(reader.line_num, cells) for cells in reader if cells]
     is_mot = not rows or rows[0][1][0].strip()[:1] in "+-.0123456789"
     columns = MOT_COLUMNS if is_mot else _csv_columns(rows.pop(0)[1], path)
@@ -1033,7 +977,7 @@ def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetect
 
     A dataset with annotations of its own (COCO, COCO-VID) is read in their place.
     """
-    entries = data = _load_json(path)
+    entries = data = load_json(path)
     if isinstance(data, dict) and "images" in data:
         entries = data.get("annotations")
     if not isinstance(entries, list):
@@ -1065,9 +1009,9 @@ def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetect
     )  # fmt: skip
 
 
-def _load_json(path: Path) -> Any:
+def load_json(path: Path) -> Any:
     try:
-        return json.loads(_read_text(path))
+        return json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
 
@@ -1116,10 +1060,10 @@ def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
     return rle_encode(canvas > 0)
 
 
-def _read_npz(
+def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int]
 ) -> tuple[RecordedDetections, IntArray]:
-    """Read our own format, as `_pack` makes it; also the frames that were `done`, if it says so."""
+    """Read our own format, as `pack_detections` makes it; also the frames that were `done`, if it says so."""
     data, _ = load_npz(path)
     count = len(data.get("frame", ()))
     data.setdefault("mask_counts", NO_RUNS)
@@ -1152,7 +1096,7 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
         if not finite[row]:
             text = f"NaN or infinite value in {found.xyxy[row]}, {found.score[row]}"
         elif not named[row]:
-            text = _unnamed_class(int(found.class_id[row]), len(found.class_names))
+            text = unnamed_class(int(found.class_id[row]), len(found.class_names))
         raise ReobjError(f"{path}, {found.unit} {found.line[row]}: {text}")
     keep = _real(found, path, frame_count)
     if len(found) and (found.score == -1).all():
@@ -1164,7 +1108,7 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
         found.score = np.clip(found.score, 0, 1)
     keep &= found.score >= config.min_score
     if config.classes:
-        keep &= np.isin(found.class_id, _class_filter(config.classes, found.class_names))
+        keep &= np.isin(found.class_id, class_filter(config.classes, found.class_names))
     if not len(found):
         found.messages.append("no detections in this file")
     rows = np.flatnonzero(keep)
@@ -1194,7 +1138,7 @@ def _real(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
             f"the image of {found.size}: x, y, w, h where x1, y1, x2, y2 is expected, or another "
             "video?"
         )
-    numbers = _shortened(np.unique(found.frame[missing]).tolist())
+    numbers = shortened(np.unique(found.frame[missing]).tolist())
     text = f"of frames that the video has not (0-based: {numbers}; it has {frame_count or 'some'})"
     if count and missing.all():
         raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
@@ -1206,7 +1150,7 @@ def _real(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
     return np.logical_not(empty | outside | missing)
 
 
-def _class_filter(wanted: str, names: Sequence[str]) -> IntArray:
+def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
     """Return the ids of comma-separated class names."""
     known = {name.lower(): i for i, name in enumerate(names)}
     chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
@@ -1216,7 +1160,7 @@ def _class_filter(wanted: str, names: Sequence[str]) -> IntArray:
     return np.array([known[name] for name in chosen], np.int64)
 
 
-def _pack(
+def pack_detections(
     frames: Sequence[tuple[int, Detections]], names: Sequence[str], size: tuple[int, int]
 ) -> dict[str, Any]:
     """Return the arrays of our npz format."""
@@ -1270,7 +1214,7 @@ def write_detections_npz(
     image_size: tuple[int, int],
 ) -> None:
     """Write (frame number, Detections) pairs, masks as run lengths, for `read_detections`."""
-    save_npz(Path(path), _pack(list(frames), class_names, image_size))
+    save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
 
 
 class DetectionCache:
@@ -1291,7 +1235,7 @@ class DetectionCache:
 
     def _load(self, path: Path) -> None:
         try:
-            chunk, done = _read_npz(path, self.image_size, self.image_size)
+            chunk, done = read_npz(path, self.image_size, self.image_size)
             self._stored |= dict.fromkeys(done.tolist(), chunk)
         except ReobjError as error:
             log.warning("%s; its frames are detected again", error)
@@ -1315,7 +1259,7 @@ class DetectionCache:
         frames = sorted(self._fresh.items())
         path = self.folder / f"chunk_{self._next:06d}.npz"
         done = {"done": np.array([index for index, _ in frames])}
-        save_npz(path, _pack(frames, [], self.image_size) | done)
+        save_npz(path, pack_detections(frames, [], self.image_size) | done)
         self._next += 1
         self._fresh.clear()
         self._load(path)
@@ -1446,7 +1390,7 @@ def _decode_yolox(outs: list[Any], geometry: _Geometry) -> _Found:
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
     score, label = _best_class(rows[:, 5:])
-    return _Found(geometry.to_image(_xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
+    return _Found(geometry.to_image(xyxy_from_cxcywh(rows)), score * rows[:, 4], label)
 
 
 def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Found:
@@ -1455,7 +1399,7 @@ def _decode_yolo(outs: list[Any], geometry: _Geometry) -> _Found:
     proto = next((o[0] for o in outs[1:]), np.empty((0, 1, 1)))  # (32, h, w)
     end = rows.shape[1] - len(proto)
     score, label = _best_class(rows[:, 4:end])
-    boxes = geometry.to_image(_xyxy_from_cxcywh(rows))
+    boxes = geometry.to_image(xyxy_from_cxcywh(rows))
     ratio = np.divide(proto.shape[:0:-1], geometry.input_size)  # (2,) map / input
 
     def masks(chosen: IntArray) -> BoolArray:
@@ -1611,7 +1555,7 @@ class OnnxDetector:
         self.layout = self._layout.name
         self.class_names = self._names(self._layout.classes(trial))
         wanted = self.config.classes
-        self._allowed = _class_filter(wanted, self.class_names) if wanted else None
+        self._allowed = class_filter(wanted, self.class_names) if wanted else None
 
     def __call__(self, image: Image) -> Detections:
         """Detect the objects in one BGR image (H, W, 3), best first."""
@@ -1623,7 +1567,7 @@ class OnnxDetector:
         label = found.class_id - self._layout.first
         keep = self._select(boxes, found.score, label)
         if len(keep) and label[keep].max() >= len(self.class_names):
-            text = _unnamed_class(label[keep].max(), len(self.class_names))
+            text = unnamed_class(label[keep].max(), len(self.class_names))
             raise ReobjError(f"{self.path}: {text}")
         masks = found.masks(keep) if found.masks is not None else None
         return Detections(boxes[keep], found.score[keep], label[keep], masks)
@@ -1693,28 +1637,6 @@ def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
     return np.sort(np.array(kept, np.int64))
 
 
-def as_detections(found: Any) -> Detections:
-    """Take detections as they come: ours, (N, 6) rows, or an object like supervision's."""
-    if isinstance(found, Detections):
-        made = found
-    elif hasattr(found, "xyxy"):
-        count, masks = len(found.xyxy), getattr(found, "mask", None)
-        score, label = getattr(found, "confidence", None), getattr(found, "class_id", None)
-        made = Detections(
-            np.asarray(found.xyxy, np.float64).reshape(-1, 4),
-            np.asarray(np.ones(count) if score is None else score, np.float64),
-            np.asarray(np.zeros(count) if label is None else label, np.int64),
-            None if masks is None else np.asarray(masks, bool),
-        )
-    else:
-        made = Detections.from_array(found)
-    masks = made.xyxy if made.masks is None else made.masks
-    lengths = [len(values) for values in (made.xyxy, made.score, made.class_id, masks)]
-    if len(set(lengths)) > 1 or not np.isfinite(made.xyxy).all():
-        raise ReobjError(f"{lengths} boxes, scores, classes, masks do not fit, or hold NaN")
-    return made
-
-
 class CallableDetector:
     """Any function image -> detections as a detector; `as_detections` says what it may return."""
 
@@ -1726,29 +1648,6 @@ class CallableDetector:
     def __call__(self, image: Image) -> Detections:
         """Detect the objects in one BGR image (H, W, 3)."""
         return as_detections(self.function(image))
-
-
-# ---- Boxes -------------------------------------------------------------------------------------
-
-
-def box_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
-    """Intersection over union of every box in a (A, 4) with every box in b (B, 4): (A, B)."""
-    a, b = a_xyxy[:, None], b_xyxy[None]  # (A, 1, 4), (1, B, 4)
-    overlap = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])  # (A, B, 2)
-    inter = overlap.clip(0).prod(-1)  # (A, B)
-    area_a, area_b = (a[..., 2:] - a[..., :2]).prod(-1), (b[..., 2:] - b[..., :2]).prod(-1)
-    return np.asarray(inter / np.maximum(area_a + area_b - inter, 1e-9), np.float64)
-
-
-def _cxcywh_from_xyxy(xyxy: Array) -> Array:
-    """Centre and size of boxes (N, 4)."""
-    return np.concatenate([(xyxy[:, :2] + xyxy[:, 2:]) / 2, xyxy[:, 2:] - xyxy[:, :2]], 1)
-
-
-def _xyxy_from_cxcywh(box: Array) -> Array:
-    """Corners (N, 4) of boxes given by centre and size (N, 4+)."""
-    half = box[:, 2:4] / 2
-    return np.concatenate([box[:, :2] - half, box[:, :2] + half], 1)
 
 
 # ---- Motion: Kalman filter and camera motion ---------------------------------------------------
@@ -1923,19 +1822,6 @@ def _warp_state(mean: Array, cov: Array, new_from_old: Array) -> tuple[Array, Ar
 
 
 @dataclass(frozen=True, slots=True)
-class Embeddings:
-    """Two-part appearance of detections: rows of unit length for the object and for what surrounds
-    it.
-
-    Attributes:
-        foreground: (D, E1); background: (D, E2), E2 may be 0.
-    """
-
-    foreground: Array
-    background: Array
-
-
-@dataclass(frozen=True, slots=True)
 class SamplingLayout:
     """Where a feature map is sampled for foreground and background; trained models bring their own.
 
@@ -2031,12 +1917,12 @@ class Embedder:
         wanted[rows] = True
         new = np.flatnonzero(wanted & ~seen.known)
         fore, back = self._parts(seen, new, rows)
-        seen.foreground = _widen(seen.foreground, fore)
+        seen.foreground = widen(seen.foreground, fore)
         seen.foreground[new], seen.known[new] = fore, True
         if share:
             around = look_around(detections.xyxy, seen.foreground, seen.sure, rows)
             back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
-        return Embeddings(seen.foreground[rows], _unit_rows(back))
+        return Embeddings(seen.foreground[rows], unit_rows(back))
 
     @property
     def trained(self) -> bool:
@@ -2087,11 +1973,11 @@ def look_around(
         xyxy: (D, 4). foreground: (D, E). sure: (D,) which of them count as neighbours.
         rows: (N,) the chosen ones.
     """
-    others, (x, y, w, h) = np.flatnonzero(sure), _cxcywh_from_xyxy(xyxy).T  # (O,), (D,) each
+    others, (x, y, w, h) = np.flatnonzero(sure), cxcywh_from_xyxy(xyxy).T  # (O,), (D,) each
     centre, size = x + 1j * y, np.sqrt(np.maximum(w, 1) * np.maximum(h, 1))
     distance = np.abs(centre[rows, None] - centre[others])  # (N, O)
     weight = np.exp(-distance / size[rows, None]) * (rows[:, None] != others)
-    return _unit_rows(weight @ foreground[others])
+    return unit_rows(weight @ foreground[others])
 
 
 @dataclass(frozen=True, slots=True)
@@ -2141,7 +2027,7 @@ def part_samples(
     inside = ((at >= 0) & (at < size)).all(0)  # (L,)
     cell = (at / size * cells_wh).astype(int)
     index = (cell[1] * objects.shape[1] + cell[0]) * inside
-    own = _on_object(detections, row, at, centre, own_half) & inside
+    own = on_object(detections, row, at, centre, own_half) & inside
     others = objects.take(index) & (inside > own)
     weight, fine = inside > (own | others & near), layout.samples**2
     weight[: fine * math.prod(shape[0])] = own[: fine * math.prod(shape[0])]
@@ -2235,7 +2121,7 @@ class CropEmbedder(Embedder):
         if self.conv_block is None:
             return Embeddings(_flat_map(fore), _flat_map(back))
         joint = self._joint(np.concatenate([fore, back], 1))
-        return Embeddings(_unit_rows(joint), np.empty((len(rows), 0)))
+        return Embeddings(unit_rows(joint), np.empty((len(rows), 0)))
 
     def cut(self, frame: Image, detections: Detections, rows: IntArray) -> tuple[Image, BoolArray]:
         """Grown boxes, black beyond the frame: crops (N, S, S, 3), object pixels (N, S, S)."""
@@ -2250,8 +2136,8 @@ class CropEmbedder(Embedder):
         unit = (np.arange(side) + 0.5) / side  # (S,)
         grid = low[:, :, None] + (high - low)[:, :, None] * unit  # (N, 2, S)
         at = np.stack(np.broadcast_arrays(grid[:, 0, None, :], grid[:, 1, :, None]))  # (2, N, S, S)
-        box = _cxcywh_from_xyxy(detections.xyxy[rows]).T[..., None, None]  # (4, N, 1, 1)
-        own = _on_object(detections, rows[:, None, None], at, box[:2], box[2:] / 2)
+        box = cxcywh_from_xyxy(detections.xyxy[rows]).T[..., None, None]  # (4, N, 1, 1)
+        own = on_object(detections, rows[:, None, None], at, box[:2], box[2:] / 2)
         return np.stack(crops), own
 
     def masked(self, crops: Image, on_object: BoolArray) -> Image:
@@ -2272,7 +2158,7 @@ class CropEmbedder(Embedder):
 
     def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
         """Corners (N, 2) of the grown boxes, whole pixels; may lie beyond the frame."""
-        box = _cxcywh_from_xyxy(xyxy)  # (N, 4)
+        box = cxcywh_from_xyxy(xyxy)  # (N, 4)
         layout, surround = self.layout, self.layout.surround_scale > 0
         grow = max(layout.context, layout.surround_scale)
         least = max(layout.min_margin, layout.surround_min_margin * surround)
@@ -2363,10 +2249,10 @@ class CropEmbedder(Embedder):
 def _flat_map(maps: Floats) -> Array:
     """Maps (N, C, h, w) as unit rows (N, C * h * w); signed square root as in `_unit_histogram`."""
     flat = maps.reshape(len(maps), -1)
-    return _unit_rows(np.sign(flat) * np.sqrt(np.abs(flat)))
+    return unit_rows(np.sign(flat) * np.sqrt(np.abs(flat)))
 
 
-def _on_object(
+def on_object(
     detections: Detections, rows: IntArray, at: Array, centre: Array, half: Array
 ) -> BoolArray:
     """Are samples at (2, ...) of detections rows (...) on their own object? Its mask, else the
@@ -2392,7 +2278,7 @@ def object_map(
     sure = np.flatnonzero(detections.score >= min_score)
     canvas = np.zeros(shape, np.uint8)
     scale = np.array([shape[1] / size_hw[1], shape[0] / size_hw[0]] * 2)
-    boxes = (_cxcywh_from_xyxy(detections.xyxy[sure]) * scale).round().clip(-9999, 9999)
+    boxes = (cxcywh_from_xyxy(detections.xyxy[sure]) * scale).round().clip(-9999, 9999)
     for i, (x, y, w, h) in zip(sure, boxes.astype(int).tolist(), strict=True):
         mask = None if detections.masks is None else detections.masks[i].view(np.uint8)
         if mask is not None and mask.any():
@@ -2412,7 +2298,7 @@ def _unit_histogram(cells: Floats) -> Array:
     mean, share = cells[..., :-2], cells[..., -2]
     trust = np.sqrt(share / np.maximum(share.max(1, keepdims=True), 1e-9))
     rows = np.sign(mean) * np.sqrt(np.abs(mean)) * trust[..., None]
-    return _unit_rows(_side_by_side(rows))
+    return unit_rows(_side_by_side(rows))
 
 
 def _side_by_side(cells: Floats) -> Floats:
@@ -2506,7 +2392,7 @@ def trained_head(model: str, head: str = "") -> Path | None:
     return path if path.is_file() else None
 
 
-class _LazyEmbeddings:
+class LazyEmbeddings:
     """Fused embeddings of one frame's detections, computed only for the rows that are asked for."""
 
     def __init__(
@@ -2548,18 +2434,12 @@ class _LazyEmbeddings:
         weight, self.split = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
         fused = np.concatenate(
             [
-                math.sqrt(weight) * _unit_rows(parts[0]),
-                math.sqrt(1 - weight) * _unit_rows(parts[1]),
+                math.sqrt(weight) * unit_rows(parts[0]),
+                math.sqrt(1 - weight) * unit_rows(parts[1]),
             ],
             1,
         )
-        return _unit_rows(fused).astype(np.float32)
-
-
-def _unit_rows(rows: npt.NDArray[Any]) -> Array:
-    """Scale rows (N, E) to unit length; zero rows stay zero."""
-    rows = np.asarray(rows, np.float64)
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
+        return unit_rows(fused).astype(np.float32)
 
 
 GALLERY_VIEWS = 12  # views kept of every identity
@@ -2595,7 +2475,7 @@ class Gallery:
         target[novel & ~room] = crowded
         blend = np.where(novel, 0.0, 0.9)[:, None]
         picked = own[np.arange(len(identity)), target]  # (N, E)
-        self.rows[identity, target] = _unit_rows(blend * picked + (1 - blend) * rows)
+        self.rows[identity, target] = unit_rows(blend * picked + (1 - blend) * rows)
         self.sight[identity[novel], target[novel]] = sight[novel]
         self.count[identity] += novel & room
 
@@ -2755,7 +2635,7 @@ def part_cosines(a: npt.NDArray[Any], b: npt.NDArray[Any], split: int) -> tuple[
     return _cosine(a[:, :split], b[:, :split]), _cosine(a[:, split:], b[:, split:])
 
 
-def _paired_cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
+def paired_cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
     """Cosines (N,) of rows (N, E) with rows (N, E), NaN where one is of zeros."""
     length = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.asarray(np.where(length > 1e-9, (a * b).sum(1) / np.maximum(length, 1e-9), np.nan))
@@ -2852,7 +2732,7 @@ class Places:
         cut = quadrics.clip_boxes(boxes, image_size)
         area, whole = ((b[:, 2:] - b[:, :2]).prod(1) for b in (cut, boxes))
         seen = before_camera[0] & (area > share * whole)
-        return np.where(seen[:, None], _cxcywh_from_xyxy(cut), np.nan)
+        return np.where(seen[:, None], cxcywh_from_xyxy(cut), np.nan)
 
     def _grow(self, identities: int) -> None:
         extra = identities - len(self.frame)
@@ -2866,79 +2746,6 @@ class Places:
 
 
 # ---- Tracker -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Tracks:
-    """Tracked detections as a struct of arrays of length M: of a frame, or of a whole video.
-
-    Attributes:
-        frame: number of the frame: what a `Tracker` returns counts its updates, from 0; a table of
-            a video has the source's numbers, in ascending order.
-        track_id: identity, from 1; 0 while a track is still tentative.
-        tracklet_id: uninterrupted piece of track, from 1; an identity that returns has several.
-        xyxy, score, class_id: of the detection; in the table of a video in native pixels.
-        detection_index: row of the detection in what was handed to the tracker; -1: unknown.
-    """
-
-    frame: IntArray
-    track_id: IntArray
-    tracklet_id: IntArray
-    xyxy: Array
-    score: Array
-    class_id: IntArray
-    detection_index: IntArray
-
-    def __len__(self) -> int:
-        return len(self.track_id)
-
-    def __getitem__(self, keep: Any) -> Tracks:
-        return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
-
-    @staticmethod
-    def concatenate(frames: Sequence[int], steps: Sequence[Tracks], scale: float = 1.0) -> Tracks:
-        """Make the table of a video from a tracker's results, frame by frame.
-
-        Rows of a tracklet get the identity that was confirmed later; what never was is left out.
-
-        Args:
-            frames: source number of each. scale: pixels of the frames per native pixel.
-        """
-        if not steps:
-            none = np.empty(0, np.int64)
-            return Tracks(none, none, none, np.empty((0, 4)), np.empty(0), none, none)
-        columns = [f.name for f in dataclasses.fields(Tracks)]
-        all_of = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
-        all_of["frame"] = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
-        tracklets, inverse = np.unique(all_of["tracklet_id"], return_inverse=True)
-        identity = np.zeros(len(tracklets), np.int64)
-        np.maximum.at(identity, inverse, all_of["track_id"])
-        all_of |= {"track_id": identity[inverse], "xyxy": all_of["xyxy"] / scale}
-        table = Tracks(**all_of)
-        return table[table.track_id > 0]
-
-    def with_identities(self, track_id: IntArray) -> Tracks:
-        """The same rows with other identities, renumbered 1, 2, ... by first appearance."""
-        _, first, inverse = np.unique(track_id, return_index=True, return_inverse=True)
-        rank = np.empty(len(first), np.int64)
-        rank[np.argsort(first)] = np.arange(1, len(first) + 1)
-        return dataclasses.replace(self, track_id=rank[inverse.ravel()])
-
-    def to_array(self) -> Array:
-        """Return (M, 8) rows x1, y1, x2, y2, id, score, class, detection index."""
-        columns = (self.xyxy, self.track_id, self.score, self.class_id, self.detection_index)
-        return np.column_stack(columns).astype(np.float64).reshape(-1, 8)
-
-    def to_supervision(self, detections: Any) -> Any:
-        """Return the rows of supervision's `Detections` that are tracked, with `tracker_id` set.
-
-        Args:
-            detections: what was handed to `update` (anything that has `tracker_id` and can be
-                indexed by rows); its masks and data are kept, itself it stays as it is.
-        """
-        found = detections[self.detection_index]
-        found.tracker_id = self.track_id
-        return found
 
 
 STATE_VERSION = 2  # of the files of Tracker.save
@@ -2967,7 +2774,7 @@ class _Live:
 
     def append(self, other: _Live) -> _Live:
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
-        return _Live(*(np.concatenate([_widen(a, b), _widen(b, a)]) for a, b in pairs))
+        return _Live(*(np.concatenate([widen(a, b), widen(b, a)]) for a, b in pairs))
 
     @staticmethod
     def born(box: Array, tracklet: IntArray, frame: int, config: TrackerConfig) -> _Live:
@@ -2998,15 +2805,6 @@ class _Live:
             np.zeros((n, 1)),
             np.zeros((n, 0), np.float32),
         )
-
-
-def _widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Pad the second axis of a with zeros to the width of b (classes or embeddings seen for the
-    first time).
-    """
-    if a.ndim != 2 or a.shape[1] >= b.shape[1]:
-        return a
-    return np.concatenate([a, np.zeros((len(a), b.shape[1] - a.shape[1]), a.dtype)], 1)
 
 
 STD_MEASURE = 0.05  # measurement noise over the box size at score .8 (DeepSORT: 1/20)
@@ -3071,7 +2869,7 @@ class Tracker:
         self.places = Places()
         self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
         self._last_pose: Array | None = None
-        self._latest: _LazyEmbeddings | None = None  # of the latest frame
+        self._latest: LazyEmbeddings | None = None  # of the latest frame
         self._view: Array | None = None  # (3, 4) img_from_world of the frame
         self._image_size = (0, 0)
         self._live = _Live.born(np.empty((0, 4)), np.empty(0, np.int64), 0, self.config)
@@ -3168,8 +2966,8 @@ class Tracker:
         """As `update`, with the tentative tracks too (track_id 0), for those who look back."""
         self.frame_number += 1
         detections = as_detections(detections)
-        lazy = _LazyEmbeddings(
-            _as_embeddings(embeddings, len(detections)),
+        lazy = LazyEmbeddings(
+            as_embeddings(embeddings, len(detections)),
             self.embedder,
             frame,
             detections,
@@ -3244,7 +3042,7 @@ class Tracker:
             share = PLACE_IN_VIEW
             self._place_boxes = self.places.project(view, self._image_size, share)
 
-    def _associate(self, detections: Detections, lazy: _LazyEmbeddings) -> IntArray:
+    def _associate(self, detections: Detections, lazy: LazyEmbeddings) -> IntArray:
         """Match detections to live tracks: high scores by motion, then what is left, low scores
         too, by overlap. Both times what is matched in doubt must look alike: where a rival costs
         little more, or the match is so dear that the detection may be of an object without a track.
@@ -3271,7 +3069,7 @@ class Tracker:
 
     def _matched(
         self, cost: Array, handicap: Array, possible: BoolArray, doubt: tuple[BoolArray, BoolArray],
-        evidence: Array, lazy: _LazyEmbeddings,
+        evidence: Array, lazy: LazyEmbeddings,
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
         """Match at least cost; look at what was matched in doubt and at its rivals; match again.
 
@@ -3299,8 +3097,8 @@ class Tracker:
         self, xyxy: Array, same_class: BoolArray, looks: bool
     ) -> tuple[Array, BoolArray, Array]:
         """Cost in [0, 1] from overlap and gated distance, feasibility and IoU, (T, D) each."""
-        live, config, box = self._live, self.config, _cxcywh_from_xyxy(xyxy)
-        iou = box_iou(_xyxy_from_cxcywh(live.mean[..., 0]), xyxy)
+        live, config, box = self._live, self.config, cxcywh_from_xyxy(xyxy)
+        iou = box_iou(xyxy_from_cxcywh(live.mean[..., 0]), xyxy)
         var = live.cov[:, :2, 0] + (STD_MEASURE * _noise_scale(live.mean)[:, :2]) ** 2  # (T, 2) S
         offset = live.mean[:, None, :2, 0] - box[None, :, :2]  # (T, D, 2)
         distance = (offset**2 / var[:, None]).sum(-1)  # (T, D) squared Mahalanobis, 2 dof
@@ -3346,7 +3144,7 @@ class Tracker:
         return np.flatnonzero(ask & ~asked)
 
     def _compare_looks(
-        self, cost: Array, evidence: Array, rows: IntArray, lazy: _LazyEmbeddings
+        self, cost: Array, evidence: Array, rows: IntArray, lazy: LazyEmbeddings
     ) -> tuple[Array, BoolArray]:
         """Blend the looks of detections (n,) into the cost (T, D), half alike where unknown; and
         what boxes and look together speak against, (T, n).
@@ -3363,7 +3161,7 @@ class Tracker:
         """Kalman update of the matched tracks."""
         rows = np.flatnonzero(track_of >= 0)
         t, live = track_of[rows], self._live
-        box = _cxcywh_from_xyxy(detections.xyxy[rows])
+        box = cxcywh_from_xyxy(detections.xyxy[rows])
         doubt = ((1 - detections.score[rows]).clip(0.05) / 0.2) ** SCORE_NOISE  # (n,)
         noise = STD_MEASURE * _noise_scale(live.mean[t]) * doubt[:, None]
         live.mean[t], live.cov[t] = kalman_update(live.mean[t], live.cov[t], box, noise)
@@ -3375,7 +3173,7 @@ class Tracker:
         live.hits[t] += 1
         live.missed[t] = 0
         classes = detections.class_id[rows].clip(0)
-        live.votes = _widen(live.votes, np.empty((0, int(classes.max(initial=0)) + 1)))
+        live.votes = widen(live.votes, np.empty((0, int(classes.max(initial=0)) + 1)))
         live.votes[t, classes] += detections.score[rows]
 
     def _begin(self, detections: Detections, track_of: IntArray) -> IntArray:
@@ -3386,14 +3184,14 @@ class Tracker:
         ids = self._next_tracklet + np.arange(len(rows))
         self._next_tracklet += len(rows)
         born = _Live.born(
-            _cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self.config
+            cxcywh_from_xyxy(detections.xyxy[rows]), ids, self.frame_number, self.config
         )
         track_of[rows] = len(self._live.mean) + np.arange(len(rows))
         self._live = self._live.append(born)
         self._count(detections, rows, track_of[rows])
         return track_of
 
-    def _look(self, detections: Detections, track_of: IntArray, lazy: _LazyEmbeddings) -> None:
+    def _look(self, detections: Detections, track_of: IntArray, lazy: LazyEmbeddings) -> None:
         """Embed tentative tracks, tracks that were not embedded lately, and learn the similarity
         statistics.
         """
@@ -3411,15 +3209,15 @@ class Tracker:
             return
         look = lazy.get(rows)  # (n, E)
         self.gallery.split = lazy.split
-        live.look = _widen(live.look, look)
+        live.look = widen(live.look, look)
         known = live.embedded[t] >= 0
         keep = np.where(known, EMBEDDING_MOMENTUM, 0.0)[:, None]
-        live.look[t] = _unit_rows(keep * live.look[t] + (1 - keep) * look)
+        live.look[t] = unit_rows(keep * live.look[t] + (1 - keep) * look)
         live.embedded[t] = self.frame_number
         self._learn(look, live.identity[t], detections.class_id[rows], self._sight(t))
 
     def _learn_looks(
-        self, detections: Detections, track_of: IntArray, rows: IntArray, lazy: _LazyEmbeddings
+        self, detections: Detections, track_of: IntArray, rows: IntArray, lazy: LazyEmbeddings
     ) -> None:
         """Feed the statistics of a track's look against the detections of the next frames."""
         live = self._live
@@ -3444,7 +3242,7 @@ class Tracker:
         """Directions (n, 3) in which tracks are seen in this frame, NaN without a pose."""
         if self._view is None:
             return np.full((len(t), 3), np.nan)
-        return sight_lines(_xyxy_from_cxcywh(self._live.mean[t, :, 0]), self._view)
+        return sight_lines(xyxy_from_cxcywh(self._live.mean[t, :, 0]), self._view)
 
     def _learn(self, look: Floats, identity: IntArray, class_id: IntArray, sight: Array) -> None:
         """Feed the similarity statistics and the gallery with embeddings (n, E) of one frame."""
@@ -3494,8 +3292,8 @@ class Tracker:
         if self._view is not None and len(identity):
             places = self.places.project(self._view, self._image_size, 0.0)
             homes = _rows_of(places, identity, np.nan)  # (I, 4)
-            box = _xyxy_from_cxcywh(self._live.mean[ready, :, 0])
-            iou = np.nan_to_num(box_iou(box, _xyxy_from_cxcywh(homes)))
+            box = xyxy_from_cxcywh(self._live.mean[ready, :, 0])
+            iou = np.nan_to_num(box_iou(box, xyxy_from_cxcywh(homes)))
             iou[:, ~_rows_of(self.places.known, identity, False)] = np.nan
         return iou
 
@@ -3595,7 +3393,7 @@ def _assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
         row_of_column[columns[good]] = rows[good]
 
 
-def _as_embeddings(embeddings: Embeddings | npt.ArrayLike | None, count: int) -> Embeddings | None:
+def as_embeddings(embeddings: Embeddings | npt.ArrayLike | None, count: int) -> Embeddings | None:
     """Accept one (D, E) array as foreground-only embeddings; check the number of rows."""
     if embeddings is None:
         return None
@@ -3632,14 +3430,14 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
         if 4 <= len(numbers) <= 8 and np.isfinite(numbers).all() and min(numbers[:2]) > 0:
             numbers += [0.0] * (8 - len(numbers) if len(numbers) > 4 else 0)
             camera = Camera("OPENCV" if len(numbers) == 8 else "PINHOLE", *size, tuple(numbers))
-            return _checked_camera(camera, f"--camera {text}")
+            return checked_camera(camera, f"--camera {text}")
     raise ReobjError(
         f"--camera {text!r}: expected fx,fy,cx,cy[,k1,k2,p1,p2], pixels of frames "
         f"of {size[0]}x{size[1]}"
     )
 
 
-def _checked_camera(camera: Camera, where: str) -> Camera:
+def checked_camera(camera: Camera, where: str) -> Camera:
     """Refuse intrinsics that belong to another image size."""
     size, centre, focal = np.array([camera.width, camera.height]), camera.K[:2, 2], camera.K[0, 0]
     if (np.abs(centre - size / 2) > 0.2 * size).any() or not 0.1 < focal / size.max() < 10:
@@ -3747,10 +3545,10 @@ def _exif_focal(video: Any) -> float:
     return 0.0
 
 
-def _spans(numbers: Iterable[int], step: int = 1) -> str:
+def spans(numbers: Iterable[int], step: int = 1) -> str:
     """Write ascending numbers as spans.
 
-    >>> _spans([3, 4, 5, 9])
+    >>> spans([3, 4, 5, 9])
     '3-5, 9'
     """
     spans: list[list[int]] = []
@@ -3767,7 +3565,7 @@ def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
     step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
     text = (
         f"{(~known).sum()} of {len(frame)} frames have no pose (frames "
-        f"{_spans(frame[~known].tolist(), step)}): these parts do not connect to the rest; slower "
+        f"{spans(frame[~known].tolist(), step)}): these parts do not connect to the rest; slower "
         "turns, fewer blurred frames and more texture help, or give --poses"
     )
     return [] if known.all() else [text]
@@ -4624,7 +4422,7 @@ def read_poses(path: str | Path, video: Any, fmt: str = "auto", camera: str = ""
     own = parse_camera(camera, size) or given.camera
     if own is None:
         raise ReobjError(f"{path}: no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2], pixels")
-    own = _checked_camera(_resized_camera(own, size, path), str(path))
+    own = checked_camera(_resized_camera(own, size, path), str(path))
     numbers = [(frame.index, frame.time_s) for frame in video]
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
     names = [video.names[n] for n in frame if video.names]
@@ -4633,7 +4431,7 @@ def read_poses(path: str | Path, video: Any, fmt: str = "auto", camera: str = ""
     poses[row >= 0] = given.cam_from_world[row[row >= 0]]
     known = np.isfinite(poses).all((1, 2))
     if not known.all():
-        lost = _spans(frame[~known].tolist())
+        lost = spans(frame[~known].tolist())
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
     status = np.where(known, "supplied", "none")
     extra = (given.metric, given.up_in_world, given.points, given.colors, tuple(messages))
@@ -4659,7 +4457,7 @@ def _number_rows(
     """Read a table of numbers (N, C), C in `columns`, and where each row is (for messages)."""
     rows: list[list[float]] = []
     where = []
-    for number, text in enumerate(_read_text(path).splitlines(), 1):
+    for number, text in enumerate(read_text(path).splitlines(), 1):
         if not text.strip() or text.lstrip().startswith("#"):
             continue
         at = f"{path}, line {number}"
@@ -4680,7 +4478,7 @@ def _number_rows(
 
 
 def _json_object(path: Path) -> dict[str, Any]:
-    content = _load_json(path)
+    content = load_json(path)
     if not isinstance(content, dict):
         raise ReobjError(f"{path}: expected an object with `frames` (nerfstudio) or `poses`")
     return content
@@ -4729,14 +4527,14 @@ def _given_tum(path: Path, size: tuple[int, int]) -> _GivenPoses:
     """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam; metres but for our own header."""
     rows, where = _number_rows(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
-    metric = re.search(f"^#.*{_NO_SCALE}", _read_text(path), re.MULTILINE) is None
+    metric = re.search(f"^#.*{NO_SCALE}", read_text(path), re.MULTILINE) is None
     return _GivenPoses(invert_rigid(world_from_cam), stamps_s=rows[:, 0], metric=metric)
 
 
-_NO_SCALE = "units: arbitrary"
+NO_SCALE = "units: arbitrary"
 
 
-_CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
+CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
 
 
 def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
@@ -4752,7 +4550,7 @@ def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
         ) from None
     where = [f"{path}, poses[{i}]" for i in range(len(rows))]
     world_from_gl = _from_quaternions(rows[:, :4], rows[:, 4:], where)
-    poses = _CV_FROM_GL @ invert_rigid(world_from_gl)
+    poses = CV_FROM_GL @ invert_rigid(world_from_gl)
     return _GivenPoses(poses, camera, metric=True, up_in_world=np.array([0, 1.0, 0]))
 
 
@@ -4798,7 +4596,7 @@ def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
         what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
         raise ReobjError(f"{path}: {what}") from None
     gl_from_world = invert_rigid(_rigid(matrix, where)) @ applied  # (N, 3, 4)
-    return _GivenPoses(_CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
+    return _GivenPoses(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
 
 
 def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | None:
@@ -4868,7 +4666,7 @@ def _copy_text_model(folder: Path, copy: Path) -> None:
     """
     images = [
         (number, text.split())
-        for number, text in enumerate(_read_text(folder / "images.txt").splitlines(), 1)
+        for number, text in enumerate(read_text(folder / "images.txt").splitlines(), 1)
         if not text.startswith("#")
     ]
     rows: list[tuple[list[str], list[str]]] = []
@@ -4888,7 +4686,7 @@ def _copy_text_model(folder: Path, copy: Path) -> None:
     (copy / "images.txt").write_text("".join(lines))
     shutil.copyfile(folder / "cameras.txt", copy / "cameras.txt")
     points = folder / "points3D.txt"
-    (copy / "points3D.txt").write_text(_read_text(points) if points.exists() else "")
+    (copy / "points3D.txt").write_text(read_text(points) if points.exists() else "")
 
 
 _POSE_READERS: dict[str, Callable[[Path, tuple[int, int]], _GivenPoses]] = {
@@ -4992,8 +4790,8 @@ def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str |
         "as they are": usual,
         "world_from_cam given as cam_from_world, or the other way round": invert_rigid(usual),
         "OpenGL axes (y up, z backward) given as OpenCV axes (y down, z forward), or reversed":
-            _CV_FROM_GL @ usual,
-        "inverted and with OpenGL axes": _CV_FROM_GL @ invert_rigid(usual),
+            CV_FROM_GL @ usual,
+        "inverted and with OpenGL axes": CV_FROM_GL @ invert_rigid(usual),
     }  # fmt: skip
     views = [view for track in tracks if (view := _track_views(poses, *track)) is not None]
     views = sorted(views, key=lambda v: -len(v[0]))[:CHECK_MOST_TRACKS]
@@ -5020,7 +4818,7 @@ CHECK_MOST_VIEWS = 40  # direction check: frames of a track used at most
 
 def _track_views(poses: Poses, frame: IntArray, xy: Array) -> tuple[IntArray, Array] | None:
     """Rows of a track's frames with a pose, thinned, and unit rays (n, 3); None if too few."""
-    place, known = _place_of(poses, frame)
+    place, known = place_of(poses, frame)
     use = np.flatnonzero(known & np.isfinite(xy).all(1))
     if len(use) < CHECK_VIEWS:
         return None
@@ -5031,7 +4829,7 @@ def _track_views(poses: Poses, frame: IntArray, xy: Array) -> tuple[IntArray, Ar
     return place[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def _place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
+def place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
     """Rows (n,) of frames in the poses, and whether these have a pose there."""
     place = np.searchsorted(poses.frame, frame).clip(0, len(poses.frame) - 1)
     return place, np.asarray((poses.frame[place] == frame) & poses.known[place], bool)
@@ -5066,7 +4864,7 @@ def write_tum(path: Path, poses: Poses) -> None:
     world_from_cam = invert_rigid(poses.cam_from_world[poses.known])
     xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
-    units = "units: metres" if poses.metric else _NO_SCALE
+    units = "units: metres" if poses.metric else NO_SCALE
     rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:
@@ -5103,16 +4901,6 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
 # ---- Objects: tracklets -> one identity and one solid each -------------------------------------
 
 
-def object_classes(table: Tracks) -> dict[int, int]:
-    """Class of each object: the one with the largest sum of scores."""
-    objects, row = np.unique(table.track_id, return_inverse=True)
-    classes, column = np.unique(table.class_id, return_inverse=True)
-    votes = np.zeros((len(objects), len(classes)))
-    np.add.at(votes, (row, column), table.score)
-    best = classes[votes.argmax(1)] if len(objects) else classes
-    return dict(zip(objects.tolist(), best.tolist(), strict=True))
-
-
 @dataclass(frozen=True, slots=True)
 class Views:
     """Boxes of G groups of track rows in V frames with poses: input of `quadrics.fit_objects`.
@@ -5143,14 +4931,14 @@ def gather_views(
     use = (view >= 0) & (table.score >= min_score)
     boxes = np.full((len(row_of_frame), count, 4), np.nan)
     score = np.zeros((len(row_of_frame), count))
-    boxes[view[use], groups[use]] = _undistort_boxes(table.xyxy[use], poses.camera)
+    boxes[view[use], groups[use]] = undistort_boxes(table.xyxy[use], poses.camera)
     score[view[use], groups[use]] = table.score[use]
     img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (V, 3, 4)
     size = (poses.camera.width, poses.camera.height)
     return Views(poses.frame[poses.known], boxes, score, img_from_world, size)
 
 
-def _undistort_boxes(xyxy: Array, camera: Camera) -> Array:
+def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
     """Boxes (N, 4) whose edges go through their undistorted middles; at the border they stay."""
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
@@ -5251,7 +5039,7 @@ class Linker:
         first = np.unique(self.atom, return_index=True)[1]  # (L,)
         self.tracklets = self.table.tracklet_id[first]
         self.identity = self.table.track_id[first]
-        self.classes = _class_shares(self.table, self.atom, len(first)).argmax(1)
+        self.classes = class_shares(self.table, self.atom, len(first)).argmax(1)
         names = np.array([*class_names, ""])[self.classes.clip(max=len(class_names))]
         self.moving = np.isin(names, list(self.moving_classes))  # as the tracker has them
 
@@ -5261,7 +5049,7 @@ class Linker:
         """
         count = len(self.tracklets)
         together, double = np.zeros((count, count), bool), np.zeros((count, count), bool)
-        for rows in _rows_by(self.table.frame):
+        for rows in rows_by(self.table.frame):
             here, box = self.atom[rows], self.table.xyxy[rows]
             together[here[:, None], here[None]] = True
             double[here[:, None], here[None]] |= box_iou(box, box) > DUPLICATE_IOU
@@ -5276,7 +5064,7 @@ class Linker:
         if not track.look.size:
             return parts
         order = np.argsort(self.atom[track.look_row], kind="stable")
-        rows, unit = track.look_row[order], _unit_rows(track.look[order])
+        rows, unit = track.look_row[order], unit_rows(track.look[order])
         atoms, starts, block = np.unique(self.atom[rows], return_index=True, return_inverse=True)
         split, sight = track.split or unit.shape[1], self._sight(rows)
         for atom, mine in zip(atoms, np.split(np.arange(len(rows)), starts[1:]), strict=True):
@@ -5286,7 +5074,7 @@ class Linker:
             cosine[:, mine] = np.where(soon, -np.inf, cosine[:, mine])
             view = np.lexsort((-cosine.max(0), block))[starts]  # (atoms,) the best of each
             own = mine[cosine[:, view].argmax(0)]
-            paired = [_paired_cosine(x[own], x[view]) for x in np.split(unit, [split], 1)]
+            paired = [paired_cosine(x[own], x[view]) for x in np.split(unit, [split], 1)]
             paired.append(angle_deg(sight[own], sight[view]))
             parts[:, atom, atoms] = np.where(np.isinf(cosine[:, view].max(0)), np.nan, paired)
         return parts
@@ -5295,10 +5083,10 @@ class Linker:
         """Directions (n, 3) in which rows of the table were seen, NaN without a pose."""
         if self.poses is None:
             return np.full((len(rows), 3), np.nan)
-        place, known = _place_of(self.poses, self.table.frame[rows])
+        place, known = place_of(self.poses, self.table.frame[rows])
         camera = self.poses.camera
         cams = np.where(known[:, None, None], self.poses.cam_from_world[place], np.nan)
-        return sight_lines(_undistort_boxes(self.table.xyxy[rows], camera), camera.K @ cams)
+        return sight_lines(undistort_boxes(self.table.xyxy[rows], camera), camera.K @ cams)
 
     def _nearness(self, foreground: Array, background: Array, angle: Array) -> Array:
         """(L, L) log odds that atoms look like one object, NaN: unknown.
@@ -5316,7 +5104,7 @@ class Linker:
         """Group the tracklets anew by their looks and list what differs from the tracker."""
         keep = np.where(self.moving, -self.identity, self.tracklets)
         whole = np.unique(keep, return_inverse=True)[1]  # (L,) tracklet of each atom
-        kind = _class_shares(self.table, whole[self.atom], int(whole.max()) + 1).argmax(1)  # (T,)
+        kind = class_shares(self.table, whole[self.atom], int(whole.max()) + 1).argmax(1)  # (T,)
         kind[whole[self.moving]] = -1 - whole[self.moving]  # a kind of its own
         near = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), whole)  # (T, T)
         banned, apart = (_grouped_max(x, whole) for x in (self.together, self.apart))
@@ -5399,7 +5187,7 @@ class Linker:
         assert self.poses is not None and self.fit is not None
         rows = labels[self.atom]  # (N,)
         views = gather_views(self.table, self.poses, rows, count, self.min_score)
-        classes = _class_shares(self.table, rows, count).argmax(1)
+        classes = class_shares(self.table, rows, count).argmax(1)
         fits = self.fit(views, classes.tolist())
         solids = quadrics.solid_boxes(fits.ellipsoids, list(fits.support), views.img_from_world)
         solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
@@ -5467,7 +5255,7 @@ class Linker:
     ) -> list[tuple[int, int, float, float]]:
         """Disjoint pairs of groups worth a joint fit: (a, b, cross IoU, look), best first."""
         apart = _grouped_max(self.together, self.group)  # (G, G) cannot be one
-        share = _class_shares(self.table, self.group[self.atom], count)  # (G, C)
+        share = class_shares(self.table, self.group[self.atom], count)  # (G, C)
         confused = np.minimum(share[:, None], share).sum(-1) >= LINK_CLASS  # (G, G)
         look = _grouped_max(np.nan_to_num(self.near, nan=-np.inf), self.group)  # (G, G)
         look = np.where(np.isfinite(look), look, 0.0)  # nothing known speaks for nothing
@@ -5565,13 +5353,6 @@ def _segments_of(table: Tracks, cut_gap: int) -> IntArray:
     return segment
 
 
-def _class_shares(table: Tracks, group: IntArray, count: int) -> Array:
-    """Share of every class in the scores of each group of rows, (count, C)."""
-    votes = np.zeros((count, int(table.class_id.max(initial=0)) + 1))
-    np.add.at(votes, (group, table.class_id.clip(0)), table.score)
-    return np.asarray(votes / np.maximum(votes.sum(1, keepdims=True), 1e-9))
-
-
 # ---- Writers -----------------------------------------------------------------------------------
 
 
@@ -5650,7 +5431,7 @@ def validate_objects(path: Path) -> list[str]:
     except ImportError as error:
         raise ReobjError("jsonschema is not installed: pip install jsonschema") from error
     schema = json.loads(Path(__file__).with_name("objects.schema.json").read_text())
-    faults = jsonschema.Draft202012Validator(schema).iter_errors(_load_json(path))
+    faults = jsonschema.Draft202012Validator(schema).iter_errors(load_json(path))
     return sorted(f"{path}: {fault.json_path}: {fault.message[:200]}" for fault in faults)
 
 
@@ -5663,15 +5444,6 @@ def quat_wxyz_from_matrix(rotation: Array) -> Array:
 
 
 # ---- Overlay -----------------------------------------------------------------------------------
-
-
-def object_color(object_id: int) -> tuple[int, int, int]:
-    """A BGR colour for an identity, well apart from its neighbours (golden-angle hues)."""
-    hue = object_id * 0.381966 % 1.0
-    color = (round(hue * 179), 200 - 60 * (object_id % 2), 255 - 45 * (object_id // 2 % 2))
-    hsv = np.array([[color]], np.uint8)
-    blue, green, red = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].tolist()
-    return blue, green, red
 
 
 def draw_tracks(image: Image, table: Tracks, labels: dict[int, str], scale: float) -> None:
@@ -5922,7 +5694,7 @@ def write_scene(result: RunResult, pictures: Pictures, video: Video) -> None:
         "warnings": result.warnings,
         "world": {k: v for k, v in result.world.items() if k != "links"},
         "links": [
-            link | {key: _rounded(link[key], 2) for key in ("place_iou", "look")}
+            link | {key: rounded(link[key], 2) for key in ("place_iou", "look")}
             for link in result.world["links"]
         ],
         "objects": [_scene_object(o, result.table, steps, pictures) for o in result.objects],
@@ -5937,7 +5709,7 @@ def write_scene(result: RunResult, pictures: Pictures, video: Video) -> None:
         part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
 
 
-def _base64(values: npt.NDArray[Any], kind: str) -> str:
+def base64_text(values: npt.NDArray[Any], kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
 
 
@@ -5958,10 +5730,12 @@ def _scene_cameras(
     size = {"width": poses.camera.width, "height": poses.camera.height}
     return {
         "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
-        "poses": _base64(invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)]), "<f4"),
-        "points": _base64(poses.points[thin], "<f4"),
-        "colors": _base64(poses.colors[thin], "u1"),
-        "up": _numbers(up),
+        "poses": base64_text(
+            invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)]), "<f4"
+        ),
+        "points": base64_text(poses.points[thin], "<f4"),
+        "colors": base64_text(poses.colors[thin], "u1"),
+        "up": numbers(up),
     }
 
 
@@ -6353,7 +6127,7 @@ def _track_frames(
     cache = DetectionCache(cache_path, video.working_size) if cache_path and source.slow else None
     tracker = Tracker(config.tracker, _embedder(config))
     pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
-    camera = None if poses is None else _scaled_camera(poses.camera, video.scale)
+    camera = None if poses is None else scaled_camera(poses.camera, video.scale)
     steps: list[tuple[int, Tracks]] = []
     looks: list[tuple[IntArray, Floats]] = []
     progress = Progress("track", video.expected)
@@ -6416,7 +6190,7 @@ def _embedder(config: Config) -> Embedder | None:
     return Embedder(config.embed.model, config.embed.head, None, config.threads, config.offline)
 
 
-def _scaled_camera(camera: Camera, scale: float) -> Camera:
+def scaled_camera(camera: Camera, scale: float) -> Camera:
     """The pinhole part of a camera for images resized by `scale`."""
     K = camera.K
     params = (K[0, 0] * scale, K[1, 1] * scale, K[0, 2] * scale, K[1, 2] * scale)
@@ -6447,17 +6221,10 @@ def _check_supplied(poses: Poses, table: Tracks) -> None:
     if poses.source != "user":
         return
     centers = (table.xyxy[:, :2] + table.xyxy[:, 2:]) / 2
-    tracks = [(table.frame[rows], centers[rows]) for rows in _rows_by(table.tracklet_id)]
+    tracks = [(table.frame[rows], centers[rows]) for rows in rows_by(table.tracklet_id)]
     fault = check_poses(poses, tracks)
     if fault:
         raise ReobjError(fault)
-
-
-def _rows_by(group: IntArray) -> list[IntArray]:
-    """Row numbers of each distinct value, in the order of the values."""
-    order = np.argsort(group, kind="stable")
-    _, starts = np.unique(group[order], return_index=True)
-    return np.split(order, starts[1:]) if len(group) else []
 
 
 def _reconstruct(
@@ -6501,7 +6268,7 @@ def make_objects(
     table, events, fits, views, fit = track.table, [], None, None, None
     located = poses is not None and poses.known.sum() >= config.objects.min_views
     if located and poses is not None:
-        fit = _fitter(config.objects, poses, track.class_names)
+        fit = fitter(config.objects, poses, track.class_names)
     if len(table) and config.objects.link and not track.fixed:
         own = config.objects
         linker = Linker(
@@ -6516,14 +6283,14 @@ def make_objects(
         group = np.searchsorted(list(classes), table.track_id)
         views = gather_views(table, poses, group, len(classes), config.objects.min_score)
         fits = fit(views, list(classes.values()))
-    objects = _object_entries(table, track.class_names, fits, views, config.objects)
+    objects = object_entries(table, track.class_names, fits, views, config.objects)
     seconds["objects"] = time.monotonic() - started
     result = RunResult(out, table, track.class_names, objects, poses, fits, seconds, [])
-    result.world = _world_entry(poses, fits, events)
+    result.world = world_entry(poses, fits, events)
     return result
 
 
-def _fitter(
+def fitter(
     config: ObjectsConfig, poses: Poses, class_names: Sequence[str]
 ) -> Callable[[Views, list[int]], Any]:
     """Bind priors, scale and gravity to `quadrics.fit_objects`."""
@@ -6573,7 +6340,7 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
 # ---- Results -----------------------------------------------------------------------------------
 
 
-def _object_entries(
+def object_entries(
     table: Tracks,
     class_names: Sequence[str],
     fits: Any,
@@ -6622,19 +6389,19 @@ def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array)
         "support": str(fits.support[i]),
         "views": int(seen.sum()),
         "dropped_boxes": int((seen & ~fits.inlier[:, i]).sum()),
-        "parallax_deg": _rounded(fits.parallax_deg[i], 2),
-        "reprojection_iou_median": _rounded(np.median(iou[seen]), 3) if seen.any() else None,
+        "parallax_deg": rounded(fits.parallax_deg[i], 2),
+        "reprojection_iou_median": rounded(np.median(iou[seen]), 3) if seen.any() else None,
     }
     if entry["status"] != "rejected":
         size = fits.size[i]
         entry |= {
-            "center": _numbers(solid.center_in_world[i]),
-            "half_axes": _numbers(solid.half_axes[i]),
-            "quat_wxyz": _numbers(quat_wxyz_from_matrix(solid.world_from_obj[i : i + 1])[0]),
-            "size": _numbers(size),
-            "cov": [_numbers(row) for row in fits.cov[i]],
-            "size_m": _numbers(size * scale.value) if scale.source != "none" else None,
-            "size_rel_sigma": _numbers(np.sqrt(np.diag(fits.cov[i])[3:6] + scale.rel_sigma**2)),
+            "center": numbers(solid.center_in_world[i]),
+            "half_axes": numbers(solid.half_axes[i]),
+            "quat_wxyz": numbers(quat_wxyz_from_matrix(solid.world_from_obj[i : i + 1])[0]),
+            "size": numbers(size),
+            "cov": [numbers(row) for row in fits.cov[i]],
+            "size_m": numbers(size * scale.value) if scale.source != "none" else None,
+            "size_rel_sigma": numbers(np.sqrt(np.diag(fits.cov[i])[3:6] + scale.rel_sigma**2)),
         }
 
 
@@ -6643,22 +6410,22 @@ def _reject(entry: dict[str, Any], reason: str) -> None:
     entry |= {"status": "rejected", "reason": reason}
 
 
-def _rounded(value: float | None, digits: int) -> float | None:
+def rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
-def _numbers(values: Array) -> list[float]:
+def numbers(values: Array) -> list[float]:
     """Six significant digits: far below any accuracy, and stable text."""
     return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
 
 
 def _spans_of(rows: Tracks) -> list[list[int]]:
     """First and last frame of every tracklet, by time."""
-    frames = [rows.frame[r] for r in _rows_by(rows.tracklet_id)]
+    frames = [rows.frame[r] for r in rows_by(rows.tracklet_id)]
     return sorted([int(f.min()), int(f.max())] for f in frames)
 
 
-def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
+def world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
     """The "world" of objects.json: units, gravity, scale, registered frames, joins and splits."""
     links = [dataclasses.asdict(event) for event in events]
     if poses is None:
@@ -6666,8 +6433,8 @@ def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) ->
     scale = None
     if fits is not None:
         scale = {
-            "metres_per_unit": _rounded(fits.scale.value, 6),
-            "rel_sigma": _rounded(fits.scale.rel_sigma, 4),
+            "metres_per_unit": rounded(fits.scale.value, 6),
+            "rel_sigma": rounded(fits.scale.rel_sigma, 4),
             "source": fits.scale.source,
         }
     up = fits.up if fits is not None and fits.up.any() else poses.up_in_world
@@ -6677,7 +6444,7 @@ def _world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) ->
         "registered_frames": int(poses.known.sum()),
         "interpolated_frames": int((poses.status == "interpolated").sum()),
         "frames": len(poses.frame),
-        "up_in_world": None if up is None else _numbers(up),
+        "up_in_world": None if up is None else numbers(up),
         "up_source": fits.up_source if fits is not None else "none" if up is None else "poses",
         "scale": scale,
         "links": links,
@@ -6712,7 +6479,7 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
     for name in old:  # of an earlier run; cameras.csv: of an earlier version
         (out / name).unlink(missing_ok=True)
     write_mot(out / "tracks.txt", result.table)
-    _write_objects_json(result, video)
+    write_objects_json(result, video)
     if result.poses is not None:
         write_cameras(out, result.poses, video)
     kept = np.array([o["status"] != "rejected" for o in result.objects], bool)
@@ -6741,7 +6508,7 @@ def write_results(result: RunResult, video: Video, config: Config) -> None:
     result.seconds["write"] = time.monotonic() - started
 
 
-def _write_objects_json(result: RunResult, video: Video) -> None:
+def write_objects_json(result: RunResult, video: Video) -> None:
     from importlib.metadata import version
 
     packages = ("numpy", "scipy", "opencv-python-headless", "pycolmap", "onnxruntime")
@@ -6969,7 +6736,7 @@ def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
     g, p = matched_rows(truth, found)
     known: dict[int, set[int]] = {}
     kept = []
-    for rows in _rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+    for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
         ids, votes = np.unique(found.identity[p[rows]], return_counts=True)
         before = known.setdefault(int(truth.identity[g[rows[0]]]), set())
         kept += [int(ids[votes.argmax()]) in before] if before else []
@@ -6993,7 +6760,7 @@ def return_ranks(truth: LabelledBoxes, found: LabelledBoxes, look: npt.NDArray[A
     use = np.isfinite(look[p]).all(1)
     g, p = g[use], p[use]
     ranks = []
-    for rows in _rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+    for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
         start, me = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
         known = np.flatnonzero(truth.frame[g] < start)
         known = known[truth.name[g[known]] == truth.name[g[rows[0]]]]
@@ -7235,7 +7002,7 @@ def score_looks(out: Path, truth: LabelledBoxes) -> dict[str, float]:
     box = np.c_[table.xyxy[:, :2], table.xyxy[:, 2:] - table.xyxy[:, :2]]
     rows = np.c_[table.frame + 1, np.arange(len(table)), box]
     found = labelled(rows, np.array(track.class_names)[table.class_id])
-    rank = return_ranks(truth, found, _unit_rows(track.look))
+    rank = return_ranks(truth, found, unit_rows(track.look))
     shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}
     return {"queries": len(rank), **shares}
 
@@ -7545,7 +7312,7 @@ def read_tracks(
 def _as_known(known: Tracks, table: Tracks, unnamed: bool) -> Tracks:
     """Give unmoved boxes their earlier scores, and unnamed ones the class that overlaps most."""
     class_id, score = table.class_id.copy(), table.score.copy()
-    for rows in _rows_by(table.frame):
+    for rows in rows_by(table.frame):
         there = known[known.frame == table.frame[rows[0]]]
         iou = np.hstack([box_iou(table.xyxy[rows], there.xyxy), np.zeros((len(rows), 1))])
         best, same = iou.argmax(1), iou.max(1) > SAME_BOX
