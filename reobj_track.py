@@ -58,7 +58,7 @@ import time
 import urllib.request
 import zipfile
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,6 +73,20 @@ from scipy.spatial.transform import Rotation, Slerp
 
 import quadrics
 from reobj import __version__
+from reobj.files import (
+    Progress,
+    atomic,
+    base64_text,
+    load_json,
+    load_npz,
+    numbers,
+    read_text,
+    rounded,
+    save_npz,
+    shortened,
+    spans,
+    without_password,
+)
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -308,38 +322,6 @@ class Poses:
     def known(self) -> BoolArray:
         """(F,) True where the frame has a pose."""
         return np.asarray(np.isfinite(self.cam_from_world).all((1, 2)), bool)
-
-
-class Progress:
-    """One line a stage on stderr with rate and time left; silent when stderr is no terminal."""
-
-    def __init__(self, stage: str, total: int = 0) -> None:
-        self.stage, self.total, self.done = stage, total, 0
-        self.started, self.shown = time.monotonic(), 0.0
-        self.enabled = sys.stderr.isatty()
-
-    def step(self, n: int = 1) -> None:
-        """Count n more; redraw at most ten times a second."""
-        self.done += n
-        if self.enabled and time.monotonic() - self.shown > 0.1:
-            self._draw()
-
-    def _draw(self) -> None:
-        self.shown = time.monotonic()
-        rate = self.done / max(self.shown - self.started, 1e-6)
-        text = f"{self.stage:<10}{self.done}"
-        if self.total:
-            left = max(self.total - self.done, 0) / rate if rate else math.inf
-            text += f"/{self.total} {100 * self.done / self.total:3.0f} %"
-            text += f", {left:.0f} s left" if math.isfinite(left) else ""
-        sys.stderr.write(f"\r{text}, {rate:.1f}/s\x1b[K")  # erase what a longer line left behind
-
-    def close(self) -> float:
-        """Finish the line and return the seconds since the start."""
-        if self.enabled and self.done:
-            self._draw()
-            sys.stderr.write("\n")
-        return time.monotonic() - self.started
 
 
 # ---- Weights -----------------------------------------------------------------------------------
@@ -709,20 +691,6 @@ class Video:
         return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
 
 
-def without_password(text: str) -> str:
-    """Return a text whose URLs have lost user and password: what may be shown and written.
-
-    >>> without_password("rtsp://me:secret@10.0.0.7/stream")
-    'rtsp://10.0.0.7/stream'
-    """
-    return re.sub(r"(?<=://)[^/@\s]*@", "", text)
-
-
-def shortened(items: Sequence[Any]) -> str:
-    """Return the first five of a list, for messages."""
-    return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
-
-
 def _image_files(source: str) -> list[Path]:
     """Return the images of a folder, glob or single file, image2 before image10; [] for videos."""
     path = Path(source)
@@ -868,13 +836,6 @@ def read_detections(
     return found
 
 
-def read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ReobjError(f"{path}: cannot be read as text ({error})") from error
-
-
 def read_mot_rows(path: Path) -> Array:
     """Read a MOTChallenge file: rows (N, 6 to 10) of numbers; (0, 10) of an empty file."""
     columns, cells, lines, is_mot = _table_cells(path)
@@ -1007,13 +968,6 @@ def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetect
         tuple(classes), video.size, video.working_size, np.arange(len(entries)), "entry", messages,
         np.array([entry.get("track_id", entry.get("instance_id", -1)) for entry in entries]),
     )  # fmt: skip
-
-
-def load_json(path: Path) -> Any:
-    try:
-        return json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
 
 
 def _coco_dataset(
@@ -1184,27 +1138,6 @@ def pack_detections(
         "mask_counts": np.concatenate(runs),
         "mask_offsets": np.cumsum([len(run) for run in runs]),
     }
-
-
-def save_npz(path: Path, arrays: Mapping[str, Any], **facts: Any) -> None:
-    """Write arrays, and facts as JSON, to an npz file that is there whole or not at all."""
-    with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **arrays, facts=np.array(json.dumps(facts)))
-
-
-def load_npz(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read the arrays and the facts that `save_npz` wrote.
-
-    Raises:
-        ReobjError: damaged, or no npz file.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays: dict[str, Any] = dict(file)
-        facts: dict[str, Any] = json.loads(str(arrays.pop("facts", "{}")))
-    except Exception as error:  # zip, zlib and numpy each have their own for damaged files
-        raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
-    return arrays, facts
 
 
 def write_detections_npz(
@@ -3545,21 +3478,6 @@ def _exif_focal(video: Any) -> float:
     return 0.0
 
 
-def spans(numbers: Iterable[int], step: int = 1) -> str:
-    """Write ascending numbers as spans.
-
-    >>> spans([3, 4, 5, 9])
-    '3-5, 9'
-    """
-    spans: list[list[int]] = []
-    for n in numbers:
-        if spans and n - spans[-1][1] <= step:
-            spans[-1][1] = n
-        else:
-            spans.append([n, n])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in spans)
-
-
 def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
     """Say which frames have no pose and what helps."""
     step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
@@ -5356,18 +5274,6 @@ def _segments_of(table: Tracks, cut_gap: int) -> IntArray:
 # ---- Writers -----------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """Write a file under a temporary name beside it; it gets its own when it is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".part-{path.name}")
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def write_mot(path: Path, table: Tracks) -> None:
     """Write MOTChallenge results: frame (from 1), id, left, top, width, height, score, 3 x -1."""
     ltwh = np.column_stack([table.xyxy[:, :2], table.xyxy[:, 2:] - table.xyxy[:, :2]])
@@ -5707,10 +5613,6 @@ def write_scene(result: RunResult, pictures: Pictures, video: Video) -> None:
     head, tail = Path(__file__).with_name("scene_template.html").read_text().split("@DATA@")
     with atomic(result.out / "scene.html") as part:
         part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
-
-
-def base64_text(values: npt.NDArray[Any], kind: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
 
 
 SCENE_POINTS = 20000  # sparse points in scene.html (more: every n-th)
@@ -6408,15 +6310,6 @@ def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array)
 def _reject(entry: dict[str, Any], reason: str) -> None:
     entry |= dict.fromkeys(SOLID_FIELDS) | {"support": None}
     entry |= {"status": "rejected", "reason": reason}
-
-
-def rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(float(value), digits)
-
-
-def numbers(values: Array) -> list[float]:
-    """Six significant digits: far below any accuracy, and stable text."""
-    return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
 
 
 def _spans_of(rows: Tracks) -> list[list[int]]:
