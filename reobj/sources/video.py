@@ -1,0 +1,275 @@
+"""Frames of a video file, image folder, camera or stream."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import json
+import math
+import os
+import queue
+import re
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from reobj.files import shortened, without_password
+from reobj.types import Frame, Image, ReobjError, option
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+IMAGE_FPS = 30.0  # of image folders
+SHORT_SHARE = 0.02  # of the announced frames may be missing at the end before it is worth a warning
+MAX_BAD_RUN = 64  # unreadable frames in a row after which a video has ended
+STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
+LIVE_WAITING = 2  # newest frames of a live source that wait for the tracker; older ones are dropped
+LIVE_SILENCE_S = 2.0  # without any frame: a live source has ended
+
+
+@dataclass(frozen=True, slots=True)
+class InputConfig:
+    """Which frames are read. Frame numbers are those of the source, whatever `every` is."""
+
+    every: int = option(1, "use every N-th frame", "--every")
+    start: int = option(0, "first frame (0-based)", "--start")
+    stop: int = option(0, "frame to stop before (0: the end)", "--stop")
+    max_size: int = option(0, "shrink frames to this longer side, px (0: native)", "--max-size")
+
+
+class Video:
+    """Frames of a video file, an image folder, a glob, a camera index or a stream's URL.
+
+    Iterating yields `Frame`s, as often as wanted. Frame numbers are those of the source: rows of
+    the sorted images, or frames of the file in order, unreadable ones counted. A live source never
+    waits: what comes while its frames are worked on is dropped, except for the newest; dropped
+    frames are counted too.
+
+    Attributes:
+        is_live: a camera or stream, which cannot be read twice; read, dropped: its frames so far.
+        source: what was given, without a URL's password. names: of image files by frame number.
+        size, working_size: (w, h) of the source after rotation, and of the frames; scale: ratio.
+        fps: mean frame rate. frame_count: of the source (0 if unknown).
+        skipped: frames of the last iteration that could not be read or had another size.
+        messages: warnings, each once.
+    """
+
+    def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
+        self._address, self.config = str(source), config or InputConfig()
+        self.source = without_password(self._address)
+        if self.config.every < 1 or self.config.start < 0 or self.config.max_size < 0:
+            raise ReobjError("--every must be at least 1, --start and --max-size at least 0")
+        self.skipped: list[int] = []
+        self.messages: list[str] = []
+        self.read = self.dropped = 0
+        self._live: Any = None  # the opened capture of a live source until it is iterated
+        self._is_url = bool(STREAM.match(self._address))
+        self._files = [] if self._is_url else _image_files(self.source)
+        self.names = [path.name for path in self._files]
+        self.is_live = self._is_url or (self.source.isdigit() and not Path(self.source).exists())
+        self.size, self.fps, self.frame_count = self._probe()
+        if 0 < self.frame_count <= self.config.start:
+            raise ReobjError(f"{self.source}: --start {self.config.start}, but it has only "
+                             f"{self.frame_count} frames")  # fmt: skip
+        ratio = min(1.0, self.config.max_size / max(self.size)) if self.config.max_size else 1.0
+        width, height = (max(round(side * ratio), 1) for side in self.size)
+        self.working_size = (width, height)
+        self.scale = width / self.size[0]
+
+    def name(self, index: int) -> str:
+        """Return the file name of a frame, "" for videos."""
+        return self.names[index] if self.names else ""
+
+    @property
+    def expected(self) -> int:
+        """Number of frames that an iteration yields at most (0 if unknown)."""
+        stop = min(self.config.stop or self.frame_count, self.frame_count or self.config.stop)
+        return max(math.ceil((stop - self.config.start) / self.config.every), 0)
+
+    def __iter__(self) -> Iterator[Frame]:
+        self.skipped.clear()
+        decoded = self._from_live() if self.is_live else self._from_capture()
+        if self._files:
+            stop = min(self.config.stop or self.frame_count, self.frame_count)
+            numbers = range(self.config.start, stop, self.config.every)
+            decoded = ((i, i / IMAGE_FPS, _read_image(self._files[i])) for i in numbers)
+        for index, time_s, image in decoded:
+            if image is None or (image.shape[1], image.shape[0]) != self.size:
+                self.skipped.append(index)
+                continue
+            if self.working_size != self.size:
+                small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
+                image = np.asarray(small, np.uint8)
+            yield Frame(index, time_s, image)
+        if self.skipped:
+            self._warn(f"{len(self.skipped)} frames skipped (unreadable or of another size): "
+                       f"{shortened(self.skipped)}")  # fmt: skip
+
+    def _warn(self, text: str) -> None:
+        if (text := f"{self.source}: {text}") not in self.messages:
+            self.messages.append(text)
+
+    def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
+        """Yield number, time and image of every wanted frame, None if it cannot be read."""
+        capture, start, every = self._open(), self.config.start, self.config.every
+        previous_s, bad, index = -1.0, 0, -1
+        pending: list[tuple[int, float, Image | None]] = []  # unreadable, or beyond the end
+        for index in range(self.config.stop or sys.maxsize):
+            wanted = index >= start and (index - start) % every == 0
+            grabbed = capture.grab()
+            # Right after the grab this is the frame's true time, also at a variable rate.
+            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            if time_s <= previous_s:  # some containers have no times
+                time_s = previous_s + 1 / self.fps
+            ok, image = capture.retrieve() if grabbed and wanted else (grabbed, None)
+            if not ok:
+                bad += 1
+                pending += [(index, time_s, None)] if wanted else []
+                if bad >= MAX_BAD_RUN:
+                    break
+                continue
+            yield from pending
+            pending, bad, previous_s = [], 0, time_s
+            if wanted:
+                yield index, time_s, image
+        read, stop = index + 1 - bad, self.config.stop or self.frame_count
+        if min(stop, self.frame_count) - read > max(1.0, SHORT_SHARE * self.frame_count):
+            self._warn(f"the file ends early: {read} of {self.frame_count} frames can be read")
+
+    def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
+        """Yield the newest frames of a live source; a thread reads them all and drops the rest."""
+        capture, self._live = self._live or self._open(), None
+        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_WAITING)
+        stopped = threading.Event()
+        thread = threading.Thread(
+            target=self._read_live, args=(capture, frames, stopped), daemon=True
+        )
+        thread.start()
+        try:
+            while (item := frames.get()) is not None:
+                yield item
+        finally:
+            stopped.set()
+            thread.join(LIVE_SILENCE_S)
+            if not thread.is_alive():  # else it hangs in the driver; the process may still end
+                capture.release()
+
+    def _read_live(
+        self,
+        capture: Any,
+        frames: queue.Queue[tuple[int, float, Image] | None],
+        stopped: threading.Event,
+    ) -> None:
+        """Read a live source until it ends; only the last LIVE_WAITING wanted frames wait."""
+        began = last = time.monotonic()
+        self.read = self.dropped = index = 0
+        try:
+            while not stopped.is_set() and time.monotonic() - last < LIVE_SILENCE_S:
+                if 0 < self.config.stop <= index:
+                    break
+                ok, image = capture.read()
+                if not ok:
+                    time.sleep(0.01)
+                    continue
+                last, at, index = time.monotonic(), index, index + 1
+                if at < self.config.start or (at - self.config.start) % self.config.every:
+                    continue
+                self.read += 1
+                if frames.full():
+                    with contextlib.suppress(queue.Empty):  # the tracker was faster
+                        frames.get_nowait()
+                        self.dropped += 1
+                frames.put((at, last - began, image))  # this thread alone puts: there is room
+        finally:
+            while not stopped.is_set():  # say that it ended, behind the frames that wait
+                with contextlib.suppress(queue.Full):
+                    frames.put(None, timeout=0.1)
+                    break
+
+    def _open(self) -> Any:
+        """Open the source with OpenCV, which turns the frames upright by the file's rotation."""
+        if not self.is_live and not self._is_url and not Path(self.source).is_file():
+            raise ReobjError(f"{self.source}: no such file or folder")
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        is_camera = self.is_live and self._address.isdigit()
+        capture = cv2.VideoCapture(int(self._address) if is_camera else self._address)
+        cv2.utils.logging.setLogLevel(level)
+        if not capture.isOpened():
+            what = "video (damaged, or no video)"
+            if self.is_live:
+                what = "camera (is it connected?)" if is_camera else "stream (is it there?)"
+            raise ReobjError(f"{self.source}: cannot be opened as a {what}")
+        return capture
+
+    def _probe(self) -> tuple[tuple[int, int], float, int]:
+        """Return size, frame rate and number of frames, from the first readable frame."""
+        images: Iterator[Image | None] = map(_read_image, self._files)
+        fps, count = IMAGE_FPS, len(self._files)
+        if not self._files:
+            capture = self._open()
+            images = (capture.read()[1] for _ in range(MAX_BAD_RUN))
+            fps = float(capture.get(cv2.CAP_PROP_FPS))
+            if not self._address.isdigit():
+                count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+            self.is_live = self.is_live and not count  # a URL may be that of a file
+            self._live = capture if self.is_live else None
+        image = next((image for image in images if image is not None), None)
+        if image is None:
+            raise ReobjError(f"{self.source}: not one frame can be decoded")
+        return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
+
+
+def _image_files(source: str) -> list[Path]:
+    """Return the images of a folder, glob or single file, image2 before image10; [] for videos."""
+    path = Path(source)
+    if path.is_file():
+        return [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
+    if not path.is_dir() and not re.search(r"[*?\[]", source):
+        return []
+    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(source))
+    files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
+    if not files:
+        raise ReobjError(f"{source}: no images there (looked for {' '.join(IMAGE_SUFFIXES)})")
+    return sorted(files, key=lambda p: re.sub(r"\d+", lambda n: n[0].zfill(20), p.name))
+
+
+def _read_image(path: Path) -> Image | None:
+    """Read an image as BGR, upright by its EXIF tag; None if it is none."""
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    except (OSError, cv2.error):
+        return None
+    return None if image is None else np.asarray(image, np.uint8)
+
+
+def resized(image: Image, size: Sequence[int]) -> Image:
+    """Resize to (w, h) by averaging; by halves first, which is 4 times as fast on large frames."""
+    while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
+        half = (image.shape[1] // 2, image.shape[0] // 2)
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def shrunk(image: Image, size_px: int) -> Image:
+    """A copy whose longer side is at most size_px."""
+    ratio = min(1.0, size_px / max(image.shape[:2]))
+    return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
+
+
+def source_fingerprint(source: Any) -> str:
+    """Hash of names, sizes and times of a file, a folder's files or a glob; streams: their name."""
+    path = Path(str(source))
+    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(source)))
+    files = sorted(p for p in found if p.is_file()) or [path] * path.is_file()
+    if not files:
+        return str(source)
+    facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
