@@ -39,7 +39,6 @@ import csv
 import dataclasses
 import functools
 import hashlib
-import http.client
 import itertools
 import json
 import logging
@@ -51,7 +50,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import urllib.request
 import zipfile
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -108,6 +106,15 @@ from reobj.files import (
     without_password,
 )
 from reobj.sources.video import IMAGE_FPS, InputConfig, Video, resized, shrunk, source_fingerprint
+from reobj.sources.weights import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    list_models,
+    model_path,
+    onnx_metadata,
+    onnx_session,
+    own_models,
+)
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -267,179 +274,6 @@ class Config:
     output: OutputConfig = field(default_factory=OutputConfig)
     threads: int = option(0, "threads of onnxruntime, OpenCV and numpy (0: all cores)", "--threads")
     offline: bool = option(False, "never download weights", "--offline")
-
-
-# ---- Weights -----------------------------------------------------------------------------------
-
-DOWNLOAD_CHUNK = 1 << 16  # bytes read at a time
-DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
-
-
-@dataclass(frozen=True, slots=True)
-class Weights:
-    """A file of pre-trained weights; without `url` it comes along in `models`."""
-
-    name: str
-    role: str  # detector, backbone or reid (appearance of persons)
-    file: str
-    url: str  # pinned at a commit
-    sha256: str
-    size: int
-    licence: str
-    note: str = ""  # AP: 164 images of COCO val2017; ms: one thread
-
-
-_GITHUB = "https://github.com/"
-_DEIM = _GITHUB + "Kazuhito00/DEIMv2-ONNX-Sample/raw/f88d4382abca74edb26ed4c7f46190ac40da0ea5/"
-_YOLOX = (_GITHUB + "Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
-          "3d4f1119d0694200671c08069ecb847aa0d8495a/")  # fmt: skip
-_PICODET = _GITHUB + "hpc203/picodet-onnxruntime/raw/dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/"
-
-WEIGHTS: tuple[Weights, ...] = (
-    Weights("deimv2-femto", "detector", "deimv2_hgnetv2_femto_coco.onnx",
-            _DEIM + "model/deimv2_hgnetv2_femto_coco.onnx",
-            "c6ad358f750132b891165e034c2ba507abefc5ebe1c1d2732a0acbcacc47e52c", 4116144,
-            "Apache-2.0", "default; COCO, AP 33.2, 39 ms"),
-    Weights("deimv2-atto", "detector", "deimv2_hgnetv2_atto_coco.onnx",
-            _DEIM + "model/deimv2_hgnetv2_atto_coco.onnx",
-            "b114aa6610ac7c2bd9b3186ffb001afa872430db957407ef2473f7148d00646e", 2248408,
-            "Apache-2.0", "smallest; COCO, AP 25.5, 21 ms"),
-    Weights("yolox-nano", "detector", "yolox_nano_416.onnx", _YOLOX + "model/yolox_nano.onnx",
-            "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14", 3660092,
-            "Apache-2.0", "COCO, AP 28.6, 27 ms"),
-    Weights("picodet-s-416", "detector", "picodet_s_416_coco.onnx",
-            _PICODET + "picodet_s_416_coco.onnx",
-            "cdab77bdde16e4f76bec734c4e5791801d1739e4c7ec1995e0e110e04300d0c2", 4040573,
-            "Apache-2.0", "COCO, AP 33.5, 46 ms"),
-    Weights("reobj", "backbone", "reobj.onnx", "",
-            "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 392965,
-            "MIT", "ours, comes along: foreground and background, trained with its head"),
-)  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class ModelRow:
-    """A known file: "verified", "wrong sha256" or "missing"."""
-
-    weights: Weights
-    state: str
-    path: Path | None
-
-
-def _model_folders() -> list[Path]:
-    """Return the folders searched for weights: REOBJ_MODELS, if set, then the platform's cache."""
-    home = Path.home()
-    if sys.platform == "win32":
-        cache = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        cache = home / "Library" / "Caches"
-    else:
-        cache = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
-    own = os.environ.get("REOBJ_MODELS")
-    return [*([Path(own).expanduser()] if own else []), Path(cache) / "reobj_track"]
-
-
-def own_models() -> Path:
-    """Return the folder of our own weights: `models`, where installed `reobj_models`."""
-    installed = Path(__file__).resolve().parent / "reobj_models"
-    return installed if installed.is_dir() else installed.with_name("models")
-
-
-def _find_model(*files: str) -> Path | None:
-    folders = [*_model_folders(), own_models()]
-    paths = (folder / file for folder in folders for file in files)
-    return next((path for path in paths if path.is_file()), None)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def list_models() -> list[ModelRow]:
-    """Return every known file of weights with its state on this machine."""
-    rows = []
-    for weights in WEIGHTS:
-        path, state = _find_model(weights.file), "missing"
-        if path is not None:
-            state = "verified" if _sha256(path) == weights.sha256 else "wrong sha256"
-        rows.append(ModelRow(weights, state, path))
-    return rows
-
-
-def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
-    """Return a model's path: an existing file as it is, a known name verified or downloaded."""
-    path, name = Path(name_or_path).expanduser(), str(name_or_path)
-    if path.is_file():
-        return path
-    weights = next((w for w in WEIGHTS if name in (w.name, w.file)), None)
-    found = _find_model(*([weights.file] if weights else [name, name + ".onnx"]))
-    if found is None:
-        if weights is not None:
-            return _fetch(weights, offline)
-        known = ", ".join(w.name for w in WEIGHTS)
-        raise ReobjError(f"model {name}: no such file, nor one of the known names ({known})")
-    if weights is not None and (digest := _sha256(found)) != weights.sha256:
-        raise ReobjError(
-            f"{found}: sha256 is {digest}, expected {weights.sha256}: delete the file to fetch it "
-            "again, or give its path instead of its name to use it as it is"
-        )
-    return found
-
-
-def _fetch(weights: Weights, offline: bool) -> Path:
-    """Download weights into the first writable folder and return the verified file."""
-    by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
-    if offline:
-        raise ReobjError(f"model {weights.name} is not here and --offline forbids the download: "
-                         f"fetch {weights.url} elsewhere and {by_hand}")  # fmt: skip
-    log.warning(
-        "fetching %s: %.1f MB, licence %s, from %s, sha256 %s",
-        weights.name, weights.size / 1e6, weights.licence, weights.url, weights.sha256,
-    )  # fmt: skip
-    target = _writable_folder() / weights.file
-    try:
-        with atomic(target) as part:
-            _download(weights, part)
-            if (digest := _sha256(part)) != weights.sha256:
-                raise ReobjError(
-                    f"{weights.url}: sha256 is {digest}, expected {weights.sha256}: not kept; run "
-                    "again; if it happens again the source has changed: do not use it"
-                )
-    except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
-        raise ReobjError(
-            f"{weights.url}: download failed ({error}): run again, or get a file with sha256 "
-            f"{weights.sha256} on another machine and {by_hand}"
-        ) from error
-    return target
-
-
-def _writable_folder() -> Path:
-    """Return the first folder for weights that can be written."""
-    for folder in _model_folders():
-        with contextlib.suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    tried = " nor ".join(map(str, _model_folders()))
-    raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
-
-
-def _download(weights: Weights, part: Path) -> None:
-    """Write the file behind the URL to `part`, with progress; a short answer is an error."""
-    request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
-    progress, done = Progress("fetch kB", weights.size // 1000), 0
-    with (
-        urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response,
-        part.open("wb") as file,
-    ):
-        while done < weights.size and (chunk := response.read(DOWNLOAD_CHUNK)):
-            file.write(chunk)
-            done += len(chunk)
-            progress.step(len(chunk) // 1000)
-    progress.close()
-    if done < weights.size:
-        raise ConnectionError(f"connection cut after {done} of {weights.size} bytes")
 
 
 # ---- Detections: files -------------------------------------------------------------------------
@@ -935,7 +769,6 @@ GFL_BINS = 8  # distance bins of NanoDet-Plus and PicoDet (reg_max 7)
 YOLO_STRIDES, GFL_STRIDES = (8, 16, 32), (8, 16, 32, 64)
 RAW_YOLOX_MAX = 8.0  # median |x, y| of raw YOLOX is below 2, of decoded boxes half the image
 RCNN_MASK = (28, 28)  # masks of Mask R-CNN that cover their box
-IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # RGB
 NANODET_STD = (57.375, 57.12, 58.395)  # BGR
 CAFFE_MEAN = (102.9801, 115.9465, 122.7717)  # BGR
 
@@ -1161,23 +994,6 @@ LAYOUTS: tuple[_Layout, ...] = (  # the first that accepts a model reads it
     _Layout("SSD with built-in NMS", _has_nms, _decode_with_nms, mean=IMAGENET_MEAN,
             std=IMAGENET_STD, nms=False, first=1),
 )  # fmt: skip
-
-
-def onnx_session(path: Path, threads: int = 0) -> Any:
-    """Make an onnxruntime session on the CPU; `threads` 0 means all cores."""
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise ReobjError("ONNX models need onnxruntime: pip install onnxruntime") from error
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3  # errors only: its warnings are about how the model was exported
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # spare the cores
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        reason = str(error).splitlines()[0]
-        raise ReobjError(f"{path}: onnxruntime cannot load it: {reason}") from error
 
 
 class OnnxDetector:
@@ -2010,12 +1826,6 @@ class _Backbone:
         fed = {"fg": _side_by_side(fore), "bg": _side_by_side(back)}
         foreground, background = self.head.run(None, fed)
         return np.asarray(foreground, np.float64), np.asarray(background, np.float64)
-
-
-def onnx_metadata(session: Any) -> dict[str, Any]:
-    """Read what `examples/train_embedding.py` wrote into a model file's metadata."""
-    text = session.get_modelmeta().custom_metadata_map.get("reobj", "{}")
-    return dict(json.loads(text))
 
 
 def trained_head(model: str, head: str = "") -> Path | None:
