@@ -35,7 +35,6 @@ import argparse
 import ast
 import base64
 import contextlib
-import csv
 import dataclasses
 import functools
 import hashlib
@@ -50,7 +49,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import zipfile
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -101,9 +99,23 @@ from reobj.files import (
     read_text,
     rounded,
     save_npz,
-    shortened,
     spans,
     without_password,
+)
+from reobj.sources.detection_files import (
+    CVAT_BOX,
+    NORMALISED_MAX,
+    DetectConfig,
+    RecordedDetections,
+    TrackResult,
+    class_filter,
+    load_class_names,
+    pack_detections,
+    read_detections,
+    read_mot_rows,
+    read_npz,
+    read_tracks,
+    unnamed_class,
 )
 from reobj.sources.video import IMAGE_FPS, InputConfig, Video, resized, shrunk, source_fingerprint
 from reobj.sources.weights import (
@@ -142,20 +154,6 @@ from reobj.types import (
 )
 
 # ---- Configuration: the only home of numbers ---------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class DetectConfig:
-    """Object detection."""
-
-    model: str = option(
-        "deimv2-femto", "detector: a name of `models`, or a .onnx file", "--detector"
-    )
-    min_score: float = option(0.1, "detections below this score are never used (ByteTrack: .1)")
-    nms_iou: float = option(0.6, "class-wise NMS overlap for models that need NMS (NanoDet: .6)")
-    classes: str = option("", "comma-separated class names to keep (default: all)", "--classes")
-    class_names: str = option("", "text file, one class name a line, where they are not COCO's")
-    max_detections: int = option(100, "detections kept a frame, best scores first")
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,437 +276,7 @@ class Config:
 
 # ---- Detections: files -------------------------------------------------------------------------
 
-MOSTLY = 0.5  # above this share of bad boxes it is the format that is wrong, not the boxes
-NORMALISED_MAX = 1.5  # coordinates up to here are shares of the image
 CACHE_FRAMES = 64  # frames in one file of the detection cache
-POLYGON_BITS = 4  # sub-pixel bits of polygon corners (cv2.fillPoly)
-COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's ids 1 to 90, without a class
-Counts = npt.NDArray[np.uint32]
-NO_RUNS: Counts = np.empty(0, np.uint32)  # of a mask without any pixel
-NUMBERS = ("frame", "id", "x1", "y1", "x2", "y2", "w", "h", "score")
-MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
-CSV_ALIASES = {"x": "x1", "y": "y1", "width": "w", "height": "h", "confidence": "score",
-               "conf": "score", "class_id": "class", "class_name": "class"}  # fmt: skip
-
-
-def rle_encode(mask: BoolArray) -> Counts:
-    """Return the run lengths of an (H, W) mask down its columns, zeros first; [] if it is empty."""
-    flat = cv2.transpose(mask.view(np.uint8)).ravel()  # (W * H,)
-    edges = np.flatnonzero(np.diff(flat, prepend=np.uint8(0)))
-    counts = np.diff(edges, prepend=0, append=flat.size).astype(np.uint32)
-    return counts if len(counts) > 1 else NO_RUNS
-
-
-def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
-    """Return the (H, W) mask of a (w, h) image; the inverse of `rle_encode`."""
-    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts) if len(counts) else np.False_
-    return np.broadcast_to(flat, size[0] * size[1]).reshape(size).T
-
-
-def coco_runs(text: str) -> Counts:
-    """Decode COCO's compressed run lengths: 5 bits a character, differences to the last but one."""
-    runs: list[int] = []
-    value = shift = 0
-    for byte in text.encode():
-        value |= (byte - 48 & 0x1F) << shift
-        shift += 5
-        if byte - 48 & 0x20:  # more to come
-            continue
-        value -= (byte - 48 >> 4 & 1) << shift  # sign
-        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-        value = shift = 0
-    return np.array(runs, np.uint32)
-
-
-@dataclass(slots=True)
-class RecordedDetections:
-    """Detections of a video as a struct of arrays, from a file.
-
-    Attributes:
-        frame: (N,) source frame numbers. xyxy: (N, 4) in native pixels.
-        runs: N run lengths of the masks, empty where there is none.
-        size, working_size: (w, h) of the masks and of the frames.
-        line: (N,) where each stands in the file, in `unit`s. messages: what was dropped or assumed.
-        identity: (N,) as the file has it, or empty.
-    """
-
-    frame: IntArray
-    xyxy: Array
-    score: Array
-    class_id: IntArray
-    runs: list[Counts]
-    class_names: tuple[str, ...]
-    size: tuple[int, int]
-    working_size: tuple[int, int]
-    line: IntArray
-    unit: str
-    messages: list[str] = field(default_factory=list)
-    identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def at(self, frame_index: int) -> Detections:
-        """Return the detections of a frame at the working size, best first; decodes its masks."""
-        low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
-        rows, runs, masks = slice(low, high), self.runs[low:high], None
-        ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
-        if any(map(len, runs)):
-            masks = np.stack([self._working_mask(counts) for counts in runs])  # (D, H, W)
-        return Detections(self.xyxy[rows] * ratio, self.score[rows], self.class_id[rows], masks)
-
-    def _working_mask(self, counts: Counts) -> BoolArray:
-        mask = rle_decode(counts, self.size)
-        if self.working_size == self.size:
-            return mask
-        share = cv2.resize(mask.astype(np.float32), self.working_size, interpolation=cv2.INTER_AREA)
-        return np.asarray(share >= 0.5)
-
-
-def load_class_names(path: str | Path) -> tuple[str, ...]:
-    """Read one class name a line."""
-    return tuple(line.strip() for line in read_text(Path(path)).splitlines() if line.strip())
-
-
-def unnamed_class(class_id: int, count: int) -> str:
-    return (f"class {class_id}, but there are only {count} class names: give a file of names with "
-            "--set detect.class_names=FILE")  # fmt: skip
-
-
-def read_detections(
-    path: str | Path, video: Video, config: DetectConfig | None = None
-) -> RecordedDetections:
-    """Read recorded detections: MOT txt, CSV with a header, COCO results JSON or our npz."""
-    path, config = Path(path), config or DetectConfig()
-    if not path.is_file():
-        raise ReobjError(f"{path}: no such file of detections")
-    names = load_class_names(config.class_names) if config.class_names else ()
-    try:
-        if path.suffix.lower() == ".npz":
-            found, _ = read_npz(path, video.size, video.working_size)
-        else:
-            read = _read_coco if path.suffix.lower() == ".json" else _read_table
-            found = read(path, names, video)
-    except ReobjError:
-        raise
-    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ReobjError(f"{path}: an entry is not as expected: {error!r}") from error
-    _check(found, path, config, video.frame_count)
-    return found
-
-
-def read_mot_rows(path: Path) -> Array:
-    """Read a MOTChallenge file: rows (N, 6 to 10) of numbers; (0, 10) of an empty file."""
-    columns, cells, lines, is_mot = _table_cells(path)
-    if not is_mot:
-        raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
-    numbers = [_column([row[i] for row in cells], lines, path) for i in range(len(columns))]
-    return np.stack(numbers, 1)
-
-
-def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
-    """Read MOT rows (frame from 1, id, left, top, w, h[, score[, class]]), or CSV with a header."""
-    columns, cells, lines, is_mot = _table_cells(path)
-    texts = {role: [row[i] for row in cells] for i, role in enumerate(columns)}
-    column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
-    if is_mot and (column["id"] % 1 != 0).any():
-        raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
-                         "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
-    if "x2" not in column:
-        column["x2"], column["y2"] = column["x1"] + column["w"], column["y1"] + column["h"]
-    xyxy = np.stack([column[role] for role in ("x1", "y1", "x2", "y2")], 1)  # (N, 4)
-    count = len(lines)
-    class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
-    messages = [f"{len(new)} class names not in the list: {shortened(new)}"] if new else []
-    frame = column["frame"].astype(np.int64) - is_mot
-    if frame.min(initial=0) == -1 and is_mot:
-        frame += 1
-        messages.append("MOT frames start at 1, this file has a frame 0: taken as 0-based")
-    return RecordedDetections(
-        frame, xyxy, column.get("score", np.ones(count)), class_id, [NO_RUNS] * count, tuple(names),
-        video.size, video.working_size, lines, "line", messages,
-        column["id"].astype(np.int64) if "id" in column else np.empty(0, np.int64),
-    )  # fmt: skip
-
-
-def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray, bool]:
-    """Return the columns' roles, the rows of cells, the lines they stand on (N,), and whether it
-    is MOT (no header).
-    """
-    reader = csv.reader(read_text(path).splitlines())
-    rows = [(reader.line_num, cells) for cells in reader if cells]
-    is_mot = not rows or rows[0][1][0].strip()[:1] in "+-.0123456789"
-    columns = MOT_COLUMNS if is_mot else _csv_columns(rows.pop(0)[1], path)
-    width = len(rows[0][1]) if is_mot and rows else len(columns)
-    known = not is_mot or width in range(6, 11)
-    expected = str(width) if known else "6 to 10 (frame, id, left, top, w, h, score)"
-    for line, cells in rows:
-        if str(len(cells)) != expected:
-            raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {expected}")
-    stripped = [[cell.strip() for cell in row] for _, row in rows]
-    return tuple(columns[:width]), stripped, np.array([line for line, _ in rows], np.int64), is_mot
-
-
-def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
-    """Return what the columns hold by a header's names."""
-    header = re.sub(r"\(.*?\)", "", ",".join(cells)).split(";")[0].lower()  # remarks go
-    plain = [name.strip() for name in header.lstrip("# ").split(",")]
-    columns = tuple(CSV_ALIASES.get(name, name) for name in plain)
-    ends = ("w", "h") if "w" in columns else ("x2", "y2")
-    missing = [role for role in ("frame", "x1", "y1", *ends) if role not in columns]
-    if missing:
-        raise ReobjError(f"{path}, line 1: no column {', '.join(missing)} in the header {header}: "
-                         "expected one such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
-    return columns
-
-
-def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
-    """Convert a column to finite numbers."""
-    with contextlib.suppress(ValueError):
-        values = np.array(cells, np.float64)
-        if np.isfinite(values).all():
-            return values
-    values = np.full(len(cells), np.nan)
-    for i, cell in enumerate(cells):
-        with contextlib.suppress(ValueError):
-            values[i] = float(cell)
-        if not math.isfinite(values[i]):
-            raise ReobjError(f"{path}, line {lines[i]}: {cell!r} is no finite number")
-    return values
-
-
-def _table_classes(
-    cells: Sequence[str], is_mot: bool, names: Sequence[str]
-) -> tuple[IntArray, Sequence[str], list[str]]:
-    """Return class ids, class names and those that are new; MOT counts from 1, -1 is no class."""
-    ids = np.array([int(cell) if cell.isdigit() else -1 for cell in cells], np.int64)
-    if not any(cells) or (is_mot and ids.min() < 1):
-        return np.zeros_like(ids), ("object",), []
-    if is_mot:
-        return ids - 1, [*names, *(f"class {i + 1}" for i in range(len(names), ids.max()))], []
-    names = names or COCO_NAMES
-    if ids.min() >= 0:
-        return ids, names, []
-    new = sorted(set(cells) - set(names))
-    index = {name: i for i, name in enumerate([*names, *new])}
-    return np.array([index[cell] for cell in cells], np.int64), list(index), new
-
-
-def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
-    """Read COCO results; a dataset JSON beside them says which frame and class their ids mean.
-
-    A dataset with annotations of its own (COCO, COCO-VID) is read in their place.
-    """
-    entries = data = load_json(path)
-    if isinstance(data, dict) and "images" in data:
-        entries = data.get("annotations")
-    if not isinstance(entries, list):
-        raise ReobjError(f"{path}: expected COCO results: [{{image_id, category_id, bbox, score}}]")
-    frame_of, name_of, messages = _coco_dataset(path, names, video, data)
-    for at, entry in enumerate(entries):
-        found = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
-        if None in found.values() or len(entry["bbox"]) != 4:
-            raise ReobjError(f"{path}, entry {at}: {found}, expected two ids and a bbox of 4")
-        if entry["category_id"] not in name_of:
-            raise ReobjError(f"{path}, entry {at}: category_id {entry['category_id']} is unknown: "
-                             "put the dataset JSON beside this file, or give a file of names (ids "
-                             "from 0) with --set detect.class_names=FILE")  # fmt: skip
-        if frame_of and entry["image_id"] not in frame_of:
-            raise ReobjError(f"{path}, entry {at}: image_id {entry['image_id']} is not in the "
-                             "dataset JSON beside this file")  # fmt: skip
-    box = np.array([entry["bbox"] for entry in entries], np.float64).reshape(-1, 4)  # x, y, w, h
-    classes = list(dict.fromkeys(name_of.values()))
-    image_ids = [entry["image_id"] for entry in entries]
-    return RecordedDetections(
-        np.array([frame_of.get(i, i) for i in image_ids], np.int64),
-        np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]),
-        np.array([entry.get("score", 1.0) for entry in entries], np.float64),
-        np.array([classes.index(name_of[entry["category_id"]]) for entry in entries], np.int64),
-        [_coco_mask(entry.get("segmentation"), video.size, f"{path}, entry {at}")
-         for at, entry in enumerate(entries)],
-        tuple(classes), video.size, video.working_size, np.arange(len(entries)), "entry", messages,
-        np.array([entry.get("track_id", entry.get("instance_id", -1)) for entry in entries]),
-    )  # fmt: skip
-
-
-def _coco_dataset(
-    path: Path, names: Sequence[str], video: Video, own: Any
-) -> tuple[dict[int, int], dict[int, str], list[str]]:
-    """Frame of each image id (empty: the id itself), name of each category id, and messages.
-
-    The dataset is the file itself (`own`) or any other JSON of the folder with `images`; they
-    belong to frames by `file_name`, or where the video has no file names by `frame_id` (COCO-VID)
-    or their order.
-    """
-    data = own if isinstance(own, dict) else None
-    for other in sorted(path.parent.glob("*.json")) if data is None else ():
-        with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
-            found = json.loads(other.read_text()) if other != path else None
-            data = found if isinstance(found, dict) and found.get("images") else data
-    ids = list(range(len(names))) or [i for i in range(1, 91) if i not in COCO_GAPS]
-    name_of = dict(zip(ids, names or COCO_NAMES, strict=True))
-    if data is None:
-        return {}, name_of, ["no dataset JSON beside it: image_id is taken as the 0-based frame"]
-    if data.get("categories") and not names:
-        name_of = {c["id"]: c["name"] for c in data["categories"]}
-    row = {name: i for i, name in enumerate(video.names)}
-    frame_of = {
-        image["id"]: row.get(Path(image["file_name"]).name, -1) if row else image.get("frame_id", i)
-        for i, image in enumerate(data["images"])
-    }
-    return frame_of, name_of, []
-
-
-def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
-    """Return the run lengths of a COCO segmentation: RLE (compressed or not), polygons or none."""
-    if not mask:
-        return NO_RUNS
-    if isinstance(mask, dict):
-        counts = mask["counts"]
-        if tuple(mask["size"]) != size[::-1]:
-            raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
-        return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
-    canvas = np.zeros(size[::-1], np.uint8)
-    for ring in mask:  # corner convention -> OpenCV's, where the first pixel's centre is (0, 0)
-        corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)
-        cv2.fillPoly(canvas, [corners], 1, shift=POLYGON_BITS)
-    return rle_encode(canvas > 0)
-
-
-def read_npz(
-    path: Path, size: tuple[int, int], working_size: tuple[int, int]
-) -> tuple[RecordedDetections, IntArray]:
-    """Read our own format, as `pack_detections` makes it; also the frames that were `done`, if it says so."""
-    data, _ = load_npz(path)
-    count = len(data.get("frame", ()))
-    data.setdefault("mask_counts", NO_RUNS)
-    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
-    shapes = {"frame": (count,), "xyxy": (count, 4), "score": (count,), "class_id": (count,),
-              "class_names": (-1,), "image_size": (2,), "mask_offsets": (count + 1,)}  # fmt: skip
-    for key, shape in shapes.items():
-        found = data[key].shape if key in data else "missing"
-        if found != shape and (key != "class_names" or found == "missing"):
-            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
-    if (made_for := tuple(data["image_size"].tolist())) != size:
-        raise ReobjError(f"{path}: made for images of {made_for} px, but the video is {size} px")
-    recorded = RecordedDetections(
-        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
-        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
-        np.split(data["mask_counts"], data["mask_offsets"][1:])[:count],
-        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
-    )  # fmt: skip
-    return recorded, data.get("done", recorded.frame)
-
-
-def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_count: int) -> None:
-    """Check detections of any format: errors for what cannot be meant, messages for single rows."""
-    finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
-    named = np.isin(found.class_id, np.arange(len(found.class_names)))
-    pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,) 0: no mask
-    fits = (pixels == 0) | (pixels == math.prod(found.size))
-    for row in np.flatnonzero(~(finite & named & fits))[:1]:
-        text = f"mask of {pixels[row]} pixels in a video of {found.size}"
-        if not finite[row]:
-            text = f"NaN or infinite value in {found.xyxy[row]}, {found.score[row]}"
-        elif not named[row]:
-            text = unnamed_class(int(found.class_id[row]), len(found.class_names))
-        raise ReobjError(f"{path}, {found.unit} {found.line[row]}: {text}")
-    keep = _real(found, path, frame_count)
-    if len(found) and (found.score == -1).all():
-        found.messages.append("scores are all -1: taken as 1")
-        found.score = -found.score
-    if ((found.score < 0) | (found.score > 1)).any():
-        found.messages.append(f"scores from {found.score.min():g} to {found.score.max():g} clipped "
-                              "to [0, 1]")  # fmt: skip
-        found.score = np.clip(found.score, 0, 1)
-    keep &= found.score >= config.min_score
-    if config.classes:
-        keep &= np.isin(found.class_id, class_filter(config.classes, found.class_names))
-    if not len(found):
-        found.messages.append("no detections in this file")
-    rows = np.flatnonzero(keep)
-    rows = rows[np.lexsort((rows, -found.score[rows], found.frame[rows]))]  # best first
-    frame = found.frame[rows]
-    rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
-    rows = rows[rank < config.max_detections]
-    found.identity = found.identity[rows] if len(found.identity) else found.identity
-    for name in ("frame", "xyxy", "score", "class_id", "line"):
-        setattr(found, name, getattr(found, name)[rows])
-    found.runs = [found.runs[row] for row in rows]
-    found.messages[:] = [f"{path.name}: {text}" for text in found.messages]
-
-
-def _real(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
-    """Return which boxes have an area, touch the image and belong to a frame of the video."""
-    count, low, high = len(found), found.xyxy[:, :2], found.xyxy[:, 2:]
-    empty = (high <= low).any(1)  # (N,)
-    outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(found.size))).any(1))
-    missing = (found.frame < 0) | (found.frame >= (frame_count or sys.maxsize))
-    if count and found.xyxy.max() <= NORMALISED_MAX:
-        raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
-                         "Multiply them by the image size")  # fmt: skip
-    if (empty | outside).sum() > MOSTLY * count:
-        raise ReobjError(
-            f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {found.size}: x, y, w, h where x1, y1, x2, y2 is expected, or another "
-            "video?"
-        )
-    numbers = shortened(np.unique(found.frame[missing]).tolist())
-    text = f"of frames that the video has not (0-based: {numbers}; it has {frame_count or 'some'})"
-    if count and missing.all():
-        raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
-    for bad, what in ((empty, "without area"), (outside, "wholly outside the image"),
-                      (missing, text)):  # fmt: skip
-        if bad.any():
-            first = f"{found.unit} {found.line[bad][0]}"
-            found.messages.append(f"{bad.sum()} boxes {what} dropped, the first at {first}")
-    return np.logical_not(empty | outside | missing)
-
-
-def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
-    """Return the ids of comma-separated class names."""
-    known = {name.lower(): i for i, name in enumerate(names)}
-    chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
-    unknown = [name for name in chosen if name not in known]
-    if unknown:
-        raise ReobjError(f"--classes: no class {', '.join(unknown)} among {', '.join(names)}")
-    return np.array([known[name] for name in chosen], np.int64)
-
-
-def pack_detections(
-    frames: Sequence[tuple[int, Detections]], names: Sequence[str], size: tuple[int, int]
-) -> dict[str, Any]:
-    """Return the arrays of our npz format."""
-    parts = [Detections.empty(), *(found for _, found in frames)]
-    runs = [NO_RUNS]
-    for found in parts:
-        expected = (len(found), size[1], size[0])
-        if found.masks is None:
-            runs += [NO_RUNS] * len(found)
-        elif found.masks.shape != expected:
-            raise ReobjError(f"masks are {found.masks.shape}, expected (D, H, W) = {expected}")
-        else:
-            runs += map(rle_encode, found.masks)
-    return {
-        "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
-        "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
-        "score": np.concatenate([d.score for d in parts]).astype(np.float64),
-        "class_id": np.concatenate([d.class_id for d in parts]).astype(np.int64),
-        "class_names": np.array(list(names), np.str_),
-        "image_size": np.array(size, np.int64),
-        "mask_counts": np.concatenate(runs),
-        "mask_offsets": np.cumsum([len(run) for run in runs]),
-    }
-
-
-def write_detections_npz(
-    path: str | Path,
-    frames: Iterable[tuple[int, Detections]],
-    class_names: Sequence[str],
-    image_size: tuple[int, int],
-) -> None:
-    """Write (frame number, Detections) pairs, masks as run lengths, for `read_detections`."""
-    save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
 
 
 class DetectionCache:
@@ -5186,47 +4754,6 @@ def _set_threads(threads: int) -> None:
         cv2.setNumThreads(threads)
 
 
-@dataclass(frozen=True, slots=True)
-class TrackResult:
-    """Identities of a video from the tracker.
-
-    Attributes:
-        table: the rows; look: (n, E) fused embeddings of those of them that the tracker embedded,
-            look_row: (n,) which these are; split: width of their foreground (0: all).
-        class_names; messages: for the user.
-        fixed: identities were given (--tracks): nothing may join, split or renumber them.
-    """
-
-    table: Tracks
-    class_names: tuple[str, ...]
-    messages: tuple[str, ...] = ()
-    fixed: bool = False
-    look: npt.NDArray[np.float16] = field(default_factory=lambda: np.empty((0, 0), np.float16))
-    look_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-    split: int = 0
-
-    def save(self, path: Path) -> None:
-        """Write as npz, atomically."""
-        columns = {f.name: getattr(self.table, f.name) for f in dataclasses.fields(Tracks)}
-        columns |= {"look": self.look, "look_row": self.look_row}
-        facts = {k: getattr(self, k) for k in ("class_names", "messages", "fixed", "split")}
-        save_npz(path, columns, **facts)
-
-    @staticmethod
-    def load(path: Path) -> TrackResult:
-        """Read what `save` wrote."""
-        try:
-            data, facts = load_npz(path)
-            table = Tracks(*(data[f.name] for f in dataclasses.fields(Tracks)))
-            names, messages = tuple(facts["class_names"]), tuple(facts["messages"])
-            looks = data["look"], data["look_row"], int(facts["split"])
-            return TrackResult(table, names, messages, bool(facts["fixed"]), *looks)
-        except (KeyError, ValueError) as error:
-            raise ReobjError(
-                f"{path}: not readable, or of another version ({error}); delete it and run again"
-            ) from error
-
-
 def track_video(
     video: Video,
     space: Workspace,
@@ -6185,9 +5712,6 @@ def _was_read(frame: IntArray, out: Path) -> BoolArray:
 
 # ---- Export: other tools' files from an output folder ------------------------------------------
 
-CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
-SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
-
 
 @dataclass(frozen=True, slots=True)
 class Saved:
@@ -6430,88 +5954,6 @@ EXPORTS: dict[str, tuple[str, Callable[[Saved, Path], None]]] = {  # name: file 
     "glb": ("objects.glb", export_glb),
     "rrd": ("scene.rrd", export_rrd),
 }
-
-
-def read_tracks(
-    path: str | Path,
-    video: Video,
-    config: DetectConfig | None = None,
-    like: TrackResult | None = None,
-) -> TrackResult:
-    """Read identities made elsewhere or corrected by hand; they stand, the linker is not asked.
-
-    Args:
-        path: CVAT for video 1.1 (XML or its zip), COCO-VID JSON (track_id or instance_id), MOT rows
-            or CSV with ids, in native pixels; frames that the video's options leave out are not
-            used.
-        like: earlier tracks of the video: they lend their scores to boxes that were not moved, and
-            their classes to files that have none.
-    """
-    path, config = Path(path), config or DetectConfig()
-    limit = dataclasses.replace(config, min_score=0.0, max_detections=sys.maxsize)
-    if path.suffix.lower() in (".xml", ".zip"):
-        found = _read_cvat(path, video)
-        _check(found, path, limit, video.frame_count)
-    else:
-        found = read_detections(path, video, limit)
-    if len(found) and (not len(found.identity) or found.identity.min() < 0):
-        raise ReobjError(f"{path}: not every box has an identity: no file of tracks")
-    start, stop, every = video.config.start, video.config.stop, video.config.every
-    use = (found.frame >= start) & ((found.frame - start) % every == 0)
-    use &= found.frame < (stop or sys.maxsize)
-    pairs = np.column_stack([found.frame, found.identity])[use]  # (N, 2)
-    unique, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
-    if (count > 1).any():
-        frame, obj = unique[count.argmax()]
-        raise ReobjError(f"{path}: identity {obj} has {count.max()} boxes in frame {frame} "
-                         "(0-based); an object is in one place at a time")  # fmt: skip
-    rows = np.flatnonzero(use)[first]
-    ids, unknown = found.identity[rows], np.full(len(rows), -1, np.int64)
-    table = Tracks(found.frame[rows], ids, ids, found.xyxy[rows], found.score[rows],
-                       found.class_id[rows], unknown)  # fmt: skip
-    names = found.class_names
-    if like is not None:
-        unnamed = names == ("object",)
-        table = _as_known(like.table, table, unnamed)
-        names = like.class_names if unnamed else names
-    return TrackResult(table, names, tuple(found.messages), fixed=True)
-
-
-def _as_known(known: Tracks, table: Tracks, unnamed: bool) -> Tracks:
-    """Give unmoved boxes their earlier scores, and unnamed ones the class that overlaps most."""
-    class_id, score = table.class_id.copy(), table.score.copy()
-    for rows in rows_by(table.frame):
-        there = known[known.frame == table.frame[rows[0]]]
-        iou = np.hstack([box_iou(table.xyxy[rows], there.xyxy), np.zeros((len(rows), 1))])
-        best, same = iou.argmax(1), iou.max(1) > SAME_BOX
-        score[rows[same]] = there.score[best[same]]
-        if unnamed:
-            class_id[rows] = np.append(there.class_id, -1)[best]  # -1: "object"
-    return dataclasses.replace(table, class_id=class_id, score=score)
-
-
-def _read_cvat(path: Path, video: Video) -> RecordedDetections:
-    """Read the boxes of "CVAT for video 1.1" that are not outside; identity = track id + 1."""
-    try:
-        text = path.read_bytes()
-        if zipfile.is_zipfile(path):
-            text = zipfile.ZipFile(path).read("annotations.xml")
-        tracks = [(t, b) for t in ET.fromstring(text).iter("track") for b in t.iter("box")]
-        tracks = [(t, b) for t, b in tracks if b.attrib.get("outside") != "1"]
-        xyxy = [[float(b.attrib[k]) for k in CVAT_BOX] for _, b in tracks]
-        frame = np.array([int(b.attrib["frame"]) for _, b in tracks], np.int64)
-        ids = np.array([int(t.attrib["id"]) + 1 for t, _ in tracks], np.int64)
-        labels = [t.attrib["label"] for t, _ in tracks]
-    except (OSError, ET.ParseError, KeyError, ValueError) as error:
-        raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r})") from None
-    if not tracks:
-        raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
-    names, class_id = np.unique(labels, return_inverse=True)
-    n = len(tracks)
-    return RecordedDetections(
-        frame, np.array(xyxy, np.float64), np.ones(n), class_id.astype(np.int64), [NO_RUNS] * n,
-        tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box", [], ids,
-    )  # fmt: skip
 
 
 def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
