@@ -1,0 +1,1 @@
+"""identity of reobj_track."""
