@@ -1,0 +1,1 @@
+"""poses of reobj_track."""
