@@ -1,0 +1,400 @@
+"""Poses supplied by the user: COLMAP, TUM, transforms.json, ScanNet, Record3D."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from reobj.cameras import (
+    CV_FROM_GL,
+    NO_SCALE,
+    Camera,
+    Poses,
+    checked_camera,
+    invert_rigid,
+    parse_camera,
+    pycolmap_camera,
+    read_model,
+)
+from reobj.files import load_json, read_text, spans
+from reobj.types import Array, IntArray, ReobjError
+
+
+@dataclass(frozen=True, slots=True)
+class _GivenPoses:
+    """Poses of a file in its own order; frames are found by name, by time stamp, or by row."""
+
+    cam_from_world: Array  # (N, 3, 4), NaN: no pose
+    camera: Camera | None = None
+    names: tuple[str, ...] = ()
+    stamps_s: Array | None = None
+    metric: bool = False
+    up_in_world: Array | None = None
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+
+
+def read_poses(path: str | Path, video: Any, fmt: str = "auto", camera: str = "") -> Poses:
+    """Read poses made elsewhere.
+
+    Args:
+        path: file or folder. video: the frames they belong to.
+        fmt: auto (recognised), colmap, tum, transforms, scannet or record3d.
+        camera: intrinsics fx,fy,cx,cy[,k1,k2,p1,p2] in place of the file's.
+    Returns:
+        poses of the frames that the file knows, NaN for the others (counted in `messages`).
+    """
+    path, size = Path(path), (int(video.size[0]), int(video.size[1]))
+    if not path.exists():
+        raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
+    reader = _POSE_READERS.get(_pose_format(path) if fmt == "auto" else fmt)
+    if reader is None:
+        known = ", ".join(_POSE_READERS)
+        raise ReobjError(f"--pose-format {fmt}: unknown; known are auto, {known}")
+    given = reader(path, size)
+    own = parse_camera(camera, size) or given.camera
+    if own is None:
+        raise ReobjError(f"{path}: no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2], pixels")
+    own = checked_camera(_resized_camera(own, size, path), str(path))
+    numbers = [(frame.index, frame.time_s) for frame in video]
+    frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
+    names = [video.names[n] for n in frame if video.names]
+    row, messages = _rows_of_frames(given, path, frame, time_s, names)
+    poses = np.full((len(frame), 3, 4), np.nan)
+    poses[row >= 0] = given.cam_from_world[row[row >= 0]]
+    known = np.isfinite(poses).all((1, 2))
+    if not known.all():
+        lost = spans(frame[~known].tolist())
+        messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
+    status = np.where(known, "supplied", "none")
+    extra = (given.metric, given.up_in_world, given.points, given.colors, tuple(messages))
+    return Poses(own, frame, time_s, poses, status, "user", *extra)
+
+
+def _pose_format(path: Path) -> str:
+    """Recognise a format from the names in a folder, or from a file's name."""
+    if path.is_dir():
+        if (path / "transforms.json").exists():
+            return "transforms"
+        return "scannet" if (path / "pose").is_dir() or any(path.glob("*.pose.txt")) else "colmap"
+    if path.name.startswith("images."):
+        return "colmap"
+    if path.suffix == ".json" or path.name == "metadata":
+        return "record3d" if "poses" in _json_object(path) else "transforms"
+    return "tum"
+
+
+def _number_rows(
+    path: Path, columns: tuple[int, ...], expected: str, finite: bool = True
+) -> tuple[Array, list[str]]:
+    """Read a table of numbers (N, C), C in `columns`, and where each row is (for messages)."""
+    rows: list[list[float]] = []
+    where = []
+    for number, text in enumerate(read_text(path).splitlines(), 1):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        at = f"{path}, line {number}"
+        try:
+            row = [float(word) for word in text.replace(",", " ").split()]
+        except ValueError:
+            what = f"{text.strip()[:60]!r} is not a row of numbers"
+            raise ReobjError(f"{at}: {what}; expected {expected}") from None
+        if len(row) not in columns or (rows and len(row) != len(rows[0])):
+            raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
+        if finite and not np.isfinite(row).all():
+            raise ReobjError(f"{at}: a number is not finite; leave out rows of frames without pose")
+        rows.append(row)
+        where.append(at)
+    if not rows:
+        raise ReobjError(f"{path}: no poses in it; expected {expected}")
+    return np.array(rows), where
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    content = load_json(path)
+    if not isinstance(content, dict):
+        raise ReobjError(f"{path}: expected an object with `frames` (nerfstudio) or `poses`")
+    return content
+
+
+POSE_TOLERANCE = 0.005  # how far supplied rotations may be off (7-Scenes: 1e-3)
+
+
+def _rigid(matrix: Array, where: Sequence[str]) -> Array:
+    """Check rigid transforms (N, 3 or 4, 4): (N, 3, 4) with exact rotations, NaN where lost."""
+    lost = ~np.asarray(np.isfinite(matrix).all((1, 2)), bool)
+    matrix = np.where(lost[:, None, None], np.eye(4)[: matrix.shape[1]], matrix)
+    rotation = matrix[:, :3, :3]
+    tolerance = POSE_TOLERANCE
+    if matrix.shape[1] == 4:
+        last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
+        what = "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)"
+        _refuse(last_row.max(1) > tolerance, where, what)
+    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))  # (N, 3, 3)
+    what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular)"
+    what += "; expected a row-major rigid pose without scale"
+    _refuse(error.max((1, 2)) > tolerance, where, what)
+    what = "the rotation is mirrored (determinant -1); turn two axes, not one"
+    _refuse(np.linalg.det(rotation) < 0, where, what)
+    u, _, vt = np.linalg.svd(rotation)
+    exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
+    return np.where(lost[:, None, None], np.nan, exact)
+
+
+def _refuse(bad: Any, where: Sequence[str], problem: str) -> None:
+    if np.any(bad):
+        raise ReobjError(f"{where[int(np.argmax(bad))]}: {problem}")
+
+
+def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
+    """Make (N, 3, 4) from unit quaternions (N, 4) xyzw and translations (N, 3)."""
+    finite = np.isfinite(np.column_stack([xyzw, translation])).all(1)
+    _refuse(~finite, where, "a number is not finite")
+    norm = np.linalg.norm(xyzw, axis=1)
+    what = "the quaternion is not of length 1; expected the columns of the format in its order"
+    _refuse(np.abs(norm - 1) > POSE_TOLERANCE, where, what)
+    return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
+
+
+def _given_tum(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """TUM: `t tx ty tz qx qy qz qw`, seconds, world_from_cam; metres but for our own header."""
+    rows, where = _number_rows(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
+    world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
+    metric = re.search(f"^#.*{NO_SCALE}", read_text(path), re.MULTILINE) is None
+    return _GivenPoses(invert_rigid(world_from_cam), stamps_s=rows[:, 0], metric=metric)
+
+
+def _given_record3d(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """Record3D: `poses` [qx qy qz qw tx ty tz] world_from_cam, OpenGL axes, y up; `K`."""
+    data = _json_object(path)
+    try:
+        rows = np.array(data["poses"], np.float64).reshape(-1, 7)
+        fx, fy, cx, cy = (float(data["K"][i]) for i in (0, 4, 6, 7))
+        camera = Camera("PINHOLE", int(data["w"]), int(data["h"]), (fx, fy, cx, cy))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ReobjError(
+            f"{path}: no Record3D metadata ({error!r}); expected poses (N x 7), K (9), w and h"
+        ) from None
+    where = [f"{path}, poses[{i}]" for i in range(len(rows))]
+    world_from_gl = _from_quaternions(rows[:, :4], rows[:, 4:], where)
+    poses = CV_FROM_GL @ invert_rigid(world_from_gl)
+    return _GivenPoses(poses, camera, metric=True, up_in_world=np.array([0, 1.0, 0]))
+
+
+def _given_scannet(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """ScanNet `pose/<frame>.txt`, z up, 7-Scenes `*.pose.txt`: 4x4 world_from_cam, m; inf: lost."""
+    folder = path / "pose" if (path / "pose").is_dir() else path
+    files = sorted(f for f in folder.glob("*.txt") if re.search(r"(\d|\.pose)$", f.stem))
+    if not files:
+        raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
+    where, expected = [str(file) for file in files], "4 rows of 4 numbers"
+    tables = [_number_rows(file, (4,), expected, finite=False)[0] for file in files]
+    _refuse([len(table) != 4 for table in tables], where, f"expected {expected}")
+    world_from_cam = _rigid(np.array(tables), where)
+    intrinsic = path / "intrinsic" / "intrinsic_color.txt"
+    camera = None
+    if intrinsic.exists():
+        K, _ = _number_rows(intrinsic, (3, 4), "a 3x3 or 4x4 matrix")
+        camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
+    up = np.array([0, 0, 1.0]) if folder.name == "pose" else None
+    names = tuple(file.stem for file in files)
+    return _GivenPoses(invert_rigid(world_from_cam), camera, names, metric=True, up_in_world=up)
+
+
+def _given_transforms(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """transforms.json of nerfstudio or instant-ngp: world_from_cam in OpenGL axes; scale unknown.
+
+    nerfstudio turned the world by `applied_transform`; this is undone: T_cv = inv(A) T diag(1, -1,
+    -1, 1).
+    """
+    path = path / "transforms.json" if path.is_dir() else path
+    data = _json_object(path)
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise ReobjError(f"{path}: no `frames`; expected nerfstudio's or ngp's transforms.json")
+    where = [f"{path}, frames[{i}]" for i in range(len(frames))]
+    try:
+        matrix = np.array([f["transform_matrix"] for f in frames], np.float64).reshape(-1, 4, 4)
+        names = tuple(str(f["file_path"]) for f in frames)
+        cameras = [_transforms_camera({**data, **f}, size) for f in frames]
+        applied = np.eye(4)
+        applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
+        raise ReobjError(f"{path}: {what}") from None
+    gl_from_world = invert_rigid(_rigid(matrix, where)) @ applied  # (N, 3, 4)
+    return _GivenPoses(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
+
+
+def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | None:
+    """Make the camera of a transforms.json frame, None without a focal length."""
+    width, height = int(data.get("w", size[0])), int(data.get("h", size[1]))
+    focal = data.get("fl_x")
+    if focal is None and "camera_angle_x" in data:
+        focal = 0.5 * width / math.tan(0.5 * float(data["camera_angle_x"]))
+    if focal is None:
+        return None
+    fisheye = data.get("is_fisheye") or "FISHEYE" in str(data.get("camera_model", "")).upper()
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
+    centre = (data.get("cx", width / 2), data.get("cy", height / 2))
+    terms = (focal, data.get("fl_y", focal), *centre, *(data.get(key, 0) for key in keys))
+    params = tuple(float(value) for value in terms)
+    if not fisheye and not any(params[4:]):
+        return Camera("PINHOLE", width, height, params[:4])
+    return Camera("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, params)
+
+
+MAX_FOCAL_SPREAD = 0.02  # how far supplied focal lengths may differ, a share
+
+
+def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
+    """The one camera of all images: the median of slightly different ones (autofocus)."""
+    found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
+    if not found:
+        return None
+    kinds = {(c.model, c.width, c.height) for c in found}
+    spread = found[-1].params[0] / found[0].params[0] - 1
+    if len(kinds) > 1 or spread > MAX_FOCAL_SPREAD:
+        raise ReobjError(f"{path}: several different cameras; expected one (single_camera)")
+    return found[len(found) // 2]
+
+
+def _given_colmap(path: Path, size: tuple[int, int]) -> _GivenPoses:
+    """COLMAP model, text or binary (preferred), with or without rigs; scale unknown."""
+    start = path if path.is_dir() else path.parent
+    folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
+    found = [f for suffix in (".bin", ".txt") for f in folders if (f / f"images{suffix}").exists()]
+    if not found:
+        raise ReobjError(
+            f"{path}: no images.bin or .txt; expected a COLMAP model, or see --pose-format"
+        )
+    folder = found[0]
+    try:
+        if (folder / "images.bin").exists():
+            model = read_model(folder)
+        else:
+            with tempfile.TemporaryDirectory() as copy:
+                _copy_text_model(folder, Path(copy))
+                model = read_model(Path(copy))
+    except (ValueError, RuntimeError, IndexError) as error:
+        reason = str(error).splitlines()[0]
+        raise ReobjError(f"{folder}: not a COLMAP model ({reason}); write it again") from None
+    if not model.names:
+        raise ReobjError(f"{folder}: the COLMAP model has no registered image")
+    facts = (model.cam_from_world, _one_camera(model.cameras, folder), model.names)
+    return _GivenPoses(*facts, points=model.points, colors=model.colors)
+
+
+def _copy_text_model(folder: Path, copy: Path) -> None:
+    """Copy a COLMAP text model so that pycolmap reads all of it.
+
+    Models of poses alone often lack points3D.txt and the blank line of points after each image:
+    pycolmap refuses the first, and with the second takes every other image for points.
+    """
+    images = [
+        (number, text.split())
+        for number, text in enumerate(read_text(folder / "images.txt").splitlines(), 1)
+        if not text.startswith("#")
+    ]
+    rows: list[tuple[list[str], list[str]]] = []
+    points_next = False
+    for number, words in images:
+        is_points = len(words) % 3 == 0 and all(w.lstrip("-").isdigit() for w in words[2::3])
+        if is_points and (points_next or not words):
+            rows[-1:] = [(rows[-1][0], words)] if rows else []
+            points_next = False
+            continue
+        if len(words) < 10:
+            expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise ReobjError(f"{folder / 'images.txt'}, line {number}: expected {expected}")
+        rows.append((words, []))
+        points_next = True
+    lines = [f"{' '.join(image)}\n{' '.join(points)}\n" for image, points in rows]
+    (copy / "images.txt").write_text("".join(lines))
+    shutil.copyfile(folder / "cameras.txt", copy / "cameras.txt")
+    points = folder / "points3D.txt"
+    (copy / "points3D.txt").write_text(read_text(points) if points.exists() else "")
+
+
+_POSE_READERS: dict[str, Callable[[Path, tuple[int, int]], _GivenPoses]] = {
+    "colmap": _given_colmap,
+    "tum": _given_tum,
+    "transforms": _given_transforms,
+    "scannet": _given_scannet,
+    "record3d": _given_record3d,
+}
+
+
+def _resized_camera(camera: Camera, size: tuple[int, int], path: Path) -> Camera:
+    """Bring intrinsics to the frames' size; another shape of image is refused."""
+    if (camera.width, camera.height) == size:
+        return camera
+    own = (camera.width, camera.height)
+    if abs(own[0] * size[1] - own[1] * size[0]) > max(*own, *size):
+        raise ReobjError(
+            f"{path}: the poses are of {own[0]}x{own[1]} images, the frames are "
+            f"{size[0]}x{size[1]}; expected the same shape (rotated or cropped video?)"
+        )
+    return Camera(camera.model, *size, tuple(pycolmap_camera(camera, size).params.tolist()))
+
+
+def _rows_of_frames(
+    given: _GivenPoses, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
+) -> tuple[IntArray, list[str]]:
+    """Find the row of each frame in a file of poses (-1: none) by name, time stamp or order."""
+    count = len(given.cam_from_world)
+    messages: list[str] = []
+    if given.names:
+        row = _rows_by_name(given.names, frame, names)
+        what = f"images {given.names[0]!r} ..., frames {names[0] if len(names) else frame[0]!r} ..."
+    elif given.stamps_s is not None:
+        row, messages = _rows_by_time(given.stamps_s, frame, time_s)
+        what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, "
+        what += f"frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
+    else:
+        row = np.arange(count) if count == len(frame) else frame.copy()
+        what = f"{count} rows, frame numbers up to {frame.max()}; expected one row a frame"
+        row[row >= count] = -1
+        if frame.max() >= count != len(frame):
+            raise ReobjError(f"{path}: {what}")
+    if (row < 0).all():
+        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({what})")
+    return row, messages
+
+
+def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
+    """Match by path, file name or stem; else by the last number in it (from 1 where none is 0)."""
+    for key in (str, lambda n: Path(n).name, lambda n: Path(n).stem):
+        rows = {key(name): r for r, name in enumerate(given)}
+        found = np.array([rows.get(key(name), -1) for name in names], np.int64)
+        if (found >= 0).any():
+            return found
+    digits = [re.findall(r"\d+", Path(name).stem) for name in given]
+    numbers = np.array([int(d[-1]) if d else -1 for d in digits])  # (N,)
+    from_one = 0 not in numbers and 1 in numbers and numbers.max() > frame.max()
+    row_of = dict(zip((numbers - from_one).tolist(), range(len(given)), strict=True))
+    return np.array([row_of.get(n, -1) for n in frame.tolist()], np.int64)
+
+
+LONE_FRAME_S = 1 / 60  # half a frame interval when there is only one frame
+
+
+def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
+    """Match the nearest stamp within half a frame; of another clock: if each frame has one."""
+    if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
+        message = "time stamps are of another clock than the frames: matched in order"
+        return np.arange(len(frame)), [message]
+    steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
+    half = 0.5 * float(np.median(steps)) if len(steps) else LONE_FRAME_S
+    nearest = np.abs(stamps_s[None] - time_s[:, None]).argmin(1)  # (F,)
+    return np.where(np.abs(stamps_s[nearest] - time_s) <= half * (1 + 1e-6), nearest, -1), []
