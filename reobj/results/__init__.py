@@ -1,0 +1,1 @@
+"""results of reobj_track."""
