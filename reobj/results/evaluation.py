@@ -1,0 +1,469 @@
+"""Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k, O3D."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+import quadrics
+from reobj import __version__
+from reobj.cameras import Poses, import_pycolmap
+from reobj.results.workspace import Workspace
+from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.video import InputConfig
+from reobj.types import (
+    COCO_NAMES,
+    Array,
+    BoolArray,
+    IntArray,
+    ReobjError,
+    box_iou,
+    rows_by,
+    unit_rows,
+)
+
+SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
+MOT_DISTRACTORS = (2, 7, 8, 12)  # on a vehicle, static, distractor, reflection (MOT16 and later)
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledBoxes:
+    """Boxes with identities of a whole video, truth or result (N rows, any order).
+
+    Attributes:
+        frame, identity: (N,); xyxy: (N, 4); name: (N,) class names, "" matches every class.
+        role: (N,) SCORED, IGNORED or ABSENT; all SCORED in a result.
+    """
+
+    frame: IntArray
+    identity: IntArray
+    xyxy: Array
+    name: npt.NDArray[np.str_]
+    role: IntArray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, keep: Any) -> LabelledBoxes:
+        return LabelledBoxes(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+
+
+def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
+    """MOTChallenge rows with class names and roles (scalars or (N,))."""
+    n, box = len(rows), rows[:, 2:6]
+    xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
+    whole = rows[:, :2].astype(np.int64)
+    names, roles = np.broadcast_to(np.asarray(name, str), n), np.broadcast_to(role, n)
+    return LabelledBoxes(whole[:, 0], whole[:, 1], xyxy, names, np.asarray(roles, np.int64))
+
+
+def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) -> LabelledBoxes:
+    """Read a MOTChallenge gt.txt.
+
+    Column 7 is the flag (0: does not count). Column 8 is a class only in files of nine columns: of
+    MOT16 and later where seqinfo.ini stands beside the gt folder; else as `gt_mot_format.json`
+    beside the file names them, else an index into class_names. Column 9 is the visibility.
+    """
+    rows = read_mot_rows(path)
+    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
+    if rows.shape[1] != 9:  # MOT15 has ten: world coordinates in place of class and visibility
+        return labelled(rows, "", np.where(flagged, ABSENT, SCORED))
+    number = rows[:, 7].astype(np.int64)
+    if (path.parent.parent / "seqinfo.ini").exists():
+        role = np.where(flagged | (number != 1), ABSENT, SCORED)
+        role[np.isin(number, MOT_DISTRACTORS)] = IGNORED
+        return labelled(rows, "", role)
+    hidden = flagged | (rows[:, 8] < min_visibility)
+    known = path.with_name("gt_mot_format.json")
+    names = {str(i): n for i, n in enumerate(class_names)}
+    if known.exists():
+        names = json.loads(known.read_text()).get("classes", names)
+    return labelled(rows, [names.get(str(n), str(n)) for n in number], hidden * IGNORED)
+
+
+def read_result(out: Path) -> LabelledBoxes:
+    """Identities of an output folder of `run`, with the objects' classes; or of a tracks.txt."""
+    rows = read_mot_rows(out / "tracks.txt" if out.is_dir() else out)
+    classes: dict[int, str] = {}
+    if (out / "objects.json").is_file():
+        objects = json.loads((out / "objects.json").read_text())["objects"]
+        classes = {int(o["id"]): str(o["class"]) for o in objects}
+    return labelled(rows, [classes.get(int(i), "") for i in rows[:, 1]])
+
+
+_Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), their IoU (g, p)
+
+
+def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
+    """One step a frame; IoU is 0 between different classes."""
+    frames = np.union1d(truth.frame, found.frame)
+    rows = []
+    for boxes in (truth, found):
+        order = np.argsort(boxes.frame, kind="stable")
+        rows.append(np.split(order, np.searchsorted(boxes.frame[order], frames[1:])))
+    steps = []
+    for g, p in zip(*rows, strict=True):
+        a, b = truth.name[g][:, None], found.name[p][None]
+        same = (a == b) | (a == "") | (b == "")
+        steps.append((g, p, np.where(same, box_iou(truth.xyxy[g], found.xyxy[p]), 0.0)))
+    return steps
+
+
+def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
+    """Assignment of the largest total score, without pairs of score 0."""
+    rows, columns = linear_sum_assignment(-score)
+    good = score[rows, columns] > 1e-12
+    return rows[good], columns[good]
+
+
+def drop_ignored(truth: LabelledBoxes, found: LabelledBoxes) -> LabelledBoxes:
+    """Results without those whose best truth is an ignored row (as MOTChallenge does)."""
+    keep = np.ones(len(found), bool)
+    for g, p, iou in _frame_steps(truth, found) if (truth.role == IGNORED).any() else ():
+        a, b = _best_pairs(np.where(iou >= 0.5, iou, 0))
+        keep[p[b]] &= truth.role[g[a]] != IGNORED
+    return found[keep]
+
+
+def _numbered(
+    truth: LabelledBoxes, found: LabelledBoxes
+) -> tuple[IntArray, IntArray, list[_Step], IntArray, IntArray]:
+    """Identities (G,) and (P,), steps with their numbers in place of rows, boxes of each."""
+    truth = truth[truth.role == SCORED]
+    gt_ids, gt, gt_size = np.unique(truth.identity, return_inverse=True, return_counts=True)
+    ids, pr, pr_size = np.unique(found.identity, return_inverse=True, return_counts=True)
+    steps = [(gt[g], pr[p], iou) for g, p, iou in _frame_steps(truth, found)]
+    return gt_ids, ids, steps, gt_size, pr_size
+
+
+def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
+    """HOTA, CLEAR MOT and identity scores, and identities per real object, as TrackEval has them.
+
+    `ids_per_object`: different identities that were matched at IoU .5 to a real object, mean over
+    the objects that were matched at all.
+    Ref: Luiten et al., IJCV 2021; Bernardin & Stiefelhagen, 2008; Ristani et al., 2016.
+    """
+    gt_ids, ids, steps, gt, pr = _numbered(truth, drop_ignored(truth, found))
+    result = _hota(steps, gt, pr) | _clear(steps, gt, pr) | _identity(steps, gt, pr)
+    result |= _returns(truth, drop_ignored(truth, found))
+    return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
+
+
+def visits(truth: LabelledBoxes, away: int = 30) -> IntArray:
+    """Visit of each true box (N,), from 0: a new one after `away` frames without the object."""
+    order = np.lexsort((truth.frame, truth.identity))
+    new = np.append(True, np.diff(truth.identity[order]) != 0)[: len(order)]
+    late = np.append(False, np.diff(truth.frame[order]) > away)[: len(order)] & ~new
+    count = np.cumsum(late)
+    visit = np.empty(len(order), np.int64)
+    visit[order] = count - np.maximum.accumulate(np.where(new, count, 0))
+    return visit
+
+
+def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, IntArray]:
+    """Rows of truth and result that show one object (M,): best pairs of IoU >= .5 a frame."""
+    pairs = [np.empty((2, 0), np.int64)]
+    for g, p, iou in _frame_steps(truth, found):
+        a, b = _best_pairs(np.where(iou >= 0.5 - 1e-12, iou, 0))
+        pairs.append(np.stack([g[a], p[b]]))
+    rows = np.concatenate(pairs, 1)
+    scored = truth.role[rows[0]] == SCORED
+    return rows[0][scored], rows[1][scored]
+
+
+def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
+    """Returns of true objects (see `visits`) and the share that kept an identity of before.
+
+    The main identity of the visit counts; visits without any match are left out.
+    """
+    visit = visits(truth)
+    g, p = matched_rows(truth, found)
+    known: dict[int, set[int]] = {}
+    kept = []
+    for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+        ids, votes = np.unique(found.identity[p[rows]], return_counts=True)
+        before = known.setdefault(int(truth.identity[g[rows[0]]]), set())
+        kept += [int(ids[votes.argmax()]) in before] if before else []
+        before.add(int(ids[votes.argmax()]))
+    return {"returns": len(kept), "returns_kept": sum(kept) / max(len(kept), 1)}
+
+
+def return_ranks(truth: LabelledBoxes, found: LabelledBoxes, look: npt.NDArray[Any]) -> IntArray:
+    """Rank of the right object, by looks alone, for the first views of every return.
+
+    A query is a box of the first 10 frames of a return (see `visits`), the gallery all boxes before
+    the return of objects of its class; an object's best view counts. Rank-k: share of ranks <= k.
+
+    Args:
+        look: (N, E) unit rows, one for each row of `found`; NaN where there is none.
+    Returns:
+        ranks from 1, (Q,).
+    """
+    visit = visits(truth)
+    g, p = matched_rows(truth, found)
+    use = np.isfinite(look[p]).all(1)
+    g, p = g[use], p[use]
+    ranks = []
+    for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+        start, me = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
+        known = np.flatnonzero(truth.frame[g] < start)
+        known = known[truth.name[g[known]] == truth.name[g[rows[0]]]]
+        ids, of = np.unique(truth.identity[g[known]], return_inverse=True)
+        if me in ids:
+            first = rows[truth.frame[g[rows]] < start + 10]
+            best = np.full((len(ids), len(first)), -np.inf)
+            np.maximum.at(best, of, look[p[known]] @ look[p[first]].T)
+            ranks.append(1 + (best > best[ids == me]).sum(0))
+    return np.concatenate(ranks) if ranks else np.empty(0, np.int64)
+
+
+def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
+    """HOTA and its parts, mean over the IoU thresholds .05 to .95."""
+    align = np.zeros((len(gt_size), len(pr_size)))  # (G, P) soft number of frames in common
+    for g, p, iou in steps:
+        union = iou.sum(0)[None] + iou.sum(1)[:, None] - iou
+        align[g[:, None], p[None]] += iou / np.maximum(union, 1e-12)
+    align /= np.maximum(gt_size[:, None] + pr_size[None] - align, 1e-12)
+    pairs = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
+    for g, p, iou in steps:
+        a, b = _best_pairs(align[g[:, None], p[None]] * iou)
+        pairs.append((g[a], p[b], iou[a, b]))
+    g_all, p_all, iou_all = (np.concatenate(x) for x in zip(*pairs, strict=True))
+    parts = []
+    for alpha in np.arange(0.05, 0.99, 0.05):
+        hit = iou_all >= alpha - 1e-12
+        together = np.zeros_like(align)
+        np.add.at(together, (g_all[hit], p_all[hit]), 1)
+        jaccard = together / np.maximum(gt_size[:, None] + pr_size[None] - together, 1)
+        ass = (together * jaccard).sum() / max(hit.sum(), 1)
+        det = hit.sum() / max(gt_size.sum() + pr_size.sum() - hit.sum(), 1)
+        parts.append((math.sqrt(ass * det), det, ass))
+    return dict(zip(("HOTA", "DetA", "AssA"), np.mean(parts, 0).tolist(), strict=True))
+
+
+def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
+    """MOTA, switches, fragments at IoU .5; a match of the last frame is kept while it overlaps."""
+    last = np.full(len(gt_size), -1)  # identity of the last match ever
+    before = last.copy()  # and of the match in the last frame with truth
+    switches = hits = 0
+    starts = np.zeros(len(gt_size), np.int64)
+    met = np.zeros((len(gt_size), len(pr_size)), bool)
+    for g, p, iou in steps:
+        if not len(g) or not len(p):
+            continue  # as TrackEval: a frame without either does not end a match
+        kept = 1000.0 * (before[g][:, None] == p[None])
+        a, b = _best_pairs(np.where(iou >= 0.5 - 1e-12, kept + iou, 0))
+        g, p = g[a], p[b]
+        switches += int(((last[g] >= 0) & (last[g] != p)).sum())
+        hits += len(g)
+        met[g, p] = True
+        starts[g] += before[g] < 0
+        last[g] = p
+        before[:] = -1
+        before[g] = p
+    gt, pr = int(gt_size.sum()), int(pr_size.sum())
+    return {
+        "MOTA": 1 - (gt + pr - 2 * hits + switches) / max(gt, 1),
+        "IDSW": switches,
+        "Frag": int((starts - 1).clip(0).sum()),
+        "recall": hits / max(gt, 1),
+        "precision": hits / max(pr, 1),
+        "ids_per_object": float(met.sum() / max(met.any(1).sum(), 1)),
+    }
+
+
+def _identity_pairs(steps: Sequence[_Step], shape: tuple[int, ...]) -> tuple[Any, Any, Array]:
+    """Best one-to-one map of true to found identities, and their frames in common, (K,) each."""
+    common = np.zeros(shape)
+    for g, p, iou in steps:
+        common[g[:, None], p[None]] += iou >= 0.5 - 1e-12
+    a, b = _best_pairs(common)
+    return a, b, common[a, b]
+
+
+def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
+    """Identity precision, recall and F1 under the best one-to-one map of identities."""
+    right = float(_identity_pairs(steps, (len(gt_size), len(pr_size)))[2].sum())
+    gt, pr = int(gt_size.sum()), int(pr_size.sum())
+    shares = (2 * right / max(gt + pr, 1), right / max(pr, 1), right / max(gt, 1))
+    return dict(zip(("IDF1", "IDP", "IDR"), shares, strict=True))
+
+
+def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | None]:
+    """True identity -> the found identity that stands for it (most frames, one to one), or None."""
+    gt_ids, ids, steps, *_ = _numbered(truth, found)
+    a, b, _ = _identity_pairs(steps, (len(gt_ids), len(ids)))
+    pairs: dict[int, int | None] = dict.fromkeys(gt_ids.tolist())
+    return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
+
+
+def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
+    """Ids and ellipsoids of a gt_objects.json (`half_axes`, or full extents `size` with axes `R`).
+
+    Where an object has a `visible_part`, that is the truth: no camera saw the rest.
+    """
+    entries = json.loads(path.read_text())["objects"]
+    seen = [e | e.get("visible_part", {}) for e in entries]
+    half = [np.array(e["size"]) / 2 if "R" in e else np.array(e["half_axes"]) for e in seen]
+    turn = np.array([e["R"] if "R" in e else e["world_from_obj"] for e in seen])  # (O, 3, 3)
+    center = np.array([e["center"] for e in seen], np.float64)
+    half_axes = np.maximum(np.array(half), 0.005)  # (O, 3) a sheet is taken as 1 cm thick
+    return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, turn[:, :3, :3])
+
+
+def true_from_found(out: Path, truth_poses: Path | None) -> tuple[float, Array, Array]:
+    """Scale, rotation and shift from our world to the truth's, from the cameras' centres.
+
+    Poses that the user supplied are in the truth's world already.
+    """
+    poses = Workspace(out).recall()[1]
+    if poses is None:
+        raise ReobjError(f"{out}: no cameras here, so nothing to compare in 3D; see `run`")
+    if poses.source == "user":
+        return 1.0, np.eye(3), np.zeros(3)
+    if truth_poses is None:
+        raise ReobjError("reconstructed cameras have a world of their own: give --gt-poses")
+    centers = _true_centers(truth_poses, poses)  # (F, 3)
+    use = poses.known & np.isfinite(centers).all(1)
+    pose, goal = poses.cam_from_world[use], centers[use]
+    ours = -np.einsum("fji,fj->fi", pose[:, :, :3], pose[:, :, 3])  # (f, 3)
+    true_from_ours = import_pycolmap().estimate_sim3d(ours, goal)
+    turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
+    return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
+
+
+def _true_centers(path: Path, poses: Poses) -> Array:
+    """Camera centres (F, 3) at the poses' frames: TUM by time, or 16 numbers a frame (c2w)."""
+    table = np.loadtxt(path, ndmin=2)
+    if table.shape[1] == 16:
+        frame = poses.frame.clip(0, len(table) - 1)
+        return np.where((frame == poses.frame)[:, None], table[frame][:, 3:12:4], np.nan)
+    nearest = np.abs(table[:, :1] - poses.time_s[None]).argmin(0)  # (F,)
+    far = np.abs(table[nearest, 0] - poses.time_s) > 0.02
+    return np.where(far[:, None], np.nan, table[nearest, 1:4])
+
+
+def score_objects(
+    out: Path, solids: Path, truth_poses: Path | None, pairs: dict[int, int | None]
+) -> dict[str, Any]:
+    """O3D (volume IoU), centre and size errors of the ellipsoids against the true ones.
+
+    Args:
+        pairs: every true identity -> found identity or None (`identity_map`): an object counts as
+            found only if the identities say so; `o3d_all` gives 0 to those without ellipsoid.
+    """
+    ids, truth = read_true_solids(solids)
+    scale, turn, shift = true_from_found(out, truth_poses)
+    data = json.loads((out / "objects.json").read_text())
+    entry = {int(o["id"]): o for o in data["objects"] if o["status"] != "rejected"}
+    rows = [i for i, t in enumerate(ids) if pairs.get(t) in entry]
+    mine = [entry[pairs[ids[i]] or 0] for i in rows]
+    if not mine:
+        return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
+    center = np.array([o["center"] for o in mine]) @ (scale * turn).T + shift  # (n, 3)
+    quat = np.array([o["quat_wxyz"] for o in mine])
+    axes = turn @ Rotation.from_quat(quat[:, [1, 2, 3, 0]]).as_matrix()
+    found = quadrics.Ellipsoids(center, scale * np.array([o["half_axes"] for o in mine]), axes)
+    goal = truth[np.array(rows)]
+    o3d = quadrics.volume_overlap(found, goal)  # (n,)
+    error = np.linalg.norm(center - goal.center_in_world, axis=1)
+    size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3
+    claimed = (data["world"].get("scale") or {}).get("metres_per_unit")
+    each = [
+        {"id": ids[i], "object": o["id"], "class": o["class"], "o3d": a, "center_error": b}
+        for i, o, a, b in zip(rows, mine, o3d.tolist(), error.tolist(), strict=True)
+    ]
+    return {
+        "true": len(pairs),
+        "found": len(mine),
+        "o3d_found": float(o3d.mean()),
+        "o3d_median": float(np.median(o3d)),
+        "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
+        "center_error_median": float(np.median(error)),
+        "size_error_median": float(np.expm1(np.median(size))),
+        "scale_error": None if not claimed else abs(claimed / scale - 1),
+        "objects": each,
+    }
+
+
+_COLUMNS = "HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split()
+
+
+def score_table(scores: dict[str, dict[str, float]]) -> str:
+    """Format one line for each name, shares in per cent."""
+    lines = [f"{'':<14}" + "".join(f"{c[:7]:>8}" for c in _COLUMNS)]
+    for name, score in scores.items():
+        unit = {"IDSW": 1, "Frag": 1, "ids_per_object": 1}
+        cells = [score[c] * unit.get(c, 100) for c in _COLUMNS]
+        lines.append(f"{name[:14]:<14}" + "".join(f"{cell:8.2f}" for cell in cells))
+    return "\n".join(lines)
+
+
+def evaluate(
+    out: Path,
+    gt: Path,
+    solids: Path | None = None,
+    truth_poses: Path | None = None,
+    classes: Sequence[str] = (),
+    min_visibility: float = 0.0,
+) -> dict[str, Any]:
+    """Score an output folder of `run` (or a tracks.txt): {"tracks": by class, "objects": 3D}."""
+    names: Sequence[str] = COCO_NAMES
+    found = read_result(out)
+    if (out / "cache" / "last-tracks.npz").exists():
+        names = Workspace(out).recall()[0].class_names
+    truth = read_truth(gt, names, min_visibility)
+    if (out / "cache" / "source.json").exists():
+        truth = truth[_was_read(truth.frame - 1, out)]
+    wanted = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
+    unknown = set(classes) - set(truth.name) - set(found.name)
+    if unknown:
+        raise ReobjError(f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor found")
+    if classes:
+        truth, found = (x[np.isin(x.name, [*classes, ""])] for x in (truth, found))
+    scores = {"all": score_tracks(truth, found)}
+    if len(wanted) > 1:
+        for name in wanted:
+            scores[name] = score_tracks(*(x[np.isin(x.name, [name, ""])] for x in (truth, found)))
+    result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
+    result["ranks"] = score_looks(out, truth)
+    if solids is not None:
+        result["objects"] = score_objects(out, solids, truth_poses, identity_map(truth, found))
+    return result
+
+
+def score_looks(out: Path, truth: LabelledBoxes) -> dict[str, float]:
+    """Share of the returns whose object is among the k most alike, by looks alone (Rank-k).
+
+    Empty where the folder holds no looks (made by another version, or with --embed none).
+    """
+    if not (out / "cache" / "last-tracks.npz").exists():
+        return {}
+    track = Workspace(out).recall()[0]
+    if not track.look.size:
+        return {}
+    table = track.table[track.look_row]
+    box = np.c_[table.xyxy[:, :2], table.xyxy[:, 2:] - table.xyxy[:, :2]]
+    rows = np.c_[table.frame + 1, np.arange(len(table)), box]
+    found = labelled(rows, np.array(track.class_names)[table.class_id])
+    rank = return_ranks(truth, found, unit_rows(track.look))
+    shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}
+    return {"queries": len(rank), **shares}
+
+
+def _was_read(frame: IntArray, out: Path) -> BoolArray:
+    """Which source frames (N,) lay within --start, --stop, --every of the run."""
+    config = InputConfig(**json.loads((out / "cache" / "source.json").read_text())["input"])
+    after = frame - config.start
+    inside = (after >= 0) & (after % config.every == 0)
+    return np.asarray(inside & (frame < (config.stop or np.inf)), bool)
