@@ -1,0 +1,158 @@
+"""overlay.mp4: boxes, identities and back-projected ellipsoids of every frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import quadrics
+from reobj.cameras import Poses
+from reobj.results.workspace import RunResult
+from reobj.sources.video import Video
+from reobj.types import Array, BoolArray, Frame, Image, Tracks, object_color
+
+
+def draw_tracks(image: Image, table: Tracks, labels: dict[int, str], scale: float) -> None:
+    """Draw the boxes and identities of one frame's rows, in place.
+
+    Args:
+        labels: text of each identity; scale: image pixels per pixel of the table.
+    """
+    for obj, box in zip(table.track_id.tolist(), table.xyxy * scale, strict=True):
+        x1, y1, x2, y2 = box.round().astype(int).tolist()
+        color = object_color(obj)
+        cv2.rectangle(image, (x1, y1), (x2, y2), color, 2, cv2.LINE_AA)
+        _draw_label(image, labels.get(obj, str(obj)), x1, y1, color)
+
+
+def _draw_label(image: Image, text: str, x: int, y: int, color: tuple[int, int, int]) -> None:
+    """Text on a filled tag above (x, y), kept inside the image."""
+    (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+    x = max(0, min(x, image.shape[1] - width - 4))
+    y = max(height + base + 2, y)
+    cv2.rectangle(image, (x, y - height - base - 2), (x + width + 4, y), color, -1)
+    dark = sum(color) > 380
+    ink, at = (0,) * 3 if dark else (255,) * 3, (x + 2, y - base)
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, 1, cv2.LINE_AA)
+
+
+def draw_ellipses(
+    image: Image, dual_c: Array, drawn: BoolArray, object_id: Sequence[int], seen: set[int]
+) -> None:
+    """Draw projected ellipsoids: the back-projection of the fit, thin for objects not in `seen`.
+
+    Args:
+        dual_c: (O, 3, 3) dual conics in pixels of `image`; drawn: (O,) which ones.
+    """
+    for conic, wanted, obj in zip(dual_c, drawn, object_id, strict=True):
+        shape = _ellipse_of_dual_conic(conic) if wanted else None
+        if shape is not None and max(shape[1]) < 4 * max(image.shape):
+            cv2.ellipse(image, shape, object_color(obj), 2 if obj in seen else 1, cv2.LINE_AA)
+
+
+def _ellipse_of_dual_conic(
+    dual_c: Array,
+) -> tuple[tuple[float, float], tuple[float, float], float] | None:
+    """Centre, full axes, angle in degrees of an ellipse, else None: C* = [S - mm', -m; -m', -1]."""
+    conic = dual_c / -dual_c[2, 2]
+    center = -conic[:2, 2]
+    values, vectors = np.linalg.eigh(conic[:2, :2] + np.outer(center, center))
+    if not (np.isfinite(values).all() and values.min() > 0):
+        return None
+    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+    minor, major = 2 * np.sqrt(values)
+    x, y = (center - 0.5).tolist()  # OpenCV draws with the pixel's centre at 0
+    return (x, y), (float(major), float(minor)), angle
+
+
+class VideoWriter:
+    """MP4 writer that appears under its name only when it is complete."""
+
+    def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
+        self.path, self.part = path, path.with_name(f".part-{path.name}")
+        fourcc = cv2.VideoWriter.fourcc(*"mp4v")  # the one H.264-free codec in the wheel
+        self.writer = cv2.VideoWriter(str(self.part), fourcc, fps, size)
+        if not self.writer.isOpened():
+            raise OSError(f"{path}: OpenCV cannot write this video")
+        self.size, self.count = size, 0
+
+    def write(self, image: Image) -> None:
+        self.writer.write(image)
+        self.count += 1
+
+    def close(self, complete: bool) -> None:
+        """Finish the file; keep it only if complete (OpenCV is silent when the disk is full)."""
+        self.writer.release()
+        try:
+            if complete and self._frames_on_disk() != self.count:
+                raise OSError(f"{self.path}: not all frames could be written; is the disk full?")
+            if complete:
+                self.part.replace(self.path)
+        finally:
+            self.part.unlink(missing_ok=True)
+
+    def _frames_on_disk(self) -> int:
+        capture = cv2.VideoCapture(str(self.part))
+        return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+
+
+OVERLAY_SIZE_PX = 1280  # longer side of the overlay
+
+
+class Overlay:
+    """overlay.mp4: boxes, identities and back-projected ellipsoids, frame by frame.
+
+    Args:
+        solids: ellipsoids of the objects that are not rejected, in their order. Those that rest on
+            a prior are drawn only while they are detected.
+    """
+
+    def __init__(self, result: RunResult, solids: quadrics.Ellipsoids | None, video: Video) -> None:
+        width, height = video.size
+        shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
+        self.size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
+        self.scale, self.table = self.size[0] / width, result.table
+        self.projected = _project_all(result.poses, solids, self.scale)
+        kept = [o for o in result.objects if o["status"] != "rejected"]
+        self.ids, self.sure = (
+            [o["id"] for o in kept],
+            {o["id"] for o in kept if o["status"] == "ok"},
+        )
+        self.labels = {o["id"]: f"{o['id']} {o['class']}" for o in result.objects}
+        fps = max(1.0, (video.fps or 30.0) / video.config.every)
+        self.writer = VideoWriter(result.out / "overlay.mp4", fps, self.size)
+
+    def take(self, frame: Frame) -> None:
+        """Draw and append one frame."""
+        low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
+        rows = self.table[slice(low, high)]
+        small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
+        image = np.asarray(small, np.uint8)
+        if frame.index in self.projected:
+            dual_c, visible = self.projected[frame.index]
+            seen = set(rows.track_id.tolist())
+            drawn = visible & np.array([i in seen or i in self.sure for i in self.ids], bool)
+            draw_ellipses(image, dual_c, drawn, self.ids, seen)
+        draw_tracks(image, rows, self.labels, self.scale)
+        self.writer.write(image)
+
+    def close(self, complete: bool) -> None:
+        """Finish the file; it appears only if it is complete."""
+        self.writer.close(complete)
+
+
+def _project_all(
+    poses: Poses | None, ellipsoids: quadrics.Ellipsoids | None, scale: float
+) -> dict[int, tuple[Array, BoolArray]]:
+    """Dual conics (O, 3, 3), scaled pixels, and visibility (O,) for every frame with a pose."""
+    if poses is None or ellipsoids is None or not len(ellipsoids.half_axes):
+        return {}
+    known = poses.cam_from_world[poses.known]
+    img_from_world = np.diag([scale, scale, 1.0]) @ poses.camera.K @ known
+    dual_c, visible = quadrics.project(ellipsoids.dual_quadrics(), img_from_world)
+    outlines = zip(dual_c, visible, strict=True)
+    return dict(zip(poses.frame[poses.known].tolist(), outlines, strict=True))
