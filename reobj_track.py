@@ -32,7 +32,6 @@ al., ECCV 2022), BoT-SORT (Aharon et al., 2022), COLMAP (Schoenberger and Frahm,
 from __future__ import annotations
 
 import argparse
-import base64
 import contextlib
 import dataclasses
 import hashlib
@@ -67,7 +66,7 @@ from reobj.cameras import (
     scaled_camera,
     sight_lines,
 )
-from reobj.files import Progress, atomic, base64_text, load_npz, numbers, rounded, save_npz
+from reobj.files import Progress, atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
@@ -78,7 +77,8 @@ from reobj.poses.checks import check_poses
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.readers import read_poses
 from reobj.results.evaluation import evaluate, labelled, score_table
-from reobj.results.overlay import Overlay, draw_tracks
+from reobj.results.overlay import Overlay
+from reobj.results.scene import Pictures, write_scene
 from reobj.results.workspace import (
     RunResult,
     Workspace,
@@ -98,7 +98,7 @@ from reobj.sources.detection_files import (
     read_tracks,
 )
 from reobj.sources.detectors import CallableDetector, DetectionCache, OnnxDetector
-from reobj.sources.video import IMAGE_FPS, InputConfig, Video, shrunk, source_fingerprint
+from reobj.sources.video import IMAGE_FPS, InputConfig, Video, source_fingerprint
 from reobj.sources.weights import list_models, model_path
 from reobj.types import (
     Array,
@@ -925,191 +925,6 @@ def _assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
 
 
 # Writers
-
-
-# ---- Scene page: one self-contained HTML file --------------------------------------------------
-
-
-SCENE_CROPS = 8  # pictures of each object in scene.html
-SCENE_MAX_CROPS = 480  # and of all objects together
-SCENE_CROP_PX = 112  # longer side of these pictures
-SCENE_FRAMES = 60  # video frames in scene.html, shown beside the time slider
-SCENE_FRAME_PX = 320  # longer side of these frames
-
-
-class Pictures:
-    """Small JPEGs for the scene page, cut while the video is read: objects and whole frames.
-
-    Attributes:
-        crops: [frame number, base64] of each object's pictures, by identity, by time.
-        frames: [frame number, base64] of whole frames with their boxes.
-    """
-
-    def __init__(self, result: RunResult, video: Video) -> None:
-        self.table, self.scale = result.table, video.scale
-        self.crops: dict[int, list[tuple[int, str]]] = {o["id"]: [] for o in result.objects}
-        self.frames: list[tuple[int, str]] = []
-        count = SCENE_MAX_CROPS // max(len(result.objects), 1)
-        count = min(max(count, 1), SCENE_CROPS)
-        ranked = sorted(result.objects, key=lambda o: -o["frames_seen"])
-        chosen = {
-            o["id"]: diverse_rows(result.table, o, result.poses, count)
-            for o in ranked[:SCENE_MAX_CROPS]
-        }
-        self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
-        shown = scene_frames(result)
-        self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
-
-    def take(self, frame: Frame) -> None:
-        """Cut what is wanted from this frame."""
-        rows = self.wanted[self.table.frame[self.wanted] == frame.index]
-        height, width = frame.image.shape[:2]
-        for obj, box in zip(self.table.track_id[rows], self.table.xyxy[rows], strict=True):
-            margin = 0.1 * (box[2:] - box[:2])
-            x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
-            x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
-            if x1 < x2 and y1 < y2:
-                crop = _jpeg(frame.image[y1:y2, x1:x2], SCENE_CROP_PX)
-                self.crops[int(obj)].append((frame.index, crop))
-        if frame.index in self.whole:
-            image = shrunk(frame.image, SCENE_FRAME_PX)
-            low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
-            scale = self.scale * image.shape[1] / width
-            draw_tracks(image, self.table[slice(low, high)], {}, scale)
-            self.frames.append((frame.index, _jpeg(image, SCENE_FRAME_PX)))
-
-
-def _jpeg(image: Image, size_px: int) -> str:
-    """Base64 of a small JPEG."""
-    data = cv2.imencode(".jpg", shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-    return base64.b64encode(data.tobytes()).decode()
-
-
-def diverse_rows(table: Tracks, entry: dict[str, Any], poses: Poses | None, count: int) -> IntArray:
-    """Row numbers (<= count,) of the views of one object that differ most: in time and, where there
-    are cameras, in viewing direction; large boxes with good scores first.
-    """
-    rows = np.flatnonzero(table.track_id == entry["id"])
-    frame, box = table.frame[rows], table.xyxy[rows]
-    quality = table.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
-    place = 2 * (frame / max(int(table.frame.max(initial=0)), 1))[:, None]  # (N, 1)
-    if poses is not None and entry["center"] is not None:
-        world_from_cam = invert_rigid(poses.cam_from_world)  # (F, 3, 4)
-        at = np.searchsorted(poses.frame, frame).clip(max=len(poses.frame) - 1)
-        ray = world_from_cam[at, :, 3] - entry["center"]
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        place = np.hstack([place, np.nan_to_num(ray)])  # (N, 4)
-        quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # no pose: last
-    chosen = [int(quality.argmax())]
-    while len(chosen) < min(count, len(rows)):
-        gap = np.linalg.norm(place[:, None] - place[chosen], axis=2).min(1)  # (N,)
-        best = int((gap * quality**0.5).argmax())
-        if gap[best] == 0:
-            break
-        chosen.append(best)
-    return np.asarray(rows[chosen], np.int64)
-
-
-def scene_frames(result: RunResult) -> IntArray:
-    """Frame numbers that the time slider of the scene page goes through, before thinning."""
-    return np.unique(result.table.frame) if result.poses is None else result.poses.frame
-
-
-SCENE_STEPS = 1500  # steps of the time slider (longer videos: every n-th camera)
-
-
-def write_scene(result: RunResult, pictures: Pictures, video: Video) -> None:
-    """Write scene.html: ellipsoids, cameras, points and pictures in one page that needs no network.
-
-    The page is `scene_template.html`; its data are objects.json's entries without covariance, and
-    base64 of little-endian float32 / uint8 arrays.
-    """
-    frames = scene_frames(result)
-    steps = frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]  # (S,)
-    seconds = video.config.every / (video.fps or 30.0) * len(frames) / max(1, len(steps))
-    data = {
-        "title": Path(str(video.source)).name,
-        "facts": _scene_facts(result.world),
-        "warnings": result.warnings,
-        "world": {k: v for k, v in result.world.items() if k != "links"},
-        "links": [
-            link | {key: rounded(link[key], 2) for key in ("place_iou", "look")}
-            for link in result.world["links"]
-        ],
-        "objects": [_scene_object(o, result.table, steps, pictures) for o in result.objects],
-        "thumbs": pictures.frames,
-        "why_flat": _why_flat(result),
-        "steps": {"frame": steps.tolist(), "seconds": seconds},
-        **_scene_cameras(result.poses, result.world.get("up_in_world"), steps),
-    }
-    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    head, tail = Path(__file__).with_name("scene_template.html").read_text().split("@DATA@")
-    with atomic(result.out / "scene.html") as part:
-        part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
-
-
-SCENE_POINTS = 20000  # sparse points in scene.html (more: every n-th)
-
-
-def _scene_cameras(
-    poses: Poses | None, up_in_world: Sequence[float] | None, steps: IntArray
-) -> dict[str, Any]:
-    """Cameras of the steps, sparse points and the upward direction, for the page."""
-    if poses is None or not poses.known.any():
-        return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
-    thin = slice(None, None, math.ceil(len(poses.points) / SCENE_POINTS) or 1)
-    K = poses.camera.K
-    up = quadrics.camera_up(K @ poses.cam_from_world[poses.known])[0]
-    if up_in_world is not None:
-        up = np.array(up_in_world)
-    size = {"width": poses.camera.width, "height": poses.camera.height}
-    return {
-        "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
-        "poses": base64_text(
-            invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)]), "<f4"
-        ),
-        "points": base64_text(poses.points[thin], "<f4"),
-        "colors": base64_text(poses.colors[thin], "u1"),
-        "up": numbers(up),
-    }
-
-
-def _scene_object(
-    entry: dict[str, Any], table: Tracks, steps: IntArray, pictures: Pictures
-) -> dict[str, Any]:
-    """An object for the page: its entry of objects.json, colour, steps in which it is seen (first,
-    last, first, last ...) and pictures.
-    """
-    seen = np.isin(steps, table.frame[table.track_id == entry["id"]])
-    runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
-    runs[1::2] -= 1
-    return {k: v for k, v in entry.items() if k != "cov"} | {
-        "color": object_color(entry["id"])[::-1],
-        "seen": runs.tolist(),
-        "crops": pictures.crops[entry["id"]],
-    }
-
-
-def _why_flat(result: RunResult) -> str:
-    """Why the page has nothing to show in 3D; "" when it has."""
-    if result.poses is not None and result.poses.known.any():
-        return ""
-    reasons = [w for w in result.warnings if "pose" in w or "identities only" in w]
-    return reasons[0] if reasons else "no camera poses (`track`, or --poses none)"
-
-
-def _scene_facts(world: dict[str, Any]) -> str:
-    """One line on cameras and scale."""
-    if not world["registered_frames"]:
-        return ""
-    facts = [f"cameras of {world['registered_frames']} of {world['frames']} frames"]
-    scale = world.get("scale")
-    if scale and scale["source"] != "none":
-        facts.append(f"scale from {scale['source']}, ± {100 * (scale['rel_sigma'] or 0):.0f} %")
-    else:
-        facts.append(f"units: {world['units']}")
-    facts += [] if world["up_in_world"] else ["up is guessed from the cameras"]
-    return " · ".join(facts)
 
 
 # ---- Run: the whole chain ----------------------------------------------------------------------
