@@ -53,13 +53,19 @@ from scipy.optimize import linear_sum_assignment
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera, Poses, load_poses, save_poses, scaled_camera, sight_lines
+from reobj.cameras import Camera, Poses, load_poses, save_poses, scaled_camera, viewing_rays
 from reobj.files import Progress, atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
 from reobj.identity.linking import Linker
-from reobj.identity.reid import Gallery, Places, SameObject, match_probability, part_cosines
+from reobj.identity.reid import (
+    EllipsoidMap,
+    Gallery,
+    SimilarityCalibration,
+    match_probability,
+    part_cosines,
+)
 from reobj.objects import ObjectsConfig, fitter, object_entries, world_entry
 from reobj.poses.checks import check_poses
 from reobj.poses.estimate import PosesConfig, estimate_poses
@@ -314,7 +320,9 @@ IOU_ODDS = 20.0  # log odds that full overlap is worth
 EMBEDDING_MOMENTUM = 0.8  # memory of a track's running mean appearance (StrongSORT: .9 every frame)
 RETURN_ODDS = 1.8  # odds beforehand that a newcomer is a certain known object and not a new one
 JUMP_ODDS = 2.0  # log odds against a return far from where the object's own track still coasts
-PRIOR_PAIRS = 10.0  # pairs that the usual looks of one and of two objects are worth (SameObject)
+PRIOR_PAIRS = (
+    10.0  # pairs that the usual looks of one and of two objects are worth (SimilarityCalibration)
+)
 PLACE_REFIT = 10  # places are fitted again every so many frames, where views are new
 PLACE_IN_VIEW = 0.5  # a detection is expected from this share of a box in view on
 
@@ -348,13 +356,13 @@ class Tracker:
         """Forget everything: the next video starts with identity 1."""
         self.frame_number = -1
         self.gallery = Gallery()
-        self.same = SameObject(PRIOR_PAIRS)  # of views coast_frames apart
-        self.same_soon = SameObject(PRIOR_PAIRS)  # of a track and a detection
+        self.same = SimilarityCalibration(PRIOR_PAIRS)  # of views coast_frames apart
+        self.same_soon = SimilarityCalibration(PRIOR_PAIRS)  # of a track and a detection
         self.last_seen = np.zeros(0, np.int64)  # (I,) frame of each identity's last detection
         self.identity_class = np.zeros(0, np.int64)  # (I,)
         self._next_tracklet = 1
         self._camera_motion = CameraMotion()
-        self.places = Places()
+        self.places = EllipsoidMap()
         self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
         self._last_pose: Array | None = None
         self._latest: LazyEmbeddings | None = None  # of the latest frame
@@ -401,8 +409,8 @@ class Tracker:
         parts: dict[str, tuple[Any, Sequence[str]]] = {
             "tracker": (self, own.split()),
             "live": (self._live, [f.name for f in dataclasses.fields(_Live)]),
-            "gallery": (self.gallery, ("rows", "sight", "count", "split")),
-            "places": (self.places, Places.ARRAYS),
+            "gallery": (self.gallery, ("rows", "viewing_ray", "count", "foreground_width")),
+            "places": (self.places, EllipsoidMap.ARRAYS),
             "same": (self.same, ("sums",)),
             "same_soon": (self.same_soon, ("sums",)),
             "camera": (self._camera_motion, ("_gray", "_corners")),
@@ -435,7 +443,7 @@ class Tracker:
         )
         return tracks[tracks.track_id > 0]
 
-    def latest_looks(self) -> tuple[IntArray, Floats]:
+    def latest_embeddings(self) -> tuple[IntArray, Floats]:
         """Which detections of the latest frame were embedded (n,), and their fused rows (n, E)."""
         lazy = self._latest
         if lazy is None or lazy.rows is None:
@@ -638,7 +646,7 @@ class Tracker:
         what boxes and look together speak against, (T, n).
         """
         known = (self._live.embedded >= 0)[:, None]
-        cosines = part_cosines(self._live.look, lazy.get(rows), lazy.split)
+        cosines = part_cosines(self._live.look, lazy.get(rows), lazy.foreground_width)
         logit = self.same_soon.logit(*cosines)  # (T, n)
         weight, cost = self.config.appearance_weight, cost.copy()
         unlike = 1 / (1 + np.exp(np.where(known, logit, 0)))
@@ -696,13 +704,13 @@ class Tracker:
         if not len(rows):
             return
         look = lazy.get(rows)  # (n, E)
-        self.gallery.split = lazy.split
+        self.gallery.foreground_width = lazy.foreground_width
         live.look = widen(live.look, look)
         known = live.embedded[t] >= 0
         keep = np.where(known, EMBEDDING_MOMENTUM, 0.0)[:, None]
         live.look[t] = unit_rows(keep * live.look[t] + (1 - keep) * look)
         live.embedded[t] = self.frame_number
-        self._learn(look, live.identity[t], detections.class_id[rows], self._sight(t))
+        self._learn(look, live.identity[t], detections.class_id[rows], self._viewing_rays(t))
 
     def _learn_looks(
         self, detections: Detections, track_of: IntArray, rows: IntArray, lazy: LazyEmbeddings
@@ -712,13 +720,15 @@ class Tracker:
         rows = rows[(live.embedded[track_of[rows]] >= 0) & (live.identity[track_of[rows]] >= 0)]
         if not len(rows):
             return
-        parts = part_cosines(live.look[track_of[rows]], lazy.get(rows), lazy.split)  # (n, n) each
+        parts = part_cosines(
+            live.look[track_of[rows]], lazy.get(rows), lazy.foreground_width
+        )  # (n, n) each
         own = np.eye(len(rows), dtype=bool)
         self._compare(self.same_soon, parts, own, detections.class_id[rows])
 
     @staticmethod
     def _compare(
-        same: SameObject, parts: tuple[Array, Array], own: BoolArray, kind: IntArray
+        same: SimilarityCalibration, parts: tuple[Array, Array], own: BoolArray, kind: IntArray
     ) -> None:
         """Show all pairs of one class in a frame, (n, n)."""
         fore, back = parts
@@ -726,13 +736,15 @@ class Tracker:
         same.add(fore[own], back[own], True)
         same.add(fore[other], back[other], False)
 
-    def _sight(self, t: IntArray) -> Array:
+    def _viewing_rays(self, t: IntArray) -> Array:
         """Directions (n, 3) in which tracks are seen in this frame, NaN without a pose."""
         if self._view is None:
             return np.full((len(t), 3), np.nan)
-        return sight_lines(xyxy_from_cxcywh(self._live.mean[t, :, 0]), self._view)
+        return viewing_rays(xyxy_from_cxcywh(self._live.mean[t, :, 0]), self._view)
 
-    def _learn(self, look: Floats, identity: IntArray, class_id: IntArray, sight: Array) -> None:
+    def _learn(
+        self, look: Floats, identity: IntArray, class_id: IntArray, viewing_ray: Array
+    ) -> None:
         """Feed the similarity statistics and the gallery with embeddings (n, E) of one frame."""
         old = np.flatnonzero(identity >= 0)
         look, identity = look[old], identity[old]
@@ -740,9 +752,9 @@ class Tracker:
             return
         if len(self.gallery.count):
             first = self.gallery.rows[identity, 0] * (self.gallery.count[identity, None] > 1)
-            parts = part_cosines(look, first, self.gallery.split)
+            parts = part_cosines(look, first, self.gallery.foreground_width)
             self._compare(self.same, parts, np.eye(len(old), dtype=bool), class_id[old])
-        self.gallery.add(identity, look, sight[old])
+        self.gallery.add(identity, look, viewing_ray[old])
 
     def _confirm(self, track_of: IntArray) -> IntArray:
         """Give tracks that were seen often enough an identity: a known one that returns, or a new
@@ -771,7 +783,7 @@ class Tracker:
         self.last_seen[live.identity[ready]] = self.frame_number
         seen = ready[live.embedded[ready] >= 0]
         if len(seen):
-            self.gallery.add(live.identity[seen], live.look[seen], self._sight(seen))
+            self.gallery.add(live.identity[seen], live.look[seen], self._viewing_rays(seen))
         return self._drop(stale, track_of)
 
     def _home_iou(self, ready: IntArray, identity: IntArray) -> Array:
@@ -815,7 +827,9 @@ class Tracker:
             return result
         iou = self._home_iou(ready, identity)  # (n, I)
         home = iou > LOW_IOU
-        logit = self.same.logit(*self.gallery.parts(live.look[ready], identity, self._sight(ready)))
+        logit = self.same.logit(
+            *self.gallery.parts(live.look[ready], identity, self._viewing_rays(ready))
+        )
         logit[home & np.isinf(logit)] = 0  # no look: the place decides
         logit += np.where(home, IOU_ODDS * iou - NO_OVERLAP_ODDS, 0)
         logit -= JUMP_ODDS * self._jumps(ready, identity)
@@ -1094,7 +1108,7 @@ def _track_frames(
             pose = pose_of.get(frame.index)
             step = tracker.step(detections, frame.image, cam_from_world=pose, camera=camera)
             steps.append((frame.index, step))
-            looks.append(tracker.latest_looks())
+            looks.append(tracker.latest_embeddings())
             progress.step()
     except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
@@ -1109,7 +1123,7 @@ def _track_frames(
     table = Tracks.concatenate([i for i, _ in steps], [s for _, s in steps], video.scale)
     messages = [*source.messages, *_video_messages(video, table)]
     look, look_row = _table_looks(table, [i for i, _ in steps], looks)
-    names, split = source.class_names, tracker.gallery.split
+    names, split = source.class_names, tracker.gallery.foreground_width
     return TrackResult(table, names, tuple(messages), False, look, look_row, split)
 
 

@@ -206,7 +206,7 @@ def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
     return np.where(at_border, xyxy, undistorted)
 
 
-def sight_lines(xyxy: Array, img_from_world: Array) -> Array:
+def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:
     """Unit vectors (N, 3) in world axes from the camera to the centres of boxes (N, 4); one
     (3, 4) matrix for all or one each, NaN: unknown.
     """

@@ -469,7 +469,7 @@ class LazyEmbeddings:
         self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
         self.weight = weight
         self.rows: Floats | None = None  # (D, E)
-        self.split = 0  # width of the foreground in the rows
+        self.foreground_width = 0  # width of the foreground in the rows
         self.done = np.zeros(len(detections), bool)
 
     @property
@@ -494,7 +494,7 @@ class LazyEmbeddings:
             assert self.embedder is not None and self.frame is not None
             embeddings = self.embedder(self.frame, self.detections, rows)
             parts = (embeddings.foreground, embeddings.background)
-        weight, self.split = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
+        weight, self.foreground_width = self.weight if parts[1].shape[1] else 1.0, parts[0].shape[1]
         fused = np.concatenate(
             [
                 math.sqrt(weight) * unit_rows(parts[0]),

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.cameras import Poses, angle_deg, place_of, sight_lines, undistort_boxes
-from reobj.identity.reid import SameObject, paired_cosine, quick_fit
+from reobj.cameras import Poses, angle_deg, place_of, undistort_boxes, viewing_rays
+from reobj.identity.reid import SimilarityCalibration, paired_cosine, quick_fit
 from reobj.sources.detection_files import TrackResult
 from reobj.types import (
     Array,
@@ -32,7 +32,7 @@ class LinkEvent:
 
     Attributes:
         place_iou: IoU of cross-projection, None where only looks decided.
-        look: log odds of the looks that it is one object (`SameObject`).
+        look: log odds of the looks that it is one object (`SimilarityCalibration`).
     """
 
     kind: str
@@ -161,7 +161,7 @@ class Linker:
         place, known = place_of(self.poses, self.table.frame[rows])
         camera = self.poses.camera
         cams = np.where(known[:, None, None], self.poses.cam_from_world[place], np.nan)
-        return sight_lines(undistort_boxes(self.table.xyxy[rows], camera), camera.K @ cams)
+        return viewing_rays(undistort_boxes(self.table.xyxy[rows], camera), camera.K @ cams)
 
     def _nearness(self, foreground: Array, background: Array, angle: Array) -> Array:
         """(L, L) log odds that atoms look like one object, NaN: unknown.
@@ -169,7 +169,7 @@ class Linker:
         What that means in this video is known without labels: atoms of a class seen side by side
         are different, views of one atom some time apart the same.
         """
-        same = SameObject(LINK_PRIOR_PAIRS)
+        same = SimilarityCalibration(LINK_PRIOR_PAIRS)
         pairs = np.triu(self.apart & (self.classes[:, None] == self.classes), 1)
         for rows, one in ((pairs, False), (np.eye(len(pairs), dtype=bool), True)):
             same.add(foreground[rows], background[rows], one)

@@ -24,11 +24,11 @@ class Gallery:
 
     def __init__(self) -> None:
         self.rows = np.zeros((0, GALLERY_VIEWS, 0), np.float32)  # (I, K, E)
-        self.sight = np.zeros((0, GALLERY_VIEWS, 3))  # (I, K, 3) directions they were seen in
+        self.viewing_ray = np.zeros((0, GALLERY_VIEWS, 3))  # (I, K, 3) directions they were seen in
         self.count = np.zeros(0, np.int64)  # (I,) views held
-        self.split = 0  # width of the foreground in the rows
+        self.foreground_width = 0  # width of the foreground in the rows
 
-    def add(self, identity: IntArray, rows: Floats, sight: Array) -> None:
+    def add(self, identity: IntArray, rows: Floats, viewing_ray: Array) -> None:
         """Store one new view (E,) for each of N different identities, seen in a direction (N, 3)
         of the world, NaN: unknown. A new one if it is novel, else blended.
         """
@@ -46,7 +46,7 @@ class Gallery:
         blend = np.where(novel, 0.0, 0.9)[:, None]
         picked = own[np.arange(len(identity)), target]  # (N, E)
         self.rows[identity, target] = unit_rows(blend * picked + (1 - blend) * rows)
-        self.sight[identity[novel], target[novel]] = sight[novel]
+        self.viewing_ray[identity[novel], target[novel]] = viewing_ray[novel]
         self.count[identity] += novel & room
 
     @staticmethod
@@ -56,7 +56,9 @@ class Gallery:
         pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -2.0
         return np.asarray(pairs.max(2).argmax(1), np.int64)
 
-    def parts(self, rows: Floats, identity: IntArray, sight: Array) -> tuple[Array, Array, Array]:
+    def parts(
+        self, rows: Floats, identity: IntArray, viewing_ray: Array
+    ) -> tuple[Array, Array, Array]:
         """Cosines of foreground and background (N, I) between each row (N, E) and the most
         similar view of each identity (I,), and the degrees between the directions in which both
         were seen, (N, 3) of the rows; NaN where unknown.
@@ -69,10 +71,10 @@ class Gallery:
         empty = np.arange(GALLERY_VIEWS) >= self.count[identity][:, None]  # (I, K)
         fused = np.where(empty, -2.0, (rows @ views.T).reshape(shape))  # (N, I, K)
         best = fused.argmax(2)[..., None]
-        angle = angle_deg(sight[:, None], self.sight[identity].reshape(-1, 3))
+        angle = angle_deg(viewing_ray[:, None], self.viewing_ray[identity].reshape(-1, 3))
         fore, back, angle = (
             np.take_along_axis(np.where(empty, np.nan, part.reshape(shape)), best, 2)[..., 0]
-            for part in (*part_cosines(rows, views, self.split), angle)
+            for part in (*part_cosines(rows, views, self.foreground_width), angle)
         )
         return fore, back, angle
 
@@ -83,17 +85,21 @@ class Gallery:
             extra = max(
                 identities - len(self.count), len(self.count), 16
             )  # doubling: amortised O(1)
-            self.rows, self.sight, self.count = (
+            self.rows, self.viewing_ray, self.count = (
                 np.concatenate([old, np.zeros((extra, *old.shape[1:]), old.dtype)])
-                for old in (self.rows, self.sight, self.count)
+                for old in (self.rows, self.viewing_ray, self.count)
             )
 
 
-def part_cosines(a: npt.NDArray[Any], b: npt.NDArray[Any], split: int) -> tuple[Array, Array]:
+def part_cosines(
+    a: npt.NDArray[Any], b: npt.NDArray[Any], foreground_width: int
+) -> tuple[Array, Array]:
     """Cosines (N, M) of the foregrounds and of the backgrounds of fused rows (N, E) and (M, E);
-    split: width of the foreground part. NaN where a row has no such part.
+    foreground_width: width of the foreground part. NaN where a row has no such part.
     """
-    return _cosine(a[:, :split], b[:, :split]), _cosine(a[:, split:], b[:, split:])
+    return _cosine(a[:, :foreground_width], b[:, :foreground_width]), _cosine(
+        a[:, foreground_width:], b[:, foreground_width:]
+    )
 
 
 def paired_cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
@@ -111,24 +117,24 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
     return np.asarray(a @ b.T)
 
 
-class SameObject:
+class SimilarityCalibration:
     """Is it the same object? From the cosines of foreground and background to a probability.
 
     No threshold on a cosine serves two videos: the pairs that a video shows without labels say what
     its cosines mean. Objects of a class side by side in a frame are different, views of a track are
-    of one object. The closeness of both parts is counted from the middle between the two, in
+    of one object. The log_similarity of both parts is counted from the middle between the two, in
     standard deviations, and weighs the more the further the two are apart. The weights are near
     the fit of examples/rank_k.py --calibrate (docs/reid.md) and serve every appearance model.
 
     Args:
         weight: number of pairs that the usual mean and spread are worth.
     Attributes:
-        sums: (2, 3, 2) count, sum and sum of squares of the closeness of the foreground and of the
+        sums: (2, 3, 2) count, sum and sum of squares of the log_similarity of the foreground and of the
             background, of different and of same objects.
     """
 
     WEIGHTS = (0.55, 0.5)  # of foreground and background
-    USUAL = ((1.3, 0.65), (1.8, 1.2))  # mean closeness of both parts: different, same
+    USUAL = ((1.3, 0.65), (1.8, 1.2))  # mean log_similarity of both parts: different, same
     USUAL_STD = 0.45
     USUAL_ANGLE_DEG = 45.0  # between two views of unknown directions
 
@@ -137,13 +143,13 @@ class SameObject:
         self.sums = weight * np.stack([mean**0, mean, mean**2 + self.USUAL_STD**2], 1)
 
     @staticmethod
-    def closeness(cosine: npt.ArrayLike) -> Array:
+    def log_similarity(cosine: npt.ArrayLike) -> Array:
         """Monotone in the cosine, steep where two views are nearly equal."""
         return np.asarray(-np.log(1.03 - np.minimum(cosine, 1.0)))
 
     def add(self, foreground: Array, background: Array, same: bool) -> None:
         """Add cosines of pairs (N,) that the video showed; NaN: unknown."""
-        close = self.closeness(np.stack([foreground.ravel(), background.ravel()]))  # (2, N)
+        close = self.log_similarity(np.stack([foreground.ravel(), background.ravel()]))  # (2, N)
         known = np.isfinite(close)
         close = np.where(known, close, 0.0)
         self.sums[int(same)] += [known.sum(1), close.sum(1), (close * close).sum(1)]
@@ -176,7 +182,7 @@ class SameObject:
         apart = ((mean[1] - mean[0]) / std).clip(0)
         angle = np.radians(np.where(np.isnan(view_angle_deg), self.USUAL_ANGLE_DEG, view_angle_deg))
         facing = np.stack([(1 + np.cos(angle)) / 2, np.cos(angle).clip(0)], -1)  # (..., 2)
-        return np.asarray(facing * (self.closeness(cosine) - mean.mean(0)) / std * (1 + apart))
+        return np.asarray(facing * (self.log_similarity(cosine) - mean.mean(0)) / std * (1 + apart))
 
     def probability(self, *known: npt.ArrayLike, prior: float = 0.5) -> Array:
         """Probability of the same object, given how likely it was beforehand; see `logit`."""
@@ -222,7 +228,7 @@ PLACE_PARALLAX_DEG = 2.0  # a place counts from this angle between its views on
 PLACE_SHAPE = 6.0
 
 
-class Places:
+class EllipsoidMap:
     """Where every identity is in 3D, for a tracker that is told the camera's poses.
 
     Of every identity a few views are kept, evenly over its life, and an ellipsoid is fitted to

@@ -189,7 +189,8 @@ def export_glb(saved: Saved, path: Path) -> None:
         world_from_obj[:3, 3] = o["center"]
         scene.add_geometry(mesh, name, name, transform=world @ world_from_obj)
     if saved.poses is not None and len(saved.poses.points):
-        cloud: Any = trimesh.points.PointCloud(saved.poses.points, colors=saved.poses.colors)
+        make_cloud: Any = trimesh.PointCloud
+        cloud = make_cloud(saved.poses.points, colors=saved.poses.colors)
         scene.add_geometry(cloud, "points", "points", transform=world)
     if saved.poses is not None and saved.poses.known.sum() > 1:
         path_of = invert_rigid(saved.poses.cam_from_world[saved.poses.known])[:, :, 3]

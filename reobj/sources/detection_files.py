@@ -358,7 +358,11 @@ def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
 def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int]
 ) -> tuple[RecordedDetections, IntArray]:
-    """Read our own format, as `pack_detections` makes it; also the frames that were `done`, if it says so."""
+    """Read our own format, as `pack_detections` makes it.
+
+    Returns:
+        the detections, and the frames that were `done` (those with detections if it does not say).
+    """
     data, _ = load_npz(path)
     count = len(data.get("frame", ()))
     data.setdefault("mask_counts", NO_RUNS)
