@@ -1,4 +1,7 @@
-"""Objects: one solid and ellipsoid each from all its boxes, and its entry in objects.json."""
+"""Objects: one solid and ellipsoid each from all its boxes, and its description.
+
+The geometry is `quadrics.fit_objects`; which rows are one object is `identity/linking.py`'s.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,9 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
-from reobj.files import numbers, rounded
-from reobj.identity.linking import LinkEvent
-from reobj.results.workspace import OBJECT_FIELDS, SOLID_FIELDS
-from reobj.types import Array, ReobjError, Tracks, object_classes, option, rows_by
+from reobj.files import rounded
+from reobj.results.result import Object, World, significant
+from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
 from reobj.views import Views
 
 
@@ -24,36 +26,37 @@ class ObjectsConfig:
     """From tracks and cameras to one solid and ellipsoid per object."""
 
     priors: str = option(
-        "", "size priors, JSON (default: priors.json beside this file)", "--priors"
+        "", "size priors, JSON (default: the priors.json that comes along)", "--priors"
     )
     known_size: str = option(
-        "", "known heights for the scale: 'chair=.82m,door=2m'", "--known-size"
+        "", "true heights that set the metric scale: 'chair=.82m,door=2m'", "--known-size"
     )
     support: str = option(
-        "auto", "shape of the solids: auto, box, cylinder, ellipsoid", "--support"
+        "auto",
+        "shape of the solids: box, cylinder, ellipsoid, or auto (by category, else by evidence)",
+        "--support",
     )
-    up: str = option("", "up in the world: x,y,z (default: from the poses or the objects)")
-    link: bool = option(True, "join and split tracklets by 3D evidence")
-    min_views: int = option(
-        3, "objects with fewer detections in frames with poses get no ellipsoid"
-    )
+    up: str = option("", "direction against gravity in the world, x,y,z (default: estimated)")
+    link: bool = option(True, "join and split the tracker's tracklets after the video")
+    min_views: int = option(3, "an object seen in fewer frames with a pose gets no ellipsoid")
     min_score: float = option(0.3, "boxes below this score do not shape the ellipsoid")
     moving: str = option(
         "person,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe",
-        "classes that move: tracked, but without ellipsoid",
+        "classes that move: they are tracked, but get no ellipsoid",
     )
 
 
-def fitter(
-    config: ObjectsConfig, poses: Poses, class_names: Sequence[str]
-) -> Callable[[Views, list[int]], Any]:
+Fit = Callable[[Views, list[int]], quadrics.ObjectFits]  # of the groups of views, their classes
+
+
+def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> Fit:
     """Bind priors, scale and gravity to `quadrics.fit_objects`."""
     priors = quadrics.load_priors(config.priors or None)
     known = parse_known_size(config.known_size)
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
 
-    def fit(views: Views, classes: list[int]) -> Any:
+    def fit(views: Views, classes: list[int]) -> quadrics.ObjectFits:
         categories = [class_names[c] if c < len(class_names) else "" for c in classes]
         return quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, categories, priors, up=up,
@@ -91,103 +94,107 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     return sizes
 
 
-def object_entries(
-    table: Tracks,
+def describe_objects(
+    tracks: Tracks,
     class_names: Sequence[str],
-    fits: Any,
+    fits: quadrics.ObjectFits | None,
     views: Views | None,
     config: ObjectsConfig,
-) -> list[dict[str, Any]]:
-    """Entries of objects.json, one an object."""
-    entries, moving, iou = [], set(config.moving.split(",")), np.empty(0)
-    if views is not None:
+) -> list[Object]:
+    """Describe every identity of the tracks: its class, visits, and its solid where it has one.
+
+    Args:
+        fits, views: of the identities in ascending order; None without cameras.
+    """
+    objects, moving, iou = [], config.moving.split(","), np.empty(0)
+    if fits is not None and views is not None:
         seen = (views.boxes, views.img_from_world, views.image_size)
         iou = quadrics.reprojection_iou(fits, *seen)  # (V, O)
-    for i, (obj, cls) in enumerate(object_classes(table).items()):
-        rows = table[table.track_id == obj]
-        entry: dict[str, Any] = dict.fromkeys(OBJECT_FIELDS)
-        name = class_names[cls] if 0 <= cls < len(class_names) else "object"
-        entry |= {
-            "id": obj,
-            "class": name,
-            "score": round(float(rows.score.mean()), 4),
-            "status": "rejected",
-            "reason": "no camera poses",
-            "views": 0,
-            "frames_seen": len(np.unique(rows.frame)),
-            "dropped_boxes": 0,
-            "tracks": np.unique(rows.tracklet_id).tolist(),
-            "frames": _spans_of(rows),
-        }
+    for i, (identity, class_id) in enumerate(object_classes(tracks).items()):
+        rows = tracks[tracks.track_id == identity]
+        spans = [rows.frame[r] for r in rows_by(rows.tracklet_id)]
+        found = Object(
+            identity,
+            class_names[class_id] if 0 <= class_id < len(class_names) else "object",
+            round(float(rows.score.mean()), 4),
+            "rejected",
+            "no camera poses",
+            frames_seen=len(np.unique(rows.frame)),
+            tracklet_ids=np.unique(rows.tracklet_id).tolist(),
+            visits=sorted([int(f.min()), int(f.max())] for f in spans),
+        )
         if fits is not None and views is not None:
-            _add_fit(entry, fits, i, views, iou[:, i])
-            if name in moving:
-                _reject(entry, "objects of this class move")
-            elif (count := entry["views"]) < config.min_views:
-                seen_in = f"seen in {count} frame{'s' * (count != 1)} with a camera pose"
-                _reject(entry, f"{seen_in}; {config.min_views} are needed")
-        entries.append(entry)
-    return entries
+            found = _with_solid(found, fits, i, views, iou[:, i], moving, config.min_views)
+        objects.append(found)
+    return objects
 
 
-def _add_fit(entry: dict[str, Any], fits: Any, i: int, views: Views, iou: Array) -> None:
-    """Add the solid, its uncertainty and its evidence to an entry."""
-    solid, scale = fits.ellipsoids, fits.scale
+def _with_solid(
+    found: Object,
+    fits: quadrics.ObjectFits,
+    i: int,
+    views: Views,
+    iou: Array,
+    moving: Sequence[str],
+    min_views: int,
+) -> Object:
+    """Add the i-th solid, its uncertainty and its evidence; or the reason why it is rejected."""
     seen = np.isfinite(views.boxes[:, i, 0])
-    entry |= {
-        "status": str(fits.status[i]),
-        "reason": str(fits.reason[i]),
-        "support": str(fits.support[i]),
-        "views": int(seen.sum()),
-        "dropped_boxes": int((seen & ~fits.inlier[:, i]).sum()),
-        "parallax_deg": rounded(fits.parallax_deg[i], 2),
-        "reprojection_iou_median": rounded(np.median(iou[seen]), 3) if seen.any() else None,
-    }
-    if entry["status"] != "rejected":
-        size = fits.size[i]
-        entry |= {
-            "center": numbers(solid.center_in_world[i]),
-            "half_axes": numbers(solid.half_axes[i]),
-            "quat_wxyz": numbers(quat_wxyz_from_matrix(solid.world_from_obj[i : i + 1])[0]),
-            "size": numbers(size),
-            "cov": [numbers(row) for row in fits.cov[i]],
-            "size_m": numbers(size * scale.value) if scale.source != "none" else None,
-            "size_rel_sigma": numbers(np.sqrt(np.diag(fits.cov[i])[3:6] + scale.rel_sigma**2)),
+    count = int(seen.sum())
+    support: str | None = str(fits.support[i])
+    status, reason = str(fits.status[i]), str(fits.reason[i])
+    if found.class_name in moving:
+        status, reason, support = "rejected", "objects of this class move", None
+    elif count < min_views:
+        seen_in = f"seen in {count} frame{'s' * (count != 1)} with a camera pose"
+        status, reason, support = "rejected", f"{seen_in}; {min_views} are needed", None
+    solid: dict[str, Any] = {}
+    if status != "rejected":
+        scale, sigma2 = fits.scale, np.diag(fits.cov[i])[3:6] + fits.scale.rel_sigma**2
+        rotation = fits.ellipsoids.world_from_obj[i : i + 1]
+        values = {
+            "center": fits.ellipsoids.center_in_world[i],
+            "half_axes": fits.ellipsoids.half_axes[i],
+            "quat_wxyz": quat_wxyz_from_matrix(rotation)[0],
+            "size": fits.size[i],
+            "size_m": fits.size[i] * scale.value if scale.source != "none" else None,
+            "size_rel_sigma": np.sqrt(sigma2),
+            "cov": fits.cov[i],
         }
+        solid = {k: None if v is None else significant(v) for k, v in values.items()}
+    return dataclasses.replace(
+        found,
+        status=status,
+        reason=reason,
+        support=support,
+        views=count,
+        dropped_boxes=int((seen & ~fits.inlier[:, i]).sum()),
+        parallax_deg=rounded(fits.parallax_deg[i], 2),
+        reprojection_iou_median=rounded(np.median(iou[seen]), 3) if seen.any() else None,
+        **solid,
+    )
 
 
-def _reject(entry: dict[str, Any], reason: str) -> None:
-    entry |= dict.fromkeys(SOLID_FIELDS) | {"support": None}
-    entry |= {"status": "rejected", "reason": reason}
-
-
-def _spans_of(rows: Tracks) -> list[list[int]]:
-    """First and last frame of every tracklet, by time."""
-    frames = [rows.frame[r] for r in rows_by(rows.tracklet_id)]
-    return sorted([int(f.min()), int(f.max())] for f in frames)
-
-
-def world_entry(poses: Poses | None, fits: Any, events: Sequence[LinkEvent]) -> dict[str, Any]:
-    """The "world" of objects.json: units, gravity, scale, registered frames, joins and splits."""
-    links = [dataclasses.asdict(event) for event in events]
+def describe_world(
+    poses: Poses | None, fits: quadrics.ObjectFits | None, events: Sequence[LinkEvent]
+) -> World:
+    """Describe what is known about the world: units, gravity, scale, frames, joins and splits."""
     if poses is None:
-        return {"units": None, "source": "none", "registered_frames": 0, "links": links}
-    scale = None
+        return World(links=tuple(events))
+    scale, up = None, poses.up_in_world
+    up_source = "none" if up is None else "poses"
     if fits is not None:
-        scale = {
-            "metres_per_unit": rounded(fits.scale.value, 6),
-            "rel_sigma": rounded(fits.scale.rel_sigma, 4),
-            "source": fits.scale.source,
-        }
-    up = fits.up if fits is not None and fits.up.any() else poses.up_in_world
-    return {
-        "units": "m" if poses.metric else "arbitrary",
-        "source": poses.source,
-        "registered_frames": int(poses.known.sum()),
-        "interpolated_frames": int((poses.status == "interpolated").sum()),
-        "frames": len(poses.frame),
-        "up_in_world": None if up is None else numbers(up),
-        "up_source": fits.up_source if fits is not None else "none" if up is None else "poses",
-        "scale": scale,
-        "links": links,
-    }
+        value, sigma = rounded(fits.scale.value, 6), rounded(fits.scale.rel_sigma, 4)
+        scale = quadrics.Scale(value, sigma, fits.scale.source)
+        up, up_source = fits.up if fits.up.any() else up, fits.up_source
+    return World(
+        "m" if poses.metric else "arbitrary",
+        poses.source,
+        int(poses.known.sum()),
+        int((poses.status == "interpolated").sum()),
+        len(poses.frame),
+        None if up is None else significant(up),
+        up_source,
+        scale,
+        tuple(events),
+    )

@@ -109,8 +109,13 @@ class Embeddings:
         foreground: (D, E1); background: (D, E2), E2 may be 0.
     """
 
-    foreground: Array
-    background: Array
+    foreground: npt.NDArray[np.floating[Any]]
+    background: npt.NDArray[np.floating[Any]]
+
+    @staticmethod
+    def empty() -> Embeddings:
+        """Make the embeddings of no detections."""
+        return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +146,12 @@ class Tracks:
         return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
     @staticmethod
+    def empty() -> Tracks:
+        """Make the tracks of a frame or video without any."""
+        none = np.empty(0, np.int64)
+        return Tracks(none, none, none, np.empty((0, 4)), np.empty(0), none, none)
+
+    @staticmethod
     def concatenate(frames: Sequence[int], steps: Sequence[Tracks], scale: float = 1.0) -> Tracks:
         """Make the table of a video from a tracker's results, frame by frame.
 
@@ -150,8 +161,7 @@ class Tracks:
             frames: source number of each. scale: pixels of the frames per native pixel.
         """
         if not steps:
-            none = np.empty(0, np.int64)
-            return Tracks(none, none, none, np.empty((0, 4)), np.empty(0), none, none)
+            return Tracks.empty()
         columns = [f.name for f in dataclasses.fields(Tracks)]
         all_of = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
         all_of["frame"] = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
@@ -184,6 +194,31 @@ class Tracks:
         found = detections[self.detection_index]
         found.tracker_id = self.track_id
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class LinkEvent:
+    """A join or a split of tracklets and its evidence.
+
+    Attributes:
+        kind: "join" or "split". tracklets: ids of all that it concerns. kept: False where the joint
+            solid did not explain the boxes of both.
+        place_iou: IoU of cross-projection, None where appearance alone decided.
+        appearance_log_odds: that it is one object, by its embeddings (`SimilarityCalibration`).
+    """
+
+    kind: str
+    tracklets: tuple[int, ...]
+    place_iou: float | None
+    appearance_log_odds: float
+    kept: bool
+
+    @staticmethod
+    def from_json(entry: dict[str, Any]) -> LinkEvent:
+        """Read an entry of objects.json's links; before 0.2 the log odds were called `look`."""
+        log_odds = entry.get("appearance_log_odds", entry.get("look", 0.0))
+        found = (entry["kind"], tuple(entry["tracklets"]), entry["place_iou"], log_odds)
+        return LinkEvent(*found, entry["kept"])
 
 
 def as_detections(found: Any) -> Detections:

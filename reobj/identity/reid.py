@@ -129,7 +129,7 @@ class SimilarityCalibration:
     Args:
         weight: number of pairs that the usual mean and spread are worth.
     Attributes:
-        sums: (2, 3, 2) count, sum and sum of squares of the log_similarity of the foreground and of the
+        sums: (2, 3, 2) count, sum and sum of squares of the log similarity of the foreground and of
             background, of different and of same objects.
     """
 

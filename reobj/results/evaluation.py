@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Poses, import_pycolmap
-from reobj.results.workspace import Workspace
+from reobj.cameras import Poses, import_pycolmap, invert_rigid
+from reobj.results.result import Result
+from reobj.results.workspace import LAST_TRACKS, Workspace
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import InputConfig
 from reobj.types import (
@@ -92,13 +93,15 @@ def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) ->
 
 
 def read_result(out: Path) -> LabelledBoxes:
-    """Identities of an output folder of `run`, with the objects' classes; or of a tracks.txt."""
-    rows = read_mot_rows(out / "tracks.txt" if out.is_dir() else out)
-    classes: dict[int, str] = {}
-    if (out / "objects.json").is_file():
-        objects = json.loads((out / "objects.json").read_text())["objects"]
-        classes = {int(o["id"]): str(o["class"]) for o in objects}
-    return labelled(rows, [classes.get(int(i), "") for i in rows[:, 1]])
+    """Read the identities of an output folder of `run`, with classes; or of a tracks.txt."""
+    if not out.is_dir():
+        return labelled(read_mot_rows(out))
+    result = Result.load(out)
+    tracks, names = result.tracks, np.array([*result.class_names, ""], str)
+    role = np.full(len(tracks), SCORED)
+    return LabelledBoxes(
+        tracks.frame + 1, tracks.track_id, tracks.xyxy, names[tracks.class_id], role
+    )
 
 
 _Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), their IoU (g, p)
@@ -198,20 +201,22 @@ def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
     return {"returns": len(kept), "returns_kept": sum(kept) / max(len(kept), 1)}
 
 
-def return_ranks(truth: LabelledBoxes, found: LabelledBoxes, look: npt.NDArray[Any]) -> IntArray:
-    """Rank of the right object, by looks alone, for the first views of every return.
+def return_ranks(
+    truth: LabelledBoxes, found: LabelledBoxes, embedding: npt.NDArray[Any]
+) -> IntArray:
+    """Rank the right object by appearance alone, for the first views of every return.
 
     A query is a box of the first 10 frames of a return (see `visits`), the gallery all boxes before
     the return of objects of its class; an object's best view counts. Rank-k: share of ranks <= k.
 
     Args:
-        look: (N, E) unit rows, one for each row of `found`; NaN where there is none.
+        embedding: (N, E) unit rows, one for each row of `found`; NaN where there is none.
     Returns:
         ranks from 1, (Q,).
     """
     visit = visits(truth)
     g, p = matched_rows(truth, found)
-    use = np.isfinite(look[p]).all(1)
+    use = np.isfinite(embedding[p]).all(1)
     g, p = g[use], p[use]
     ranks = []
     for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
@@ -222,7 +227,7 @@ def return_ranks(truth: LabelledBoxes, found: LabelledBoxes, look: npt.NDArray[A
         if me in ids:
             first = rows[truth.frame[g[rows]] < start + 10]
             best = np.full((len(ids), len(first)), -np.inf)
-            np.maximum.at(best, of, look[p[known]] @ look[p[first]].T)
+            np.maximum.at(best, of, embedding[p[known]] @ embedding[p[first]].T)
             ranks.append(1 + (best > best[ids == me]).sum(0))
     return np.concatenate(ranks) if ranks else np.empty(0, np.int64)
 
@@ -308,7 +313,7 @@ def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | 
 
 
 def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
-    """Ids and ellipsoids of a gt_objects.json (`half_axes`, or full extents `size` with axes `R`).
+    """Read ids and ellipsoids of a gt_objects.json: `half_axes`, or extents `size` with axes `R`.
 
     Where an object has a `visible_part`, that is the truth: no camera saw the rest.
     """
@@ -321,29 +326,33 @@ def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
     return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, turn[:, :3, :3])
 
 
-def true_from_found(out: Path, truth_poses: Path | None) -> tuple[float, Array, Array]:
-    """Scale, rotation and shift from our world to the truth's, from the cameras' centres.
+def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, Array, Array]:
+    """Find the similarity that brings our world onto the truth's, from the camera centres.
 
     Poses that the user supplied are in the truth's world already.
+
+    Returns:
+        scale, rotation (3, 3) and shift (3,): x_in_truth = scale * rotation @ x_in_ours + shift.
     """
-    poses = Workspace(out).recall()[1]
+    poses = result.poses
     if poses is None:
-        raise ReobjError(f"{out}: no cameras here, so nothing to compare in 3D; see `run`")
+        raise ReobjError(f"{result.out}: no cameras here, so nothing to compare in 3D; see `run`")
     if poses.source == "user":
         return 1.0, np.eye(3), np.zeros(3)
     if truth_poses is None:
         raise ReobjError("reconstructed cameras have a world of their own: give --gt-poses")
     centers = _true_centers(truth_poses, poses)  # (F, 3)
     use = poses.known & np.isfinite(centers).all(1)
-    pose, goal = poses.cam_from_world[use], centers[use]
-    ours = -np.einsum("fji,fj->fi", pose[:, :, :3], pose[:, :, 3])  # (f, 3)
-    true_from_ours = import_pycolmap().estimate_sim3d(ours, goal)
+    ours = invert_rigid(poses.cam_from_world[use])[:, :, 3]  # (f, 3)
+    true_from_ours = import_pycolmap().estimate_sim3d(ours, centers[use])  # Umeyama, PAMI 1991
+    if true_from_ours is None:
+        raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
     turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
     return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
 
 
 def _true_centers(path: Path, poses: Poses) -> Array:
-    """Camera centres (F, 3) at the poses' frames: TUM by time, or 16 numbers a frame (c2w)."""
+    """Read camera centres (F, 3) of the poses' frames: TUM by time, or a 4x4 c2w a line."""
     table = np.loadtxt(path, ndmin=2)
     if table.shape[1] == 16:
         frame = poses.frame.clip(0, len(table) - 1)
@@ -354,33 +363,33 @@ def _true_centers(path: Path, poses: Poses) -> Array:
 
 
 def score_objects(
-    out: Path, solids: Path, truth_poses: Path | None, pairs: dict[int, int | None]
+    result: Result, solids: Path, truth_poses: Path | None, pairs: dict[int, int | None]
 ) -> dict[str, Any]:
-    """O3D (volume IoU), centre and size errors of the ellipsoids against the true ones.
+    """Score the ellipsoids against the true ones: O3D (volume IoU), centre and size errors.
 
     Args:
         pairs: every true identity -> found identity or None (`identity_map`): an object counts as
             found only if the identities say so; `o3d_all` gives 0 to those without ellipsoid.
     """
     ids, truth = read_true_solids(solids)
-    scale, turn, shift = true_from_found(out, truth_poses)
-    data = json.loads((out / "objects.json").read_text())
-    entry = {int(o["id"]): o for o in data["objects"] if o["status"] != "rejected"}
-    rows = [i for i, t in enumerate(ids) if pairs.get(t) in entry]
-    mine = [entry[pairs[ids[i]] or 0] for i in rows]
+    scale, turn, shift = align_with_truth(result, truth_poses)
+    located = {o.id: o for o in result.objects if o.located}
+    rows = [i for i, t in enumerate(ids) if pairs.get(t) in located]
+    mine = [located[pairs[ids[i]] or 0] for i in rows]
     if not mine:
         return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
-    center = np.array([o["center"] for o in mine]) @ (scale * turn).T + shift  # (n, 3)
-    quat = np.array([o["quat_wxyz"] for o in mine])
+    center = np.array([o.center for o in mine], np.float64) @ (scale * turn).T + shift  # (n, 3)
+    quat = np.array([o.quat_wxyz for o in mine], np.float64)
     axes = turn @ Rotation.from_quat(quat[:, [1, 2, 3, 0]]).as_matrix()
-    found = quadrics.Ellipsoids(center, scale * np.array([o["half_axes"] for o in mine]), axes)
+    half_axes = scale * np.array([o.half_axes for o in mine], np.float64)
+    found = quadrics.Ellipsoids(center, half_axes, axes)
     goal = truth[np.array(rows)]
     o3d = quadrics.volume_overlap(found, goal)  # (n,)
     error = np.linalg.norm(center - goal.center_in_world, axis=1)
     size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3
-    claimed = (data["world"].get("scale") or {}).get("metres_per_unit")
+    claimed = result.world.scale.value if result.world.scale is not None else None
     each = [
-        {"id": ids[i], "object": o["id"], "class": o["class"], "o3d": a, "center_error": b}
+        {"id": ids[i], "object": o.id, "class": o.class_name, "o3d": a, "center_error": b}
         for i, o, a, b in zip(rows, mine, o3d.tolist(), error.tolist(), strict=True)
     ]
     return {
@@ -417,14 +426,22 @@ def evaluate(
     classes: Sequence[str] = (),
     min_visibility: float = 0.0,
 ) -> dict[str, Any]:
-    """Score an output folder of `run` (or a tracks.txt): {"tracks": by class, "objects": 3D}."""
+    """Score an output folder of `run` (or a tracks.txt) against ground truth.
+
+    Args:
+        gt: MOTChallenge gt.txt. solids: gt_objects.json; truth_poses: TUM or a 4x4 c2w a line.
+        classes: only these. min_visibility: truth that is less visible is ignored.
+    Returns:
+        {"tracks": scores by class, "ranks": Rank-k of the returns, "objects": scores in 3D}.
+    """
     names: Sequence[str] = COCO_NAMES
-    found = read_result(out)
-    if (out / "cache" / "last-tracks.npz").exists():
-        names = Workspace(out).recall()[0].class_names
+    found, tracked = read_result(out), None
+    if (out / LAST_TRACKS).exists():
+        tracked = Workspace(out).load_last()
+        names = tracked.class_names
     truth = read_truth(gt, names, min_visibility)
-    if (out / "cache" / "source.json").exists():
-        truth = truth[_was_read(truth.frame - 1, out)]
+    if tracked is not None:
+        truth = truth[_was_read(truth.frame - 1, Workspace(out).source[1])]
     wanted = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
     unknown = set(classes) - set(truth.name) - set(found.name)
     if unknown:
@@ -436,34 +453,33 @@ def evaluate(
         for name in wanted:
             scores[name] = score_tracks(*(x[np.isin(x.name, [name, ""])] for x in (truth, found)))
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
-    result["ranks"] = score_looks(out, truth)
+    result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
     if solids is not None:
-        result["objects"] = score_objects(out, solids, truth_poses, identity_map(truth, found))
+        pairs = identity_map(truth, found)
+        result["objects"] = score_objects(Result.load(out), solids, truth_poses, pairs)
     return result
 
 
-def score_looks(out: Path, truth: LabelledBoxes) -> dict[str, float]:
-    """Share of the returns whose object is among the k most alike, by looks alone (Rank-k).
+def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
+    """Score appearance alone: the share of returns whose object is among the k most similar.
 
-    Empty where the folder holds no looks (made by another version, or with --embed none).
+    Empty where nothing was embedded (--embed none).
     """
-    if not (out / "cache" / "last-tracks.npz").exists():
+    embeddings, tracks = tracked.embeddings, tracked.tracks[tracked.embedding_row]
+    if not embeddings.foreground.size:
         return {}
-    track = Workspace(out).recall()[0]
-    if not track.look.size:
-        return {}
-    table = track.table[track.look_row]
-    box = np.c_[table.xyxy[:, :2], table.xyxy[:, 2:] - table.xyxy[:, :2]]
-    rows = np.c_[table.frame + 1, np.arange(len(table)), box]
-    found = labelled(rows, np.array(track.class_names)[table.class_id])
-    rank = return_ranks(truth, found, unit_rows(track.look))
+    identity = np.arange(len(tracks))
+    names = np.array(tracked.class_names)[tracks.class_id]
+    role = np.full(len(tracks), SCORED)
+    found = LabelledBoxes(tracks.frame + 1, identity, tracks.xyxy, names, role)
+    fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
+    rank = return_ranks(truth, found, unit_rows(fused))
     shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}
     return {"queries": len(rank), **shares}
 
 
-def _was_read(frame: IntArray, out: Path) -> BoolArray:
-    """Which source frames (N,) lay within --start, --stop, --every of the run."""
-    config = InputConfig(**json.loads((out / "cache" / "source.json").read_text())["input"])
+def _was_read(frame: IntArray, config: InputConfig) -> BoolArray:
+    """Mark the source frames (N,) that lie within --start, --stop, --every."""
     after = frame - config.start
     inside = (after >= 0) & (after % config.every == 0)
     return np.asarray(inside & (frame < (config.stop or np.inf)), bool)

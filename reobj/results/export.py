@@ -1,4 +1,4 @@
-"""Files for other tools: COCO-VID, CVAT, GLB, rerun."""
+"""Files for other tools: COCO-VID, CVAT, GLB, rerun; from an output folder."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -15,94 +14,78 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reobj import __version__
-from reobj.cameras import Poses, invert_rigid, load_poses
+from reobj.cameras import invert_rigid
 from reobj.files import atomic
-from reobj.results.evaluation import labelled
-from reobj.sources.detection_files import CVAT_BOX, read_mot_rows
-from reobj.sources.video import IMAGE_FPS, InputConfig, Video
+from reobj.results.result import Result
+from reobj.results.workspace import Workspace
+from reobj.sources.detection_files import CVAT_BOX
+from reobj.sources.video import IMAGE_FPS, Video
 from reobj.types import Array, ReobjError, Tracks, log, object_classes, object_color
 
 
-@dataclass(frozen=True, slots=True)
-class Saved:
-    """What an output folder of `run` holds, read back for the exports.
+def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
+    """Write what an output folder holds in another tool's format.
 
-    Attributes:
-        data: objects.json; its `objects` and `world` as documented.
-        table: the final identities in native pixels (tracks.txt); class_id counts in class_names.
-        poses: cameras and sparse points, None if there are none. video: the source, None if gone.
+    Args:
+        out: output folder of `run`. to: coco-vid, cvat, glb or rrd.
+        path: default: OUT/ and the format's own name.
+    Returns:
+        The file written.
     """
-
-    out: Path
-    data: dict[str, Any]
-    table: Tracks
-    class_names: tuple[str, ...]
-    poses: Poses | None
-    video: Video | None
-
-    @staticmethod
-    def load(out: str | Path) -> Saved:
-        """Read an output folder; ReobjError when `run` or `track` did not finish there."""
-        out = Path(out)
-        if not (out / "objects.json").is_file() or not (out / "tracks.txt").is_file():
-            raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
-        data = json.loads((out / "objects.json").read_text())
-        names = tuple(dict.fromkeys(o["class"] for o in data["objects"]))
-        class_of = {o["id"]: names.index(o["class"]) for o in data["objects"]}
-        tracks = out / "tracks.txt"
-        rows = read_mot_rows(tracks)
-        found = labelled(rows)
-        classes = np.array([class_of[i] for i in found.identity.tolist()], np.int64)
-        unknown = np.full(len(found), -1, np.int64)
-        ids, score = found.identity, rows[:, 6]
-        table = Tracks(found.frame - 1, ids, ids, found.xyxy, score, classes, unknown)
-        poses, source = (out / "cache" / n for n in ("last-poses.npz", "source.json"))
-        video = None
-        if source.is_file():
-            with contextlib.suppress(ReobjError):  # moved or deleted since: most exports need none
-                facts = json.loads(source.read_text())
-                video = Video(facts["source"], InputConfig(**facts["input"]))
-        read = load_poses(poses) if poses.is_file() else None
-        return Saved(out, data, table, names, read, video)
-
-    def frames(self) -> list[int]:
-        """Numbers of the frames that were read; without the video those with a track."""
-        if self.poses is not None:
-            return [int(f) for f in self.poses.frame]
-        seen = np.unique(self.table.frame).tolist()
-        if self.video is None or not self.video.frame_count:
-            return [int(f) for f in seen]
-        config, count = self.video.config, self.video.frame_count
-        return list(range(config.start, min(config.stop or count, count), config.every))
+    if to not in EXPORTS:
+        raise ReobjError(f"no export called {to!r}; there are {', '.join(EXPORTS)}")
+    name, write = EXPORTS[to]
+    path = Path(path) if path else Path(out) / name
+    write(Result.load(out), path)
+    return path
 
 
-def export_coco_vid(saved: Saved, path: Path) -> None:
-    """Write COCO-VID (MMTracking's): videos, images with frame_id, annotations with instance_id
-    and track_id; bbox is x, y, w, h from the image's corner.
+def _frames_read(result: Result) -> tuple[list[int], list[str]]:
+    """List the frames that were read (where nothing tells, those with a track), and file names.
+
+    Returns:
+        source frame numbers, and the image names by frame number ([]: a video, or it is gone).
     """
-    video, table = saved.data["video"], saved.table
-    names = saved.video.names if saved.video is not None else []
-    size = {"width": video["width"], "height": video["height"]}
-    frames = saved.frames()
+    video = None
+    if result.out is not None and (result.out / "cache" / "source.json").is_file():
+        with contextlib.suppress(ReobjError):  # moved or deleted since: most exports need none
+            video = Video(*Workspace(result.out).source)
+    names = video.names if video is not None else []
+    if result.poses is not None:
+        return result.poses.frame.tolist(), names
+    if video is None or not video.frame_count:
+        return np.unique(result.tracks.frame).tolist(), names
+    config, count = video.config, video.frame_count
+    return list(range(config.start, min(config.stop or count, count), config.every)), names
+
+
+def export_coco_vid(result: Result, path: Path) -> None:
+    """Write COCO-VID as MMTracking reads it: images with frame_id, annotations with instance_id.
+
+    bbox is x, y, w, h from the image's corner.
+    """
+    video, tracks = result.video, result.tracks
+    frames, names = _frames_read(result)
+    size = {"width": video.width, "height": video.height}
     image_id = {frame: i for i, frame in enumerate(frames, 1)}
     images = [
         {"id": image_id[f], "file_name": names[f] if names else f"{f:06d}.jpg", **size,
          "video_id": 1, "frame_id": f}
         for f in frames
     ]  # fmt: skip
-    corners = table.xyxy.round(2)
+    corners = tracks.xyxy.round(2)
     boxes = np.hstack([corners[:, :2], corners[:, 2:] - corners[:, :2]]).round(2).tolist()
     annotations = [
-        {"id": i + 1, "image_id": image_id[int(table.frame[i])], "video_id": 1,
-         "category_id": int(table.class_id[i]) + 1, "instance_id": int(table.track_id[i]),
-         "track_id": int(table.track_id[i]), "bbox": box, "area": round(box[2] * box[3], 2),
-         "iscrowd": 0, "score": float(table.score[i])}
+        {"id": i + 1, "image_id": image_id[int(tracks.frame[i])], "video_id": 1,
+         "category_id": int(tracks.class_id[i]) + 1, "instance_id": int(tracks.track_id[i]),
+         "track_id": int(tracks.track_id[i]), "bbox": box, "area": round(box[2] * box[3], 2),
+         "iscrowd": 0, "score": float(tracks.score[i])}
         for i, box in enumerate(boxes)
     ]  # fmt: skip
     data = {
         "info": {"description": f"reobj_track {__version__}"},
-        "videos": [{"id": 1, "name": Path(video["path"]).name, "fps": video["fps"], **size}],
-        "categories": [{"id": i, "name": name} for i, name in enumerate(saved.class_names, 1)],
+        "videos": [{"id": 1, "name": Path(video.path).name, "fps": video.fps, **size}],
+        "categories": [{"id": i, "name": name} for i, name in enumerate(result.class_names, 1)],
         "images": images,
         "annotations": annotations,
     }
@@ -110,29 +93,30 @@ def export_coco_vid(saved: Saved, path: Path) -> None:
         part.write_text(json.dumps(data) + "\n")
 
 
-def export_cvat(saved: Saved, path: Path) -> None:
+def export_cvat(result: Result, path: Path) -> None:
     """Write "CVAT for video 1.1": a track an object, every box a keyframe, `outside` where a visit
     ends. CVAT numbers tracks from 0 in the order of the file: track 0 is object 1.
 
     Source: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
     """
-    table, video = saved.table, saved.data["video"]
-    frames = saved.frames()
+    tracks, video = result.tracks, result.video
+    frames, _ = _frames_read(result)
     root = ET.Element("annotations")
     ET.SubElement(root, "version").text = "1.1"
     task = ET.SubElement(ET.SubElement(root, "meta"), "task")
-    for key, value in (("name", Path(video["path"]).name), ("mode", "interpolation"),
+    for key, value in (("name", Path(video.path).name), ("mode", "interpolation"),
                        ("start_frame", 0), ("stop_frame", max(frames, default=0))):  # fmt: skip
         ET.SubElement(task, key).text = str(value)
     labels, size = ET.SubElement(task, "labels"), ET.SubElement(task, "original_size")
-    for name in saved.class_names:
+    for name in result.class_names:
         ET.SubElement(ET.SubElement(labels, "label"), "name").text = name
     for key in ("width", "height"):
-        ET.SubElement(size, key).text = str(video[key])
+        ET.SubElement(size, key).text = str(getattr(video, key))
     following = dict(itertools.pairwise(frames))
-    for obj, cls in object_classes(table).items():
-        track = {"id": str(obj - 1), "label": saved.class_names[cls], "source": "auto"}
-        _cvat_boxes(ET.SubElement(root, "track", track), table[table.track_id == obj], following)
+    for identity, class_id in object_classes(tracks).items():
+        facts = {"id": str(identity - 1), "label": result.class_names[class_id], "source": "auto"}
+        rows = tracks[tracks.track_id == identity]
+        _cvat_boxes(ET.SubElement(root, "track", facts), rows, following)
     ET.indent(root)
     with atomic(path) as part:
         ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
@@ -149,57 +133,58 @@ def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> N
             ET.SubElement(track, "box", facts | corners | {"z_order": "0"})
 
 
-def _upright(saved: Saved, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
-    """Metres per unit (1 if unknown) and the rotation (3, 3) that brings the world's up onto this
-    axis; what is unknown is said.
+def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
+    """Return metres per unit (1 if unknown) and the rotation (3, 3) that brings up onto this axis.
+
+    What is unknown is said.
     """
-    world = saved.data["world"]
-    scale, up = world.get("scale") or {}, world.get("up_in_world")
-    metres = scale.get("metres_per_unit") if scale.get("source") != "none" else None
-    if any(o["center"] for o in saved.data["objects"]):
+    scale, up = result.world.scale, result.world.up_in_world
+    metres = scale.value if scale is not None and scale.source != "none" else None
+    if any(o.located for o in result.objects):
         if not metres:
             log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
         if up is None:
             log.warning("up is unknown: %s keeps the world's axes", path)
-    turn = Rotation.align_vectors([up_axis], [up or up_axis])[0].as_matrix()
+    turn = Rotation.align_vectors([up_axis], [up_axis if up is None else up])[0].as_matrix()
     return metres or 1.0, np.asarray(turn)
 
 
-def export_glb(saved: Saved, path: Path) -> None:
-    """Write binary glTF 2.0: y up, in metres if the scale is known; a named mesh an object, its
-    facts in `extras`; the sparse points and the camera's path. Needs trimesh.
+def export_glb(result: Result, path: Path) -> None:
+    """Write binary glTF 2.0: a named mesh an object, its facts in `extras`; points; camera path.
+
+    y is up, units are metres if the scale is known. Needs trimesh.
     """
     try:
         import trimesh
     except ImportError as error:
         raise ReobjError("trimesh is not installed: pip install 'reobj-track[viewer]'") from error
-    scale, turn = _upright(saved, path, [0.0, 1, 0])
-    world = np.eye(4)
+    scale, turn = _upright(result, path, [0.0, 1, 0])
+    world, poses = np.eye(4), result.poses
     world[:3, :3] = scale * turn
     scene: Any = trimesh.Scene()
-    for o in saved.data["objects"]:
-        if o["status"] == "rejected":
+    for o in result.objects:
+        if o.center is None or o.half_axes is None or o.quat_wxyz is None:
             continue
-        mesh, name = trimesh.creation.icosphere(subdivisions=3), f"{o['class']} {o['id']}"
-        mesh.visual.face_colors = [*object_color(o["id"])[::-1], 255]
-        mesh.metadata = {k: o[k] for k in ("id", "class", "status", "support", "size_m")}
+        mesh, name = trimesh.creation.icosphere(subdivisions=3), f"{o.class_name} {o.id}"
+        mesh.visual.face_colors = [*object_color(o.id)[::-1], 255]
+        entry = o.to_json()
+        mesh.metadata = {k: entry[k] for k in ("id", "class", "status", "support", "size_m")}
         world_from_obj = np.eye(4)
-        own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
-        world_from_obj[:3, :3] = own * o["half_axes"]
-        world_from_obj[:3, 3] = o["center"]
+        rotation = Rotation.from_quat(np.roll(o.quat_wxyz, -1)).as_matrix()
+        world_from_obj[:3, :3], world_from_obj[:3, 3] = rotation * o.half_axes, o.center
         scene.add_geometry(mesh, name, name, transform=world @ world_from_obj)
-    if saved.poses is not None and len(saved.poses.points):
+    if poses is not None and len(poses.points):
         make_cloud: Any = trimesh.PointCloud
-        cloud = make_cloud(saved.poses.points, colors=saved.poses.colors)
+        cloud = make_cloud(poses.points, colors=poses.colors)
         scene.add_geometry(cloud, "points", "points", transform=world)
-    if saved.poses is not None and saved.poses.known.sum() > 1:
-        path_of = invert_rigid(saved.poses.cam_from_world[saved.poses.known])[:, :, 3]
-        scene.add_geometry(trimesh.load_path(path_of), "cameras", "cameras", transform=world)
+    if poses is not None and poses.known.sum() > 1:
+        centers = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
+        scene.add_geometry(trimesh.load_path(centers), "cameras", "cameras", transform=world)
     with atomic(path) as part:
         part.write_bytes(scene.export(file_type="glb"))
 
 
-def export_rrd(saved: Saved, path: Path) -> None:
+def export_rrd(result: Result, path: Path) -> None:
     """Write a recording for the rerun viewer: z up, in metres if the scale is known; ellipsoids,
     points, and on the timeline `frame` the camera and the boxes it sees. Needs rerun-sdk.
     """
@@ -207,9 +192,9 @@ def export_rrd(saved: Saved, path: Path) -> None:
         import rerun as rr
     except ImportError as error:
         raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
-    scale, turn = _upright(saved, path, [0.0, 0, 1])
-    names = {o["id"]: f"{o['id']} {o['class']}" for o in saved.data["objects"]}
-    rec = rr.RecordingStream("reobj_track", recording_id=Path(saved.data["video"]["path"]).name)
+    scale, turn = _upright(result, path, [0.0, 0, 1])
+    names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
+    rec = rr.RecordingStream("reobj_track", recording_id=Path(result.video.path).name)
     rec.set_log_time_enabled(False)  # when the export was made is of no interest
     with atomic(path) as part:
         rec.save(part)
@@ -217,27 +202,26 @@ def export_rrd(saved: Saved, path: Path) -> None:
         rec.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Horizontal(*views)))
         rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
-        for o in saved.data["objects"]:
-            if o["status"] != "rejected":
+        for o in result.objects:
+            if o.center is not None and o.half_axes is not None and o.quat_wxyz is not None:
                 solid = rr.Ellipsoids3D(
-                    half_sizes=scale * np.array([o["half_axes"]]), labels=[names[o["id"]]],
-                    centers=scale * np.array([o["center"]]),
-                    quaternions=[np.roll(o["quat_wxyz"], -1)], fill_mode="solid",
-                    colors=[object_color(o["id"])[::-1]],
+                    half_sizes=scale * o.half_axes[None], labels=[names[o.id]],
+                    centers=scale * o.center[None], quaternions=[np.roll(o.quat_wxyz, -1)],
+                    fill_mode="solid", colors=[object_color(o.id)[::-1]],
                 )  # fmt: skip
-                rec.log(["world", "objects", o["class"], str(o["id"])], solid, static=True)
-        if saved.poses is not None:
-            cloud = rr.Points3D(scale * saved.poses.points, colors=saved.poses.colors)
+                rec.log(["world", "objects", o.class_name, str(o.id)], solid, static=True)
+        if result.poses is not None:
+            cloud = rr.Points3D(scale * result.poses.points, colors=result.poses.colors)
             rec.log("world/points", cloud, static=True)
-        _rrd_frames(rr, rec, saved, names, scale)
+        _rrd_frames(rr, rec, result, names, scale)
         rec.disconnect()  # writes what is left
 
 
-def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str], scale: float) -> None:
+def _rrd_frames(rr: Any, rec: Any, result: Result, names: dict[int, str], scale: float) -> None:
     """Log each frame's camera, if it has one, and boxes."""
-    poses, table, frames = saved.poses, saved.table, saved.frames()
+    poses, tracks, (frames, _) = result.poses, result.tracks, _frames_read(result)
     pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
-    fps = saved.data["video"]["fps"] or IMAGE_FPS
+    fps = result.video.fps or IMAGE_FPS
     for frame in frames:
         rec.set_time("frame", sequence=frame)
         rec.set_time("time", duration=frame / fps)
@@ -250,7 +234,7 @@ def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str], scale: f
             to_child = {"relation": rr.TransformRelation.ChildFromParent}
             move = rr.Transform3D(translation=scale * pose[:, 3], mat3x3=pose[:, :3], **to_child)
             rec.log("world/camera", rr.Pinhole(**lens, resolution=size), move)
-        rows = table[table.frame == frame]
+        rows = tracks[tracks.frame == frame]
         boxes = rr.Boxes2D(
             array=rows.xyxy, array_format=rr.Box2DFormat.XYXY,
             labels=[names[i] for i in rows.track_id.tolist()],
@@ -259,25 +243,9 @@ def _rrd_frames(rr: Any, rec: Any, saved: Saved, names: dict[int, str], scale: f
         rec.log("world/camera/boxes", boxes)
 
 
-EXPORTS: dict[str, tuple[str, Callable[[Saved, Path], None]]] = {  # name: file in OUT, writer
+EXPORTS: dict[str, tuple[str, Callable[[Result, Path], None]]] = {  # name: file in OUT, writer
     "coco-vid": ("coco_vid.json", export_coco_vid),
     "cvat": ("cvat.xml", export_cvat),
     "glb": ("objects.glb", export_glb),
     "rrd": ("scene.rrd", export_rrd),
 }
-
-
-def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
-    """Write what an output folder holds in another tool's format.
-
-    Args:
-        out: output folder of `run`. to: a name of EXPORTS. path: default: OUT/ and its own name.
-    Returns:
-        The file written.
-    """
-    if to not in EXPORTS:
-        raise ReobjError(f"no export called {to!r}; there are {', '.join(EXPORTS)}")
-    name, write = EXPORTS[to]
-    path = Path(path) if path else Path(out) / name
-    write(Saved.load(out), path)
-    return path

@@ -1,4 +1,7 @@
-"""overlay.mp4: boxes, identities and back-projected ellipsoids of every frame."""
+"""overlay.mp4: boxes, identities and back-projected ellipsoids of every frame.
+
+A sink under the one loop over the video (`write_pictures` in scene.py).
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,18 @@ import cv2
 import numpy as np
 
 import quadrics
-from reobj.cameras import Poses
-from reobj.results.workspace import RunResult
+from reobj.results.result import Result
 from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, Tracks, object_color
 
 
-def draw_tracks(image: Image, table: Tracks, labels: dict[int, str], scale: float) -> None:
+def draw_tracks(image: Image, tracks: Tracks, labels: dict[int, str], scale: float) -> None:
     """Draw the boxes and identities of one frame's rows, in place.
 
     Args:
-        labels: text of each identity; scale: image pixels per pixel of the table.
+        labels: text of each identity; scale: image pixels per pixel of the tracks.
     """
-    for obj, box in zip(table.track_id.tolist(), table.xyxy * scale, strict=True):
+    for obj, box in zip(tracks.track_id.tolist(), tracks.xyxy * scale, strict=True):
         x1, y1, x2, y2 = box.round().astype(int).tolist()
         color = object_color(obj)
         cv2.rectangle(image, (x1, y1), (x2, y2), color, 2, cv2.LINE_AA)
@@ -30,7 +32,7 @@ def draw_tracks(image: Image, table: Tracks, labels: dict[int, str], scale: floa
 
 
 def _draw_label(image: Image, text: str, x: int, y: int, color: tuple[int, int, int]) -> None:
-    """Text on a filled tag above (x, y), kept inside the image."""
+    """Draw text on a filled tag above (x, y), kept inside the image."""
     (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
     x = max(0, min(x, image.shape[1] - width - 4))
     y = max(height + base + 2, y)
@@ -57,7 +59,11 @@ def draw_ellipses(
 def _ellipse_of_dual_conic(
     dual_c: Array,
 ) -> tuple[tuple[float, float], tuple[float, float], float] | None:
-    """Centre, full axes, angle in degrees of an ellipse, else None: C* = [S - mm', -m; -m', -1]."""
+    """Read an ellipse off its dual conic C* = [S - mm', -m; -m', -1]; None where it is none.
+
+    Returns:
+        centre, full axes, angle in degrees, as cv2.ellipse wants them.
+    """
     conic = dual_c / -dual_c[2, 2]
     center = -conic[:2, 2]
     values, vectors = np.linalg.eigh(conic[:2, :2] + np.outer(center, center))
@@ -100,40 +106,35 @@ class VideoWriter:
         return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
 
 
-OVERLAY_SIZE_PX = 1280  # longer side of the overlay
+OVERLAY_SIZE_PX = 1280  # longer side: HD; larger videos are shrunk
 
 
 class Overlay:
-    """overlay.mp4: boxes, identities and back-projected ellipsoids, frame by frame.
+    """Write overlay.mp4 frame by frame.
 
-    Args:
-        solids: ellipsoids of the objects that are not rejected, in their order. Those that rest on
-            a prior are drawn only while they are detected.
+    Ellipsoids that rest on a prior are drawn only while their object is detected.
     """
 
-    def __init__(self, result: RunResult, solids: quadrics.Ellipsoids | None, video: Video) -> None:
+    def __init__(self, result: Result, path: Path, video: Video) -> None:
         width, height = video.size
         shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
         self.size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
-        self.scale, self.table = self.size[0] / width, result.table
-        self.projected = _project_all(result.poses, solids, self.scale)
-        kept = [o for o in result.objects if o["status"] != "rejected"]
-        self.ids, self.sure = (
-            [o["id"] for o in kept],
-            {o["id"] for o in kept if o["status"] == "ok"},
-        )
-        self.labels = {o["id"]: f"{o['id']} {o['class']}" for o in result.objects}
+        self.scale, self.tracks = self.size[0] / width, result.tracks
+        located = [o for o in result.objects if o.located]
+        self.ids, self.sure = [o.id for o in located], {o.id for o in located if o.status == "ok"}
+        self.labels = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
+        self.outlines = _project_all(result, self.scale)
         fps = max(1.0, (video.fps or 30.0) / video.config.every)
-        self.writer = VideoWriter(result.out / "overlay.mp4", fps, self.size)
+        self.writer = VideoWriter(path, fps, self.size)
 
     def take(self, frame: Frame) -> None:
         """Draw and append one frame."""
-        low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
-        rows = self.table[slice(low, high)]
+        low, high = np.searchsorted(self.tracks.frame, [frame.index, frame.index + 1])
+        rows = self.tracks[slice(low, high)]
         small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
         image = np.asarray(small, np.uint8)
-        if frame.index in self.projected:
-            dual_c, visible = self.projected[frame.index]
+        if frame.index in self.outlines:
+            dual_c, visible = self.outlines[frame.index]
             seen = set(rows.track_id.tolist())
             drawn = visible & np.array([i in seen or i in self.sure for i in self.ids], bool)
             draw_ellipses(image, dual_c, drawn, self.ids, seen)
@@ -145,14 +146,19 @@ class Overlay:
         self.writer.close(complete)
 
 
-def _project_all(
-    poses: Poses | None, ellipsoids: quadrics.Ellipsoids | None, scale: float
-) -> dict[int, tuple[Array, BoolArray]]:
-    """Dual conics (O, 3, 3), scaled pixels, and visibility (O,) for every frame with a pose."""
-    if poses is None or ellipsoids is None or not len(ellipsoids.half_axes):
+def _project_all(result: Result, scale: float) -> dict[int, tuple[Array, BoolArray]]:
+    """Project the located objects' ellipsoids into every frame with a pose.
+
+    Returns:
+        by frame number: dual conics (O, 3, 3) in scaled pixels, and visible (O,).
+    """
+    poses, fits = result.poses, result.fits
+    if poses is None or fits is None:
         return {}
-    known = poses.cam_from_world[poses.known]
-    img_from_world = np.diag([scale, scale, 1.0]) @ poses.camera.K @ known
+    ellipsoids = fits.ellipsoids[np.array([o.located for o in result.objects], bool)]
+    img_from_world = (
+        np.diag([scale, scale, 1.0]) @ poses.camera.K @ poses.cam_from_world[poses.known]
+    )
     dual_c, visible = quadrics.project(ellipsoids.dual_quadrics(), img_from_world)
-    outlines = zip(dual_c, visible, strict=True)
-    return dict(zip(poses.frame[poses.known].tolist(), outlines, strict=True))
+    frames = poses.frame[poses.known].tolist()
+    return dict(zip(frames, zip(dual_c, visible, strict=True), strict=True))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,9 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, invert_rigid
-from reobj.files import atomic, base64_text, numbers, rounded
-from reobj.results.overlay import draw_tracks
-from reobj.results.workspace import RunResult
+from reobj.files import Progress, atomic, base64_text, rounded
+from reobj.results.overlay import Overlay, draw_tracks
+from reobj.results.result import Object, Result, World, significant
 from reobj.sources.video import Video, shrunk
 from reobj.types import Frame, Image, IntArray, Tracks, object_color
 
@@ -35,15 +34,15 @@ class Pictures:
         frames: [frame number, base64] of whole frames with their boxes.
     """
 
-    def __init__(self, result: RunResult, video: Video) -> None:
-        self.table, self.scale = result.table, video.scale
-        self.crops: dict[int, list[tuple[int, str]]] = {o["id"]: [] for o in result.objects}
+    def __init__(self, result: Result, video: Video) -> None:
+        self.tracks, self.scale = result.tracks, video.scale
+        self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
         count = SCENE_MAX_CROPS // max(len(result.objects), 1)
         count = min(max(count, 1), SCENE_CROPS)
-        ranked = sorted(result.objects, key=lambda o: -o["frames_seen"])
+        ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         chosen = {
-            o["id"]: diverse_rows(result.table, o, result.poses, count)
+            o.id: diverse_rows(result.tracks, o, result.poses, count)
             for o in ranked[:SCENE_MAX_CROPS]
         }
         self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
@@ -52,9 +51,9 @@ class Pictures:
 
     def take(self, frame: Frame) -> None:
         """Cut what is wanted from this frame."""
-        rows = self.wanted[self.table.frame[self.wanted] == frame.index]
+        rows = self.wanted[self.tracks.frame[self.wanted] == frame.index]
         height, width = frame.image.shape[:2]
-        for obj, box in zip(self.table.track_id[rows], self.table.xyxy[rows], strict=True):
+        for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
             margin = 0.1 * (box[2:] - box[:2])
             x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
             x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
@@ -63,30 +62,31 @@ class Pictures:
                 self.crops[int(obj)].append((frame.index, crop))
         if frame.index in self.whole:
             image = shrunk(frame.image, SCENE_FRAME_PX)
-            low, high = np.searchsorted(self.table.frame, [frame.index, frame.index + 1])
+            low, high = np.searchsorted(self.tracks.frame, [frame.index, frame.index + 1])
             scale = self.scale * image.shape[1] / width
-            draw_tracks(image, self.table[slice(low, high)], {}, scale)
+            draw_tracks(image, self.tracks[slice(low, high)], {}, scale)
             self.frames.append((frame.index, _jpeg(image, SCENE_FRAME_PX)))
 
 
 def _jpeg(image: Image, size_px: int) -> str:
-    """Base64 of a small JPEG."""
+    """Encode a small JPEG as base64."""
     data = cv2.imencode(".jpg", shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return base64.b64encode(data.tobytes()).decode()
 
 
-def diverse_rows(table: Tracks, entry: dict[str, Any], poses: Poses | None, count: int) -> IntArray:
-    """Row numbers (<= count,) of the views of one object that differ most: in time and, where there
-    are cameras, in viewing direction; large boxes with good scores first.
+def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int) -> IntArray:
+    """Choose rows (<= count,) of the views of one object that differ most.
+
+    In time and, where there are cameras, in viewing direction; large boxes of good score first.
     """
-    rows = np.flatnonzero(table.track_id == entry["id"])
-    frame, box = table.frame[rows], table.xyxy[rows]
-    quality = table.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
-    place = 2 * (frame / max(int(table.frame.max(initial=0)), 1))[:, None]  # (N, 1)
-    if poses is not None and entry["center"] is not None:
+    rows = np.flatnonzero(tracks.track_id == found.id)
+    frame, box = tracks.frame[rows], tracks.xyxy[rows]
+    quality = tracks.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
+    place = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
+    if poses is not None and found.center is not None:
         world_from_cam = invert_rigid(poses.cam_from_world)  # (F, 3, 4)
         at = np.searchsorted(poses.frame, frame).clip(max=len(poses.frame) - 1)
-        ray = world_from_cam[at, :, 3] - entry["center"]
+        ray = world_from_cam[at, :, 3] - found.center
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         place = np.hstack([place, np.nan_to_num(ray)])  # (N, 4)
         quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # no pose: last
@@ -100,58 +100,57 @@ def diverse_rows(table: Tracks, entry: dict[str, Any], poses: Poses | None, coun
     return np.asarray(rows[chosen], np.int64)
 
 
-def scene_frames(result: RunResult) -> IntArray:
-    """Frame numbers that the time slider of the scene page goes through, before thinning."""
-    return np.unique(result.table.frame) if result.poses is None else result.poses.frame
+def scene_frames(result: Result) -> IntArray:
+    """Return the frames that the time slider of the page goes through, before thinning."""
+    return np.unique(result.tracks.frame) if result.poses is None else result.poses.frame
 
 
-SCENE_STEPS = 1500  # steps of the time slider (longer videos: every n-th camera)
+SCENE_STEPS = 1500  # positions of the time slider; of longer videos every n-th frame
 
 
-def write_scene(result: RunResult, pictures: Pictures, video: Video) -> None:
+def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) -> None:
     """Write scene.html: ellipsoids, cameras, points and pictures in one page that needs no network.
 
-    The page is `scene_template.html`; its data are objects.json's entries without covariance, and
-    base64 of little-endian float32 / uint8 arrays.
+    The page is `scene.html` beside this file; its data are objects.json's entries without
+    covariance, and base64 of little-endian float32 / uint8 arrays.
     """
     frames = scene_frames(result)
     steps = frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]  # (S,)
     seconds = video.config.every / (video.fps or 30.0) * len(frames) / max(1, len(steps))
+    world = result.world.to_json()
     data = {
         "title": Path(str(video.source)).name,
         "facts": _scene_facts(result.world),
         "warnings": result.warnings,
-        "world": {k: v for k, v in result.world.items() if k != "links"},
+        "world": {k: v for k, v in world.items() if k != "links"},
         "links": [
-            link | {key: rounded(link[key], 2) for key in ("place_iou", "look")}
-            for link in result.world["links"]
+            link | {key: rounded(link[key], 2) for key in ("place_iou", "appearance_log_odds")}
+            for link in world["links"]
         ],
-        "objects": [_scene_object(o, result.table, steps, pictures) for o in result.objects],
+        "objects": [_scene_object(o, result.tracks, steps, pictures) for o in result.objects],
         "thumbs": pictures.frames,
         "why_flat": _why_flat(result),
         "steps": {"frame": steps.tolist(), "seconds": seconds},
-        **_scene_cameras(result.poses, result.world.get("up_in_world"), steps),
+        **_scene_cameras(result, steps),
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = Path(__file__).with_name("scene.html").read_text().split("@DATA@")
-    with atomic(result.out / "scene.html") as part:
+    with atomic(path) as part:
         part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
 
 
-SCENE_POINTS = 20000  # sparse points in scene.html (more: every n-th)
+SCENE_POINTS = 20000  # sparse points shown; of more every n-th
 
 
-def _scene_cameras(
-    poses: Poses | None, up_in_world: Sequence[float] | None, steps: IntArray
-) -> dict[str, Any]:
-    """Cameras of the steps, sparse points and the upward direction, for the page."""
+def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
+    """Return the cameras of the steps, the sparse points and the upward direction."""
+    poses, up = result.poses, result.world.up_in_world
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
     thin = slice(None, None, math.ceil(len(poses.points) / SCENE_POINTS) or 1)
     K = poses.camera.K
-    up = quadrics.camera_up(K @ poses.cam_from_world[poses.known])[0]
-    if up_in_world is not None:
-        up = np.array(up_in_world)
+    if up is None:
+        up = quadrics.camera_up(K @ poses.cam_from_world[poses.known])[0]
     size = {"width": poses.camera.width, "height": poses.camera.height}
     return {
         "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
@@ -160,43 +159,68 @@ def _scene_cameras(
         ),
         "points": base64_text(poses.points[thin], "<f4"),
         "colors": base64_text(poses.colors[thin], "u1"),
-        "up": numbers(up),
+        "up": significant(up).tolist(),
     }
 
 
 def _scene_object(
-    entry: dict[str, Any], table: Tracks, steps: IntArray, pictures: Pictures
+    found: Object, tracks: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
-    """An object for the page: its entry of objects.json, colour, steps in which it is seen (first,
-    last, first, last ...) and pictures.
+    """Return an object for the page: its entry of objects.json, colour, pictures, and the steps in
+    which it is seen (first, last, first, last ...).
     """
-    seen = np.isin(steps, table.frame[table.track_id == entry["id"]])
+    seen = np.isin(steps, tracks.frame[tracks.track_id == found.id])
     runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
     runs[1::2] -= 1
-    return {k: v for k, v in entry.items() if k != "cov"} | {
-        "color": object_color(entry["id"])[::-1],
+    return {k: v for k, v in found.to_json().items() if k != "cov"} | {
+        "color": object_color(found.id)[::-1],
         "seen": runs.tolist(),
-        "crops": pictures.crops[entry["id"]],
+        "crops": pictures.crops[found.id],
     }
 
 
-def _why_flat(result: RunResult) -> str:
-    """Why the page has nothing to show in 3D; "" when it has."""
+def _why_flat(result: Result) -> str:
+    """Say why the page has nothing to show in 3D; "" when it has."""
     if result.poses is not None and result.poses.known.any():
         return ""
     reasons = [w for w in result.warnings if "pose" in w or "identities only" in w]
     return reasons[0] if reasons else "no camera poses (`track`, or --poses none)"
 
 
-def _scene_facts(world: dict[str, Any]) -> str:
-    """One line on cameras and scale."""
-    if not world["registered_frames"]:
+def _scene_facts(world: World) -> str:
+    """Say in one line what is known of cameras and scale."""
+    if not world.registered_frames:
         return ""
-    facts = [f"cameras of {world['registered_frames']} of {world['frames']} frames"]
-    scale = world.get("scale")
-    if scale and scale["source"] != "none":
-        facts.append(f"scale from {scale['source']}, ± {100 * (scale['rel_sigma'] or 0):.0f} %")
+    facts = [f"cameras of {world.registered_frames} of {world.frames} frames"]
+    if world.scale is not None and world.scale.source != "none":
+        sigma = 100 * (world.scale.rel_sigma or 0)
+        facts.append(f"scale from {world.scale.source}, ± {sigma:.0f} %")
     else:
-        facts.append(f"units: {world['units']}")
-    facts += [] if world["up_in_world"] else ["up is guessed from the cameras"]
+        facts.append(f"units: {world.units}")
+    facts += ["up is guessed from the cameras"] if world.up_in_world is None else []
     return " · ".join(facts)
+
+
+def write_pictures(
+    result: Result, out: Path, video: Video, overlay: bool = True, scene: bool = True
+) -> None:
+    """Read the video once and write overlay.mp4 and scene.html; a live source has no second pass.
+
+    Each file appears only when it is complete.
+    """
+    film = Overlay(result, out / "overlay.mp4", video) if overlay and not video.is_live else None
+    pictures = Pictures(result, video) if scene else None
+    sinks = [sink for sink in (film, pictures) if sink is not None and not video.is_live]
+    progress, complete = Progress("pictures", video.expected), False
+    try:
+        for frame in video if sinks else ():
+            for sink in sinks:
+                sink.take(frame)
+            progress.step()
+        complete = True
+    finally:
+        progress.close()
+        if film is not None:
+            film.close(complete)
+    if pictures is not None:
+        write_scene(result, pictures, out / "scene.html", video)

@@ -489,67 +489,29 @@ CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
 SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
 
 
-@dataclass(frozen=True, slots=True)
-class TrackResult:
-    """Identities of a video from the tracker.
-
-    Attributes:
-        table: the rows; look: (n, E) fused embeddings of those of them that the tracker embedded,
-            look_row: (n,) which these are; split: width of their foreground (0: all).
-        class_names; messages: for the user.
-        fixed: identities were given (--tracks): nothing may join, split or renumber them.
-    """
-
-    table: Tracks
-    class_names: tuple[str, ...]
-    messages: tuple[str, ...] = ()
-    fixed: bool = False
-    look: npt.NDArray[np.float16] = field(default_factory=lambda: np.empty((0, 0), np.float16))
-    look_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-    split: int = 0
-
-    def save(self, path: Path) -> None:
-        """Write as npz, atomically."""
-        columns = {f.name: getattr(self.table, f.name) for f in dataclasses.fields(Tracks)}
-        columns |= {"look": self.look, "look_row": self.look_row}
-        facts = {k: getattr(self, k) for k in ("class_names", "messages", "fixed", "split")}
-        save_npz(path, columns, **facts)
-
-    @staticmethod
-    def load(path: Path) -> TrackResult:
-        """Read what `save` wrote."""
-        try:
-            data, facts = load_npz(path)
-            table = Tracks(*(data[f.name] for f in dataclasses.fields(Tracks)))
-            names, messages = tuple(facts["class_names"]), tuple(facts["messages"])
-            looks = data["look"], data["look_row"], int(facts["split"])
-            return TrackResult(table, names, messages, bool(facts["fixed"]), *looks)
-        except (KeyError, ValueError) as error:
-            raise ReobjError(
-                f"{path}: not readable, or of another version ({error}); delete it and run again"
-            ) from error
-
-
 def read_tracks(
     path: str | Path,
     video: Video,
     config: DetectConfig | None = None,
-    like: TrackResult | None = None,
-) -> TrackResult:
-    """Read identities made elsewhere or corrected by hand; they stand, the linker is not asked.
+    known: Tracks | None = None,
+    known_names: Sequence[str] = (),
+) -> tuple[Tracks, tuple[str, ...], list[str]]:
+    """Read identities made elsewhere or corrected by hand.
 
     Args:
         path: CVAT for video 1.1 (XML or its zip), COCO-VID JSON (track_id or instance_id), MOT rows
             or CSV with ids, in native pixels; frames that the video's options leave out are not
             used.
-        like: earlier tracks of the video: they lend their scores to boxes that were not moved, and
-            their classes to files that have none.
+        known, known_names: earlier tracks of the video and their class names: they lend their
+            scores to boxes that were not moved, and their classes to files that have none.
+    Returns:
+        tracks, their class names, and messages for the user.
     """
     path, config = Path(path), config or DetectConfig()
     limit = dataclasses.replace(config, min_score=0.0, max_detections=sys.maxsize)
     if path.suffix.lower() in (".xml", ".zip"):
         found = _read_cvat(path, video)
-        _check(found, path, limit, video.frame_count)
+        check_detections(found, path, limit, video.frame_count)
     else:
         found = read_detections(path, video, limit)
     if len(found) and (not len(found.identity) or found.identity.min() < 0):
@@ -560,32 +522,31 @@ def read_tracks(
     pairs = np.column_stack([found.frame, found.identity])[use]  # (N, 2)
     unique, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
-        frame, obj = unique[count.argmax()]
-        raise ReobjError(f"{path}: identity {obj} has {count.max()} boxes in frame {frame} "
+        frame, identity = unique[count.argmax()]
+        raise ReobjError(f"{path}: identity {identity} has {count.max()} boxes in frame {frame} "
                          "(0-based); an object is in one place at a time")  # fmt: skip
     rows = np.flatnonzero(use)[first]
     ids, unknown = found.identity[rows], np.full(len(rows), -1, np.int64)
-    table = Tracks(found.frame[rows], ids, ids, found.xyxy[rows], found.score[rows],
-                       found.class_id[rows], unknown)  # fmt: skip
-    names = found.class_names
-    if like is not None:
+    columns = (found.xyxy[rows], found.score[rows], found.class_id[rows], unknown)
+    tracks, names = Tracks(found.frame[rows], ids, ids, *columns), found.class_names
+    if known is not None:
         unnamed = names == ("object",)
-        table = _as_known(like.table, table, unnamed)
-        names = like.class_names if unnamed else names
-    return TrackResult(table, names, tuple(found.messages), fixed=True)
+        tracks = _lend(known, tracks, unnamed)
+        names = tuple(known_names) if unnamed else names
+    return tracks, names, found.messages
 
 
-def _as_known(known: Tracks, table: Tracks, unnamed: bool) -> Tracks:
+def _lend(known: Tracks, tracks: Tracks, unnamed: bool) -> Tracks:
     """Give unmoved boxes their earlier scores, and unnamed ones the class that overlaps most."""
-    class_id, score = table.class_id.copy(), table.score.copy()
-    for rows in rows_by(table.frame):
-        there = known[known.frame == table.frame[rows[0]]]
-        iou = np.hstack([box_iou(table.xyxy[rows], there.xyxy), np.zeros((len(rows), 1))])
+    class_id, score = tracks.class_id.copy(), tracks.score.copy()
+    for rows in rows_by(tracks.frame):
+        there = known[known.frame == tracks.frame[rows[0]]]
+        iou = np.hstack([box_iou(tracks.xyxy[rows], there.xyxy), np.zeros((len(rows), 1))])
         best, same = iou.argmax(1), iou.max(1) > SAME_BOX
         score[rows[same]] = there.score[best[same]]
         if unnamed:
             class_id[rows] = np.append(there.class_id, -1)[best]  # -1: "object"
-    return dataclasses.replace(table, class_id=class_id, score=score)
+    return dataclasses.replace(tracks, class_id=class_id, score=score)
 
 
 def _read_cvat(path: Path, video: Video) -> RecordedDetections:

@@ -1,0 +1,72 @@
+"""The poses of a run: supplied by the user and checked, from the cache, or reconstructed."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from reobj.cameras import Poses, load_poses, save_poses, write_colmap
+from reobj.poses.checks import check_poses
+from reobj.poses.estimate import PosesConfig, estimate_poses
+from reobj.poses.readers import read_poses
+from reobj.results.workspace import Workspace
+from reobj.sources.video import Video, source_fingerprint
+from reobj.types import ReobjError, Tracks, rows_by
+
+
+def supplied_poses(video: Video, config: PosesConfig) -> Poses | None:
+    """Read poses given by the user; None if they are to be reconstructed."""
+    if config.mode in ("auto", "none"):
+        return None
+    return read_poses(config.mode, video, config.fmt, config.camera)
+
+
+def check_directions(poses: Poses, tracks: Tracks) -> None:
+    """Refuse supplied poses whose direction or axes contradict the tracks.
+
+    Raises:
+        ReobjError: names the likely mistake.
+    """
+    centers = (tracks.xyxy[:, :2] + tracks.xyxy[:, 2:]) / 2
+    rays = [(tracks.frame[rows], centers[rows]) for rows in rows_by(tracks.tracklet_id)]
+    if fault := check_poses(poses, rays):
+        raise ReobjError(fault)
+
+
+def reconstruct_cached(
+    video: Video, config: PosesConfig, workspace: Workspace, moving: Tracks | None = None
+) -> tuple[Poses, Path]:
+    """Reconstruct the cameras of a video, or take them from the output folder's cache.
+
+    Args:
+        moving: tracks of things that move; nothing on them is matched.
+    Returns:
+        poses, and the folder of their COLMAP model (missing if the reconstruction failed).
+    """
+    boxes = np.empty((0, 5))
+    if moving is not None and len(moving):
+        boxes = np.column_stack([moving.frame, moving.xyxy])
+    digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
+    content = source_fingerprint(video.source)
+    path = workspace.path("poses", content, video.config, config, digest)
+    model = path.with_suffix(".sparse")
+    if path.exists():
+        return load_poses(path), model
+    work = workspace.cache / "sfm"
+    boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
+    poses = estimate_poses(video, config, work, boxes_to_mask=boxes_of)
+    if poses.known.any():
+        shutil.rmtree(model, ignore_errors=True)
+        (work / "sparse").replace(model)
+        save_poses(path, poses)
+    return poses, model
+
+
+def write_supplied_model(poses: Poses, video: Video, out: Path) -> None:
+    """Write sparse/ of supplied poses; a reconstruction has its own, with more in it."""
+    if poses.source == "user" and poses.known.any():
+        names = [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
+        write_colmap(out / "sparse", poses, names)

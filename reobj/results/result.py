@@ -1,0 +1,432 @@
+"""What a run found, typed: objects, their world, tracks and cameras; its files, and their reading.
+
+The pictures (overlay.mp4, scene.html) need the video and have rooms of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import quadrics
+from reobj import __version__
+from reobj.cameras import Poses, load_poses, write_tum
+from reobj.files import atomic, load_json, load_npz, save_npz, without_password
+from reobj.sources.detection_files import read_mot_rows
+from reobj.types import (
+    Array,
+    Embeddings,
+    Floats,
+    IntArray,
+    LinkEvent,
+    ReobjError,
+    Tracks,
+    object_color,
+)
+
+FORMAT = "reobj-objects"
+FORMAT_VERSION = 1  # of objects.json
+LAST_POSES = "cache/last-poses.npz"  # in an output folder
+STALE = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html")  # of earlier runs
+CONVENTIONS = {
+    "pose": "cam_from_world",
+    "camera_axes": "x right, y down, z forward",
+    "quaternion": "wxyz, world_from_obj",
+    "pixels": "centre of the top-left pixel at (0.5, 0.5) (COLMAP)",
+    "frames": "0-based",
+    "size": "full extents of the solid along its own axes",
+    "ellipsoid": "inscribed in a box or cylinder",
+    "cov": "9x9: center, log half axes, rotation vector in object axes",
+}
+_JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Object:
+    """One physical object; lengths in world units, None where no solid was fitted.
+
+    Attributes:
+        id: identity in the tracks, from 1. class_name: of the largest sum of scores; score: mean.
+        status: "ok", "prior_dominated" (some size rests on the category's prior) or "rejected".
+        reason: why it is not "ok", "" if it is. support: "box", "cylinder" or "ellipsoid".
+        center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
+        size: (3,) full extents of the solid along its own axes; size_m: the same in metres, None
+            where the scale is unknown; size_rel_sigma: (3,) relative standard deviation.
+        cov: (9, 9) of center, log half axes, rotation vector in object axes.
+        views: frames with a pose that show it; dropped_boxes: of them, outliers.
+        frames_seen: frames that show it. parallax_deg: widest angle between two viewing rays.
+        reprojection_iou_median: overlap of the projected solid with the boxes.
+        tracklet_ids: its unbroken tracks; visits: first and last frame of each, by time.
+    """
+
+    id: int
+    class_name: str
+    score: float
+    status: str
+    reason: str
+    support: str | None = None
+    center: Array | None = None
+    half_axes: Array | None = None
+    quat_wxyz: Array | None = None
+    size: Array | None = None
+    size_m: Array | None = None
+    size_rel_sigma: Array | None = None
+    cov: Array | None = None
+    views: int = 0
+    frames_seen: int = 0
+    parallax_deg: float | None = None
+    dropped_boxes: int = 0
+    reprojection_iou_median: float | None = None
+    tracklet_ids: list[int] = field(default_factory=list)
+    visits: list[list[int]] = field(default_factory=list)
+
+    @property
+    def located(self) -> bool:
+        """True where a solid was fitted and not rejected."""
+        return self.status != "rejected"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of objects.json."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {_JSON_KEYS.get(k, k): _plain(v) for k, v in values.items()}
+
+    @staticmethod
+    def from_json(entry: dict[str, Any]) -> Object:
+        """Read an entry of objects.json; what it has besides is ignored."""
+        values = {f.name: entry[_JSON_KEYS.get(f.name, f.name)] for f in dataclasses.fields(Object)}
+        for name in ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov"):
+            values[name] = None if values[name] is None else np.array(values[name], np.float64)
+        return Object(**values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """What is known about the world that the objects stand in.
+
+    Attributes:
+        units: "m", "arbitrary", or None without cameras. source: of the poses.
+        registered_frames, interpolated_frames, frames: with a pose, between two, in all.
+        up_in_world: (3,) unit vector against gravity; up_source: where it comes from.
+        scale: metres per unit, its relative sigma and source; None without a fit.
+        links: joins and splits of tracklets with their evidence.
+    """
+
+    units: str | None = None
+    source: str = "none"
+    registered_frames: int = 0
+    interpolated_frames: int = 0
+    frames: int = 0
+    up_in_world: Array | None = None
+    up_source: str = "none"
+    scale: quadrics.Scale | None = None
+    links: tuple[LinkEvent, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the `world` of objects.json."""
+        values = {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        if self.scale is not None:
+            values["scale"] = {
+                "metres_per_unit": self.scale.value,
+                "rel_sigma": self.scale.rel_sigma,
+                "source": self.scale.source,
+            }
+        return values | {"links": [dataclasses.asdict(event) for event in self.links]}
+
+    @staticmethod
+    def from_json(entry: dict[str, Any]) -> World:
+        """Read the `world` of objects.json."""
+        values = {f.name: entry[f.name] for f in dataclasses.fields(World) if f.name in entry}
+        if (up := values.get("up_in_world")) is not None:
+            values["up_in_world"] = np.array(up, np.float64)
+        if (scale := values.get("scale")) is not None:
+            facts = (scale["metres_per_unit"], scale["rel_sigma"], scale["source"])
+            values["scale"] = quadrics.Scale(*facts)
+        values["links"] = tuple(LinkEvent.from_json(link) for link in values.get("links", ()))
+        return World(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class VideoInfo:
+    """Which video a result is of: its path without password, native size in pixels, frame rate."""
+
+    path: str
+    width: int
+    height: int
+    fps: float
+
+
+@dataclass(slots=True, eq=False)
+class Result:
+    """What was found in a video: tracks, cameras, objects.
+
+    Attributes:
+        tracks: all rows of the video in native pixels, with the objects' identities.
+        class_names: names of the tracks' `class_id`.
+        objects: one for each identity, by id. world: units, gravity, scale, joins and splits.
+        poses: cameras, or None. fits: of the objects, in their order; None if nothing was fitted
+            here (no cameras, or read from a folder).
+        embeddings: (n, E1) and (n, E2), fused: foreground and background of the rows
+            `embedding_row` (n,) of the tracks that the tracker embedded.
+        identities_given: the user gave the identities; nothing may join, split or renumber them.
+        seconds: wall time by stage. warnings: what the user should know.
+        out: the folder that it was saved to or loaded from.
+    """
+
+    tracks: Tracks
+    class_names: tuple[str, ...]
+    video: VideoInfo
+    objects: list[Object] = field(default_factory=list)
+    world: World = field(default_factory=World)
+    poses: Poses | None = None
+    fits: quadrics.ObjectFits | None = None
+    embeddings: Embeddings = field(default_factory=Embeddings.empty)
+    embedding_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    identities_given: bool = False
+    seconds: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    out: Path | None = None
+
+    def save(self, out: str | Path) -> None:
+        """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
+
+        Each file appears only when it is complete; those of an earlier run are removed.
+        """
+        self.out = out = Path(out)
+        for name in STALE:
+            (out / name).unlink(missing_ok=True)
+        write_mot(out / "tracks.txt", self.tracks)
+        self._write_objects(out / "objects.json")
+        if self.poses is not None and self.poses.known.any():
+            write_tum(out / "poses.txt", self.poses)
+        if self.fits is not None:
+            located = np.array([o.located for o in self.objects], bool)
+            ids = [o.id for o in self.objects if o.located]
+            write_ply(out / "objects.ply", self.fits.ellipsoids[located], ids)
+
+    @staticmethod
+    def load(out: str | Path) -> Result:
+        """Read what `save` wrote; without the fits and the embeddings.
+
+        Raises:
+            ReobjError: no `run` or `track` finished there, or another version wrote the folder.
+        """
+        out = Path(out)
+        if not (out / "objects.json").is_file() or not (out / "tracks.txt").is_file():
+            raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
+        data = load_json(out / "objects.json")
+        try:
+            objects = [Object.from_json(entry) for entry in data["objects"]]
+            world = World.from_json(data["world"])
+            facts = {f.name: data["video"][f.name] for f in dataclasses.fields(VideoInfo)}
+        except (KeyError, TypeError, ValueError) as error:
+            raise ReobjError(f"{out / 'objects.json'}: {_written_by(out)} ({error!r})") from error
+        names = tuple(dict.fromkeys(o.class_name for o in objects))
+        class_of = {o.id: names.index(o.class_name) for o in objects}
+        rows = read_mot_rows(out / "tracks.txt")
+        ids = rows[:, 1].astype(np.int64)
+        unknown = np.full(len(rows), -1, np.int64)
+        classes = np.array([class_of.get(i, -1) for i in ids.tolist()], np.int64)
+        corners = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], 1)  # (N, 4)
+        frame = rows[:, 0].astype(np.int64) - 1
+        tracks = Tracks(frame, ids, ids, corners, rows[:, 6], classes, unknown)
+        poses = load_poses(out / LAST_POSES) if (out / LAST_POSES).is_file() else None
+        warnings = list(data.get("warnings", ()))
+        return Result(
+            tracks, names, VideoInfo(**facts), objects, world, poses, warnings=warnings, out=out
+        )
+
+    def keep_embeddings(
+        self,
+        frames: Sequence[int],
+        embedded: Sequence[tuple[IntArray, Floats]],
+        foreground_width: int,
+    ) -> None:
+        """Keep the embeddings of a tracker for those rows of the tracks that have one.
+
+        Args:
+            frames: source frame numbers. embedded: of each, detection indices (n,) and their fused
+                rows (n, E). foreground_width: columns of the foreground (0: all).
+        """
+        tracks = self.tracks
+        keys = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
+        row_of = {key: row for row, key in enumerate(keys)}
+        found = zip(frames, embedded, strict=True)
+        rows = [row_of.get((f, d), -1) for f, (index, _) in found for d in index.tolist()]
+        row = np.array(rows, np.int64)
+        parts = [part for _, part in embedded if part.size] or [np.empty((0, 0), np.float32)]
+        fused = np.concatenate(parts)[row >= 0].astype(np.float16)
+        width = foreground_width or fused.shape[1]
+        self.embeddings = Embeddings(fused[:, :width], fused[:, width:])
+        self.embedding_row = row[row >= 0]
+
+    def save_tracked(self, path: Path) -> None:
+        """Write what tracking found, before anything is linked or fitted, as npz."""
+        columns = {f.name: getattr(self.tracks, f.name) for f in dataclasses.fields(Tracks)}
+        columns |= {name: getattr(self.embeddings, name) for name in ("foreground", "background")}
+        facts = {"class_names": self.class_names, "warnings": self.warnings,
+                 "identities_given": self.identities_given,
+                 "video": dataclasses.asdict(self.video), "version": __version__}  # fmt: skip
+        save_npz(path, columns | {"embedding_row": self.embedding_row}, **facts)
+
+    @staticmethod
+    def load_tracked(path: Path) -> Result:
+        """Read what `save_tracked` wrote."""
+        data, facts = load_npz(path)
+        try:
+            return Result(
+                Tracks(*(data[f.name] for f in dataclasses.fields(Tracks))),
+                tuple(facts["class_names"]),
+                VideoInfo(**facts["video"]),
+                embeddings=Embeddings(data["foreground"], data["background"]),
+                embedding_row=data["embedding_row"],
+                identities_given=bool(facts["identities_given"]),
+                warnings=list(facts["warnings"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ReobjError(f"{path}: {_written_by(path.parent.parent)} ({error!r})") from error
+
+    def summary(self) -> str:
+        """Return the table that `run` prints: object, class, frames, size with sigma, status."""
+        scaled = any(o.size_m is not None for o in self.objects)
+        unit = "m" if scaled else "units"
+        lines = [
+            f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  "
+            f"{'width x depth x height, ' + unit:<26} {'sigma':>6}  status"
+        ]
+        for o in self.objects:
+            size = o.size if o.size_m is None else o.size_m
+            text = "-" if size is None else " x ".join(f"{s:.2f}" for s in size)
+            sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
+            reason = f" ({o.reason})" if o.reason else ""
+            lines.append(
+                f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
+                f"{text:<26} {sigma:>6}  {o.status}{reason}"
+            )
+        counts = sorted(Counter(o.class_name for o in self.objects).items())
+        lines.append("distinct objects: " + (", ".join(f"{n} {c}" for c, n in counts) or "none"))
+        if self.poses is not None:
+            known, count = self.world.registered_frames, self.world.frames
+            lines.append(f"cameras: {known} of {count} frames ({self.poses.source})")
+        if scale := self.world.scale:
+            sigma = f"{100 * (scale.rel_sigma or 0):.0f} %"
+            lines.append(f"scale: {scale.value} m per unit, sigma {sigma} (from {scale.source})")
+        lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in self.seconds.items()))
+        if self.out is not None:
+            files = [self.out / n for n in ("scene.html", "overlay.mp4", "objects.json")]
+            lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
+        return "\n".join(lines)
+
+    def _write_objects(self, path: Path) -> None:
+        versions = {}
+        for name in ("numpy", "scipy", "opencv-python-headless", "pycolmap", "onnxruntime"):
+            with contextlib.suppress(PackageNotFoundError):  # installed under another name
+                versions[name] = version(name)
+        tracked = {"tracked_frames": len(np.unique(self.tracks.frame))}
+        data = {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "command": without_password(" ".join(sys.argv)),
+            "reobj_track": __version__,
+            "versions": versions,
+            "conventions": CONVENTIONS,
+            "video": dataclasses.asdict(self.video) | tracked,
+            "world": self.world.to_json(),
+            "objects": [o.to_json() for o in self.objects],
+            "warnings": self.warnings,
+        }
+        with atomic(path) as part:
+            part.write_text(json.dumps(data, indent=1) + "\n")
+
+
+def significant(values: Array) -> Array:
+    """Round to six significant digits: far below any accuracy, and stable text."""
+    rounded = [float(f"{v:.6g}") for v in np.ravel(values)]
+    return np.array(rounded, np.float64).reshape(np.shape(values))
+
+
+def _plain(value: Any) -> Any:
+    """Return arrays as nested lists, anything else as it is."""
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _written_by(out: Path) -> str:
+    """Say which version wrote an output folder that this one cannot read."""
+    data: dict[str, Any] = {}
+    with contextlib.suppress(ReobjError):
+        data = load_json(out / "objects.json")
+    wrote = data.get("reobj_track", "of before 0.2") if isinstance(data, dict) else "unknown"
+    return (
+        f"written by reobj_track {wrote}, this is {__version__}: run again into another folder, or "
+        "with --overwrite"
+    )
+
+
+def validate_objects(path: Path) -> list[str]:
+    """Check an objects.json against objects.schema.json; returns one line for each fault."""
+    try:
+        import jsonschema
+    except ImportError as error:
+        raise ReobjError("jsonschema is not installed: pip install jsonschema") from error
+    schema = json.loads(Path(__file__).with_name("objects.schema.json").read_text())
+    faults = jsonschema.Draft202012Validator(schema).iter_errors(load_json(path))
+    return sorted(f"{path}: {fault.json_path}: {fault.message[:200]}" for fault in faults)
+
+
+def write_mot(path: Path, tracks: Tracks) -> None:
+    """Write MOTChallenge results: frame (from 1), id, left, top, width, height, score, 3 x -1."""
+    ltwh = np.column_stack([tracks.xyxy[:, :2], tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]])
+    rows = np.column_stack([tracks.frame + 1, tracks.track_id, ltwh, tracks.score])  # (N, 7)
+    with atomic(path) as part:
+        np.savetxt(part, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
+
+
+PLY_DETAIL = 2  # subdivisions of an octahedron: 512 triangles an ellipsoid
+
+
+def write_ply(path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int]) -> None:
+    """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world."""
+    sphere, faces = _sphere_mesh(PLY_DETAIL)  # (P, 3), (T, 3)
+    half = ellipsoids.half_axes[:, None] * sphere  # (O, P, 3)
+    points = half @ np.swapaxes(ellipsoids.world_from_obj, 1, 2)
+    points += ellipsoids.center_in_world[:, None]
+    colors = np.array([object_color(i)[::-1] for i in object_id], np.uint8).reshape(-1, 3)  # RGB
+    vertex = np.zeros(points.shape[:2], [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertex["xyz"], vertex["rgb"] = points, colors[:, None]
+    face = np.zeros((len(points), len(faces)), [("n", "u1"), ("i", "<i4", 3)])
+    face["n"], face["i"] = 3, faces + (np.arange(len(points)) * len(sphere))[:, None, None]
+    names = [f"property float {n}\n" for n in "xyz"]
+    names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
+    header = (
+        "ply\nformat binary_little_endian 1.0\ncomment reobj_track ellipsoids\n"
+        f"element vertex {vertex.size}\n{''.join(names)}"
+        f"element face {face.size}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    with atomic(path) as part:
+        part.write_bytes(header.encode() + vertex.tobytes() + face.tobytes())
+
+
+def _sphere_mesh(detail: int) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Triangulate the unit sphere: points (P, 3), triangles (T, 3) of a divided octahedron."""
+    points = np.concatenate([np.eye(3), -np.eye(3)])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
+                      [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])  # fmt: skip
+    for _ in range(detail + 1):
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2)
+        edges, edge_of = np.unique(edges, axis=0, return_inverse=True)
+        middle = points[edges].sum(1)  # (E, 3)
+        (a, b, c), (ab, bc, ca) = faces.T, len(points) + edge_of.reshape(-1, 3).T
+        points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
+        faces = np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])  # (4, 3, T)
+        faces = faces.transpose(2, 0, 1).reshape(-1, 3)
+    return points, faces
