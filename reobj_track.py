@@ -411,9 +411,9 @@ class Tracker:
             "live": (self._live, [f.name for f in dataclasses.fields(_Live)]),
             "gallery": (self.gallery, ("rows", "viewing_ray", "count", "foreground_width")),
             "places": (self.places, EllipsoidMap.ARRAYS),
-            "same": (self.same, ("sums",)),
-            "same_soon": (self.same_soon, ("sums",)),
-            "camera": (self._camera_motion, ("_gray", "_corners")),
+            "same": (self.same, SimilarityCalibration.ARRAYS),
+            "same_soon": (self.same_soon, SimilarityCalibration.ARRAYS),
+            "camera": (self._camera_motion, CameraMotion.ARRAYS),
         }
         return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
 
