@@ -66,6 +66,7 @@ from reobj.identity.reid import (
     match_probability,
     part_cosines,
 )
+from reobj.identity.sampling import SamplingLayout as SamplingLayout
 from reobj.objects import ObjectsConfig, fitter, object_entries, world_entry
 from reobj.poses.checks import check_poses
 from reobj.poses.estimate import PosesConfig, estimate_poses

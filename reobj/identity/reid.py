@@ -232,7 +232,12 @@ class SimilarityCalibration:
         return np.asarray(1 / (1 + np.exp(-self.logit(*known) - math.log(prior / (1 - prior)))))
 
 
-def match_probability(logit: Array, prior_odds: float = 1.0) -> Array:
+# odds beforehand that a newcomer is a certain known object and not a new one: fitted with WEIGHTS
+# (with other embeddings 1.0 to 1.5: docs/appearance.md)
+RETURN_ODDS = 1.8
+
+
+def match_probability(logit: Array, prior_odds: float = RETURN_ODDS) -> Array:
     """Compute the probability (N, M) that row and column are one object: o / (1 + o + o').
 
     o are the odds of the pair, o' those of the likeliest other pair of its row or column (the
