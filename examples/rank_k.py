@@ -2,7 +2,7 @@
 """Measure re-identification: Rank-k, mAP, twins, by view angle and by time gap.
 
     python examples/rank_k.py --rooms 900 901 902 903 904 --recording redkitchen_7scenes \\
-        --models mobilenetv2 --person osnet_x0_25_msmt17 -o OUT
+        --models mobilenetv2_feat --person osnet_x0_25_msmt17 -o OUT
 
 writes OUT/rank_k.csv, OUT/by_bin.csv, OUT/cost.csv and plots, and prints Markdown tables.
 
@@ -60,11 +60,16 @@ import numpy.typing as npt
 
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
 import reobj_track as rt
+from reobj.cameras import viewing_rays
+from reobj.files import atomic
+from reobj.identity.crops import flat_maps
+from reobj.identity.reid import RETURN_ODDS, SimilarityCalibration, match_probability
+from reobj.results.evaluation import ABSENT, SCORED, read_truth
+from reobj.sources.detection_files import NO_RUNS, rle_decode, rle_encode
+from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session
+from reobj.types import Array, BoolArray, Image, IntArray
 
-Array = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-Look = Callable[[rt.Image, rt.Detections, IntArray], rt.Embeddings]
+Look = Callable[[Image, rt.Detections, IntArray], rt.Embeddings]
 
 ANGLES_DEG = (0, 15, 30, 45, 60, 90, 180)
 GAPS = (0, 30, 60, 120, 240, 10**9)  # frames
@@ -103,13 +108,13 @@ class Scene:
     runs: list[Any]
     size: tuple[int, int]
 
-    def at(self, f: int) -> tuple[rt.Image, rt.Detections, IntArray]:
+    def at(self, f: int) -> tuple[Image, rt.Detections, IntArray]:
         """Image of frame f, all its detections, and which of them are scored."""
         rows = np.flatnonzero(self.row == f)
         runs = [self.runs[i] for i in rows]
         masks = None
         if any(map(len, runs)):
-            masks = np.stack([rt.rle_decode(r, self.size) for r in runs])  # (D, H, W)
+            masks = np.stack([rle_decode(r, self.size) for r in runs])  # (D, H, W)
         classes = np.unique(self.name, return_inverse=True)[1][rows].astype(np.int64)
         found = rt.Detections(self.xyxy[rows], np.ones(len(rows)), classes, masks)
         return read_image(self.images[f]), found, np.flatnonzero(self.identity[rows] > 0)
@@ -187,7 +192,7 @@ def render_scene(config: Any, folder: Path, every: int) -> None:
         found = rr.simulate_detections(
             room, frame.truth, frame.instance, rr.DetectorConfig(false_positives=0), rng
         )
-        sight = rt.sight_lines(found.xyxy, K @ poses[number])
+        sight = viewing_rays(found.xyxy, K @ poses[number])
         for i, k in enumerate(found.truth_index):
             item = room.objects[k]
             rows.append({
@@ -197,7 +202,7 @@ def render_scene(config: Any, folder: Path, every: int) -> None:
             })  # fmt: skip
     lengths = [len(r["run"]) for r in rows]
     arrays: dict[str, Any] = {k: np.array([r[k] for r in rows]) for k in rows[0] if k != "run"}
-    with rt.atomic(folder / "scene.npz") as part, part.open("wb") as file:
+    with atomic(folder / "scene.npz") as part, part.open("wb") as file:
         np.savez_compressed(
             file, **arrays, number=numbers, size=np.array([config.width, config.height]),
             mask_counts=np.concatenate([r["run"] for r in rows]),
@@ -215,8 +220,8 @@ def recording_scene(folder: Path, every: int = 1, min_visibility: float = 0.0) -
     if truth_file is None:
         raise rt.ReobjError(f"{folder}: expected identities in gt_mot.txt, gt.txt or gt/gt.txt")
     files = image_files(folder)
-    truth = rt.read_truth(truth_file, rt.COCO_NAMES, min_visibility)
-    truth = truth[truth.role != rt.ABSENT]
+    truth = read_truth(truth_file, rt.COCO_NAMES, min_visibility)
+    truth = truth[truth.role != ABSENT]
     if len(truth) and truth.frame.max() > len(files):
         raise rt.ReobjError(
             f"{truth_file}: frame {truth.frame.max()} of {len(files)} images in {folder}: give the "
@@ -226,8 +231,8 @@ def recording_scene(folder: Path, every: int = 1, min_visibility: float = 0.0) -
     n = len(truth)
     scene = Scene(
         folder.name, files, np.arange(len(files)), truth.frame - 1, truth.xyxy, truth.name,
-        np.full(n, -1), np.where(truth.role == rt.SCORED, truth.identity, 0),
-        sights(folder, truth.frame - 1, truth.xyxy), [rt.NO_RUNS] * n, (size[0], size[1]),
+        np.full(n, -1), np.where(truth.role == SCORED, truth.identity, 0),
+        sights(folder, truth.frame - 1, truth.xyxy), [NO_RUNS] * n, (size[0], size[1]),
     )  # fmt: skip
     return scene.sampled(every)
 
@@ -250,7 +255,7 @@ def sights(folder: Path, row: IntArray, xyxy: Array) -> Array:
     cams = np.linalg.inv(np.loadtxt(files[0]).reshape(-1, 4, 4))[:, :3]  # (F, 3, 4)
     K = pinhole(json.loads(files[1].read_text()))
     for f in np.unique(row):
-        sight[row == f] = rt.sight_lines(xyxy[row == f], K @ cams[f])
+        sight[row == f] = viewing_rays(xyxy[row == f], K @ cams[f])
     return sight
 
 
@@ -296,7 +301,7 @@ def depth_scene(folder: Path, min_score: float = 0.3, reach: float = 0.3) -> Sce
     return Scene(
         f"{folder.name} (depth)", files, np.arange(len(files)), row, found[:, 1:5],
         np.array(rt.COCO_NAMES)[found[:, 6].astype(int)], np.full(len(row), -1), identity,
-        sights(folder, row, found[:, 1:5]), [rt.NO_RUNS] * len(row), (size[0], size[1]),
+        sights(folder, row, found[:, 1:5]), [NO_RUNS] * len(row), (size[0], size[1]),
     )  # fmt: skip
 
 
@@ -347,7 +352,7 @@ def scannet_scene(
             good = len(x) >= min_mask and (box[2:] - box[:2]).min() >= min_side and touched < 2
             boxes.append(box)
             labels.append(int(k))
-            runs.append(rt.rle_encode(np.ascontiguousarray(mask)))
+            runs.append(rle_encode(np.ascontiguousarray(mask)))
             rows.append(f)
             scored.append(good and int(k) in names)
     identity = np.where(scored, labels, 0)
@@ -400,9 +405,7 @@ def scannet_sights(folder: Path, stems: Sequence[str], row: IntArray, xyxy: Arra
         pose = folder / "pose" / f"{stem}.txt"
         if intrinsic.is_file() and pose.is_file():
             K = np.loadtxt(intrinsic)[:3, :3]
-            sight[row == f] = rt.sight_lines(
-                xyxy[row == f], K @ np.linalg.inv(np.loadtxt(pose))[:3]
-            )
+            sight[row == f] = viewing_rays(xyxy[row == f], K @ np.linalg.inv(np.loadtxt(pose))[:3])
     return sight
 
 
@@ -416,10 +419,10 @@ class Crops(rt.CropEmbedder):
     """`CropEmbedder` that shares the maps of a frozen backbone with others, to save time."""
 
     def __init__(self, model: str, head: str = "", memo: Memo | None = None) -> None:
-        super().__init__(model, rt.EmbedConfig(head=head), threads=1)
+        super().__init__(model, head, threads=1)
         self.memo = memo if self.frozen else None
 
-    def maps(self, crops: rt.Image) -> npt.NDArray[np.float32]:
+    def maps(self, crops: Image) -> npt.NDArray[np.float32]:
         if self.memo is None:
             return super().maps(crops)
         keys = [hash(crop.tobytes()) for crop in crops]
@@ -440,36 +443,29 @@ class OneCrop(Crops):
         self.part = part
 
     def __call__(
-        self, frame: rt.Image, detections: rt.Detections, rows: IntArray | None = None
+        self, frame: Image, detections: rt.Detections, rows: IntArray | None = None
     ) -> rt.Embeddings:
         rows = np.arange(len(detections)) if rows is None else rows
         crops, own = self.cut(frame, detections, rows)
         if self.part != "full":
             crops = np.split(self.masked(crops, own), 2)[PARTS.index(self.part)]
         maps = self.maps(crops)
-        found = flat(maps) if self.conv_block is None else self._joint(maps)
+        found = flat_maps(maps) if self.conv_block is None else self.run_conv_block(maps)
         return rt.Embeddings(found, np.empty((len(rows), 0)))
-
-
-def flat(maps: npt.NDArray[Any]) -> Array:
-    """Maps (N, ...) as unit rows with the signed square root, as `CropEmbedder` without block."""
-    rows = maps.reshape(len(maps), -1).astype(np.float64)
-    rows = np.sign(rows) * np.sqrt(np.abs(rows))
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12))
 
 
 def person_look(name: str, threads: int = 1) -> Look:
     """DeepSORT's way: the plain box, resized, through one network; pooled if it gives a map."""
-    session = rt.onnx_session(rt.model_path(name), threads)
+    session = onnx_session(rt.model_path(name), threads)
     entry = session.get_inputs()[0]
     side = tuple(s if isinstance(s, int) else 128 for s in entry.shape[:1:-1])
 
-    def look(image: rt.Image, found: rt.Detections, rows: IntArray) -> rt.Embeddings:
+    def look(image: Image, found: rt.Detections, rows: IntArray) -> rt.Embeddings:
         crops = []
         for x1, y1, x2, y2 in found.xyxy[rows].round().astype(int):
             part = image[max(y1, 0) : max(y2, y1 + 1, 1), max(x1, 0) : max(x2, x1 + 1, 1)]
             crops.append(cv2.resize(part if part.size else image[-1:, -1:], side)[..., ::-1])
-        batch = (np.array(crops, np.float32) - rt.IMAGENET_MEAN) / rt.IMAGENET_STD
+        batch = (np.array(crops, np.float32) - IMAGENET_MEAN) / IMAGENET_STD
         feed = {entry.name: batch.transpose(0, 3, 1, 2).astype(np.float32)}
         out = session.run(None, feed)[0].astype(np.float64)
         out = out.mean((2, 3)) if out.ndim == 4 else out
@@ -481,14 +477,12 @@ def person_look(name: str, threads: int = 1) -> Look:
 
 def looks(args: Any, memo: Memo | None = None) -> dict[str, tuple[Look, tuple[str, ...]]]:
     """Every method: how to embed, and the names of its one or two parts."""
-    found: dict[str, tuple[Look, tuple[str, ...]]] = {
-        "colour, frame": (rt.Embedder("colour", threads=1), PARTS)
-    }
+    found: dict[str, tuple[Look, tuple[str, ...]]] = {}
     for name in args.models:
         stem, frame = Path(name).stem, rt.Embedder(name, threads=1)
         found[f"{stem}, frame"] = (frame, PARTS)
         if frame.frozen and frame.trained:
-            plain = rt.Embedder(name, rt.EmbedConfig(head="none"), threads=1)
+            plain = rt.Embedder(name, "none", threads=1)
             found[f"{stem} no-train, frame"] = (plain, PARTS)
         if not args.no_crops:
             found |= crop_looks(name, args.blocks, memo)
@@ -709,9 +703,9 @@ class Cases:
     newcomer: BoolArray
     shown: tuple[Array, Array]
 
-    def decider(self) -> rt.SameObject:
-        """`SameObject` that has seen what the video shows."""
-        found = rt.SameObject(rt.TrackerConfig().prior_weight)
+    def decider(self) -> SimilarityCalibration:
+        """`SimilarityCalibration` that has seen what the video shows."""
+        found = SimilarityCalibration()
         for same, cosine in enumerate(self.shown):
             found.add(cosine[:, 0], cosine[:, 1], bool(same))
         return found
@@ -732,7 +726,7 @@ class Cases:
         found = []
         for q in np.unique(self.query[self.newcomer]):
             rows = self.query == q
-            chance = rt.match_probability(logit[None, rows], odds)[0]
+            chance = match_probability(logit[None, rows], odds)[0]
             found.append((chance.max(), self.same[rows][chance.argmax()]))
         table = np.array(found, np.float64).reshape(-1, 2)
         return table[:, 0], table[:, 1] > 0
@@ -793,12 +787,12 @@ def fit_logistic(terms: Array, same: BoolArray, weight: Array) -> Array:
 
 
 def calibrate(cases: Sequence[Cases]) -> tuple[Array, float]:
-    """`SameObject.WEIGHTS` and `tracker.return_odds`: the likeliest ones."""
+    """`SimilarityCalibration.WEIGHTS` and `RETURN_ODDS`: the likeliest ones."""
     fitted: list[tuple[Array, BoolArray, Array]] = []
     for c in cases:
         for angle in (c.angle, np.full(len(c.same), np.nan)):
             weight = c.balance(bool(np.isfinite(angle).any())) / max(len(c.same), 1)
-            terms = np.nan_to_num(c.decider().scores(c.cosine, angle))
+            terms = np.nan_to_num(c.decider().part_scores(c.cosine, angle))
             fitted.append((terms, c.same, weight))
     terms, same, weight = (np.concatenate(x) for x in zip(*fitted, strict=True))
     weights = fit_logistic(terms, same, weight)
@@ -833,7 +827,7 @@ def expected_error(rows: Sequence[dict[str, float]]) -> float:
 
 def unmasked(scene: Scene) -> Scene:
     """The scene as a detector without masks sees it."""
-    return dataclasses.replace(scene, runs=[rt.NO_RUNS] * len(scene.runs))
+    return dataclasses.replace(scene, runs=[NO_RUNS] * len(scene.runs))
 
 
 def scene_cases(
@@ -849,21 +843,24 @@ def scene_cases(
 
 
 def print_calibration(args: Any) -> None:
-    """Fit what `SameObject` and the tracker hold as constants, on rooms with and without masks."""
+    """Fit and print the constants of `reobj.identity.reid`, on rooms with and without masks."""
     plans = [(plan, seed) for plan in args.plan for seed in args.calibrate]
     rooms = [room_scene(seed, args.cache, args.every, plan) for plan, seed in plans]
     rooms += [unmasked(scene) for scene in rooms]
     cases: list[Cases] = []
-    for model in ["colour", *args.models]:
+    for model in args.models:
         own = scene_cases(rooms, embed(rooms, rt.Embedder(model, threads=1)), args.weight)
         weights, odds = calibrate(own)
-        print(f"{model}: SameObject.WEIGHTS {weights.round(2)}, tracker.return_odds {odds:.2f}")
-        close = [[rt.SameObject.closeness(c.shown[k]).mean(0) for c in own if len(c.shown[k])]
-                 for k in (0, 1)]  # fmt: skip
-        print(f"  SameObject.USUAL {np.array([np.mean(x, 0) for x in close]).round(2).tolist()}")
+        print(f"{model}: SimilarityCalibration.WEIGHTS {weights.round(2)}, RETURN_ODDS {odds:.2f}")
+        shown = [[c.shown[k] for c in own if len(c.shown[k])] for k in (0, 1)]
+        usual = [
+            np.mean([SimilarityCalibration.log_similarity(x).mean(0) for x in kind], 0)
+            for kind in shown
+        ]
+        print(f"  SimilarityCalibration.USUAL {np.array(usual).round(2).tolist()}")
         cases += own
     weights, odds = calibrate(cases)
-    print(f"together: SameObject.WEIGHTS {weights.round(2)}, tracker.return_odds {odds:.2f}")
+    print(f"together: SimilarityCalibration.WEIGHTS {weights.round(2)}, RETURN_ODDS {odds:.2f}")
 
 
 def reliabilities(cases: Sequence[Cases]) -> list[dict[str, Any]]:
@@ -875,7 +872,7 @@ def reliabilities(cases: Sequence[Cases]) -> list[dict[str, Any]]:
         if not own:
             continue
         if known.startswith("decision"):
-            odds = rt.TrackerConfig().return_odds
+            odds = RETURN_ODDS
             both = zip(*(c.decisions(odds, angle) for c in own), strict=True)
             p, same = (np.concatenate(x) for x in both)
             weight = np.ones(len(p))
@@ -992,7 +989,7 @@ def ratio(rows: Sequence[dict[str, Any]], ours: str, protocol: str, gap: str) ->
 def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Write rows, lists left out."""
     hidden = ("ranks", "identity", "bins")
-    with rt.atomic(path) as part, part.open("w", newline="") as file:
+    with atomic(path) as part, part.open("w", newline="") as file:
         names = list(dict.fromkeys(k for r in rows for k in r if k not in hidden))
         writer = csv.DictWriter(file, names, extrasaction="ignore")
         writer.writeheader()
@@ -1088,7 +1085,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--cache", type=Path, default=Path("build/rank_k"), help="for rendered rooms")
     add("--every", type=int, default=6, help="use every n-th frame (default %(default)s)")
     add("--away", type=int, default=30, help="frames that count as away (default %(default)s)")
-    add("--models", nargs="*", default=[], help="backbones beside the colour descriptor")
+    add("--models", nargs="*", default=["reobj"], help="appearance models (default %(default)s)")
     add("--person", nargs="*", default=[], help="networks for the plain box (DeepSORT's way)")
     add("--calibrate", type=int, nargs="*", default=[], metavar="SEED",
         help="fit the constants of the probability on these rooms, print them")  # fmt: skip

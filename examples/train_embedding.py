@@ -57,6 +57,9 @@ sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve
 import render_room as rr  # noqa: E402
 
 import reobj_track as rt  # noqa: E402
+from reobj.identity.sampling import PartSamples, occupancy_map, sample_parts  # noqa: E402
+from reobj.sources.detection_files import RecordedDetections, read_npz  # noqa: E402
+from reobj.types import Array, Image, IntArray, box_iou  # noqa: E402
 
 try:
     import torch
@@ -66,18 +69,16 @@ try:
 except ImportError:
     sys.exit("train_embedding.py needs PyTorch: pip install torch matplotlib onnx")
 
-Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
-
 SIZE_WH = (320, 240)  # of a training picture; in use the longer side is 320, any shape
 STRIDE = 16  # sides of the network's input are multiples of it
 # Channels of the map: fixed colours, learned from 15 pixels, learned from the surroundings.
 COLOURS, NEAR, DEEP = 17, 24, 40
 CHANNELS, WIDTH = COLOURS + NEAR + DEEP, 128  # of the map and of each embedding
-LAYOUT = {"size_px": 320, "context": 0.5, "reach": 0.05, "samples": 3, "foreground_cells": 3,
-          "background_cells": 4, "wide": 1.5, "wide_reach": 0.2, "wide_cells": 4,
-          "foreground_channels": COLOURS + NEAR}  # fmt: skip
+LAYOUT = {
+    "size_px": 320, "context": 0.5, "min_margin": 0.05, "samples": 3, "foreground_cells": 3,
+    "background_cells": 4, "surround_scale": 1.5, "surround_min_margin": 0.2,
+    "surround_cells": 4, "foreground_channels": COLOURS + NEAR,
+}  # fmt: skip
 
 
 # ---- Clips: pictures with identified boxes -------------------------------------------------------
@@ -253,7 +254,7 @@ def tracks_clip(folder: Path, tracks: Path) -> Clip:
     return clip
 
 
-def recorded_masks(folder: Path) -> list[rt.RecordedDetections]:
+def recorded_masks(folder: Path) -> list[RecordedDetections]:
     """Detections with masks in an output folder of `run` or beside a tracks.txt."""
     found = []
     for path in sorted([*folder.glob("cache/*/chunk_*.npz"), *folder.glob("*.npz")]):
@@ -261,7 +262,7 @@ def recorded_masks(folder: Path) -> list[rt.RecordedDetections]:
             if "mask_counts" not in data or not len(data["mask_counts"]):
                 continue
             size = tuple(data["image_size"].tolist())
-        found.append(rt._read_npz(path, size, size)[0])
+        found.append(read_npz(path, size, size)[0])
     return found
 
 
@@ -270,7 +271,7 @@ def paint(label: Image, found: rt.Detections, xyxy: Array, identity: IntArray) -
     if found.masks is None or not len(identity):
         return
     ratio = np.tile(np.divide(label.shape[::-1], found.masks.shape[:0:-1]), 2)
-    overlap = rt.box_iou(xyxy, found.xyxy * ratio)  # (D, M)
+    overlap = box_iou(xyxy, found.xyxy * ratio)  # (D, M)
     for row in np.flatnonzero(overlap.max(1) > 0.7):
         mask = found.masks[overlap[row].argmax()].astype(np.uint8)
         label[cv2.resize(mask, label.shape[::-1]) > 0] = identity[row] + 1
@@ -333,7 +334,7 @@ class View:
     picture: Image  # (H, W, 3)
     identity: IntArray  # (D,)
     look: IntArray  # (D,)
-    samples: rt.PartSamples
+    samples: PartSamples
 
 
 def photo_tone(rng: np.random.Generator, strength: float) -> Callable[[Image], Image]:
@@ -437,14 +438,14 @@ def make_view(
     """Augment one frame as `augmented` does and sample its boxes."""
     picture, found, rows = augmented(clip, frame, rng, change, flip, wanted)
     shape = (SIZE_WH[1] // 4, SIZE_WH[0] // 4)
-    objects = rt.object_map(found, SIZE_WH[::-1], shape, layout().object_score)
-    samples = rt.part_samples(found, [rows, rows], SIZE_WH[::-1], objects, layout())
+    objects = occupancy_map(found, SIZE_WH[::-1], shape, layout().object_score)
+    samples = sample_parts(found, [rows, rows], SIZE_WH[::-1], objects, layout())
     return View(picture, clip.identity[frame][rows], clip.look[frame][rows], samples)
 
 
-def layout() -> rt.EmbedConfig:
+def layout() -> rt.SamplingLayout:
     """Where the map is sampled."""
-    return rt.EmbedConfig(**LAYOUT)  # type: ignore[arg-type]
+    return rt.SamplingLayout(**LAYOUT)  # type: ignore[arg-type]
 
 
 def jittered(
@@ -515,7 +516,7 @@ class Residual(nn.Module):
 
 
 class ColourMap(nn.Module):
-    """Soft histogram of Lab colour and gradients (`reobj_track._colour_features`), at 1/4: fixed.
+    """Soft histogram of Lab colour and gradients at 1/4 of the picture; nothing of it is trained.
 
     Three colour values of 0 to 255 (B, 3, H, W), BGR, to (B, 17, H / 4, W / 4).
     """
@@ -668,7 +669,9 @@ class Head(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        fore, near, wide = (int(LAYOUT[f"{k}_cells"]) for k in ("foreground", "background", "wide"))
+        fore, near, wide = (
+            int(LAYOUT[f"{k}_cells"]) for k in ("foreground", "background", "surround")
+        )
         assert near == wide
         self.parts = nn.ModuleList(
             [PartHead(1, fore, int(LAYOUT["foreground_channels"])), PartHead(2, near, CHANNELS)]
@@ -714,9 +717,9 @@ def principal(weight: Any, rows: Any) -> None:
     weight[: len(axes)] = axes
 
 
-def pooled(flat: Any, samples: Sequence[rt.PartSamples], cells_a_map: int) -> list[Any]:
-    """Cells (N, cells, C + 2) of all foregrounds and backgrounds (`reobj_track.part_cells` in
-    torch); flat: all maps' cells, one map after the other.
+def pooled(flat: Any, samples: Sequence[PartSamples], cells_a_map: int) -> list[Any]:
+    """Pool cells (N, cells, C + 2) of all foregrounds and backgrounds, as
+    `reobj.identity.sampling.pool_cells` does; flat: all maps' cells, one map after the other.
     """
     index = np.concatenate([s.index + i * cells_a_map for i, s in enumerate(samples)])
     weight = np.concatenate([s.weight for s in samples]).astype(np.float32)  # (cells, S)

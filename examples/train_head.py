@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Train a head for a frozen backbone of `reobj_track.py`, such as MobileNetV2's ImageNet weights.
 
-    python examples/train_head.py -o OUT --backbone mobilenetv2 --rooms 1008:1193 ...
+    python examples/train_head.py -o OUT --backbone mobilenetv2_feat --rooms 1008:1193 ...
 
-writes OUT/mobilenetv2_head.onnx, two vectors an object from the cells of one pass over the frame,
-or with --crops OUT/SETUP/crops_mobilenetv2_head.onnx, re-OBJ's ConvBlock on two masked crops an
-object (use: `--embed mobilenetv2` or `--embed crops`, each with `--set embed.head=FILE`), beside
-checkpoints, log and curves as of `train_embedding.py`, whose sources, augmentation, loss and
+writes OUT/mobilenetv2_feat_head.onnx, two vectors an object from the cells of one pass over the
+frame, or with --crops OUT/SETUP/crops_mobilenetv2_feat_head.onnx, re-OBJ's ConvBlock on two masked
+crops an object (use: `--embed mobilenetv2_feat` or `--embed crops`, with `--set embed.head=FILE`),
+beside checkpoints, log and curves as of `train_embedding.py`, whose sources, augmentation, loss and
 validation these are. What the backbone shows of every scene is computed once and kept in the cache.
 Ref: Bansal et al., re-OBJ, ICIAP 2019 (ConvBlock).
 """
@@ -34,16 +34,16 @@ from torch import nn  # noqa: E402
 from torch.nn import functional as F  # noqa: E402
 
 import reobj_track as rt  # noqa: E402
-
-Image = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
+from reobj.files import atomic  # noqa: E402
+from reobj.types import Image, IntArray  # noqa: E402
 
 FROZEN_WH = (640, 480)  # of a picture for a frozen backbone
 FROZEN: dict[str, Any] = {
-    "size_px": 384, "context": 0.5, "reach": 0.05, "samples": 4, "foreground_cells": 3,
-    "background_cells": 4, "wide": 1.5, "wide_reach": 0.2, "wide_cells": 4,
+    "size_px": 384, "context": 0.5, "min_margin": 0.05, "samples": 4, "foreground_cells": 3,
+    "background_cells": 4, "surround_scale": 1.5, "surround_min_margin": 0.2,
+    "surround_cells": 4,
 }  # fmt: skip
-CROPS: dict[str, Any] = {"context": 0.5, "reach": 0.05, "crop_px": 224}
+CROPS: dict[str, Any] = {"context": 0.5, "min_margin": 0.05, "crop_px": 224}
 CROP_SETUPS = {"concat": ("fg", "bg"), "fg": ("fg",), "bg": ("bg",), "full": ("full",)}
 
 
@@ -78,9 +78,9 @@ class Frozen:
     def __init__(self, args: argparse.Namespace) -> None:
         self.args, self.crops, self.cache = args, bool(args.crops), args.cache / "seen"
         self.layout: dict[str, Any] = CROPS if self.crops else FROZEN
-        config = rt.EmbedConfig(head="none", **self.layout)
+        layout = rt.SamplingLayout(**self.layout)
         kind = rt.CropEmbedder if self.crops else rt.Embedder
-        self.embedder = kind(args.backbone, config, threads=args.threads)
+        self.embedder = kind(args.backbone, "none", layout, threads=args.threads)
         self.name = f"{'crops' if self.crops else 'frame'}_{Path(args.backbone).stem}"
         self.cache.mkdir(parents=True, exist_ok=True)
 
@@ -91,11 +91,7 @@ class Frozen:
             three = np.concatenate([self.embedder.masked(crops, own), crops])
             parts = np.split(self.embedder.maps(three), 3)
             return dict(zip(("fg", "bg", "full"), parts, strict=True))
-        features, layout = self.embedder._features(picture), self.embedder.layout
-        size_hw, shape = picture.shape[:2], features.shape[:2]
-        objects = rt.object_map(found, size_hw, shape, layout.object_score)
-        samples = rt.part_samples(found, [rows, rows], size_hw, objects, layout)
-        fore, back = rt.part_cells(features, samples, layout)
+        fore, back = self.embedder.cells(picture, found, rows)
         return {"fg": fore.reshape(len(rows), -1), "bg": back.reshape(len(rows), -1)}
 
     def scene(self, source: Source, copy: int, parts: Sequence[str]) -> Seen:
@@ -127,7 +123,7 @@ class Frozen:
         table: dict[str, Any] = {
             k: np.concatenate([r[k] for r in found_rows]) for k in found_rows[0]
         }
-        with rt.atomic(path) as part, part.open("wb") as file:
+        with atomic(path) as part, part.open("wb") as file:
             np.savez(file, **table)
 
 
@@ -271,7 +267,7 @@ class HeadTrainer(te.Trainer):
         shapes = [self.pool.rooms[0].parts[n].shape[1:] for n in self.names]
         if self.frozen.crops:
             return nn.ModuleList(ConvBlock(shape[0], 192 // len(shapes)) for shape in shapes)
-        fore, *back = (FROZEN[f"{k}_cells"] for k in ("foreground", "background", "wide"))
+        fore, *back = (FROZEN[f"{k}_cells"] for k in ("foreground", "background", "surround"))
         channels = shapes[0][0] // int(fore) ** 2 - 2
         return nn.ModuleList([CellHead([int(fore)], channels),
                               CellHead([int(n) for n in back], channels)])  # fmt: skip

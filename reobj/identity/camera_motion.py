@@ -1,8 +1,10 @@
-"""Image motion between frames that the camera makes, from sparse optical flow."""
+"""The camera's motion in the image, from one frame to the next, by sparse optical flow.
+
+`CameraMotion` returns a similarity transform for each new image, and `parallax` what it leaves
+unexplained near a point of a deep scene. No poses and no depth: those are of `reobj.poses`.
+"""
 
 from __future__ import annotations
-
-from typing import Any
 
 import cv2
 import numpy as np
@@ -10,86 +12,123 @@ import numpy as np
 from reobj.sources.video import resized
 from reobj.types import Array, Floats, Image
 
-FLOW_SIZE_PX = 320  # longer side of the image for optical flow
-FLOW_CORNERS = 100  # corners followed
-FLOW_NEIGHBOURS = 5  # of these the nearest tell how a track moves besides, in a deep scene
-FLOW_MIN_CORNERS = 8  # with fewer that agree, the camera is taken to stand still
+FLOW_SIZE_PX = 320  # longer side of the image in which corners are followed (chosen, for speed)
+FLOW_CORNERS = 100  # corners followed (chosen, for speed; BoT-SORT: 1000)
+CORNER_QUALITY = 0.01  # least strength of a corner over that of the strongest (as BoT-SORT)
+CORNER_SPACING_PX = 12  # between corners of the small image, so that they spread (chosen)
+# nearest corners that tell the parallax of a point (chosen). IoU of the true boxes with those moved
+# so instead of by the transform alone: rendered room v900 .76 -> .82, room 0 at every 4th frame
+# .65 -> .78 (docs/tracking.md)
+PARALLAX_CORNERS = 5
 
 
 class CameraMotion:
-    """Global image motion between consecutive frames from sparse optical flow, as a 3x3 matrix.
+    """Image motion of the camera between consecutive frames, as a 3x3 similarity transform.
 
-    A similarity transform is fitted by RANSAC to corner tracks (as BoT-SORT does). What counts is
-    how many agree, not their share: in wide steps most are lost, and in 450 pairs of frames of
-    different videos at most 7 agreed. With fewer than flow_min_corners the identity is returned, so
-    a textureless frame never stops the tracker.
+    RANSAC fits the transform to corners followed by optical flow (as BoT-SORT does) or, where the
+    step was too wide to follow any, to matched ORB points. It needs a number of inliers and no
+    majority: in wide steps most corners are lost. Without enough inliers the motion is the
+    identity, so a frame without texture never stops the tracker.
+
+    Attributes:
+        residual_flow: (K, 4) in a deep scene (see `parallax`), else (0, 4): x, y of the corners in
+            the old image, and the motion x, y that the transform does not explain, pixels.
+        gray, corners: the latest image, small and gray, and its corners (C, 1, 2); None at first.
+            They are the whole state (`ARRAYS`).
     """
 
+    ARRAYS = ("gray", "corners")
+
     def __init__(self) -> None:
-        self._gray: Image | None = None
-        self._corners: Any = None
-        self.flow = np.empty((0, 4))  # (K, 4) corners of the old image and what they moved besides
+        self.gray: Image | None = None
+        self.corners: Floats | None = None
+        self.residual_flow = np.empty((0, 4))
 
     def __call__(self, image: Image) -> Array:
-        """Return new_from_old (3, 3) in pixels of `image`."""
+        """Estimate new_from_old (3, 3) between the previous image and this one (H, W, 3) BGR, in
+        pixels of `image`; the identity for a first image and after a change of size.
+        """
         shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
         small = resized(image, [round(side * shrink) for side in image.shape[1::-1]])
         gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
-        new_from_old, self.flow = np.eye(3), np.empty((0, 4))
-        if self._gray is not None and self._corners is not None and self._gray.shape == gray.shape:
-            new_from_old = self._flow(gray)
-        self._gray = gray
-        self._corners = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, 0.01, 12)
-        self.flow /= shrink
-        to_small = np.diag([shrink, shrink, 1.0])
-        return np.asarray(np.linalg.inv(to_small) @ new_from_old @ to_small)
+        new_from_old, residual_flow = np.eye(3), np.empty((0, 4))
+        if self.gray is not None and self.corners is not None and self.gray.shape == gray.shape:
+            moved, status, _ = cv2.calcOpticalFlowPyrLK(
+                self.gray, gray, self.corners, np.empty_like(self.corners)
+            )  # (C, 1, 2), (C, 1)
+            found = status.ravel() == 1
+            fit = _fit_similarity(self.corners[found, 0], np.asarray(moved)[found, 0])
+            fit = fit or _fit_similarity(*_orb_matches(self.gray, gray))
+            new_from_old, residual_flow = fit or (new_from_old, residual_flow)
+        self.gray = gray
+        corners = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX)
+        self.corners = None if corners is None else np.asarray(corners, np.float32)
+        self.residual_flow = residual_flow / shrink
+        small_from_image = np.diag([shrink, shrink, 1.0])
+        return np.asarray(np.linalg.inv(small_from_image) @ new_from_old @ small_from_image)
 
     def parallax(self, xy: Array) -> Array:
-        """What things at xy (N, 2) of the old image moved besides, (N, 2), in a deep scene: as the
-        corners near them (median of the nearest).
+        """Estimate the parallax at points of the old image: their motion beyond the transform.
+
+        Only in a deep scene, where the transform explains less than half of the corners: there a
+        point moves as the median of its nearest corners. Where the transform explains most of
+        them, the rest are objects that move by themselves, and the parallax is 0.
+
+        Args:
+            xy: (N, 2) pixels of the old image.
+        Returns:
+            (N, 2) pixels, to be added to where `new_from_old` takes the points.
         """
-        if not len(self.flow):
+        if not len(self.residual_flow):
             return np.zeros_like(xy)
-        apart = ((xy[:, None] - self.flow[:, :2]) ** 2).sum(-1)  # (N, K)
-        near = apart.argsort(1)[:, :FLOW_NEIGHBOURS]
-        return np.asarray(np.median(self.flow[near, 2:], 1))
-
-    def _flow(self, gray: Image) -> Array:
-        """Fit the similarity small_new_from_small_old (3, 3): to the corners followed, or, where
-        the step was too wide for that, to points that look alike.
-        """
-        assert self._gray is not None and self._corners is not None
-        guess = np.empty_like(self._corners)
-        moved, ok, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, self._corners, guess)
-        good = ok.ravel() == 1
-        found = self._similarity(self._corners[good, 0], moved[good, 0])
-        if found is None:
-            found = self._similarity(*_alike_points(self._gray, gray))
-        return np.eye(3) if found is None else found
-
-    def _similarity(self, old: Floats, new: Floats) -> Array | None:
-        """Fit (3, 3) to points (K, 2), None: too few agree. Where it holds for most of them, the
-        others move by themselves; where not, the scene is deep, and `flow` says how they move.
-        """
-        if len(old) < FLOW_MIN_CORNERS:
-            return None
-        cv2.setRNGSeed(0)
-        affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=2.0)
-        if affine is None or inliers.sum() < FLOW_MIN_CORNERS:
-            return None
-        if inliers.mean() < 0.5:
-            self.flow = np.c_[old, new - old @ affine[:, :2].T - affine[:, 2]]
-        return np.vstack([affine, [0, 0, 1]])
+        distance2 = ((xy[:, None] - self.residual_flow[:, :2]) ** 2).sum(-1)  # (N, K)
+        nearest = distance2.argsort(1)[:, :PARALLAX_CORNERS]  # (N, 5)
+        return np.asarray(np.median(self.residual_flow[nearest, 2:], 1))
 
 
-def _alike_points(old: Image, new: Image) -> tuple[Floats, Floats]:
-    """Points (K, 2) of two gray images that look alike, wherever they are (ORB)."""
-    orb = cv2.ORB.create(300, fastThreshold=7)
-    (a, look_a), (b, look_b) = (orb.detectAndCompute(image, None) for image in (old, new))
-    if look_a is None or look_b is None:
+ORB_POINTS = 300  # points of each image that are matched (chosen)
+ORB_FAST_THRESHOLD = 7  # contrast of a corner, of 255 (chosen below OpenCV's 20 for poor texture)
+
+
+def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
+    """Match ORB points of two gray images, however far apart: mutual nearest descriptors.
+
+    Returns:
+        positions (K, 2) in the old and in the new image.
+    """
+    orb = cv2.ORB.create(ORB_POINTS, fastThreshold=ORB_FAST_THRESHOLD)
+    (in_old, old_words), (in_new, new_words) = (
+        orb.detectAndCompute(image, None) for image in (old, new)
+    )
+    if old_words is None or new_words is None:
         return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(look_a, look_b)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(old_words, new_words)
     index = np.array([(m.queryIdx, m.trainIdx) for m in pairs], np.int64).reshape(-1, 2)
-    points = (np.array(cv2.KeyPoint.convert(found), np.float32) for found in (a, b))
+    points = (np.array(cv2.KeyPoint.convert(found), np.float32) for found in (in_old, in_new))
     at_old, at_new = (xy[rows] for xy, rows in zip(points, index.T, strict=True))
     return at_old, at_new
+
+
+# inliers that make a fit: in 450 pairs of frames of different videos at most 7 corners agreed
+FLOW_MIN_INLIERS = 8
+INLIER_PX = 2.0  # distance in the small image up to which a point agrees (chosen; OpenCV: 3)
+DEEP_INLIERS = 0.5  # a scene is deep where a smaller share of the corners are inliers (chosen)
+
+
+def _fit_similarity(old: Floats, new: Floats) -> tuple[Array, Array] | None:
+    """Fit a similarity transform to points (K, 2) by RANSAC; None with too few inliers.
+
+    Returns:
+        new_from_old (3, 3), and the residual flow (K, 4) of `CameraMotion` in a deep scene, where
+        most points are outliers; else (0, 4).
+    """
+    if len(old) < FLOW_MIN_INLIERS:
+        return None
+    cv2.setRNGSeed(0)
+    affine, inliers = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=INLIER_PX)
+    if affine is None or inliers.sum() < FLOW_MIN_INLIERS:
+        return None
+    residual_flow = np.empty((0, 4))
+    if inliers.mean() < DEEP_INLIERS:
+        residual_flow = np.c_[old, new - old @ affine[:, :2].T - affine[:, 2]]
+    return np.vstack([affine, [0, 0, 1]]), residual_flow

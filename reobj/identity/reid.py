@@ -1,4 +1,11 @@
-"""Re-identification: gallery of views, calibrated similarity, places in 3D."""
+"""Re-identification: what identities looked like, what a similarity means, where identities are.
+
+`Gallery` keeps a few views of every identity, `SimilarityCalibration` turns cosines into log odds,
+`match_probability` sets these against rivals, and `EllipsoidMap` keeps places in 3D. Which
+detection takes which identity is decided by the tracker and the linker.
+
+Axes: I identities, K views of an identity in the gallery, V in the map, E width of an embedding.
+"""
 
 from __future__ import annotations
 
@@ -12,64 +19,78 @@ import quadrics
 from reobj.cameras import angle_deg
 from reobj.types import Array, BoolArray, Floats, IntArray, cxcywh_from_xyxy, unit_rows
 
-GALLERY_VIEWS = 12  # views kept of every identity
-GALLERY_NOVELTY = 0.95  # a view less similar than this to all kept ones is a new view (cosine)
+# ---- Gallery -----------------------------------------------------------------------------------
+
+GALLERY_VIEWS = 12  # views kept of every identity (chosen)
+GALLERY_NOVELTY = 0.95  # cosine to all kept views below which a view is a new one (chosen)
+GALLERY_BLEND = 0.9  # share of the kept view where a view is not new (chosen)
+UNUSED = -2.0  # below any cosine
 
 
 class Gallery:
-    """What every identity of the video looked like: a few diverse views each, never forgotten.
+    """A few diverse views of the appearance of every identity of a video, never forgotten.
 
-    Arrays grow with the number of identities, not with time: `views` per identity at most.
+    Memory grows with the number of identities, not with time: `views` per identity at most.
+
+    Args:
+        views: K, views kept of every identity.
+        novelty: cosine to all kept views below which a view is kept as a new one.
+
+    Attributes:
+        rows: (I, K, E) unit rows. viewing_ray: (I, K, 3) directions they were seen in, NaN unknown.
+        count: (I,) views held. foreground_width: width of the foreground in the rows.
     """
 
-    def __init__(self) -> None:
-        self.rows = np.zeros((0, GALLERY_VIEWS, 0), np.float32)  # (I, K, E)
-        self.viewing_ray = np.zeros((0, GALLERY_VIEWS, 3))  # (I, K, 3) directions they were seen in
-        self.count = np.zeros(0, np.int64)  # (I,) views held
-        self.foreground_width = 0  # width of the foreground in the rows
+    def __init__(self, views: int = GALLERY_VIEWS, novelty: float = GALLERY_NOVELTY) -> None:
+        self.views, self.novelty = views, novelty
+        self.rows = np.zeros((0, views, 0), np.float32)
+        self.viewing_ray = np.zeros((0, views, 3))
+        self.count = np.zeros(0, np.int64)
+        self.foreground_width = 0
 
     def add(self, identity: IntArray, rows: Floats, viewing_ray: Array) -> None:
-        """Store one new view (E,) for each of N different identities, seen in a direction (N, 3)
-        of the world, NaN: unknown. A new one if it is novel, else blended.
+        """Add one view to each of N different identities.
+
+        A novel view is kept; where all K are taken, it replaces the one most similar to another.
+        A view that is not novel is blended into the most similar one.
+
+        Args:
+            identity: (N,). rows: (N, E) unit rows.
+            viewing_ray: (N, 3) direction in the world in which it was seen, NaN: unknown.
         """
         self._grow(int(identity.max(initial=-1)) + 1, rows.shape[1])
         own = self.rows[identity]  # (N, K, E)
-        slot = np.arange(own.shape[1])
         similarity = np.einsum("nke,ne->nk", own, rows)  # (N, K)
-        similarity[slot >= self.count[identity][:, None]] = -2.0
+        similarity[np.arange(self.views) >= self.count[identity][:, None]] = UNUSED
         nearest = similarity.argmax(1)  # (N,)
-        novel = similarity.max(1) < GALLERY_NOVELTY  # (N,)
-        room = self.count[identity] < GALLERY_VIEWS
-        crowded = self._most_redundant(own[novel & ~room])
-        target = np.where(novel & room, self.count[identity], nearest)  # (N,)
-        target[novel & ~room] = crowded
-        blend = np.where(novel, 0.0, 0.9)[:, None]
+        novel = similarity.max(1) < self.novelty  # (N,)
+        room = self.count[identity] < self.views
+        target = np.where(novel & room, self.count[identity], nearest)  # (N,) slot that is written
+        target[novel & ~room] = _most_redundant(own[novel & ~room])
+        blend = np.where(novel, 0.0, GALLERY_BLEND)[:, None]
         picked = own[np.arange(len(identity)), target]  # (N, E)
         self.rows[identity, target] = unit_rows(blend * picked + (1 - blend) * rows)
         self.viewing_ray[identity[novel], target[novel]] = viewing_ray[novel]
         self.count[identity] += novel & room
 
-    @staticmethod
-    def _most_redundant(full: Floats) -> IntArray:
-        """For full sets of views (N, K, E): the view that is most like another one, (N,)."""
-        pairs = np.einsum("nke,nle->nkl", full, full)
-        pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = -2.0
-        return np.asarray(pairs.max(2).argmax(1), np.int64)
-
     def parts(
         self, rows: Floats, identity: IntArray, viewing_ray: Array
     ) -> tuple[Array, Array, Array]:
-        """Cosines of foreground and background (N, I) between each row (N, E) and the most
-        similar view of each identity (I,), and the degrees between the directions in which both
-        were seen, (N, 3) of the rows; NaN where unknown.
+        """Compare rows (N, E) with the most similar view of each identity (I,).
+
+        Args:
+            viewing_ray: (N, 3) of the rows, NaN: unknown.
+        Returns:
+            foreground, background: (N, I) cosines. angle: (N, I) degrees between the viewing rays.
+            NaN where unknown.
         """
-        shape = (len(rows), len(identity), GALLERY_VIEWS)
+        shape = (len(rows), len(identity), self.views)
         if not rows.size or not len(identity) or self.rows.shape[2] != rows.shape[1]:
             unknown = np.full(shape[:2], np.nan)
             return unknown, unknown, unknown
         views = self.rows[identity].reshape(-1, rows.shape[1])  # (I * K, E)
-        empty = np.arange(GALLERY_VIEWS) >= self.count[identity][:, None]  # (I, K)
-        fused = np.where(empty, -2.0, (rows @ views.T).reshape(shape))  # (N, I, K)
+        empty = np.arange(self.views) >= self.count[identity][:, None]  # (I, K)
+        fused = np.where(empty, UNUSED, (rows @ views.T).reshape(shape))  # (N, I, K)
         best = fused.argmax(2)[..., None]
         angle = angle_deg(viewing_ray[:, None], self.viewing_ray[identity].reshape(-1, 3))
         fore, back, angle = (
@@ -80,36 +101,43 @@ class Gallery:
 
     def _grow(self, identities: int, width: int) -> None:
         if self.rows.shape[2] == 0:
-            self.rows = np.zeros((len(self.count), GALLERY_VIEWS, width), np.float32)
+            self.rows = np.zeros((len(self.count), self.views, width), np.float32)
         if identities > len(self.count):
-            extra = max(
-                identities - len(self.count), len(self.count), 16
-            )  # doubling: amortised O(1)
+            extra = max(identities - len(self.count), len(self.count), 16)  # amortised O(1)
             self.rows, self.viewing_ray, self.count = (
                 np.concatenate([old, np.zeros((extra, *old.shape[1:]), old.dtype)])
                 for old in (self.rows, self.viewing_ray, self.count)
             )
 
 
+def _most_redundant(full: Floats) -> IntArray:
+    """Find in each full set of views (N, K, E) the one most similar to another of its set, (N,)."""
+    pairs = np.einsum("nke,nle->nkl", full, full)
+    pairs[:, np.arange(full.shape[1]), np.arange(full.shape[1])] = UNUSED
+    return np.asarray(pairs.max(2).argmax(1), np.int64)
+
+
 def part_cosines(
     a: npt.NDArray[Any], b: npt.NDArray[Any], foreground_width: int
 ) -> tuple[Array, Array]:
-    """Cosines (N, M) of the foregrounds and of the backgrounds of fused rows (N, E) and (M, E);
-    foreground_width: width of the foreground part. NaN where a row has no such part.
+    """Compute the cosines of both parts of fused rows (N, E) and (M, E).
+
+    Returns:
+        foreground, background: (N, M) cosines, NaN where a row has no such part.
     """
-    return _cosine(a[:, :foreground_width], b[:, :foreground_width]), _cosine(
-        a[:, foreground_width:], b[:, foreground_width:]
-    )
+    parts = (slice(foreground_width), slice(foreground_width, None))
+    foreground, background = (_cosine(a[:, part], b[:, part]) for part in parts)
+    return foreground, background
 
 
 def paired_cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
-    """Cosines (N,) of rows (N, E) with rows (N, E), NaN where one is of zeros."""
+    """Compute the cosines (N,) of rows (N, E) with their partners (N, E), NaN for rows of zeros."""
     length = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.asarray(np.where(length > 1e-9, (a * b).sum(1) / np.maximum(length, 1e-9), np.nan))
 
 
 def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
-    """Cosines (N, M) of rows (N, E) and (M, E), NaN for rows of zeros."""
+    """Compute the cosines (N, M) of all pairs of rows (N, E) and (M, E), NaN for rows of zeros."""
     if not a.shape[1]:
         return np.full((len(a), len(b)), np.nan)
     lengths = (np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
@@ -117,42 +145,52 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
     return np.asarray(a @ b.T)
 
 
-class SimilarityCalibration:
-    """Is it the same object? From the cosines of foreground and background to a probability.
+# ---- Calibrated similarity ---------------------------------------------------------------------
 
-    No threshold on a cosine serves two videos: the pairs that a video shows without labels say what
-    its cosines mean. Objects of a class side by side in a frame are different, views of a track are
-    of one object. The log_similarity of both parts is counted from the middle between the two, in
-    standard deviations, and weighs the more the further the two are apart. The weights are near
-    the fit of examples/rank_k.py --calibrate (docs/reid.md) and serve every appearance model.
+PRIOR_PAIRS = 10.0  # pairs that the usual mean and spread are worth (chosen)
+LOG_SIMILARITY_AT_1 = 1.03  # -log(1.03 - cosine) is finite, 3.5 at most (chosen)
+USUAL_ANGLE_DEG = 45.0  # between two views of unknown directions (chosen)
+OUTLIER_SHARE = 1e-3  # of the pairs of either kind that look like the other kind (chosen)
+
+
+class SimilarityCalibration:
+    """Calibrate cosines of foreground and background to log odds of being one object.
+
+    No threshold on a cosine serves two videos, but every video shows pairs without labels: objects
+    of a class side by side in a frame are different, views of a track are of one object. The log
+    similarity of each part is counted from the middle between the means of the two kinds, in
+    standard deviations, times 1 + the distance of the means: where they are far apart a step says
+    more. The constants serve every appearance model.
 
     Args:
         weight: number of pairs that the usual mean and spread are worth.
     Attributes:
-        sums: (2, 3, 2) count, sum and sum of squares of the log similarity of the foreground and of
-            background, of different and of same objects.
+        moments: (2, 3, 2) count, sum and sum of squares of the log similarity of foreground and
+            background (last axis), of different and of same objects (first axis).
     """
 
+    # fitted by `examples/rank_k.py --calibrate` to 12 rendered rooms, with and without masks; the
+    # weights lie between the fits of several embeddings (docs/appearance.md)
     WEIGHTS = (0.55, 0.5)  # of foreground and background
-    USUAL = ((1.3, 0.65), (1.8, 1.2))  # mean log_similarity of both parts: different, same
-    USUAL_STD = 0.45
-    USUAL_ANGLE_DEG = 45.0  # between two views of unknown directions
+    USUAL = ((1.3, 0.65), (1.8, 1.2))  # mean log similarity of both parts: different, same objects
+    USUAL_STD = 0.45  # of the log similarity within a kind
+    ARRAYS = ("moments",)
 
-    def __init__(self, weight: float) -> None:
+    def __init__(self, weight: float = PRIOR_PAIRS) -> None:
         mean = np.array(self.USUAL)  # (2, 2)
-        self.sums = weight * np.stack([mean**0, mean, mean**2 + self.USUAL_STD**2], 1)
+        self.moments = weight * np.stack([mean**0, mean, mean**2 + self.USUAL_STD**2], 1)
 
     @staticmethod
     def log_similarity(cosine: npt.ArrayLike) -> Array:
-        """Monotone in the cosine, steep where two views are nearly equal."""
-        return np.asarray(-np.log(1.03 - np.minimum(cosine, 1.0)))
+        """Compute -log(1.03 - cosine): monotone, steep where two views are nearly equal."""
+        return np.asarray(-np.log(LOG_SIMILARITY_AT_1 - np.minimum(cosine, 1.0)))
 
     def add(self, foreground: Array, background: Array, same: bool) -> None:
-        """Add cosines of pairs (N,) that the video showed; NaN: unknown."""
-        close = self.log_similarity(np.stack([foreground.ravel(), background.ravel()]))  # (2, N)
-        known = np.isfinite(close)
-        close = np.where(known, close, 0.0)
-        self.sums[int(same)] += [known.sum(1), close.sum(1), (close * close).sum(1)]
+        """Add the cosines of pairs (N,) of one kind that the video shows; NaN: unknown."""
+        value = self.log_similarity(np.stack([foreground.ravel(), background.ravel()]))  # (2, N)
+        known = np.isfinite(value)
+        value = np.where(known, value, 0.0)
+        self.moments[int(same)] += [known.sum(1), value.sum(1), (value * value).sum(1)]
 
     def logit(
         self,
@@ -160,40 +198,54 @@ class SimilarityCalibration:
         background: npt.ArrayLike = np.nan,
         view_angle_deg: npt.ArrayLike = np.nan,
     ) -> Array:
-        """Log of the odds that it is the same object, where both are equally likely beforehand;
-        within about +-7: one case in a thousand is like nothing that was seen.
+        """Compute the log odds of being one object, where both kinds are equally likely beforehand.
+
+        They lie within about +-7, because a thousandth of the pairs may be outliers.
 
         Args:
-            foreground, background: cosines; any shapes that broadcast. Without a background the
-                foreground decides; without a foreground nothing speaks for it: -inf.
-            view_angle_deg: between the directions of view. From another side, an object looks less
-                like itself, and what surrounds it soon not at all. NaN: as 45 degrees.
+            foreground, background: cosines; any shapes that broadcast. Without a background (NaN)
+                the foreground decides; without a foreground nothing speaks for one object: -inf.
+            view_angle_deg: between the viewing rays. From another side, an object looks less like
+                itself, and from 90 degrees on its background says nothing. NaN: as 45 degrees.
         """
         parts = np.stack(np.broadcast_arrays(foreground, background), -1)  # (..., 2)
-        evidence = self.WEIGHTS * self.scores(parts, view_angle_deg)
-        logit = np.where(np.isnan(evidence), 0, evidence).sum(-1)
-        return _with_outliers(np.where(np.isnan(parts[..., 0]), -np.inf, logit))
+        scores = self.WEIGHTS * self.part_scores(parts, view_angle_deg)
+        logit = np.where(np.isnan(scores), 0, scores).sum(-1)
+        # of a mixture of both kinds, in which OUTLIER_SHARE of either is like the other
+        odds = np.exp(np.where(np.isnan(parts[..., 0]), -np.inf, logit).clip(None, 50))
+        bounded = (odds + OUTLIER_SHARE) / (1 + OUTLIER_SHARE * odds)
+        return np.asarray(np.where(odds > 0, np.log(bounded), -np.inf))
 
-    def scores(self, cosine: Array, view_angle_deg: npt.ArrayLike = np.nan) -> Array:
-        """What each part (..., 2) says for one object, before it is weighted."""
-        count, total, squares = np.moveaxis(self.sums, 1, 0)  # (2, 2) each: kinds, parts
+    def part_scores(self, cosine: Array, view_angle_deg: npt.ArrayLike = np.nan) -> Array:
+        """Standardise the cosines (..., 2) of both parts: evidence for one object, unweighted."""
+        count, total, squares = np.moveaxis(self.moments, 1, 0)  # (2, 2) each: kinds, parts
         mean = total / count
         std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
-        apart = ((mean[1] - mean[0]) / std).clip(0)
-        angle = np.radians(np.where(np.isnan(view_angle_deg), self.USUAL_ANGLE_DEG, view_angle_deg))
+        separation = ((mean[1] - mean[0]) / std).clip(0)
+        angle = np.radians(np.where(np.isnan(view_angle_deg), USUAL_ANGLE_DEG, view_angle_deg))
         facing = np.stack([(1 + np.cos(angle)) / 2, np.cos(angle).clip(0)], -1)  # (..., 2)
-        return np.asarray(facing * (self.log_similarity(cosine) - mean.mean(0)) / std * (1 + apart))
+        deviation = (self.log_similarity(cosine) - mean.mean(0)) / std  # (..., 2)
+        return np.asarray(facing * deviation * (1 + separation))
 
     def probability(self, *known: npt.ArrayLike, prior: float = 0.5) -> Array:
-        """Probability of the same object, given how likely it was beforehand; see `logit`."""
+        """Compute the probability of one object from the arguments of `logit` and its prior."""
         return np.asarray(1 / (1 + np.exp(-self.logit(*known) - math.log(prior / (1 - prior)))))
 
 
-def match_probability(logit: Array, prior_odds: float = 1.0) -> Array:
-    """Probability (N, M) that row and column are one object, of log odds of the pairs (N, M).
+# odds beforehand that a newcomer is a certain known object and not a new one: fitted with WEIGHTS
+# (with other embeddings 1.0 to 1.5: docs/appearance.md)
+RETURN_ODDS = 1.8
 
-    Against the likeliest other pair of its row or column (the ratio test among look-alikes) and
-    against no pair at all, which beforehand is `prior_odds` times less likely.
+
+def match_probability(logit: Array, prior_odds: float = RETURN_ODDS) -> Array:
+    """Compute the probability (N, M) that row and column are one object: o / (1 + o + o').
+
+    o are the odds of the pair, o' those of the likeliest other pair of its row or column (the
+    ratio test among look-alikes), and 1 is for no pair at all.
+
+    Args:
+        logit: (N, M) log odds of the pairs.
+        prior_odds: how much likelier beforehand a certain pair is than none.
     """
     odds = prior_odds * np.exp(logit)
     rival = np.maximum(_best_other(odds), _best_other(odds.T).T)
@@ -201,93 +253,108 @@ def match_probability(logit: Array, prior_odds: float = 1.0) -> Array:
 
 
 def _best_other(odds: Array) -> Array:
-    """(N, M) largest of the other entries of the row, 0 if there are none."""
+    """Return (N, M) the largest of the other entries of the row, 0 if there are none."""
     top = np.sort(np.pad(odds, ((0, 0), (2, 0))), 1)[:, -2:]  # (N, 2) second, best
     return np.where(odds == top[:, 1:], top[:, :1], top[:, 1:])
 
 
-def _with_outliers(logit: Array, share: float = 1e-3) -> Array:
-    """Bound log odds as if this share of either kind were like the other; -inf stays."""
-    odds = np.exp(logit.clip(None, 50))
-    return np.asarray(np.where(odds > 0, np.log((odds + share) / (1 + share * odds)), -np.inf))
+# ---- Places in 3D ------------------------------------------------------------------------------
 
 
 def quick_fit(boxes: Array, img_from_world: Array, image_size: tuple[int, int]) -> Any:
-    """Ellipsoids of any size from boxes (V, G, 4), in a few steps (`quadrics.fit_objects`)."""
+    """Fit ellipsoids of any size to boxes (V, G, 4) in a few steps (`quadrics.fit_objects`)."""
     config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
     return quadrics.fit_objects(
         boxes, img_from_world, image_size, support="ellipsoid", config=config
     )
 
 
-PLACE_VIEWS = 16  # with poses: views kept of every object to tell its place in 3D
-PLACE_EVERY = 5  # frames between them; when they are full every other one goes and this doubles
-PLACE_PARALLAX_DEG = 2.0  # a place counts from this angle between its views on
-# and where the longest axis is at most this many middle ones: half-seen things give needles (95 %
-# of priors.json: 5.8)
-PLACE_SHAPE = 6.0
+MAP_VIEWS = 16  # views kept of every identity (chosen)
+MAP_FIRST_STEP = 5  # frames between them; doubled whenever they are full (chosen)
+MAP_MIN_VIEWS = 3  # of a fit: fewer boxes leave an ellipsoid undetermined (9 unknowns, 4 a box)
+MAP_MIN_PARALLAX_DEG = 2.0  # between the views of a fit (chosen)
+# longest half axis over the middle one: objects that were half seen give needles, reaching behind
+# the camera (95 % of priors.json are below 5.8; IDF1 of redkitchen with poses 79.1 -> 88.4)
+MAP_MAX_ELONGATION = 6.0
+NO_FRAME = -1000  # of a free view: long before the first frame
 
 
 class EllipsoidMap:
-    """Where every identity is in 3D, for a tracker that is told the camera's poses.
+    """The place in 3D of every identity, for a tracker that is given the camera's poses.
 
     Of every identity a few views are kept, evenly over its life, and an ellipsoid is fitted to
-    them now and then. Rows grow with the number of identities, not with time.
+    them now and then. Memory grows with the number of identities, not with time.
+
+    Attributes:
+        frame: (I, V) frame of each view, negative: free. boxes: (I, V, 4) x1, y1, x2, y2.
+        img_from_world: (I, V, 3, 4). step: (I,) frames between views.
+        fresh: (I,) views since the last fit. dual_q: (I, 4, 4) ellipsoids, NaN unknown.
     """
 
-    ARRAYS = ("frame", "boxes", "img_from_world", "every", "fresh", "dual_q")
+    ARRAYS = ("frame", "boxes", "img_from_world", "step", "fresh", "dual_q")
 
     def __init__(self) -> None:
-        views = PLACE_VIEWS
-        self.frame = np.zeros((0, views), np.int64)  # (I, V), < 0: free
-        self.boxes = np.zeros((0, views, 4))  # (I, V, 4)
-        self.img_from_world = np.zeros((0, views, 3, 4))  # (I, V, 3, 4)
-        self.every = np.zeros(0, np.int64)  # (I,) frames between views
-        self.fresh = np.zeros(0, np.int64)  # (I,) views since the last fit
-        self.dual_q = np.zeros((0, 4, 4))  # (I, 4, 4), NaN: unknown
+        self.frame = np.zeros((0, MAP_VIEWS), np.int64)
+        self.boxes = np.zeros((0, MAP_VIEWS, 4))
+        self.img_from_world = np.zeros((0, MAP_VIEWS, 3, 4))
+        self.step = np.zeros(0, np.int64)
+        self.fresh = np.zeros(0, np.int64)
+        self.dual_q = np.zeros((0, 4, 4))
 
     def add(self, frame: int, identity: IntArray, xyxy: Array, img_from_world: Array) -> None:
-        """Keep boxes (N, 4) of N different identities in this frame as views, where one is due."""
+        """Add a view (N, 4) of each of N different identities, where one is due in this frame.
+
+        When an identity's views are full, every other one goes and the step between them doubles.
+        """
         self._grow(int(identity.max(initial=-1)) + 1)
-        due = frame - self.frame[identity].max(1) >= self.every[identity]
+        due = frame - self.frame[identity].max(1) >= self.step[identity]
         for i, box in zip(identity[due], xyxy[due], strict=True):
             if (self.frame[i] >= 0).all():
-                self.frame[i, self.frame[i].argsort()[1::2]] = -1000
-                self.every[i] *= 2
+                self.frame[i, self.frame[i].argsort()[1::2]] = NO_FRAME
+                self.step[i] *= 2
             slot = self.frame[i].argmin()
             self.frame[i, slot], self.boxes[i, slot] = frame, box
             self.img_from_world[i, slot] = img_from_world
             self.fresh[i] += 1
 
     def refit(self, image_size: tuple[int, int]) -> bool:
-        """Fit the ellipsoids of all identities with enough new views, all at once; any?"""
-        seen = self.frame >= 0
-        due = np.flatnonzero((seen.sum(1) >= 3) & (self.fresh > seen.sum(1) // 4))
+        """Fit the ellipsoids of all identities with enough fresh views (a quarter of theirs).
+
+        A fit that is rejected, has no parallax or is a needle makes the place unknown.
+
+        Returns:
+            Whether any was due.
+        """
+        seen = self.frame >= 0  # (I, V)
+        due = np.flatnonzero((seen.sum(1) >= MAP_MIN_VIEWS) & (self.fresh > seen.sum(1) // 4))
         if not len(due):
             return False
         at, slot = np.nonzero(seen[due])
         frames, first, row = np.unique(
             self.frame[due][at, slot], return_index=True, return_inverse=True
         )
-        boxes = np.full((len(frames), len(due), 4), np.nan)
+        boxes = np.full((len(frames), len(due), 4), np.nan)  # (F, O, 4)
         boxes[row, at] = self.boxes[due][at, slot]
         cameras = self.img_from_world[due][at, slot][first]  # (F, 3, 4)
         fits = quick_fit(boxes, cameras, image_size)
-        good = (fits.status != "rejected") & (fits.parallax_deg >= PLACE_PARALLAX_DEG)
+        good = (fits.status != "rejected") & (fits.parallax_deg >= MAP_MIN_PARALLAX_DEG)  # (O,)
         axes = np.sort(fits.ellipsoids.half_axes, 1)  # (O, 3)
-        good &= axes[:, 2] <= PLACE_SHAPE * axes[:, 1]
+        good &= axes[:, 2] <= MAP_MAX_ELONGATION * axes[:, 1]
         self.dual_q[due] = np.where(good[:, None, None], fits.ellipsoids.dual_quadrics(), np.nan)
         self.fresh[due] = 0
         return True
 
     @property
     def known(self) -> BoolArray:
-        """(I,): is the place of the identity known?"""
+        """(I,) whether the place of the identity is known."""
         return np.asarray(np.isfinite(self.dual_q[:, 0, 0]), bool)
 
     def project(self, img_from_world: Array, image_size: tuple[int, int], share: float) -> Array:
-        """Boxes cx, cy, w, h (I, 4) of the ellipsoids' parts in an image; NaN where the place is
-        unknown, or no more than this share of the box lies in the image.
+        """Project the ellipsoids into an image.
+
+        Returns:
+            (I, 4) boxes cx, cy, w, h of their parts in the image; NaN where the place is unknown,
+            or where no more than `share` of the box lies in the image.
         """
         dual_c, before_camera = quadrics.project(self.dual_q, img_from_world[None])
         boxes = quadrics.boxes_from_dual_conics(dual_c[0])  # (I, 4)
@@ -300,7 +367,7 @@ class EllipsoidMap:
         extra = identities - len(self.frame)
         if extra > 0:
             extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
-            fills = {"frame": -1000, "dual_q": np.nan, "every": PLACE_EVERY}
+            fills = {"frame": NO_FRAME, "dual_q": np.nan, "step": MAP_FIRST_STEP}
             for name in self.ARRAYS:
                 old = getattr(self, name)
                 new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
