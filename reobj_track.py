@@ -84,11 +84,13 @@ from reobj.results.workspace import (
     write_objects_json,
     write_ply,
 )
-from reobj.sources.detection_files import DetectConfig, TrackResult, read_detections, read_tracks
-from reobj.sources.detectors import CallableDetector, DetectionCache, OnnxDetector
+from reobj.sources.detection_files import DetectConfig, TrackResult, read_tracks
+from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections  # noqa: F401
+from reobj.sources.recorded import write_detections_npz  # noqa: F401
 from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.sources.weights import list_models, model_path
 from reobj.types import (
+    COCO_NAMES,  # noqa: F401
     Array,
     BoolArray,
     Detections,
@@ -1023,7 +1025,7 @@ def track_video(
     seconds: dict[str, float],
 ) -> TrackResult:
     """Detect and track all frames, or take both from the cache."""
-    source = _detection_source(video, config, detections)
+    source = open_detections(video, config.detect, detections, config.threads, config.offline)
     if video.is_live:  # what it showed before is no answer
         source = dataclasses.replace(source, key="")
     key = (source_fingerprint(video.source), config.input, source.key)
@@ -1059,43 +1061,21 @@ def track(
     """
     config = config or Config()
     video = source if isinstance(source, Video) else Video(source, config.input)
-    found = _detection_source(video, config, detections)
+    found = open_detections(video, config.detect, detections, config.threads, config.offline)
     tracker = Tracker(config.tracker, _embedder(config))
     for frame in video:
-        yield frame, tracker.update(found.detect(frame), frame.image)
-
-
-@dataclass(frozen=True, slots=True)
-class _Source:
-    """Where detections come from: key for the cache ("": not cached), and frame -> Detections."""
-
-    key: str
-    class_names: tuple[str, ...]
-    detect: Callable[[Frame], Detections]
-    slow: bool
-    messages: Sequence[str] = ()
-
-
-def _detection_source(video: Video, config: Config, detections: Any) -> _Source:
-    """A file of recorded detections, a callable, or the ONNX detector."""
-    if callable(detections):
-        call = CallableDetector(detections)
-        return _Source("", call.class_names, lambda frame: call(frame.image), False)
-    if detections:
-        recorded = read_detections(detections, video, config.detect)
-        key, names = source_fingerprint(detections), recorded.class_names
-        return _Source(key, names, lambda frame: recorded.at(frame.index), False, recorded.messages)
-    path = model_path(config.detect.model, offline=config.offline)
-    detector = OnnxDetector(path, config.detect, config.threads)
-    key = json.dumps([path.name, path.stat().st_size, dataclasses.asdict(config.detect)])
-    return _Source(key, detector.class_names, lambda frame: detector(frame.image), True)
+        yield frame, tracker.update(found(frame), frame.image)
 
 
 def _track_frames(
-    video: Video, source: _Source, cache_path: Path | None, config: Config, poses: Poses | None
+    video: Video,
+    source: DetectionSource,
+    cache_path: Path | None,
+    config: Config,
+    poses: Poses | None,
 ) -> TrackResult:
     """One pass over the video: detections (cached if they are dear), tracker, progress."""
-    cache = DetectionCache(cache_path, video.working_size) if cache_path and source.slow else None
+    source = source.cached(cache_path, video.working_size) if cache_path else source
     tracker = Tracker(config.tracker, _embedder(config))
     pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
     camera = None if poses is None else scaled_camera(poses.camera, video.scale)
@@ -1104,7 +1084,7 @@ def _track_frames(
     progress = Progress("track", video.expected)
     try:
         for frame in video:
-            detections = _detect_cached(frame, source, cache)
+            detections = source(frame)
             pose = pose_of.get(frame.index)
             step = tracker.step(detections, frame.image, cam_from_world=pose, camera=camera)
             steps.append((frame.index, step))
@@ -1115,8 +1095,7 @@ def _track_frames(
             raise
     finally:
         progress.close()
-        if cache is not None:
-            cache.flush()
+        source.flush()
     if not steps:
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
@@ -1138,16 +1117,6 @@ def _table_looks(
     row = np.array(rows, np.int64)
     parts = [part for _, part in looks if part.size] or [np.empty((0, 0), np.float32)]
     return np.concatenate(parts)[row >= 0].astype(np.float16), row[row >= 0]
-
-
-def _detect_cached(frame: Frame, source: _Source, cache: DetectionCache | None) -> Detections:
-    """Detections of a frame, from the cache if they were computed before."""
-    found = cache.get(frame.index) if cache is not None else None
-    if found is None:
-        found = source.detect(frame)
-        if cache is not None:
-            cache.put(frame.index, found)
-    return found
 
 
 def _embedder(config: Config) -> Embedder | None:
