@@ -1,4 +1,7 @@
-"""Files and text: whole or not at all, JSON and npz, progress on stderr."""
+"""Files that are written whole or not at all, text, JSON and npz; progress; text for messages.
+
+What a file means is the business of the rooms that read and write it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,10 @@ from reobj.types import Array, ReobjError
 
 @contextlib.contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Write a file under a temporary name beside it; it gets its own when it is complete."""
+    """Yield a temporary path beside `path` that replaces it at the end of the `with` block.
+
+    An exception in the block leaves `path` as it was, and nothing beside it.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".part-{path.name}")
     try:
@@ -32,6 +38,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def read_text(path: Path) -> str:
+    """Read a UTF-8 file, with or without a byte order mark."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -39,35 +46,48 @@ def read_text(path: Path) -> str:
 
 
 def load_json(path: Path) -> Any:
+    """Read a JSON file; an error names the line."""
     try:
         return json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
 
 
-def save_npz(path: Path, arrays: Mapping[str, Any], **facts: Any) -> None:
-    """Write arrays, and facts as JSON, to an npz file that is there whole or not at all."""
-    with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **arrays, facts=np.array(json.dumps(facts)))
+def save_npz(path: Path, arrays: Mapping[str, Any], **metadata: Any) -> None:
+    """Write arrays, and metadata as JSON, to a compressed npz file; same input, same bytes."""
+    try:
+        with atomic(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, **arrays, metadata=np.array(json.dumps(metadata)))
+    except OSError as error:  # zipfile's own does not name the file
+        raise ReobjError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def load_npz(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read the arrays and the facts that `save_npz` wrote.
+    """Read a file that `save_npz` wrote, or any npz file without pickled objects.
 
+    Returns:
+        the arrays, and the metadata ({} if the file has none).
     Raises:
         ReobjError: damaged, or no npz file.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays: dict[str, Any] = dict(file)
-        facts: dict[str, Any] = json.loads(str(arrays.pop("facts", "{}")))
+        metadata: dict[str, Any] = json.loads(str(arrays.pop("metadata", "{}")))
     except Exception as error:  # zip, zlib and numpy each have their own for damaged files
         raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
-    return arrays, facts
+    return arrays, metadata
+
+
+REDRAW_S = 0.1  # chosen: as often as an eye follows, too seldom to cost time
 
 
 class Progress:
-    """One line a stage on stderr with rate and time left; silent when stderr is no terminal."""
+    """Show one line a stage on stderr with rate and time left, if stderr is a terminal.
+
+    Attributes:
+        done, total: steps so far and in all (0: unknown).
+    """
 
     def __init__(self, stage: str, total: int = 0) -> None:
         self.stage, self.total, self.done = stage, total, 0
@@ -75,9 +95,9 @@ class Progress:
         self.enabled = sys.stderr.isatty()
 
     def step(self, n: int = 1) -> None:
-        """Count n more; redraw at most ten times a second."""
+        """Count n more steps."""
         self.done += n
-        if self.enabled and time.monotonic() - self.shown > 0.1:
+        if self.enabled and time.monotonic() - self.shown > REDRAW_S:
             self._draw()
 
     def _draw(self) -> None:
@@ -99,7 +119,7 @@ class Progress:
 
 
 def without_password(text: str) -> str:
-    """Return a text whose URLs have lost user and password: what may be shown and written.
+    """Remove user and password from the URLs in a text: what is left may be shown and written.
 
     >>> without_password("rtsp://me:secret@10.0.0.7/stream")
     'rtsp://10.0.0.7/stream'
@@ -108,33 +128,39 @@ def without_password(text: str) -> str:
 
 
 def shortened(items: Sequence[Any]) -> str:
-    """Return the first five of a list, for messages."""
+    """Write the first five items, for messages.
+
+    >>> shortened([1, 2, 3, 4, 5, 6])
+    '1, 2, 3, 4, 5, ...'
+    """
     return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
 
 
 def spans(numbers: Iterable[int], step: int = 1) -> str:
-    """Write ascending numbers as spans.
+    """Write ascending numbers as spans of those at most `step` apart, for messages.
 
     >>> spans([3, 4, 5, 9])
     '3-5, 9'
     """
-    spans: list[list[int]] = []
+    found: list[list[int]] = []
     for n in numbers:
-        if spans and n - spans[-1][1] <= step:
-            spans[-1][1] = n
+        if found and n - found[-1][1] <= step:
+            found[-1][1] = n
         else:
-            spans.append([n, n])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in spans)
+            found.append([n, n])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in found)
 
 
 def rounded(value: float | None, digits: int) -> float | None:
+    """Round for JSON, which has no NaN and no infinity: these become None."""
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
 def numbers(values: Array) -> list[float]:
-    """Six significant digits: far below any accuracy, and stable text."""
+    """Round to six significant digits, for JSON: far below any accuracy, and stable text."""
     return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
 
 
 def base64_text(values: npt.NDArray[Any], kind: str) -> str:
+    """Encode an array's bytes, C order, as the dtype `kind` ("<f4"), for pages with scripts."""
     return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()

@@ -1,4 +1,9 @@
-"""Recorded detections and tracks: MOT, CSV, COCO, npz, CVAT."""
+"""Recorded detections and tracks of other tools: read MOT, CSV, COCO, CVAT, and our own npz.
+
+Start at `read_detections`, `read_tracks` and `read_mot_rows`. Every reader makes a
+`RecordedDetections`, which is then checked in one place: what cannot be meant is an error that
+names the line, single rows that are of no use are dropped and counted in its messages.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +15,23 @@ import math
 import re
 import sys
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from reobj.files import load_json, load_npz, read_text, save_npz, shortened
+from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
+from reobj.sources.recorded import RecordedDetections, read_npz
 from reobj.sources.video import Video
 from reobj.types import (
     COCO_NAMES,
     Array,
     BoolArray,
-    Detections,
     IntArray,
     ReobjError,
     Tracks,
@@ -35,118 +40,42 @@ from reobj.types import (
     rows_by,
 )
 
-MOSTLY = 0.5  # above this share of bad boxes it is the format that is wrong, not the boxes
-NORMALISED_MAX = 1.5  # coordinates up to here are shares of the image
-POLYGON_BITS = 4  # sub-pixel bits of polygon corners (cv2.fillPoly)
-COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's ids 1 to 90, without a class
-Counts = npt.NDArray[np.uint32]
-NO_RUNS: Counts = np.empty(0, np.uint32)  # of a mask without any pixel
-NUMBERS = ("frame", "id", "x1", "y1", "x2", "y2", "w", "h", "score")
-MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
-CSV_ALIASES = {"x": "x1", "y": "y1", "width": "w", "height": "h", "confidence": "score",
-               "conf": "score", "class_id": "class", "class_name": "class"}  # fmt: skip
-
 
 @dataclass(frozen=True, slots=True)
 class DetectConfig:
-    """Object detection."""
+    """Choose the detector and which detections are used, recorded ones included."""
 
     model: str = option(
         "deimv2-femto", "detector: a name of `models`, or a .onnx file", "--detector"
     )
-    min_score: float = option(0.1, "detections below this score are never used (ByteTrack: .1)")
-    nms_iou: float = option(0.6, "class-wise NMS overlap for models that need NMS (NanoDet: .6)")
+    min_score: float = option(0.1, "drop detections with a lower score (ByteTrack: .1)")
+    nms_iou: float = option(
+        0.6,
+        "drop boxes that overlap a better one of their class by more than this (IoU; NanoDet: .6), "
+        "where the detector leaves that to us",
+    )
     classes: str = option("", "comma-separated class names to keep (default: all)", "--classes")
     class_names: str = option("", "text file, one class name a line, where they are not COCO's")
-    max_detections: int = option(100, "detections kept a frame, best scores first")
-
-
-def rle_encode(mask: BoolArray) -> Counts:
-    """Return the run lengths of an (H, W) mask down its columns, zeros first; [] if it is empty."""
-    flat = cv2.transpose(mask.view(np.uint8)).ravel()  # (W * H,)
-    edges = np.flatnonzero(np.diff(flat, prepend=np.uint8(0)))
-    counts = np.diff(edges, prepend=0, append=flat.size).astype(np.uint32)
-    return counts if len(counts) > 1 else NO_RUNS
-
-
-def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
-    """Return the (H, W) mask of a (w, h) image; the inverse of `rle_encode`."""
-    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts) if len(counts) else np.False_
-    return np.broadcast_to(flat, size[0] * size[1]).reshape(size).T
-
-
-def coco_runs(text: str) -> Counts:
-    """Decode COCO's compressed run lengths: 5 bits a character, differences to the last but one."""
-    runs: list[int] = []
-    value = shift = 0
-    for byte in text.encode():
-        value |= (byte - 48 & 0x1F) << shift
-        shift += 5
-        if byte - 48 & 0x20:  # more to come
-            continue
-        value -= (byte - 48 >> 4 & 1) << shift  # sign
-        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-        value = shift = 0
-    return np.array(runs, np.uint32)
-
-
-@dataclass(slots=True)
-class RecordedDetections:
-    """Detections of a video as a struct of arrays, from a file.
-
-    Attributes:
-        frame: (N,) source frame numbers. xyxy: (N, 4) in native pixels.
-        runs: N run lengths of the masks, empty where there is none.
-        size, working_size: (w, h) of the masks and of the frames.
-        line: (N,) where each stands in the file, in `unit`s. messages: what was dropped or assumed.
-        identity: (N,) as the file has it, or empty.
-    """
-
-    frame: IntArray
-    xyxy: Array
-    score: Array
-    class_id: IntArray
-    runs: list[Counts]
-    class_names: tuple[str, ...]
-    size: tuple[int, int]
-    working_size: tuple[int, int]
-    line: IntArray
-    unit: str
-    messages: list[str] = field(default_factory=list)
-    identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def at(self, frame_index: int) -> Detections:
-        """Return the detections of a frame at the working size, best first; decodes its masks."""
-        low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
-        rows, runs, masks = slice(low, high), self.runs[low:high], None
-        ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
-        if any(map(len, runs)):
-            masks = np.stack([self._working_mask(counts) for counts in runs])  # (D, H, W)
-        return Detections(self.xyxy[rows] * ratio, self.score[rows], self.class_id[rows], masks)
-
-    def _working_mask(self, counts: Counts) -> BoolArray:
-        mask = rle_decode(counts, self.size)
-        if self.working_size == self.size:
-            return mask
-        share = cv2.resize(mask.astype(np.float32), self.working_size, interpolation=cv2.INTER_AREA)
-        return np.asarray(share >= 0.5)
+    max_detections: int = option(100, "most detections that are kept in a frame, best scores first")
 
 
 def load_class_names(path: str | Path) -> tuple[str, ...]:
-    """Read one class name a line."""
+    """Read class names, one a line in the order of their ids; empty lines do not count."""
     return tuple(line.strip() for line in read_text(Path(path)).splitlines() if line.strip())
 
 
 def unnamed_class(class_id: int, count: int) -> str:
+    """Write the message about a class id beyond the class names."""
     return (f"class {class_id}, but there are only {count} class names: give a file of names with "
             "--set detect.class_names=FILE")  # fmt: skip
 
 
 def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
-    """Return the ids of comma-separated class names."""
+    """Return the ids of comma-separated class names, whatever their case.
+
+    Raises:
+        ReobjError: a name that is not among `names`.
+    """
     known = {name.lower(): i for i, name in enumerate(names)}
     chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
     unknown = [name for name in chosen if name not in known]
@@ -158,7 +87,14 @@ def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
 def read_detections(
     path: str | Path, video: Video, config: DetectConfig | None = None
 ) -> RecordedDetections:
-    """Read recorded detections: MOT txt, CSV with a header, COCO results JSON or our npz."""
+    """Read recorded detections of a video: MOT txt, CSV with a header, COCO JSON or our npz.
+
+    Args:
+        path: the file; boxes in px of the source, frame numbers of the source (MOT: from 1).
+        config: min_score, classes, class_names and max_detections apply.
+    Raises:
+        ReobjError: names the file, the line and what was expected there.
+    """
     path, config = Path(path), config or DetectConfig()
     if not path.is_file():
         raise ReobjError(f"{path}: no such file of detections")
@@ -178,12 +114,23 @@ def read_detections(
 
 
 def read_mot_rows(path: Path) -> Array:
-    """Read a MOTChallenge file: rows (N, 6 to 10) of numbers; (0, 10) of an empty file."""
+    """Read a MOTChallenge file as numbers.
+
+    Returns:
+        (N, 6 to 10) frame (from 1), id, left, top, w, h[, score[, class or x[, y[, z]]]]; of an
+        empty file (0, 10).
+    Raises:
+        ReobjError: names the line that has another number of columns or is no number.
+    """
     columns, cells, lines, is_mot = _table_cells(path)
     if not is_mot:
         raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
     numbers = [_column([row[i] for row in cells], lines, path) for i in range(len(columns))]
     return np.stack(numbers, 1)
+
+
+MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
+NUMBERS = ("frame", "id", "x1", "y1", "x2", "y2", "w", "h", "score")  # columns that hold numbers
 
 
 def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
@@ -212,11 +159,17 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
 
 
 def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray, bool]:
-    """Return the columns' roles, the rows of cells, the lines they stand on (N,), and whether it
-    is MOT (no header).
+    """Split a table into cells.
+
+    Returns:
+        What each column holds (a name of MOT_COLUMNS, "x2", "y2", or any other of a header), the N
+        rows of cells, the lines they stand on (N,), and whether it is MOT (no header).
     """
     reader = csv.reader(read_text(path).splitlines())
-    rows = [(reader.line_num, cells) for cells in reader if cells]
+    try:
+        rows = [(reader.line_num, cells) for cells in reader if cells]
+    except csv.Error as error:
+        raise ReobjError(f"{path}, line {reader.line_num}: no table ({error})") from error
     is_mot = not rows or rows[0][1][0].strip()[:1] in "+-.0123456789"
     columns = MOT_COLUMNS if is_mot else _csv_columns(rows.pop(0)[1], path)
     width = len(rows[0][1]) if is_mot and rows else len(columns)
@@ -229,9 +182,13 @@ def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray
     return tuple(columns[:width]), stripped, np.array([line for line, _ in rows], np.int64), is_mot
 
 
+CSV_ALIASES = {"x": "x1", "y": "y1", "width": "w", "height": "h", "confidence": "score",
+               "conf": "score", "class_id": "class", "class_name": "class"}  # fmt: skip
+
+
 def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
-    """Return what the columns hold by a header's names."""
-    header = re.sub(r"\(.*?\)", "", ",".join(cells)).split(";")[0].lower()  # remarks go
+    """Name the columns by a header, without its remarks in () and after ;."""
+    header = re.sub(r"\(.*?\)", "", ",".join(cells)).split(";")[0].lower()
     plain = [name.strip() for name in header.lstrip("# ").split(",")]
     columns = tuple(CSV_ALIASES.get(name, name) for name in plain)
     ends = ("w", "h") if "w" in columns else ("x2", "y2")
@@ -243,7 +200,7 @@ def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
 
 
 def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
-    """Convert a column to finite numbers."""
+    """Convert a column to finite numbers (N,); an error names the line."""
     with contextlib.suppress(ValueError):
         values = np.array(cells, np.float64)
         if np.isfinite(values).all():
@@ -260,7 +217,11 @@ def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
 def _table_classes(
     cells: Sequence[str], is_mot: bool, names: Sequence[str]
 ) -> tuple[IntArray, Sequence[str], list[str]]:
-    """Return class ids, class names and those that are new; MOT counts from 1, -1 is no class."""
+    """Read the column of classes: ids or names; in MOT ids from 1, and -1 for "no class".
+
+    Returns:
+        Class ids (N,) from 0, class names, and those of them that were not among `names`.
+    """
     ids = np.array([int(cell) if cell.isdigit() else -1 for cell in cells], np.int64)
     if not any(cells) or (is_mot and ids.min() < 1):
         return np.zeros_like(ids), ("object",), []
@@ -275,10 +236,7 @@ def _table_classes(
 
 
 def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
-    """Read COCO results; a dataset JSON beside them says which frame and class their ids mean.
-
-    A dataset with annotations of its own (COCO, COCO-VID) is read in their place.
-    """
+    """Read COCO results, or a COCO or COCO-VID dataset that holds its annotations itself."""
     entries = data = load_json(path)
     if isinstance(data, dict) and "images" in data:
         entries = data.get("annotations")
@@ -311,14 +269,21 @@ def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetect
     )  # fmt: skip
 
 
+COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's ids 1 to 90, without a class
+
+
 def _coco_dataset(
     path: Path, names: Sequence[str], video: Video, own: Any
 ) -> tuple[dict[int, int], dict[int, str], list[str]]:
-    """Frame of each image id (empty: the id itself), name of each category id, and messages.
+    """Look up what image and category ids mean, in the file itself or in a dataset beside it.
 
-    The dataset is the file itself (`own`) or any other JSON of the folder with `images`; they
-    belong to frames by `file_name`, or where the video has no file names by `frame_id` (COCO-VID)
-    or their order.
+    A dataset is a JSON file with `images`. They belong to frames by `file_name`; where the video
+    has no file names by `frame_id` (COCO-VID), else by their order.
+
+    Args:
+        own: content of the file.
+    Returns:
+        Frame by image id (empty: the id is the frame), class name by category id, and messages.
     """
     data = own if isinstance(own, dict) else None
     for other in sorted(path.parent.glob("*.json")) if data is None else ():
@@ -340,52 +305,22 @@ def _coco_dataset(
 
 
 def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
-    """Return the run lengths of a COCO segmentation: RLE (compressed or not), polygons or none."""
+    """Read a COCO segmentation as run lengths: RLE (compressed or not), polygons or none."""
     if not mask:
         return NO_RUNS
-    if isinstance(mask, dict):
-        counts = mask["counts"]
-        if tuple(mask["size"]) != size[::-1]:
-            raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
-        return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
-    canvas = np.zeros(size[::-1], np.uint8)
-    for ring in mask:  # corner convention -> OpenCV's, where the first pixel's centre is (0, 0)
-        corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)
-        cv2.fillPoly(canvas, [corners], 1, shift=POLYGON_BITS)
-    return rle_encode(canvas > 0)
-
-
-def read_npz(
-    path: Path, size: tuple[int, int], working_size: tuple[int, int]
-) -> tuple[RecordedDetections, IntArray]:
-    """Read our own format, as `pack_detections` makes it.
-
-    Returns:
-        the detections, and the frames that were `done` (those with detections if it does not say).
-    """
-    data, _ = load_npz(path)
-    count = len(data.get("frame", ()))
-    data.setdefault("mask_counts", NO_RUNS)
-    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
-    shapes = {"frame": (count,), "xyxy": (count, 4), "score": (count,), "class_id": (count,),
-              "class_names": (-1,), "image_size": (2,), "mask_offsets": (count + 1,)}  # fmt: skip
-    for key, shape in shapes.items():
-        found = data[key].shape if key in data else "missing"
-        if found != shape and (key != "class_names" or found == "missing"):
-            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
-    if (made_for := tuple(data["image_size"].tolist())) != size:
-        raise ReobjError(f"{path}: made for images of {made_for} px, but the video is {size} px")
-    recorded = RecordedDetections(
-        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
-        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
-        np.split(data["mask_counts"], data["mask_offsets"][1:])[:count],
-        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
-    )  # fmt: skip
-    return recorded, data.get("done", recorded.frame)
+    if not isinstance(mask, dict):
+        return polygon_runs(mask, size)
+    counts = mask["counts"]
+    if tuple(mask["size"]) != size[::-1]:
+        raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
+    return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
 
 
 def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_count: int) -> None:
-    """Check detections of any format: errors for what cannot be meant, messages for single rows."""
+    """Check detections of any format, drop what is not used and sort the rest by frame and score.
+
+    Errors for what cannot be meant, messages for single rows.
+    """
     finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
     named = np.isin(found.class_id, np.arange(len(found.class_names)))
     pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,) 0: no mask
@@ -397,7 +332,7 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
         elif not named[row]:
             text = unnamed_class(int(found.class_id[row]), len(found.class_names))
         raise ReobjError(f"{path}, {found.unit} {found.line[row]}: {text}")
-    keep = _real(found, path, frame_count)
+    keep = _usable(found, path, frame_count)
     if len(found) and (found.score == -1).all():
         found.messages.append("scores are all -1: taken as 1")
         found.score = -found.score
@@ -422,8 +357,12 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
     found.messages[:] = [f"{path.name}: {text}" for text in found.messages]
 
 
-def _real(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
-    """Return which boxes have an area, touch the image and belong to a frame of the video."""
+NORMALISED_MAX = 1.5  # px; chosen: boxes wholly below are shares of the image, some a bit outside
+UNUSABLE_SHARE = 0.5  # chosen: where most boxes are of no use, it is the format that is wrong
+
+
+def _usable(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
+    """Tell which boxes (N,) have an area, touch the image and belong to a frame of the video."""
     count, low, high = len(found), found.xyxy[:, :2], found.xyxy[:, 2:]
     empty = (high <= low).any(1)  # (N,)
     outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(found.size))).any(1))
@@ -431,7 +370,7 @@ def _real(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
     if count and found.xyxy.max() <= NORMALISED_MAX:
         raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
                          "Multiply them by the image size")  # fmt: skip
-    if (empty | outside).sum() > MOSTLY * count:
+    if (empty | outside).sum() > UNUSABLE_SHARE * count:
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
             f"the image of {found.size}: x, y, w, h where x1, y1, x2, y2 is expected, or another "
@@ -447,42 +386,6 @@ def _real(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
             first = f"{found.unit} {found.line[bad][0]}"
             found.messages.append(f"{bad.sum()} boxes {what} dropped, the first at {first}")
     return np.logical_not(empty | outside | missing)
-
-
-def pack_detections(
-    frames: Sequence[tuple[int, Detections]], names: Sequence[str], size: tuple[int, int]
-) -> dict[str, Any]:
-    """Return the arrays of our npz format."""
-    parts = [Detections.empty(), *(found for _, found in frames)]
-    runs = [NO_RUNS]
-    for found in parts:
-        expected = (len(found), size[1], size[0])
-        if found.masks is None:
-            runs += [NO_RUNS] * len(found)
-        elif found.masks.shape != expected:
-            raise ReobjError(f"masks are {found.masks.shape}, expected (D, H, W) = {expected}")
-        else:
-            runs += map(rle_encode, found.masks)
-    return {
-        "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
-        "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
-        "score": np.concatenate([d.score for d in parts]).astype(np.float64),
-        "class_id": np.concatenate([d.class_id for d in parts]).astype(np.int64),
-        "class_names": np.array(list(names), np.str_),
-        "image_size": np.array(size, np.int64),
-        "mask_counts": np.concatenate(runs),
-        "mask_offsets": np.cumsum([len(run) for run in runs]),
-    }
-
-
-def write_detections_npz(
-    path: str | Path,
-    frames: Iterable[tuple[int, Detections]],
-    class_names: Sequence[str],
-    image_size: tuple[int, int],
-) -> None:
-    """Write (frame number, Detections) pairs, masks as run lengths, for `read_detections`."""
-    save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
 
 
 CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
@@ -550,7 +453,7 @@ def _lend(known: Tracks, tracks: Tracks, unnamed: bool) -> Tracks:
 
 
 def _read_cvat(path: Path, video: Video) -> RecordedDetections:
-    """Read the boxes of "CVAT for video 1.1" that are not outside; identity = track id + 1."""
+    """Read the boxes of "CVAT for video 1.1" that are not "outside"; identity is track id + 1."""
     try:
         text = path.read_bytes()
         if zipfile.is_zipfile(path):

@@ -1,8 +1,12 @@
-"""Frames of a video file, image folder, camera or stream."""
+"""Frames of a video file, an image folder, a camera or a stream, with what can be wrong with them.
+
+What is in the frames is not asked here. Start at `Video`; `resized` and `shrunk` scale images.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import glob
 import hashlib
 import json
@@ -24,52 +28,59 @@ import numpy as np
 from reobj.files import shortened, without_password
 from reobj.types import Frame, Image, ReobjError, option
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-IMAGE_FPS = 30.0  # of image folders
-SHORT_SHARE = 0.02  # of the announced frames may be missing at the end before it is worth a warning
-MAX_BAD_RUN = 64  # unreadable frames in a row after which a video has ended
-STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
-LIVE_WAITING = 2  # newest frames of a live source that wait for the tracker; older ones are dropped
-LIVE_SILENCE_S = 2.0  # without any frame: a live source has ended
+IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
 
 
 @dataclass(frozen=True, slots=True)
 class InputConfig:
-    """Which frames are read. Frame numbers are those of the source, whatever `every` is."""
+    """Choose the frames to read, which keep their numbers in the source whatever is left out."""
 
-    every: int = option(1, "use every N-th frame", "--every")
-    start: int = option(0, "first frame (0-based)", "--start")
-    stop: int = option(0, "frame to stop before (0: the end)", "--stop")
-    max_size: int = option(0, "shrink frames to this longer side, px (0: native)", "--max-size")
+    every: int = option(1, "read every N-th frame", "--every")
+    start: int = option(0, "number of the first frame to read (0-based)", "--start")
+    stop: int = option(0, "number of the frame to stop before (0: read to the end)", "--stop")
+    max_size: int = option(
+        0, "shrink frames whose longer side has more pixels to this (0: never)", "--max-size"
+    )
+
+
+STREAM_URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
+MAX_UNREADABLE = 64  # frames in a row; chosen: 2 s without a picture, then the video has ended
+MISSING_SHARE = 0.02  # of the announced frames; chosen: containers often announce a few too many
+LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: one to work on next and the newest one
+LIVE_TIMEOUT_S = 2.0  # chosen: no frame for so long, and a live source has ended
 
 
 class Video:
-    """Frames of a video file, an image folder, a glob, a camera index or a stream's URL.
+    """Iterate over the frames of a video file, image folder, glob, camera index or stream URL.
 
-    Iterating yields `Frame`s, as often as wanted. Frame numbers are those of the source: rows of
-    the sorted images, or frames of the file in order, unreadable ones counted. A live source never
-    waits: what comes while its frames are worked on is dropped, except for the newest; dropped
-    frames are counted too.
+    Iterating yields `Frame`s, and may be done again unless the source is live. Frame numbers count
+    the frames of the source from 0: images in the order of the numbers in their names, frames of a
+    file as they are stored; those that cannot be read are counted. A live source is read as fast
+    as it delivers: frames that come while the caller works are counted and dropped, except for the
+    `LIVE_QUEUE` newest ones.
 
     Attributes:
-        is_live: a camera or stream, which cannot be read twice; read, dropped: its frames so far.
-        source: what was given, without a URL's password. names: of image files by frame number.
-        size, working_size: (w, h) of the source after rotation, and of the frames; scale: ratio.
-        fps: mean frame rate. frame_count: of the source (0 if unknown).
-        skipped: frames of the last iteration that could not be read or had another size.
-        messages: warnings, each once.
+        source: what was given, without a URL's password.
+        names: file names of images by frame number, [] for videos.
+        is_live: a camera or stream, which cannot be read twice.
+        read, dropped: wanted frames of a live source so far, and those of them never yielded.
+        size: (w, h) of the source in px, after rotation by its metadata.
+        working_size: (w, h) of the frames that are yielded, px; scale: working px per native px.
+        fps: mean frame rate, Hz. frame_count: of the source (0: unknown).
+        skipped: numbers of the frames, in the last iteration, that could not be read or had
+            another size. messages: warnings for the user, each once.
     """
 
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
         self._address, self.config = str(source), config or InputConfig()
         self.source = without_password(self._address)
-        if self.config.every < 1 or self.config.start < 0 or self.config.max_size < 0:
-            raise ReobjError("--every must be at least 1, --start and --max-size at least 0")
+        if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
+            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
         self.messages: list[str] = []
         self.read = self.dropped = 0
-        self._live: Any = None  # the opened capture of a live source until it is iterated
-        self._is_url = bool(STREAM.match(self._address))
+        self._opened: Any = None  # capture of a live source, until it is iterated
+        self._is_url = bool(STREAM_URL.match(self._address))
         self._files = [] if self._is_url else _image_files(self.source)
         self.names = [path.name for path in self._files]
         self.is_live = self._is_url or (self.source.isdigit() and not Path(self.source).exists())
@@ -88,7 +99,7 @@ class Video:
 
     @property
     def expected(self) -> int:
-        """Number of frames that an iteration yields at most (0 if unknown)."""
+        """Count the frames that an iteration yields at most (0: unknown)."""
         stop = min(self.config.stop or self.frame_count, self.frame_count or self.config.stop)
         return max(math.ceil((stop - self.config.start) / self.config.every), 0)
 
@@ -116,36 +127,43 @@ class Video:
             self.messages.append(text)
 
     def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
-        """Yield number, time and image of every wanted frame, None if it cannot be read."""
+        """Decode a file: yield number, time in s and image of the wanted frames.
+
+        The image is None if it cannot be read. Frames that cannot be grabbed are held back until a
+        later one can: at the end of the file they do not exist.
+        """
         capture, start, every = self._open(), self.config.start, self.config.every
-        previous_s, bad, index = -1.0, 0, -1
-        pending: list[tuple[int, float, Image | None]] = []  # unreadable, or beyond the end
+        previous_s, unreadable, index = -1.0, 0, -1
+        pending: list[tuple[int, float, Image | None]] = []  # unreadable, or after the end
         for index in range(self.config.stop or sys.maxsize):
             wanted = index >= start and (index - start) % every == 0
             grabbed = capture.grab()
             # Right after the grab this is the frame's true time, also at a variable rate.
             time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            if time_s <= previous_s:  # some containers have no times
+            if time_s <= previous_s:  # some containers hold no times
                 time_s = previous_s + 1 / self.fps
             ok, image = capture.retrieve() if grabbed and wanted else (grabbed, None)
             if not ok:
-                bad += 1
+                unreadable += 1
                 pending += [(index, time_s, None)] if wanted else []
-                if bad >= MAX_BAD_RUN:
+                if unreadable >= MAX_UNREADABLE:
                     break
                 continue
             yield from pending
-            pending, bad, previous_s = [], 0, time_s
+            pending, unreadable, previous_s = [], 0, time_s
             if wanted:
                 yield index, time_s, image
-        read, stop = index + 1 - bad, self.config.stop or self.frame_count
-        if min(stop, self.frame_count) - read > max(1.0, SHORT_SHARE * self.frame_count):
+        read, stop = index + 1 - unreadable, self.config.stop or self.frame_count
+        if min(stop, self.frame_count) - read > max(1.0, MISSING_SHARE * self.frame_count):
             self._warn(f"the file ends early: {read} of {self.frame_count} frames can be read")
 
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
-        """Yield the newest frames of a live source; a thread reads them all and drops the rest."""
-        capture, self._live = self._live or self._open(), None
-        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_WAITING)
+        """Yield number, time in s since the start and image of the newest frames of a live source.
+
+        A thread reads all frames, so that the driver's own queue never fills with old ones.
+        """
+        capture, self._opened = self._opened or self._open(), None
+        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_QUEUE)
         stopped = threading.Event()
         thread = threading.Thread(
             target=self._read_live, args=(capture, frames, stopped), daemon=True
@@ -156,7 +174,7 @@ class Video:
                 yield item
         finally:
             stopped.set()
-            thread.join(LIVE_SILENCE_S)
+            thread.join(LIVE_TIMEOUT_S)
             if not thread.is_alive():  # else it hangs in the driver; the process may still end
                 capture.release()
 
@@ -166,11 +184,11 @@ class Video:
         frames: queue.Queue[tuple[int, float, Image] | None],
         stopped: threading.Event,
     ) -> None:
-        """Read a live source until it ends; only the last LIVE_WAITING wanted frames wait."""
+        """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
         began = last = time.monotonic()
         self.read = self.dropped = index = 0
         try:
-            while not stopped.is_set() and time.monotonic() - last < LIVE_SILENCE_S:
+            while not stopped.is_set() and time.monotonic() - last < LIVE_TIMEOUT_S:
                 if 0 < self.config.stop <= index:
                     break
                 ok, image = capture.read()
@@ -187,13 +205,13 @@ class Video:
                         self.dropped += 1
                 frames.put((at, last - began, image))  # this thread alone puts: there is room
         finally:
-            while not stopped.is_set():  # say that it ended, behind the frames that wait
+            while not stopped.is_set():  # None ends the iteration, after the frames that wait
                 with contextlib.suppress(queue.Full):
                     frames.put(None, timeout=0.1)
                     break
 
     def _open(self) -> Any:
-        """Open the source with OpenCV, which turns the frames upright by the file's rotation."""
+        """Open the source with OpenCV, which turns frames upright by the file's rotation tag."""
         if not self.is_live and not self._is_url and not Path(self.source).is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
@@ -209,25 +227,32 @@ class Video:
         return capture
 
     def _probe(self) -> tuple[tuple[int, int], float, int]:
-        """Return size, frame rate and number of frames, from the first readable frame."""
+        """Read the first readable frame.
+
+        Returns:
+            (w, h) in px, frame rate in Hz, and number of frames (0: unknown).
+        """
         images: Iterator[Image | None] = map(_read_image, self._files)
         fps, count = IMAGE_FPS, len(self._files)
         if not self._files:
             capture = self._open()
-            images = (capture.read()[1] for _ in range(MAX_BAD_RUN))
+            images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
             fps = float(capture.get(cv2.CAP_PROP_FPS))
             if not self._address.isdigit():
                 count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
             self.is_live = self.is_live and not count  # a URL may be that of a file
-            self._live = capture if self.is_live else None
+            self._opened = capture if self.is_live else None
         image = next((image for image in images if image is not None), None)
         if image is None:
             raise ReobjError(f"{self.source}: not one frame can be decoded")
         return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
 
 
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+
+
 def _image_files(source: str) -> list[Path]:
-    """Return the images of a folder, glob or single file, image2 before image10; [] for videos."""
+    """List the images of a folder, glob or single file, image2 before image10; [] for videos."""
     path = Path(source)
     if path.is_file():
         return [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
@@ -241,7 +266,7 @@ def _image_files(source: str) -> list[Path]:
 
 
 def _read_image(path: Path) -> Image | None:
-    """Read an image as BGR, upright by its EXIF tag; None if it is none."""
+    """Read an image file as BGR, turned upright by its EXIF tag; None if it is no image."""
     try:
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
@@ -251,7 +276,7 @@ def _read_image(path: Path) -> Image | None:
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:
-    """Resize to (w, h) by averaging; by halves first, which is 4 times as fast on large frames."""
+    """Resize to (w, h) by averaging pixels; by halves first: 4 times as fast on large frames."""
     while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
         half = (image.shape[1] // 2, image.shape[0] // 2)
         image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
@@ -259,13 +284,17 @@ def resized(image: Image, size: Sequence[int]) -> Image:
 
 
 def shrunk(image: Image, size_px: int) -> Image:
-    """A copy whose longer side is at most size_px."""
+    """Shrink an image so that its longer side has at most `size_px`; never enlarge."""
     ratio = min(1.0, size_px / max(image.shape[:2]))
     return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
 
 
 def source_fingerprint(source: Any) -> str:
-    """Hash of names, sizes and times of a file, a folder's files or a glob; streams: their name."""
+    """Hash names, sizes and times of a file, a folder's files or a glob's matches.
+
+    Returns:
+        16 hex digits; of a camera or stream its name as it is.
+    """
     path = Path(str(source))
     found = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(source)))
     files = sorted(p for p in found if p.is_file()) or [path] * path.is_file()

@@ -1,4 +1,7 @@
-"""Weights: the table of known files, their download, and onnxruntime sessions."""
+"""Weights: the table of known files, their download, and onnxruntime sessions on them.
+
+What a network computes is the business of the rooms that run it. Start at `model_path`.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +19,30 @@ from typing import Any
 from reobj.files import Progress, atomic
 from reobj.types import ReobjError, log
 
-DOWNLOAD_CHUNK = 1 << 16  # bytes read at a time
-DOWNLOAD_TIMEOUT_S = 30  # without any byte: the connection counts as cut
+# Mean and standard deviation of the pixels of ImageNet, RGB, 0..255 (torchvision: .485, .456, .406
+# and .229, .224, .225, times 255): what most published networks were trained with.
+IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """A file of pre-trained weights; without `url` it comes along in `models`."""
+    """Describe a file of pre-trained weights.
+
+    Attributes:
+        name, file: either names it on the command line. role: "detector" or "backbone".
+        url: where to download it, pinned at a commit; "": it comes along in reobj/models.
+        sha256, size: of the whole file, bytes.
+        note: for the table; AP on 164 images of COCO val2017, ms an image with one thread.
+    """
 
     name: str
-    role: str  # detector, backbone or reid (appearance of persons)
+    role: str
     file: str
-    url: str  # pinned at a commit
+    url: str
     sha256: str
     size: int
     licence: str
-    note: str = ""  # AP: 164 images of COCO val2017; ms: one thread
+    note: str = ""
 
 
 _GITHUB = "https://github.com/"
@@ -63,7 +74,7 @@ WEIGHTS: tuple[Weights, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class ModelRow:
-    """A known file: "verified", "wrong sha256" or "missing"."""
+    """Tell whether a known file is here: `state` "verified", "wrong sha256" or "missing"."""
 
     weights: Weights
     state: str
@@ -71,7 +82,7 @@ class ModelRow:
 
 
 def _model_folders() -> list[Path]:
-    """Return the folders searched for weights: REOBJ_MODELS, if set, then the platform's cache."""
+    """List the folders for downloads: REOBJ_MODELS, if set, then the platform's cache."""
     home = Path.home()
     if sys.platform == "win32":
         cache = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
@@ -84,11 +95,12 @@ def _model_folders() -> list[Path]:
 
 
 def own_models() -> Path:
-    """Return the folder of the weights that come along."""
+    """Return the folder of the weights that come along with the package."""
     return Path(__file__).resolve().parents[1] / "models"
 
 
 def _find_model(*files: str) -> Path | None:
+    """Return the first of the files that is in a folder of weights."""
     folders = [*_model_folders(), own_models()]
     paths = (folder / file for folder in folders for file in files)
     return next((path for path in paths if path.is_file()), None)
@@ -100,7 +112,7 @@ def _sha256(path: Path) -> str:
 
 
 def list_models() -> list[ModelRow]:
-    """Return every known file of weights with its state on this machine."""
+    """List all known weights with their state on this machine; reads and hashes the files."""
     rows = []
     for weights in WEIGHTS:
         path, state = _find_model(weights.file), "missing"
@@ -111,7 +123,15 @@ def list_models() -> list[ModelRow]:
 
 
 def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
-    """Return a model's path: an existing file as it is, a known name verified or downloaded."""
+    """Find a file of weights, or download it.
+
+    Args:
+        name_or_path: an existing file, taken as it is; a name of the table, whose file is verified
+            or downloaded; or another file in a folder of weights, with or without ".onnx".
+        offline: never download.
+    Raises:
+        ReobjError: unknown, changed, or not to be had; says what to do.
+    """
     path, name = Path(name_or_path).expanduser(), str(name_or_path)
     if path.is_file():
         return path
@@ -131,7 +151,7 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
 
 
 def _fetch(weights: Weights, offline: bool) -> Path:
-    """Download weights into the first writable folder and return the verified file."""
+    """Download weights into the first writable folder; keep the file only if its sha256 fits."""
     by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
     if offline:
         raise ReobjError(f"model {weights.name} is not here and --offline forbids the download: "
@@ -158,7 +178,7 @@ def _fetch(weights: Weights, offline: bool) -> Path:
 
 
 def _writable_folder() -> Path:
-    """Return the first folder for weights that can be written."""
+    """Return the first folder for downloads that can be written; makes it."""
     for folder in _model_folders():
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -168,8 +188,12 @@ def _writable_folder() -> Path:
     raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
 
 
+DOWNLOAD_CHUNK = 1 << 16  # bytes; chosen: small enough for a moving progress line
+DOWNLOAD_TIMEOUT_S = 30  # chosen: no byte for so long, and the connection counts as cut
+
+
 def _download(weights: Weights, part: Path) -> None:
-    """Write the file behind the URL to `part`, with progress; a short answer is an error."""
+    """Write the file behind the URL to `part`; a connection cut early is an error."""
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
     progress, done = Progress("fetch kB", weights.size // 1000), 0
     with (
@@ -185,11 +209,8 @@ def _download(weights: Weights, part: Path) -> None:
         raise ConnectionError(f"connection cut after {done} of {weights.size} bytes")
 
 
-IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # RGB
-
-
 def onnx_session(path: Path, threads: int = 0) -> Any:
-    """Make an onnxruntime session on the CPU; `threads` 0 means all cores."""
+    """Make an onnxruntime session on the CPU (threads 0: all cores)."""
     try:
         import onnxruntime
     except ImportError as error:
@@ -206,6 +227,5 @@ def onnx_session(path: Path, threads: int = 0) -> Any:
 
 
 def onnx_metadata(session: Any) -> dict[str, Any]:
-    """Read what `examples/train_embedding.py` wrote into a model file's metadata."""
-    text = session.get_modelmeta().custom_metadata_map.get("reobj", "{}")
-    return dict(json.loads(text))
+    """Read what `examples/train_embedding.py` wrote into a model file; {} for other models."""
+    return dict(json.loads(session.get_modelmeta().custom_metadata_map.get("reobj", "{}")))

@@ -1,0 +1,63 @@
+"""Masks as run lengths: encode, decode, COCO's compressed strings and polygons.
+
+Run lengths go down the columns of the image (COCO's order) and start with the length of the zeros
+at the top left; a mask without any pixel has none (`NO_RUNS`) and counts as "no mask".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from reobj.types import BoolArray
+
+Counts = npt.NDArray[np.uint32]
+NO_RUNS: Counts = np.empty(0, np.uint32)
+
+
+def rle_encode(mask: BoolArray) -> Counts:
+    """Encode an (H, W) mask as run lengths."""
+    flat = cv2.transpose(mask.view(np.uint8)).ravel()  # (W * H,)
+    edges = np.flatnonzero(np.diff(flat, prepend=np.uint8(0)))
+    counts = np.diff(edges, prepend=0, append=flat.size).astype(np.uint32)
+    return counts if len(counts) > 1 else NO_RUNS
+
+
+def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
+    """Decode run lengths to the (H, W) mask of a (w, h) image."""
+    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts) if len(counts) else np.False_
+    return np.broadcast_to(flat, size[0] * size[1]).reshape(size).T
+
+
+def coco_runs(text: str) -> Counts:
+    """Decode COCO's compressed run lengths (maskApi.c of pycocotools, rleFrString).
+
+    Five bits a character, low ones first, 32 where more follow, the last of a number with its sign;
+    from the fourth run on the difference to the last but one.
+    """
+    runs: list[int] = []
+    value = shift = 0
+    for byte in text.encode():
+        value |= (byte - 48 & 0x1F) << shift
+        shift += 5
+        if byte - 48 & 0x20:
+            continue
+        value -= (byte - 48 >> 4 & 1) << shift  # sign
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = shift = 0
+    return np.array(runs, np.uint32)
+
+
+POLYGON_BITS = 4  # sub-pixel bits of cv2.fillPoly; chosen: 1/16 px, finer than any annotation
+
+
+def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Counts:
+    """Fill polygons (x, y, x, y, ... in px, corner convention) in a (w, h) image."""
+    canvas = np.zeros(size[::-1], np.uint8)
+    for ring in rings:  # for OpenCV the centre of the first pixel is (0, 0), here (0.5, 0.5)
+        corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)
+        cv2.fillPoly(canvas, [corners], 1, shift=POLYGON_BITS)
+    return rle_encode(canvas > 0)

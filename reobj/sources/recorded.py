@@ -1,0 +1,144 @@
+"""Detections of a whole video as arrays, and the npz format that holds them with their masks.
+
+Other formats are read in `detection_files`; what is wrong with the content is checked there too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from reobj.files import load_npz, save_npz
+from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
+from reobj.types import Array, BoolArray, Detections, IntArray, ReobjError
+
+
+@dataclass(slots=True)
+class RecordedDetections:
+    """Hold the detections of a video as a struct of arrays, ready to be asked frame by frame.
+
+    Attributes:
+        frame: (N,) source frame numbers, ascending once read.
+        xyxy: (N, 4) px of the source. score: (N,) in [0, 1]. class_id: (N,) index into class_names.
+        runs: run lengths of the N masks (see `masks`), empty where there is none.
+        size, working_size: (w, h) of the masks, and of the frames that `at` answers for.
+        line: (N,) where each stands in the file, counted in `unit`s, for messages.
+        messages: what was dropped or assumed, for the user.
+        identity: (N,) as the file has it, or empty.
+    """
+
+    frame: IntArray
+    xyxy: Array
+    score: Array
+    class_id: IntArray
+    runs: list[Counts]
+    class_names: tuple[str, ...]
+    size: tuple[int, int]
+    working_size: tuple[int, int]
+    line: IntArray
+    unit: str
+    messages: list[str] = field(default_factory=list)
+    identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def at(self, frame_index: int) -> Detections:
+        """Return the detections of a frame in px of the working size; decodes its masks."""
+        low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
+        rows, runs, masks = slice(low, high), self.runs[low:high], None
+        ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
+        if any(map(len, runs)):
+            decoded = (rle_decode(counts, self.size) for counts in runs)
+            masks = np.stack([_resized_mask(mask, self.working_size) for mask in decoded])
+        return Detections(self.xyxy[rows] * ratio, self.score[rows], self.class_id[rows], masks)
+
+
+def _resized_mask(mask: BoolArray, size: tuple[int, int]) -> BoolArray:
+    """Resize an (H, W) mask to (w, h): pixels of which at least half is covered."""
+    if mask.shape == size[::-1]:
+        return mask
+    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(share >= 0.5)
+
+
+def pack_detections(
+    frames: Sequence[tuple[int, Detections]], names: Sequence[str], size: tuple[int, int]
+) -> dict[str, Any]:
+    """Pack (frame number, Detections) pairs into the arrays of our npz format.
+
+    Returns:
+        frame (N,), xyxy (N, 4), score (N,), class_id (N,), class_names (C,), image_size (w, h), and
+        the run lengths of the masks: those of row i are mask_counts[mask_offsets[i] :
+        mask_offsets[i + 1]].
+    """
+    parts = [Detections.empty(), *(found for _, found in frames)]
+    runs = [NO_RUNS]
+    for found in parts:
+        expected = (len(found), size[1], size[0])
+        if found.masks is None:
+            runs += [NO_RUNS] * len(found)
+        elif found.masks.shape != expected:
+            raise ReobjError(f"masks are {found.masks.shape}, expected (D, H, W) = {expected}")
+        else:
+            runs += map(rle_encode, found.masks)
+    return {
+        "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
+        "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
+        "score": np.concatenate([d.score for d in parts]).astype(np.float64),
+        "class_id": np.concatenate([d.class_id for d in parts]).astype(np.int64),
+        "class_names": np.array(list(names), np.str_),
+        "image_size": np.array(size, np.int64),
+        "mask_counts": np.concatenate(runs),
+        "mask_offsets": np.cumsum([len(run) for run in runs]),
+    }
+
+
+def write_detections_npz(
+    path: str | Path,
+    frames: Iterable[tuple[int, Detections]],
+    class_names: Sequence[str],
+    image_size: tuple[int, int],
+) -> None:
+    """Write detections to an npz file for `read_detections`.
+
+    Args:
+        frames: (frame number of the source, Detections) pairs; boxes and masks in its pixels.
+        class_names: by class id. image_size: (w, h) of the source.
+    """
+    save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
+
+
+def read_npz(
+    path: Path, size: tuple[int, int], working_size: tuple[int, int]
+) -> tuple[RecordedDetections, IntArray]:
+    """Read our own format, as `pack_detections` makes it, for a video of (w, h) `size`.
+
+    Returns:
+        The detections, unchecked, and the numbers of the frames that were `done`, also those
+        without a detection (where the file does not say: the frame of every detection).
+    """
+    data, _ = load_npz(path)
+    count = len(data.get("frame", ()))
+    data.setdefault("mask_counts", NO_RUNS)
+    data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
+    shapes = {"frame": (count,), "xyxy": (count, 4), "score": (count,), "class_id": (count,),
+              "class_names": (-1,), "image_size": (2,), "mask_offsets": (count + 1,)}  # fmt: skip
+    for key, shape in shapes.items():
+        found = data[key].shape if key in data else "missing"
+        if found != shape and (key != "class_names" or found == "missing"):
+            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
+    if (made_for := tuple(data["image_size"].tolist())) != size:
+        raise ReobjError(f"{path}: made for images of {made_for} px, but the video is {size} px")
+    recorded = RecordedDetections(
+        data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
+        data["score"].astype(np.float64), data["class_id"].astype(np.int64),
+        np.split(data["mask_counts"], data["mask_offsets"][1:])[:count],
+        tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
+    )  # fmt: skip
+    return recorded, data.get("done", recorded.frame)

@@ -1,0 +1,205 @@
+"""Files that are whole or not at all, JSON and npz, progress, and text for messages."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from reobj import files
+
+# ---- Whole files ---------------------------------------------------------------------------------
+
+
+def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"  # in a folder that is not there yet
+    with files.atomic(path) as part:
+        part.write_text("half")
+        assert part.parent == path.parent and not path.exists()  # the same disk: a rename is atomic
+        part.write_text("whole")
+    assert path.read_text() == "whole" and list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_an_error_leaves_what_was_there(tmp_path: Path, error: type[BaseException]) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(error), files.atomic(path) as part:
+        part.write_text("new, but only ha")
+        raise error
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_part_of_a_killed_run_is_no_obstacle(tmp_path: Path) -> None:
+    with files.atomic(tmp_path / "a.txt") as part:
+        part.touch()
+    (tmp_path / "a.txt").rename(part)
+    part.write_text("left behind by a kill, and longer")
+    with files.atomic(tmp_path / "a.txt") as part:
+        part.write_text("new")
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["new"]
+
+
+# ---- Text, JSON, npz -----------------------------------------------------------------------------
+
+
+def test_text_with_and_without_byte_order_mark(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    for data in ("größer".encode(), b"\xef\xbb\xbf" + "größer".encode()):
+        path.write_bytes(data)
+        assert files.read_text(path) == "größer"
+    path.write_bytes("größer".encode("latin-1"))
+    for bad in (path, tmp_path, tmp_path / "none"):
+        with pytest.raises(rt.ReobjError, match=f"^{bad}: cannot be read as text"):
+            files.read_text(bad)
+
+
+def test_json_names_the_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text('{"a": [1, 2.5, null]}')
+    assert files.load_json(path) == {"a": [1, 2.5, None]}
+    path.write_text('{"a": 1,\n\n"b" 2}')
+    with pytest.raises(rt.ReobjError, match=r"a\.json, line 3: not valid JSON"):
+        files.load_json(path)
+
+
+def test_npz_round_trip(tmp_path: Path) -> None:
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "names": np.array(["x", "yy"])}
+    files.save_npz(tmp_path / "a.npz", arrays, version=2, of={"up": None})
+    found, metadata = files.load_npz(tmp_path / "a.npz")
+    assert found.keys() == arrays.keys() and metadata == {"version": 2, "of": {"up": None}}
+    for key, value in arrays.items():
+        np.testing.assert_array_equal(found[key], value)
+    files.save_npz(tmp_path / "b.npz", arrays, version=2, of={"up": None})
+    assert (tmp_path / "b.npz").read_bytes() == (tmp_path / "a.npz").read_bytes()
+    np.savez(tmp_path / "c.npz", a=1)  # of other tools: no metadata
+    assert files.load_npz(tmp_path / "c.npz") == ({"a": 1}, {})
+
+
+def test_damaged_npz(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    files.save_npz(path, {"a": np.random.default_rng(0).random(999)})
+    whole = path.read_bytes()
+    changed = bytearray(whole)
+    changed[len(whole) // 2] ^= 1  # one bit
+    objects = io.BytesIO()
+    np.savez(objects, a=np.array([{"code": 1}], object))  # pickled: could run anything
+    for data in (whole[:-40], bytes(changed), b"", b"no zip", objects.getvalue()):
+        path.write_bytes(data)
+        with pytest.raises(rt.ReobjError, match=r"a\.npz: damaged, or no npz file"):
+            files.load_npz(path)
+
+
+def test_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*args: Any, **kwargs: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(rt.ReobjError, match=r"a\.npz: cannot be written .No space left on device"):
+        files.save_npz(tmp_path / "a.npz", {})
+    assert not list(tmp_path.iterdir())
+
+
+# ---- Progress ------------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Seconds that `time.monotonic` shows: set item 0."""
+    now = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_progress_tells_share_rate_and_time_left(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    progress = files.Progress("track", 200)
+    clock[0] += 4
+    progress.step(20)  # 5 a second, 180 left: 36 s
+    clock[0] += 0.01
+    progress.step()  # too soon for an eye
+    assert screen.getvalue() == "\rtrack     20/200  10 %, 36 s left, 5.0/s\x1b[K"
+    clock[0] += 5.99
+    assert progress.close() == pytest.approx(10)
+    assert screen.getvalue().endswith("\rtrack     21/200  10 %, 85 s left, 2.1/s\x1b[K\n")
+
+
+def test_progress_without_a_total(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    progress = files.Progress("live")
+    clock[0] += 2
+    progress.step(3)
+    assert screen.getvalue() == "\rlive      3, 1.5/s\x1b[K"
+
+
+def test_progress_is_silent_without_a_terminal(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    progress = files.Progress("track", 200)
+    clock[0] += 4
+    progress.step(20)
+    assert progress.close() == 4 and capsys.readouterr().err == ""
+
+
+# ---- Text for messages ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("rtsp://me:secret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
+        ("run http://token@a/b rtsp://u:p@c -o out", "run http://a/b rtsp://c -o out"),
+        ("http://a/b@c", "http://a/b@c"),  # part of the path
+        ("me@home.org", "me@home.org"),
+    ],
+)
+def test_passwords_are_not_shown(text: str, expected: str) -> None:
+    assert files.without_password(text) == expected
+
+
+def test_lists_are_shortened() -> None:
+    assert files.shortened([]) == "" and files.shortened([1, 2, 3, 4, 5]) == "1, 2, 3, 4, 5"
+    assert files.shortened("abcdef") == "a, b, c, d, e, ..."
+
+
+@pytest.mark.parametrize(
+    ("numbers", "step", "expected"),
+    [
+        ([], 1, ""),
+        ([7], 1, "7"),
+        ([3, 4, 5, 9], 1, "3-5, 9"),
+        ([0, 10, 20, 40], 10, "0-20, 40"),  # every tenth frame
+    ],
+)
+def test_spans(numbers: list[int], step: int, expected: str) -> None:
+    assert files.spans(numbers, step) == expected
+
+
+def test_numbers_for_json() -> None:
+    assert files.rounded(1.23456, 2) == 1.23 and files.rounded(None, 2) is None
+    assert [files.rounded(v, 2) for v in (math.nan, math.inf)] == [None, None]
+    text = json.dumps(files.numbers(np.array([[1 / 3, 2e-9 / 3], [123456.789, 0]])))
+    assert text == "[0.333333, 6.66667e-10, 123457.0, 0.0]"
+
+
+def test_arrays_as_text() -> None:
+    array = np.array([[1.5, 2], [3, 4]]).T  # not in C order
+    assert base64.b64decode(files.base64_text(array, "<f4")) == struct.pack("<4f", 1.5, 3, 2, 4)
