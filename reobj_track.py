@@ -66,7 +66,6 @@ from reobj.identity.embedding import (
     EmbedConfig,
     Embedder,
     LazyEmbeddings,
-    SamplingLayout,
     as_embeddings,
 )
 from reobj.identity.linking import link
@@ -77,6 +76,7 @@ from reobj.identity.reid import (
     match_probability,
     part_cosines,
 )
+from reobj.identity.sampling import SamplingLayout
 from reobj.objects import ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.options import add_flags, config_from_args, list_options
 from reobj.poses.estimate import PosesConfig, estimate_poses
@@ -87,7 +87,7 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
-from reobj.results.evaluation import evaluate, score_table
+from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, export
 from reobj.results.result import Object, Result, VideoInfo, World, validate_objects
 from reobj.results.scene import write_pictures
@@ -96,9 +96,9 @@ from reobj.sources.detection_files import (
     DetectConfig,
     read_detections,
     read_tracks,
-    write_detections_npz,
 )
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
+from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.sources.weights import list_models, model_path
 from reobj.types import (
@@ -656,9 +656,7 @@ class Tracker:
         self._next_tracklet += len(rows)
         box = cxcywh_from_xyxy(detections.xyxy[rows])
         track_of[rows] = len(self.state.mean) + np.arange(len(rows))
-        self.state = self.state.append(
-            TrackState.spawn(box, ids, self.frame_number, self.config)
-        )
+        self.state = self.state.append(TrackState.spawn(box, ids, self.frame_number, self.config))
         self._count_hits(detections, rows, track_of[rows])
         return track_of
 
@@ -1034,7 +1032,9 @@ def _track_video(
         return Result.load_tracked(path)
     started = time.monotonic()
     if cached:
-        source = source.cached(workspace.path("detections", *key).with_suffix(""), video.working_size)
+        source = source.cached(
+            workspace.path("detections", *key).with_suffix(""), video.working_size
+        )
     embed = config.embed
     embedder = make_embedder(embed.model, embed.head, config.threads, config.offline)
     tracker = Tracker(config.tracker, embedder)
@@ -1058,7 +1058,7 @@ def _track_video(
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
     tracks = Tracks.concatenate(frames, steps, video.scale)
-    result = Result(tracks, source.class_names, _video_info(video))
+    result = Result(tracks, source.class_names, VideoInfo.of(video))
     result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
     result.warnings += [*source.messages, *video.messages]
     if video.is_live:
@@ -1082,12 +1082,8 @@ def _given_tracks(
     known = (None, ()) if before is None else (before.tracks, before.class_names)
     tracks, class_names, messages = read_tracks(path, video, config, *known)
     return Result(
-        tracks, class_names, _video_info(video), identities_given=True, warnings=messages
+        tracks, class_names, VideoInfo.of(video), identities_given=True, warnings=messages
     )
-
-
-def _video_info(video: Video) -> VideoInfo:
-    return VideoInfo(str(video.source), *video.size, video.fps)
 
 
 def _finish(result: Result, video: Video, workspace: Workspace, config: Config) -> Result:
@@ -1259,17 +1255,7 @@ def _cmd_eval(args: argparse.Namespace) -> int:
         poses = next((p for p in beside if p.exists()), None)
     classes = [c.strip() for c in args.classes.split(",") if c.strip()]
     scores = evaluate(args.out, args.gt, args.gt_objects, poses, classes, args.min_visibility)
-    print(score_table(scores["tracks"]))
-    if ranks := scores["ranks"]:
-        names = {k: k.replace("rank", "Rank-") for k in ranks if k != "queries"}
-        shares = ", ".join(f"{name} {ranks[k]:.3f}" for k, name in names.items())
-        queries = f"{ranks['queries']:.0f} queries"
-        print(f"returns by appearance alone, {queries}: {shares or 'no returns'}")
-    else:
-        print("Rank-k: no embeddings here (an output folder of `run` or `track` keeps them)")
-    if "objects" in scores:
-        facts = {k: v for k, v in scores["objects"].items() if k != "objects"}
-        print("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in facts.items() if v is not None))
+    print(score_report(scores))
     if args.out.is_dir():
         with atomic(args.out / "eval.json") as part:
             part.write_text(json.dumps(scores, indent=1))

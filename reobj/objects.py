@@ -184,7 +184,7 @@ def describe_world(
     scale, up = None, poses.up_in_world
     up_source = "none" if up is None else "poses"
     if fits is not None:
-        value, sigma = rounded(fits.scale.value, 6), rounded(fits.scale.rel_sigma, 4)
+        value, sigma = round(fits.scale.value, 6), round(fits.scale.rel_sigma, 4)
         scale = quadrics.Scale(value, sigma, fits.scale.source)
         up, up_source = fits.up if fits.up.any() else up, fits.up_source
     return World(

@@ -1,4 +1,4 @@
-"""Options: declared as fields of config dataclasses, set by flags or `--set section.field=value`."""
+"""Options: fields of config dataclasses, set by flags or `--set section.field=value`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ C = TypeVar("C")
 
 def every_option(config: Any) -> dict[str, dataclasses.Field[Any]]:
     """List the options of a config by their name for --set: `section.field`, or `field`."""
-    options = {}
+    options: dict[str, dataclasses.Field[Any]] = {}
     for f in dataclasses.fields(config):
         own = getattr(config, f.name)
         if dataclasses.is_dataclass(own):
@@ -61,8 +61,9 @@ def with_option(config: C, name: str, value: Any) -> C:
         raise ReobjError(f"--set {name}: expected ={expected}, found {value!r}") from None
     section, _, field_name = name.rpartition(".")
     if section:
-        field_name, value = section, dataclasses.replace(
-            getattr(config, section), **{field_name: value}
+        field_name, value = (
+            section,
+            dataclasses.replace(getattr(config, section), **{field_name: value}),
         )
     changed: Any = dataclasses.replace(config, **{field_name: value})  # type: ignore[type-var]
     return changed  # type: ignore[no-any-return]
@@ -82,10 +83,8 @@ def config_from_args(config: C, args: argparse.Namespace) -> C:
 
 def list_options(config: Any) -> str:
     """Return a line for every option: name, default and meaning."""
-    options = every_option(config)
-    width = max(len(f"{name}={f.default}") for name, f in options.items() if len(str(f.default)) < 9)
     lines = []
-    for name, f in options.items():
-        default = f.default if len(str(f.default)) < 9 else f"{str(f.default)[:8]}..."
-        lines.append(f"{f'{name}={default}':<{width + 4}} {f.metadata['help']}")
+    for name, f in every_option(config).items():
+        default = str(f.default) if len(str(f.default)) < 12 else f"{str(f.default)[:9]}..."
+        lines.append(f"{f'{name}={default}':<32} {f.metadata['help']}")
     return "\n".join(lines)

@@ -418,6 +418,22 @@ def score_table(scores: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
+def score_report(scores: dict[str, Any]) -> str:
+    """Format what `evaluate` returns for the terminal."""
+    lines = [score_table(scores["tracks"])]
+    ranks = scores["ranks"]
+    shares = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
+    if ranks:
+        lines.append(f"returns by appearance alone, {ranks['queries']:.0f} queries: "
+                     + (", ".join(shares) or "no returns"))  # fmt: skip
+    else:
+        lines.append("Rank-k: no embeddings here (an output folder of `run` or `track` keeps them)")
+    if "objects" in scores:
+        facts = {k: v for k, v in scores["objects"].items() if k != "objects" and v is not None}
+        lines.append("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in facts.items()))
+    return "\n".join(lines)
+
+
 def evaluate(
     out: Path,
     gt: Path,

@@ -24,6 +24,7 @@ from reobj import __version__
 from reobj.cameras import Poses, load_poses, write_tum
 from reobj.files import atomic, load_json, load_npz, save_npz, without_password
 from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.video import Video
 from reobj.types import (
     Array,
     Embeddings,
@@ -164,6 +165,11 @@ class VideoInfo:
     width: int
     height: int
     fps: float
+
+    @staticmethod
+    def of(video: Video) -> VideoInfo:
+        """Describe an opened video."""
+        return VideoInfo(str(video.source), *video.size, video.fps)
 
 
 @dataclass(slots=True, eq=False)

@@ -16,15 +16,14 @@ import re
 import sys
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import numpy.typing as npt
 
-from reobj.files import load_json, load_npz, read_text, save_npz, shortened
+from reobj.files import load_json, read_text, shortened
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, read_npz
 from reobj.sources.video import Video
@@ -414,7 +413,7 @@ def read_tracks(
     limit = dataclasses.replace(config, min_score=0.0, max_detections=sys.maxsize)
     if path.suffix.lower() in (".xml", ".zip"):
         found = _read_cvat(path, video)
-        check_detections(found, path, limit, video.frame_count)
+        _check(found, path, limit, video.frame_count)
     else:
         found = read_detections(path, video, limit)
     if len(found) and (not len(found.identity) or found.identity.min() < 0):
