@@ -41,6 +41,8 @@ class Gallery:
         count: (I,) views held. foreground_width: width of the foreground in the rows.
     """
 
+    ARRAYS = ("rows", "viewing_ray", "count", "foreground_width")  # the whole state
+
     def __init__(self, views: int = GALLERY_VIEWS, novelty: float = GALLERY_NOVELTY) -> None:
         self.views, self.novelty = views, novelty
         self.rows = np.zeros((0, views, 0), np.float32)
