@@ -68,6 +68,7 @@ from reobj.identity.embedding import (
     LazyEmbeddings,
     as_embeddings,
 )
+from reobj.identity.gaps import fill_gaps
 from reobj.identity.linking import link
 from reobj.identity.reid import (
     EllipsoidMap,
@@ -159,9 +160,6 @@ class TrackerConfig:
     std_velocity: float = option(
         1 / 80, "process noise of a velocity, over the box size; more for jerky cameras"
     )
-    class_cost: float = option(
-        0.2, "cost added when track and detection differ in class; more trusts the detector more"
-    )
     appearance_weight: float = option(0.7, "share of appearance in the cost of ambiguous matches")
     foreground_weight: float = option(
         0.5, "share of the foreground in the appearance; less trusts the surroundings more"
@@ -179,6 +177,9 @@ class OutputConfig:
 
     overlay: bool = option(True, "write overlay.mp4")
     scene: bool = option(True, "write scene.html")
+    fill_gaps: int = option(
+        5, "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never)"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,6 +332,7 @@ DISTANCE_WEIGHT = 0.2  # share of the gated distance in the cost; the rest is 1 
 AGE_COST = 0.2  # at most, of tracks not seen for AGE_FRAMES; linear before
 AGE_FRAMES = 10
 UNCONFIRMED_COST = 0.2  # of tentative tracks
+CLASS_COST = 0.2  # where track and detection differ in class; taken off the overlap as evidence
 AMBIGUITY_MARGIN = 0.3  # a match is ambiguous where a rival costs less than this more
 WEAK_MATCH_COST = 0.5  # from this cost on a match is weak: perhaps an object without a track
 IOU_ODDS = 20.0  # log odds of one object that full overlap is worth ...
@@ -520,7 +522,7 @@ class Tracker:
         config = self.config
         same_class = _same_class(self.state.votes, detections.class_id)  # (T, D), as all below
         cost, feasible, iou = self._motion_cost(detections.xyxy, same_class, lazy.available)
-        evidence = IOU_ODDS * (iou - config.class_cost * ~same_class) - NO_OVERLAP_ODDS
+        evidence = IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS
         priority = self._priority_cost()[:, None]
         first = feasible & (detections.score >= config.high_score)
         weak = (cost + priority > WEAK_MATCH_COST) & (self.state.embedded >= 0)[:, None]
@@ -555,7 +557,7 @@ class Tracker:
             feasible &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(-1)
             feasible &= iou >= MOTION_ONLY_IOU
         cost = (1 - DISTANCE_WEIGHT) * (1 - iou) + DISTANCE_WEIGHT * distance.clip(0, 1)
-        cost = cost + self.config.class_cost * ~same_class
+        cost = cost + CLASS_COST * ~same_class
         return cost, feasible & (same_class | (iou > LOW_IOU)), iou
 
     def _priority_cost(self) -> Array:
@@ -1107,8 +1109,9 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
         group = np.searchsorted(list(classes), tracks.track_id)
         views = gather_views(tracks, poses, group, len(classes), own.min_score)
         result.fits = fit(views, list(classes.values()))
-    result.tracks, result.out = tracks, workspace.out
     result.objects = describe_objects(tracks, class_names, result.fits, views, own)
+    gap = 0 if result.identities_given else config.output.fill_gaps
+    result.tracks, result.out = fill_gaps(tracks, video.size, gap), workspace.out
     result.world = describe_world(poses, result.fits, events)
     result.seconds["objects"] = time.monotonic() - started
     result.warnings += poses.messages if poses is not None else ()
