@@ -446,8 +446,6 @@ class Tracker:
             return np.empty(0, np.int64), np.empty((0, 0), np.float32)
         return np.flatnonzero(lazy.done), lazy.rows[lazy.done]
 
-    # -- predict
-
     def _predict(
         self, frame: Image | None, cam_from_world: Array | None, camera: Camera | None
     ) -> None:
@@ -507,8 +505,6 @@ class Tracker:
         self.places.add(self.frame_number, confirmed.track_id - 1, confirmed.xyxy, view)
         if self.frame_number % PLACE_REFIT == 0 and self.places.refit(self._image_size):
             self._place_boxes = self.places.project(view, self._image_size, PLACE_IN_VIEW)
-
-    # -- associate
 
     def _associate(self, detections: Detections, lazy: LazyEmbeddings) -> IntArray:
         """Match detections to tracks: high scores by motion, then the rest by overlap.
@@ -628,8 +624,6 @@ class Tracker:
         cost[:, rows] = (1 - weight) * cost[:, rows] + weight * unlike
         return cost, known & (logit + evidence[:, rows] < 0)
 
-    # -- update, spawn, embed
-
     def _update_states(self, detections: Detections, track_of: IntArray) -> None:
         """Correct the matched tracks; boxes of low score are less certain."""
         rows = np.flatnonzero(track_of >= 0)
@@ -716,8 +710,6 @@ class Tracker:
         if self._view is None:
             return np.full((len(t), 3), np.nan)
         return viewing_rays(xyxy_from_cxcywh(self.state.mean[t, :, 0]), self._view)
-
-    # -- confirm, recognise
 
     def _confirm(self, track_of: IntArray) -> IntArray:
         """Give tracks that were seen often enough an identity: a known one, or a new one.
@@ -828,8 +820,6 @@ class Tracker:
         patience = np.where(state.identity < 0, tentative, config.coast_frames)
         if (state.missed > patience).any():
             self.state = state.select(state.missed <= patience)
-
-    # -- save, load
 
     def save(self, path: str | Path) -> None:
         """Write the whole state, without the embedder, as an .npz file.
@@ -1153,10 +1143,29 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(sub, "run", "video -> identities -> cameras -> ellipsoids -> files to look at")
     _add_run(sub, "track", "identities only (2D)")
     _add_run(sub, "poses", "cameras only (pycolmap)")
-    _add_objects(sub)
-    _add_eval(sub)
-    _add_export(sub)
-    _add_models(sub)
+    text = "(re)fit the ellipsoids from what an output folder already holds"
+    add = _command(sub, "objects", text, _cmd_objects, "objects", "output").add_argument
+    add("out", help="output folder of an earlier `run`")
+    text = "only check objects.json against its schema (needs jsonschema)"
+    add("--validate", action="store_true", help=text)
+    add("--tracks", help=TRACKS_HELP)
+    text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
+    add = _command(sub, "eval", text, _cmd_eval).add_argument
+    add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
+    add("--gt", type=Path, required=True, help="true tracks, MOTChallenge gt.txt")
+    add("--gt-objects", type=Path, help="true solids, e.g. a gt_objects.json")
+    add("--gt-poses", type=Path, help="true cameras, TUM or 4x4 world_from_cam a line (default: "
+        "poses.txt or poses_c2w.txt beside --gt-objects)")  # fmt: skip
+    add("--classes", default="", help="score these classes only, comma-separated")
+    add("--min-visibility", type=float, default=0.0, help="ignore truth that is less visible")
+    text = "write what an output folder holds in another tool's format"
+    add = _command(sub, "export", text, _cmd_export).add_argument
+    add("out", help="output folder of an earlier `run`")
+    add("--to", required=True, choices=EXPORTS, help="the format")
+    add("-o", "--output", help="file to write (default: in the output folder)")
+    text = "list, download and verify weights"
+    add = _command(sub, "models", text, _cmd_models, "").add_argument
+    add("names", nargs="*", metavar="NAME", help="weights to download or verify; none: list all")
     return parser
 
 
@@ -1220,15 +1229,6 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_objects(sub: Any) -> None:
-    text = "(re)fit the ellipsoids from what an output folder already holds"
-    parser = _command(sub, "objects", text, _cmd_objects, "objects")
-    parser.add_argument("out", help="output folder of an earlier `run`")
-    text = "only check objects.json against its schema (needs jsonschema)"
-    parser.add_argument("--validate", action="store_true", help=text)
-    parser.add_argument("--tracks", help=TRACKS_HELP)
-
-
 def _cmd_objects(args: argparse.Namespace) -> int:
     if args.validate:
         out = Path(args.out)
@@ -1237,18 +1237,6 @@ def _cmd_objects(args: argparse.Namespace) -> int:
         return 2 if faults else 0
     print(refit(args.out, config_from_args(Config(), args), args.tracks).summary())
     return 0
-
-
-def _add_eval(sub: Any) -> None:
-    text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
-    add = _command(sub, "eval", text, _cmd_eval).add_argument
-    add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
-    add("--gt", type=Path, required=True, help="true tracks, MOTChallenge gt.txt")
-    add("--gt-objects", type=Path, help="true solids, e.g. a gt_objects.json")
-    add("--gt-poses", type=Path, help="true cameras, TUM or 4x4 world_from_cam a line (default: "
-        "poses.txt or poses_c2w.txt beside --gt-objects)")  # fmt: skip
-    add("--classes", default="", help="score these classes only, comma-separated")
-    add("--min-visibility", type=float, default=0.0, help="ignore truth that is less visible")
 
 
 def _cmd_eval(args: argparse.Namespace) -> int:
@@ -1265,23 +1253,9 @@ def _cmd_eval(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_export(sub: Any) -> None:
-    text = "write what an output folder holds in another tool's format"
-    parser = _command(sub, "export", text, _cmd_export)
-    parser.add_argument("out", help="output folder of an earlier `run`")
-    parser.add_argument("--to", required=True, choices=EXPORTS, help="the format")
-    parser.add_argument("-o", "--output", help="file to write (default: in the output folder)")
-
-
 def _cmd_export(args: argparse.Namespace) -> int:
     print(export(args.out, args.to, args.output))
     return 0
-
-
-def _add_models(sub: Any) -> None:
-    parser = _command(sub, "models", "list, download and verify weights", _cmd_models, "")
-    names = "weights to download or verify; none: list all"
-    parser.add_argument("names", nargs="*", metavar="NAME", help=names)
 
 
 def _cmd_models(args: argparse.Namespace) -> int:
