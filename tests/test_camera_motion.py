@@ -111,6 +111,18 @@ def test_frames_without_texture_and_of_another_size() -> None:
         np.testing.assert_array_equal(motion(image), np.eye(3))
 
 
+def test_corners_are_of_the_latest_image() -> None:
+    """Where the texture of the left half goes and that of the right half comes."""
+    image, motion = textured(np.random.default_rng(2)), CameraMotion()
+    for side in (slice(0, 320), slice(320, 640)):
+        half = np.full_like(image, 128)
+        half[:, side] = image[:, side]
+        motion(half)
+        assert motion.corners is not None
+        x = 2 * motion.corners[:, 0, 0]  # followed in an image of half the size
+        assert len(x) > 20 and x.min() > side.start - 10 and x.max() < side.stop + 10
+
+
 def test_the_state_is_what_arrays_names() -> None:
     """A second object with the same arrays goes on exactly as the first one."""
     rng = np.random.default_rng(1)

@@ -227,6 +227,18 @@ def test_foreground_is_of_the_object_and_background_of_the_rest(net: str) -> Non
     assert look.background.shape == (1, 64)
 
 
+def test_without_a_head_cells_with_few_samples_weigh_less(net: str) -> None:
+    """By the root of the share: at the corners of the box little of a cell is in the ellipse."""
+    image = np.full((512, 512, 3), 250, np.uint8)
+    layout = rt.SamplingLayout(size_px=512, foreground_cells=4)
+    embedder, found = rt.Embedder(net, layout=layout, threads=1), boxes((128, 128, 384, 384))
+    fore, _ = embedder.cells(image, found, np.arange(1))
+    share = fore[0, :, 4]
+    assert share.max() == 1 and share[0] < 0.5
+    look = embedder(image, found).foreground.reshape(16, 4)
+    np.testing.assert_allclose(look[:, 0] / look[5, 0], np.sqrt(share), atol=1e-5)
+
+
 def test_without_a_head_each_box_of_the_background_counts_the_same(net: str) -> None:
     layout = rt.SamplingLayout(surround_scale=1.5, surround_cells=5)
     image, found = scene_with_twins()
@@ -280,14 +292,34 @@ def test_some_rows_are_embedded_as_all_rows(trained: bool, net: str, monkeypatch
     assert len(computed) == 2  # one of each embedder
     np.testing.assert_allclose(whole.foreground[::-1], turned.foreground, atol=1e-5)
     np.testing.assert_allclose(whole.background[::-1], turned.background, atol=1e-5)
-    later(image.copy(), detections)
     later(image, detections[:])
-    assert len(computed) == 4  # another frame, other detections
+    assert len(computed) == 3  # other detections
+    later(image, detections)
+    later(image.copy(), detections)
+    assert len(computed) == 5  # another frame
     assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
 
 
-def test_weak_detections_hide_no_background_and_are_no_neighbours() -> None:
+def test_no_foreground_is_computed_twice(monkeypatch) -> None:
+    """The first request computes those of the neighbours too."""
+    computed, plain = [], rt.Embedder.cells
+
+    def counted(self, frame, detections, fore_rows, back_rows):
+        computed.append((fore_rows.tolist(), back_rows.tolist()))
+        return plain(self, frame, detections, fore_rows, back_rows)
+
+    monkeypatch.setattr(rt.Embedder, "cells", counted)
     image, two = scene_with_twins()
+    three = rt.Detections(two.xyxy[[0, 1, 1]], np.array([0.9, 0.9, 0.2]), np.zeros(3, np.int64))
+    embedder = rt.Embedder("reobj", threads=1)
+    for row in (1, 0, 2):
+        embedder(image, three, np.array([row]))
+    assert computed == [([0, 1], [1]), ([], [0]), ([2], [2])]
+
+
+def test_weak_detections_hide_no_background_and_are_no_neighbours() -> None:
+    image, _ = scene_with_twins()
+    two = boxes((90, 90, 150, 150), (155, 90, 215, 150))
     weak = rt.Detections(two.xyxy, np.array([0.9, 0.29]), two.class_id)
     alone, with_weak, both = (
         rt.Embedder("reobj", threads=1)(image, found, np.array([0])).background
@@ -295,6 +327,7 @@ def test_weak_detections_hide_no_background_and_are_no_neighbours() -> None:
     )
     np.testing.assert_allclose(with_weak, alone, atol=1e-6)
     assert not alone[:, 128:].any() and both[:, 128:].any()
+    assert np.abs(both[:, :128] / 0.8**0.5 - alone[:, :128]).max() > 0.01  # hidden background
 
 
 # ---- Neighbours ----
@@ -312,6 +345,12 @@ def test_neighbour_embedding_is_of_the_near_and_confident_others() -> None:
     assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # the unsure one has some
     larger = neighbour_embedding(3 * xyxy + 7, look, confident, np.arange(4))
     np.testing.assert_allclose(around, larger)
+    unlike = np.array(
+        [(0, 0, 40, 10), (30, 0, 110, 80), (60, 0, 70, 10)], float
+    )  # sizes 20, 80, 10
+    found = neighbour_embedding(unlike, np.eye(3), np.ones(3, bool), np.arange(1))[0]
+    weights = np.exp(-np.array([np.hypot(50, 35), 45]) / 20)  # over the size of its own
+    np.testing.assert_allclose(found[1:], weights / np.linalg.norm(weights))
     assert not neighbour_embedding(xyxy[:1], look[:1], confident[:1], np.arange(1)).any()
     some = neighbour_embedding(xyxy, look, confident, np.array([2, 3]))
     np.testing.assert_allclose(around[2:], some)
@@ -411,9 +450,10 @@ def test_fused_rows_weigh_the_cosines_of_the_parts() -> None:
     assert rows.dtype == np.float32
 
 
-def test_fused_rows_without_a_background_are_the_foreground() -> None:
+@pytest.mark.parametrize("weight", [0.5, 0.0])
+def test_fused_rows_without_a_background_are_the_foreground(weight: float) -> None:
     given = as_embeddings([[3.0, 4.0]], 1)
-    lazy = LazyEmbeddings(given, None, None, boxes((0, 0, 9, 9)), 0.5)
+    lazy = LazyEmbeddings(given, None, None, boxes((0, 0, 9, 9)), weight)
     np.testing.assert_allclose(lazy.get(np.arange(1)), [[0.6, 0.8]], atol=1e-6)
 
 

@@ -107,6 +107,12 @@ def test_gallery_parts_are_of_the_most_similar_view() -> None:
     assert (fore, back) == (pytest.approx(0.8), pytest.approx(1))
 
 
+def test_unused_views_are_compared_with_nothing() -> None:
+    """Also where all used ones are less than 0 alike."""
+    fore, _, _ = filled((0, 30)).parts(at_degrees(150), one(), UNKNOWN)
+    np.testing.assert_allclose(fore, [[-0.5]], atol=1e-6)
+
+
 def test_gallery_parts_of_what_is_not_known() -> None:
     gallery = filled((0, 90))
     gallery.add(one(2), at_degrees(45), UNKNOWN)
