@@ -251,7 +251,8 @@ def test_evidence_tells_cartons_from_bottles(demo) -> None:
     fits = q.fit_objects(boxes, cams, (640, 480), up=UP, support="evidence")
     assert fits.support.tolist()[:4] == ["box"] * 4
     assert set(fits.support.tolist()[4:]) <= {"ellipsoid", "cylinder"}
-    depth = np.linalg.norm(fits.ellipsoids.center_in_world - q._cameras(cams).center[0], axis=1)
+    eye = -np.linalg.solve(cams[0, :, :3], cams[0, :, 3])
+    depth = np.linalg.norm(fits.ellipsoids.center_in_world - eye, axis=1)
     assert (fits.rms_px * depth / 528.0 <= 0.002).all()  # metres
 
 
@@ -265,7 +266,7 @@ def test_clean_boxes_give_the_truth(support: str) -> None:
     assert (
         np.linalg.norm(fits.ellipsoids.center_in_world - truth.center_in_world, axis=1).max() < 0.01
     )
-    overlap = q.box_overlap if support == "box" else q.volume_overlap
+    overlap = syn.box_overlap if support == "box" else q.volume_overlap
     assert np.median(overlap(fits.ellipsoids, truth)) > 0.98
     assert (fits.support == support).all() and fits.inlier.sum() == 40 * 8
 
@@ -290,8 +291,8 @@ def test_cuboids_need_the_box_support() -> None:
     args = (60, 10, 120, 0.02, "box")
     box, truth, *_ = fitted(*args)
     ellipsoid = fitted(*args, support="ellipsoid")[0]
-    assert q.box_overlap(box.ellipsoids, truth).mean() >= 0.90
-    assert q.box_overlap(ellipsoid.ellipsoids, truth).mean() < 0.55
+    assert syn.box_overlap(box.ellipsoids, truth).mean() >= 0.90
+    assert syn.box_overlap(ellipsoid.ellipsoids, truth).mean() < 0.55
 
 
 @pytest.mark.parametrize("kind", ["far", "near"])
@@ -318,27 +319,8 @@ def test_cut_edges_are_one_sided() -> None:
     one_sided = q.fit_objects(cut, flat, size, names, priors, up=UP)
     naive = q.fit_objects(cut, flat, (10**6, 10**6), names, priors, up=UP)
     live = np.isfinite(one_sided.size).all(1) & (np.isfinite(cut[..., 0]).sum(0) >= 5)
-    gain = [np.nanmean(q.box_overlap(f.ellipsoids[live], truth[live])) for f in (one_sided, naive)]
+    gain = [np.nanmean(syn.box_overlap(f.ellipsoids[live], truth[live])) for f in (one_sided, naive)]
     assert gain[0] > gain[1] + 0.1
-
-
-def test_mask_hull_lines_help() -> None:
-    rng = np.random.default_rng(13)
-    boxes, cams, truth, priors, names = syn.scenes(60, 3, 30, 0.02, "ellipsoid", rng)
-    joint, flat = syn.as_one(boxes, cams)
-    lines = syn.outline_lines(truth, flat, joint, 12, 0.02, rng)
-    plain = q.fit_objects(joint, flat, syn.IMAGE, names, priors, up=UP)
-    hull = q.fit_objects(joint, flat, syn.IMAGE, names, priors, up=UP, lines=lines)
-    gain = q.volume_overlap(hull.ellipsoids, truth) - q.volume_overlap(plain.ellipsoids, truth)
-    assert gain.mean() > 0.02
-
-
-def test_hull_lines_of_a_rectangle_are_its_box() -> None:
-    mask = np.zeros((40, 50), bool)
-    mask[10:31, 5:20] = True
-    box = q.box_lines(np.array([5.0, 10.0, 20.0, 31.0]))  # left, top, right, bottom
-    assert np.allclose(q.hull_lines(mask, 4)[[2, 3, 0, 1]], box)
-    assert np.isnan(q.hull_lines(np.zeros((4, 4), bool))).all()
 
 
 @pytest.mark.parametrize("shape", q.SUPPORTS)
@@ -468,7 +450,7 @@ def test_lying_book_keeps_a_vertical_third_axis() -> None:
     boxes = syn.noisy(q.solid_boxes(truth, "box", cams), 0.01, rng)
     fits = q.fit_objects(boxes, cams, syn.IMAGE, ["book"], q.load_priors(), up=UP)
     assert fits.ellipsoids.world_from_obj[0, :, 2] @ np.array(UP) > 0.98
-    assert q.box_overlap(fits.ellipsoids, truth)[0] > 0.8
+    assert syn.box_overlap(fits.ellipsoids, truth)[0] > 0.8
 
 
 # ---- fit_objects: ugly input ---------------------------------------------------------------
@@ -508,8 +490,13 @@ def test_empty_input(shape: tuple[int, int], reason: str | None) -> None:
 def test_wrong_shapes_say_what_is_expected(arguments, message: str) -> None:
     with pytest.raises(q.QuadricsError, match=message):
         q.fit_objects(*(arguments if len(arguments) > 2 else (*arguments, (640, 480))))
-    with pytest.raises(q.QuadricsError, match="unknown support"):
-        q.support_codes("cone", 1)
+    seen = (np.full((3, 2, 4), np.nan), np.zeros((3, 3, 4)), (640, 480))
+    for support, complaint in (("cone", "unknown support"), (["box"], "1 supports for 2 objects")):
+        with pytest.raises(q.QuadricsError, match=complaint):
+            q.fit_objects(*seen, support=support)
+    for fit in (q.fit_sfmo, lambda x: q.fit_psfmo(x, q.load_priors(), [])):
+        with pytest.raises(q.QuadricsError, match="give boxes_xyxy"):
+            fit(None)
 
 
 @pytest.mark.filterwarnings("error")
@@ -529,7 +516,7 @@ def test_thousands_of_frames_use_few_views() -> None:
     fits = q.fit_objects(boxes, cams, syn.IMAGE, up=UP, support="box")
     assert time.perf_counter() - start < 5.0
     assert fits.inlier.sum() > 0.9 * np.isfinite(boxes[..., 0]).sum()
-    assert q.box_overlap(fits.ellipsoids, truth).min() > 0.8
+    assert syn.box_overlap(fits.ellipsoids, truth).min() > 0.8
 
 
 def test_fast_enough() -> None:
@@ -568,7 +555,7 @@ def test_overlap_matches_monte_carlo_and_symmetry(kind: str) -> None:
     rng = np.random.default_rng(21)
     a, b = random_solids(8, rng), random_solids(8, rng)
     b = q.Ellipsoids(a.center_in_world + rng.normal(0, 0.05, (8, 3)), b.half_axes, b.world_from_obj)
-    measure = q.volume_overlap if kind == "ellipsoid" else q.box_overlap
+    measure = q.volume_overlap if kind == "ellipsoid" else syn.box_overlap
     unit = rng.uniform(-1, 1, (400000, 3))
     for k in range(8):
         point = a.center_in_world[k] + (unit * a.half_axes[k]) @ a.world_from_obj[k].T
@@ -697,11 +684,11 @@ def test_build_priors_from_meshes_and_table(tmp_path: Path) -> None:
 
 def test_example_scripts_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "quadrics.md"
-    page.write_text("head\n<!-- table masks -->\nold\n<!-- end masks -->\ntail\n")
-    assert syn.main(["--quick", "--only", "masks", "-o", str(tmp_path)]) == 0
+    page.write_text("head\n<!-- table cuboids -->\nold\n<!-- end cuboids -->\ntail\n")
+    assert syn.main(["--quick", "--only", "cuboids", "-o", str(tmp_path)]) == 0
     text = page.read_text()
-    assert "hull tangents" in text and "old" not in text and text.endswith("tail\n")
-    assert "masks" in capsys.readouterr().out
+    assert "% boxes)" in text and "old" not in text and text.endswith("tail\n")
+    assert "cuboids" in capsys.readouterr().out
     import tuw_demo
 
     assert tuw_demo.main([str(tmp_path)]) == 2
