@@ -58,13 +58,13 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 ELLIPSOID, BOX, CYLINDER = 0, 1, 2
-AXIS_ORDERS: IntArray = np.array([p for p in np.ndindex(3, 3, 3) if len(set(p)) == 3])  # (6, 3)
 BY_CATEGORY, BY_EVIDENCE = -1, -2  # support not named by the caller
 SUPPORTS = ("ellipsoid", "box", "cylinder")  # index = code
 # axes that share one root in the support function: h = sum over groups of sqrt(sum a_k^2 m_k^2)
 AXIS_GROUPS: Array = np.array(
     [np.ones((3, 3)), np.eye(3), [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
 )  # (3 supports, 3, 3)
+AXIS_ORDERS: IntArray = np.array([p for p in np.ndindex(3, 3, 3) if len(set(p)) == 3])  # (6, 3)
 
 
 class QuadricsError(ValueError):
@@ -86,10 +86,10 @@ class FitConfig:
         correlation_deg: Views of an object nearer to each other than this (deg) repeat their errors
             and count as fewer; 0: every view counts fully, and certainty grows with their number.
         max_views: An object seen in more frames is fitted from this many, spread over the path.
-        start_views: From this many views the likely orientations and shapes of an object are told
-            from the unlikely ones. Fewer are faster and miss the right one more often.
-        start_iterations: Steps that each of them gets there.
-        iterations: Most steps of a fit to all views; it ends earlier when it has converged.
+        start_views: On this many views the candidate orientations and shapes of an object compete;
+            fewer are faster and more often let the wrong one win.
+        start_iterations: Optimisation steps of each candidate on those views.
+        iterations: Most optimisation steps on all views; a fit that has converged stops earlier.
     """
 
     edge_noise_px: float = 1.0

@@ -29,7 +29,7 @@ IMAGE = (1280, 960)  # px
 FOCAL = 1000.0  # px
 UP = (0.0, 0.0, 1.0)
 TILT_DEG = 1.5  # deg, how upright things stand according to fit_objects
-CUBOIDS = ((0.59, 0.60, 0.82), (0.60, 0.19, 0.45), (0.22, 0.28, 0.04))  # m, literature 2.4
+CUBOIDS = ((0.59, 0.60, 0.82), (0.60, 0.19, 0.45), (0.22, 0.28, 0.04))  # m
 
 
 def look_at(center: Array, target: Array, roll: Array) -> Array:
@@ -157,12 +157,12 @@ def box_overlap(a: Ellipsoids, b: Ellipsoids, nodes: int = 40) -> Array:
     return np.where(safe & np.isfinite(center).all(1), iou, np.nan)
 
 
-def plain_lfd(boxes: Array, cams: Array) -> Array:
+def plain_lfd(boxes: Array, cams: Array, passes: int = 2) -> Array:
     """LfD as published, one object at a time: the stand-in for the official code.
 
     boxes (V, 4), cams (V, 3, 4) -> dual quadric (4, 4). For each view beta C* = P Q* P' with P and
-    C* in the frame where the ellipse is centred and of unit size; null vector by SVD; repeated once
-    with the origin at the first centre. Ref: Rubino et al., PAMI 2018.
+    C* in the frame where the ellipse is centred and of unit size; null vector by SVD; each further
+    pass has its origin at the centre found before. Ref: Rubino et al., PAMI 2018.
     """
     i, j = np.triu_indices(4)
     r, s = np.triu_indices(3)
@@ -171,7 +171,7 @@ def plain_lfd(boxes: Array, cams: Array) -> Array:
         expand[4 * a + b, k] = expand[4 * b + a, k] = 1.0
     origin = np.zeros(3)
     dual_q = np.zeros((4, 4))
-    for _ in range(2):
+    for _ in range(passes):
         shift = np.eye(4)
         shift[:3, 3] = origin
         rows = np.zeros((6 * len(boxes), 10 + len(boxes)))
