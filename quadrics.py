@@ -500,7 +500,7 @@ class _Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Edges(_Rows):
-    """Back-projected tangent planes of V views with E lines each, for a batch of objects."""
+    """Back-projected tangent planes of V views with E edges each, for a batch of objects."""
 
     normal: Array  # (O, V, E, 3) unit, outward
     offset: Array  # (O, V, E)
@@ -557,7 +557,7 @@ def _ray_point(center: Array, ray: Array, weight: Array) -> Array:
 def _congruence(matrix: Array) -> Array:
     """Write the map Q -> M Q M' as rows (..., R, C) between the upper triangles of both.
 
-    matrix: (..., k, n) M; R = k (k + 1) / 2, C = n (n + 1) / 2. Ref: [LfD] eq. 6, [SfMO] G_red.
+    matrix: (..., k, n) M; R = k (k + 1) / 2, C = n (n + 1) / 2. Ref: [LfD]; [SfMO] G_red.
     """
     (r, s), (i, j) = (np.triu_indices(n) for n in matrix.shape[-2:])
     r, s = r[:, None], s[:, None]
