@@ -84,7 +84,12 @@ from reobj.results.workspace import (
     write_objects_json,
     write_ply,
 )
-from reobj.sources.detection_files import DetectConfig, TrackResult, read_tracks
+from reobj.sources.detection_files import (
+    DetectConfig,
+    TrackResult,
+    read_detections,  # noqa: F401
+    read_tracks,
+)
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections  # noqa: F401
 from reobj.sources.recorded import write_detections_npz  # noqa: F401
 from reobj.sources.video import InputConfig, Video, source_fingerprint

@@ -516,7 +516,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
 @pytest.fixture
 def stream(request: pytest.FixtureRequest) -> Iterator[tuple[Stream, str]]:
     server = Stream(*request.param)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
     yield server, f"http://me:secret@127.0.0.1:{server.server_port}/camera.mjpg"
     server.shutdown()
     server.server_close()
@@ -545,7 +545,7 @@ def test_a_file_behind_a_url_is_read_like_a_file(tmp_path: Path) -> None:
     writer.release()
     handler = functools.partial(QuietFiles, directory=str(tmp_path))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         url = f"http://127.0.0.1:{server.server_port}/"
         video = rt.Video(url + "a.mp4", rt.InputConfig(every=3))
         assert not video.is_live and video.frame_count == 12

@@ -1,223 +1,27 @@
-"""Weights (download, resume, verify) and ONNX detectors (every layout, on graphs made here)."""
+"""Detectors: every ONNX layout on graphs made here, the cache, and sources of detections."""
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import http.server
+import json
 import os
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import reobj_track as rt
+from reobj.sources import detectors
+from reobj.sources.detectors import DetectionCache, DetectionSource, as_source, open_detections
+from reobj.sources.recorded import RecordedDetections
+from reobj.types import Image
 
-SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[1].parent / "shared"))
+SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 needs_shared = pytest.mark.skipif(
     not (SHARED / "models").is_dir(), reason="no weights: set REOBJ_SHARED"
 )
-
-# ---- Weights -------------------------------------------------------------------------------------
-
-BLOB = np.random.default_rng(0).integers(0, 256, 300_000, dtype=np.uint8).tobytes()
-
-
-class Handler(http.server.BaseHTTPRequestHandler):
-    """Serves BLOB; `server.mode` says how badly."""
-
-    server: Any
-
-    def do_GET(self) -> None:
-        mode, asked = self.server.mode, self.headers.get("Range")
-        self.server.asked.append(asked)
-        if mode == "404":
-            self.send_error(404)
-            return
-        body = BLOB[::-1] if mode == "wrong" else BLOB
-        start = int(asked[6:-1]) if asked and mode != "no range" else 0
-        self.send_response(206 if start else 200)
-        self.send_header("Content-Length", str(len(body) - start))
-        self.end_headers()
-        self.wfile.write(body[start : 100_000 if mode == "cut" else None])
-
-    def log_message(self, *args: Any) -> None:
-        pass
-
-
-@pytest.fixture()
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A server on 127.0.0.1 with the weights "toy", and an empty cache folder."""
-    made: Any = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    made.mode, made.asked = "good", []
-    threading.Thread(target=made.serve_forever, daemon=True).start()
-    url = f"http://127.0.0.1:{made.server_port}/toy.onnx"
-    toy = rt.Weights(
-        "toy", "detector", "toy.onnx", url, hashlib.sha256(BLOB).hexdigest(), len(BLOB), "MIT"
-    )
-    monkeypatch.setattr(
-        rt, "WEIGHTS", (toy, dataclasses.replace(toy, name="own", file="own.onnx", url=""))
-    )
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.delenv("REOBJ_MODELS", raising=False)
-    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
-        monkeypatch.delenv(name, raising=False)
-    made.target = tmp_path / "reobj_track" / "toy.onnx"
-    made.part = made.target.with_name("toy.onnx.part")
-    yield made
-    made.shutdown()
-    made.server_close()
-
-
-def test_download_verifies_and_is_done_once(server: Any, caplog: pytest.LogCaptureFixture) -> None:
-    assert rt.model_path("toy") == server.target
-    assert server.target.read_bytes() == BLOB and not server.part.exists()
-    for shown in (
-        "0.3 MB",
-        "licence MIT",
-        "http://127.0.0.1",
-        "sha256 " + hashlib.sha256(BLOB).hexdigest(),
-    ):
-        assert shown in caplog.text
-    assert rt.model_path("toy") == rt.model_path("toy.onnx", offline=True) == server.target
-    assert len(server.asked) == 1
-
-
-def test_wrong_hash_deletes_the_file(server: Any) -> None:
-    server.mode = "wrong"
-    found, expected = hashlib.sha256(BLOB[::-1]).hexdigest(), hashlib.sha256(BLOB).hexdigest()
-    with pytest.raises(
-        rt.ReobjError, match=f"sha256 is {found}, expected {expected}: file deleted"
-    ):
-        rt.model_path("toy")
-    assert not server.target.exists() and not server.part.exists()
-
-
-@pytest.mark.parametrize("after", ["good", "no range"])  # a server may not know how to resume
-def test_cut_download_resumes(server: Any, after: str) -> None:
-    server.mode = "cut"
-    with pytest.raises(
-        rt.ReobjError, match=r"connection cut after 100000 of 300000 bytes.: run again"
-    ):
-        rt.model_path("toy")
-    assert not server.target.exists() and server.part.stat().st_size == 100_000
-    server.mode = after
-    assert rt.model_path("toy").read_bytes() == BLOB
-    assert server.asked == [None, "bytes=100000-"]
-
-
-def test_complete_or_strange_part_files(server: Any) -> None:
-    server.part.parent.mkdir()
-    server.part.write_bytes(BLOB)  # killed between the last byte and the rename
-    assert rt.model_path("toy").read_bytes() == BLOB and server.asked == []
-    server.target.unlink()
-    server.part.write_bytes(BLOB + b"more")
-    assert rt.model_path("toy").read_bytes() == BLOB and server.asked == [None]
-
-
-def test_404_names_url_and_hash(server: Any) -> None:
-    server.mode = "404"
-    with pytest.raises(
-        rt.ReobjError, match=r"toy.onnx: download failed .HTTP Error 404.*sha256.*put it at"
-    ):
-        rt.model_path("toy")
-    assert list(server.target.parent.iterdir()) == []  # nothing left behind
-
-
-def test_no_network_says_what_to_do(server: Any) -> None:
-    server.shutdown()
-    server.server_close()
-    with pytest.raises(rt.ReobjError) as caught:
-        rt.model_path("toy")
-    url, target = rt.WEIGHTS[0].url, str(server.target)
-    for part in ("download failed", "refused", url, target, "REOBJ_MODELS"):
-        assert part in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_offline_forbids_the_download(server: Any) -> None:
-    with pytest.raises(rt.ReobjError, match=r"--offline forbids the download.*REOBJ_MODELS"):
-        rt.model_path("toy", offline=True)
-    assert server.asked == [] and not server.target.parent.exists()
-
-
-def test_own_folder_comes_first_and_may_be_read_only(
-    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    own = tmp_path / "own"
-    own.mkdir()
-    (own / "toy.onnx").write_bytes(BLOB)
-    (own / "mine.onnx").write_bytes(b"anything")
-    monkeypatch.setenv("REOBJ_MODELS", str(own))
-    assert rt.model_path("toy") == own / "toy.onnx"
-    assert rt.model_path("mine") == own / "mine.onnx"  # unknown to the table: not verified
-    assert server.asked == []
-    monkeypatch.setenv("REOBJ_MODELS", "/proc/none")  # nothing can be written there
-    assert rt.model_path("toy") == server.target
-
-
-def test_changed_file_is_refused_but_not_deleted(server: Any) -> None:
-    rt.model_path("toy")
-    server.target.write_bytes(b"changed")
-    with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
-        rt.model_path("toy")
-    assert rt.model_path(server.target) == server.target  # by its path: as it is
-    assert [row.state for row in rt.list_models()] == ["wrong sha256", "not offered"]
-
-
-def test_states_and_unknown_names(server: Any) -> None:
-    assert [(row.weights.name, row.state) for row in rt.list_models()] == [
-        ("toy", "missing"),
-        ("own", "not offered"),
-    ]
-    rt.model_path("toy")
-    assert rt.list_models()[0].state == "verified" and rt.list_models()[0].path == server.target
-    with pytest.raises(
-        rt.ReobjError, match=r"model own is not offered for download: put it at .*REOBJ_MODELS"
-    ):
-        rt.model_path("own")
-    with pytest.raises(
-        rt.ReobjError, match=r"model yolo99: no such file, nor one of the known names \(toy, own\)"
-    ):
-        rt.model_path("yolo99")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_full_disk_while_downloading(server: Any) -> None:
-    server.part.parent.mkdir()
-    server.part.symlink_to("/dev/full")
-    with pytest.raises(rt.ReobjError, match=r"No space left on device.*run again"):
-        rt.model_path("toy")
-    assert not server.target.exists()
-
-
-def test_table_of_weights() -> None:
-    names = [weights.name for weights in rt.WEIGHTS]
-    assert len(set(names)) == len(names) and rt.DetectConfig().model in names
-    for weights in rt.WEIGHTS:
-        assert (
-            len(weights.sha256) == 64
-            and weights.size > 0
-            and weights.role in ("detector", "backbone")
-        )
-        if weights.url:
-            assert "AGPL" not in weights.licence
-            assert len(weights.url.split("/raw/")[1].split("/")[0]) == 40  # pinned at a commit
-
-
-@needs_shared
-def test_table_agrees_with_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
-    for row in rt.list_models():
-        assert (
-            row.state == "verified" and row.path and row.path.stat().st_size == row.weights.size
-        ), row
-
 
 # ---- Layouts -------------------------------------------------------------------------------------
 
@@ -539,44 +343,57 @@ def test_nms_against_the_slow_way() -> None:
     assert rt.nms(np.empty((0, 4)), np.empty(0, np.int64), 0.5).tolist() == []
 
 
-# ---- Callables -----------------------------------------------------------------------------------
+# ---- Cache ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "found",
-    [
-        rt.Detections(np.array([BOX]), np.array([0.5]), np.array([3])),
-        [[*BOX, 0.5, 3]],
-        SimpleNamespace(
-            xyxy=np.array([BOX], np.float32),
-            confidence=np.array([0.5]),
-            class_id=np.array([3]),
-            mask=None,
-        ),
-    ],
-)
-def test_callables(found: Any) -> None:
-    made = rt.CallableDetector(lambda image: found, ["a", "b", "c", "d"])(IMAGE)
-    assert (
-        made.xyxy.tolist() == [BOX]
-        and made.score.tolist() == [0.5]
-        and made.class_id.tolist() == [3]
+def some(index: int, masks: bool = False) -> rt.Detections:
+    count = index % 4  # also none at all
+    rng = np.random.default_rng(index)
+    corner = rng.random((count, 2)) * 20
+    found = rng.random((count, 24, 32)) < 0.5 if masks else None
+    return rt.Detections(
+        np.hstack([corner, corner + 5]), rng.random(count), rng.integers(0, 9, count), found
     )
-    assert len(rt.as_detections([])) == 0
 
 
-def test_half_filled_objects() -> None:
-    mask = np.ones((1, 4, 4), bool)
-    made = rt.as_detections(
-        SimpleNamespace(xyxy=np.array([BOX]), confidence=None, class_id=None, mask=mask)
-    )
-    assert made.score.tolist() == [1] and made.class_id.tolist() == [0] and made.masks is not None
-    with pytest.raises(
-        rt.ReobjError, match=r"\[1, 2, 1, 1\] boxes, scores, classes, masks do not fit"
-    ):
-        rt.as_detections(SimpleNamespace(xyxy=np.array([BOX]), confidence=np.ones(2)))
-    with pytest.raises(rt.ReobjError, match="NaN"):
-        rt.as_detections([[np.nan, 1, 2, 3, 0.5, 1]])
+def assert_same(a: rt.Detections | None, b: rt.Detections) -> None:
+    assert a is not None
+    for key in ("xyxy", "score", "class_id"):
+        np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+    if b.masks is not None and len(b):
+        np.testing.assert_array_equal(a.masks, b.masks)
+
+
+@pytest.mark.parametrize("masks", [False, True])
+def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> None:
+    cache = rt.DetectionCache(tmp_path / "c", (32, 24))
+    for index in range(0, 300, 2):
+        cache.put(index, some(index, masks))
+        assert_same(cache.get(index), some(index, masks))
+    stored = 150 // rt.CACHE_FRAMES * rt.CACHE_FRAMES
+    (tmp_path / "c" / "chunk_000009.npz.tmp").write_bytes(b"half")  # a kill while writing
+    reopened = rt.DetectionCache(tmp_path / "c", (32, 24))
+    assert reopened.get(2 * stored - 2) is not None and reopened.get(2 * stored) is None
+    assert reopened.get(299) is None and reopened.get(298) is None
+    for index in range(0, 2 * stored, 2):
+        assert_same(reopened.get(index), some(index, masks))
+    reopened.put(298, some(298, masks))
+    reopened.flush()
+    assert_same(rt.DetectionCache(tmp_path / "c", (32, 24)).get(298), some(298, masks))
+
+
+def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> None:
+    cache = rt.DetectionCache(tmp_path, (32, 24))
+    cache.put(1, some(1))
+    cache.flush()
+    cache.put(2, some(2))
+    cache.flush()
+    first = tmp_path / "chunk_000000.npz"
+    first.write_bytes(first.read_bytes()[:-40])
+    reopened = rt.DetectionCache(tmp_path, (32, 24))
+    assert reopened.get(1) is None and reopened.get(2) is not None
+    assert "detected again" in caplog.text
+    assert rt.DetectionCache(tmp_path, (64, 48)).get(2) is None  # made at another working size
 
 
 # ---- Real weights --------------------------------------------------------------------------------
