@@ -163,4 +163,4 @@ def numbers(values: Array) -> list[float]:
 
 def base64_text(values: npt.NDArray[Any], kind: str) -> str:
     """Encode an array's bytes, C order, as the dtype `kind` ("<f4"), for pages with scripts."""
-    return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
+    return base64.b64encode(np.asarray(values, kind).tobytes()).decode()

@@ -63,10 +63,9 @@ def test_mot(tmp_path: Path, video: rt.Video) -> None:
     [
         ("1,-1,10,20,30,40,.9\n", ("object",)),  # 7 columns (MOT17)
         ("1,-1,10,20,30,40\n", ("object",)),  # no score
-        (
-            "\n1,7,10,20,30,40,1,2,.7\n",
-            ("class 1", "class 2"),
-        ),  # ground truth: class and visibility
+        # ground truth: class from 1, and visibility
+        ("\n1,7,10,20,30,40,1,2,.7\n", ("class 1", "class 2")),
+        ("1,7,10,20,30,40,1,1,.7\n", ("class 1",)),
         ("0,-1,10,20,30,40,.9\n", ("object",)),  # 0-based frames
     ],
 )
@@ -135,10 +134,14 @@ def test_options_apply_to_recorded_detections(tmp_path: Path, video: rt.Video) -
         assert read(tmp_path, "a.csv", CSV, video, min_score=min_score).frame.tolist() == kept
     assert read(tmp_path, "a.csv", CSV, video, classes="Cup, tv").frame.tolist() == [2]
     assert read(tmp_path, "a.txt", MOT, video, max_detections=1).at(0).score.tolist() == [0.95]
-    (tmp_path / "names.txt").write_text("sofa\nlamp\n")
-    named = read(tmp_path, "a.csv", CSV.replace("56", "0").replace("41", "1"), video,
-                 class_names=str(tmp_path / "names.txt"))  # fmt: skip
-    assert named.class_names == ("sofa", "lamp") and named.at(2).class_id.tolist() == [1]
+    table = CSV.replace("41", "60")
+    assert read(tmp_path, "a.csv", table, video, classes="dining_table").frame.tolist() == [2]
+    (tmp_path / "names.txt").write_text("Sofa\n\nlamp\n")
+    options = {"class_names": str(tmp_path / "names.txt")}
+    own = CSV.replace("56", "0").replace("41", "1")
+    named = read(tmp_path, "a.csv", own, video, **options)
+    assert named.class_names == ("Sofa", "lamp") and named.at(2).class_id.tolist() == [1]
+    assert read(tmp_path, "a.csv", own, video, classes="sofa", **options).frame.tolist() == [0]
 
 
 def coco_entries(**changes: Any) -> list[dict[str, Any]]:
@@ -330,6 +333,7 @@ def test_bad_npz(tmp_path: Path, video: rt.Video, change: dict[str, Any], expect
         ("d.txt", LINE + "1,-1,640,20,30,40,.9\n", "1 boxes wholly outside .* at line 2", 1),
         ("d.txt", LINE + "1,-1,-30,20,30,40,.9\n", "1 boxes wholly outside .* at line 2", 1),
         ("d.txt", LINE + "20,-1,10,20,30,40,.9\n", "", 2),  # the last frame
+        ("d.csv", CSV + "-1,10,20,30,40,.9,56\n", "1 boxes of frames .* -1; it has 20. dropped", 2),
         ("d.txt", LINE + "21,-1,10,20,30,40,.9\n50,-1,1,2,3,4,.9\n",
          "2 boxes of frames that the video has not .0-based: 20, 49; it has 20. dropped", 1),
         ("d.txt", LINE.replace(".9", "-1") * 2, "scores are all -1: taken as 1", 2),
@@ -349,6 +353,7 @@ def test_single_bad_rows_are_counted(
     hits = [message for message in found.messages if not expected or re.search(expected, message)]
     assert len(hits) == (1 if expected else 0), found.messages
     assert len(set(found.messages)) == len(found.messages)  # each said once
+    assert ((found.score >= 0) & (found.score <= 1)).all()
 
 
 @needs_shared

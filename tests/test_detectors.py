@@ -151,8 +151,8 @@ def ssd() -> dict[str, Any]:
 
 def rcnn() -> dict[str, Any]:
     """Boxes in the 640 x 320 input that the image is enlarged to; the left half is masked."""
-    mask = np.zeros((1, 1, 28, 28))
-    mask[..., :14] = 1
+    mask = np.full((1, 1, 28, 28), 0.4)
+    mask[..., :14] = 0.6
     return {
         "boxes": np.multiply([BOX], 2),
         "labels": np.array([LABEL + 1]),
@@ -232,6 +232,68 @@ def test_dynamic_input_takes_the_image_shape(
     assert detector.class_names == rt.COCO_NAMES
 
 
+def test_masks_are_exact_to_the_pixel(tmp_path: Path) -> None:
+    """A mask of 28 x 28 over a box of 80 x 60: its edges at 5 and 20 lie at 94.3 and 82.9."""
+    outputs = rcnn()
+    outputs["boxes"] = np.multiply([[80.0, 40, 160, 100]], 2)
+    outputs["masks"] = np.zeros((1, 1, 28, 28))
+    outputs["masks"][..., :20, :5] = 1
+    found = rt.OnnxDetector(model(tmp_path, outputs, shape=(3, "h", "w")))(IMAGE)
+    expected = np.zeros((160, 320), bool)
+    expected[40:83, 80:94] = True
+    assert found.masks is not None
+    np.testing.assert_array_equal(found.masks[0], expected)
+
+
+def test_prototypes_lie_where_the_image_does(tmp_path: Path) -> None:
+    """The upper half of the box: input rows up to 32, image rows up to (32 - 16) * 5."""
+    outputs = yolo_seg()
+    outputs["output1"][0, 1] = np.where(np.arange(16) < 8, 1, -1)[:, None]
+    found = rt.OnnxDetector(model(tmp_path, outputs))(IMAGE)
+    expected = np.zeros((160, 320), bool)
+    expected[40:80, 80:160] = True
+    assert found.masks is not None
+    assert (found.masks[0] != expected).sum() <= 80  # a row at most
+
+
+def test_an_input_need_not_be_square(tmp_path: Path) -> None:
+    """64 x 32, a fifth of the image: 8 x 4 + 4 x 2 + 2 x 1 cells."""
+    rows = np.zeros((1, 7, 42))
+    rows[0, :, 20] = [*center([16, 8, 32, 24]), 0, 0, SCORE]
+    found = rt.OnnxDetector(model(tmp_path, {"o": rows}, shape=(1, 3, 32, 64)))(IMAGE)
+    np.testing.assert_allclose(found.xyxy, [BOX], atol=1e-3)
+
+
+def test_the_size_of_the_image_is_width_and_height(tmp_path: Path) -> None:
+    """As DEIM wants it beside the image; a model that answers with a box of that size."""
+    helper = onnx.helper
+    tensors = {"labels": np.int64([[LABEL]]), "scores": np.float32([[SCORE]]),
+               "zeros": np.float32([[0, 0]]), "box shape": np.int64([1, 1, 4])}  # fmt: skip
+    nodes = [
+        helper.make_node("Identity", ["constant labels"], ["labels"]),
+        helper.make_node("Identity", ["constant scores"], ["scores"]),
+        helper.make_node("Cast", ["orig_target_sizes"], ["size"], to=1),
+        helper.make_node("Concat", ["constant zeros", "size"], ["whole"], axis=1),
+        helper.make_node("Reshape", ["whole", "constant box shape"], ["boxes"]),
+    ]
+    inputs = [helper.make_tensor_value_info("images", 1, [1, 3, 64, 64]),
+              helper.make_tensor_value_info("orig_target_sizes", 7, [1, 2])]  # fmt: skip
+    outputs = [helper.make_tensor_value_info("labels", 7, [1, 1]),
+               helper.make_tensor_value_info("boxes", 1, [1, 1, 4]),
+               helper.make_tensor_value_info("scores", 1, [1, 1])]  # fmt: skip
+    constants = [onnx.numpy_helper.from_array(v, f"constant {k}") for k, v in tensors.items()]
+    graph = helper.make_graph(nodes, "g", inputs, outputs, constants)
+    assert rt.OnnxDetector(save_model(graph, tmp_path))(IMAGE).xyxy.tolist() == [[0, 0, 320, 160]]
+
+
+def test_background_is_no_class(tmp_path: Path) -> None:
+    """Label 0 of a model that counts its classes from 1."""
+    outputs = ssd()
+    outputs["scores"] = [[SCORE, 0.9]]
+    outputs["labels"] = np.array([[LABEL + 1, 0]])
+    assert rt.OnnxDetector(model(tmp_path, outputs))(IMAGE).class_id.tolist() == [LABEL]
+
+
 # What the projects' own inference code feeds: order of the channels, mean and deviation of 0..255.
 TORCHVISION = (np.multiply([0.485, 0.456, 0.406], 255), np.multiply([0.229, 0.224, 0.225], 255))
 SEEN_ROWS = [
@@ -303,8 +365,9 @@ def test_detections_are_selected(tmp_path: Path) -> None:
             (far, [0, 0, 0.0625]),
         ]
     ):
-        rows[0, :, column] = [*center(box), *scores]
+        rows[0, :, 30 - column] = [*center(box), *scores]
     rows[0, :, 9] = [60, 32, 20, 20, 0, 0, 0.5]  # reaches beyond the image: clipped
+    rows[0, :, 5] = [30, 8, 10, 10, 0, 0, 0.8]  # in the border above the image: nothing is left
     path = model(tmp_path, {"o": rows}, names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
     found = rt.OnnxDetector(path)(IMAGE)
     # NMS within a class only; min_score; best first
@@ -331,8 +394,8 @@ def test_class_names_come_from_the_user_first(
     (tmp_path / "names.txt").write_text("a\nb\nc\n")
     config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
     assert rt.OnnxDetector(path, config).class_names == ("a", "b", "c")
-    (tmp_path / "names.txt").write_text("a\n")
-    with pytest.raises(rt.ReobjError, match="class 2, but there are only 1 class names"):
+    (tmp_path / "names.txt").write_text("a\n\nb\n")
+    with pytest.raises(rt.ReobjError, match="class 2, but there are only 2 class names"):
         rt.OnnxDetector(path, config)(IMAGE)
 
 
@@ -461,6 +524,16 @@ def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> 
     for index in (1, 2, 3):
         assert_same(again.get(index), some(index))
     assert len(caplog.records) == 1  # said once, not in every later run
+
+
+def test_what_was_put_last_counts(tmp_path: Path) -> None:
+    cache = DetectionCache(tmp_path, (32, 24))
+    cache.put(1, some(2))
+    cache.flush()
+    cache.put(1, some(3))
+    assert_same(cache.get(1), some(3))
+    cache.flush()
+    assert_same(DetectionCache(tmp_path, (32, 24)).get(1), some(3))
 
 
 def test_a_cache_of_another_working_size_is_none(tmp_path: Path) -> None:

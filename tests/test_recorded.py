@@ -47,6 +47,12 @@ def test_round_trip(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_file_may_say_which_frames_were_done(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.npz", (3, three()))
+    np.savez(path, done=[2, 3, 4], **np.load(path))
+    assert recorded.read_npz(path, SIZE, SIZE)[1].tolist() == [2, 3, 4]
+
+
 def test_boxes_and_masks_follow_the_working_size(tmp_path: Path) -> None:
     """Half the width, a third of the height; a pixel stays if at least half of it is covered."""
     masks = np.zeros((1, 48, 64), bool)

@@ -174,6 +174,11 @@ def test_own_folder_comes_first_and_may_be_read_only(
     assert server.asked == []
     monkeypatch.setenv("REOBJ_MODELS", "/proc/none")  # nothing can be written there
     assert rt.model_path("toy") == server.target
+    monkeypatch.setenv("REOBJ_MODELS", str(own))  # now in both
+    assert rt.model_path("toy") == own / "toy_416.onnx"
+    (own / "toy_416.onnx").unlink()
+    server.target.unlink()
+    assert rt.model_path("toy") == own / "toy_416.onnx"  # downloads go there too
 
 
 @pytest.mark.parametrize(
@@ -202,11 +207,20 @@ def test_the_cache_of_each_platform(
 def test_a_changed_file_is_refused_but_not_deleted(server: Any) -> None:
     rt.model_path("toy")
     server.target.write_bytes(b"changed")
-    with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
-        rt.model_path("toy")
+    for name in ("toy", "toy_416.onnx"):
+        with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
+            rt.model_path(name)
     assert rt.model_path(server.target) == server.target  # by its path: as it is
     assert [row.state for row in rt.list_models()] == ["wrong sha256"]
     assert server.target.read_bytes() == b"changed"
+
+
+def test_a_file_of_that_name_is_taken_as_it_is(
+    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "toy").write_bytes(b"mine")
+    assert rt.model_path("toy") == Path("toy") and server.asked == []
 
 
 def test_states_and_unknown_names(server: Any) -> None:

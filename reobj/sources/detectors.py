@@ -216,9 +216,9 @@ class DetectionCache:
 
     def get(self, index: int) -> Detections | None:
         """Return the detections of a frame, None if it was not detected yet."""
-        if index in self._fresh or index not in self._stored:
-            return self._fresh.get(index)
-        return self._stored[index].at(index)
+        if index in self._fresh:
+            return self._fresh[index]
+        return self._stored[index].at(index) if index in self._stored else None
 
     def put(self, index: int, detections: Detections) -> None:
         """Store the detections of a frame, also when there are none."""
