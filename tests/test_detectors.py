@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -638,6 +639,22 @@ def test_the_options_of_a_file_apply(clip: rt.Video, tmp_path: Path) -> None:
     path.write_text("1,-1,10,20,30,10,.9\n1,-1,12,20,30,10,.3\n")
     assert len(open_detections(clip, rt.DetectConfig(), path)(frame())) == 2
     assert len(open_detections(clip, rt.DetectConfig(min_score=0.5), path)(frame())) == 1
+
+
+def test_a_changed_option_or_file_changes_the_key(clip: rt.Video, tmp_path: Path) -> None:
+    """Also of recorded detections: tracks made of them are cached under it."""
+    path, names = tmp_path / "det.csv", tmp_path / "names.txt"
+    path.write_text("frame,x1,y1,x2,y2,score,class\n0,10,20,30,40,.9,0\n")
+    names.write_text("cup\n")
+    config = rt.DetectConfig(class_names=str(names))
+    keys = {open_detections(clip, config, path).key, open_detections(clip, config, path).key}
+    assert len(keys) == 1
+    for change in ({"min_score": 0.2}, {"classes": "cup"}, {"max_detections": 3}):
+        changed = dataclasses.replace(config, **change)
+        keys.add(open_detections(clip, changed, path).key)
+    names.write_text("wok, bowl\n")
+    keys.add(open_detections(clip, config, path).key)
+    assert len(keys) == 5
 
 
 def test_a_function_gets_its_class_names_from_the_options(clip: rt.Video, tmp_path: Path) -> None:
