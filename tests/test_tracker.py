@@ -277,7 +277,7 @@ def test_crossing_objects_keep_their_identity_by_appearance() -> None:
 
 
 @pytest.mark.parametrize("left", [130, 140, 145])
-def test_a_coasting_track_does_not_take_a_newcomer_that_views_different(left: int) -> None:
+def test_a_coasting_track_does_not_take_a_newcomer_that_looks_different(left: int) -> None:
     """The newcomer lies nearer to a third object, which has a detection of its own."""
     seen, gone, new = unit(np.random.default_rng(13), 3)
     tracker = rt.Tracker(rt.TrackerConfig(n_init=1))
@@ -618,3 +618,228 @@ def test_a_frame_without_pose_changes_no_place() -> None:
     for _ in range(20):
         tracker.update(rt.Detections.empty(), cam_from_world=np.full((3, 4), np.nan), camera=CAMERA)
     np.testing.assert_array_equal(tracker.places.dual_q, places)
+
+
+# ---- Rules of the association ----
+
+
+def test_another_class_costs() -> None:
+    """Two boxes about as near to a chair's track: the cup is a little nearer, the chair is it."""
+    tracker = rt.Tracker()
+    for _ in range(5):
+        tracker.update(rows((100, 100, 200, 200)))
+    cup, chair = (93, 100, 193, 200, 0.9, CUP), (112, 100, 212, 200)
+    tracks = tracker.update(rows(cup, chair))
+    assert tracks.detection_index[tracks.track_id == 1].tolist() == [1]
+
+
+@pytest.mark.parametrize(("kind", "expected"), [(CHAIR, [1]), (CUP, [])])
+def test_another_class_speaks_against_one_object(kind: int, expected: list[int]) -> None:
+    """Rather unlike, but well overlapping: enough for the same class, too little for another."""
+    seen, new = unit(np.random.default_rng(21), 2)
+    new = new - (new @ seen) * seen
+    new = 0.3 * seen + np.sqrt(1 - 0.3**2) * new / np.linalg.norm(new)
+    tracker = rt.Tracker()
+    for _ in range(12):
+        tracker.update(rows((100, 100, 150, 150)), embeddings=seen[None])
+    for _ in range(12):  # the longer away, the more a track gives way: now the match is weak
+        tracker.update(rt.Detections.empty())
+    found = rows((114, 100, 164, 150), class_id=kind)
+    assert tracker.update(found, embeddings=new[None]).track_id.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("box", "same"),
+    [
+        ((103, 100, 113, 350), True),
+        ((111, 100, 121, 350), False),  # within the gate of so tall a box, but beside it
+        ((72, 170, 138, 280), False),  # in the same place, but of another shape
+    ],
+)
+def test_without_appearance_boxes_must_overlap_and_be_of_a_size(
+    box: tuple[float, ...], same: bool
+) -> None:
+    tracker = rt.Tracker()
+    for _ in range(5):
+        tracker.update(rows((100, 100, 110, 350)))
+    assert (update(tracker, rows(box)).tracklet_id == 1).tolist() == [same]
+
+
+@pytest.mark.parametrize(("half", "same"), [(47, True), (60, False)])
+def test_without_appearance_no_side_doubles(half: int, same: bool) -> None:
+    tracker = rt.Tracker()
+    for _ in range(5):
+        tracker.update(rows((100, 100, 150, 150)))
+    found = update(tracker, rows((125 - half, 125 - half, 125 + half, 125 + half)))
+    assert (found.tracklet_id == 1).tolist() == [same]
+
+
+def test_who_was_just_seen_chooses_first() -> None:
+    """One detection between two tracks, a little nearer to the one that was missed for a while."""
+    tracker = rt.Tracker()
+    seen, missed = (100, 100, 200, 200), (110, 100, 210, 200)
+    for _ in range(8):
+        tracker.update(rows(seen, missed))
+    for _ in range(8):
+        tracker.update(rows(seen))
+    assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
+
+
+def test_who_has_an_identity_chooses_first() -> None:
+    """One detection between two tracks, a little nearer to the tentative one."""
+    tracker = rt.Tracker()
+    known, tentative = (100, 100, 200, 200), (110, 100, 210, 200)
+    for _ in range(8):
+        tracker.update(rows(known))
+    for _ in range(2):
+        tracks = update(tracker, rows(known, tentative))
+    assert tracks.track_id.tolist() == [1, 0]
+    assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
+
+
+def test_a_clear_match_is_not_questioned() -> None:
+    """No rival and much overlap: the look of one frame (a hand before it) changes nothing."""
+    views = unit(np.random.default_rng(22), 2)
+    tracker = rt.Tracker()
+    for _ in range(13):
+        tracker.update(rows((100, 100, 150, 150)), embeddings=views[:1])
+    assert tracker.update(rows((102, 100, 152, 150)), embeddings=views[1:]).track_id.tolist() == [1]
+
+
+@pytest.mark.parametrize(("seen", "gap", "same"), [(1, 1, True), (1, 2, False), (2, 2, True)])
+def test_tentative_tracks_wait_as_long_as_they_were_seen(seen: int, gap: int, same: bool) -> None:
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=4))
+    known, new = (0, 0, 50, 50), (200, 0, 250, 50)
+    tracker.update(rows(known))
+    for _ in range(seen):
+        before = update(tracker, rows(known, new)).tracklet_id[1]
+    for _ in range(gap):
+        tracker.update(rows(known))
+    assert (update(tracker, rows(known, new)).tracklet_id[1] == before) == same
+
+
+def test_low_scores_are_matched_after_high_ones() -> None:
+    """A faint box right on the track, a clear one beside it: the clear one goes on."""
+    tracker = rt.Tracker()
+    for _ in range(5):
+        tracker.update(rows((100, 100, 200, 200)))
+    tracks = tracker.update(rows((100, 100, 200, 200, 0.3), (115, 100, 215, 200, 0.9)))
+    assert tracks.detection_index.tolist() == [1]
+
+
+# ---- Rules of re-identification ----
+
+
+def gone(tracker: rt.Tracker, view: np.ndarray, frames: int = 60) -> None:
+    """Show one chair of this appearance on the left for 12 frames, then nothing."""
+    for _ in range(12):
+        tracker.update(rows((0, 0, 50, 50)), embeddings=view)
+    for _ in range(frames):
+        tracker.update(rt.Detections.empty())
+
+
+def test_an_identity_goes_to_one_of_two_newcomers() -> None:
+    """Both look like the object that is gone; even where little is asked for, one is another."""
+    view = unit(np.random.default_rng(23), 1)
+    tracker = rt.Tracker(rt.TrackerConfig(return_probability=0.01))
+    gone(tracker, view)
+    for _ in range(5):
+        both = rows((300, 0, 350, 50), (500, 0, 550, 50))
+        tracks = tracker.update(both, embeddings=view.repeat(2, 0))
+    assert sorted(tracks.track_id.tolist()) == [1, 2]
+
+
+def test_who_was_seen_beside_the_newcomer_is_another_object() -> None:
+    """The newcomer turns up in the last frame of an object that it equals, and is missed once; a
+    third one comes a frame later, so that both are named at once.
+    """
+    views = unit(np.random.default_rng(24), 2)
+    old, new, third = (0, 0, 50, 50), (300, 0, 350, 50), (600, 0, 650, 50)
+    tracker = rt.Tracker()
+    for _ in range(12):
+        tracker.update(rows(old), embeddings=views[:1])
+    tracker.update(rows(old, new), embeddings=views[[0, 0]])
+    tracker.update(rows(third), embeddings=views[1:])
+    for _ in range(3):
+        tracks = tracker.update(rows(new, third), embeddings=views)
+    assert sorted(tracks.track_id.tolist()) == [2, 3]
+
+
+def test_a_return_ends_the_track_that_still_coasts() -> None:
+    """Its object is elsewhere: what turns up in the old place is another one."""
+    views = unit(np.random.default_rng(25), 2)
+    old, new = (0, 0, 50, 50), (400, 0, 450, 50)
+    tracker = rt.Tracker()
+    gone(tracker, views[:1], frames=5)
+    for _ in range(4):
+        tracks = tracker.update(rows(new), embeddings=views[:1])
+    assert tracks.track_id.tolist() == [1] and tracker.state.identity.tolist() == [0]
+    for _ in range(4):
+        tracks = tracker.update(rows(new, old), embeddings=views)
+    assert tracks.track_id.tolist() == [1, 2]
+
+
+def test_a_track_votes_for_its_class() -> None:
+    """Most of its score is a cup's: it may be the cup that left, though it last was a chair."""
+    view = unit(np.random.default_rng(26), 1)
+    tracker = rt.Tracker()
+    for _ in range(12):
+        tracker.update(rows((0, 0, 50, 50), class_id=CUP), embeddings=view)
+    for _ in range(60):
+        tracker.update(rt.Detections.empty())
+    for kind in (CUP, CUP, CHAIR, CHAIR):
+        found = rows((300, 0, 350, 50), class_id=kind)
+        tracks = tracker.update(found, embeddings=view)
+    assert tracks.track_id.tolist() == [1]
+
+
+# ---- Rules with poses ----
+
+
+def test_tracks_follow_their_places_through_a_jerky_camera() -> None:
+    """The camera jumps to and fro by more than a ball's width; no track is lost for a frame."""
+    tracker = rt.Tracker()
+    walk(tracker, PAST)
+    assert tracker.places.known.sum() == 2
+    tracklets = tracker.latest.tracklet_id.tolist()
+    for i in range(12):
+        pose = pose_at(0.5 - 0.5 * (i % 2))
+        found, _ = balls_seen(pose)
+        tracks = tracker.update(found, cam_from_world=pose, camera=CAMERA)
+        assert sorted(tracks.tracklet_id.tolist()) == sorted(tracklets)
+        assert tracks.track_id.tolist() == [1, 2]
+
+
+def test_tracks_grow_as_their_places_come_near() -> None:
+    """Steps of a metre towards the balls and back: boxes half as large again."""
+    tracker = rt.Tracker()
+    walk(tracker, PAST)
+    for i in range(6):
+        pose = pose_at(0.5)
+        pose[2, 3] = -1.4 * (i % 2)
+        before = tracker.state.mean[:, 2, 0].copy()
+        found, _ = balls_seen(pose)
+        tracks = tracker.update(found, cam_from_world=pose, camera=CAMERA)
+        assert tracks.track_id.tolist() == [1, 2]
+        width = found.xyxy[:, 2] - found.xyxy[:, 0]
+        assert (np.abs(np.log(tracker.state.mean[:, 2, 0] / width)) < 0.15).all()
+        assert i < 2 or (np.abs(np.log(before / width)) > 0.3).all()
+
+
+def test_out_of_view_no_time_passes_for_a_track_of_known_place() -> None:
+    """Half a turn away and back takes longer than a track waits; the same tracklets go on."""
+    tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
+    walk(tracker, PAST)
+    before = tracker.latest.tracklet_id.tolist()
+    walk(tracker, AWAY + [pose_at(0.5, 180 - 3.0 * i) for i in range(61)])
+    assert tracker.latest.tracklet_id.tolist() == before
+
+
+def test_in_view_a_missed_track_of_known_place_is_given_up() -> None:
+    tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
+    walk(tracker, PAST)
+    for _ in range(6):
+        tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
+    assert len(tracker.state.mean) == 0 or (tracker.state.missed == 6).all()
+    tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
+    assert len(tracker.state.mean) == 0
