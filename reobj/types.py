@@ -102,8 +102,7 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Embeddings:
-    """Two-part appearance of detections: rows of unit length for the object and for what surrounds
-    it.
+    """Two-part appearance of detections: rows of unit length for object and surroundings.
 
     Attributes:
         foreground: (D, E1); background: (D, E2), E2 may be 0.
@@ -288,8 +287,9 @@ def rows_by(group: IntArray) -> list[IntArray]:
 
 
 def widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Pad the second axis of a with zeros to the width of b (classes or embeddings seen for the
-    first time).
+    """Pad the second axis of a with zeros to the width of b.
+
+    (For classes or embeddings that are seen for the first time.)
     """
     if a.ndim != 2 or a.shape[1] >= b.shape[1]:
         return a

@@ -67,8 +67,10 @@ RENAMED = {
 }
 # Where one of them is a field term after all: the room's word for something else.
 STILL_USED = {
-    ("reobj/files.py", "home"),
     ("reobj/sources/weights.py", "home"),  # the user's folder
+    ("quadrics.py", "near"),  # the near plane, and a depth's other uses
+    ("quadrics.py", "live"),  # objects that have boxes to be fitted to
+    ("quadrics.py", "doubt"),  # reasons why a size rests on its prior
 }
 
 
@@ -115,12 +117,9 @@ def test_public_names_have_docstrings(module: str) -> None:
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_docstrings_begin_with_a_sentence(module: str) -> None:
-    """The first paragraph ends with a full stop (or a colon, before a list)."""
-    first = {
-        name: text.partition("\n\n")[0].rstrip() for name, text in documented(module).items() if text
-    }
-    assert {n: t for n, t in first.items() if not t.endswith((".", ":", ".)", "?"))} == {}
+def test_docstrings_begin_with_a_line_that_is_a_sentence(module: str) -> None:
+    first = {name: text.splitlines()[0] for name, text in documented(module).items() if text}
+    assert {name: line for name, line in first.items() if not line.endswith((".", ".)"))} == {}
 
 
 @pytest.mark.parametrize("module", MODULES)
