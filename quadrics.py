@@ -8,9 +8,9 @@ Usage:
     fits.ellipsoids.center_in_world, fits.size, fits.cov, fits.status, fits.reason
 
 How `fit_objects` works:
-    1. Every visible box edge (or tangent line of a mask) is an image line l; its back-projected
-       plane P'l = (n, d) touches the object: -(n.c + d) = h(n), h the support function of the
-       solid (box, cylinder or ellipsoid). Edges on the image border are one-sided.
+    1. Every visible box edge is an image line l; its back-projected plane P'l = (n, d) touches
+       the object: -(n.c + d) = h(n), h the support function of the solid (box, cylinder or
+       ellipsoid). Edges on the image border are one-sided.
     2. Start: consensus of viewing rays and of the depths that the size priors suggest; several
        orientations; robust loss; one batched Levenberg-Marquardt with analytic Jacobians.
     3. Explicit inlier test per view, noise level re-estimated, final fit, 9x9 covariance.
@@ -20,8 +20,10 @@ Conventions: float64; boxes (F, O, 4) x1 y1 x2 y2 in pixels of the COLMAP corner
 where an object is unseen; img_from_world (F, 3, 4) = K [R | t] of cameras looking along +z; half
 axes; rotation world_from_obj with the object's axes as columns (third axis = up where up is
 known); covariance order: center (3, world), log half axes (3), rotation vector (3, object frame).
-Axes of the shape comments: F frames, O objects, V views of one object, E lines of one view,
-B problems (object x shape x start) solved side by side.
+Axes of the shape comments: F frames, O objects, V views of one object, E = 4 edges of one view
+(left, top, right, bottom), B problems (object x shape x start) solved side by side.
+Constants stand where they are read. Where none is named, their source is our own choice: the
+tables of docs/quadrics.md hold for these values.
 
 References:
     [LfD]   Rubino, Crocco, Del Bue: 3D object localisation from multi-view detections. PAMI 2018
@@ -35,15 +37,21 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
 __version__ = "0.1.0"
+__all__ = [
+    "SUPPORTS", "Array", "BoolArray", "Ellipsoids", "FitConfig", "IntArray", "ObjectFits", "Priors",
+    "PsfmoResult", "QuadricsError", "Scale", "SfmoResult", "box_iou", "boxes_from_dual_conics",
+    "camera_up", "clip_boxes", "fit_lfd", "fit_objects", "fit_psfmo", "fit_sfmo", "load_priors",
+    "project", "reprojection_iou", "rotation_vectors", "rotations", "solid_boxes", "volume_overlap",
+]  # fmt: skip
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -56,8 +64,7 @@ SUPPORTS = ("ellipsoid", "box", "cylinder")  # index = code
 AXIS_GROUPS: Array = np.array(
     [np.ones((3, 3)), np.eye(3), [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
 )  # (3 supports, 3, 3)
-VECH10 = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-VECH6 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+AXIS_ORDERS: IntArray = np.array([p for p in np.ndindex(3, 3, 3) if len(set(p)) == 3])  # (6, 3)
 
 
 class QuadricsError(ValueError):
@@ -69,70 +76,30 @@ class QuadricsError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
-    """Every number that `fit_objects` uses, with unit, meaning and origin."""
+    """Set what a user of `fit_objects` may reasonably change.
 
-    edge_noise_px: float = 1.0  # px, floor of a box edge's standard deviation (detector rounding)
-    edge_noise_rel: float = 0.02  # of the box's width (left, right edge) or height (top, bottom)
-    noise_prior_dof: float = 12.0  # weight, in residuals, of those two against the residuals seen
-    object_noise_dof: float = 20.0  # weight of the pooled noise level in one object's own level
-    noise_range: tuple[float, float] = (0.05, 20.0)  # limits of the noise factor
-    border_px: float = 3.0  # px, an edge this near the image border is one-sided
-    correlation_deg: float = 3.0  # deg, views nearer than this share their errors; 0: independent
-    max_views: int = 48  # views used per object in the fit
-    start_views: int = 8  # views used to choose the start
-    start_offset: float = 0.5  # box sizes, a ray that misses the centre by more does not support it
-    start_center_rel: float = 0.1  # box sizes, sigma of a box's centre as the centre's image
-    start_depth_log: float = 0.3  # log, how well a box's extent tells the depth of a known size
-    start_size_log: float = 0.25  # log, how well it tells the size at a known depth
-    start_cut_weight: float = 0.3  # vote of a box that touches the border
-    start_iterations: int = 7  # LM steps for every start
-    rival_rad: float = 0.2  # rad, a start that ends this far from the best one is another mode
-    rival_cost: float = 20.0  # cost (2 log likelihood ratio) up to which a rival is fitted fully
-    iterations: int = 40  # LM steps of the final fits
-    chunk: int = 384  # problems solved side by side (fits a core's L2 cache)
-    cauchy: float = 3.0  # sigma, scale of the Cauchy loss while outliers are still in
-    cauchy_hidden: float = 2.0  # sigma, same where the solid sticks out of the box (occlusion)
-    hidden_cap: float = 7.4  # most that a hidden edge costs: -2 log(.2 hidden / 20 sigma / .4)
-    outlier_cap: float = 12.0  # most that any other edge costs in the evidence, for .02 wrong
-    huber: float = 3.0  # sigma, scale of the Huber loss after the inlier test
-    huber_hidden: float = 2.5  # sigma, same where the solid sticks out of the box
-    behind: float = 12.0  # sigma, constant residual of a view that has the object behind it
-    size_wall: float = 2.5  # sigma of growth, beyond it the size prior turns quartic
-    size_wall_log: float = 0.25  # log, that sigma is at least this: a category may be wrong
-    size_wall_rise: float = 16.0  # how steep: extra cost rise * (s^2 - wall^2)^2 / wall^2
-    near_depth: float = 1e-3  # of the start depth; nearer than this counts as behind
-    view_outlier: float = 6.0  # mean squared residual of a view (chi2 .9999, 4 dof, is 23.5 / 4)
-    edge_outlier: float = 5.0  # sigma, a single edge farther off is dropped (occlusion)
-    max_noise: float = 8.0  # noise factor above which the boxes are not of one static object
-    min_inlier_share: float = 0.4  # of the views; below it the object is rejected
-    tilt_deg: float = 1.5  # deg, how upright an object stands when gravity is known
-    camera_roll_deg: float = 6.0  # deg, spread of a hand-held camera's roll: up from cameras
-    camera_pitch_deg: float = 35.0  # deg, same of its pitch
-    camera_up_views: float = 4.0  # views of independent roll that a video is worth
-    max_tilt_deg: float = 20.0  # deg, objects less sure of their vertical do not vote on gravity
-    yaw_sigma_rad: float = 0.9  # rad, std of a uniform angle in +-90 deg: cap of unknown rotation
-    round_log_ratio: float = 0.05  # log(w/d) spread of yaw-symmetric categories
-    unknown_scale_log: float = 3.0  # log, prior spread of the global scale when poses have none
-    # unknown category: spread of the 110 indoor categories of priors.json
-    unknown_aspect_log: float = 0.6  # log, standard deviation of each axis about the common size
-    unknown_size_log: float = 0.9  # log, standard deviation of the common size
-    unknown_size_m: tuple[float, float, float] = (0.29, 0.25, 0.25)  # m, geometric mean
-    prior_dominated: float = 0.7071  # posterior / prior sigma above which the prior did the work
-    loose_log: float = 0.35  # log, an axis less certain than this is not called measured
-    odd_size: float = 3.5  # sigma from the prior: said in the reason
-    absurd_size: float = 6.0  # sigma from the prior: rejected
-    min_parallax_deg: float = 1.0  # deg, below it depth is the prior's
-    scale_min_parallax_deg: float = 3.0  # deg, objects used for the global scale
-    scale_log_sigma: float = 0.5  # log, objects with a worse common-size sigma give no scale
-    vote_high: float = 1.5  # sigma, width of the consensus on scale above it (hidden objects)
-    vote_low: float = 2.5  # sigma, same below it
-    min_up_objects: int = 3  # upright objects needed to trust the gravity estimate
-    probe: float = 1.5  # sigma, where the cost is probed for the covariance
-    bend_weight: float = 4.0  # of q q'; its second moment is .75, the 95 % tail of nine needs more
-    max_bend: float = 30.0  # sigma, limit of the bend of a principal axis
-    max_widening: float = 4.0  # limit of that correction, as a factor on sigma
-    smooth_cov: float = 0.05  # same for the covariance: the spread of m, near kinks
-    smooth: float = 1e-3  # rounds the kink of |m| in the box support
+    Attributes:
+        edge_noise_px, edge_noise_rel: How far a box edge lies from the object's true outline, as a
+            standard deviation: hypot(edge_noise_px, edge_noise_rel * box width or height). Only a
+            first guess: the boxes themselves correct both by one factor an object.
+        border_px: An edge this near the image border (px) only says that the object reaches it.
+        correlation_deg: Views of an object nearer to each other than this (deg) repeat their errors
+            and count as fewer; 0: every view counts fully, and certainty grows with their number.
+        max_views: An object seen in more frames is fitted from this many, spread over the path.
+        start_views: On this many views the candidate orientations and shapes of an object compete;
+            fewer are faster and more often let the wrong one win.
+        start_iterations: Optimisation steps of each candidate on those views.
+        iterations: Most optimisation steps on all views; a fit that has converged stops earlier.
+    """
+
+    edge_noise_px: float = 1.0
+    edge_noise_rel: float = 0.02
+    border_px: float = 3.0
+    correlation_deg: float = 3.0
+    max_views: int = 48
+    start_views: int = 8
+    start_iterations: int = 7
+    iterations: int = 40
 
 
 # ---- Ellipsoids and dual quadrics -----------------------------------------------------------
@@ -152,19 +119,13 @@ class Ellipsoids:
     def __getitem__(self, index: Any) -> Ellipsoids:
         """Select objects by slice, mask or index array."""
         index = np.atleast_1d(np.arange(len(self))[index])
-        return Ellipsoids(
-            self.center_in_world[index], self.half_axes[index], self.world_from_obj[index]
-        )
+        return Ellipsoids(*(getattr(self, name)[index] for name in self.__slots__))
 
     def dual_quadrics(self) -> Array:
         """Return (O, 4, 4) dual quadrics with [3, 3] = -1: R diag(a^2) R' - c c', -c, -1."""
-        spread = np.einsum(
-            "oik,ok,ojk->oij", self.world_from_obj, self.half_axes**2, self.world_from_obj
-        )
-        center_h = np.concatenate([self.center_in_world, np.ones((len(self), 1))], 1)  # (O, 4)
-        dual_q: Array = -center_h[:, :, None] * center_h[:, None, :]  # (O, 4, 4)
-        dual_q[:, :3, :3] += spread
-        return dual_q
+        rot = self.world_from_obj
+        spread = np.einsum("oik,ok,ojk->oij", rot, self.half_axes**2, rot)
+        return _dual_quadrics(self.center_in_world, spread)
 
     @staticmethod
     @np.errstate(all="ignore")
@@ -188,8 +149,22 @@ class Ellipsoids:
         return ellipsoids, good & (value > 0).all(1)
 
 
+def _dual_quadrics(center: Array, block: Array) -> Array:
+    """Join centres (O, 3) and centred blocks (O, 3, 3) into dual quadrics with [3, 3] = -1."""
+    center_h = np.concatenate([center, np.ones((len(center), 1))], 1)  # (O, 4)
+    dual_q: Array = -center_h[:, :, None] * center_h[:, None, :]  # (O, 4, 4)
+    dual_q[:, :3, :3] += block
+    return dual_q
+
+
+def _chunks(n: int, size: int) -> Iterator[IntArray]:
+    """Split the numbers below n into runs of at most `size`."""
+    for lo in range(0, n, size):
+        yield np.arange(lo, min(lo + size, n))
+
+
 def _finite(x: Array, *axes: int) -> BoolArray:
-    """True where everything along the given axes is finite."""
+    """Test whether everything along the given axes is finite."""
     return np.asarray(np.isfinite(x).all(axis=axes))
 
 
@@ -210,7 +185,7 @@ def _solve(lhs: Array, rhs: Array) -> Array:
 
 
 def _eigh(matrix: Array) -> tuple[Array, Array]:
-    """Eigenvalues and vectors of symmetric (B, n, n); the identity's where not finite."""
+    """Decompose symmetric (B, n, n) into eigenvalues and vectors; the identity where not finite."""
     bad = np.asarray(~(np.abs(matrix) < 1e150).all((1, 2)))[:, None, None]
     value, vector = np.linalg.eigh(np.where(bad, np.eye(matrix.shape[1]), matrix))
     return value, vector
@@ -257,30 +232,21 @@ def _with_positive_depth(img_from_world: Array) -> Array:
 # ---- Solids: projected boxes, IoU -----------------------------------------------------------
 
 
-def support_codes(support: str | Sequence[str | None] | None, n: int) -> IntArray:
+def _support_codes(support: str | Sequence[str | None] | None, n: int) -> IntArray:
     """Turn support names into codes (n,); None: BY_CATEGORY, "evidence": BY_EVIDENCE."""
     names = [support] * n if support is None or isinstance(support, str) else list(support)
     if len(names) != n:
-        raise QuadricsError(
-            f"{len(names)} supports given for {n} objects: give one name or one each"
-        )
+        raise QuadricsError(f"{len(names)} supports for {n} objects: give one name or one each")
     table: dict[str | None, int] = {name: k for k, name in enumerate(SUPPORTS)}
     table.update({None: BY_CATEGORY, "evidence": BY_EVIDENCE})
     unknown = {str(x) for x in names if x not in table}
     if unknown:
-        raise QuadricsError(
-            f"unknown support {sorted(unknown)}: use one of {SUPPORTS} or 'evidence'"
-        )
+        raise QuadricsError(f"unknown support {sorted(unknown)}: use {SUPPORTS} or 'evidence'")
     return np.array([table[x] for x in names], np.int64)
 
 
-def _disc_points(n: int) -> Array:
-    angle = np.arange(n) * (2.0 * np.pi / n)
-    return np.stack([np.cos(angle), np.sin(angle)], -1)
-
-
 def _corner_bounds(solids: Ellipsoids, cams: Array, near: float) -> Array:
-    """Bounds (F, O, 4) of the eight projected corners; corners behind are pulled to `near`."""
+    """Bound the eight projected corners (F, O, 4); corners behind are pulled to `near`."""
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)  # (3, 8)
     offset = solids.world_from_obj @ (solids.half_axes[:, :, None] * signs)  # (O, 3, 8)
     corner = solids.center_in_world[:, :, None] + offset  # (O, 3, 8)
@@ -293,7 +259,7 @@ def _corner_bounds(solids: Ellipsoids, cams: Array, near: float) -> Array:
 
 
 def _rim_bounds(solids: Ellipsoids, cams: Array) -> Array:
-    """Bounds (F, O, 4) of a cylinder: union of the exact bounds of its two rims."""
+    """Bound a projected cylinder (F, O, 4): union of the exact bounds of its two rims."""
     flat = solids.half_axes * np.array([1.0, 1.0, 0.0])
     lift = solids.world_from_obj[:, :, 2] * solids.half_axes[:, 2:]  # (O, 3)
     out = []
@@ -318,7 +284,7 @@ def solid_boxes(
     Returns:
         (F, O, 4) xyxy in pixels, not clipped; NaN where nothing is in front of the camera.
     """
-    codes = support_codes(support, len(solids))
+    codes = _support_codes(support, len(solids))
     if (codes < 0).any():
         raise QuadricsError(f"solids have a shape: name one of {SUPPORTS} for each")
     cams = _with_positive_depth(np.asarray(img_from_world, np.float64))  # (F, 3, 4)
@@ -348,7 +314,7 @@ def clip_boxes(boxes_xyxy: Array, image_size: tuple[float, float]) -> Array:
 
 @np.errstate(all="ignore")
 def box_iou(a: Array, b: Array) -> Array:
-    """IoU of (..., 4) xyxy boxes pair by pair; 0 where one of them is NaN."""
+    """Measure the IoU (...) of (..., 4) xyxy boxes pair by pair; 0 where one of them is NaN."""
     size = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
     inter = np.prod(np.clip(size, 0.0, None), -1)
     union = np.prod(a[..., 2:] - a[..., :2], -1) + np.prod(b[..., 2:] - b[..., :2], -1) - inter
@@ -362,21 +328,21 @@ def reprojection_iou(
     img_from_world: Array,
     image_size: tuple[float, float],
     support: str | Sequence[str] | None = None,
-    chunk: int = 256,
 ) -> Array:
-    """IoU (F, O) of each fitted solid's projected box, clipped to the image, with its detection.
+    """Compare each fitted solid's projected box, clipped to the image, with its detection.
 
-    `support` is needed when plain Ellipsoids are given (default "ellipsoid"). Unseen or behind: 0.
+    Args:
+        fits: of `fit_objects`, or plain solids; boxes_xyxy: (F, O, 4); img_from_world: (F, 3, 4).
+        support: shape of plain solids (default "ellipsoid"), one name or one an object.
+    Returns:
+        IoU (F, O); 0 where the object is unseen, behind the camera or outside the image.
     """
-    if isinstance(fits, ObjectFits):
-        solids, names = fits.ellipsoids, list(fits.support)
-    else:
-        solids, names = fits, ["ellipsoid"] * len(fits)
-    names = names if support is None else [SUPPORTS[k] for k in support_codes(support, len(solids))]
+    solids = fits.ellipsoids if isinstance(fits, ObjectFits) else fits
+    if support is None:
+        support = list(fits.support) if isinstance(fits, ObjectFits) else "ellipsoid"
     out = np.zeros(boxes_xyxy.shape[:2])
-    for lo in range(0, len(boxes_xyxy), chunk):  # over frames, to bound the memory
-        part = slice(lo, lo + chunk)
-        predicted = clip_boxes(solid_boxes(solids, names, img_from_world[part]), image_size)
+    for part in _chunks(len(boxes_xyxy), 256):  # frames, to bound the memory
+        predicted = clip_boxes(solid_boxes(solids, support, img_from_world[part]), image_size)
         out[part] = box_iou(predicted, clip_boxes(boxes_xyxy[part], image_size))
     return out
 
@@ -399,7 +365,7 @@ class Priors:
     upright: BoolArray  # (C,)
 
     def index(self, categories: Sequence[str | None]) -> IntArray:
-        """Row of each category (O,), -1 where the category is not in the table."""
+        """Find the row of each category (O,), -1 where it is not in the table."""
         table = {_plain(name): k for k, name in enumerate(self.names)}
         for alias, name in self.aliases.items():
             table.setdefault(_plain(alias), table.get(_plain(name), -1))
@@ -407,7 +373,7 @@ class Priors:
 
 
 def _plain(name: str) -> str:
-    """Lower case with single spaces: "Potted_Plant" and "potted plant" are the same."""
+    """Normalise a category: "Potted_Plant" and "potted plant" are the same."""
     return re.sub(r"[\s_\-]+", " ", name.strip().lower())
 
 
@@ -429,17 +395,15 @@ def load_priors(path: str | Path | None = None) -> Priors:
         raise QuadricsError(
             f"{path}: a category lacks or garbles {error}; see docs/quadrics.md"
         ) from error
-    columns = [np.array(column) for column in zip(*rows, strict=True)] if rows else _no_priors()
+    columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
+    if not rows:
+        columns = [np.zeros(s) for s in ((0, 3), (0, 3, 3), (0, 2), (0, 2, 2))]
+        columns += [np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0, bool)]
     return Priors(tuple(table), aliases, *columns)
 
 
-def _no_priors() -> list[Any]:
-    shapes = ((0, 3), (0, 3, 3), (0, 2), (0, 2, 2))
-    flags = [np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0, bool)]
-    return [*(np.zeros(s) for s in shapes), *flags]
-
-
-def _prior_row(entry: Mapping[str, Any]) -> tuple[Array, Array, Array, Array, int, bool, bool]:
+def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Parse one category into the columns of `Priors`; without "axis_ratio" the sizes imply it."""
     size = entry["size_m"]
     std = np.array(size["log_std"], np.float64)  # (3,)
     corr_wd, corr_wh, corr_dh = size.get("corr", (0.0, 0.0, 0.0))
@@ -449,15 +413,10 @@ def _prior_row(entry: Mapping[str, Any]) -> tuple[Array, Array, Array, Array, in
     difference = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, -1.0]])
     implied = {"mean_log": difference @ log_mean, "cov_log": difference @ log_cov @ difference.T}
     ratio = entry.get("axis_ratio", implied)
-    return (
-        log_mean,
-        log_cov,
-        np.array(ratio["mean_log"], np.float64),
-        np.array(ratio["cov_log"], np.float64),
-        SUPPORTS.index(entry.get("support", "ellipsoid")),
-        bool(entry.get("yaw_symmetric", False)),
-        bool(entry.get("upright", True)),
-    )
+    ratios = (np.array(ratio[key], np.float64) for key in ("mean_log", "cov_log"))
+    code = SUPPORTS.index(entry.get("support", "ellipsoid"))
+    round_, upright = bool(entry.get("yaw_symmetric", False)), bool(entry.get("upright", True))
+    return log_mean, log_cov, *ratios, code, round_, upright
 
 
 # ---- Views: cameras, selection, tangent planes ----------------------------------------------
@@ -481,8 +440,7 @@ def _cameras(img_from_world: Array, limit: float = 1e12) -> _Cameras:
     unit = linear / np.where(size > 0, size, 1.0)
     bad = ~(np.abs(np.linalg.det(unit)) > 1e-9) | ~_finite(cams, 1, 2)
     inverse = np.linalg.inv(np.where(bad[:, None, None], np.eye(3), linear))
-    cams[bad] = np.nan
-    inverse[bad] = np.nan
+    cams[bad], inverse[bad] = np.nan, np.nan
     center = -np.einsum("fij,fj->fi", inverse, cams[:, :, 3])  # (F, 3)
     return _Cameras(cams, center, inverse)
 
@@ -531,9 +489,18 @@ def _select_views(usable: BoolArray, quality: Array, cams: _Cameras, max_views: 
     return out
 
 
+class _Rows:
+    """Struct of arrays with one row each for the same things: indexing picks things."""
+
+    __slots__: tuple[str, ...] = ()
+
+    def __getitem__(self, index: Any) -> Self:
+        return type(self)(*(getattr(self, name)[index] for name in self.__slots__))
+
+
 @dataclass(frozen=True, slots=True)
-class _Edges:
-    """Back-projected tangent planes of V views with E lines each, for a batch of objects."""
+class _Edges(_Rows):
+    """Back-projected tangent planes of V views with E edges each, for a batch of objects."""
 
     normal: Array  # (O, V, E, 3) unit, outward
     offset: Array  # (O, V, E)
@@ -544,44 +511,25 @@ class _Edges:
     sigma_px: Array  # (O, V, E)
     share: Array  # (O, V, E) how many views share this one's errors; gain holds 1 / sqrt(share)
 
-    def take(self, index: IntArray) -> _Edges:
-        return _Edges(*(getattr(self, f.name)[index] for f in fields(self)))
-
-
-def box_lines(boxes_xyxy: Array) -> Array:
-    """Write boxes (..., 4) as outward tangent lines (..., 4, 3): left, top, right, bottom.
-
-    A line l has a unit normal; l.(u, v, 1) is the signed distance in px, positive outside.
-    """
-    lines = np.zeros((*boxes_xyxy.shape[:-1], 4, 3))
-    lines[..., 0, 0], lines[..., 1, 1], lines[..., 2, 0], lines[..., 3, 1] = -1, -1, 1, 1
-    lines[..., :2, 2] = boxes_xyxy[..., :2]
-    lines[..., 2:, 2] = -boxes_xyxy[..., 2:]
-    return lines
-
 
 def _tangent_planes(
-    boxes: Array, cams: Array, image_size: tuple[float, float], lines: Array | None, cfg: FitConfig
+    boxes: Array, cams: Array, image_size: tuple[float, float], cfg: FitConfig
 ) -> _Edges:
-    """Back-project box edges (and further tangent lines) of gathered views.
+    """Back-project the box edges of gathered views.
 
     Args:
         boxes: (O, V, 4), NaN where there is no view; cams: (O, V, 3, 4), with metric depth.
-        lines: (O, V, K, 3) extra outward tangent lines (see `hull_lines`), NaN where missing.
     """
-    tangents = box_lines(boxes)  # (O, V, 4, 3)
-    w, h = image_size
+    lines = np.zeros((*boxes.shape, 3))  # (O, V, E, 3): l.(u, v, 1) is the signed distance in px,
+    lines[..., [0, 2], 0] = -1, 1  # positive outside the box
+    lines[..., [1, 3], 1] = -1, 1
+    lines[..., :2, 2], lines[..., 2:, 2] = boxes[..., :2], -boxes[..., 2:]
     low = boxes[..., :2] <= cfg.border_px
-    high = boxes[..., 2:] >= np.array([w, h]) - cfg.border_px
-    border = np.concatenate([low, high], -1)  # (O, V, 4)
-    if lines is not None:
-        cut = border.any(-1, keepdims=True) & np.ones(lines.shape[-2], bool)
-        tangents = np.concatenate([tangents, lines], 2)  # (O, V, E, 3)
-        border = np.concatenate([border, cut], 2)
-    sides = boxes[..., 2:] - boxes[..., :2]  # (O, V, 2)
-    size = np.linalg.norm(tangents[..., :2] * sides[..., None, :], axis=-1)  # (O, V, E) px
+    high = boxes[..., 2:] >= np.array(image_size) - cfg.border_px
+    border = np.concatenate([low, high], -1)  # (O, V, E)
+    size = np.tile(boxes[..., 2:] - boxes[..., :2], 2)  # (O, V, E) px across the edge
     sigma = np.hypot(cfg.edge_noise_px, cfg.edge_noise_rel * size)
-    plane = np.einsum("ovek,ovkj->ovej", tangents, cams)  # (O, V, E, 4)
+    plane = np.einsum("ovek,ovkj->ovej", lines, cams)  # (O, V, E, 4)
     norm = np.linalg.norm(plane[..., :3], axis=-1)  # (O, V, E) px per metre at depth 1
     plane = plane / _nonzero(norm)[..., None]
     used = _finite(plane, -1) & (norm > 0) & np.isfinite(sigma)
@@ -593,39 +541,37 @@ def _tangent_planes(
     return _Edges(*own, np.ones_like(gain))
 
 
-@np.errstate(all="ignore")
-def hull_lines(mask: npt.ArrayLike, n_lines: int = 12) -> Array:
-    """Tangent lines (K, 3) of a mask's convex hull in K evenly spread directions.
-
-    They are the hull's support function: more tangents than the four box edges.
-    Args:
-        mask: (H, W) bool, pixel (row v, column u) covers [u, u + 1] x [v, v + 1].
-    Ref: literature 4.2, convex-hull quadrics.
-    """
-    rows, cols = np.nonzero(np.asarray(mask))
-    normal = _disc_points(n_lines)  # (K, 2)
-    if not len(rows):
-        return np.full((n_lines, 3), np.nan)
-    v, inverse = np.unique(rows, return_inverse=True)
-    left, right = np.full(len(v), np.inf), np.full(len(v), -np.inf)
-    np.minimum.at(left, inverse, cols.astype(np.float64))
-    np.maximum.at(right, inverse, cols + 1.0)
-    u = np.concatenate([left, left, right, right])
-    points = np.stack([u, np.tile(np.concatenate([v, v + 1.0]), 2)], -1)  # (4 rows, 2)
-    return np.concatenate([normal, -(points @ normal.T).max(0)[:, None]], 1)
-
-
 # ---- LfD ------------------------------------------------------------------------------------
 
 
-def _ray_point(cams: _Cameras, rays: Array, weight: Array, index: IntArray) -> Array:
-    """Least-squares meeting point (O, 3) of unit viewing rays (O, V, 3) with weights (O, V)."""
-    center = np.where(index[..., None] < 0, 0.0, cams.center[index])  # (O, V, 3)
-    proj = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # (O, V, 3, 3)
-    lhs = np.einsum("ov,ovij->oij", weight, proj) + 1e-9 * np.eye(3)
+def _ray_point(center: Array, ray: Array, weight: Array) -> Array:
+    """Intersect rays (O, V, 3) from `center` in points (O, 3) by weighted least squares."""
+    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    across = np.eye(3) - unit[..., :, None] * unit[..., None, :]  # (O, V, 3, 3)
+    lhs = np.einsum("ov,ovij->oij", weight, across) + 1e-9 * np.eye(3)
     shift = np.einsum("ov,ovi->oi", weight, center) / np.maximum(weight.sum(1), 1e-12)[:, None]
-    rhs = np.einsum("ov,ovij,ovj->oi", weight, proj, center - shift[:, None], optimize=True)
+    rhs = np.einsum("ov,ovij,ovj->oi", weight, across, center - shift[:, None], optimize=True)
     return np.asarray(shift + _solve(lhs, rhs))
+
+
+def _congruence(matrix: Array) -> Array:
+    """Write the map Q -> M Q M' as rows (..., R, C) between the upper triangles of both.
+
+    matrix: (..., k, n) M; R = k (k + 1) / 2, C = n (n + 1) / 2. Ref: [LfD]; [SfMO] G_red.
+    """
+    (r, s), (i, j) = (np.triu_indices(n) for n in matrix.shape[-2:])
+    r, s = r[:, None], s[:, None]
+    rows: Array = matrix[..., r, i] * matrix[..., s, j]
+    rows += np.where(i != j, matrix[..., r, j] * matrix[..., s, i], 0.0)
+    return rows
+
+
+def _symmetric(entries: Array, n: int) -> Array:
+    """Fill symmetric matrices (O, n, n) from their upper triangles, row by row."""
+    i, j = np.triu_indices(n)
+    out = np.zeros((len(entries), n, n))
+    out[:, i, j] = out[:, j, i] = entries
+    return out
 
 
 def _lfd_system(boxes: Array, cams: Array, origin: Array, unit: Array, seen: BoolArray) -> Array:
@@ -644,27 +590,24 @@ def _lfd_system(boxes: Array, cams: Array, origin: Array, unit: Array, seen: Boo
     mid = 0.5 * (boxes[..., 2:] + boxes[..., :2])
     local[..., :2, :] -= mid[..., None] * local[..., 2:, :]
     local[..., :2, :] /= scale[..., None, None]
-    r, s = np.array(VECH6).T
-    i, j = np.array(VECH10).T
-    block = local[..., r[:, None], i] * local[..., s[:, None], j]  # (O, V, 6, 10)
-    block += np.where(i != j, local[..., r[:, None], j] * local[..., s[:, None], i], 0.0)
+    block = _congruence(local)  # (O, V, 6, 10)
     conic = np.zeros((n_obj, n_view, 6))
     conic[..., 0], conic[..., 3] = (half[..., 0] / scale) ** 2, (half[..., 1] / scale) ** 2
     conic[..., 5] = -1.0
-    system = np.zeros((n_obj, 7 * n_view, 10 + n_view))
-    for v in range(n_view):  # over views
-        on = seen[:, v, None]
-        system[:, 6 * v : 6 * v + 6, :10] = np.where(on[..., None], block[:, v], 0.0)
-        system[:, 6 * v : 6 * v + 6, 10 + v] = np.where(on, -conic[:, v], 0.0)
-        system[:, 6 * n_view + v, 10 + v] = np.where(on[:, 0], 0.0, 1e3)
-    return system
+    view, on = np.arange(n_view), seen[..., None]  # (V,), (O, V, 1)
+    top = np.zeros((n_obj, n_view, 6, 10 + n_view))
+    top[..., :10] = np.where(on[..., None], block, 0.0)
+    top[:, view, :, 10 + view] = np.where(on, -conic, 0.0).transpose(1, 0, 2)
+    pin = np.zeros((n_obj, n_view, 10 + n_view))
+    pin[:, view, 10 + view] = np.where(seen, 0.0, 1e3)
+    return np.concatenate([top.reshape(n_obj, 6 * n_view, -1), pin], 1)
 
 
 @np.errstate(all="ignore")
 def fit_lfd(
     boxes_xyxy: Array, img_from_world: Array, max_views: int = 48
 ) -> tuple[Array, BoolArray]:
-    """Closed-form ellipsoids from boxes, all objects at once.
+    """Fit ellipsoids to boxes in closed form, all objects at once.
 
     Needs >= 3 views and > ~20 deg between them; below that it is often no ellipsoid at all.
     Invariant to shifts and units of the world: solved around the rays' meeting point, then
@@ -687,55 +630,34 @@ def fit_lfd(
     if not enough.any():
         return dual_q, np.zeros(n_obj, bool)
     index, seen = index[enough], seen[enough]
-    boxes = np.where(
-        seen[..., None], _gather(boxes_xyxy, index, np.flatnonzero(enough)), [0, 0, 1, 1.0]
-    )
+    boxes = boxes_xyxy[index, np.flatnonzero(enough)[:, None]]  # (O, V, 4)
+    boxes = np.where(seen[..., None], boxes, [0, 0, 1, 1.0])
     mats = np.where(seen[..., None, None], cams.matrix[index], np.eye(3, 4))  # (O, V, 3, 4)
-    rays, extent = _rays(boxes, cams, index)
-    unit_rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    origin = _ray_point(cams, unit_rays, seen.astype(np.float64), index)  # (O, 3)
+    center = np.where(seen[..., None], cams.center[index], 0.0)
+    ray, extent = _rays(boxes, cams, index)
+    origin = _ray_point(center, ray, seen.astype(np.float64))  # (O, 3)
     depth = np.abs(np.einsum("ovj,oj->ov", mats[..., 2, :3], origin) + mats[..., 2, 3])
     # an object measures ~.1 unit, as in the authors' data: the null vector's norm is not scale free
     unit = 10.0 * np.sum(seen * depth * extent.mean(-1), 1) / seen.sum(1) + 1e-12  # (O,)
     for _ in range(2):
         system = _lfd_system(boxes, mats, origin, unit, seen)
         solution = np.linalg.svd(system, full_matrices=False)[2][:, -1, :10]  # (O, 10)
-        local_q = _unvech(solution)  # (O, 4, 4), may be at infinity
+        local_q = _symmetric(solution, 4)  # (O, 4, 4), may be at infinity
         local_q = local_q / -_nonzero(local_q[:, 3:, 3:], 1e-12)
+        world_from_local = unit[:, None, None] * np.eye(4)  # (O, 4, 4)
+        world_from_local[:, :3, 3], world_from_local[:, 3, 3] = origin, 1.0
+        dual_q[enough] = world_from_local @ local_q @ world_from_local.transpose(0, 2, 1)
         shift = -local_q[:, :3, 3] * unit[:, None]
-        world_q = _move_dual(local_q, origin, unit)
-        origin = np.where(
-            np.isfinite(shift) & (np.abs(shift) < 1e3 * unit[:, None]), origin + shift, origin
-        )
-    dual_q[enough] = world_q
+        near = np.isfinite(shift) & (np.abs(shift) < 1e3 * unit[:, None])
+        origin = np.where(near, origin + shift, origin)
     return dual_q, Ellipsoids.from_dual_quadrics(dual_q)[1]
 
 
-def _gather(values: Array, index: IntArray, objects: IntArray) -> Array:
-    """Pick (O, V, ...) from (F, O_all, ...); frame -1 picks anything (mask it afterwards)."""
-    return values[np.maximum(index, 0), objects[:, None]]
-
-
-def _unvech(v: Array) -> Array:
-    """(O, 10) -> symmetric (O, 4, 4)."""
-    i, j = np.array(VECH10).T
-    out = np.zeros((len(v), 4, 4))
-    out[:, i, j] = v
-    out[:, j, i] = v
-    return out
-
-
-def _move_dual(dual_q: Array, origin: Array, unit: Array) -> Array:
-    """Dual quadrics of local coordinates in world: X = origin + unit * X_local."""
-    world_from_local = np.zeros((len(origin), 4, 4))
-    world_from_local[:, :3, :3] = unit[:, None, None] * np.eye(3)
-    world_from_local[:, :3, 3] = origin
-    world_from_local[:, 3, 3] = 1.0
-    return world_from_local @ dual_q @ world_from_local.transpose(0, 2, 1)
-
-
 def _rays(boxes: Array, cams: _Cameras, index: IntArray) -> tuple[Array, Array]:
-    """Ray of each box centre with depth 1 (O, V, 3), and the box's size at depth 1 (O, V, 2)."""
+    """Back-project box centres to rays of depth 1 (O, V, 3) and boxes to sizes there (O, V, 2).
+
+    boxes: (O, V, 4); index: (O, V) their frames, -1 where there is none.
+    """
     seen = index >= 0
     inverse = np.where(seen[..., None, None], cams.ray[np.maximum(index, 0)], np.eye(3))
     mid = 0.5 * (boxes[..., :2] + boxes[..., 2:])
@@ -746,6 +668,8 @@ def _rays(boxes: Array, cams: _Cameras, index: IntArray) -> tuple[Array, Array]:
 
 
 # ---- SfMO and PSfMO: affine cameras ---------------------------------------------------------
+
+UNKNOWN_RATIO_COV: Array = 0.5 * np.eye(2) + 0.25  # log(w/h), log(d/h) of an unknown category
 
 
 @dataclass(frozen=True, slots=True)
@@ -765,22 +689,27 @@ class SfmoResult:
     note: str
 
 
-def _box_conics(boxes: Array) -> tuple[Array, Array]:
-    """Centres (F, O, 2) and shape rows (F, O, 3) = (a^2, 0, b^2) of the inscribed ellipses."""
-    half = 0.5 * (boxes[..., 2:] - boxes[..., :2])
-    zero = np.zeros(half.shape[:-1])
-    rows = np.stack([half[..., 0] ** 2, zero, half[..., 1] ** 2], -1)
-    return 0.5 * (boxes[..., :2] + boxes[..., 2:]), np.where(
-        np.isfinite(half[..., :1]), rows, np.nan
-    )
+def _ellipses(boxes_xyxy: Array | None, dual_c: Array | None) -> tuple[Array, Array, BoolArray]:
+    """Read dual conics, or the ellipses inscribed in boxes, as centres and shapes.
 
-
-def _dual_conic_parts(dual_c: Array) -> tuple[Array, Array]:
-    """Centres (F, O, 2) and shape rows (F, O, 3) of dual conics (F, O, 3, 3), any scale."""
-    scaled = -dual_c / _nonzero(dual_c[..., 2:, 2:])
-    center = -scaled[..., :2, 2]
-    block = scaled[..., :2, :2] + center[..., :, None] * center[..., None, :]
-    return center, np.stack([block[..., 0, 0], block[..., 0, 1], block[..., 1, 1]], -1)
+    Returns:
+        centres (F, O, 2), shape rows (F, O, 3) = entries 11, 12, 22 of the centred dual ellipse
+        ((a^2, 0, b^2) for a box), and which are seen (F, O).
+    """
+    if dual_c is not None:
+        conic = np.asarray(dual_c, np.float64)
+        conic = -conic / _nonzero(conic[..., 2:, 2:])
+        center = -conic[..., :2, 2]
+        block = conic[..., :2, :2] + center[..., :, None] * center[..., None, :]
+        rows = np.stack([block[..., 0, 0], block[..., 0, 1], block[..., 1, 1]], -1)
+    elif boxes_xyxy is not None:
+        boxes = np.asarray(boxes_xyxy, np.float64)
+        center = 0.5 * (boxes[..., :2] + boxes[..., 2:])
+        square = (0.5 * (boxes[..., 2:] - boxes[..., :2])) ** 2
+        rows = np.stack([square[..., 0], np.zeros(square.shape[:-1]), square[..., 1]], -1)
+    else:
+        raise QuadricsError("give boxes_xyxy (F, O, 4) or dual_c (F, O, 3, 3)")
+    return center, rows, _finite(rows, -1) & (np.abs(center) < 1e7).all(-1)
 
 
 def _complete_rank3(tracks: Array, seen: BoolArray, iterations: int = 500) -> Array:
@@ -796,7 +725,12 @@ def _complete_rank3(tracks: Array, seen: BoolArray, iterations: int = 500) -> Ar
     given = np.where(mask > 0, tracks.reshape(-1, n_obj), 0.0)
     if mask.all():
         return tracks
-    filled = np.array([_interpolate(track) for track in np.where(mask > 0, given, np.nan).T]).T
+    filled = np.zeros((n_obj, 2 * n_frame))
+    for o in np.flatnonzero(seen.any(0)):
+        on = np.flatnonzero(seen[:, o])
+        for k in (0, 1):
+            filled[o, k::2] = np.interp(np.arange(n_frame), on, tracks[on, k, o])
+    filled = filled.T  # (2F, O)
     mean = filled.mean(1, keepdims=True)
     points = np.linalg.svd(filled - mean, full_matrices=False)[2][:3].T  # (O, 3)
     last, ridge = np.inf, np.diag([1e-2, 1e-2, 1e-2, 1e-9])  # holds frames with few objects
@@ -816,124 +750,72 @@ def _complete_rank3(tracks: Array, seen: BoolArray, iterations: int = 500) -> Ar
     return np.where(mask > 0, given, model).reshape(n_frame, 2, n_obj)
 
 
-def _interpolate(track: Array) -> Array:
-    """Fill the NaN of one track (2F,) = x and y in turns by linear interpolation over frames."""
-    pair = track.reshape(-1, 2)
-    good = np.flatnonzero(np.isfinite(pair[:, 0]))
-    if not len(good):
-        return np.zeros_like(track)
-    every = np.arange(len(pair))
-    return np.stack([np.interp(every, good, pair[good, k]) for k in (0, 1)], 1).ravel()
-
-
 def _metric_upgrade(motion: Array) -> Array:
-    """Upgrade (3, 3) Q for which the rows of motion (F, 2, 3) @ Q are orthogonal, equally long.
+    """Find Q (3, 3) for which the rows of motion (F, 2, 3) @ Q are orthogonal and equally long.
 
     Linear in L = Q Q': m1 L m1 = m2 L m2, m1 L m2 = 0, mean of m L m = 1; L is made positive.
     Ref: [SfMO] section 3; Tomasi and Kanade 1992.
     """
-    i, j = np.array(VECH6).T
-    double = np.where(i == j, 1.0, 2.0)
-
-    def form(a: Array, b: Array) -> Array:
-        return double * 0.5 * (a[:, i] * b[:, j] + a[:, j] * b[:, i])
-
-    m1, m2 = motion[:, 0], motion[:, 1]
-    f11, f22 = form(m1, m1), form(m2, m2)
-    rows = np.concatenate([f11 - f22, form(m1, m2), (f11 + f22).mean(0, keepdims=True)])
+    f11, f12, f22 = _congruence(motion).transpose(1, 0, 2)  # (F, 6) each
+    rows = np.concatenate([f11 - f22, f12, (f11 + f22).mean(0, keepdims=True)])
     target = np.zeros(len(rows))
     target[-1] = 2.0
-    solution = np.linalg.lstsq(rows, target, rcond=None)[0]
-    metric = np.zeros((3, 3))
-    metric[i, j] = metric[j, i] = solution
-    value, vector = np.linalg.eigh(metric)
+    solution: Array = np.linalg.lstsq(rows, target, rcond=None)[0]
+    value, vector = np.linalg.eigh(_symmetric(solution[None], 3)[0])
     return np.asarray(vector * np.sqrt(np.maximum(value, 1e-3 * np.abs(value).max() + 1e-12)))
 
 
-def _shape_design(affine: Array) -> Array:
-    """Rows (..., F, 3, 6) that map vech E to (A E A')_11, _12, _22. Ref: [SfMO] G_red."""
-    i, j = np.array(VECH6).T
-    pairs = [(0, 0), (0, 1), (1, 1)]
-    rows = [
-        affine[..., r, :][..., i] * affine[..., s, :][..., j]
-        + np.where(i == j, 0.0, affine[..., r, :][..., j] * affine[..., s, :][..., i])
-        for r, s in pairs
-    ]
-    return np.stack(rows, -2)
-
-
 def _fit_shapes(design: Array, rows: Array, seen: BoolArray) -> Array:
-    """Least-squares centred quadrics (O, 3, 3) from shape rows (F, O, 3); design (O, F, 3, 6)."""
+    """Fit centred quadrics (O, 3, 3) to shape rows (F, O, 3) by least squares, no prior."""
     weight = seen.T[:, :, None, None].astype(np.float64)  # (O, F, 1, 1)
     target = np.where(seen.T[..., None], rows.transpose(1, 0, 2), 0.0)  # (O, F, 3)
     flat = (design * weight).reshape(len(target), -1, 6)
-    coefficient = (np.linalg.pinv(flat) @ target.reshape(len(target), -1, 1))[..., 0]  # (O, 6)
-    i, j = np.array(VECH6).T
-    block = np.zeros((len(target), 3, 3))
-    block[:, i, j] = coefficient
-    block[:, j, i] = coefficient
-    return block
-
-
-def _block_ellipsoids(center: Array, block: Array) -> tuple[Ellipsoids, BoolArray]:
-    """Ellipsoids with centres (O, 3) and centred quadrics (O, 3, 3)."""
-    point = np.concatenate([center, np.ones((len(center), 1))], 1)
-    dual_q = -point[:, :, None] * point[:, None]
-    dual_q[:, :3, :3] += block
-    return Ellipsoids.from_dual_quadrics(dual_q)
+    entries = np.linalg.pinv(flat) @ target.reshape(len(target), -1, 1)  # (O, 6, 1)
+    return _symmetric(np.asarray(entries[..., 0], np.float64), 3)
 
 
 @np.errstate(all="ignore")
 def fit_sfmo(boxes_xyxy: Array | None, dual_c: Array | None = None) -> SfmoResult:
-    """Structure from motion with objects: cameras and ellipsoids from boxes alone.
+    """Factorise boxes alone into affine cameras and ellipsoids: structure from motion with objects.
 
-    Affine cameras; needs >= 4 objects in general position and >= 3 frames. Unseen boxes (NaN) are
-    completed by a rank-3 model. Scale, rotation and mirror image of the result are arbitrary.
+    Needs >= 4 objects in general position and >= 3 frames. Unseen boxes (NaN) are completed by a
+    rank-3 model. Scale, rotation and mirror image of the result are arbitrary.
 
     Args:
         boxes_xyxy: (F, O, 4), NaN where unseen, or None when dual_c (F, O, 3, 3) holds ellipses.
+    Returns:
+        SfmoResult; `ok` is False where there is too little to factorise.
     Ref: [SfMO].
     """
-    if dual_c is None and boxes_xyxy is None:
-        raise QuadricsError("give boxes_xyxy (F, O, 4) or dual_c (F, O, 3, 3)")
-    center_px, rows = (
-        _dual_conic_parts(np.asarray(dual_c, np.float64))
-        if dual_c is not None
-        else _box_conics(np.asarray(boxes_xyxy, np.float64))
-    )
-    seen = _finite(rows, -1) & (np.abs(center_px) < 1e7).all(-1)  # (F, O)
+    center_px, rows, seen = _ellipses(boxes_xyxy, dual_c)
     n_obj = seen.shape[1]
     # frames with few objects say little and extrapolate wildly: leave them out when others do
     rich, some = (np.flatnonzero(seen.sum(1) >= k) for k in (max(5, 0.65 * n_obj), 4))
     frames = rich if len(rich) >= 3 else some
+    cams = np.full((len(seen), 2, 4), np.nan)
     if n_obj < 4 or len(frames) < 3:
-        return _no_sfmo(len(seen), n_obj)
+        nan = Ellipsoids(*(np.full(s, np.nan) for s in ((n_obj, 3), (n_obj, 3), (n_obj, 3, 3))))
+        note = "needs 3 frames that show the same 4 objects"
+        return SfmoResult(nan, nan, cams, np.zeros(n_obj, bool), np.nan, False, note)
     on = seen[frames]
     tracks = _complete_rank3(center_px[frames].transpose(0, 2, 1), on)  # (F', 2, O)
     offset = tracks.mean(2)  # (F', 2)
     flat = (tracks - offset[..., None]).reshape(-1, n_obj)
     u, d, vt = np.linalg.svd(flat, full_matrices=False)
-    upgrade = _metric_upgrade((u[:, :3] * np.sqrt(d[:3])).reshape(-1, 2, 3))
-    affine = (u[:, :3] * np.sqrt(d[:3])).reshape(-1, 2, 3) @ upgrade
+    motion = (u[:, :3] * np.sqrt(d[:3])).reshape(-1, 2, 3)  # (F', 2, 3)
+    upgrade = _metric_upgrade(motion)
+    affine = motion @ upgrade
     points = (np.linalg.inv(upgrade) @ (np.sqrt(d[:3, None]) * vt[:3])).T  # (O, 3)
     error = (tracks - offset[..., None] - affine @ points.T).transpose(0, 2, 1)[on]
-    block = _fit_shapes(
-        np.broadcast_to(_shape_design(affine), (n_obj, len(frames), 3, 6)), rows[frames], on
-    )
-    ellipsoids, real = _block_ellipsoids(points, block)
-    cams = np.full((len(seen), 2, 4), np.nan)
+    design = np.broadcast_to(_congruence(affine), (n_obj, len(frames), 3, 6))
+    block = _fit_shapes(design, rows[frames], on)  # (O, 3, 3)
+    ellipsoids, real = Ellipsoids.from_dual_quadrics(_dual_quadrics(points, block))
     cams[frames] = np.concatenate([affine, offset[..., None]], 2)
     flip = np.array([1.0, 1.0, -1.0])
-    mirrored = _block_ellipsoids(points * flip, block * flip[:, None] * flip)[0]
+    twin = _dual_quadrics(points * flip, block * flip[:, None] * flip)
+    mirrored = Ellipsoids.from_dual_quadrics(twin)[0]
     rms = float(np.sqrt((error**2).mean()))
     return SfmoResult(ellipsoids, mirrored, cams, real, rms, True, "affine, no metric meaning")
-
-
-def _no_sfmo(n_frame: int, n_obj: int) -> SfmoResult:
-    nan = Ellipsoids(*(np.full(s, np.nan) for s in ((n_obj, 3), (n_obj, 3), (n_obj, 3, 3))))
-    note = "needs 3 frames that show the same 4 objects"
-    cams, real = np.full((n_frame, 2, 4), np.nan), np.zeros(n_obj, bool)
-    return SfmoResult(nan, nan, cams, real, np.nan, False, note)
 
 
 @dataclass(frozen=True, slots=True)
@@ -948,11 +830,16 @@ class PsfmoResult:
     start: SfmoResult | None  # None when the cameras were given
 
 
-def _shape_gaussian(mean_log: Array, cov_log: Array) -> tuple[Array, Array]:
-    """Mean (O, 3) and covariance (O, 3, 3) of u = a^2 / sum a^2 from log(w/h), log(d/h).
+def _shape_gaussian(priors: Priors, categories: Sequence[str | None]) -> tuple[Array, Array]:
+    """Turn priors of log axis ratios into Gaussians of u = a^2 / sum a^2: (O, 3), (O, 3, 3).
 
     Five-point Gauss-Hermite rule in both directions. Ref: [PSfMO] shape model.
     """
+    index = priors.index(categories)
+    known = index >= 0
+    mean_log, cov_log = np.zeros((len(index), 2)), np.tile(UNKNOWN_RATIO_COV, (len(index), 1, 1))
+    mean_log[known] = priors.ratio_mean[index[known]]
+    cov_log[known] = priors.ratio_cov[index[known]]
     node, weight = np.polynomial.hermite_e.hermegauss(5)
     grid = np.stack(np.meshgrid(node, node), -1).reshape(-1, 2)  # (25, 2)
     mass = np.outer(weight, weight).ravel() / weight.sum() ** 2
@@ -966,17 +853,17 @@ def _shape_gaussian(mean_log: Array, cov_log: Array) -> tuple[Array, Array]:
 
 def _psfmo_em(
     system: Array, target: Array, count: Array, mean: Array, cov: Array, iterations: int
-) -> tuple[Array, Array, Array, Array]:
-    """EM of the PPCA shape model for a batch of objects, orientation fixed.
+) -> tuple[Array, Array, Array]:
+    """Fit the PPCA shape model by EM to a batch of objects, orientation fixed.
 
     c = s^2 A (P h + mu) + e, h ~ N(0, S), e ~ N(0, sigma^2). E step: Gaussian posterior of h in
-    closed form; M step: s^2 by least squares, then sigma^2. Ref: [PSfMO], literature 3.2.
+    closed form; M step: s^2 by least squares, then sigma^2. Ref: [PSfMO].
 
     Args:
         system: (B, M, 3) A, rows of unseen views zero; target: (B, M) c; count: (B,) rows in use.
         mean, cov: (B, 3) mu, (B, 3, 3) covariance of P h.
     Returns:
-        l (B, 3) squared half axes, sigma (B,), scale s^2 (B,), log likelihood (B,).
+        s^2 (P h + mu) (B, 3): squared half axes, sigma (B,), log likelihood (B,).
     """
     value, vector = np.linalg.eigh(cov)
     basis, spread = vector[:, :, 1:], np.maximum(value[:, 1:], 1e-8)  # (B, 3, 2), (B, 2)
@@ -1000,7 +887,7 @@ def _psfmo_em(
     inner = np.linalg.slogdet(precision)[1] + np.log(spread).sum(1)
     fit = ((left**2).sum(1)) / sigma2 + (h**2 / spread).sum(1)
     likelihood = -0.5 * (count * np.log(2.0 * np.pi * sigma2) + inner + fit)
-    return scale[:, None] * shape, np.sqrt(sigma2), scale, likelihood
+    return scale[:, None] * shape, np.sqrt(sigma2), likelihood
 
 
 @np.errstate(all="ignore")
@@ -1012,111 +899,101 @@ def fit_psfmo(
     dual_c: Array | None = None,
     iterations: int = 50,
 ) -> PsfmoResult:
-    """Probabilistic structure from motion with objects: axis ratios drawn from the category.
+    """Fit ellipsoids whose axis ratios are drawn from the category (probabilistic SfMO).
 
     Without cameras it starts from `fit_sfmo` (affine frame, no metric meaning); with img_from_world
     (F, 3, 4) each camera is linearised at the object's centre and the result is in world units.
-    Orientation comes from the start; all six assignments of CAD axes to it are tried.
+    Orientation comes from the start; all six assignments of the category's axes (w, d, h) to the
+    ellipsoid's are tried and the likeliest is kept.
 
     Args:
         boxes_xyxy, dual_c: as in `fit_sfmo`. categories: (O,); unknown ones get a broad prior.
+        iterations: steps of EM.
+    Returns:
+        PsfmoResult; NaN axes where an object is seen in fewer than two frames.
     Ref: [PSfMO].
     """
-    parts = _dual_conic_parts(dual_c) if dual_c is not None else _box_conics(np.asarray(boxes_xyxy))
-    center_px, rows = parts
-    seen = _finite(rows, -1) & (np.abs(center_px) < 1e7).all(-1)  # (F, O)
+    center_px, rows, seen = _ellipses(boxes_xyxy, dual_c)
     start = None
     if img_from_world is None:
         start = fit_sfmo(boxes_xyxy, dual_c)
-        affine = np.broadcast_to(
-            start.img_from_world[None, ..., :3], (seen.shape[1], len(seen), 2, 3)
-        )
+        affine = np.broadcast_to(start.img_from_world[..., :3], (seen.shape[1], len(seen), 2, 3))
         solids = start.ellipsoids
     else:
         solids, affine = _known_camera_start(center_px, rows, seen, img_from_world)
     seen = seen & _finite(affine, 2, 3).T
-    design = _shape_design(np.where(np.isfinite(affine), affine, 0.0))  # (O, F, 3, 6)
-    return _psfmo_solve(design, rows, seen, solids, priors, categories, start, iterations)
+    design = _congruence(np.where(np.isfinite(affine), affine, 0.0))  # (O, F, 3, 6)
+    mean, cov = _shape_gaussian(priors, categories)
+    usable = _finite(solids.half_axes, 1) & (seen.sum(0) >= 2)
+    rot = np.where(usable[:, None, None], solids.world_from_obj, np.eye(3))
+    i, j = np.triu_indices(3)
+    outer = rot[:, i] * rot[:, j]  # (O, 6, 3): upper triangle of R diag(l) R' = outer l
+    on, n = seen.T[..., None], len(solids)  # (O, F, 1)
+    target = np.where(on, rows.transpose(1, 0, 2), 0.0)  # (O, F, 3)
+    count = np.maximum(3.0 * seen.sum(0), 1.0)
+    unit = np.abs(target).sum((1, 2)) / count + 1e-12  # (O,) measurements over their mean
+    system = np.where(on[..., None], design @ outer[:, None], 0.0).reshape(n, -1, 3)
+    system, target = system / unit[:, None, None], target.reshape(n, -1) / unit[:, None]
+    results = [
+        _psfmo_em(system, target, count, mean[:, p], cov[:, p][:, :, p], iterations)
+        for p in AXIS_ORDERS
+    ]
+    squared, noise, likelihood = (np.stack(column) for column in zip(*results, strict=True))
+    best, row = np.argmax(np.nan_to_num(likelihood, nan=-np.inf), 0), np.arange(n)  # (O,)
+    half = np.where(usable[:, None], np.sqrt(np.maximum(squared[best, row], 0.0)), np.nan)
+    mirrored = None if start is None else replace(start.mirrored, half_axes=half)
+    return PsfmoResult(
+        replace(solids, half_axes=half), mirrored, noise[best, row], AXIS_ORDERS[best],
+        likelihood[best, row], start,
+    )  # fmt: skip
 
 
 def _known_camera_start(
     center_px: Array, rows: Array, seen: BoolArray, img_from_world: Array
 ) -> tuple[Ellipsoids, Array]:
-    """Centres from rays, cameras linearised there (O, F, 2, 3), shapes by least squares."""
+    """Intersect the rays of the box centres, linearise the cameras there and fit the shapes.
+
+    Returns the ellipsoids (least squares, no prior) and the affine cameras (O, F, 2, 3).
+    """
     cams = _cameras(img_from_world)
     seen = seen & _finite(cams.center, 1)[:, None]
     boxes = np.concatenate([center_px, center_px], -1)
     n_obj = seen.shape[1]
     index = np.where(seen.T, np.arange(len(seen)), -1)  # (O, F)
     ray = _rays(np.where(seen.T[..., None], boxes.transpose(1, 0, 2), 0.0), cams, index)[0]
-    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    center = _ray_point(cams, unit, seen.T.astype(np.float64), index)  # (O, 3)
+    eye = np.where(seen.T[..., None], cams.center, 0.0)  # (O, F, 3)
+    center = _ray_point(eye, ray, seen.T.astype(np.float64))  # (O, 3)
     mats = np.where(seen.T[..., None, None], cams.matrix[None], np.eye(3, 4))  # (O, F, 3, 4)
     image = np.einsum("ofij,oj->ofi", mats[..., :3], center) + mats[..., 3]
     depth = _nonzero(image[..., 2:])[..., None]
     affine = (mats[..., :2, :3] - image[..., :2, None] / depth * mats[..., 2:, :3]) / depth
-    block = _fit_shapes(_shape_design(affine), rows, seen & _finite(affine, 2, 3).T)
-    solids = _block_ellipsoids(center, block)[0]
+    block = _fit_shapes(_congruence(affine), rows, seen & _finite(affine, 2, 3).T)
+    solids = Ellipsoids.from_dual_quadrics(_dual_quadrics(center, block))[0]
     return solids, np.where(seen.T[..., None, None], affine, np.nan).reshape(n_obj, -1, 2, 3)
-
-
-def _psfmo_solve(
-    design: Array, rows: Array, seen: BoolArray, solids: Ellipsoids, priors: Priors,
-    categories: Sequence[str | None], start: SfmoResult | None, iterations: int,
-) -> PsfmoResult:  # fmt: skip
-    """Run EM for all objects and all six axis assignments; keep the likeliest."""
-    n = len(solids)
-    index = priors.index(categories)
-    mean_log, cov_log = np.zeros((n, 2)), np.tile(0.5 * np.eye(2) + 0.25, (n, 1, 1))
-    known = index >= 0
-    mean_log[known], cov_log[known] = (
-        priors.ratio_mean[index[known]],
-        priors.ratio_cov[index[known]],
-    )
-    mean, cov = _shape_gaussian(mean_log, cov_log)
-    perms = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
-    usable = _finite(solids.half_axes, 1) & (seen.sum(0) >= 2)
-    rot = np.where(usable[:, None, None], solids.world_from_obj, np.eye(3))
-    i, j = np.array(VECH6).T
-    outer = rot[:, i] * rot[:, j]  # (O, 6, 3): vech(R diag(l) R') = outer l
-    on = seen.T[..., None]  # (O, F, 1)
-    target = np.where(on, rows.transpose(1, 0, 2), 0.0)  # (O, F, 3)
-    count = np.maximum(3.0 * seen.sum(0), 1.0)
-    unit = np.abs(target).sum((1, 2)) / count + 1e-12  # (O,) measurements over their mean
-    system = np.where(on[..., None], design @ outer[:, None], 0.0).reshape(n, -1, 3)
-    results = [
-        _psfmo_em(
-            system / unit[:, None, None], target.reshape(n, -1) / unit[:, None], count,
-            mean[:, p], cov[:, p][:, :, p], iterations,
-        )
-        for p in perms
-    ]  # fmt: skip
-    best = np.argmax(np.nan_to_num([r[3] for r in results], nan=-np.inf), 0)  # (O,)
-    row = np.arange(n)
-    squared = np.array([r[0] for r in results])[best, row]
-    half = np.where(usable[:, None], np.sqrt(np.maximum(squared, 0.0)), np.nan)
-    noise, likelihood = (np.array([r[k] for r in results])[best, row] for k in (1, 3))
-    found = Ellipsoids(solids.center_in_world, half, solids.world_from_obj)
-    twin = None
-    if start is not None:
-        other = start.mirrored
-        twin = Ellipsoids(other.center_in_world, half, other.world_from_obj)
-    return PsfmoResult(found, twin, noise, perms[best], likelihood, start)
 
 
 # ---- Levenberg-Marquardt over a batch of solids ---------------------------------------------
 
+NEAR_DEPTH = 1e-3  # of the longest half axis; a centre nearer to the camera counts as behind it
+BEHIND = 12.0  # sigma, constant residual of the edges of a view that has the object behind it
+SMOOTH = 1e-3  # rounds the kink of |m| in the support of box and cylinder
+SIZE_WALL = 2.5  # sigma of growth, beyond it the size prior turns quartic
+SIZE_WALL_RISE = 16.0  # how steep: extra cost rise * (s^2 - wall^2)^2 / wall^2
+# Positive residuals (the solid sticks out of the box) happen whenever something stands in front of
+# the object: they turn robust sooner than negative ones.
+CAUCHY = 3.0  # sigma, scale of the loss while outliers are still in
+CAUCHY_HIDDEN = 2.0  # sigma, same for positive residuals
+HUBER = 3.0  # sigma, scale of the loss after the inlier test
+HUBER_HIDDEN = 2.5  # sigma, same for positive residuals
+
 
 @dataclass(slots=True)
-class _State:
+class _State(_Rows):
     """Current solids of B problems."""
 
     center: Array  # (B, 3)
     log_half: Array  # (B, 3)
     rot: Array  # (B, 3, 3) world_from_obj
-
-    def take(self, index: IntArray | BoolArray) -> _State:
-        return _State(self.center[index], self.log_half[index], self.rot[index])
 
     def put(self, index: IntArray | BoolArray, other: _State) -> None:
         self.center[index], self.log_half[index] = other.center, other.log_half
@@ -1129,7 +1006,7 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
-class _Problem:
+class _Problem(_Rows):
     """What stays fixed in each of B problems, besides the edges."""
 
     groups: Array  # (B, 3, 3) of AXIS_GROUPS
@@ -1139,12 +1016,9 @@ class _Problem:
     up: Array  # (B, 3) unit, or zeros
     tilt_info: Array  # (B, 3) 1 / rad^2 for the three components of up in object axes
 
-    def take(self, index: IntArray | BoolArray) -> _Problem:
-        return _Problem(*(getattr(self, f.name)[index] for f in fields(self)))
-
 
 def rotations(rotvec: Array) -> Array:
-    """Rotation matrices (B, 3, 3) of rotation vectors (B, 3). Ref: Rodrigues."""
+    """Turn rotation vectors (B, 3), rad, into matrices (B, 3, 3). Ref: Rodrigues."""
     angle = np.linalg.norm(rotvec, axis=-1)[:, None, None]  # (B, 1, 1)
     skew = _skew(rotvec)
     s = np.sinc(angle / np.pi)
@@ -1154,7 +1028,7 @@ def rotations(rotvec: Array) -> Array:
 
 
 def rotation_vectors(rot: Array) -> Array:
-    """Rotation vectors (B, 3) of matrices (B, 3, 3), through the quaternion (exact near pi too)."""
+    """Turn rotation matrices (B, 3, 3) into vectors (B, 3), by quaternions: exact near pi too."""
     diag = np.einsum("bii->bi", rot)
     trace = diag.sum(1)
     square = np.concatenate([1.0 + trace[:, None], 1.0 + 2.0 * diag - trace[:, None]], 1)  # (B, 4)
@@ -1173,18 +1047,11 @@ def rotation_vectors(rot: Array) -> Array:
     return np.asarray(quat[:, 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0))
 
 
-def _axis_symmetries() -> Array:
-    """The 24 rotations (24, 3, 3) that map the coordinate axes onto themselves."""
-    eye = np.eye(3)
-    perms = [eye[:, p] for p in ([0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0])]
+def _state_difference(a: _State, b: _State, code: IntArray) -> Array:
+    """Find the smallest increment (B, 9) from solid b to solid a, over relabellings of a's axes."""
     signs = np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, 8).T
-    every = np.array([p * s for p in perms for s in signs])
-    return np.asarray(every[np.linalg.det(every) > 0])
-
-
-def state_difference(a: _State, b: _State, code: IntArray) -> Array:
-    """Smallest increment (B, 9) that turns solid b into solid a, over relabellings of a's axes."""
-    group = _axis_symmetries()  # (24, 3, 3)
+    group = np.array([np.eye(3)[:, order] * s for order in AXIS_ORDERS for s in signs])
+    group = group[np.linalg.det(group) > 0]  # the 24 rotations of the axes onto themselves
     turned = a.rot[:, None] @ group  # (B, 24, 3, 3)
     trace = np.einsum("bij,bgij->bg", b.rot, turned)
     keeps_axis = np.abs(group[:, 2, 2]) > 0.5
@@ -1197,37 +1064,35 @@ def state_difference(a: _State, b: _State, code: IntArray) -> Array:
 
 
 def _skew(v: Array) -> Array:
-    """(..., 3) -> (..., 3, 3) with _skew(v) @ x = v x x."""
+    """Write the cross product with v (..., 3) as a matrix (..., 3, 3): _skew(v) @ x = v x x."""
     zero = np.zeros_like(v[..., 0])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
     return np.stack(rows, -1).reshape(*v.shape[:-1], 3, 3)
 
 
-class _Residuals(NamedTuple):
-    value: Array  # (B, M) in sigma; 0 where unused
-    jacobian: Array  # (B, M, 9), empty when not asked for
-
-
 def _residuals(
-    state: _State, edges: _Edges, groups: Array, cfg: FitConfig, jacobian: bool
-) -> _Residuals:
-    """Signed edge residuals in sigma: how far the solid sticks out of each tangent plane.
+    state: _State, edges: _Edges, groups: Array, jacobian: bool, smooth: float = SMOOTH
+) -> tuple[Array, Array]:
+    """Measure signed edge residuals: how far the solid sticks out of each tangent plane.
 
     h = sum_k p_k with p_k = a_k^2 m_k^2 / sqrt(sum of its group), m = R' n; then dh/dlog a_k = p_k
     and dh/dm_k = a_k^2 m_k / sqrt(...). Residual = gain (n.c + d + h) / depth(c): the distance in
     the image between the solid's outline and the edge, to second order.
+
+    Returns:
+        value (B, M) in sigma, M = V E, 0 where unused; jacobian (B, M, 9), empty if not asked for.
     """
     n_prob, n_view, n_edge = edges.offset.shape
     flat = n_view * n_edge
     normal = edges.normal.reshape(n_prob, flat, 3)
-    depth = (edges.depth_row[..., :3] @ state.center[:, :, None])[..., 0] + edges.depth_row[..., 3]
-    near = cfg.near_depth * np.exp(state.log_half.max(1))[:, None]  # (B, 1)
+    depth = _depth(state, edges)  # (B, V)
+    near = NEAR_DEPTH * np.exp(state.log_half.max(1))[:, None]  # (B, 1)
     behind = (depth <= near) & edges.used.any(-1)  # (B, V)
     inv_depth = 1.0 / np.where(depth > near, depth, np.inf)  # (B, V), 0 where behind
     half = np.exp(state.log_half)[:, None]  # (B, 1, 3)
     m = normal @ state.rot  # (B, M, 3)
-    square = (m * m + cfg.smooth**2) * (half * half)
+    square = (m * m + smooth**2) * (half * half)
     root = np.sqrt(square @ groups) + 1e-300
     part = square / root  # (B, M, 3)
     gap = (normal @ state.center[:, :, None])[..., 0] + edges.offset.reshape(n_prob, flat)
@@ -1236,9 +1101,9 @@ def _residuals(
     off = edges.one_sided.reshape(n_prob, flat) & (gap > 0)
     scale[off] = 0.0
     value = scale * gap
-    value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = cfg.behind
+    value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = BEHIND
     if not jacobian:
-        return _Residuals(value, np.empty(0))
+        return value, np.empty(0)
     jac = np.empty((n_prob, flat, 9))
     shrink = np.repeat(inv_depth, n_edge, 1) * value * (scale > 0)  # (B, M)
     rows = np.repeat(edges.depth_row[..., :3], n_edge, 1)  # (B, M, 3)
@@ -1248,21 +1113,23 @@ def _residuals(
     jac[..., 6] = v[..., 1] * m[..., 2] - v[..., 2] * m[..., 1]
     jac[..., 7] = v[..., 2] * m[..., 0] - v[..., 0] * m[..., 2]
     jac[..., 8] = v[..., 0] * m[..., 1] - v[..., 1] * m[..., 0]
-    return _Residuals(value, jac)
+    return value, jac
 
 
-def _robust(value: Array, cfg: FitConfig, loss: str) -> tuple[Array, Array]:
-    """Loss rho(r^2) and its weight drho/dr^2 for residuals in sigma.
+def _depth(state: _State, edges: _Edges) -> Array:
+    """Compute the depth (B, V) of the centres in the views."""
+    ahead = edges.depth_row[..., :3] @ state.center[:, :, None]  # (B, V, 1)
+    return np.asarray(ahead[..., 0] + edges.depth_row[..., 3])
 
-    Positive residuals (the solid sticks out of the box) happen whenever something stands in front
-    of the object: they turn robust sooner than negative ones.
-    """
+
+def _robust(value: Array, loss: str) -> tuple[Array, Array]:
+    """Return the loss rho(r^2) of residuals in sigma and its weight drho/dr^2."""
     square = value * value
     if loss == "cauchy":
-        c2 = np.where(value > 0, cfg.cauchy_hidden, cfg.cauchy) ** 2
+        c2 = np.where(value > 0, CAUCHY_HIDDEN, CAUCHY) ** 2
         return c2 * np.log1p(square / c2), 1.0 / (1.0 + square / c2)
     size = np.abs(value)
-    k = np.where(value > 0, cfg.huber_hidden, cfg.huber)
+    k = np.where(value > 0, HUBER_HIDDEN, HUBER)
     outer = size > k
     rho = np.where(outer, 2.0 * k * size - k**2, square)
     return rho, np.where(outer, k / np.maximum(size, k), 1.0)
@@ -1275,15 +1142,15 @@ class _Normal(NamedTuple):
 
 
 def _normal_equations(
-    state: _State, edges: _Edges, prob: _Problem, cfg: FitConfig, loss: str
+    state: _State, edges: _Edges, prob: _Problem, loss: str, smooth: float = SMOOTH
 ) -> _Normal:
-    """Cost, gradient and Gauss-Newton Hessian: edges + size prior + upright prior."""
-    res = _residuals(state, edges, prob.groups, cfg, jacobian=True)
-    rho, weight = _robust(res.value, cfg, loss)
-    weighted = (res.jacobian * weight[..., None]).transpose(0, 2, 1)  # (B, 9, M)
-    hessian = weighted @ res.jacobian  # (B, 9, 9)
-    gradient = (weighted @ res.value[..., None])[..., 0]  # (B, 9)
-    size_cost, pull, info = _size_prior(state, prob, cfg)
+    """Sum up cost, gradient and Gauss-Newton Hessian of edges, size prior and upright prior."""
+    value, jacobian = _residuals(state, edges, prob.groups, True, smooth)
+    rho, weight = _robust(value, loss)
+    weighted = (jacobian * weight[..., None]).transpose(0, 2, 1)  # (B, 9, M)
+    hessian = weighted @ jacobian  # (B, 9, 9)
+    gradient = (weighted @ value[..., None])[..., 0]  # (B, 9)
+    size_cost, pull, info = _size_prior(state, prob)
     hessian[:, 3:6, 3:6] += info
     gradient[:, 3:6] += pull
     up = (prob.up[:, None] @ state.rot)[:, 0]  # (B, 3) in object axes
@@ -1295,37 +1162,35 @@ def _normal_equations(
     return _Normal(cost, hessian, gradient)
 
 
-def _size_prior(state: _State, prob: _Problem, cfg: FitConfig) -> tuple[Array, Array, Array]:
-    """Cost (B,), half gradient (B, 3) and information (B, 3, 3) of the log-normal size prior.
+def _size_prior(state: _State, prob: _Problem) -> tuple[Array, Array, Array]:
+    """Return cost (B,), half gradient (B, 3), information (B, 3, 3) of the log-normal size prior.
 
-    Quadratic in log size; quartic for growth beyond `size_wall` sigma: edges that may be hidden or
-    lie on the image border leave solids free to grow, and no chair is 100 m long. Shrinking stays
+    Quadratic in log size; quartic for growth beyond SIZE_WALL: edges that may be hidden or lie on
+    the image border leave solids free to grow, and no chair is 100 m long. Shrinking stays
     quadratic: of a hidden object the boxes show a part.
     """
     error = state.log_half - prob.size_mean  # (B, 3)
     pull = (prob.size_info @ error[..., None])[..., 0]
     own = (error > 0) / prob.size_var  # (B, 3)
-    wall = cfg.size_wall**2
+    wall = SIZE_WALL**2
     over = np.maximum((own * error**2).sum(1) - wall, 0.0)  # (B,) sigma^2
-    steep = (2.0 * cfg.size_wall_rise / wall * over)[:, None]  # (B, 1)
-    cost = (error * pull).sum(1) + cfg.size_wall_rise / wall * over**2
+    steep = (2.0 * SIZE_WALL_RISE / wall * over)[:, None]  # (B, 1)
+    cost = (error * pull).sum(1) + SIZE_WALL_RISE / wall * over**2
     extra = (steep * own)[:, None] * np.eye(3)  # (B, 3, 3)
     return cost, pull + steep * own * error, prob.size_info + extra
 
 
-def _solve_step(normal: _Normal, damping: Array) -> Array:
-    """Damped step (B, 9), scaled by the Hessian's diagonal (Marquardt)."""
+def _step(normal: _Normal, damping: Array, reach: Array) -> Array:
+    """Solve for the damped step (B, 9), scaled by the Hessian's diagonal (Marquardt), and limit it.
+
+    At most a third of the distance `reach` (B,), a factor 4 in size, 0.7 rad in rotation.
+    """
     diag = np.einsum("bii->bi", normal.hessian)  # (B, 9)
     scale = 1.0 / np.sqrt(np.maximum(diag, 1e-12 * (1e-300 + diag.max(1, keepdims=True))))
     scale[:, 6:] = np.minimum(scale[:, 6:], 30.0)
     system = normal.hessian * scale[:, :, None] * scale[:, None, :]
     system[:, np.arange(9), np.arange(9)] += damping[:, None] + 1e-10
-    step = _solve(system, -scale * normal.gradient)
-    return np.asarray(scale * step)
-
-
-def _limit_step(step: Array, state: _State, reach: Array) -> Array:
-    """Shorten steps: a third of the distance, a factor 4 in size, 0.7 rad in rotation."""
+    step = np.asarray(scale * _solve(system, -scale * normal.gradient))
     bound = np.stack([reach / 3.0, np.full(len(reach), 1.4), np.full(len(reach), 0.7)], 1)
     length = np.linalg.norm(step.reshape(-1, 3, 3), axis=2)  # (B, 3)
     factor = np.min(bound / np.maximum(length, 1e-300), axis=1)
@@ -1333,54 +1198,57 @@ def _limit_step(step: Array, state: _State, reach: Array) -> Array:
 
 
 def _minimise(
-    state: _State, edges: _Edges, prob: _Problem, cfg: FitConfig, loss: str, iterations: int
+    state: _State, edges: _Edges, prob: _Problem, loss: str, iterations: int
 ) -> tuple[_State, Array, Array]:
-    """Levenberg-Marquardt for B problems side by side; converged ones leave the batch.
+    """Run Levenberg-Marquardt on B problems side by side; converged ones leave the batch.
 
     Returns the states, their costs (B,) and their Hessians (B, 9, 9).
     """
-    normal = _normal_equations(state, edges, prob, cfg, loss)
-    state, final = (state.take(np.arange(len(normal.cost))) for _ in range(2))  # copies
+    normal = _normal_equations(state, edges, prob, loss)
+    state, final = (state[np.arange(len(normal.cost))] for _ in range(2))  # copies
     cost, hessian = normal.cost.copy(), normal.hessian.copy()
     alive = np.arange(len(cost))  # (A,) problems still moving
     damping, quiet = np.full(len(cost), 1e-3), np.zeros(len(cost), np.int64)
-    reach = _reach(state, edges)
+    seen = edges.used.any(-1)  # (B, V)
+    reach = np.sum(np.abs(_depth(state, edges)) * seen, 1) / np.maximum(seen.sum(1), 1) + 1e-12
     for _ in range(iterations):
-        step = _limit_step(_solve_step(normal, damping), state, reach)
-        trial = state.moved(step)
-        new = _normal_equations(trial, edges, prob, cfg, loss)
+        trial = state.moved(_step(normal, damping, reach))
+        new = _normal_equations(trial, edges, prob, loss)
         gain = normal.cost - new.cost
         better = gain > 0
         quiet = np.where(better & (gain < 1e-5 * (1.0 + new.cost)), quiet + 1, 0)
         damping = np.clip(np.where(better, 0.2 * damping, 5.0 * damping), 1e-9, 1e9)
-        state.put(better, trial.take(better))
+        state.put(better, trial[better])
         for old, fresh in zip(normal, new, strict=True):
             old[better] = fresh[better]
         done = (quiet > 0) | (damping > 1e6)
-        final.put(alive[better], state.take(better))
+        final.put(alive[better], state[better])
         cost[alive[better]], hessian[alive[better]] = new.cost[better], new.hessian[better]
         if done.all():
             break
         if done.mean() > 0.25:  # shrink the batch
             keep = np.flatnonzero(~done)
-            state, edges, prob = state.take(keep), edges.take(keep), prob.take(keep)
+            state, edges, prob = state[keep], edges[keep], prob[keep]
             normal = _Normal(*(x[keep] for x in normal))
             alive, damping, quiet, reach = alive[keep], damping[keep], quiet[keep], reach[keep]
     return final, cost, hessian
 
 
-def _reach(state: _State, edges: _Edges) -> Array:
-    """Median distance (B,) from the cameras to the start: the scale of steps."""
-    depth = (edges.depth_row[..., :3] @ state.center[:, :, None])[..., 0] + edges.depth_row[..., 3]
-    seen = edges.used.any(-1)
-    return np.asarray(np.sum(np.abs(depth) * seen, 1) / np.maximum(seen.sum(1), 1) + 1e-12)
-
-
 # ---- fit_objects: data, priors, starts ------------------------------------------------------
+
+START_OFFSET = 0.5  # box sizes, a ray that misses the centre by more does not support it
+START_CUT_VOTE = 0.3  # vote of a box that touches the border
+START_DEPTH_LOG = 0.3  # log, how well a box's extent tells the depth of a known size
+START_SIZE_LOG = 0.25  # log, how well it tells the size at a known depth
+START_CENTER = 0.1  # box sizes, sigma of a box's centre as the centre's image
+# Size of an unknown category: the spread of the 110 indoor categories of priors.json.
+UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean
+UNKNOWN_SIZE_LOG = 0.9  # log, standard deviation of the common size
+UNKNOWN_ASPECT_LOG = 0.6  # log, standard deviation of each axis about the common size
 
 
 @dataclass(frozen=True, slots=True)
-class _Data:
+class _Data(_Rows):
     """Gathered views of O objects."""
 
     index: IntArray  # (O, V) frame or -1
@@ -1389,12 +1257,13 @@ class _Data:
     cam_center: Array  # (O, V, 3)
     edges: _Edges
 
-    def take_views(self, slot: IntArray) -> _Data:
-        """Keep the views (O, S) named by slot."""
-        row = np.arange(len(slot))[:, None]
-        edges = _Edges(*(getattr(self.edges, f.name)[row, slot] for f in fields(_Edges)))
-        own = {name: getattr(self, name)[row, slot] for name in ("index", "ray", "extent")}
-        return _Data(cam_center=self.cam_center[row, slot], edges=edges, **own)
+    def take_views(self, n: int) -> _Data:
+        """Keep up to n views of each object, evenly spread."""
+        count = (self.index >= 0).sum(1)[:, None]  # (O, 1)
+        size = min(n, self.index.shape[1])
+        even = np.round(np.linspace(0.0, 1.0, size) * (count - 1)).astype(np.int64)
+        slot = np.where(count <= size, np.arange(size), even)  # (O, S)
+        return self[np.arange(len(slot))[:, None], slot]
 
 
 @dataclass(frozen=True, slots=True)
@@ -1408,64 +1277,48 @@ class _Spec:
     round_: BoolArray  # (O,) yaw symmetric
     upright: BoolArray  # (O,)
     up: Array  # (3,) unit or zeros
-    tilt_rad: float
-    round_sigma: float  # log(w / d) of round things
-    wall_sigma: float  # least log spread that the wall against growth assumes
+    tilt_rad: float  # how uncertain `up` is
 
 
 def _gather_data(
     boxes: Array, usable: BoolArray, quality: Array, cams: _Cameras,
-    image_size: tuple[float, float], lines: Array | None, cfg: FitConfig,
+    image_size: tuple[float, float], cfg: FitConfig,
 ) -> _Data:  # fmt: skip
     """Choose each object's views and back-project their edges."""
     index = _select_views(usable, quality, cams, cfg.max_views)  # (O, V)
     seen = (index >= 0)[..., None]
-    objects = np.arange(boxes.shape[1])
-    picked = np.where(seen, _gather(boxes, index, objects), np.nan)  # (O, V, 4)
+    picked = np.where(seen, boxes[index, np.arange(len(index))[:, None]], np.nan)  # (O, V, 4)
     mats = np.where(seen[..., None], cams.matrix[index], np.nan)  # (O, V, 3, 4)
-    extra = (
-        None if lines is None else np.where(seen[..., None], _gather(lines, index, objects), np.nan)
-    )
-    edges = _tangent_planes(picked, mats, image_size, extra, cfg)
-    if cfg.correlation_deg > 0:
-        share = edges.share * _redundancy(cams, index, picked, cfg)[..., None]
-        edges = replace(edges, gain=edges.gain / np.sqrt(share), share=share)
+    edges = _tangent_planes(picked, mats, image_size, cfg)
     ray, extent = _rays(np.where(seen, picked, [0.0, 0.0, 1.0, 1.0]), cams, index)
-    return _Data(index, ray, extent, np.where(seen, cams.center[index], 0.0), edges)
+    center = np.where(seen, cams.center[index], 0.0)  # (O, V, 3)
+    # Errors of a detector, of occlusion and of a solid that only resembles the object repeat in
+    # neighbouring frames; counting each frame as a new measurement would make the result too sure.
+    if cfg.correlation_deg > 0:
+        point = _ray_point(center, ray, seen[..., 0].astype(np.float64))  # (O, 3)
+        angle = np.arccos(np.clip(_cosines(center, point), -1.0, 1.0))  # (O, V, V)
+        near = np.exp(-0.5 * (angle / np.deg2rad(cfg.correlation_deg)) ** 2) * seen[:, None, :, 0]
+        share = np.maximum(near.sum(-1), 1.0)[..., None] * edges.share  # (O, V, E)
+        edges = replace(edges, gain=edges.gain / np.sqrt(share), share=share)
+    return _Data(index, ray, extent, center, edges)
 
 
-def _redundancy(cams: _Cameras, index: IntArray, boxes: Array, cfg: FitConfig) -> Array:
-    """How many views (O, V) share each view's errors: sum of exp(-(angle / correlation)^2 / 2).
-
-    Errors of a detector, of occlusion and of a solid that only resembles the object repeat in
-    neighbouring frames; counting each frame as a new measurement would make the result too sure.
-    """
-    seen = index >= 0
-    ray, _ = _rays(np.where(seen[..., None], boxes, 0.0), cams, index)
-    center = np.where(seen[..., None], cams.center[index], 0.0)
-    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    point = _ray_point(cams, unit, seen.astype(np.float64), index)  # (O, 3)
+def _cosines(center: Array, point: Array) -> Array:
+    """Compute cosines (O, V, V) of the angles at which points (O, 3) see pairs of cameras."""
     view = center - point[:, None]
     view = view / np.maximum(np.linalg.norm(view, axis=-1, keepdims=True), 1e-300)
-    cos = np.clip(view @ view.transpose(0, 2, 1), -1.0, 1.0)  # (O, V, V)
-    near = np.exp(-0.5 * (np.arccos(cos) / np.deg2rad(cfg.correlation_deg)) ** 2)
-    return np.asarray(np.maximum((near * seen[:, None]).sum(-1), 1.0))
+    return np.asarray(view @ view.transpose(0, 2, 1))
 
 
 def _prior_spec(
-    names: Sequence[str | None],
-    priors: Priors | None,
-    codes: IntArray,
-    world: _World,
-    cfg: FitConfig,
+    names: Sequence[str | None], priors: Priors | None, codes: IntArray, world: _World
 ) -> _Spec:
     """Look up size, shape and uprightness of every object, in world units."""
     n = len(names)
     rows = np.full(n, -1) if priors is None else priors.index(names)
     known = rows >= 0
-    mean = np.tile(np.log(cfg.unknown_size_m), (n, 1))  # (O, 3)
-    aspect, common = cfg.unknown_aspect_log**2 * np.eye(3), cfg.unknown_size_log**2
-    cov = np.tile(aspect + common, (n, 1, 1))  # (O, 3, 3)
+    mean = np.tile(np.log(UNKNOWN_SIZE_M), (n, 1))  # (O, 3)
+    cov = np.tile(UNKNOWN_ASPECT_LOG**2 * np.eye(3) + UNKNOWN_SIZE_LOG**2, (n, 1, 1))  # (O, 3, 3)
     natural, round_, upright = np.full(n, -1), np.zeros(n, bool), np.ones(n, bool)
     if priors is not None and known.any():
         pick = rows[known]
@@ -1473,18 +1326,14 @@ def _prior_spec(
         natural[known], round_[known] = priors.support[pick], priors.yaw_symmetric[pick]
         upright[known] = priors.upright[pick]
     cov = cov + world.scale_sigma**2
-    wanted = np.where(codes >= 0, codes, natural)  # (O,)
-    wanted = np.where(codes == BY_EVIDENCE, -1, wanted)
+    wanted = np.where(codes == BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
     allowed = (wanted[:, None] == np.arange(3)) | (wanted < 0)[:, None]
     size_mean = mean - np.log(2.0) - world.log_scale
-    flags = (natural, allowed, round_, upright)
-    return _Spec(
-        size_mean, cov, *flags, world.up, world.tilt_rad, cfg.round_log_ratio, cfg.size_wall_log
-    )
+    return _Spec(size_mean, cov, natural, allowed, round_, upright, world.up, world.tilt_rad)
 
 
 def _shape_shift(log_half: Array, natural: IntArray, code: IntArray) -> Array:
-    """Log factor (B,) from the size of an object's own solid to that of a stand-in ellipsoid.
+    """Compute the log factor (B,) from the size of an object's own solid to a stand-in ellipsoid's.
 
     An ellipsoid tangent to the boxes of a cuboid is larger than the cuboid: equal mean support,
     sum(a) / 2 against sqrt(sum(a^2) / 3) (rms over directions; 1.5 for a cube, 1 for a rod).
@@ -1496,19 +1345,13 @@ def _shape_shift(log_half: Array, natural: IntArray, code: IntArray) -> Array:
     return swapped - np.where((natural == ELLIPSOID) & (code == BOX), shift, 0.0)
 
 
-def _up_frame(up: Array) -> Array:
-    """Right-handed frame (3, 3) with its third column along up (identity when up is zero)."""
-    if not np.any(up):
-        return np.eye(3)
-    side = np.eye(3)[np.argmin(np.abs(up))]
-    x = np.cross(side, up)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(up, x), up], 1)
-
-
 def _start_rotations(up: Array) -> Array:
-    """(3 vertical axes, 4 yaws, 3, 3) rotations: object axis k along up, four yaws each."""
-    frame = _up_frame(up)
+    """List rotations (3 axes, 4 yaws, 3, 3) with object axis k along up (z when it is zero)."""
+    frame = np.eye(3)
+    if np.any(up):
+        x = np.cross(frame[np.argmin(np.abs(up))], up)
+        x /= np.linalg.norm(x)
+        frame = np.stack([x, np.cross(up, x), up], 1)
     yaws = rotations(np.outer(np.arange(4) * (np.pi / 4), [0.0, 0.0, 1.0]))  # (4, 3, 3)
     standing = np.eye(3)[:, [[2, 0, 1], [1, 2, 0], [0, 1, 2]]].transpose(1, 0, 2)  # (3, 3, 3)
     out: Array = frame @ yaws[None] @ standing[:, None]
@@ -1528,7 +1371,7 @@ def _start_table(spec: _Spec) -> tuple[IntArray, IntArray, IntArray, IntArray]:
 
 
 def _pair_points(cam_center: Array, ray: Array) -> Array:
-    """Midpoints (O, S (S - 1) / 2, 3) of the shortest links between all pairs of rays."""
+    """Find the midpoints (O, S (S - 1) / 2, 3) of the shortest links between all pairs of rays."""
     i, j = np.triu_indices(ray.shape[1], 1)
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     a, b = unit[:, i], unit[:, j]
@@ -1537,13 +1380,12 @@ def _pair_points(cam_center: Array, ray: Array) -> Array:
     det = np.maximum(1.0 - cos**2, 1e-12)
     s = ((base * a).sum(-1) - cos * (base * b).sum(-1)) / det
     t = (cos * (base * a).sum(-1) - (base * b).sum(-1)) / det
-    return np.asarray(
-        0.5 * (cam_center[:, i] + s[..., None] * a + cam_center[:, j] + t[..., None] * b)
-    )
+    middle = cam_center[:, i] + s[..., None] * a + cam_center[:, j] + t[..., None] * b
+    return np.asarray(0.5 * middle)
 
 
 def _ray_misfit(data: _Data, points: Array) -> tuple[Array, Array]:
-    """Offset of points (O, C, 3) from box centres in box sizes, squared, and depth: (O, C, V)."""
+    """Measure points (O, C, 3): squared offset from box centres in box sizes, depth; (O, C, V)."""
     rows = data.edges.depth_row
     depth = np.einsum("ocj,ovj->ocv", points, rows[..., :3]) + rows[:, None, :, 3]
     safe = np.where(depth > 0, depth, np.inf)[..., None]
@@ -1553,60 +1395,57 @@ def _ray_misfit(data: _Data, points: Array) -> tuple[Array, Array]:
     return np.where(depth > 0, misfit, np.inf), depth
 
 
-class _Start(NamedTuple):
-    """Where the fits of O objects begin."""
-
-    center: Array  # (O, 3)
-    log_half: Array  # (O, 3)
-    trusted: BoolArray  # (O, S) views that agree on the centre
-
-
-def _start_points(data: _Data, spec: _Spec, cfg: FitConfig) -> _Start:
-    """Robust starts from rays and prior depths.
+def _start_points(data: _Data, spec: _Spec) -> tuple[Array, Array, BoolArray]:
+    """Find robust starts from rays and prior depths.
 
     Candidates are the midpoints of all ray pairs and one point a ray at the depth where the box
     has the prior's mean extent; the candidate with the best consensus is refined by weighted least
     squares over inlier rays, the prior depth entering with its own sigma.
+
+    Returns:
+        centres (O, 3), log half axes (O, 3), and which of the S views agree on the centre (O, S).
     """
     seen = data.edges.used.any(-1).astype(np.float64)  # (O, S)
-    weight = seen * np.where(data.edges.one_sided.any(-1), cfg.start_cut_weight, 1.0)
+    weight = seen * np.where(data.edges.one_sided.any(-1), START_CUT_VOTE, 1.0)
     extent = np.maximum(data.extent.mean(-1), 1e-12)  # (O, S)
     common = spec.size_cov.mean((1, 2))  # (O,) variance of the common log size
-    sigma = np.sqrt(common + cfg.start_depth_log**2)[:, None]  # of log prior depth
+    sigma = np.sqrt(common + START_DEPTH_LOG**2)[:, None]  # of log prior depth
     # mean extent of a box over all directions is sum(a): E|m_k| = 1 / 2, full size 2 a_k
     prior_depth = np.exp(spec.size_mean).sum(1)[:, None] / extent  # (O, S)
     single = data.cam_center + prior_depth[..., None] * data.ray
     points = np.concatenate([_pair_points(data.cam_center, data.ray), single], 1)  # (O, C, 3)
     misfit, depth = _ray_misfit(data, points)  # (O, C, S)
     ratio = np.log(np.maximum(depth, 1e-12) / prior_depth[:, None]) / sigma[:, None]
-    vote = np.minimum(np.nan_to_num(misfit / cfg.start_offset**2, nan=1.0), 1.0)
+    vote = np.minimum(np.nan_to_num(misfit / START_OFFSET**2, nan=1.0), 1.0)
     vote += 0.1 * np.minimum(ratio**2, 4.0)
     best = np.argmin((vote * weight[:, None]).sum(-1), 1)  # (O,)
     row = np.arange(len(best))
-    near = 4.0 * np.nan_to_num(misfit[row, best], posinf=1e6) / cfg.start_offset**2  # (O, S)
+    near = 4.0 * np.nan_to_num(misfit[row, best], posinf=1e6) / START_OFFSET**2  # (O, S)
     agree = weight / (1.0 + near) ** 2
-    center, z = _refine_start(data, single, points[row, best], agree, prior_depth, sigma, cfg)
+    center, z = _refine_start(data, single, points[row, best], agree, prior_depth, sigma)
     seen_size = (agree * z * extent).sum(1) / np.maximum(agree.sum(1), 1e-12)
     growth = np.log(np.maximum(seen_size, 1e-12)) - np.log(np.exp(spec.size_mean).sum(1))
-    share = common / (common + cfg.start_size_log**2)
+    share = common / (common + START_SIZE_LOG**2)
     log_half = spec.size_mean + (share * np.clip(growth, -12.0, 12.0))[:, None]
     trusted = (seen > 0) & (near < 4.0)
     trusted |= (2.0 * trusted.sum(1) < seen.sum(1))[:, None]  # no majority: trust all
-    return _Start(center, log_half, trusted)
+    return center, log_half, trusted
 
 
 def _refine_start(
-    data: _Data, single: Array, center: Array, agree: Array, prior_depth: Array, sigma: Array,
-    cfg: FitConfig,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Weighted least squares of centres (O, 3) over rays and prior depths; also depths (O, S)."""
+    data: _Data, single: Array, center: Array, agree: Array, prior_depth: Array, sigma: Array
+) -> tuple[Array, Array]:
+    """Refine centres (O, 3) by weighted least squares over rays and prior depths.
+
+    Returns centres (O, 3) and their depths (O, S).
+    """
     unit = data.ray / np.linalg.norm(data.ray, axis=-1, keepdims=True)
     along = unit[..., :, None] * unit[..., None, :]  # (O, S, 3, 3)
     extent = np.maximum(data.extent.mean(-1), 1e-12)
     z = np.abs(_ray_misfit(data, center[:, None])[1][:, 0]) + 1e-9  # (O, S)
     count = np.maximum((agree > 0).sum(1), 1)[:, None]
     for _ in range(2):
-        across = agree / (z * cfg.start_center_rel * extent) ** 2
+        across = agree / (z * START_CENTER * extent) ** 2
         depth = agree / (prior_depth * sigma) ** 2 / count  # one common error: counts once
         info = across[..., None, None] * (np.eye(3) - along) + depth[..., None, None] * along
         target = (info @ (single - center[:, None])[..., None]).sum(1)[..., 0]  # (O, 3)
@@ -1622,9 +1461,25 @@ def _refine_start(
 
 # ---- fit_objects: starts, inliers, evidence -------------------------------------------------
 
+CHUNK = 384  # problems solved side by side: they fit the second-level cache of a core
+ROUND_LOG = 0.05  # log, spread of width / depth of yaw-symmetric categories
+SIZE_WALL_LOG = 0.25  # log, least spread that SIZE_WALL counts in: a category may be wrong
+NOISE_PRIOR_DOF = 12.0  # weight, in residuals, of the nominal noise against the residuals seen
+# A start that ends elsewhere is fitted fully too, if ...
+RIVAL_RAD = 0.2  # rad, ... it is turned from the best one by more than this
+RIVAL_COST = 20.0  # ... and costs more by less than this (2 log likelihood ratio)
+OBJECT_NOISE_DOF = 20.0  # weight of the pooled noise level in one object's own level
+NOISE_RANGE = (0.05, 20.0)  # limits of the noise factor
+VIEW_OUTLIER = 6.0  # mean squared residual of a view (chi2 .9999, 4 dof, is 23.5 / 4)
+EDGE_OUTLIER = 5.0  # sigma, a single edge farther off is dropped (occlusion)
+HIDDEN_CAP = 7.4  # most that a hidden edge costs: -2 log(.2 hidden / 20 sigma / .4)
+OUTLIER_CAP = 12.0  # most that any other edge costs, for .02 wrong
+# (9, 9) information that keeps unobservable rotations finite; .9 rad: a uniform angle in +-90 deg
+ROTATION_CAP: Array = np.diag([0.0] * 6 + [0.9**-2] * 3)
+
 
 @dataclass(slots=True)
-class _Fit:
+class _Fit(_Rows):
     """Fits of B problems (later: the best one of each object)."""
 
     obj: IntArray  # (B,)
@@ -1638,157 +1493,113 @@ class _Fit:
     views: BoolArray  # (B, V) inlier views
     spread: Array  # (B, 9, 9) second moment of rival solutions
 
-    def take(self, index: IntArray) -> _Fit:
-        parts = {f.name: getattr(self, f.name) for f in fields(self)}
-        picked = {k: v.take(index) if k == "state" else v[index] for k, v in parts.items()}
-        return _Fit(**picked)
-
 
 def _problems(spec: _Spec, obj: IntArray, code: IntArray, axis: IntArray) -> _Problem:
+    """Gather the fixed terms of fits of `obj` with support `code`, vertical axis `axis` (B,)."""
     mean = spec.size_mean[obj]
     shift = _shape_shift(mean, spec.natural[obj], code)
     tilt = np.full((len(obj), 3), 1.0 / spec.tilt_rad**2) * bool(np.any(spec.up))
     tilt[np.arange(len(obj)), axis] = 0.0
     up = np.broadcast_to(spec.up, (len(obj), 3))
     round_ = spec.round_[obj] | ((code == CYLINDER) & (spec.natural[obj] != CYLINDER))
-    tie = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]) / spec.round_sigma**2
+    tie = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]) / ROUND_LOG**2
     info = np.linalg.inv(spec.size_cov)[obj] + round_[:, None, None] * tie
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
-    var = np.maximum(np.einsum("oii->oi", spec.size_cov), spec.wall_sigma**2)[obj]
+    var = np.maximum(np.einsum("oii->oi", spec.size_cov), SIZE_WALL_LOG**2)[obj]
     return _Problem(AXIS_GROUPS[code], mean + shift[:, None], info, var, up, tilt)
 
 
-def _chunks(n: int, size: int) -> Iterator[IntArray]:
-    for lo in range(0, n, size):
-        yield np.arange(lo, min(lo + size, n))
-
-
 def _minimise_all(
-    state: _State,
-    edges: _Edges,
-    obj: IntArray,
-    prob: _Problem,
-    cfg: FitConfig,
-    loss: str,
-    iterations: int,
+    state: _State, edges_of: Callable[[IntArray], _Edges], prob: _Problem, loss: str, steps: int
 ) -> tuple[_State, Array, Array]:
-    """`_minimise` in chunks of problems; edges are per object and gathered by obj."""
-    out, cost, hessian = (
-        state.take(np.arange(len(obj))),
-        np.zeros(len(obj)),
-        np.zeros((len(obj), 9, 9)),
-    )
-    for part in _chunks(len(obj), cfg.chunk):
-        done = _minimise(
-            state.take(part), edges.take(obj[part]), prob.take(part), cfg, loss, iterations
-        )
+    """Run `_minimise` in chunks of problems; `edges_of` gathers the edges of some of them."""
+    n = len(state.center)
+    out, cost, hessian = state[np.arange(n)], np.zeros(n), np.zeros((n, 9, 9))
+    for part in _chunks(n, CHUNK):
+        done = _minimise(state[part], edges_of(part), prob[part], loss, steps)
         out.put(part, done[0])
         cost[part], hessian[part] = done[1], done[2]
     return out, cost, hessian
 
 
-def _spread_slots(data: _Data, n: int) -> IntArray:
-    """Slots (O, S) of up to n views spread over each object's gathered views."""
-    count = (data.index >= 0).sum(1)[:, None]  # (O, 1)
-    size = min(n, data.index.shape[1])
-    spread = np.round(np.linspace(0.0, 1.0, size) * (count - 1)).astype(np.int64)
-    return np.where(count <= size, np.arange(size), spread)
-
-
 def _best_starts(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     """Try all starts on few views; keep the best of each object and support."""
-    few = data.take_views(_spread_slots(data, cfg.start_views))
+    few = data.take_views(cfg.start_views)
     obj, code, axis, yaw = _start_table(spec)
-    begin = _start_points(few, spec, cfg)
-    few_edges = replace(few.edges, used=few.edges.used & begin.trusted[..., None])
-    few_edges = replace(few_edges, gain=few_edges.gain * few_edges.used)
+    center, log_half, trusted = _start_points(few, spec)
+    used = few.edges.used & trusted[..., None]
+    edges = replace(few.edges, used=used, gain=few.edges.gain * used)
     prob = _problems(spec, obj, code, axis)
-    shift = _shape_shift(begin.log_half[obj], spec.natural[obj], code)
+    shift = _shape_shift(log_half[obj], spec.natural[obj], code)
     rot = _start_rotations(spec.up)[axis, yaw]
-    start = _State(begin.center[obj], begin.log_half[obj] + shift[:, None], rot)
+    start = _State(center[obj], log_half[obj] + shift[:, None], rot)
     state, cost, hessian = _minimise_all(
-        start, few_edges, obj, prob, cfg, "cauchy", cfg.start_iterations
+        start, lambda part: edges[obj[part]], prob, "cauchy", cfg.start_iterations
     )
     # noise level integrated out (Student t): a poor fit must not buy an absurd size
-    pull, n = _size_prior(state, prob, cfg)[0], _count(few_edges.used[obj], few, obj)
-    dof = cfg.noise_prior_dof
-    cost = (dof + n) * np.log1p(np.maximum(cost - pull, 0.0) / dof) + pull
+    pull, n = _size_prior(state, prob)[0], _count(used[obj], few, obj)
+    misfit = np.log1p(np.maximum(cost - pull, 0.0) / NOISE_PRIOR_DOF)
+    cost = (NOISE_PRIOR_DOF + n) * misfit + pull
     order = np.lexsort((cost, code, obj))  # groups of one object and support, best first
     first = _group_starts(obj[order], code[order])
     best = order[first][np.cumsum(first) - 1]  # (B,) best of its group, in sorted order
-    delta = state_difference(state.take(order), state.take(best), code[order])
+    delta = _state_difference(state[order], state[best], code[order])
     rise = cost[order] - cost[best]
-    spread = _mode_spread(delta, rise, np.flatnonzero(first))
-    rival = _rivals(delta, rise, first, cfg)
-    keep, group = order[first | rival], (np.cumsum(first) - 1)[first | rival]
+    # Each start's solution counts with its likelihood ratio: modes that the data cannot tell apart
+    # (yaw of a box in few views) widen the covariance by their second moment about the best.
+    weight = np.exp(-0.5 * np.clip(rise, 0.0, 100.0))
+    other = np.where((weight < 1e-3)[:, None], 0.0, delta)
+    moment = weight[:, None, None] * other[:, :, None] * other[:, None]  # (B, 9, 9)
+    total, mass = (np.add.reduceat(x, np.flatnonzero(first)) for x in (moment, weight))
+    # the best solution of each group that differs from the winner and may yet beat it
+    candidate = (np.linalg.norm(delta[:, 6:], axis=1) > RIVAL_RAD) & (rise < RIVAL_COST)
+    group, count = np.cumsum(first) - 1, np.cumsum(candidate)
+    before = (count - candidate)[first]  # candidates before each group
+    chosen = first | (candidate & (count - before[group] == 1))
+    keep, group = order[chosen], group[chosen]
     good: BoolArray = data.edges.used[obj[keep]]
     zero, one = np.zeros(len(keep)), np.ones(len(keep))
     return _Fit(
-        obj[keep], code[keep], axis[keep], state.take(keep), hessian[keep], good, one, zero,
-        np.asarray(good.any(-1)), spread[group],
+        obj[keep], code[keep], axis[keep], state[keep], hessian[keep], good, one, zero,
+        np.asarray(good.any(-1)), total[group] / mass[group, None, None],
     )  # fmt: skip
 
 
 def _group_starts(*keys: IntArray) -> BoolArray:
-    """True where a sorted list of key tuples starts a new group."""
+    """Mark where a sorted list of key tuples starts a new group."""
     first = np.ones(len(keys[0]), bool)
     first[1:] = np.any([np.diff(key) != 0 for key in keys], axis=0)
     return first
 
 
-def _mode_spread(delta: Array, rise: Array, start: IntArray) -> Array:
-    """Second moment (G, 9, 9) of the other starts' solutions around the best of their group.
-
-    Each counts with its likelihood ratio exp(-rise / 2): several modes that the data cannot tell
-    apart (yaw of a box in few views) widen the covariance.
-    """
-    weight = np.exp(-0.5 * np.clip(rise, 0.0, 100.0))
-    delta = np.where((weight < 1e-3)[:, None], 0.0, delta)
-    moment = weight[:, None, None] * delta[:, :, None] * delta[:, None]
-    return np.add.reduceat(moment, start) / np.add.reduceat(weight, start)[:, None, None]
-
-
-def _rivals(delta: Array, rise: Array, first: BoolArray, cfg: FitConfig) -> BoolArray:
-    """Mark the best solution of each group that differs from the winner and may yet beat it."""
-    far = np.linalg.norm(delta[:, 6:], axis=1) > cfg.rival_rad
-    candidate = far & (rise < cfg.rival_cost)
-    count = np.cumsum(candidate)
-    before = (count - candidate)[first]  # candidates before each group
-    return np.asarray(candidate & (count - before[np.cumsum(first) - 1] == 1))
-
-
-def _with_edges(edges: _Edges, obj: IntArray, good: BoolArray, noise: Array) -> _Edges:
-    """Edges of each problem with outliers switched off and the noise level applied."""
-    gain = edges.gain[obj] * good / noise[:, None, None]
-    return replace(edges.take(obj), gain=gain, used=good)
+def _with_edges(fit: _Fit, data: _Data, part: IntArray) -> _Edges:
+    """Gather edges of some of the problems, outliers switched off and the noise level applied."""
+    good = fit.good[part]
+    edges = data.edges[fit.obj[part]]
+    return replace(edges, gain=edges.gain * good / fit.noise[part, None, None], used=good)
 
 
 def _refit(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig, loss: str) -> None:
     """Minimise over all views with the fit's inlier edges and noise level, in place."""
     prob = _problems(spec, fit.obj, fit.code, fit.axis)
-    for part in _chunks(len(fit.obj), cfg.chunk):
-        edges = _with_edges(data.edges, fit.obj[part], fit.good[part], fit.noise[part])
-        state, _, hessian = _minimise(
-            fit.state.take(part), edges, prob.take(part), cfg, loss, cfg.iterations
-        )
-        fit.state.put(part, state)
-        fit.hessian[part] = hessian
+    fit.state, _, fit.hessian = _minimise_all(
+        fit.state, lambda part: _with_edges(fit, data, part), prob, loss, cfg.iterations
+    )
 
 
-def _all_residuals(fit: _Fit, data: _Data, cfg: FitConfig) -> Array:
-    """Residuals (B, V, E) in nominal sigma of every edge, outlier or not."""
+def _all_residuals(fit: _Fit, data: _Data) -> Array:
+    """Compute residuals (B, V, E) in nominal sigma of every edge, outlier or not."""
     out = np.zeros(fit.good.shape)
-    for part in _chunks(len(fit.obj), cfg.chunk):
-        edges = data.edges.take(fit.obj[part])
-        groups = AXIS_GROUPS[fit.code[part]]
-        value = _residuals(fit.state.take(part), edges, groups, cfg, jacobian=False).value
+    for part in _chunks(len(fit.obj), CHUNK):
+        edges = data.edges[fit.obj[part]]
+        value, _ = _residuals(fit.state[part], edges, AXIS_GROUPS[fit.code[part]], jacobian=False)
         out[part] = value.reshape(out[part].shape) * np.sqrt(edges.share)
     return out
 
 
 def _free_dof(fit: _Fit, spec: _Spec, data: _Data) -> Array:
-    """Residuals minus the parameters that the data determine (B,): trace of the hat matrix."""
+    """Count residuals minus parameters that the data determine (B,): trace of the hat matrix."""
     prior_info = np.zeros((len(fit.obj), 9, 9))
     prior_info[:, 3:6, 3:6] = np.linalg.inv(spec.size_cov)[fit.obj]
     cov = _safe_inverse(fit.hessian)
@@ -1798,16 +1609,22 @@ def _free_dof(fit: _Fit, spec: _Spec, data: _Data) -> Array:
 
 
 def _count(used: BoolArray, data: _Data, obj: IntArray) -> Array:
-    """Number (B,) of independent residuals among the edges (B, V, E) in use."""
+    """Count the independent residuals (B,) among the edges (B, V, E) in use."""
     return np.asarray((used / data.edges.share[obj]).sum((1, 2)))
 
 
-def _update_noise(
-    fit: _Fit, value: Array, spec: _Spec, data: _Data, cfg: FitConfig, robust: bool
-) -> None:
+def _least(values: Array, obj: IntArray) -> Array:
+    """Find the lowest of the values (B,) of all fits to the same object, for each fit."""
+    best = np.full(int(obj.max()) + 1, np.inf)
+    np.minimum.at(best, obj, values)
+    return np.asarray(best[obj])
+
+
+def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: bool) -> None:
     """Estimate the noise factor: pooled over all objects, then each object's own, shrunk.
 
-    Inverse-gamma posterior: nominal level with `noise_prior_dof`, pooled with `object_noise_dof`.
+    Inverse-gamma posteriors: the nominal level with NOISE_PRIOR_DOF, the pooled one with
+    OBJECT_NOISE_DOF. Robust: from the median residual instead of the mean square.
     """
     n = np.maximum(_count(fit.good, data, fit.obj), 1.0)
     dof = _free_dof(fit, spec, data)
@@ -1816,151 +1633,138 @@ def _update_noise(
         size[~fit.good.any((1, 2))] = 0.0
         square = (np.nanmedian(size, 1) / 0.6745) ** 2 * n
     else:
-        capped = np.minimum(value**2, (cfg.huber * fit.noise[:, None, None]) ** 2)
+        capped = np.minimum(value**2, (HUBER * fit.noise[:, None, None]) ** 2)
         square = (capped * fit.good / data.edges.share[fit.obj]).sum((1, 2))
-    best = np.full(int(fit.obj.max()) + 1, np.inf)
-    np.minimum.at(best, fit.obj, square / dof)  # of the supports tried, the one that fits
-    mine = square / dof <= best[fit.obj]
     level = square / dof
-    typical = np.median(level[mine])
-    mine &= level < 25 * typical
-    pooled = cfg.noise_prior_dof + square[mine].sum()
-    pooled /= cfg.noise_prior_dof + dof[mine].sum()
-    own = (cfg.object_noise_dof * pooled + square) / (cfg.object_noise_dof + dof)
-    fit.noise = np.clip(np.sqrt(own), *cfg.noise_range)
+    mine = level <= _least(level, fit.obj)  # of the supports tried, the one that fits
+    mine &= level < 25 * np.median(level[mine])
+    pooled = NOISE_PRIOR_DOF + square[mine].sum()
+    pooled /= NOISE_PRIOR_DOF + dof[mine].sum()
+    own = (OBJECT_NOISE_DOF * pooled + square) / (OBJECT_NOISE_DOF + dof)
+    fit.noise = np.clip(np.sqrt(own), *NOISE_RANGE)
 
 
-def _mark_inliers(fit: _Fit, value: Array, data: _Data, cfg: FitConfig) -> None:
-    """Flag views and edges that the solid explains, in place."""
-    used = data.edges.used[fit.obj]
-    standard = value / fit.noise[:, None, None]  # (B, V, E)
-    fit.views = _inlier_views(standard, used, cfg)
-    fit.good = used & (np.abs(standard) <= cfg.edge_outlier) & fit.views[..., None]
-
-
-def _inlier_views(standard: Array, used: BoolArray, cfg: FitConfig) -> BoolArray:
-    """Inlier test (...) of views from their residuals (..., E) in sigma.
+def _inlier_views(standard: Array, used: BoolArray) -> BoolArray:
+    """Tell the views (...) that the solid explains from their residuals (..., E) in sigma.
 
     A view agrees when its mean square is small, when three quarters of its edges are close, or when
     half are close and the others only say that part of the object is hidden.
     """
     count = np.maximum((used & (standard != 0.0)).sum(-1), 1)
     mean = (np.minimum(standard**2, 1e6) * used).sum(-1) / count
-    close = used & (np.abs(standard) <= cfg.edge_outlier)
+    close = used & (np.abs(standard) <= EDGE_OUTLIER)
     share = close.sum(-1) / np.maximum(used.sum(-1), 1)
-    hidden_only = ~(used & (standard < -cfg.edge_outlier)).any(-1)
-    agrees = (mean <= cfg.view_outlier) | (share >= 0.75) | ((share >= 0.5) & hidden_only)
+    hidden_only = ~(used & (standard < -EDGE_OUTLIER)).any(-1)
+    agrees = (mean <= VIEW_OUTLIER) | (share >= 0.75) | ((share >= 0.5) & hidden_only)
     return np.asarray(used.any(-1) & agrees)
 
 
-def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data, cfg: FitConfig) -> Array:
-    """Laplace evidence (B,) of each support, noise level integrated out (Student t).
+def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data) -> Array:
+    """Compute the Laplace evidence (B,) of each support, noise integrated out (Student t).
 
     -2 log p = (v + n) log(1 + S / v) + size prior + log det(H), S the truncated squares.
     """
     used = data.edges.used[fit.obj]
     prob = _problems(spec, fit.obj, fit.code, fit.axis)
-    pull = _size_prior(fit.state, prob, cfg)[0]
-    noise = np.full(int(fit.obj.max()) + 1, np.inf)
-    np.minimum.at(noise, fit.obj, fit.noise)  # the level that the best support reaches
-    square = (value / noise[fit.obj, None, None]) ** 2
-    cap = np.where(value > 0, cfg.hidden_cap, cfg.outlier_cap)
+    pull = _size_prior(fit.state, prob)[0]
+    noise = _least(fit.noise, fit.obj)  # the level that the best support reaches
+    square = (value / noise[:, None, None]) ** 2
+    cap = np.where(value > 0, HIDDEN_CAP, OUTLIER_CAP)
     total = (np.minimum(square, cap) * used / data.edges.share[fit.obj]).sum((1, 2))
-    dof, n = cfg.noise_prior_dof, _count(used, data, fit.obj)
-    hessian = fit.hessian + _rotation_cap(cfg)
-    misfit = (dof + n) * np.log1p(total / dof) + pull
-    return np.asarray(-0.5 * (misfit + np.linalg.slogdet(hessian)[1]))
-
-
-def _rotation_cap(cfg: FitConfig) -> Array:
-    """Information (9, 9) that keeps unobservable rotations finite: a uniform angle's variance."""
-    return np.diag([0.0] * 6 + [cfg.yaw_sigma_rad**-2] * 3)
+    misfit = (NOISE_PRIOR_DOF + _count(used, data, fit.obj)) * np.log1p(total / NOISE_PRIOR_DOF)
+    determinant = np.linalg.slogdet(fit.hessian + ROTATION_CAP)[1]
+    return np.asarray(-0.5 * (misfit + pull + determinant))
 
 
 def _safe_inverse(hessian: Array) -> Array:
-    """Inverse (B, 9, 9) of information matrices by scaled eigenvalues; tiny ones are floored."""
-    diag = np.maximum(np.einsum("bii->bi", hessian), 1e-30)
-    scale = 1.0 / np.sqrt(diag)
+    """Invert information matrices (B, 9, 9) by scaled eigenvalues; tiny ones are floored."""
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", hessian), 1e-30))  # (B, 9)
     value, vector = _eigh(hessian * scale[:, :, None] * scale[:, None, :])
     inverse = (vector / np.maximum(value, 1e-10)[:, None]) @ vector.transpose(0, 2, 1)
     return np.asarray(inverse * scale[:, :, None] * scale[:, None, :])
 
 
-def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig) -> Array:
-    """Covariance (B, 9, 9) of a posterior that is bent, to second order around its mode.
+PROBE = 1.5  # sigma, where the cost is probed
+BEND_WEIGHT = 4.0  # of q q'; its second moment is .75, the 95 % tail of nine needs more
+MAX_BEND = 30.0  # sigma, limit of the bend of a principal axis
+MAX_WIDENING = 4.0  # limit of the stretching, as a factor on sigma
+SMOOTH_COV = 0.05  # rounds the kink of |m| as SMOOTH does, by as much as m varies near a kink
+
+
+def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
+    """Compute the covariance (B, 9, 9) of a bent posterior, to second order around its mode.
 
     Along each principal axis v of the Laplace covariance the mode is displaced by +-k sigma and the
     other eight directions are re-minimised (one Gauss-Newton step): the path s v + s^2 q / 2. With
-    s ~ N(0, 1) its second moment is v v' + 3/4 q q' (`bend_weight` is more, for the tail); where
+    s ~ N(0, 1) its second moment is v v' + 3/4 q q' (BEND_WEIGHT is more, for the tail); where
     the cost along the path grows slower than s^2 (kinks of box and cylinder), v is stretched.
     Ref: second-order delta method.
     """
     prob = _problems(spec, fit.obj, fit.code, fit.axis)
-    soft = replace(cfg, smooth=cfg.smooth_cov)
-    info = np.empty_like(fit.hessian)
-    for part in _chunks(len(info), cfg.chunk):
-        edges = _with_edges(data.edges, fit.obj[part], fit.good[part], fit.noise[part])
-        own = (fit.state.take(part), edges, prob.take(part))
-        info[part] = _normal_equations(*own, soft, "huber").hessian
-    info += _rotation_cap(cfg)
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", info), 1e-30))  # (B, 9)
-    value, vector = _eigh(info * scale[:, :, None] * scale[:, None, :])
-    axes = scale[:, :, None] * vector / np.sqrt(np.maximum(value, 1e-10))[:, None]  # (B, 9, 9)
-    prob = _problems(spec, fit.obj, fit.code, fit.axis)
-    out = np.empty_like(axes)
-    for part in _chunks(len(axes), cfg.chunk):
-        edges = _with_edges(data.edges, fit.obj[part], fit.good[part], fit.noise[part])
-        own = (fit.state.take(part), edges, prob.take(part))
-        out[part] = _second_moment(*own, axes[part], cfg)
-    return np.asarray(out)
+    out = np.empty_like(fit.hessian)
+    for part in _chunks(len(out), CHUNK):
+        own = (fit.state[part], _with_edges(fit, data, part), prob[part])
+        info = _normal_equations(*own, "huber", SMOOTH_COV).hessian + ROTATION_CAP
+        scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", info), 1e-30))  # (B, 9)
+        value, vector = _eigh(info * scale[:, :, None] * scale[:, None, :])
+        axes = scale[:, :, None] * vector / np.sqrt(np.maximum(value, 1e-10))[:, None]  # (B, 9, 9)
+        out[part] = _second_moment(*own, axes)
+    return out
 
 
-def _second_moment(
-    state: _State, edges: _Edges, prob: _Problem, axes: Array, cfg: FitConfig
-) -> Array:
-    """Sum over axes (B, 9, 9 as columns) of stretched v v' + 3/4 q q'."""
-    base = _normal_equations(state, edges, prob, cfg, "huber").cost
+def _second_moment(state: _State, edges: _Edges, prob: _Problem, axes: Array) -> Array:
+    """Sum up stretched v v' + BEND_WEIGHT q q' over the principal axes v (B, 9, 9 as columns)."""
+    base = _normal_equations(state, edges, prob, "huber").cost
     total = np.zeros_like(axes)
-    k = cfg.probe
     for i in range(9):  # over principal axes
         bend, widen = np.zeros((len(axes), 9)), np.ones(len(axes))
-        for side in (-k, k):
+        for side in (-PROBE, PROBE):
             moved = state.moved(side * axes[:, :, i])
-            normal = _normal_equations(moved, edges, prob, cfg, "huber")
+            normal = _normal_equations(moved, edges, prob, "huber")
             hess = axes.transpose(0, 2, 1) @ normal.hessian @ axes + 1e-3 * np.eye(9)  # whitened
             grad = (axes.transpose(0, 2, 1) @ normal.gradient[..., None])[..., 0]
             hess[:, i], hess[:, :, i], hess[:, i, i], grad[:, i] = 0.0, 0.0, 1.0, 0.0
-            step = -_solve(hess, grad)  # (B, 9) whitened
-            step = np.clip(step, -cfg.max_bend, cfg.max_bend)
-            rise = (
-                normal.cost
-                + 2.0 * (grad * step).sum(1)
-                + np.einsum("bi,bij,bj->b", step, hess, step)
-                - base
-            )
-            widen = np.maximum(widen, k**2 / np.maximum(rise, k**2 / cfg.max_widening**2))
-            bend += (axes @ step[..., None])[..., 0] / k**2
+            step = np.clip(-_solve(hess, grad), -MAX_BEND, MAX_BEND)  # (B, 9) whitened
+            rise = normal.cost + 2.0 * (grad * step).sum(1)
+            rise = rise + np.einsum("bi,bij,bj->b", step, hess, step) - base
+            floor = PROBE**2 / MAX_WIDENING**2
+            widen = np.maximum(widen, PROBE**2 / np.maximum(rise, floor))
+            bend += (axes @ step[..., None])[..., 0] / PROBE**2
         v = axes[:, :, i] * np.sqrt(widen)[:, None]
-        total += v[:, :, None] * v[:, None] + cfg.bend_weight * bend[:, :, None] * bend[:, None]
+        total += v[:, :, None] * v[:, None] + BEND_WEIGHT * bend[:, :, None] * bend[:, None]
     return total
 
 
 def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
-    """Best fit of every object: starts, robust fit, noise, inliers, final fit, support."""
+    """Fit every object: starts, robust fit, noise, inliers, final fit, support."""
     fit = _best_starts(data, spec, cfg)
     _refit(fit, data, spec, cfg, "cauchy")
     for robust in (True, False):
-        value = _all_residuals(fit, data, cfg)
-        _update_noise(fit, value, spec, data, cfg, robust)
-        _mark_inliers(fit, value, data, cfg)
+        value = _all_residuals(fit, data)
+        _update_noise(fit, value, spec, data, robust)
+        used = data.edges.used[fit.obj]
+        standard = value / fit.noise[:, None, None]  # (B, V, E)
+        fit.views = _inlier_views(standard, used)
+        fit.good = used & (np.abs(standard) <= EDGE_OUTLIER) & fit.views[..., None]
         _refit(fit, data, spec, cfg, "huber")
-    value = _all_residuals(fit, data, cfg)
-    fit.evidence = _log_evidence(fit, value, spec, data, cfg)
+    fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data)
     order = np.lexsort((-fit.evidence, fit.obj))
-    return fit.take(order[_group_starts(fit.obj[order])])
+    return fit[order[_group_starts(fit.obj[order])]]
 
 
 # ---- fit_objects: scale, gravity, report ----------------------------------------------------
+
+CAMERA_ROLL_DEG = 6.0  # deg, spread of a hand-held camera's roll
+CAMERA_PITCH_DEG = 35.0  # deg, same of its pitch
+CAMERA_UP_VIEWS = 4.0  # views of independent roll that a video is worth
+UPRIGHT_TILT_DEG = 1.5  # deg, how upright an object stands when gravity is known
+MAX_TILT_DEG = 20.0  # deg, objects less sure of their vertical do not vote on gravity
+MIN_UP_OBJECTS = 3  # upright objects needed to trust the estimate
+SCALE_MIN_PARALLAX_DEG = 3.0  # deg, objects seen from narrower angles give no scale
+SCALE_LOG_SIGMA = 0.5  # log, objects with a worse common-size sigma give no scale
+UNKNOWN_SCALE_LOG = 3.0  # log, prior spread of the global scale when the poses have none
+VOTE_HIGH = 1.5  # sigma, width of the consensus on scale above it
+VOTE_LOW = 2.5  # sigma, same below it
 
 
 class Scale(NamedTuple):
@@ -1994,13 +1798,17 @@ class ObjectFits:
 
 
 @np.errstate(all="ignore")
-def camera_up(img_from_world: Array, cfg: FitConfig | None = None) -> tuple[Array, float]:
-    """Rough "up" (3,) of hand-held video and its sigma in rad; zeros when views are mixed.
+def camera_up(img_from_world: Array) -> tuple[Array, float]:
+    """Estimate "up" roughly from the cameras of a hand-held video.
 
     Level cameras: up is perpendicular to every camera's x axis (roll small) and near the mean
     upward image direction (pitch free). Minimises mean((x.u)^2) / roll^2 + |u - m|^2 / pitch^2.
+
+    Args:
+        img_from_world: (F, 3, 4), NaN where unknown.
+    Returns:
+        up (3,), a unit vector or zeros when the views are mixed, and its sigma in rad.
     """
-    cfg = cfg or FitConfig()
     ray = _cameras(img_from_world).ray
     ray = ray[_finite(ray, 1, 2)]  # (F, 3, 3)
     if not len(ray):
@@ -2009,8 +1817,8 @@ def camera_up(img_from_world: Array, cfg: FitConfig | None = None) -> tuple[Arra
     mean = up.mean(0)
     if np.linalg.norm(mean) < 0.3:
         return np.zeros(3), np.inf
-    roll, pitch = np.deg2rad(cfg.camera_roll_deg), np.deg2rad(cfg.camera_pitch_deg)
-    info = min(len(x), cfg.camera_up_views) * x.T @ x / len(x) / roll**2 + np.eye(3) / pitch**2
+    roll, pitch = np.deg2rad(CAMERA_ROLL_DEG), np.deg2rad(CAMERA_PITCH_DEG)
+    info = min(len(x), CAMERA_UP_VIEWS) * x.T @ x / len(x) / roll**2 + np.eye(3) / pitch**2
     best = np.linalg.solve(info, mean / pitch**2)
     best /= np.linalg.norm(best)
     level = np.eye(3) - np.outer(best, best)
@@ -2018,20 +1826,20 @@ def camera_up(img_from_world: Array, cfg: FitConfig | None = None) -> tuple[Arra
     return best, float(1.0 / np.sqrt(worst))
 
 
-def _refine_up(fit: _Fit, spec: _Spec, cfg: FitConfig) -> tuple[Array, float] | None:
-    """Gravity from the third axes of upright objects: robust mean and its sigma in rad.
+def _refine_up(fit: _Fit, spec: _Spec) -> tuple[Array, float] | None:
+    """Estimate "up" from the third axes of upright objects: robust mean and its sigma in rad.
 
     Each axis is weighted by its tilt variance without the rough prior; None if there are too few.
     """
     upright = spec.upright[fit.obj] & (spec.natural[fit.obj] >= 0) & (fit.axis == 2)
-    cov = _safe_inverse(fit.hessian + _rotation_cap(cfg))
+    cov = _safe_inverse(fit.hessian + ROTATION_CAP)
     tilt = np.einsum("bii->bi", cov)[:, 6:8]  # (B, 2) rad^2 about the two level axes
     info = np.maximum(1.0 / tilt - 1.0 / spec.tilt_rad**2, 1e-12).min(1)
     # an object that its solid fits badly (hidden in part, odd shape) stands askew in the fit
-    sigma2 = 1.0 / info + (np.deg2rad(cfg.tilt_deg) * (1.0 + fit.noise**2)) ** 2
+    sigma2 = 1.0 / info + (np.deg2rad(UPRIGHT_TILT_DEG) * (1.0 + fit.noise**2)) ** 2
     axis = fit.state.rot[:, :, 2] * np.sign(fit.state.rot[:, :, 2] @ spec.up)[:, None]
-    use = upright & (sigma2 < np.deg2rad(cfg.max_tilt_deg) ** 2)
-    if use.sum() < cfg.min_up_objects:
+    use = upright & (sigma2 < np.deg2rad(MAX_TILT_DEG) ** 2)
+    if use.sum() < MIN_UP_OBJECTS:
         return None
     axis, sigma2 = axis[use], sigma2[use]  # (N, 3), (N,)
     rough = 1.0 / spec.tilt_rad**2
@@ -2046,39 +1854,28 @@ def _refine_up(fit: _Fit, spec: _Spec, cfg: FitConfig) -> tuple[Array, float] | 
     return (up, float(1.0 / np.sqrt(info + rough))) if info > rough else None
 
 
-def _weighted_median(values: Array, weight: Array) -> float:
-    order = np.argsort(values)
-    share = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
+def _scale_from_priors(fit: _Fit, data: _Data, spec: _Spec) -> tuple[float, float] | None:
+    """Estimate log metres per unit and its sigma from the sizes of well-seen known objects.
 
-
-def _scale_from_priors(
-    fit: _Fit, data: _Data, metric_spec: _Spec, cfg: FitConfig
-) -> tuple[float, float] | None:
-    """Log of metres per unit and its sigma from the size priors of well-seen known objects.
-
-    One vote an object: generalised least squares of log(prior) - log(fitted) over its axes, then
-    the votes' consensus.
+    One vote an object: generalised least squares of log(prior) - log(fitted) over its axes, `spec`
+    holding the priors in metres; then the votes' consensus.
     """
     obj = fit.obj
-    cov = _safe_inverse(fit.hessian + _rotation_cap(cfg))[:, 3:6, 3:6]
-    prior = _problems(metric_spec, obj, fit.code, fit.axis)
+    cov = _safe_inverse(fit.hessian + ROTATION_CAP)[:, 3:6, 3:6]
+    prior = _problems(spec, obj, fit.code, fit.axis)
     inverse = np.linalg.inv(np.linalg.inv(prior.size_info) + cov)
     info = inverse.sum((1, 2))
     vote = (inverse.sum(2) * (prior.size_mean - fit.state.log_half)).sum(1) / info
     common = np.sqrt(cov.mean((1, 2)))
-    wide = _parallax(fit, data) >= cfg.scale_min_parallax_deg
-    use = (
-        wide & (common < cfg.scale_log_sigma) & (metric_spec.natural[obj] >= 0) & np.isfinite(vote)
-    )
-    use &= fit.views.sum(1) >= 2
+    use = (_parallax(fit, data) >= SCALE_MIN_PARALLAX_DEG) & (common < SCALE_LOG_SIGMA)
+    use &= (spec.natural[obj] >= 0) & np.isfinite(vote) & (fit.views.sum(1) >= 2)
     if not use.any():
         return None
-    return _consensus(vote[use], 1.0 / np.sqrt(info[use]), cfg)
+    return _consensus(vote[use], 1.0 / np.sqrt(info[use]))
 
 
-def _consensus(vote: Array, sigma: Array, cfg: FitConfig) -> tuple[float, float]:
-    """Robust location of votes (N,) and its sigma when high outliers are common.
+def _consensus(vote: Array, sigma: Array) -> tuple[float, float]:
+    """Locate votes (N,) robustly where high outliers are common; also the sigma.
 
     A partly hidden object looks smaller than it is and votes too high; nothing makes it look
     larger. The vote that most others support is refined by reweighting (Geman-McClure), high votes
@@ -2087,7 +1884,7 @@ def _consensus(vote: Array, sigma: Array, cfg: FitConfig) -> tuple[float, float]
 
     def scaled(middle: Array) -> Array:
         gap = (vote - middle[:, None]) / sigma  # (C, N)
-        return (gap / np.where(gap > 0, cfg.vote_high, cfg.vote_low)) ** 2
+        return (gap / np.where(gap > 0, VOTE_HIGH, VOTE_LOW)) ** 2
 
     square = scaled(vote)
     mid = float(vote[np.argmin((square / (1.0 + square)).sum(1))])
@@ -2096,9 +1893,8 @@ def _consensus(vote: Array, sigma: Array, cfg: FitConfig) -> tuple[float, float]
         weight = 1.0 / sigma**2 / (1.0 + square) ** 2
         mid = float((weight * vote).sum() / weight.sum())
     spread = float((weight * (vote - mid) ** 2 / sigma**2).sum() / weight.sum())
-    return mid, float(
-        np.sqrt(max(spread, 1.0) * len(vote) / (weight * sigma**2).sum() / weight.sum())
-    )
+    full = (weight * sigma**2).sum()
+    return mid, float(np.sqrt(max(spread, 1.0) * len(vote) / full / weight.sum()))
 
 
 def _known_sizes(
@@ -2110,9 +1906,7 @@ def _known_sizes(
     for key, (name, metres) in (known_size or {}).items():
         axis = name if isinstance(name, int) else "wdh".find(name[:1].lower())
         if axis not in (0, 1, 2) or not metres > 0:
-            raise QuadricsError(
-                f"known_size[{key!r}]: give (w|d|h, metres > 0), not {name, metres}"
-            )
+            raise QuadricsError(f"known_size[{key!r}] = {name, metres}: give (w|d|h, metres > 0)")
         for row, number in enumerate(live.tolist()):
             own = None if categories is None else categories[number]
             if key == number or (isinstance(key, str) and _plain(key) == _plain(own or "")):
@@ -2120,34 +1914,35 @@ def _known_sizes(
     return out
 
 
-def _scale_from_known(
-    fit: _Fit, sizes: list[tuple[int, int, float]], cfg: FitConfig
-) -> tuple[float, float] | None:
-    """Log of metres per unit and its sigma from sizes that the user knows."""
+def _scale_from_known(fit: _Fit, sizes: list[tuple[int, int, float]]) -> tuple[float, float] | None:
+    """Estimate log metres per unit and its sigma from sizes that the user knows."""
     if not sizes:
         return None
     row, axis, metres = (np.array(column) for column in zip(*sizes, strict=True))
-    cov = _safe_inverse(fit.hessian + _rotation_cap(cfg))
+    cov = _safe_inverse(fit.hessian + ROTATION_CAP)
     vote = np.log(metres) - fit.state.log_half[row, axis] - np.log(2.0)
     info = 1.0 / (cov[row, 3 + axis, 3 + axis] + 1e-6)
-    return _weighted_median(vote, info), float(np.sqrt(1.0 / info.sum()))
+    order = np.argsort(vote)
+    share = np.cumsum(info[order])
+    middle = vote[order][np.searchsorted(share, 0.5 * share[-1])]  # weighted median
+    return float(middle), float(np.sqrt(1.0 / info.sum()))
 
 
 def _parallax(fit: _Fit, data: _Data) -> Array:
-    """Widest angle (B,) in degrees between the rays from inlier cameras to the centre."""
-    ray = data.cam_center[fit.obj] - fit.state.center[:, None]  # (B, V, 3)
-    unit = ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-300)
-    cos = unit @ unit.transpose(0, 2, 1)  # (B, V, V)
+    """Measure the widest angle (B,) in degrees between rays from inlier cameras to the centre."""
+    cos = _cosines(data.cam_center[fit.obj], fit.state.center)  # (B, V, V)
     pair = fit.views[:, :, None] & fit.views[:, None]
     lowest = np.where(pair, cos, 1.0).min((1, 2))
     return np.asarray(np.rad2deg(np.arccos(np.clip(lowest, -1.0, 1.0))))
 
 
-def _stand_up(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntArray]:
+def _vertical_axis_last(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntArray]:
     """Relabel axes so that the vertical one comes third (not for lying cylinders).
 
     Every start has its vertical axis pointing up, so the third axis does too.
-    Returns solids, covariance (B, 9, 9), and order (B, 3): the prior's axis behind each new one.
+
+    Returns:
+        solids, their covariance (B, 9, 9), and order (B, 3): the prior's axis behind each new one.
     """
     order = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])[np.where(fit.code == CYLINDER, 2, fit.axis)]
     row = np.arange(len(fit.obj))[:, None]
@@ -2160,76 +1955,74 @@ def _stand_up(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntArray]:
 
 def _inlier_table(
     solids: Ellipsoids, codes: IntArray, noise: Array, boxes: Array, usable: BoolArray,
-    cams: _Cameras, image_size: tuple[float, float], cfg: FitConfig, chunk: int = 60000,
+    cams: _Cameras, image_size: tuple[float, float], cfg: FitConfig,
 ) -> BoolArray:  # fmt: skip
-    """Inlier test (F, O) of every usable box, also those that the fit did not use."""
+    """Apply the inlier test (F, O) to every usable box, also to those that the fit did not use."""
     inlier = np.zeros(usable.shape, bool)
     frame, obj = np.nonzero(usable)
-    for lo in range(0, len(frame), chunk):
-        f, o = frame[lo : lo + chunk], obj[lo : lo + chunk]
-        edges = _tangent_planes(
-            boxes[f, o][:, None], cams.matrix[f][:, None], image_size, None, cfg
-        )
-        state = _State(
-            solids.center_in_world[o], np.log(solids.half_axes[o]), solids.world_from_obj[o]
-        )
-        value = _residuals(state, edges, AXIS_GROUPS[codes[o]], cfg, jacobian=False).value
-        inlier[f, o] = _inlier_views(value / noise[o, None], edges.used[:, 0], cfg)
+    for part in _chunks(len(frame), 60000):  # boxes, to bound the memory
+        f, o = frame[part], obj[part]
+        edges = _tangent_planes(boxes[f, o][:, None], cams.matrix[f][:, None], image_size, cfg)
+        own = solids[o]
+        state = _State(own.center_in_world, np.log(own.half_axes), own.world_from_obj)
+        value = _residuals(state, edges, AXIS_GROUPS[codes[o]], jacobian=False)[0]
+        inlier[f, o] = _inlier_views(value / noise[o, None], edges.used[:, 0])
     return inlier
 
 
-def _size_distance(fit: _Fit, spec: _Spec) -> tuple[Array, Array]:
-    """Distance (B,) of each log size from its prior, and of its growth alone, in sigma."""
-    prob = _problems(spec, fit.obj, fit.code, fit.axis)
-    error = fit.state.log_half - prob.size_mean
-    far = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))
-    own = (error > 0) / prob.size_var
-    return far, np.sqrt((own * error**2).sum(1))
+MAX_NOISE = 8.0  # noise factor above which the boxes are not of one static object
+MIN_INLIER_SHARE = 0.4  # of the views; below it the object is rejected
+ABSURD_SIZE = 6.0  # sigma of growth above the prior: rejected
+ODD_SIZE = 3.5  # sigma from the prior: said in the reason
+PRIOR_DOMINATED = 0.7071  # posterior / prior sigma, above it the prior brought more than the boxes
+LOOSE_LOG = 0.35  # log, an axis less certain than this is not called measured
+MIN_PARALLAX_DEG = 1.0  # deg, below it depth is the prior's
 
 
-def _wrongs(fit: _Fit, post: Array, seen: IntArray, grown: Array, cfg: FitConfig) -> list[str]:
-    """Why each of B fits must be rejected; empty where nothing is wrong."""
-    inside = fit.views.sum(1)
+def _rejection_reasons(fit: _Fit, post: Array, seen: IntArray, grown: Array) -> list[str]:
+    """Say why each of B fits must be rejected; empty where nothing is wrong."""
     finite = _finite(fit.state.center, 1) & _finite(post, 1)
-    tests = (
-        (~finite, "no finite solution"),
-        (fit.noise > cfg.max_noise, "the boxes fit no solid: errors {noise:.1f} times the usual"),
-        (grown > cfg.absurd_size, "size is {grown:.1f} sigma above its category's"),
-        (
-            inside < np.maximum(1.0, cfg.min_inlier_share * seen),
-            "only {inside} of {seen} boxes agree on one solid",
-        ),
-    )
-    numbers = {"noise": fit.noise, "grown": grown, "inside": inside, "seen": seen}
     out = []
-    for b in range(len(seen)):
-        own = {name: value[b] for name, value in numbers.items()}
-        out.append(next((text.format(**own) for bad, text in tests if bad[b]), ""))
+    for b, (noise, inside) in enumerate(zip(fit.noise, fit.views.sum(1), strict=True)):
+        why = ""
+        if not finite[b]:
+            why = "no finite solution"
+        elif noise > MAX_NOISE:
+            why = f"the boxes fit no solid: errors {noise:.1f} times the usual"
+        elif grown[b] > ABSURD_SIZE:
+            why = f"size is {grown[b]:.1f} sigma above its category's"
+        elif inside < max(1.0, MIN_INLIER_SHARE * seen[b]):
+            why = f"only {inside} of {seen[b]} boxes agree on one solid"
+        out.append(why)
     return out
 
 
-def _judge(
-    fit: _Fit, share: Array, post: Array, parallax: Array, seen: IntArray,
-    size: tuple[Array, Array], cfg: FitConfig,
-) -> tuple[list[str], list[str]]:  # fmt: skip
-    """Honest status and its reason for each of B fits.
+def _status(
+    fit: _Fit, spec: _Spec, share: Array, post: Array, parallax: Array, seen: IntArray
+) -> tuple[list[str], list[str]]:
+    """Decide the status of each of B fits and give its reason.
 
     Args:
         share, post: (B, 3) posterior / prior sigma and posterior sigma of the log axes.
-        seen: (B,) views given; size: `_size_distance`.
+        parallax: (B,) deg; seen: (B,) views given.
+    Returns:
+        "ok", "prior_dominated" or "rejected", and the reason (empty: none), B each.
     """
-    weak = (share > cfg.prior_dominated) | (post > cfg.loose_log)
-    far, grown = size
+    weak = (share > PRIOR_DOMINATED) | (post > LOOSE_LOG)
+    prob = _problems(spec, fit.obj, fit.code, fit.axis)
+    error = fit.state.log_half - prob.size_mean
+    far = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))  # (B,) sigma
+    grown = np.sqrt(((error > 0) / prob.size_var * error**2).sum(1))  # (B,) same, growth alone
     status, reason = [], []
-    for b, wrong in enumerate(_wrongs(fit, post, seen, grown, cfg)):
+    for b, wrong in enumerate(_rejection_reasons(fit, post, seen, grown)):
         doubt = []
         if weak[b].any():
             axes = ", ".join("xyz"[k] for k in np.flatnonzero(weak[b]))
             doubt.append(f"size along {axes} rests on the prior")
-        if parallax[b] < cfg.min_parallax_deg:
+        if parallax[b] < MIN_PARALLAX_DEG:
             doubt.append(f"parallax {parallax[b]:.1f} deg: depth rests on the prior")
         status.append("rejected" if wrong else "prior_dominated" if doubt else "ok")
-        if far[b] > cfg.odd_size:
+        if far[b] > ODD_SIZE:
             why = "another thing?" if grown[b] > 0.7 * far[b] else "hidden in part?"
             doubt.append(f"size is {far[b]:.1f} sigma from its category's: {why}")
         reason.append("; ".join([wrong] * bool(wrong) + doubt))
@@ -2247,23 +2040,23 @@ class _World(NamedTuple):
     up_source: str
 
 
-def _first_world(
-    up: Sequence[float] | Array | None, metric: bool, cams: _Cameras, cfg: FitConfig
-) -> _World:
-    scale = (0.0, 0.0, "poses") if metric else (0.0, cfg.unknown_scale_log, "none")
+def _first_world(up: Sequence[float] | Array | None, metric: bool, cams: _Cameras) -> _World:
+    """Collect what is known before the first pass: gravity as given, or rough from the cameras."""
+    scale = (0.0, 0.0, "poses") if metric else (0.0, UNKNOWN_SCALE_LOG, "none")
     given = np.zeros(3) if up is None else np.nan_to_num(np.asarray(up, np.float64).reshape(3))
     size = float(np.linalg.norm(given))
     if size > 0:
-        return _World(*scale, given / size, float(np.deg2rad(cfg.tilt_deg)), "given")
-    rough, sigma = camera_up(cams.matrix, cfg)
+        return _World(*scale, given / size, float(np.deg2rad(UPRIGHT_TILT_DEG)), "given")
+    rough, sigma = camera_up(cams.matrix)
     if not rough.any():
         return _World(*scale, rough, np.inf, "none")
-    return _World(*scale, rough, float(np.hypot(sigma, np.deg2rad(cfg.tilt_deg))), "cameras")
+    return _World(*scale, rough, float(np.hypot(sigma, np.deg2rad(UPRIGHT_TILT_DEG))), "cameras")
 
 
 def _check_input(
     boxes: Array, cams: Array, image_size: tuple[float, float], names: Sequence[Any] | None
 ) -> None:
+    """Raise QuadricsError where shapes do not fit together."""
     if boxes.ndim != 3 or boxes.shape[2] != 4:
         raise QuadricsError(f"boxes_xyxy has shape {boxes.shape}, expected (frames, objects, 4)")
     if cams.shape != (len(boxes), 3, 4):
@@ -2287,7 +2080,6 @@ def fit_objects(
     score: npt.ArrayLike | None = None,
     metric: bool = True,
     known_size: Mapping[str | int, tuple[str | int, float]] | None = None,
-    lines: npt.ArrayLike | None = None,
     config: FitConfig | None = None,
 ) -> ObjectFits:
     """Fit one solid and its inscribed ellipsoid to every object's boxes, all objects at once.
@@ -2302,71 +2094,63 @@ def fit_objects(
         score: (F, O) detection scores, used to choose among many views.
         metric: True: world units are metres; False: one global scale is estimated from the priors.
         known_size: {category or object number: ("w" | "d" | "h", metres)}; overrides the scale.
-        lines: (F, O, K, 3) further outward tangent lines, e.g. `hull_lines` of masks.
+        config: the few numbers that a user may change.
     Returns:
         ObjectFits in world units. It never raises on ugly numbers: such objects are "rejected".
+    Raises:
+        QuadricsError: shapes that do not fit together, an unknown support, a garbled known_size.
     """
     cfg = config or FitConfig()
     boxes, given = np.asarray(boxes_xyxy, np.float64), np.asarray(img_from_world, np.float64)
     _check_input(boxes, given, image_size, categories)
-    codes = support_codes(support, boxes.shape[1])
+    codes = _support_codes(support, boxes.shape[1])
     cams = _cameras(given)
     usable = _usable_boxes(boxes, cams)
-    quality = np.ones(usable.shape)
-    if score is not None:
-        quality = np.nan_to_num(np.asarray(score, np.float64))
-    inside = (boxes[..., :2] > cfg.border_px) & (
-        boxes[..., 2:] < np.array(image_size) - cfg.border_px
-    )
-    quality = quality + inside.all(-1)  # uncut boxes first
+    quality = np.nan_to_num(np.asarray(1.0 if score is None else score, np.float64))
+    far = np.array(image_size) - cfg.border_px
+    uncut = (boxes[..., :2] > cfg.border_px).all(-1) & (boxes[..., 2:] < far).all(-1)
+    quality = quality + uncut  # (F, O), uncut boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
     sizes = _known_sizes(known_size, categories, live)
-    world = _first_world(up, metric and not sizes, cams, cfg)
+    world = _first_world(up, metric and not sizes, cams)
     if not len(live):
         return _report(None, boxes, usable, cams, live, world, image_size, cfg)
-    extra = None if lines is None else np.asarray(lines, np.float64)[:, live]
     seen = (boxes[:, live], usable[:, live], quality[:, live])
-    data = _gather_data(*seen, cams, image_size, extra, cfg)
+    data = _gather_data(*seen, cams, image_size, cfg)
     names = [None if categories is None else categories[int(k)] for k in live]
-    solved, world = _solve_passes(data, names, priors, codes[live], sizes, world, cfg)
-    return _report(solved, boxes, usable, cams, live, world, image_size, cfg)
-
-
-class _Solved(NamedTuple):
-    fit: _Fit
-    spec: _Spec
-    data: _Data
+    fit, spec, world = _solve_passes(data, names, priors, codes[live], sizes, world, cfg)
+    return _report((fit, spec, data), boxes, usable, cams, live, world, image_size, cfg)
 
 
 def _solve_passes(
     data: _Data, names: Sequence[str | None], priors: Priors | None, codes: IntArray,
     sizes: list[tuple[int, int, float]], world: _World, cfg: FitConfig,
-) -> tuple[_Solved, _World]:  # fmt: skip
+) -> tuple[_Fit, _Spec, _World]:  # fmt: skip
     """Fit once; if that tells scale or gravity, fit again with them."""
-    spec = _prior_spec(names, priors, codes, world, cfg)
+    spec = _prior_spec(names, priors, codes, world)
     fit = _fit_all(data, spec, cfg)
     better = world
     if world.scale_source == "none":
-        metric = _prior_spec(names, priors, codes, world._replace(scale_sigma=0.0), cfg)
-        found, source = _scale_from_known(fit, sizes, cfg), "known_size"
+        metric = _prior_spec(names, priors, codes, world._replace(scale_sigma=0.0))
+        found, source = _scale_from_known(fit, sizes), "known_size"
         if found is None:
-            found, source = _scale_from_priors(fit, data, metric, cfg), "priors"
+            found, source = _scale_from_priors(fit, data, metric), "priors"
         if found is not None:
             better = better._replace(log_scale=found[0], scale_sigma=found[1], scale_source=source)
     if world.up_source == "cameras":
-        upright = _refine_up(fit, spec, cfg)
+        upright = _refine_up(fit, spec)
         if upright is not None:
-            tilt = float(np.hypot(np.deg2rad(cfg.tilt_deg), upright[1]))
+            tilt = float(np.hypot(np.deg2rad(UPRIGHT_TILT_DEG), upright[1]))
             better = better._replace(up=upright[0], tilt_rad=tilt, up_source="objects")
     if better is not world:
-        spec = _prior_spec(names, priors, codes, better, cfg)
+        spec = _prior_spec(names, priors, codes, better)
         fit = _fit_all(data, spec, cfg)
-    return _Solved(fit, spec, data), better
+    return fit, spec, better
 
 
 def _report(
-    solved: _Solved | None, boxes: Array, usable: BoolArray, cams: _Cameras, live: IntArray,
-    world: _World, image_size: tuple[float, float], cfg: FitConfig,
+    solved: tuple[_Fit, _Spec, _Data] | None, boxes: Array, usable: BoolArray, cams: _Cameras,
+    live: IntArray, world: _World, image_size: tuple[float, float], cfg: FitConfig,
 ) -> ObjectFits:  # fmt: skip
     """Spread the fits of the live objects over all O objects and judge them."""
     n = boxes.shape[1]
@@ -2377,10 +2161,10 @@ def _report(
     names = ["ellipsoid"] * n
     if solved is not None:
         fit, spec, data = solved
-        wide = _curved_covariance(fit, data, spec, cfg) + fit.spread
+        wide = _curved_covariance(fit, data, spec) + fit.spread
         # the noise level is itself estimated: Student's 95 % region for three parameters
-        wide *= (1.0 + 3.5 / (cfg.object_noise_dof + _free_dof(fit, spec, data)))[:, None, None]
-        found, cov[live], order = _stand_up(fit, wide)
+        wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
+        found, cov[live], order = _vertical_axis_last(fit, wide)
         for name in ("center_in_world", "half_axes", "world_from_obj"):
             getattr(solids, name)[live] = getattr(found, name)
         prior = np.sqrt(np.einsum("bii->bi", spec.size_cov))[np.arange(len(live))[:, None], order]
@@ -2390,11 +2174,11 @@ def _report(
         cov[live] *= shrink[:, :, None] * shrink[:, None]
         post = post * shrink[:, 3:6]
         share[live], angle[live] = post / prior, _parallax(fit, data)
-        value = _all_residuals(fit, data, cfg) * data.edges.sigma_px
+        value = _all_residuals(fit, data) * data.edges.sigma_px
         count = np.maximum(fit.good.sum((1, 2)), 1)
         rms[live] = np.sqrt((value**2 * fit.good).sum((1, 2)) / count)
-        seen, size = (data.index >= 0).sum(1), _size_distance(fit, spec)
-        verdict, why = _judge(fit, share[live], post, angle[live], seen, size, cfg)
+        seen = (data.index >= 0).sum(1)
+        verdict, why = _status(fit, spec, share[live], post, angle[live], seen)
         for row, k in enumerate(live.tolist()):
             status[k], reason[k], names[k] = verdict[row], why[row], SUPPORTS[fit.code[row]]
         own = (boxes[:, live], usable[:, live], cams, image_size, cfg)
@@ -2410,42 +2194,41 @@ def _report(
 
 
 @np.errstate(all="ignore")
-def volume_overlap(a: Ellipsoids, b: Ellipsoids, nodes: int = 40, chunk: int = 256) -> Array:
-    """O3D: intersection over union of the volumes of ellipsoids, pair by pair.
+def volume_overlap(a: Ellipsoids, b: Ellipsoids, nodes: int = 40) -> Array:
+    """Measure O3D, the intersection over union of the volumes of ellipsoids, pair by pair.
 
     In the frame where `a` is the unit ball and `b` has level axes, chords along x are exact and
     the other two directions are integrated by Gauss-Chebyshev-like rules over the common extent.
-    Accuracy ~1e-3 with the default nodes. Returns (O,); NaN where an input is not finite.
+
+    Args:
+        a, b: O ellipsoids each; nodes: of the rules, 40 are accurate to 1e-3.
+    Returns:
+        (O,); NaN where an input is not finite.
     """
     if len(a) != len(b):
         raise QuadricsError(f"{len(a)} and {len(b)} ellipsoids: the two lists must pair up")
-    parts = [_overlap_chunk(a[part], b[part], nodes) for part in _chunks(len(a), chunk)]
-    return np.concatenate(parts) if parts else np.zeros(0)
-
-
-def _overlap_chunk(a: Ellipsoids, b: Ellipsoids, nodes: int) -> Array:
-    to_unit = a.world_from_obj.transpose(0, 2, 1) / a.half_axes[:, :, None]  # (O, 3, 3)
-    root = to_unit @ (b.world_from_obj * b.half_axes[:, None, :])
-    safe = _finite(root, 1, 2)[:, None, None]
-    axes, half, _ = np.linalg.svd(np.where(safe, root, np.eye(3)))  # (O, 3, 3), (O, 3)
-    shift = to_unit @ (b.center_in_world - a.center_in_world)[..., None]
-    center = (axes.transpose(0, 2, 1) @ shift)[..., 0]  # (O, 3)
-    inter = _ball_ellipsoid_volume(center, half, nodes)
-    volume_b = 4.0 / 3.0 * np.pi * half.prod(1)
-    iou = inter / (4.0 / 3.0 * np.pi + volume_b - inter)
-    return np.where(safe[:, 0, 0] & _finite(center, 1), np.clip(iou, 0.0, 1.0), np.nan)
-
-
-def _cosine_rule(nodes: int) -> tuple[Array, Array]:
-    """Nodes and weights on [-1, 1] for integrands that end in square roots (x = -cos t)."""
-    x, w = np.polynomial.legendre.leggauss(nodes)
-    t = 0.5 * np.pi * (x + 1.0)
-    return -np.cos(t), 0.5 * np.pi * w * np.sin(t)
+    iou = np.empty(len(a))
+    for part in _chunks(len(a), 256):  # pairs, to bound the memory
+        one, two = a[part], b[part]
+        to_unit = one.world_from_obj.transpose(0, 2, 1) / one.half_axes[:, :, None]  # (O, 3, 3)
+        root = to_unit @ (two.world_from_obj * two.half_axes[:, None, :])
+        safe = _finite(root, 1, 2)[:, None, None]
+        axes, half, _ = np.linalg.svd(np.where(safe, root, np.eye(3)))  # (O, 3, 3), (O, 3)
+        shift = to_unit @ (two.center_in_world - one.center_in_world)[..., None]
+        center = (axes.transpose(0, 2, 1) @ shift)[..., 0]  # (O, 3)
+        inter = _ball_ellipsoid_volume(center, half, nodes)
+        volume_b = 4.0 / 3.0 * np.pi * half.prod(1)
+        ratio = inter / (4.0 / 3.0 * np.pi + volume_b - inter)
+        good = safe[:, 0, 0] & _finite(center, 1)
+        iou[part] = np.where(good, np.clip(ratio, 0.0, 1.0), np.nan)
+    return iou
 
 
 def _ball_ellipsoid_volume(center: Array, half: Array, nodes: int) -> Array:
-    """Volume (O,) common to the unit ball and ellipsoids with level axes."""
-    x, w = _cosine_rule(nodes)
+    """Integrate the volume (O,) common to the unit ball and ellipsoids with level axes."""
+    node, mass = np.polynomial.legendre.leggauss(nodes)
+    t = 0.5 * np.pi * (node + 1.0)  # x = -cos t: for integrands that end in square roots
+    x, w = -np.cos(t), 0.5 * np.pi * mass * np.sin(t)
     low = np.maximum(-1.0, center[:, 2] - half[:, 2])  # (O,)
     high = np.minimum(1.0, center[:, 2] + half[:, 2])
     z = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * x  # (O, N)
@@ -2462,43 +2245,3 @@ def _ball_ellipsoid_volume(center: Array, half: Array, nodes: int) -> Array:
     length = np.minimum(chord, mid + chord_b) - np.maximum(-chord, mid - chord_b)
     area = (np.clip(length, 0.0, None) @ w) * 0.5 * np.clip(y_high - y_low, 0.0, None)  # (O, N)
     return np.asarray((area @ w) * 0.5 * np.clip(high - low, 0.0, None))
-
-
-@np.errstate(all="ignore")
-def box_overlap(a: Ellipsoids, b: Ellipsoids, nodes: int = 40, chunk: int = 256) -> Array:
-    """Intersection over union of oriented boxes (half extents = half_axes), pair by pair.
-
-    In the frame where `a` is the cube [-1, 1]^3, chords of both boxes along x are exact (slabs)
-    and integrated over the common extent in y and z. Accuracy ~1e-3. Returns (O,).
-    """
-    if len(a) != len(b):
-        raise QuadricsError(f"{len(a)} and {len(b)} boxes: the two lists must pair up")
-    parts = [_box_chunk(a[part], b[part], nodes) for part in _chunks(len(a), chunk)]
-    return np.concatenate(parts) if parts else np.zeros(0)
-
-
-def _box_chunk(a: Ellipsoids, b: Ellipsoids, nodes: int) -> Array:
-    to_cube = a.world_from_obj.transpose(0, 2, 1) / a.half_axes[:, :, None]  # (O, 3, 3)
-    edges = to_cube @ (b.world_from_obj * b.half_axes[:, None, :])  # (O, 3, 3) columns
-    safe = _finite(edges, 1, 2) & (np.abs(np.linalg.det(edges)) > 1e-300)
-    edges = np.where(safe[:, None, None], edges, np.eye(3))
-    center = (to_cube @ (b.center_in_world - a.center_in_world)[..., None])[..., 0]
-    reach = np.abs(edges).sum(2)  # (O, 3) half extent of b along the cube's axes
-    low, high = np.maximum(-1.0, center - reach), np.minimum(1.0, center + reach)
-    span = np.clip(high - low, 0.0, None)  # (O, 3)
-    x, w = np.polynomial.legendre.leggauss(nodes)
-    y, z = (0.5 * (low + high)[:, k, None] + 0.5 * span[:, k, None] * x for k in (1, 2))
-    slab = np.linalg.inv(edges)  # (O, 3, 3): rows n_k with |n_k (p - c)| <= 1 inside b
-    first, last = low[:, 0, None, None], high[:, 0, None, None]
-    for k in range(3):  # over slabs
-        along = _nonzero(np.asarray(slab[:, k, 0]), 1e-12)[:, None, None]
-        level_y = slab[:, k, 1, None] * (y - center[:, 1, None])  # (O, N)
-        level_z = slab[:, k, 2, None] * (z - center[:, 2, None])
-        mid = center[:, 0, None, None] - (level_y[:, :, None] + level_z[:, None]) / along
-        first = np.maximum(first, mid - 1.0 / np.abs(along))  # (O, N, N)
-        last = np.minimum(last, mid + 1.0 / np.abs(along))
-    chord = np.clip(last - first, 0.0, None)
-    inter = 0.25 * span[:, 1] * span[:, 2] * np.einsum("oyz,y,z->o", chord, w, w, optimize=True)
-    volume_b = 8.0 * np.abs(np.linalg.det(edges))
-    iou = np.clip(inter / (8.0 + volume_b - inter), 0.0, 1.0)
-    return np.where(safe & _finite(center, 1), iou, np.nan)

@@ -339,10 +339,8 @@ IOU_ODDS = 20.0  # log odds of one object that full overlap is worth ...
 NO_OVERLAP_ODDS = 6.0  # ... and that the appearance must make up for where there is no overlap
 EMBEDDING_MOMENTUM = 0.8  # memory of a track's mean embedding (StrongSORT: .9 every frame)
 # Re-identification
-RETURN_ODDS = 1.8  # prior odds that a newcomer is a certain known object and not a new one
 JUMP_ODDS = 2.0  # log odds against a return far from where the object's own track still coasts
 JUMP_GATE = 9.0  # far: three times the gate's radius
-PRIOR_PAIRS = 10.0  # pairs that the prior of `SimilarityCalibration` is worth
 # With poses
 PLACE_REFIT = 10  # frames between two fits of the places that have new views
 PLACE_IN_VIEW = 0.5  # share of a projected box in the image from which a detection is expected
@@ -381,8 +379,8 @@ class Tracker:
         self.frame_number = -1
         self.state = TrackState.spawn(np.empty((0, 4)), none, 0, self.config)
         self.gallery = Gallery()
-        self.reid_calibration = SimilarityCalibration(PRIOR_PAIRS)  # of views some time apart
-        self.match_calibration = SimilarityCalibration(PRIOR_PAIRS)  # of a track and a detection
+        self.reid_calibration = SimilarityCalibration()  # of views some time apart
+        self.match_calibration = SimilarityCalibration()  # of a track and a detection
         self.places = EllipsoidMap()
         self.last_seen = none  # (I,) frame of each identity's last detection
         self.identity_class = none  # (I,)
@@ -772,7 +770,7 @@ class Tracker:
         possible = self.last_seen[identity] < state.first[ready][:, None]
         possible &= self.identity_class[identity] == state.votes[ready].argmax(1)[:, None]
         logit[~possible | (iou == 0)] = -np.inf
-        probability = match_probability(logit, RETURN_ODDS)
+        probability = match_probability(logit)
         claimed = np.full(len(identity), -1, np.int64)
         good = probability >= self.config.return_probability
         _assign(1 - probability, good | (at_known_place & (logit > 0)), claimed)

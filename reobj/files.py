@@ -73,7 +73,8 @@ def load_npz(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays: dict[str, Any] = dict(file)
-        metadata: dict[str, Any] = json.loads(str(arrays.pop("metadata", "{}")))
+        text = arrays.pop("metadata", arrays.pop("facts", "{}"))  # facts: before 0.2
+        metadata: dict[str, Any] = json.loads(str(text))
     except Exception as error:  # zip, zlib and numpy each have their own for damaged files
         raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
     return arrays, metadata
@@ -163,4 +164,4 @@ def numbers(values: Array) -> list[float]:
 
 def base64_text(values: npt.NDArray[Any], kind: str) -> str:
     """Encode an array's bytes, C order, as the dtype `kind` ("<f4"), for pages with scripts."""
-    return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
+    return base64.b64encode(np.asarray(values, kind).tobytes()).decode()

@@ -1,124 +1,381 @@
-"""The trained two-part embedding: sampling of the map, the weights that come along, training."""
+"""Embeddings of detections from one feature map a frame: tiny networks, and the weights that come
+along.
+"""
 
 from __future__ import annotations
 
-import csv
-import importlib
 import json
-import math
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-from test_rank_k import backbone
-from test_tracker import scene_with_twins
 
 import reobj_track as rt
+from reobj.identity.embedding import (
+    Backbone,
+    LazyEmbeddings,
+    as_embeddings,
+    neighbour_embedding,
+    trained_head,
+)
+from reobj.sources.weights import onnx_metadata, onnx_session, own_models
 
-ROOT = Path(__file__).resolve().parents[1]
-LAYOUT = rt.EmbedConfig(context=0.5, samples=4, foreground_cells=3, background_cells=4)
+# of ImageNet's pixels, RGB (torchvision's documentation)
+IMAGENET_MEAN = 255 * np.array([0.485, 0.456, 0.406])
+IMAGENET_STD = 255 * np.array([0.229, 0.224, 0.225])
+BACKBONE_FILES = Path(__file__).resolve().parents[2] / "shared" / "models"
 
 
-def boxes(*xyxy: tuple[float, float, float, float], masks: np.ndarray | None = None):
+def boxes(*xyxy: tuple[float, ...], masks: np.ndarray | None = None) -> rt.Detections:
     n = len(xyxy)
     return rt.Detections(np.array(xyxy, float), np.full(n, 0.9), np.zeros(n, np.int64), masks)
 
 
-def samples(detections: rt.Detections, layout: rt.EmbedConfig = LAYOUT) -> list[SimpleNamespace]:
-    """Of foreground, grown and wider boxes: index, weight (N, k, k, S), share, others (N, k, k)."""
-    rows = np.arange(len(detections))
-    objects = rt.object_map(detections, (200, 400), (50, 100))
-    both = rt.part_samples(detections, [rows, rows], (200, 400), objects, layout)
-    values = {"index": both.index, "weight": both.weight}
-    values |= {"share": both.share[:, 0], "others": both.share[:, 1]}
-    near, parts = layout.background_cells**2, []
-    for part, some in ((0, slice(None)), (1, slice(near)), (1, slice(near, None))):
-        cut = {name: both.split(value)[part][:, some] for name, value in values.items()}
-        side = math.isqrt(cut["share"].shape[1])
-        cut = {n: v.reshape(len(rows), side, side, *v.shape[2:]) for n, v in cut.items()}
-        parts.append(SimpleNamespace(**cut))
-    return parts[: 2 + (layout.wide > 0)]
+def scene_with_twins() -> tuple[np.ndarray, rt.Detections]:
+    """Two identical patches on different backgrounds."""
+    rng = np.random.default_rng(13)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (240, 480, 3), dtype=np.uint8), (0, 0), 8)
+    image[:, :240] = (0.5 * image[:, :240] + [100, 20, 20]).clip(0, 255).astype(np.uint8)
+    image[:, 240:] = (0.5 * image[:, 240:] + [20, 20, 100]).clip(0, 255).astype(np.uint8)
+    patch = cv2.GaussianBlur(rng.integers(0, 256, (60, 60, 3), dtype=np.uint8), (0, 0), 3)
+    image[90:150, 90:150] = image[90:150, 330:390] = patch
+    return image, boxes((90, 90, 150, 150), (330, 90, 390, 150))
 
 
-# ---- Sampling ----
+def save_onnx(
+    path: Path, nodes: list, ends: tuple, weights: dict[str, np.ndarray], **facts
+) -> Path:
+    """Write a graph; ends: name and shape of inputs, then of outputs."""
+    onnx = pytest.importorskip("onnx")
+    from onnx import TensorProto, helper
 
-
-def test_foreground_is_the_inscribed_ellipse_and_background_the_rest() -> None:
-    fore, back = samples(boxes((100, 50, 200, 150)))
-    assert fore.weight.mean() == pytest.approx(np.pi / 4, abs=0.03)
-    assert back.weight.mean() == pytest.approx(1 - np.pi / 16, abs=0.03)
-    row, column = np.divmod(back.index[0][back.weight[0]], 100)
-    assert column.min() * 4 >= 48 and column.max() * 4 <= 250  # grown by half a box on every side
-    assert row.min() <= 2 and row.max() >= 47  # rows 0..200
-    assert fore.share.shape == (1, 3, 3) and back.share.shape == (1, 4, 4)
-    assert back.others.mean() < 0.02  # the rim of its own outline, drawn on the coarse map
-
-
-def test_masks_of_all_objects_are_no_background() -> None:
-    masks = np.zeros((2, 200, 400), bool)
-    masks[0, 50:150, 100:150] = masks[1, :, 200:] = True
-    fore, back = samples(boxes((100, 50, 200, 150), (200, 0, 400, 200), masks=masks))
-    left = fore.index[0] % 100 < 37  # the mask is the left half of the box
-    np.testing.assert_array_equal(fore.weight[0], left)
-    right = back.index[0] % 100 >= 50
-    assert (
-        not (back.weight[0] & right).any() and not (back.weight[0] & masks_at(masks[0], back)).any()
+    inputs, outputs = (
+        [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in some] for some in ends
     )
-    np.testing.assert_allclose(back.others[0][:, 3], 1.0)
+    start = [onnx.numpy_helper.from_array(w.astype(np.float32), n) for n, w in weights.items()]
+    made = [helper.make_node(op, a, b, **how) for op, a, b, how in nodes]
+    graph = helper.make_graph(made, "g", inputs, outputs, start)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
+    model.ir_version = 8
+    if facts:
+        helper.set_model_props(model, {"reobj": json.dumps(facts)})
+    onnx.save(model, path)
+    return path
 
 
-def masks_at(mask: np.ndarray, part: SimpleNamespace) -> np.ndarray:
-    row, column = np.divmod(part.index[0], 100)
-    return np.asarray(mask[row * 4 + 2, column * 4 + 2])
+def mean_backbone(path: Path, channels: int = 4, stride: int = 32) -> Path:
+    """A backbone: the mean of its three input channels (then zeros) in squares of `stride`."""
+    weight = np.zeros((channels, 3, stride, stride))
+    weight[:3] = np.eye(3)[:, :, None, None] / stride**2
+    nodes = [("Conv", ["image", "w"], ["map"], {"strides": [stride, stride]})]
+    ends = ([("image", ["n", 3, "h", "v"])], [("map", ["n", channels, "a", "b"])])
+    return save_onnx(path, nodes, ends, {"w": weight})
 
 
-def test_small_boxes_reach_further() -> None:
-    wide = rt.EmbedConfig(context=0.5, reach=0.1, samples=4)
-    _, near = samples(boxes((100, 100, 110, 110)))
-    _, far = samples(boxes((100, 100, 110, 110)), wide)
-    assert np.ptp(near.index % 100) * 4 <= 20 and np.ptp(far.index % 100) * 4 >= 76
-
-
-def test_surroundings_hold_other_objects_but_not_the_own() -> None:
-    masks = np.zeros((2, 200, 400), bool)
-    masks[0, 80:120, 180:220] = masks[1, :, 240:] = True
-    found = boxes((180, 80, 220, 120), (240, 0, 400, 200), masks=masks)
-    layout = rt.EmbedConfig(context=0.5, samples=4, wide=1.5, wide_reach=0.2, wide_cells=5)
-    _, _, wide = samples(found, layout)
-    column = wide.index[0] % 100
-    assert (column.min() * 4, column.max() * 4) == (104, 292)  # 200 -+ (20 + .2 * 400), 4 px a cell
-    assert (
-        wide.weight[0][column > 60].all() and not (wide.weight[0] & masks_at(masks[0], wide)).any()
+def sum_head(path: Path, **facts) -> Path:
+    """A head of two rows: of all numbers of the cells of either part (cells * (C + 2) of 4
+    channels), times the weights 1, 2 and 1, 3; unit length is not asked of it.
+    """
+    nodes, weights = [], {}
+    for name, out, cells, second in (("fg", "foreground", 4, 2), ("bg", "background", 16, 3)):
+        weights[f"w{name}"] = np.ones((cells * 6, 2)) * [1, second]
+        nodes.append(("MatMul", [name, f"w{name}"], [out], {}))
+    ends = (
+        [("fg", ["n", 24]), ("bg", ["m", 96])],
+        [("foreground", ["n", 2]), ("background", ["m", 2])],
     )
-    assert wide.share.shape == (1 + 1, 5, 5) and wide.share[0, 2, 2] == 0
-    np.testing.assert_allclose(wide.others[0][:, 4], 1.0)
+    return save_onnx(path, nodes, ends, weights, **facts)
 
 
-def test_cells_are_means_of_the_samples_that_count() -> None:
-    """On a map that holds its own columns and rows; the foreground reads only the first channel."""
-    layout = rt.EmbedConfig(context=0.5, samples=4, wide=1.0, wide_cells=5, foreground_channels=1)
-    found = boxes((100, 50, 200, 150), (120, 60, 150, 90))
-    rows, objects = [np.array([1]), np.array([0, 1])], np.zeros((50, 100), bool)
-    both = rt.part_samples(found, rows, (200, 400), objects, layout)
-    y, x = np.mgrid[:50, :100].astype(np.float32)
-    fore, back = rt.part_cells(np.stack([x, y], -1), both, layout)
-    assert fore.shape == (1, 4, 3) and back.shape == (2, 16 + 25, 4)
-    np.testing.assert_allclose(fore[0, :, 0].reshape(2, 2).mean(0), [32, 35.5], atol=0.6)
-    first = np.where(both.weight[4], np.divmod(both.index[4], 100), np.nan)  # of the grown box
-    np.testing.assert_allclose(back[0, 0, 1::-1], np.nanmean(first, 1), rtol=1e-5)
-    assert (
-        fore[0, 0, 1] == both.weight[0].mean() and back[1, 20, 2] == both.weight[4 + 41 + 20].mean()
+@pytest.fixture
+def net(tmp_path: Path) -> str:
+    return str(mean_backbone(tmp_path / "net.onnx"))
+
+
+# ---- Backbones ----
+
+
+def test_a_foreign_backbone_gets_rgb_normalised_as_imagenet(net: str) -> None:
+    """The first channel is red; mean and deviation are those of red."""
+    image = np.zeros((1, 64, 96, 3), np.uint8)
+    image[..., :48, :] = (10, 20, 250)  # BGR
+    maps = rt.Embedder(net, threads=1).backbone.maps(image)
+    assert maps.shape == (1, 2, 3, 4)
+    expected = (np.array([250, 20, 10]) - IMAGENET_MEAN) / IMAGENET_STD
+    np.testing.assert_allclose(maps[0, :, 0, :3], np.tile(expected, (2, 1)), rtol=1e-4)
+    black = -IMAGENET_MEAN / IMAGENET_STD
+    np.testing.assert_allclose(
+        maps[0, :, 1, :3], np.tile((expected + black) / 2, (2, 1)), rtol=1e-4
     )
 
 
-@pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])
-def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
-    for part in samples(boxes(box)):
-        assert part.index.min() >= 0 and part.index.max() < 5000
-        assert part.share.max() <= 1
-    assert box[0] != 900 or not samples(boxes(box))[0].weight.any()
+def test_a_network_of_our_own_gets_bgr_bytes() -> None:
+    """Its metadata say that it takes channels last; swapping red and blue changes the map."""
+    image = np.zeros((1, 64, 64, 3), np.uint8)
+    image[..., 0] = 250
+    backbone = rt.Embedder("reobj", threads=1).backbone
+    assert backbone.channels_last
+    blue, red = (
+        backbone.session.run(None, {backbone.input: i})[0] for i in (image, image[..., ::-1])
+    )
+    np.testing.assert_array_equal(backbone.maps(image), blue)
+    assert np.abs(blue - red).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("size_hw", "size_px", "expected"),
+    [
+        ((480, 640), 320, (8, 10)),  # 240 x 320: 7.5 -> 8 squares of 32
+        ((480, 640), 960, (15, 20)),  # never enlarged
+        ((20, 400), 160, (1, 5)),  # at least one square
+    ],
+)
+def test_size_of_the_map(net: str, size_hw, size_px, expected) -> None:
+    layout = rt.SamplingLayout(size_px=size_px)
+    features = rt.Embedder(net, layout=layout, threads=1).backbone(
+        np.zeros((*size_hw, 3), np.uint8)
+    )
+    assert features.shape == (*expected, 4)
+
+
+def test_a_model_without_a_map_is_refused(tmp_path: Path) -> None:
+    nodes = [("GlobalAveragePool", ["image"], ["p"], {}), ("Flatten", ["p"], ["row"], {})]
+    ends = ([("image", ["n", 3, "h", "v"])], [("row", ["n", 3])])
+    path = save_onnx(tmp_path / "flat.onnx", nodes, ends, {})
+    with pytest.raises(rt.ReobjError, match="spatial output"):
+        rt.Embedder(str(path))
+
+
+def test_real_backbones_are_found_by_their_file_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not BACKBONE_FILES.is_dir():
+        pytest.skip("no frozen backbones here")
+    monkeypatch.setenv("REOBJ_MODELS", str(BACKBONE_FILES))
+    image, found = scene_with_twins()
+    for name, widths in (("mobilenetv2_feat", (128, 256)), ("squeezenet1.1", None)):
+        embedder = rt.Embedder(name, threads=1, offline=True)
+        assert embedder.frozen and embedder.trained == (widths is not None)
+        look = embedder(image, found)
+        again = embedder((0.95 * image).astype(np.uint8), found)
+        assert (look.foreground * again.foreground).sum(1).min() > 0.9
+        assert (look.background * again.background).sum(1).min() > 0.9
+        assert widths is None or (look.foreground.shape[1], look.background.shape[1]) == widths
+
+
+# ---- Heads ----
+
+
+@pytest.mark.parametrize("name", ["mobilenetv2_feat", "crops:mobilenetv2_feat"])
+def test_heads_of_mobilenetv2_come_along(name: str) -> None:
+    path = trained_head(name)
+    assert path is not None and path.parent == own_models()
+    facts = onnx_metadata(onnx_session(path, 1))
+    assert facts["trained"]["rooms"] > 10 and {"layout", "trained"} <= set(facts)
+    assert trained_head(name, "none") is None and trained_head("squeezenet1.1") is None
+
+
+def test_a_head_is_found_beside_its_backbone_or_given(net: str, tmp_path: Path) -> None:
+    assert trained_head(net) is None and not rt.Embedder(net, threads=1).trained
+    other = sum_head(tmp_path / "other.onnx", layout={"neighbours": 0.0})
+    assert trained_head(net, str(other)) == other
+    with pytest.raises(rt.ReobjError, match="nowhere"):
+        trained_head(net, str(tmp_path / "nowhere.onnx"))
+    beside = sum_head(tmp_path / "net_head.onnx", layout={"size_px": 64, "neighbours": 0.0})
+    assert trained_head(net) == beside
+    found = rt.Embedder(net, threads=1)
+    assert found.trained and found.layout == rt.SamplingLayout(size_px=64, neighbours=0.0)
+    assert not rt.Embedder(net, "none", threads=1).trained
+    assert rt.Embedder(net, str(other), threads=1).layout.size_px == 480
+
+
+def test_a_head_gets_the_cells_of_its_part(net: str, tmp_path: Path) -> None:
+    """Foreground cells of a grey box on black give another row than its background."""
+    sum_head(tmp_path / "net_head.onnx", layout={"neighbours": 0.0})
+    embedder, image = rt.Embedder(net, threads=1), np.zeros((256, 256, 3), np.uint8)
+    image[64:192, 64:192] = 200
+    found = boxes((64, 64, 192, 192))
+    fore, back = embedder.cells(image, found, np.arange(1))
+    look = embedder(image, found)
+    np.testing.assert_allclose(look.foreground[0], fore.sum() * np.array([1, 2]), rtol=1e-5)
+    expected = np.sign(back.sum()) * np.array([1, 3]) / 10**0.5
+    np.testing.assert_allclose(look.background[0], expected, rtol=1e-5)
+    assert fore.sum() > 0 > back[..., :3].sum()
+
+
+# ---- Embedder ----
+
+
+def test_foreground_is_of_the_object_and_background_of_the_rest(net: str) -> None:
+    """A red object on blue, and without a head the signed roots of the cells."""
+    image = np.full((512, 512, 3), (250, 0, 0), np.uint8)
+    image[128:384, 128:384] = (0, 0, 250)
+    mask = np.zeros((1, 512, 512), bool)
+    mask[0, 128:384, 128:384] = True
+    embedder = rt.Embedder(net, layout=rt.SamplingLayout(size_px=512), threads=1)
+    found = boxes((128, 128, 384, 384), masks=mask)
+    fore, back = embedder.cells(image, found, np.arange(1))
+    red, blue = (np.array(rgb) - IMAGENET_MEAN for rgb in ((250, 0, 0), (0, 0, 250)))
+    np.testing.assert_allclose(fore[0, :, :3], np.tile(red / IMAGENET_STD, (4, 1)), rtol=1e-4)
+    np.testing.assert_allclose(fore[0, :, 4], 1)
+    outer = [0, 1, 2, 3, 4, 7, 8, 11, 12, 13, 14, 15]  # the middle cells are of the object
+    np.testing.assert_allclose(back[0, outer, :3], np.tile(blue / IMAGENET_STD, (12, 1)), rtol=1e-4)
+    np.testing.assert_allclose(back[0, [5, 6, 9, 10], 4], 0)
+    look = embedder(image, found)
+    roots = np.sign(fore[0, :, :4]) * np.sqrt(np.abs(fore[0, :, :4]))
+    expected = roots.ravel() / np.linalg.norm(roots)
+    np.testing.assert_allclose(look.foreground[0], expected, atol=1e-6)
+    assert look.background.shape == (1, 64)
+
+
+def test_without_a_head_cells_with_few_samples_weigh_less(net: str) -> None:
+    """By the root of the share: at the corners of the box little of a cell is in the ellipse."""
+    image = np.full((512, 512, 3), 250, np.uint8)
+    layout = rt.SamplingLayout(size_px=512, foreground_cells=4)
+    embedder, found = rt.Embedder(net, layout=layout, threads=1), boxes((128, 128, 384, 384))
+    fore, _ = embedder.cells(image, found, np.arange(1))
+    share = fore[0, :, 4]
+    assert share.max() == 1 and share[0] < 0.5
+    look = embedder(image, found).foreground.reshape(16, 4)
+    np.testing.assert_allclose(look[:, 0] / look[5, 0], np.sqrt(share), atol=1e-5)
+
+
+def test_without_a_head_each_box_of_the_background_counts_the_same(net: str) -> None:
+    layout = rt.SamplingLayout(surround_scale=1.5, surround_cells=5)
+    image, found = scene_with_twins()
+    background = rt.Embedder(net, layout=layout, threads=1)(image, found).background
+    assert background.shape == (2, (16 + 25) * 4)
+    np.testing.assert_allclose(np.linalg.norm(background[:, :64], axis=1), 0.5**0.5, rtol=1e-5)
+
+
+def test_a_mask_decides_what_is_foreground(net: str) -> None:
+    """With a mask of the left half, a change of the right half of the box is none."""
+    image, plain = scene_with_twins()
+    masks = np.zeros((2, *image.shape[:2]), bool)
+    masks[0, 90:150, 90:120] = masks[1, 90:150, 330:360] = True
+    masked = boxes(*plain.xyxy, masks=masks)
+    changed = image.copy()
+    changed[95:145, 135:150] = 255  # in the box, outside the mask
+    embedder = rt.Embedder("reobj", threads=1)
+    before, after, other, whole = (
+        embedder(picture, found).foreground[0]
+        for picture, found in ((image, masked), (changed, masked), (changed, plain), (image, plain))
+    )
+    assert before @ after > 0.97 > other @ whole
+
+
+@pytest.mark.parametrize(
+    "box", [(-50, -50, 20, 20), (470, 230, 600, 400), (10, 10, 10.5, 10.5), (900, 900, 950, 950)]
+)
+def test_boxes_at_and_over_the_border(box: tuple[float, ...], net: str) -> None:
+    image, _ = scene_with_twins()
+    for embedder in (rt.Embedder(net, threads=1), rt.Embedder("reobj", threads=1)):
+        found = embedder(image, boxes(box))
+        assert np.isfinite(found.foreground).all() and np.isfinite(found.background).all()
+
+
+@pytest.mark.parametrize("trained", [True, False])
+def test_some_rows_are_embedded_as_all_rows(trained: bool, net: str, monkeypatch) -> None:
+    """In whatever order they are asked for, also by and by; the map is made once a frame."""
+    model, computed, plain = "reobj" if trained else net, [], Backbone.__call__
+    monkeypatch.setattr(
+        Backbone, "__call__", lambda self, frame: (computed.append(1), plain(self, frame))[1]
+    )
+    image, detections = scene_with_twins()
+    embedder = rt.Embedder(model, threads=1)
+    whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
+    np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-5)
+    np.testing.assert_allclose(whole.background[1:], part.background, atol=1e-5)
+    later = rt.Embedder(model, threads=1)
+    for _ in range(2):
+        later(image, detections, np.array([1]))
+    turned = later(image, detections, np.array([1, 0]))
+    assert len(computed) == 2  # one of each embedder
+    np.testing.assert_allclose(whole.foreground[::-1], turned.foreground, atol=1e-5)
+    np.testing.assert_allclose(whole.background[::-1], turned.background, atol=1e-5)
+    later(image, detections[:])
+    assert len(computed) == 3  # other detections
+    later(image, detections)
+    later(image.copy(), detections)
+    assert len(computed) == 5  # another frame
+    assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
+
+
+def test_no_foreground_is_computed_twice(monkeypatch) -> None:
+    """The first request computes those of the neighbours too."""
+    computed, plain = [], rt.Embedder.cells
+
+    def counted(self, frame, detections, fore_rows, back_rows):
+        computed.append((fore_rows.tolist(), back_rows.tolist()))
+        return plain(self, frame, detections, fore_rows, back_rows)
+
+    monkeypatch.setattr(rt.Embedder, "cells", counted)
+    image, two = scene_with_twins()
+    three = rt.Detections(two.xyxy[[0, 1, 1]], np.array([0.9, 0.9, 0.2]), np.zeros(3, np.int64))
+    embedder = rt.Embedder("reobj", threads=1)
+    for row in (1, 0, 2):
+        embedder(image, three, np.array([row]))
+    assert computed == [([0, 1], [1]), ([], [0]), ([2], [2])]
+
+
+def test_weak_detections_hide_no_background_and_are_no_neighbours() -> None:
+    image, _ = scene_with_twins()
+    two = boxes((90, 90, 150, 150), (155, 90, 215, 150))
+    weak = rt.Detections(two.xyxy, np.array([0.9, 0.29]), two.class_id)
+    alone, with_weak, both = (
+        rt.Embedder("reobj", threads=1)(image, found, np.array([0])).background
+        for found in (two[:1], weak, two)
+    )
+    np.testing.assert_allclose(with_weak, alone, atol=1e-6)
+    assert not alone[:, 128:].any() and both[:, 128:].any()
+    assert np.abs(both[:, :128] / 0.8**0.5 - alone[:, :128]).max() > 0.01  # hidden background
+
+
+# ---- Neighbours ----
+
+
+def test_neighbour_embedding_is_of_the_near_and_confident_others() -> None:
+    """The near one of two others counts more, unsure ones and oneself do not; alone: nothing."""
+    xyxy = np.array([(0, 0, 40, 40), (50, 0, 90, 40), (300, 0, 340, 40), (0, 0, 40, 40)], float)
+    confident, look = np.array([True, True, True, False]), np.eye(4)
+    around = neighbour_embedding(xyxy, look, confident, np.arange(4))
+    weights = np.exp(-np.array([50, 300]) / 40)  # distances of the centres over the size
+    np.testing.assert_allclose(around[0, 1:3], weights / np.linalg.norm(weights))
+    np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1)
+    assert around[0, 1] > 0.99 > around[2, 1] > around[2, 0] > 0 and not around[:, 3].any()
+    assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # the unsure one has some
+    larger = neighbour_embedding(3 * xyxy + 7, look, confident, np.arange(4))
+    np.testing.assert_allclose(around, larger)
+    unlike = np.array(
+        [(0, 0, 40, 10), (30, 0, 110, 80), (60, 0, 70, 10)], float
+    )  # sizes 20, 80, 10
+    found = neighbour_embedding(unlike, np.eye(3), np.ones(3, bool), np.arange(1))[0]
+    weights = np.exp(-np.array([np.hypot(50, 35), 45]) / 20)  # over the size of its own
+    np.testing.assert_allclose(found[1:], weights / np.linalg.norm(weights))
+    assert not neighbour_embedding(xyxy[:1], look[:1], confident[:1], np.arange(1)).any()
+    some = neighbour_embedding(xyxy, look, confident, np.array([2, 3]))
+    np.testing.assert_allclose(around[2:], some)
+
+
+def test_neighbours_tell_places_apart_that_look_the_same() -> None:
+    """Twins on a plain wall; a red and a green thing stand near, but out of their background."""
+    image, grey = np.full((480, 640, 3), 160, np.uint8), (40, 40, 40)
+    things = {20: grey, 440: grey, 200: (0, 0, 220), 620: (0, 220, 0)}
+    for x, colour in things.items():
+        image[220:260, x - 20 : x + 20] = colour
+    found = boxes(*[(x - 20, 220, x + 20, 260) for x in things])
+    plain, told = (
+        rt.Embedder("reobj", layout=rt.SamplingLayout(neighbours=share), threads=1)(image, found)
+        for share in (0.0, 0.2)
+    )
+    assert (plain.background.shape[1], told.background.shape[1]) == (128, 256)
+    np.testing.assert_allclose(np.linalg.norm(told.background, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(told.background[:, :128], 0.8**0.5 * plain.background, atol=1e-5)
+    around = neighbour_embedding(found.xyxy, plain.foreground, np.ones(4, bool), np.arange(4))
+    np.testing.assert_allclose(told.background[:, 128:], 0.2**0.5 * around, atol=1e-5)
+    cosine = [(b[0] @ b[1]).item() for b in (told.background, plain.background)]
+    assert cosine[0] < cosine[1] - 0.02
+    alone = rt.Embedder("reobj", threads=1)(image, found[:1]).background
+    assert not alone[:, 128:].any() and np.linalg.norm(alone) == pytest.approx(1, abs=1e-5)
 
 
 # ---- The weights that come along ----
@@ -127,7 +384,7 @@ def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
 def test_own_weights_are_found_without_a_download(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("REOBJ_MODELS", str(tmp_path))
     path = rt.model_path("reobj", offline=True)
-    assert path.parent == rt.own_models()
+    assert path.parent == own_models()
     assert sum(f.stat().st_size for f in path.parent.iterdir()) < 5e6
     state = {row.weights.name: row.state for row in rt.list_models()}
     assert state["reobj"] == "verified"
@@ -164,315 +421,66 @@ def test_own_foreground_sees_no_context() -> None:
     assert (one.background * two.background).sum() < 0.95
 
 
-def test_what_stands_around_is_the_look_of_near_neighbours() -> None:
-    """The near one of two others counts more, unsure ones and oneself do not; alone: nothing."""
-    xyxy = np.array([(0, 0, 40, 40), (50, 0, 90, 40), (300, 0, 340, 40), (0, 0, 40, 40)], float)
-    sure, look = np.array([True, True, True, False]), np.eye(4)
-    around = rt.look_around(xyxy, look, sure, np.arange(4))
-    np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1)
-    assert around[0, 1] > 0.99 > around[2, 1] > around[2, 0] > 0 and not around[:, 3].any()
-    assert not around.diagonal().any() and around[3, 0] > around[3, 1]  # the unsure one has some
-    np.testing.assert_allclose(around, rt.look_around(3 * xyxy + 7, look, sure, np.arange(4)))
-    assert not rt.look_around(xyxy[:1], look[:1], sure[:1], np.arange(1)).any()
-    np.testing.assert_allclose(around[2:], rt.look_around(xyxy, look, sure, np.array([2, 3])))
-
-
-def test_neighbours_tell_places_apart_that_look_the_same() -> None:
-    """Twins on a plain wall; a red and a green thing stand near, but out of their background."""
-    image, grey = np.full((480, 640, 3), 160, np.uint8), (40, 40, 40)
-    things = {20: grey, 440: grey, 200: (0, 0, 220), 620: (0, 220, 0)}
-    for x, colour in things.items():
-        image[220:260, x - 20 : x + 20] = colour
-    found = boxes(*[(x - 20, 220, x + 20, 260) for x in things])
-    plain, told = (
-        rt.Embedder("reobj", rt.EmbedConfig(neighbours=share), threads=1)(image, found).background
-        for share in (0.0, 0.2)
-    )
-    assert (plain.shape[1], told.shape[1]) == (128, 256)
-    np.testing.assert_allclose(np.linalg.norm(told, axis=1), 1, atol=1e-5)
-    assert told[0] @ told[1] < plain[0] @ plain[1] - 0.02
-    alone = rt.Embedder("reobj", threads=1)(image, found[:1]).background
-    assert not alone[:, 128:].any() and np.linalg.norm(alone) == pytest.approx(1, abs=1e-5)
-
-
-@pytest.mark.parametrize("model", ["reobj", "colour"])
-def test_some_rows_are_embedded_as_all_rows(model: str) -> None:
-    """In whatever order they are asked for, also by and by: then the map is made once."""
-    image, detections = scene_with_twins()
-    embedder = rt.Embedder(model, threads=1)
-    whole, part = embedder(image, detections), embedder(image, detections, np.array([1]))
-    np.testing.assert_allclose(whole.foreground[1:], part.foreground, atol=1e-5)
-    np.testing.assert_allclose(whole.background[1:], part.background, atol=1e-5)
-    later = rt.Embedder(model, threads=1)
-    later(image, detections, np.array([1]))
-    later._features = None  # type: ignore[assignment]
-    later(image, detections, np.array([1]))
-    turned = later(image, detections, np.array([1, 0]))
-    np.testing.assert_allclose(whole.foreground[::-1], turned.foreground, atol=1e-5)
-    np.testing.assert_allclose(whole.background[::-1], turned.background, atol=1e-5)
-    assert len(embedder(image, detections, np.zeros(0, np.int64)).background) == 0
-
-
-def test_a_map_serves_the_next_frame() -> None:
-    """The look of boxes that moved with the image: nearly that of a map of their own, far from that
-    of another place; no map is computed.
-    """
-    rng = np.random.default_rng(5)
-    wide = cv2.GaussianBlur(rng.integers(0, 256, (520, 700, 3), dtype=np.uint8), (0, 0), 6)
-    old, new = wide[:480, :640], wide[3:483, 6:646]  # things move by (-6, -3)
-    there = boxes((100, 100, 180, 220), (300, 200, 380, 300))
-    here = boxes((94, 97, 174, 217), (294, 197, 374, 297))
-    embedder, computed = rt.Embedder(threads=1), []
-    own = rt.Embedder(threads=1)(new, here)
-    plain = embedder._features
-    embedder._features = lambda frame: (computed.append(1), plain(frame))[1]
-    embedder(old, there)
-    assert not embedder.keep_map(new, here, there.xyxy, new)  # another video came between
-    assert embedder.keep_map(new, here, there.xyxy, old)
-    kept = embedder(new, here)
-    assert len(computed) == 1
-    for mine, theirs in ((kept.foreground, own.foreground), (kept.background, own.background)):
-        cosine = mine @ theirs.T
-        assert cosine.diagonal().min() > 0.95 > cosine[0, 1]
-    embedder(new, there)  # other detections: a map of its own again
-    assert len(computed) == 2
-
-
 def test_own_weights_say_how_they_were_trained() -> None:
-    session = rt.onnx_session(rt.model_path("reobj"), 1)
-    facts = json.loads(session.get_modelmeta().custom_metadata_map["reobj"])
+    facts = onnx_metadata(onnx_session(rt.model_path("reobj"), 1))
     assert {"layout", "multiple", "head", "trained"} <= set(facts)
     assert {"steps", "seed", "minutes", "rooms"} <= set(facts["trained"])
+    layout = rt.Embedder("reobj", threads=1).layout
+    assert (layout.size_px, layout.surround_scale, layout.foreground_channels) == (320, 1.5, 41)
 
 
-@pytest.mark.parametrize("name", ["mobilenetv2", "crops:mobilenetv2"])
-def test_heads_of_mobilenetv2_come_along(name: str) -> None:
-    path = rt.trained_head(name, rt.EmbedConfig())
-    assert path is not None and path.parent == rt.own_models()
-    facts = rt._facts(rt.onnx_session(path, 1))
-    assert facts["trained"]["rooms"] > 10 and {"layout", "trained"} <= set(facts)
-    assert rt.trained_head(name, rt.EmbedConfig(head="none")) is None
+# ---- Embeddings on request ----
 
 
-# ---- Training ----
-
-
-@pytest.fixture(scope="module")
-def te() -> ModuleType:
-    pytest.importorskip("torch", reason="needs pip install torch")
-    return importlib.import_module("train_embedding")
-
-
-@pytest.fixture(scope="module")
-def th(te) -> ModuleType:
-    return importlib.import_module("train_head")
-
-
-@pytest.fixture(scope="module")
-def trained(te, tmp_path_factory) -> Path:
-    """Two steps on one small room, then two more from the checkpoint."""
-    folder = tmp_path_factory.mktemp("train")
-    command = ["-o", str(folder), "--rooms", "3:4", "--cache", str(folder / "rooms")]
-    command += [
-        "--frames",
-        "6",
-        "--val-rooms",
-        "3",
-        "--scenes",
-        "2",
-        "--views",
-        "4",
-        "--every",
-        "1",
+def test_fused_rows_weigh_the_cosines_of_the_parts() -> None:
+    rng = np.random.default_rng(2)
+    given = rt.Embeddings(rng.normal(size=(4, 6)), rng.normal(size=(4, 3)))
+    lazy = LazyEmbeddings(given, None, None, boxes(*[(0, 0, 9, 9)] * 4), 0.7)
+    assert lazy.available and lazy.rows is None and not lazy.done.any()
+    some = lazy.get(np.array([2, 0]))
+    assert lazy.done.tolist() == [True, False, True, False] and lazy.foreground_width == 6
+    assert lazy.rows is not None and not lazy.rows[1].any()
+    np.testing.assert_array_equal(lazy.rows[[2, 0]], some)
+    rows = lazy.get(np.arange(4))
+    cosine = [
+        a / np.linalg.norm(a, axis=1, keepdims=True) for a in (given.foreground, given.background)
     ]
-    command += ["--average", "0.5"]
-    assert te.main([*command, "--steps", "2"]) == 0
-    assert te.main([*command, "--steps", "3", "--resume"]) == 0
-    return folder
+    fore, back = (a @ a.T for a in cosine)
+    np.testing.assert_allclose(rows @ rows.T, 0.7 * fore + 0.3 * back, atol=1e-6)
+    assert rows.dtype == np.float32
 
 
-def test_training_logs_resumes_and_draws_curves(trained) -> None:
-    with (trained / "log.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [int(row["step"]) for row in rows] == [1, 2, 3]
-    assert all(np.isfinite(float(row["loss"])) for row in rows)
-    assert cv2.imread(str(trained / "curves.png")) is not None
+@pytest.mark.parametrize("weight", [0.5, 0.0])
+def test_fused_rows_without_a_background_are_the_foreground(weight: float) -> None:
+    given = as_embeddings([[3.0, 4.0]], 1)
+    lazy = LazyEmbeddings(given, None, None, boxes((0, 0, 9, 9)), weight)
+    np.testing.assert_allclose(lazy.get(np.arange(1)), [[0.6, 0.8]], atol=1e-6)
 
 
-def test_exported_model_equals_the_trained_network(te, trained) -> None:
-    """Pooling in numpy and the ONNX graphs give what the network gives in PyTorch."""
-    import torch
+def test_only_rows_that_are_asked_for_are_computed() -> None:
+    asked = []
 
-    clip = te.room_clip(3, trained / "rooms")
-    net = te.Net()
-    state = torch.load(trained / "best.pt", weights_only=True)
-    mean = {k[7:]: v for k, v in state["mean"].items() if k.startswith("module.")}
-    assert any((mean[k] != v).any() for k, v in state["net"].items())
-    net.load_state_dict(mean)
-    net.eval()
-    frame, rng = int(np.argmax([len(i) for i in clip.identity])), np.random.default_rng(0)
-    view = te.make_view(clip, frame, rng, None, False, clip.identity[frame])
-    with torch.no_grad():
-        expected = net([view], "cpu")
-    masks = clip.labels[frame][None] == (clip.identity[frame] + 1)[:, None, None]
-    n = len(masks)
-    detections = rt.Detections(clip.xyxy[frame], np.ones(n), np.zeros(n, np.int64), masks)
-    found = rt.Embedder(str(trained / "reobj.onnx"), rt.EmbedConfig(neighbours=0), threads=1)(
-        view.picture, detections
-    )
-    assert n == len(view.identity) >= 3
-    for mine, theirs in zip((found.foreground, found.background), expected, strict=True):
-        np.testing.assert_allclose(mine, theirs.numpy(), atol=2e-4)
+    def embedder(frame, detections, rows):
+        asked.append(rows.tolist())
+        return rt.Embeddings(np.eye(3)[rows], np.empty((len(rows), 0)))
+
+    found = boxes(*[(0, 0, 9, 9)] * 3)
+    lazy = LazyEmbeddings(None, embedder, np.zeros((9, 9, 3), np.uint8), found, 0.5)
+    assert lazy.available and asked == []
+    for rows in ([1], [1], [2, 1]):
+        np.testing.assert_array_equal(lazy.get(np.array(rows)), np.eye(3)[rows])
+    assert asked == [[1], [2]]
+    assert lazy.get(np.zeros(0, np.int64)).shape == (0, 3)
+    assert not LazyEmbeddings(None, embedder, None, found, 0.5).available
+    assert not LazyEmbeddings(None, None, np.zeros((9, 9, 3), np.uint8), found, 0.5).available
 
 
-def test_colour_channels_are_those_of_the_training_free_descriptor(te) -> None:
-    import torch
-
-    image, _ = scene_with_twins()
-    image = cv2.GaussianBlur(image, (0, 0), 2)[:, :320]
-    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].float()
-    own = te.ColourMap()(planes)[0].numpy().transpose(1, 2, 0)  # (60, 80, 17)
-    other = cv2.resize(rt._colour_features(image), (80, 60), interpolation=cv2.INTER_AREA)
-    assert np.corrcoef(own[..., :11].ravel(), other[..., :11].ravel())[0, 1] > 0.98
-
-
-@pytest.mark.parametrize(
-    ("hard", "soft", "expected"), [(True, False, 0.9), (False, False, 0.5), (False, True, 0.9018)]
-)
-def test_triplet_loss_picks_the_negative(te, hard: bool, soft: bool, expected: float) -> None:
-    """Anchor 0, positive 1 at cosine .6, negatives at .9 (hardest) and .5 (semi-hard); their soft
-    maximum is .1 log(e^9 + e^5).
-    """
-    import torch
-
-    cosines = (1.0, 0.6, 0.9, 0.5)
-    rows = torch.tensor([[c, (1 - c * c) ** 0.5] for c in cosines])
-    same, different = torch.zeros(4, 4, dtype=torch.bool), torch.zeros(4, 4, dtype=torch.bool)
-    same[0, 1] = different[0, 2] = different[0, 3] = True
-    loss = float(te.triplet_loss(rows, same, different, hard, soft))
-    assert loss == pytest.approx(0.1 * np.log1p(np.exp((expected - 0.6) / 0.1)), abs=1e-4)
-
-
-def test_windows_of_large_pictures_are_narrower(te) -> None:
-    """Sizes differ by up to 1 : 3 where the picture holds the detail."""
-    rng = np.random.default_rng(0)
-    number = np.arange(1)
-    widths = []
-    for scale in (1, 2):
-        image = np.zeros((240 * scale, 320 * scale, 3), np.uint8)
-        box = np.array([[150.0, 110, 170, 130]]) * scale
-        clip = te.Clip("x", [image], None, [box], [number], [number], True)
-        found = [te.augmented(clip, 0, rng, lambda image: image, False, number) for _ in range(200)]
-        boxes = np.concatenate([d.xyxy[rows] for _, d, rows in found])
-        widths.append(boxes[:, 2] - boxes[:, 0])
-    assert widths[0].max() < 45 < 55 < widths[1].max() and widths[1].min() < 24
-
-
-def test_overlapping_pseudo_objects_are_dropped(te) -> None:
-    center = np.array([[0.0, 0, 0], [0.1, 0, 0], [2.0, 0, 0], [5.0, 0, 0]])
-    assert te.apart(center, np.array([1.0, 1.0, 1.0, 0.0])).tolist() == [0, 2]
-
-
-def test_mot_tracks_become_a_clip(te, tmp_path) -> None:
-    (tmp_path / "images").mkdir()
-    for i in range(2):
-        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), np.full((480, 640, 3), 90 * i, np.uint8))
-    (tmp_path / "tracks.txt").write_text(
-        "1,7,100,100,200,200,.9,-1,-1,-1\n2,7,90,90,200,200,.9,-1,-1,-1\n"
-    )
-    clip = te.tracks_clip(tmp_path / "images", tmp_path / "tracks.txt")
-    assert [i.tolist() for i in clip.identity] == [[0], [0]] and clip.labels is None
-    np.testing.assert_allclose(clip.xyxy[0], [[100, 100, 300, 300]])  # 640 px on the longer side
-
-
-def test_tracks_take_the_masks_of_the_detections(te, tmp_path) -> None:
-    """Of those beside tracks.txt and of the cache of `run`; by box, whatever their order."""
-    (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images" / "0.png"), np.zeros((240, 320, 3), np.uint8))
-    rows = ["1,7,100,100,80,100,.9,-1,-1,-1", "1,9,10,10,40,40,.9,-1,-1,-1"]
-    (tmp_path / "tracks.txt").write_text("\n".join(rows))
-    masks = np.zeros((3, 240, 320), bool)
-    masks[0, 10:50, 10:50] = masks[1, 150:200, 100:180] = masks[2, 210:, 200:] = True
-    found = boxes((10, 10, 50, 50), (100, 100, 180, 200), (200, 210, 320, 240), masks=masks)
-    rt.write_detections_npz(tmp_path / "cache/d/chunk_000000.npz", [(0, found)], [], (320, 240))
-    clip = te.tracks_clip(tmp_path / "images", tmp_path / "tracks.txt")
-    expected = masks[1] * 1 + masks[0] * 2
-    np.testing.assert_array_equal(clip.labels[0], expected)
-    np.testing.assert_array_equal(np.sort(clip.identity[0]), [0, 1])
-
-
-def test_scannet_folders_become_a_clip(te, tmp_path) -> None:
-    for name in ("color", "instance-filt"):
-        (tmp_path / name).mkdir()
-    label = np.zeros((240, 320), np.uint8)
-    label[20:120, 30:100], label[50:200, 150:250] = 3, 5  # objects 2 and 4
-    for i in range(2):
-        cv2.imwrite(str(tmp_path / "color" / f"{i}.jpg"), np.full((480, 640, 3), 90, np.uint8))
-        cv2.imwrite(str(tmp_path / "instance-filt" / f"{i}.png"), label)
-    groups = [{"objectId": 2, "label": "chair"}, {"objectId": 4, "label": "chair"}]
-    (tmp_path / "x.aggregation.json").write_text(json.dumps({"segGroups": groups}))
-    clip = te.scannet_clip(tmp_path)
-    assert len(clip.images) == 2 and clip.images[0].shape == (480, 640, 3)
-    np.testing.assert_allclose(clip.xyxy[1][0], [60, 40, 200, 240])
-    assert len(set(clip.identity[0].tolist())) == 2 and len(set(clip.look[0].tolist())) == 1
-    for box, identity in zip(clip.xyxy[0].astype(int), clip.identity[0], strict=True):
-        inner = clip.labels[0][box[1] + 2 : box[3] - 2, box[0] + 2 : box[2] - 2]
-        assert (inner == identity + 1).all()
-
-
-@pytest.mark.parametrize("crops", [False, True])
-def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, crops: bool) -> None:
-    """A step of training; the exported head gives through the tool what it gives in PyTorch."""
-    backbone(tmp_path / "net.onnx", tmp_path / "block.onnx", channels=8)
-    command = ["-o", str(tmp_path), "--backbone", str(tmp_path / "net.onnx"), "--rooms", "3"]
-    command += ["--cache", str(trained / "rooms"), "--val-rooms", "3", "--frames", "6"]
-    assert th.main([*command, *["--crops"] * crops, "--steps", "2", "--every", "1"]) == 0
-    out = tmp_path / "concat" if crops else tmp_path
-    name = "crops_net_head.onnx" if crops else "net_head.onnx"
-    assert cv2.imread(str(out / "curves.png")) is not None
-    (out / name).replace(tmp_path / name)
-    image, detections = scene_with_twins()
-    kind = rt.CropEmbedder if crops else rt.Embedder
-    alone = rt.EmbedConfig(neighbours=0)
-    look = kind(str(tmp_path / "net.onnx"), alone, threads=1)(image, detections)
-    plain = rt.EmbedConfig(head="none")
-    frozen = kind(str(tmp_path / "net.onnx"), plain, threads=1)(image, detections)
-    assert look.foreground.shape != frozen.foreground.shape  # "none": no training
-    assert look.background.shape == ((2, 0) if crops else (2, 128))
-    np.testing.assert_allclose(np.linalg.norm(look.foreground, axis=1), 1, atol=1e-3)
-    args = th.build_parser().parse_args([*command, *["--crops"] * crops])
-    see = th.Frozen(args).see(image, detections, np.arange(2))
-    assert_same_as_in_torch(th, args, see, out / "best.pt", look)
-
-
-def test_fine_rooms_have_pictures_and_a_cache_of_their_own(th, te, tmp_path) -> None:
-    for name in ("fine_7.npz", "room_8.npz"):
-        (tmp_path / name).touch()
-    command = ["-o", "x", "--backbone", "x", "--cache", str(tmp_path), "--no-render"]
-    args = th.build_parser().parse_args([*command, "--rooms", "7:9", "--fine-rooms", "7:9"])
-    assert [name for name, _ in th.sources(args)] == ["room 8", "fine 7"]
-    small, fine = te.room_config(7), te.room_config(7, fine=True)
-    assert fine.width == 2 * small.width and fine.hfov_deg == small.hfov_deg
-
-
-def assert_same_as_in_torch(th, args, see, checkpoint: Path, look: rt.Embeddings) -> None:
-    import torch
-
-    names = ["fg", "bg"]
-    trainer = th.HeadTrainer(args, th.Frozen(args), names)
-    trainer.net.load_state_dict(torch.load(checkpoint, weights_only=True)["net"])
-    trainer.net.eval()
-    seen = th.Seen(see, np.arange(2), np.arange(2), np.zeros(2))
-    with torch.no_grad():
-        expected = [part.numpy() for part in trainer.embed(trainer.net, [seen])]
-    if args.crops:  # one row of both
-        expected = [np.concatenate(expected, 1) / 2**0.5]
-    for mine, theirs in zip((look.foreground, look.background), expected, strict=False):
-        np.testing.assert_allclose(mine, theirs, atol=5e-3)  # weights kept as float16
-
-
-@pytest.mark.parametrize("command", [["-o", "x"], ["-o", "x", "--sparse", "no=where"]])
-def test_bad_input_is_refused(te, command: list[str], tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit):
-        te.main(command)
+def test_embeddings_as_they_come() -> None:
+    assert as_embeddings(None, 3) is None
+    both = rt.Embeddings(np.ones((2, 4)), np.ones((2, 1)))
+    assert as_embeddings(both, 2) is both
+    plain = as_embeddings(np.ones((2, 4)), 2)
+    assert plain is not None
+    assert plain.foreground.shape == (2, 4) and plain.background.shape == (2, 0)
+    with pytest.raises(rt.ReobjError, match="one row a detection"):
+        as_embeddings(both, 3)

@@ -27,6 +27,10 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
         assert part.parent == path.parent and not path.exists()  # the same disk: a rename is atomic
         part.write_text("whole")
     assert path.read_text() == "whole" and list(path.parent.iterdir()) == [path]
+    with files.atomic(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "whole"
+    assert path.read_text() == "new" and list(path.parent.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])

@@ -13,6 +13,7 @@ import pytest
 import rank_k as rk
 
 import reobj_track as rt
+from reobj.identity.reid import SimilarityCalibration
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -68,6 +69,46 @@ def pairs(**changes: object) -> rk.Pairs:
 )
 def test_galleries(protocol: str, away: int, gallery_of_first: list[int]) -> None:
     assert np.flatnonzero(pairs().gallery(protocol, away)[0]).tolist() == gallery_of_first
+
+
+def single(identity: np.ndarray, frame: np.ndarray) -> rk.Pairs:
+    """One scene, one class."""
+    zero = np.zeros(len(identity), np.int64)
+    return rk.Pairs(zero, frame, zero, zero, identity, np.tile([0.0, 0, 1], (len(zero), 1)))
+
+
+def test_the_single_protocol_has_one_view_of_each_object() -> None:
+    """The gallery of every query is drawn: one view of each object that it may be compared with, of
+    its own object too, and every view has its turn.
+    """
+    own = single(np.repeat([0, 1, 2], 6), np.tile(10 * np.arange(6), 3))
+    allowed, drawn = own.gallery("twins", 0), np.zeros((18, 18))
+    for seed in range(40):
+        chosen = rk.one_view(own, allowed, np.random.default_rng(seed))
+        assert not (chosen & ~allowed).any()
+        per_object = np.add.reduceat(chosen, [0, 6, 12], 1)
+        np.testing.assert_array_equal(per_object, np.ones((18, 3)))
+        drawn += chosen
+    assert (drawn[allowed] > 0).all()
+
+
+def test_single_view_ranks_are_lower_than_those_of_the_whole_gallery() -> None:
+    """Every query has one view of its own object that is alike (1), others that are not (0) and a
+    twin half alike in every view (.5): the whole gallery finds it always, one random view of five
+    only where that is drawn.
+    """
+    views = 6
+    own = single(np.repeat([0, 1], views), np.tile(10 * np.arange(views), 2))
+    same, position = own.same(), np.tile(np.arange(views), 2)
+    following = (position[:, None] + 1) % views == position[None]
+    cosine = np.where(same, np.where(following, 1.0, 0.0), 0.5)
+    whole, precision = rk.rank_pairs(cosine, own, "twins", 0)
+    assert (whole == 1).all() and (precision < 1).all()
+    ranks, _ = rk.rank_pairs(cosine, own, "single", 0)
+    assert len(ranks) == 10 * len(same) and set(ranks) == {1.0, 2.0}
+    assert (ranks == 1).mean() == pytest.approx(1 / (views - 1), abs=0.1)
+    row = rk.summary(*rk.rank_pairs(cosine, own, "single", 0), own)
+    assert row["queries"] == len(same) and row["rank1"] == pytest.approx(20, abs=10)
 
 
 def test_one_instance_of_a_class_counts_only_in_the_class_protocol() -> None:
@@ -158,16 +199,16 @@ def test_scannet_faults(scannet: Path) -> None:
 
 
 def recording(folder: Path, textured: bool) -> Path:
-    """Eight frames, two equal objects in fixed places on a wall."""
+    """Eight frames, two equal objects in fixed places on a wall, far from the borders."""
     (folder / "images").mkdir(parents=True)
     grid = RNG.integers(0, 255, (12, 16, 3), np.uint8)
-    wall = cv2.resize(grid, (160, 120)) if textured else np.full((120, 160, 3), 90, np.uint8)
+    wall = cv2.resize(grid, (640, 480)) if textured else np.full((480, 640, 3), 90, np.uint8)
     lines = []
     for f in range(8):
         image, colour = wall.copy(), RNG.integers(0, 255, 3).tolist()
-        for k, x in ((1, 20), (2, 100)):
-            cv2.rectangle(image, (x, 40), (x + 30, 80), colour, -1)
-            lines.append(f"{f + 1},{k},{x + 1},41,30,40,1,56,1.0")
+        for k, x in ((1, 200), (2, 400)):
+            cv2.rectangle(image, (x, 220), (x + 30, 260), colour, -1)
+            lines.append(f"{f + 1},{k},{x + 1},221,30,40,1,56,1.0")
         cv2.imwrite(str(folder / "images" / f"{f:04d}.png"), image)
     (folder / "gt_mot.txt").write_text("\n".join(lines) + "\n")
     return folder
@@ -176,7 +217,7 @@ def recording(folder: Path, textured: bool) -> Path:
 @pytest.mark.parametrize("textured", [True, False])
 def test_twins_are_told_apart_by_the_background(textured: bool, tmp_path: Path) -> None:
     out, clip = tmp_path / "out", recording(tmp_path / "clip", textured)
-    assert rk.main(["--recording", str(clip), "--every", "1", "-o", str(out)]) == 0
+    assert rk.main(["--recording", str(clip), "--every", "1", "--no-crops", "-o", str(out)]) == 0
     with (out / "rank_k.csv").open() as file:
         table = [r for r in csv.DictReader(file) if (r["protocol"], r["gap"]) == ("twins", "any")]
     rank1 = {r["setup"]: float(r["rank1"]) for r in table}
@@ -192,68 +233,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert not (tmp_path / "out").exists()
 
 
-def backbone(path: Path, block: Path, channels: int = 4) -> None:
-    """A backbone at stride 32 (mean colours) and a ConvBlock (mean over the map) as ONNX."""
-    onnx = pytest.importorskip("onnx")
-    from onnx import TensorProto, helper
-
-    weight = np.zeros((channels, 3, 32, 32), np.float32)
-    weight[:3] = np.eye(3)[:, :, None, None] / 1024
-    nodes = [helper.make_node("Conv", ["image", "w"], ["map"], strides=[32, 32])]
-    shape = ["n", 3, "h", "v"]
-    for file, inputs, outputs, ops, init in (
-        (path, ("image", shape), ("map", ["n", channels, "a", "b"]), nodes,
-         [onnx.numpy_helper.from_array(weight, "w")]),
-        (block, ("maps", ["n", 2 * channels, 7, 7]), ("row", ["n", 2 * channels, 1, 1]),
-         [helper.make_node("GlobalAveragePool", ["maps"], ["row"])], []),
-    ):  # fmt: skip
-        ends = [
-            helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in (inputs, outputs)
-        ]
-        graph = helper.make_graph(ops, "g", ends[:1], ends[1:], init)
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
-        model.ir_version = 8
-        onnx.save(model, file)
-
-
-def test_crops_hold_object_or_surroundings(tmp_path: Path) -> None:
-    """A red box on green: foreground red, background green, joined by a ConvBlock."""
-    backbone(tmp_path / "net.onnx", tmp_path / "block.onnx")
-    image = np.full((120, 160, 3), (0, 200, 0), np.uint8)
-    image[40:80, 60:100] = (0, 0, 200)
-    mask = np.zeros((1, 120, 160), bool)
-    mask[0, 40:80, 60:100] = True
-    found = rt.Detections(np.array([[60.0, 40, 100, 80]]), np.ones(1), np.zeros(1, int), mask)
-    config = rt.EmbedConfig()
-    crops = rt.CropEmbedder(str(tmp_path / "net.onnx"), config, threads=1)
-    pixels, on_object = crops.cut(image, found, np.arange(1))
-    assert on_object.mean() == pytest.approx(0.25, abs=0.01)  # grown by half on every side
-    assert (pixels[on_object] == (0, 0, 200)).mean() > 0.97
-    (fore,), (back,) = np.split(crops.masked(pixels, on_object).astype(int), 2)  # (S, S, 3) each
-    grey = np.array(rt.IMAGENET_MEAN[::-1]).round()
-    assert (fore[:20, :20] == grey).all() and (back[102:122, 102:122] == grey).all()
-    np.testing.assert_allclose(fore + back, pixels[0] + grey, atol=2)  # also along the soft edge
-    plain = crops.masked(np.full_like(pixels, 220), on_object).astype(int)
-    assert 0 < np.abs(np.diff(plain, axis=2)).max() < 8  # of 100 grey values: no hard edge
-    look = crops(image, found)
-    assert look.foreground.shape == look.background.shape == (1, 4 * 49)
-    assert look.foreground @ look.background.T < 0.9
-    joined = rt.EmbedConfig(head=str(tmp_path / "block.onnx"))
-    joint = rt.CropEmbedder(str(tmp_path / "net.onnx"), joined, threads=1)(image, found)
-    assert joint.foreground.shape == (1, 8) and joint.background.shape == (1, 0)
-    small = rt.EmbedConfig(head=str(tmp_path / "block.onnx"), crop_px=96)
-    with pytest.raises(rt.ReobjError, match="crop_px"):
-        rt.CropEmbedder(str(tmp_path / "net.onnx"), small, threads=1)(image, found)
-
-
-def test_crops_are_an_embedder_of_the_tool(tmp_path: Path) -> None:
-    """`--embed crops:FILE` reaches the tracker."""
-    backbone(tmp_path / "net.onnx", tmp_path / "block.onnx")
-    config = rt.Config(embed=rt.EmbedConfig(model=f"crops:{tmp_path / 'net.onnx'}"))
-    assert isinstance(rt._embedder(config), rt.CropEmbedder)
-
-
-def normal_cases(n: int = 4000, objects: int = 3) -> rk.Cases:
+def normal_cases(n: int = 2400, objects: int = 3) -> rk.Cases:
     """Newcomers against some objects of which at most one is right; both parts are normal."""
     close = {True: (2.0, 1.9), False: (1.2, 1.4)}
 
@@ -273,7 +253,7 @@ def test_calibration_finds_the_true_odds(monkeypatch: pytest.MonkeyPatch) -> Non
     """With the constants fitted to them, normal pairs and decisions come out calibrated."""
     cases = normal_cases()
     weights, odds = rk.calibrate([cases])
-    monkeypatch.setattr(rt.SameObject, "WEIGHTS", tuple(weights))
+    monkeypatch.setattr(SimilarityCalibration, "WEIGHTS", tuple(weights))
     p = cases.decider().probability(*cases.cosine.T)
     bins = rk.reliability(p, cases.same, cases.balance(False))
     assert rk.expected_error(bins) < 0.03
@@ -291,67 +271,3 @@ def test_constants_are_those_of_normal_pairs() -> None:
     assert set(rows) == {"f", "fb", "decision"}
     assert rows["fb"]["ece"] < 0.1 and rows["fb"]["right"] > rows["f"]["right"] > 0.7
     assert rows["decision"]["log_loss"] < np.log(2)  # of guessing
-
-
-def test_probability_follows_its_evidence() -> None:
-    """Monotone in both cosines; a background from another side counts less; bounded."""
-    same = rt.SameObject(10)
-    high, low = same.logit(0.9, 0.9), same.logit(0.9, 0.2)
-    assert high > low and same.logit(0.95, 0.9) > high
-    near = same.logit(0.9, [0.2, 0.9], 0.0)
-    side = same.logit(0.9, [0.2, 0.9], 80.0)
-    assert np.ptp(near) > 3 * np.ptp(side)
-    assert np.ptp(same.logit(0.9, [0.2, 0.9], 90.0)) == pytest.approx(0)
-    assert np.isfinite(same.logit(0.9, np.nan))
-    assert np.abs(same.logit([1.0, -1.0], [1.0, -1.0])).max() < 7
-    assert same.probability(0.9, 0.9, prior=0.1) < same.probability(0.9, 0.9)
-    assert same.logit(np.full((2, 3), 0.5), 0.4).shape == (2, 3)
-    assert same.logit(np.nan, 0.5) == -np.inf and same.probability(np.nan) == 0
-
-
-def test_probability_adapts_to_the_video() -> None:
-    """Where all objects look alike the same cosine says less; unknown parts teach nothing."""
-    plain, alike = rt.SameObject(10), rt.SameObject(10)
-    alike.add(np.full(200, 0.95), np.full(200, np.nan), False)
-    assert alike.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
-    assert np.array_equal(alike.sums[:, :, 1], plain.sums[:, :, 1])
-    alike.add(np.full(200, 0.99), np.full(200, 0.99), True)
-    assert alike.logit(0.99, 0.99) > 0 > alike.logit(0.93, 0.9)
-
-
-def test_part_cosines_of_fused_rows() -> None:
-    fore, back = (rt._unit_rows(RNG.normal(size=(4, n))) for n in (6, 3))
-    fused = np.concatenate([np.sqrt(0.7) * fore, np.sqrt(0.3) * back], 1)
-    got = rt.part_cosines(fused, fused[:2], 6)
-    assert np.allclose(got[0], fore @ fore[:2].T) and np.allclose(got[1], back @ back[:2].T)
-    assert np.isnan(rt.part_cosines(fused[:, :6], fused[:, :6], 6)[1]).all()
-
-
-def test_gallery_parts_are_of_the_most_similar_view() -> None:
-    gallery = rt.Gallery(rt.TrackerConfig())
-    gallery.split = 2
-    views = np.array([[1, 0, 1, 0], [0, 1, 0, 1.0]], np.float32) / np.sqrt(2)
-    ahead, left, unknown = np.array([[[0, 0, 1.0]], [[-1, 0, 0]], np.full((1, 3), np.nan)])
-    for view, sight in zip(views, (ahead, left), strict=True):
-        gallery.add(np.array([0]), view[None], sight)
-    fore, back, angle = gallery.parts(views[1:], np.array([0]), ahead)
-    assert (fore, back, angle) == (pytest.approx(1), pytest.approx(1), pytest.approx(90))
-    gallery.add(np.array([0]), views[1:], ahead)  # nothing new: the kept view stays as it was
-    assert gallery.parts(views[1:], np.array([0]), left)[2] == pytest.approx(0)
-    assert np.isnan(gallery.parts(views[1:], np.array([0]), unknown)[2])
-    assert np.isnan(gallery.parts(views, np.array([], int), views[:, :3])[0]).size == 0
-
-
-def test_trained_crops_see_only_their_part() -> None:
-    """With the shipped model: another wall changes the background's rows alone."""
-    mask = np.zeros((1, 120, 160), bool)
-    mask[0, 40:80, 60:100] = True
-    found = rt.Detections(np.array([[60.0, 40, 100, 80]]), np.ones(1), np.zeros(1, int), mask)
-    walls = np.full((2, 120, 160, 3), 60, np.uint8)
-    walls[0, ..., 2] = walls[1, ..., 0] = 200  # red, blue
-    walls[:, 40:80, 60:100] = RNG.integers(0, 255, (40, 40, 3), np.uint8)
-    crops = rt.CropEmbedder("reobj", rt.EmbedConfig(crop_px=64), threads=1)
-    one, other = (crops(wall, found) for wall in walls)
-    assert one.foreground.shape == one.background.shape == (1, 128)
-    assert np.allclose(one.foreground, other.foreground, atol=1e-4)
-    assert (one.background @ other.background.T).item() < 0.99

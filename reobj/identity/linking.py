@@ -30,7 +30,6 @@ LINK_PROBABILITY = 0.5  # join by appearance from this probability on, rivals co
 VIEW_GAP = (
     30  # frames; views of a fragment this far apart show how the appearance of one object varies
 )
-PRIOR_PAIRS = 10.0  # pairs that the prior of `SimilarityCalibration` is worth
 DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes on one object
 MIN_LINK_LOG_ODDS = -4.0  # never join by place what is less alike: 1 in 55
 MIN_CLASS_AGREEMENT = 0.1  # join by place only where the class shares agree in so much
@@ -163,7 +162,7 @@ class Linker:
         if not embeddings.foreground.size:
             return
         foreground, background, angle = self._best_views(embeddings, embedding_row)
-        calibration = SimilarityCalibration(PRIOR_PAIRS)
+        calibration = SimilarityCalibration()
         pairs = np.triu(self.distinct & (self.classes[:, None] == self.classes), 1)
         for rows, same in ((pairs, False), (np.eye(len(pairs), dtype=bool), True)):
             calibration.add(foreground[rows], background[rows], same)

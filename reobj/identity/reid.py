@@ -320,7 +320,7 @@ class EllipsoidMap:
             self.fresh[i] += 1
 
     def refit(self, image_size: tuple[int, int]) -> bool:
-        """Fit the ellipsoids of all identities with enough fresh views (a quarter of theirs).
+        """Fit the ellipsoids of all identities with enough fresh views (above a quarter of theirs).
 
         A fit that is rejected, has no parallax or is a needle makes the place unknown.
 

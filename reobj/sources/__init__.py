@@ -1,1 +1,1 @@
-"""sources of reobj_track."""
+"""What comes in: frames, weights, recorded detections, detectors."""

@@ -216,9 +216,9 @@ class DetectionCache:
 
     def get(self, index: int) -> Detections | None:
         """Return the detections of a frame, None if it was not detected yet."""
-        if index in self._fresh or index not in self._stored:
-            return self._fresh.get(index)
-        return self._stored[index].at(index)
+        if index in self._fresh:
+            return self._fresh[index]
+        return self._stored[index].at(index) if index in self._stored else None
 
     def put(self, index: int, detections: Detections) -> None:
         """Store the detections of a frame, also when there are none."""
@@ -303,13 +303,19 @@ def open_detections(
     if detections is None or detections == "":
         path = model_path(config.model, offline)
         detector = OnnxDetector(path, config, threads)
-        key = json.dumps([path.name, path.stat().st_size, dataclasses.asdict(config)])
+        key = _cache_key(config, path.name, path.stat().st_size)
         return dataclasses.replace(as_source(detector), key=key, slow=True)
     if isinstance(detections, str | Path):
         recorded = as_source(read_detections(detections, video, config))
-        return dataclasses.replace(recorded, key=source_fingerprint(detections))
+        return dataclasses.replace(recorded, key=_cache_key(config, source_fingerprint(detections)))
     names = load_class_names(config.class_names) if config.class_names else ()
     return as_source(detections, names)
+
+
+def _cache_key(config: DetectConfig, *source: str | int) -> str:
+    """Make a key of what identifies a source, the options and the file of class names."""
+    names = source_fingerprint(config.class_names) if config.class_names else ""
+    return json.dumps([*source, dataclasses.asdict(config), names])
 
 
 def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource:

@@ -1,0 +1,374 @@
+"""Recorded detections in MOT, CSV, COCO and npz files, with everything that can be wrong there."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from reobj.sources import detection_files
+from reobj.sources.recorded import RecordedDetections
+
+SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+needs_shared = pytest.mark.skipif(
+    not (SHARED / "data").is_dir(), reason="no real recordings: set REOBJ_SHARED"
+)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> rt.Video:
+    """20 images of 640 x 480."""
+    folder = tmp_path_factory.mktemp("v") / "im"
+    folder.mkdir()
+    for index in range(20):
+        cv2.imwrite(str(folder / f"im{index}.png"), np.zeros((480, 640, 3), np.uint8))
+    return rt.Video(folder)
+
+
+def read(
+    tmp_path: Path, name: str, text: str, video: rt.Video, **config: Any
+) -> RecordedDetections:
+    (tmp_path / name).write_text(text)
+    return rt.read_detections(tmp_path / name, video, rt.DetectConfig(**config))
+
+
+MOT = "1,-1,10,20,30,40,.9,-1,-1,-1\n3,-1,50,60,30,40,.5,-1,-1,-1\n1,-1,100,20,30,40,.95,-1,-1,-1\n"
+CSV = "frame,x1,y1,x2,y2,score,class\n0,10,20,40,60,.9,56\n2,50,60,80,100,.5,41\n"
+
+
+def test_mot(tmp_path: Path, video: rt.Video) -> None:
+    found = read(tmp_path, "det.txt", MOT, video)
+    assert found.frame.tolist() == [0, 0, 2] and found.class_names == ("object",)
+    assert len(found) == 3
+    first = found.at(0)
+    assert first.xyxy.tolist() == [[100, 20, 130, 60], [10, 20, 40, 60]]  # best first, corners
+    assert (
+        first.score.tolist() == [0.95, 0.9]
+        and first.class_id.tolist() == [0, 0]
+        and first.masks is None
+    )
+    assert len(found.at(1)) == 0 and found.at(1).xyxy.shape == (0, 4)
+    assert found.messages == []
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("1,-1,10,20,30,40,.9\n", ("object",)),  # 7 columns (MOT17)
+        ("1,-1,10,20,30,40\n", ("object",)),  # no score
+        # ground truth: class from 1, and visibility
+        ("\n1,7,10,20,30,40,1,2,.7\n", ("class 1", "class 2")),
+        ("1,7,10,20,30,40,1,1,.7\n", ("class 1",)),
+        ("0,-1,10,20,30,40,.9\n", ("object",)),  # 0-based frames
+    ],
+)
+def test_mot_variants(tmp_path: Path, video: rt.Video, text: str, names: tuple[str, ...]) -> None:
+    found = read(tmp_path, "det.txt", text, video)
+    assert found.at(0).xyxy.tolist() == [[10, 20, 40, 60]] and found.class_names == names
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", []),
+        ("\n\n", []),
+        ("1,2,3,4,5,6\n", [[1, 2, 3, 4, 5, 6]]),
+        ("1,-1,1.5,2e1,30,40,.9,-1,-1,-1\n", [[1, -1, 1.5, 20, 30, 40, 0.9, -1, -1, -1]]),
+        ("1, 2, 3, 4, 5, 6, 1\n\n2, 2, 3, 4, 5, 6, 0\n",
+         [[1, 2, 3, 4, 5, 6, 1], [2, 2, 3, 4, 5, 6, 0]]),
+    ],
+)  # fmt: skip
+def test_mot_rows_as_they_are(tmp_path: Path, text: str, expected: list[list[float]]) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    rows = detection_files.read_mot_rows(tmp_path / "a.txt")
+    assert rows.tolist() == expected and rows.shape[1] == (len(expected[0]) if expected else 10)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("1,2,3,4,5\n", "line 1: 5 columns, expected 6 to 10"),
+        ("1,2,3,4,5,6,7,8,9,10,11\n", "line 1: 11 columns, expected 6 to 10"),
+        ("1,2,3,4,5,6\n\n1,2,3,4,5,6,7\n", "line 3: 7 columns, expected 6"),
+        ("1,2,3,4,5,6\n\n1,2,3,4,5,six\n", "line 3: 'six' is no finite number"),
+        ("1,2,3,4,5,6\n1,2,3,4,5,\n", "line 2: '' is no finite number"),
+        ("1,2,3,4,5,nan\n", "line 1: 'nan' is no finite number"),
+        ("1,2,3,4,5,6,1,1,1,x\n", "line 1: 'x' is no finite number"),  # the last column too
+        ("frame,x1,y1,x2,y2\n0,1,2,3,4\n", "line 1: no MOTChallenge file"),
+        ("1," + "2" * 200_000, "line 1: no table"),
+    ],
+)  # fmt: skip
+def test_damaged_mot_rows(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(rt.ReobjError, match=rf"a\.txt, {expected}") as caught:
+        detection_files.read_mot_rows(tmp_path / "a.txt")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        CSV,
+        CSV.replace("frame,", "# frame(0-based row),").replace(
+            "class\n", "class(COCO-80) ; some tool, 640\n"
+        ),
+        "class_id,confidence,frame,x,y,width,height\n56,.9,0,10,20,30,40\n41,.5,2,50,60,30,40\n",
+        "Frame,X1,Y1,X2,Y2,Conf,class_name\n0,10,20,40,60,.9,chair\n2,50,60,80,100,.5,cup\n",
+    ],
+)
+def test_csv_variants(tmp_path: Path, video: rt.Video, text: str) -> None:
+    found = read(tmp_path, "det.csv", text, video)
+    assert found.at(0).xyxy.tolist() == [[10, 20, 40, 60]] and found.at(2).score.tolist() == [0.5]
+    assert [found.class_names[found.at(f).class_id[0]] for f in (0, 2)] == ["chair", "cup"]
+
+
+def test_options_apply_to_recorded_detections(tmp_path: Path, video: rt.Video) -> None:
+    for min_score, kept in ((0.4, [0, 2]), (0.5, [0, 2]), (0.51, [0]), (0.9, [0]), (0.91, [])):
+        assert read(tmp_path, "a.csv", CSV, video, min_score=min_score).frame.tolist() == kept
+    assert read(tmp_path, "a.csv", CSV, video, classes="Cup, tv").frame.tolist() == [2]
+    assert read(tmp_path, "a.txt", MOT, video, max_detections=1).at(0).score.tolist() == [0.95]
+    table = CSV.replace("41", "60")
+    assert read(tmp_path, "a.csv", table, video, classes="dining_table").frame.tolist() == [2]
+    (tmp_path / "names.txt").write_text("Sofa\n\nlamp\n")
+    options = {"class_names": str(tmp_path / "names.txt")}
+    own = CSV.replace("56", "0").replace("41", "1")
+    named = read(tmp_path, "a.csv", own, video, **options)
+    assert named.class_names == ("Sofa", "lamp") and named.at(2).class_id.tolist() == [1]
+    assert read(tmp_path, "a.csv", own, video, classes="sofa", **options).frame.tolist() == [0]
+
+
+def coco_entries(**changes: Any) -> list[dict[str, Any]]:
+    return [{"image_id": 4, "category_id": 62, "bbox": [10, 20, 30, 40], "score": 0.9} | changes]
+
+
+def test_coco(tmp_path: Path, video: rt.Video) -> None:
+    found = read(tmp_path, "res.json", json.dumps(coco_entries()), video)
+    assert found.frame.tolist() == [4] and found.at(4).xyxy.tolist() == [[10, 20, 40, 60]]
+    assert found.class_names[found.at(4).class_id[0]] == "chair"  # COCO's category 62
+    (tmp_path / "names.txt").write_text("sofa\nlamp\n")
+    named = read(tmp_path, "res.json", json.dumps(coco_entries(category_id=1)), video,
+                 class_names=str(tmp_path / "names.txt"))  # fmt: skip
+    assert named.class_names == ("sofa", "lamp") and named.class_id.tolist() == [1]
+
+
+def test_coco_ids_are_those_of_the_dataset_beside(tmp_path: Path, video: rt.Video) -> None:
+    """An image_id is no frame number (trap 7 of the formats): the dataset JSON says which it is."""
+    images = [{"id": 900 + i, "file_name": f"some/im{19 - i}.png"} for i in range(20)]
+    dataset = {"images": images, "categories": [{"id": 7, "name": "wok"}, {"id": 9, "name": "cup"}]}
+    (tmp_path / "instances.json").write_text(json.dumps(dataset))
+    (tmp_path / "broken.json").write_text("{")
+    found = read(tmp_path, "res.json", json.dumps(coco_entries(image_id=903, category_id=9)), video)
+    assert found.frame.tolist() == [16] and not found.messages
+    assert found.class_names[found.class_id[0]] == "cup"
+    with pytest.raises(rt.ReobjError, match="image_id 4 is not in the dataset"):
+        read(tmp_path, "res.json", json.dumps(coco_entries(category_id=9)), video)
+
+
+def test_datasets_with_their_own_annotations(tmp_path: Path) -> None:
+    """COCO-VID of a video without file names: `frame_id` says which frame, else the order."""
+    writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 25, (64, 48))
+    for _ in range(9):
+        writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    video = rt.Video(tmp_path / "a.mp4")
+    images = [{"id": 70 + i, "file_name": f"{i}.jpg", "frame_id": 8 - i} for i in range(9)]
+    entries = coco_entries(image_id=72, category_id=5, score=0.5, track_id=3)
+    data = {"images": images, "categories": [{"id": 5, "name": "wok"}], "annotations": entries}
+    found = read(tmp_path, "vid.json", json.dumps(data), video)
+    assert found.frame.tolist() == [6] and found.identity.tolist() == [3]
+    assert found.class_names == ("wok",) and found.score.tolist() == [0.5]
+    for image in images:
+        del image["frame_id"]
+    assert read(tmp_path, "vid.json", json.dumps(data), video).frame.tolist() == [2]
+
+
+@pytest.mark.parametrize(
+    ("category", "name"), [(1, "person"), (13, "stop sign"), (90, "toothbrush")]
+)
+def test_category_ids_of_coco(tmp_path: Path, video: rt.Video, category: int, name: str) -> None:
+    """As published: 91 ids, 80 of them used."""
+    found = read(tmp_path, "a.json", json.dumps(coco_entries(category_id=category)), video)
+    assert found.class_names[found.class_id[0]] == name
+    with pytest.raises(rt.ReobjError, match="category_id 12 is unknown"):
+        read(tmp_path, "a.json", json.dumps(coco_entries(category_id=12)), video)
+
+
+def coco_number(value: int) -> str:
+    """Write a number as in COCO's compressed run lengths: 5 bits a character, low ones first."""
+    low, rest = value & 31, value >> 5
+    last = rest == (-1 if low & 16 else 0)
+    return chr(48 + low) if last else chr(48 + low + 32) + coco_number(rest)
+
+
+def test_coco_masks(tmp_path: Path, video: rt.Video) -> None:
+    mask = np.zeros((480, 640), bool)
+    mask[20:60, 10:40] = True
+    runs = [10 * 480 + 20, *[40, 440] * 29, 40, 600 * 480 + 420]  # down the columns
+    text = "".join(map(coco_number, [*runs[:3], *np.subtract(runs[3:], runs[1:-2])]))
+    kinds = [
+        {"size": [480, 640], "counts": runs},
+        {"size": [480, 640], "counts": text},
+        [[10, 20, 40, 20, 40, 60, 10, 60]],
+        None,
+        [],
+    ]
+    entries = [coco_entries(image_id=i, segmentation=kind)[0] for i, kind in enumerate(kinds)]
+    found = read(tmp_path, "res.json", json.dumps(entries), video)
+    for frame in (0, 1, 2):
+        masks = found.at(frame).masks
+        assert masks is not None and masks.shape == (1, 480, 640)
+        if frame < 2:
+            np.testing.assert_array_equal(masks[0], mask)
+        assert (masks[0] & mask).sum() / (
+            masks[0] | mask
+        ).sum() > 0.94  # polygons: half a pixel around
+    assert found.at(3).masks is None and found.at(4).masks is None
+
+
+def test_npz(tmp_path: Path, video: rt.Video) -> None:
+    """Frames in any order; at half the size boxes and masks are half as large."""
+    made = np.zeros((2, 480, 640), bool)
+    made[0, 20:60, 10:40] = True
+    xyxy = np.array([[10.0, 20, 40, 60], [100, 20, 140, 60]])
+    two = rt.Detections(xyxy, np.array([0.8, 0.9]), np.array([1, 0]), made)
+    path = tmp_path / "d.npz"
+    rt.write_detections_npz(path, [(5, two), (2, two[[1]])], ("cup", "box"), (640, 480))
+    found = rt.read_detections(path, video)
+    assert found.frame.tolist() == [2, 5, 5] and found.class_names == ("cup", "box")
+    half = rt.read_detections(path, rt.Video(video.source, rt.InputConfig(max_size=320))).at(5)
+    assert half.xyxy.tolist() == [[50, 10, 70, 30], [5, 10, 20, 30]]  # best first
+    assert half.masks is not None
+    np.testing.assert_array_equal(half.masks, made[::-1, ::2, ::2])
+
+
+LINE = "1,-1,10,20,30,40,.9\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("d.txt", LINE + "2,-1,10,20\n", "line 2: 4 columns, expected 7"),  # one line differs
+        ("d.txt", "1,10,20\n", "line 1: 3 columns, expected 6 to 10"),
+        ("d.txt", LINE + "2,-1,10,nan,30,40,.9\n", "line 2: 'nan' is no finite number"),
+        ("d.txt", LINE + "2,-1,10,inf,30,40,.9\n", "line 2: 'inf' is no finite"),
+        ("d.txt", LINE + "2,-1,10,2O,30,40,.9\n", "line 2: '2O' is no finite number"),
+        ("d.txt", "1,-1,10,ten,30,40,.9\n", "line 1: 'ten' is no finite number"),
+        ("d.txt", "0,10.5,20.5,40,60,.9,56\n", "needs a header"),  # CSV without a header is no MOT
+        ("d.txt", "99,-1,10,20,30,40,.9\n",
+         "frames that the video has not .0-based: 98; it has 20.: detections of another video"),
+        ("d.txt", "1,-1,.1,.2,.3,.4,.9\n", "no coordinate above 1.5: normalised"),
+        ("d.txt", LINE + "1,-1,9000,20,30,40,.9\n" * 2,
+         r"0 of 3 boxes have no area and 2 lie outside the image of \(640, 480\)"),
+        ("d.txt", "1,-1,9000,20,30,40,.9\n", "another video"),  # all outside
+        ("d.csv", CSV + "3,1,2\n", "line 4: 3 columns, expected 7"),
+        ("d.csv", CSV + "3,1,2,nan,5,.9,56\n", "line 4: 'nan'"),
+        ("d.csv", CSV + "3,1,2,4,5,.9,80\n", "line 4: class 80, but there are only 80 class names"),
+        ("d.csv", "frame,x1,y1,score\n0,1,2,.9\n", "line 1: no column x2, y2 in the header"),
+        ("d.csv", "x1,y1,x2,y2\n1,2,3,4\n", "no column frame"),
+        ("d.csv", "frame,x1,y1,x2,y2\n0,100,90,30,40\n", "x, y, w, h where x1, y1, x2, y2"),
+        ("d.json", "{", "line 1: not valid JSON"),
+        ("d.json", '{"images": []}', "expected COCO results"),
+        ("d.json", json.dumps([{"image_id": 1, "bbox": [1, 2, 3, 4]}]),
+         "entry 0: .*'category_id': None.*expected two ids"),
+        ("d.json", json.dumps(coco_entries(bbox=[1, 2, 3])),
+         r"entry 0: .*'bbox': \[1, 2, 3\]}, expected .* a bbox of 4"),
+        ("d.json", json.dumps(coco_entries(category_id=500)), "category_id 500 is unknown"),
+        ("d.json", json.dumps(coco_entries(segmentation={"size": [48, 64], "counts": [48 * 64]})),
+         r"entry 0: mask of .h, w. \[48, 64\] in a video of \(480, 640\)"),
+        ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": [8, 9]})),
+         r"entry 0: mask of 17 pixels in a video of \(640, 480\)"),
+        ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: NaN"),
+        ("d.json", json.dumps(coco_entries(image_id="x")), "not as expected"),
+        ("d.json", "[1, 2]", "not as expected"),
+        ("d.npz", "no zip", "d.npz: damaged"),
+    ],
+)  # fmt: skip
+def test_bad_files_give_one_clear_line(
+    tmp_path: Path, video: rt.Video, name: str, text: str, expected: str
+) -> None:
+    with pytest.raises(rt.ReobjError, match=expected) as caught:
+        read(tmp_path, name, text, video)
+    assert name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_missing_file_and_unknown_class(tmp_path: Path, video: rt.Video) -> None:
+    with pytest.raises(rt.ReobjError, match="no such file of detections"):
+        rt.read_detections(tmp_path / "none.txt", video)
+    with pytest.raises(rt.ReobjError, match="--classes: no class chaise among person"):
+        read(tmp_path, "a.csv", CSV, video, classes="chaise")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"mask_offsets": [0, 1], "mask_counts": np.uint32([99])}, "row 0: mask of 99 pixels"),
+        ({"class_id": [7]}, "row 0: class 7, but there are only 1 class names"),
+        ({"class_id": [-1]}, "row 0: class -1"),
+        ({"score": [np.nan]}, "row 0: NaN or infinite value"),
+    ],
+)
+def test_bad_npz(tmp_path: Path, video: rt.Video, change: dict[str, Any], expected: str) -> None:
+    one = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.array([0.9]), np.array([0]))
+    rt.write_detections_npz(tmp_path / "a.npz", [(0, one)], ["x"], (640, 480))
+    np.savez(tmp_path / "a.npz", **(dict(np.load(tmp_path / "a.npz")) | change))
+    with pytest.raises(rt.ReobjError, match=rf"a\.npz, {expected}"):
+        rt.read_detections(tmp_path / "a.npz", video)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected", "kept"),
+    [
+        ("d.txt", LINE * 3 + "1,-1,10,20,0,40,.9\n2,-1,1,2,-3,4,1\n",
+         "2 boxes without area dropped, the first at line 4", 3),
+        ("d.txt", LINE * 3 + "1,-1,700,20,30,40,.9\n", "1 boxes wholly outside the image", 3),
+        # partly outside: kept; an edge on the border of the image has no pixel in it
+        ("d.txt", LINE + "1,-1,-20,20,30,40,.9\n1,-1,630,20,30,40,.9\n", "", 3),
+        ("d.txt", LINE + "1,-1,640,20,30,40,.9\n", "1 boxes wholly outside .* at line 2", 1),
+        ("d.txt", LINE + "1,-1,-30,20,30,40,.9\n", "1 boxes wholly outside .* at line 2", 1),
+        ("d.txt", LINE + "20,-1,10,20,30,40,.9\n", "", 2),  # the last frame
+        ("d.csv", CSV + "-1,10,20,30,40,.9,56\n", "1 boxes of frames .* -1; it has 20. dropped", 2),
+        ("d.txt", LINE + "21,-1,10,20,30,40,.9\n50,-1,1,2,3,4,.9\n",
+         "2 boxes of frames that the video has not .0-based: 20, 49; it has 20. dropped", 1),
+        ("d.txt", LINE.replace(".9", "-1") * 2, "scores are all -1: taken as 1", 2),
+        ("d.txt", LINE + LINE.replace(".9", "1.7"), r"scores from 0.9 to 1.7 clipped", 2),
+        ("d.txt", "", "no detections in this file", 0),
+        ("d.json", "[]", "no detections in this file", 0),
+        ("d.json", json.dumps(coco_entries()), "image_id is taken as the 0-based frame", 1),
+        ("d.csv", CSV.replace("56", "wok").replace("41", "cup"),
+         "1 class names not in the list: wok", 2),
+    ],
+)  # fmt: skip
+def test_single_bad_rows_are_counted(
+    tmp_path: Path, video: rt.Video, name: str, text: str, expected: str, kept: int
+) -> None:
+    found = read(tmp_path, name, text, video)
+    assert len(found) == kept
+    hits = [message for message in found.messages if not expected or re.search(expected, message)]
+    assert len(hits) == (1 if expected else 0), found.messages
+    assert len(set(found.messages)) == len(found.messages)  # each said once
+    assert ((found.score >= 0) & (found.score <= 1)).all()
+
+
+@needs_shared
+@pytest.mark.parametrize(
+    "name", ["redkitchen_7scenes", "office_loop", "studio_room", "livingroom13"]
+)
+def test_real_detections(name: str) -> None:
+    video = rt.Video(SHARED / "data" / name / "images")
+    found = rt.read_detections(SHARED / "data" / name / "detections_yolov8s.csv", video)
+    assert found.messages == [] and len(found) > 200 and found.class_names == rt.COCO_NAMES
+    assert found.frame.max() < video.frame_count
+
+
+@needs_shared
+def test_real_mot_files() -> None:
+    folder = SHARED / "data/redkitchen_7scenes"
+    found = rt.read_detections(folder / "gt_mot.txt", rt.Video(folder / "images"))
+    assert len(found) == 3106 and found.class_names == tuple(f"class {i}" for i in range(1, 6))

@@ -1,0 +1,805 @@
+"""Detectors: every ONNX layout on graphs made here, the cache, and sources of detections."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from reobj.sources import detectors
+from reobj.sources.detectors import DetectionCache, DetectionSource, as_source, open_detections
+from reobj.sources.recorded import RecordedDetections
+from reobj.types import Image
+
+SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+needs_shared = pytest.mark.skipif(
+    not (SHARED / "models").is_dir(), reason="no weights: set REOBJ_SHARED"
+)
+
+# ---- Layouts -------------------------------------------------------------------------------------
+
+onnx = pytest.importorskip("onnx", reason="pip install onnx (extra `dev`)")
+IMAGE = np.zeros((160, 320, 3), np.uint8)  # (H, W, 3)
+BOX = [80.0, 40.0, 160.0, 120.0]  # what every model below finds in it
+# The same in a 64 x 64 input.
+STRETCHED, CORNER, CENTRE = [16, 16, 32, 48], [16, 8, 32, 24], [16, 24, 32, 40]
+LABEL, SCORE = 2, 0.75
+
+
+def model(
+    folder: Path,
+    outputs: dict[str, Any],
+    shape: tuple[Any, ...] = (1, 3, 64, 64),
+    kind: int = 1,
+    sizes: bool = False,
+    names: str = "",
+    seen: tuple[str, tuple[int, ...], Any] | None = None,
+) -> Path:
+    """Write a model that answers the same to every image.
+
+    seen: (output, index, weights): to this number the mean of weights * input is added.
+    """
+    helper, proto = onnx.helper, onnx.TensorProto
+    arrays = {name: np.asarray(value) for name, value in outputs.items()}
+    arrays = {
+        name: a.astype(np.float32) if a.dtype == np.float64 else a for name, a in arrays.items()
+    }
+    nodes = []
+    constants = {f"constant {name}": a for name, a in arrays.items()}
+    for name in arrays:
+        if seen is None or seen[0] != name:
+            nodes.append(helper.make_node("Identity", [f"constant {name}"], [name]))
+            continue
+        at = np.zeros_like(arrays[name])
+        at[seen[1]] = 1
+        constants |= {"weights": np.float32(seen[2]), "at": at}
+        nodes += [helper.make_node("Mul", ["images", "weights"], ["weighted"]),
+                  helper.make_node("ReduceMean", ["weighted"], ["mean"], keepdims=0),
+                  helper.make_node("Mul", ["mean", "at"], ["added"]),
+                  helper.make_node("Add", ["added", f"constant {name}"], [name])]  # fmt: skip
+    inputs = [helper.make_tensor_value_info("images", kind, shape)]
+    if sizes:
+        inputs.append(helper.make_tensor_value_info("orig_target_sizes", proto.INT64, ["n", 2]))
+    made = [
+        helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(a.dtype), a.shape)
+        for name, a in arrays.items()
+    ]
+    tensors = [onnx.numpy_helper.from_array(a, name) for name, a in constants.items()]
+    graph = helper.make_graph(nodes, "g", inputs, made, tensors)
+    return save_model(graph, folder, names)
+
+
+def save_model(graph: Any, folder: Path, names: str = "") -> Path:
+    opset = onnx.helper.make_opsetid("", 17)
+    made = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=8)
+    if names:
+        onnx.helper.set_model_props(made, {"names": names})
+    onnx.save(made, folder / "m.onnx")
+    return folder / "m.onnx"
+
+
+def center(box: list[int]) -> list[float]:
+    x1, y1, x2, y2 = box
+    return [(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1]
+
+
+def bins(distance: float) -> np.ndarray[Any, Any]:
+    """Logits of 8 bins whose expectation is the distance."""
+    logits = np.full(8, -50.0)
+    low = int(distance)
+    logits[low], logits[low + 1] = np.log(1 - distance + low), np.log(max(distance - low, 1e-20))
+    return logits
+
+
+def gfl(cell: float, row: float, box: list[int]) -> np.ndarray[Any, Any]:
+    """Distances to the sides in units of stride 8, for a cell at (cell, row) strides."""
+    x1, y1, x2, y2 = np.divide(box, 8)
+    return np.concatenate([bins(d) for d in (cell - x1, row - y1, x2 - cell, y2 - row)])
+
+
+def yolox(raw: bool) -> dict[str, Any]:
+    rows = np.tile([0.3, 0.4, 0.1, 0.2, 0.01, 0, 0, 0], (1, 84, 1))
+    cx, cy, w, h = center(CORNER)
+    if raw:  # cell (3, 2) of stride 8
+        rows[0, 2 * 8 + 3] = [cx / 8 - 3, cy / 8 - 2, np.log(w / 8), np.log(h / 8), 0.75, 0, 0, 1]
+    else:
+        rows[..., :2] = 32
+        rows[0, 7] = [cx, cy, w, h, 1, 0.1, 0, 0.75]
+    return {"output": rows}
+
+
+def yolov8() -> dict[str, Any]:
+    rows = np.zeros((1, 7, 84))
+    rows[0, :, 50] = [*center(CENTRE), 0, 0.2, 0.75]
+    return {"output0": rows}
+
+
+def yolo_seg() -> dict[str, Any]:
+    rows, proto = np.zeros((1, 7 + 32, 84)), np.zeros((1, 32, 16, 16))
+    rows[0, :, 50] = [*center(CENTRE), 0, 0.2, 0.75, 0, 1, *[0] * 30]
+    proto[0, 1] = np.where(np.arange(16) < 6, 1, -1)  # left half of the box, up to input x = 24
+    return {"output0": rows, "output1": proto}
+
+
+def nanodet() -> dict[str, Any]:
+    rows = np.zeros((1, 85, 3 + 32))
+    rows[0, 4 * 8 + 3] = [0, 0, 0.75, *gfl(3, 4, STRETCHED)]  # measured from the cell's corner
+    return {"output": rows}
+
+
+def picodet() -> dict[str, Any]:
+    counts = (64, 16, 4, 1)
+    scores, sides = [np.zeros((1, n, 3)) for n in counts], [np.zeros((1, n, 32)) for n in counts]
+    scores[0][0, 3 * 8 + 2], sides[0][0, 3 * 8 + 2] = [0, 0, 0.75], gfl(2.5, 3.5, STRETCHED)
+    return {f"o{i}": value for i, value in enumerate(scores + sides)}
+
+
+def detr() -> dict[str, Any]:
+    return {"labels": np.array([[LABEL, 1]]), "boxes": [[BOX, BOX]], "scores": [[SCORE, 0.01]]}
+
+
+def ssd() -> dict[str, Any]:
+    box = np.divide(STRETCHED, 64)
+    return {"bboxes": [[box, box]], "labels": np.array([[LABEL + 1, 1]]), "scores": [[SCORE, 0.01]]}
+
+
+def rcnn() -> dict[str, Any]:
+    """Boxes in the 640 x 320 input that the image is enlarged to; the left half is masked."""
+    mask = np.full((1, 1, 28, 28), 0.4)
+    mask[..., :14] = 0.6
+    return {
+        "boxes": np.multiply([BOX], 2),
+        "labels": np.array([LABEL + 1]),
+        "scores": [SCORE],
+        "masks": mask,
+    }
+
+
+LAYOUT_ROWS = [
+    ("YOLOX", yolox(raw=True), {}, 0),
+    ("YOLOX", yolox(raw=False), {}, 0),  # exported with its decoder
+    ("YOLOv8, YOLO11 (and -seg)", yolov8(), {}, 0),
+    ("YOLOv8, YOLO11 (and -seg)", yolo_seg(), {}, 120),
+    ("NanoDet-Plus", nanodet(), {}, 0),
+    ("PicoDet", picodet(), {}, 0),
+    ("DEIM, D-FINE, RT-DETR (labels, boxes, scores)", detr(), {"sizes": True}, 0),
+    ("SSD with built-in NMS", ssd(), {}, 0),
+    ("Mask R-CNN", rcnn(), {"shape": (3, "h", "w")}, 120),
+]
+
+
+@pytest.mark.parametrize(
+    ("layout", "outputs", "options", "mask_end"), LAYOUT_ROWS, ids=lambda v: str(v)[:20]
+)
+def test_layouts(
+    tmp_path: Path, layout: str, outputs: dict[str, Any], options: dict[str, Any], mask_end: int
+) -> None:
+    detector = rt.OnnxDetector(model(tmp_path, outputs, **options))
+    assert detector.layout == layout
+    found = detector(IMAGE)
+    np.testing.assert_allclose(found.xyxy, [BOX], atol=1e-3)
+    np.testing.assert_allclose(found.score, [SCORE], atol=1e-6)
+    assert found.class_id.tolist() == [LABEL] and found.class_id.dtype == np.int64
+    assert (found.masks is not None) == bool(mask_end)
+    if found.masks is not None:
+        expected = np.zeros((160, 320), bool)
+        expected[40:120, 80:mask_end] = True
+        assert found.masks.shape == (1, 160, 320)
+        assert (found.masks[0] != expected).sum() <= 80  # a column at most
+
+
+@pytest.mark.parametrize(
+    ("image_size", "fed"),
+    [
+        ((1920, 1080), (640, 384)),  # 360 is no multiple of 32
+        ((960, 1280), (480, 640)),
+        ((1000, 300), (640, 192)),
+        ((1000, 301), (640, 224)),
+    ],
+)
+def test_dynamic_input_takes_the_image_shape(
+    tmp_path: Path, image_size: tuple[int, int], fed: tuple[int, int]
+) -> None:
+    """A model that answers with the shape that it is fed: 1, 3, width, height."""
+    helper = onnx.helper
+    tensors = {"labels": np.int64([[LABEL]]), "scores": np.float32([[SCORE]]),
+               "order": np.int64([0, 1, 3, 2]), "box shape": np.int64([1, 1, 4])}  # fmt: skip
+    nodes = [
+        helper.make_node("Identity", ["constant labels"], ["labels"]),
+        helper.make_node("Identity", ["constant scores"], ["scores"]),
+        helper.make_node("Shape", ["images"], ["shape"]),
+        helper.make_node("Gather", ["shape", "constant order"], ["whole"]),
+        helper.make_node("Cast", ["whole"], ["float"], to=1),
+        helper.make_node("Reshape", ["float", "constant box shape"], ["boxes"]),
+    ]
+    inputs = [helper.make_tensor_value_info("images", 1, [1, 3, "h", "w"]),
+              helper.make_tensor_value_info("orig_target_sizes", 7, [1, 2])]  # fmt: skip
+    outputs = [helper.make_tensor_value_info("labels", 7, [1, 1]),
+               helper.make_tensor_value_info("boxes", 1, [1, 1, 4]),
+               helper.make_tensor_value_info("scores", 1, [1, 1])]  # fmt: skip
+    constants = [onnx.numpy_helper.from_array(v, f"constant {k}") for k, v in tensors.items()]
+    detector = rt.OnnxDetector(
+        save_model(helper.make_graph(nodes, "g", inputs, outputs, constants), tmp_path)
+    )
+    image = np.zeros((image_size[1], image_size[0], 3), np.uint8)
+    assert detector(image).xyxy.tolist() == [[1, 3, *fed]]
+    assert detector.class_names == rt.COCO_NAMES
+
+
+def test_masks_are_exact_to_the_pixel(tmp_path: Path) -> None:
+    """A mask of 28 x 28 over a box of 80 x 60: its edges at 5 and 20 lie at 94.3 and 82.9."""
+    outputs = rcnn()
+    outputs["boxes"] = np.multiply([[80.0, 40, 160, 100]], 2)
+    outputs["masks"] = np.zeros((1, 1, 28, 28))
+    outputs["masks"][..., :20, :5] = 1
+    found = rt.OnnxDetector(model(tmp_path, outputs, shape=(3, "h", "w")))(IMAGE)
+    expected = np.zeros((160, 320), bool)
+    expected[40:83, 80:94] = True
+    assert found.masks is not None
+    np.testing.assert_array_equal(found.masks[0], expected)
+
+
+def test_prototypes_lie_where_the_image_does(tmp_path: Path) -> None:
+    """The upper half of the box: input rows up to 32, image rows up to (32 - 16) * 5."""
+    outputs = yolo_seg()
+    outputs["output1"][0, 1] = np.where(np.arange(16) < 8, 1, -1)[:, None]
+    found = rt.OnnxDetector(model(tmp_path, outputs))(IMAGE)
+    expected = np.zeros((160, 320), bool)
+    expected[40:80, 80:160] = True
+    assert found.masks is not None
+    assert (found.masks[0] != expected).sum() <= 80  # a row at most
+
+
+def test_an_input_need_not_be_square(tmp_path: Path) -> None:
+    """64 x 32, a fifth of the image: 8 x 4 + 4 x 2 + 2 x 1 cells."""
+    rows = np.zeros((1, 7, 42))
+    rows[0, :, 20] = [*center([16, 8, 32, 24]), 0, 0, SCORE]
+    found = rt.OnnxDetector(model(tmp_path, {"o": rows}, shape=(1, 3, 32, 64)))(IMAGE)
+    np.testing.assert_allclose(found.xyxy, [BOX], atol=1e-3)
+
+
+def test_the_size_of_the_image_is_width_and_height(tmp_path: Path) -> None:
+    """As DEIM wants it beside the image; a model that answers with a box of that size."""
+    helper = onnx.helper
+    tensors = {"labels": np.int64([[LABEL]]), "scores": np.float32([[SCORE]]),
+               "zeros": np.float32([[0, 0]]), "box shape": np.int64([1, 1, 4])}  # fmt: skip
+    nodes = [
+        helper.make_node("Identity", ["constant labels"], ["labels"]),
+        helper.make_node("Identity", ["constant scores"], ["scores"]),
+        helper.make_node("Cast", ["orig_target_sizes"], ["size"], to=1),
+        helper.make_node("Concat", ["constant zeros", "size"], ["whole"], axis=1),
+        helper.make_node("Reshape", ["whole", "constant box shape"], ["boxes"]),
+    ]
+    inputs = [helper.make_tensor_value_info("images", 1, [1, 3, 64, 64]),
+              helper.make_tensor_value_info("orig_target_sizes", 7, [1, 2])]  # fmt: skip
+    outputs = [helper.make_tensor_value_info("labels", 7, [1, 1]),
+               helper.make_tensor_value_info("boxes", 1, [1, 1, 4]),
+               helper.make_tensor_value_info("scores", 1, [1, 1])]  # fmt: skip
+    constants = [onnx.numpy_helper.from_array(v, f"constant {k}") for k, v in tensors.items()]
+    graph = helper.make_graph(nodes, "g", inputs, outputs, constants)
+    assert rt.OnnxDetector(save_model(graph, tmp_path))(IMAGE).xyxy.tolist() == [[0, 0, 320, 160]]
+
+
+def test_background_is_no_class(tmp_path: Path) -> None:
+    """Label 0 of a model that counts its classes from 1."""
+    outputs = ssd()
+    outputs["scores"] = [[SCORE, 0.9]]
+    outputs["labels"] = np.array([[LABEL + 1, 0]])
+    assert rt.OnnxDetector(model(tmp_path, outputs))(IMAGE).class_id.tolist() == [LABEL]
+
+
+# What the projects' own inference code feeds: order of the channels, mean and deviation of 0..255.
+TORCHVISION = (np.multiply([0.485, 0.456, 0.406], 255), np.multiply([0.229, 0.224, 0.225], 255))
+SEEN_ROWS = [
+    ("DEIM", detr(), ("scores", (0, 0)), {"sizes": True}, "RGB", 0, 255),
+    ("PicoDet", picodet(), ("o0", (0, 26, 2)), {}, "RGB", *TORCHVISION),
+    ("NanoDet-Plus", nanodet(), ("output", (0, 35, 2)), {}, "BGR",
+     [103.53, 116.28, 123.675], [57.375, 57.12, 58.395]),
+    ("YOLOX", yolox(raw=False), ("output", (0, 7, 7)), {}, "BGR", 0, 1),
+    ("YOLOv8", yolov8(), ("output0", (0, 6, 50)), {}, "RGB", 0, 255),
+    ("Mask R-CNN", rcnn(), ("scores", (0,)), {"shape": (3, "h", "w")}, "BGR",
+     [102.9801, 115.9465, 122.7717], 1),
+    ("SSD", ssd(), ("scores", (0, 0)), {}, "RGB", *TORCHVISION),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("layout", "outputs", "at", "options", "order", "mean", "std"),
+    SEEN_ROWS,
+    ids=lambda v: str(v)[:12],
+)
+def test_channels_and_scaling(
+    tmp_path: Path, layout: str, outputs: dict[str, Any], at: Any, options: dict[str, Any],
+    order: str, mean: Any, std: Any,
+) -> None:  # fmt: skip
+    """A model whose score tells the three channels apart: its base + (x + 2 y + 4 z) / 3."""
+    weights = np.reshape([1, 2, 4], (3, 1, 1))
+    path = model(tmp_path, outputs, seen=(*at, weights), **options)
+    detector = rt.OnnxDetector(path)
+    assert detector.layout.startswith(layout)
+    blue, green, red = 220, 150, 130
+    image = np.full((640, 640, 3), (blue, green, red), np.uint8)
+    channels = (red, green, blue) if order == "RGB" else (blue, green, red)
+    expected = SCORE + np.dot((np.array(channels) - mean) / std, [1, 2, 4]) / 3
+    assert detector(image).score[0] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "at", "unit", "where"),
+    [
+        (yolov8(), ("output0", (0, 6, 50)), 1 / 255, slice(16, 48)),  # in the middle
+        (yolox(raw=False), ("output", (0, 7, 7)), 1, slice(0, 32)),  # in the corner
+    ],
+)
+@pytest.mark.parametrize("portrait", [False, True])
+def test_borders(
+    tmp_path: Path, outputs: dict[str, Any], at: Any, unit: float, where: slice, portrait: bool
+) -> None:
+    """The image is where its boxes are mapped from; grey of 114 around it."""
+    inside = np.zeros((3, 64, 64))
+    inside[:, where] = 1
+    image = np.full_like(IMAGE, 200)
+    if portrait:
+        inside, image = inside.transpose(0, 2, 1), image.transpose(1, 0, 2)
+    for weights, value in ((inside, 200), (1 - inside, 114)):
+        path = model(tmp_path, outputs, seen=(*at, weights))
+        expected = SCORE + value * unit / 2  # half of the input
+        assert rt.OnnxDetector(path)(image).score[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_detections_are_selected(tmp_path: Path) -> None:
+    rows = np.zeros((1, 7, 84))
+    wide, near, far = [16, 24, 32, 40], [17, 24, 33, 40], [40, 24, 60, 40]
+    for column, (box, scores) in enumerate(
+        [
+            (wide, [0.9, 0, 0]),
+            (near, [0.8, 0, 0]),
+            (near, [0, 0.7, 0]),
+            (far, [0.6, 0, 0]),
+            (far, [0, 0, 0.0625]),
+        ]
+    ):
+        rows[0, :, 30 - column] = [*center(box), *scores]
+    rows[0, :, 9] = [60, 32, 20, 20, 0, 0, 0.5]  # reaches beyond the image: clipped
+    rows[0, :, 5] = [30, 8, 10, 10, 0, 0, 0.8]  # in the border above the image: nothing is left
+    path = model(tmp_path, {"o": rows}, names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
+    found = rt.OnnxDetector(path)(IMAGE)
+    # NMS within a class only; min_score; best first
+    assert found.score.tolist() == pytest.approx([0.9, 0.7, 0.6, 0.5])
+    assert found.class_id.tolist() == [0, 1, 0, 2]
+    assert found.xyxy[3].tolist() == pytest.approx([250, 30, 320, 130])
+    only = rt.OnnxDetector(path, rt.DetectConfig(classes="TV, bowl"))
+    assert only.class_names == ("cup", "bowl", "tv") and only(IMAGE).class_id.tolist() == [1, 2]
+    two = rt.OnnxDetector(path, rt.DetectConfig(max_detections=2))(IMAGE)
+    assert two.score.tolist() == pytest.approx([0.9, 0.7])
+    for min_score, count in ((0.5, 4), (0.51, 3), (0.0625, 5), (0.063, 4)):  # at least, not above
+        assert len(rt.OnnxDetector(path, rt.DetectConfig(min_score=min_score))(IMAGE)) == count
+    assert len(rt.OnnxDetector(path, rt.DetectConfig(nms_iou=0.99))(IMAGE)) == 5
+    with pytest.raises(rt.ReobjError, match="no class sofa among cup, bowl, tv"):
+        rt.OnnxDetector(path, rt.DetectConfig(classes="sofa"))
+
+
+def test_class_names_come_from_the_user_first(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = model(tmp_path, yolov8())
+    assert rt.OnnxDetector(path).class_names == ("class 0", "class 1", "class 2")
+    assert "3 classes without names" in caplog.text
+    (tmp_path / "names.txt").write_text("a\nb\nc\n")
+    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
+    assert rt.OnnxDetector(path, config).class_names == ("a", "b", "c")
+    (tmp_path / "names.txt").write_text("a\n\nb\n")
+    with pytest.raises(rt.ReobjError, match="class 2, but there are only 2 class names"):
+        rt.OnnxDetector(path, config)(IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "shape", "expected"),
+    [
+        (
+            {"logits": np.zeros((1, 1000))},
+            (1, 3, 64, 64),
+            r"outputs logits \(1, 1000\); known layouts: DEIM.*YOLOX",
+        ),
+        (
+            {"features": np.zeros((1, 320, 7, 7))},
+            (1, 3, 224, 224),
+            "no known object detector: outputs features",
+        ),
+        (
+            {"o": np.zeros((1, 5))},
+            (1, 10),
+            r"no known object detector: input is tensor.float. \[1, 10\]",
+        ),
+        ({"o": np.zeros((1, 84, 8))}, (1, 1, 64, 64), "expected an image .1, 3, H, W."),  # grey
+    ],
+)
+def test_other_networks_are_refused(
+    tmp_path: Path, outputs: dict[str, Any], shape: Any, expected: str
+) -> None:
+    with pytest.raises(rt.ReobjError, match=expected) as caught:
+        rt.OnnxDetector(model(tmp_path, outputs, shape))
+    assert "m.onnx" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_no_onnx_file(tmp_path: Path) -> None:
+    (tmp_path / "a.onnx").write_bytes(b"no model")
+    with pytest.raises(rt.ReobjError, match=r"a.onnx: onnxruntime cannot load it"):
+        rt.OnnxDetector(tmp_path / "a.onnx")
+
+
+def reference_nms(xyxy: Any, label: Any, max_iou: float) -> list[int]:
+    kept: list[int] = []
+    for i in range(len(xyxy)):
+        ok = True
+        for j in kept:
+            low, high = np.maximum(xyxy[i, :2], xyxy[j, :2]), np.minimum(xyxy[i, 2:], xyxy[j, 2:])
+            inter = np.clip(high - low, 0, None).prod()
+            area = (xyxy[i, 2:] - xyxy[i, :2]).prod() + (xyxy[j, 2:] - xyxy[j, :2]).prod() - inter
+            ok &= label[i] != label[j] or inter <= max_iou * area
+        if ok:
+            kept.append(i)
+    return kept
+
+
+def test_nms_against_the_slow_way() -> None:
+    rng = np.random.default_rng(3)
+    corner = rng.random((200, 2)) * 60
+    xyxy, label = (
+        np.hstack([corner, corner + 10 + rng.random((200, 2)) * 30]),
+        rng.integers(0, 3, 200),
+    )
+    for limit in (0.3, 0.6):
+        assert detectors.nms(xyxy, label, limit).tolist() == reference_nms(xyxy, label, limit)
+    assert detectors.nms(np.empty((0, 4)), np.empty(0, np.int64), 0.5).tolist() == []
+
+
+@pytest.mark.parametrize(("limit", "kept"), [(0.49, [0]), (0.5, [0, 1]), (0.51, [0, 1])])
+def test_nms_leaves_the_overlap_that_is_allowed(limit: float, kept: list[int]) -> None:
+    xyxy = np.array([[0.0, 0, 10, 10], [0, 0, 10, 5]])  # overlap 1/2
+    assert detectors.nms(xyxy, np.zeros(2, np.int64), limit).tolist() == kept
+    assert detectors.nms(xyxy, np.array([0, 1]), limit).tolist() == [0, 1]  # of two classes
+
+
+# ---- Cache ---------------------------------------------------------------------------------------
+
+
+def some(index: int, masks: bool = False) -> rt.Detections:
+    count = index % 4  # also none at all
+    rng = np.random.default_rng(index)
+    corner = rng.random((count, 2)) * 20
+    found = rng.random((count, 24, 32)) < 0.5 if masks else None
+    return rt.Detections(
+        np.hstack([corner, corner + 5]), rng.random(count), rng.integers(0, 9, count), found
+    )
+
+
+def assert_same(a: rt.Detections | None, b: rt.Detections) -> None:
+    assert a is not None
+    for key in ("xyxy", "score", "class_id"):
+        np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+    if b.masks is not None and len(b):
+        np.testing.assert_array_equal(a.masks, b.masks)
+
+
+@pytest.mark.parametrize("masks", [False, True])
+def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> None:
+    cache = DetectionCache(tmp_path / "c", (32, 24))
+    for index in range(0, 300, 2):
+        cache.put(index, some(index, masks))
+        assert_same(cache.get(index), some(index, masks))
+    stored = 150 // detectors.CACHE_FRAMES * detectors.CACHE_FRAMES
+    (tmp_path / "c" / ".part-chunk_000009.npz").write_bytes(b"half")  # a kill while writing
+    reopened = DetectionCache(tmp_path / "c", (32, 24))
+    assert reopened.get(2 * stored - 2) is not None and reopened.get(2 * stored) is None
+    assert reopened.get(299) is None and reopened.get(298) is None
+    for index in range(0, 2 * stored, 2):
+        assert_same(reopened.get(index), some(index, masks))
+    reopened.put(298, some(298, masks))
+    reopened.flush()
+    assert_same(DetectionCache(tmp_path / "c", (32, 24)).get(298), some(298, masks))
+
+
+def test_damaged_cache_files_are_detected_again(tmp_path: Path, caplog: Any) -> None:
+    cache = DetectionCache(tmp_path, (32, 24))
+    for index in (1, 2, 3):
+        cache.put(index, some(index))
+        cache.flush()
+    second = tmp_path / "chunk_000001.npz"
+    second.write_bytes(second.read_bytes()[:-40])
+    reopened = DetectionCache(tmp_path, (32, 24))
+    assert reopened.get(2) is None
+    for index in (1, 3):
+        assert_same(reopened.get(index), some(index))
+    assert caplog.text.count("its frames are detected again") == 1 and second.name in caplog.text
+    reopened.put(2, some(2))
+    reopened.flush()
+    again = DetectionCache(tmp_path, (32, 24))
+    for index in (1, 2, 3):
+        assert_same(again.get(index), some(index))
+    assert len(caplog.records) == 1  # said once, not in every later run
+
+
+def test_what_was_put_last_counts(tmp_path: Path) -> None:
+    cache = DetectionCache(tmp_path, (32, 24))
+    cache.put(1, some(2))
+    cache.flush()
+    cache.put(1, some(3))
+    assert_same(cache.get(1), some(3))
+    cache.flush()
+    assert_same(DetectionCache(tmp_path, (32, 24)).get(1), some(3))
+
+
+def test_a_cache_of_another_working_size_is_none(tmp_path: Path) -> None:
+    cache = DetectionCache(tmp_path, (32, 24))
+    cache.put(2, some(2))
+    cache.flush()
+    assert DetectionCache(tmp_path, (64, 48)).get(2) is None
+
+
+def test_frames_without_detections_are_remembered(tmp_path: Path) -> None:
+    cache = DetectionCache(tmp_path, (32, 24))
+    cache.put(7, rt.Detections.empty())
+    cache.flush()
+    found = DetectionCache(tmp_path, (32, 24)).get(7)
+    assert found is not None and len(found) == 0
+
+
+# ---- Sources of detections -----------------------------------------------------------------------
+
+
+def frame(index: int = 0, image: Image = IMAGE) -> rt.Frame:
+    return rt.Frame(index, 0.0, image)
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        rt.Detections(np.array([BOX]), np.array([0.5]), np.array([3])),
+        [[*BOX, 0.5, 3]],
+        SimpleNamespace(
+            xyxy=np.array([BOX], np.float32),
+            confidence=np.array([0.5]),
+            class_id=np.array([3]),
+            mask=None,
+        ),
+    ],
+)
+def test_a_function_is_a_source(found: Any) -> None:
+    images = []
+    source = as_source(lambda image: images.append(image) or found)
+    made = source(frame(4))
+    assert made.xyxy.tolist() == [BOX] and made.score.tolist() == [0.5]
+    assert made.class_id.tolist() == [3] and images[0] is IMAGE
+    assert source.key == "" and source.class_names == rt.COCO_NAMES and source.messages == ()
+    assert as_source(source) is source
+    assert len(as_source(lambda image: [])(frame())) == 0
+
+
+def test_class_names_of_a_function() -> None:
+    class Own:
+        class_names = ("cup", "wok")
+
+        def __call__(self, image: Image) -> Any:
+            return [[*BOX, 0.5, 2]]
+
+    assert as_source(Own()).class_names == ("cup", "wok")
+    source = as_source(Own(), ["a", "b", "c"])
+    assert source.class_names == ("a", "b", "c") and source(frame()).class_id.tolist() == [2]
+    with pytest.raises(rt.ReobjError, match="frame 9: class 2, but there are only 2 class names"):
+        as_source(Own())(frame(9))
+
+
+@pytest.mark.parametrize("other", ["det.txt", None, 3])
+def test_what_is_no_detector_is_refused(other: Any) -> None:
+    with pytest.raises(rt.ReobjError, match="is no detector: expected a function"):
+        as_source(other)
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> rt.Video:
+    """Six black images of 64 x 48, read at half their size."""
+    (tmp_path / "im").mkdir()
+    for index in range(6):
+        cv2.imwrite(str(tmp_path / "im" / f"{index}.png"), np.zeros((48, 64, 3), np.uint8))
+    return rt.Video(tmp_path / "im", rt.InputConfig(every=2, max_size=32))
+
+
+def test_a_file_is_asked_by_frame_number(clip: rt.Video, tmp_path: Path) -> None:
+    path = tmp_path / "det.txt"
+    path.write_text("".join(f"{i + 1},-1,{10 + i},20,30,10,.9\n" for i in range(7)))
+    source = open_detections(clip, rt.DetectConfig(), path)
+    assert [f.index for f in clip] == [0, 2, 4]
+    assert [source(f).xyxy[0, 0] for f in clip] == [5, 6, 7]  # half of 10, 12, 14
+    assert source.class_names == ("object",)
+    assert any("frames that the video has not" in text for text in source.messages)
+    assert source.cached(tmp_path / "cache", clip.working_size) is source  # it is on disk
+    recorded = as_source(rt.read_detections(path, clip))
+    assert recorded(frame(4)).xyxy[0, 0] == 7 and recorded.messages == source.messages
+    assert recorded.class_names == ("object",)
+    path.write_text("1,-1,10,20,30,10,.9\n")
+    assert source.key != open_detections(clip, rt.DetectConfig(), str(path)).key != ""
+    empty = RecordedDetections(
+        np.empty(0, np.int64), np.empty((0, 4)), np.empty(0), np.empty(0, np.int64), [],
+        ("cup",), (64, 48), (32, 24), np.empty(0, np.int64), "row",
+    )  # fmt: skip
+    for made in (as_source(empty), open_detections(clip, rt.DetectConfig(), empty)):
+        assert made.class_names == ("cup",) and len(made(frame())) == 0
+
+
+def test_the_options_of_a_file_apply(clip: rt.Video, tmp_path: Path) -> None:
+    path = tmp_path / "det.txt"
+    path.write_text("1,-1,10,20,30,10,.9\n1,-1,12,20,30,10,.3\n")
+    assert len(open_detections(clip, rt.DetectConfig(), path)(frame())) == 2
+    assert len(open_detections(clip, rt.DetectConfig(min_score=0.5), path)(frame())) == 1
+
+
+def test_a_changed_option_or_file_changes_the_key(clip: rt.Video, tmp_path: Path) -> None:
+    """Also of recorded detections: tracks made of them are cached under it."""
+    path, names = tmp_path / "det.csv", tmp_path / "names.txt"
+    path.write_text("frame,x1,y1,x2,y2,score,class\n0,10,20,30,40,.9,0\n")
+    names.write_text("cup\n")
+    config = rt.DetectConfig(class_names=str(names))
+    keys = {open_detections(clip, config, path).key, open_detections(clip, config, path).key}
+    assert len(keys) == 1
+    for change in ({"min_score": 0.2}, {"classes": "cup"}, {"max_detections": 3}):
+        changed = dataclasses.replace(config, **change)
+        keys.add(open_detections(clip, changed, path).key)
+    names.write_text("wok, bowl\n")
+    keys.add(open_detections(clip, config, path).key)
+    assert len(keys) == 5
+
+
+def test_a_function_gets_its_class_names_from_the_options(clip: rt.Video, tmp_path: Path) -> None:
+    (tmp_path / "names.txt").write_text("cup\nwok\n")
+    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
+    source = open_detections(clip, config, lambda image: [[*BOX, 0.5, 1]])
+    assert source.class_names == ("cup", "wok") and source.key == ""
+    assert source(frame()).class_id.tolist() == [1]
+
+
+def test_a_model_is_a_source(
+    clip: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Named by the options, run with the threads asked for, kept on disk under a key."""
+    threads, make = [], detectors.onnx_session
+    monkeypatch.setattr(
+        detectors, "onnx_session", lambda path, n: threads.append(n) or make(path, n)
+    )
+    path = model(tmp_path, yolov8(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
+    config = rt.DetectConfig(model=str(path))
+    source = open_detections(clip, config, threads=1)
+    assert source.class_names == ("cup", "bowl", "tv") and threads == [1]
+    np.testing.assert_allclose(source(frame()).xyxy, [BOX], atol=1e-3)
+    direct = as_source(rt.OnnxDetector(path))
+    np.testing.assert_array_equal(direct(frame()).xyxy, source(frame()).xyxy)
+    assert direct.class_names == source.class_names
+    cached = source.cached(tmp_path / "cache", (320, 160))
+    assert len(cached(frame(5))) == 1
+    cached.flush()
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    keys = {source.key, open_detections(clip, config).key}
+    assert len(keys) == 1 and "" not in keys and str(tmp_path) in source.key
+    for change in ({"min_score": 0.2}, {"nms_iou": 0.5}, {"classes": "tv"}):
+        keys.add(open_detections(clip, rt.DetectConfig(model=str(path), **change)).key)
+    assert len(keys) == 4
+
+
+def test_no_detections_named_and_no_network(
+    clip: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("REOBJ_MODELS", raising=False)
+    with pytest.raises(rt.ReobjError, match="model deimv2-femto is not here and --offline"):
+        open_detections(clip, rt.DetectConfig(), offline=True)
+
+
+class Counting:
+    """A slow detector: counts the frames that it is asked for."""
+
+    def __init__(self, key: str = "key", slow: bool = True) -> None:
+        self.asked: list[int] = []
+        self.source = DetectionSource(self.detect, ("cup",), key, ["a message"], slow)
+
+    def detect(self, frame: rt.Frame) -> rt.Detections:
+        self.asked.append(frame.index)
+        return some(frame.index)
+
+
+def test_a_slow_source_is_asked_once(tmp_path: Path) -> None:
+    counting = Counting()
+    first = counting.source.cached(tmp_path, (32, 24))
+    for index in (1, 2, 3, 2):
+        assert_same(first(frame(index)), some(index))
+    assert counting.asked == [1, 2, 3]
+    assert (first.class_names, first.key, first.messages) == (("cup",), "key", ["a message"])
+    first.flush()
+    second = counting.source.cached(tmp_path, (32, 24))  # the next run
+    for index in (3, 4):
+        assert_same(second(frame(index)), some(index))
+    assert counting.asked == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("options", [{"key": ""}, {"slow": False}])
+def test_what_may_not_or_need_not_be_cached(tmp_path: Path, options: dict[str, Any]) -> None:
+    counting = Counting(**options)
+    source = counting.source.cached(tmp_path / "cache", (32, 24))
+    for _ in range(2):
+        source(frame(1))
+    source.flush()
+    assert counting.asked == [1, 1] and not (tmp_path / "cache").exists()
+
+
+def test_flush_never_hides_an_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """It stands in a `finally`: what it cannot write is a warning, and the first error is kept."""
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    source = Counting().source.cached(tmp_path / "cache", (32, 24))
+    with pytest.raises(KeyboardInterrupt):
+        try:
+            source(frame(1))
+            raise KeyboardInterrupt
+        finally:
+            source.flush()
+    assert "cannot be written" in caplog.text and "detected again" in caplog.text
+    source.flush()  # as often as wanted
+
+
+# ---- Real weights --------------------------------------------------------------------------------
+
+
+@needs_shared
+@pytest.mark.parametrize(
+    ("name", "recall", "iou"),
+    # Confident YOLOv8s boxes found again on 10 frames of redkitchen, and how tightly: a wrong
+    # channel order, a wrong mean or half a cell of shift lose more than the margin.
+    [
+        ("deimv2-femto", 0.85, 0.9),
+        ("deimv2-atto", 0.75, 0.88),
+        ("yolox-nano", 0.6, 0.88),
+        ("picodet-s-416", 0.85, 0.89),
+        ("nanodet-plus-m_512", 0.88, 0.87),
+        ("yolo11n-seg_dyn", 0.8, 0.92),
+    ],
+)
+def test_real_weights_agree_with_yolov8s(
+    name: str, recall: float, iou: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
+    folder = SHARED / "data/redkitchen_7scenes"
+    video = rt.Video(folder / "images", rt.InputConfig(every=50))
+    reference = rt.read_detections(
+        folder / "detections_yolov8s.csv", video, rt.DetectConfig(min_score=0.6)
+    )
+    detector = rt.OnnxDetector(name, rt.DetectConfig(min_score=0.3), threads=1)
+    best = []
+    for frame in video:
+        a, b = reference.at(frame.index), detector(frame.image)
+        low = np.maximum(a.xyxy[:, None, :2], b.xyxy[None, :, :2])
+        high = np.minimum(a.xyxy[:, None, 2:], b.xyxy[None, :, 2:])
+        inter = np.clip(high - low, 0, None).prod(2)
+        areas = [(d.xyxy[:, 2:] - d.xyxy[:, :2]).prod(1) for d in (a, b)]
+        overlap = (
+            inter
+            / (areas[0][:, None] + areas[1][None] - inter)
+            * (a.class_id[:, None] == b.class_id[None])
+        )
+        best += overlap.max(1, initial=0).tolist()
+        assert b.masks is None or b.masks.shape == (len(b), 480, 640)
+    hit = [value for value in best if value > 0.5]
+    assert len(best) > 30 and len(hit) / len(best) >= recall, (len(hit), len(best))
+    assert np.mean(hit) >= iou
+
+
+@needs_shared
+@pytest.mark.parametrize("name", ["mobilenetv2_feat", "squeezenet1.1", "osnet_x0_25_msmt17"])
+def test_real_networks_that_are_no_detectors(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
+    with pytest.raises(rt.ReobjError, match="no known object detector"):
+        rt.OnnxDetector(name)

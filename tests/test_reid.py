@@ -1,0 +1,386 @@
+"""Gallery, calibrated similarity and places: against formulas and rooms written down here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import quadrics
+import reobj_track as rt
+from reobj.identity.reid import (
+    EllipsoidMap,
+    Gallery,
+    SimilarityCalibration,
+    match_probability,
+    paired_cosine,
+    part_cosines,
+)
+
+UNKNOWN = np.full((1, 3), np.nan)
+
+
+def unit(rng: np.random.Generator, n: int, dim: int = 64) -> np.ndarray:
+    vectors = rng.normal(size=(n, dim))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def at_degrees(*angles: float) -> np.ndarray:
+    """Unit rows (n, 2) in these directions."""
+    a = np.radians(angles)
+    return np.stack([np.cos(a), np.sin(a)], 1).astype(np.float32)
+
+
+def one(value: int = 0) -> np.ndarray:
+    return np.array([value])
+
+
+# ---- Gallery ----
+
+
+def filled(angles: tuple[float, ...], **options) -> Gallery:
+    """A gallery that was shown views of identity 0 in these directions, one after the other."""
+    gallery = Gallery(**options)
+    gallery.foreground_width = 2
+    for row in at_degrees(*angles):
+        gallery.add(one(), row[None], UNKNOWN)
+    return gallery
+
+
+def kept(gallery: Gallery) -> list[int]:
+    rows = gallery.rows[0, : gallery.count[0]]
+    return np.degrees(np.arctan2(rows[:, 1], rows[:, 0])).round().astype(int).tolist()
+
+
+@pytest.mark.parametrize(
+    ("angles", "options", "expected"),
+    [
+        ((0, 30), {}, [0, 30]),  # cosine .87: a new view
+        ((0, 18), {}, [2]),  # cosine .951: blended, nine parts to one
+        ((0, 30), {"novelty": 0.8}, [3]),
+        ((0, 15), {"novelty": 0.98}, [0, 15]),
+        ((0, 90, 100), {}, [0, 91]),  # blended into the nearest view
+        ((0, 30, 150, 270), {"views": 3}, [270, 30, 150]),  # takes the place of one of two alike
+        ((0, 150, 180, 90), {"views": 3}, [0, 90, 180]),
+    ],
+)
+def test_views_that_are_kept(angles, options, expected) -> None:
+    gallery = filled(angles, **options)
+    assert [k % 360 for k in kept(gallery)] == expected
+    assert gallery.rows.shape[1] == options.get("views", 12)
+    lengths = np.linalg.norm(gallery.rows[0, : len(expected)], axis=1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-6)
+
+
+def test_a_gallery_is_bounded_and_of_its_own_views() -> None:
+    rng, gallery = np.random.default_rng(9), Gallery(views=6)
+    for _ in range(40):
+        gallery.add(np.array([0, 3]), unit(rng, 2).astype(np.float32), np.repeat(UNKNOWN, 2, 0))
+    assert gallery.count[:5].tolist() == [6, 0, 0, 6, 0]
+    sizes = gallery.rows.nbytes
+    for _ in range(40):
+        gallery.add(one(3), unit(rng, 1).astype(np.float32), UNKNOWN)
+    assert gallery.rows.nbytes == sizes
+
+
+def test_memory_follows_the_identities() -> None:
+    gallery = Gallery(views=2)
+    for identity in range(100):
+        gallery.add(one(identity), at_degrees(identity), UNKNOWN)
+    assert gallery.count[:100].tolist() == [1] * 100 and len(gallery.count) < 256
+    np.testing.assert_allclose(gallery.rows[:100, 0], at_degrees(*range(100)), atol=1e-6)
+
+
+def test_gallery_parts_are_of_the_most_similar_view() -> None:
+    gallery = Gallery()
+    gallery.foreground_width = 2
+    views = np.array([[1, 0, 1, 0], [0, 1, 0, 1.0]], np.float32) / np.sqrt(2)
+    ahead, left = np.array([[[0, 0, 1.0]], [[-1, 0, 0]]])
+    for view, ray in zip(views, (ahead, left), strict=True):
+        gallery.add(one(), view[None], ray)
+    fore, back, angle = gallery.parts(views[1:], one(), ahead)
+    assert (fore, back, angle) == (pytest.approx(1), pytest.approx(1), pytest.approx(90))
+    gallery.add(one(), views[1:], ahead)  # nothing new: the kept view's ray stays
+    assert gallery.parts(views[1:], one(), left)[2] == pytest.approx(0)
+    assert np.isnan(gallery.parts(views[1:], one(), UNKNOWN)[2])
+    mixed = np.array([[0.6, 0.8, 0, 1.0]], np.float32) / np.sqrt(2)  # nearer to the second
+    fore, back, _ = gallery.parts(mixed, one(), ahead)
+    assert (fore, back) == (pytest.approx(0.8), pytest.approx(1))
+
+
+def test_unused_views_are_compared_with_nothing() -> None:
+    """Also where all used ones are less than 0 alike."""
+    fore, _, _ = filled((0, 30)).parts(at_degrees(150), one(), UNKNOWN)
+    np.testing.assert_allclose(fore, [[-0.5]], atol=1e-6)
+
+
+def test_gallery_parts_of_what_is_not_known() -> None:
+    gallery = filled((0, 90))
+    gallery.add(one(2), at_degrees(45), UNKNOWN)
+    row = at_degrees(45)
+    fore, back, _ = gallery.parts(row, np.array([2, 1, 0]), UNKNOWN)
+    np.testing.assert_allclose(fore, [[1, np.nan, 0.5**0.5]], rtol=1e-6)
+    assert np.isnan(back).all()  # no background part
+    for rows, identity in ((np.zeros((1, 0)), one()), (np.ones((1, 3)), one()), (row, one()[:0])):
+        for part in gallery.parts(rows.astype(np.float32), identity, UNKNOWN):
+            assert part.shape == (1, len(identity)) and np.isnan(part).all()
+
+
+# ---- Cosines ----
+
+
+def test_part_cosines_of_fused_rows() -> None:
+    rng = np.random.default_rng(0)
+    fore, back = unit(rng, 4, 6), unit(rng, 4, 3)
+    fused = np.concatenate([np.sqrt(0.7) * fore, np.sqrt(0.3) * back], 1)
+    got = part_cosines(fused, fused[:2], 6)
+    np.testing.assert_allclose(got[0], fore @ fore[:2].T)
+    np.testing.assert_allclose(got[1], back @ back[:2].T)
+    assert np.isnan(part_cosines(fused[:, :6], fused[:, :6], 6)[1]).all()
+    blank = np.concatenate([fused[:1], 0 * fused[:1]])
+    assert np.isnan(part_cosines(blank, fused, 6)[0]).all(1).tolist() == [False, True]
+
+
+def test_paired_cosine() -> None:
+    a = np.array([[3.0, 4], [1, 0], [0, 0]])
+    b = np.array([[4.0, 3], [0, 2], [1, 1]])
+    np.testing.assert_allclose(paired_cosine(a, b), [24 / 25, 0, np.nan])
+
+
+# ---- Calibrated similarity ----
+
+
+def reference_logit(pairs, weight, foreground, background, angle_deg=45.0) -> float:
+    """The documented formula, from all pairs; the usual ones stand in as samples of their mean and
+    spread. pairs: {same: (n, 2) cosines}, NaN where unknown.
+    """
+    total = 0.0
+    a = np.radians(angle_deg)
+    facing = ((1 + np.cos(a)) / 2, max(np.cos(a), 0))
+    for k, (cosine, share) in enumerate(zip((foreground, background), (0.55, 0.5), strict=True)):
+        if np.isnan(cosine):
+            continue
+        samples = []
+        for same, usual in ((False, (1.3, 0.65)), (True, (1.8, 1.2))):
+            shown = np.asarray(pairs.get(same, np.empty((0, 2))))[:, k]
+            shown = -np.log(1.03 - shown[~np.isnan(shown)])
+            stand_in = np.repeat([usual[k] - 0.45, usual[k] + 0.45], weight // 2)
+            samples.append(np.concatenate([stand_in, shown]))
+        different, same_mean = samples[0].mean(), samples[1].mean()
+        std = np.sqrt((samples[0].var() + samples[1].var()) / 2)
+        separation = max((same_mean - different) / std, 0)
+        middle = (different + same_mean) / 2
+        total += share * facing[k] * (-np.log(1.03 - cosine) - middle) / std * (1 + separation)
+    odds = np.exp(total)
+    return float(np.log((odds + 1e-3) / (1 + 1e-3 * odds)))
+
+
+SHOWN = {
+    False: np.array([[0.6, 0.1], [0.7, 0.35], [0.2, np.nan], [0.5, 0.5]]),
+    True: np.array([[0.95, 0.9], [0.8, 0.6], [0.9, np.nan]]),
+}
+
+
+@pytest.mark.parametrize("shown", [{}, SHOWN], ids=["usual", "after a video"])
+@pytest.mark.parametrize("weight", [10, 4])
+@pytest.mark.parametrize(
+    ("foreground", "background", "angle"),
+    [(0.9, 0.8, 45.0), (0.3, 0.9, 0.0), (0.9, np.nan, 70.0), (0.8, 0.2, 120.0), (1.0, 1.0, 0.0)],
+)
+def test_log_odds_follow_the_documented_formula(
+    shown, weight, foreground, background, angle
+) -> None:
+    calibration = SimilarityCalibration(weight)
+    for same, pairs in shown.items():
+        calibration.add(pairs[:, 0], pairs[:, 1], same)
+    expected = reference_logit(shown, weight, foreground, background, angle)
+    assert calibration.logit(foreground, background, angle) == pytest.approx(expected, abs=1e-9)
+    unknown = reference_logit(shown, weight, foreground, background)
+    assert calibration.logit(foreground, background) == pytest.approx(unknown, abs=1e-9)
+
+
+def test_the_usual_pairs_are_worth_ten() -> None:
+    ten = SimilarityCalibration(10)
+    assert SimilarityCalibration().logit(0.7, 0.4) == ten.logit(0.7, 0.4)
+
+
+def test_probability_follows_its_evidence() -> None:
+    """Monotone in both cosines; a background from another side counts less; bounded."""
+    same = SimilarityCalibration()
+    high, low = same.logit(0.9, 0.9), same.logit(0.9, 0.2)
+    assert high > low and same.logit(0.95, 0.9) > high
+    near = same.logit(0.9, [0.2, 0.9], 0.0)
+    side = same.logit(0.9, [0.2, 0.9], 80.0)
+    assert np.ptp(near) > 3 * np.ptp(side)
+    assert np.ptp(same.logit(0.9, [0.2, 0.9], 90.0)) == pytest.approx(0)
+    assert np.isfinite(same.logit(0.9, np.nan))
+    assert np.abs(same.logit([1.0, -1.0], [1.0, -1.0])).max() < 7
+    assert same.logit(np.full((2, 3), 0.5), 0.4).shape == (2, 3)
+    assert same.logit(np.nan, 0.5) == -np.inf and same.probability(np.nan) == 0
+
+
+def test_probability_has_a_prior() -> None:
+    same = SimilarityCalibration()
+    odds = np.exp(same.logit(0.9, 0.9))
+    assert same.probability(0.9, 0.9) == pytest.approx(odds / (1 + odds))
+    assert same.probability(0.9, 0.9, prior=0.2) == pytest.approx(odds / 4 / (1 + odds / 4))
+
+
+def test_probability_adapts_to_the_video() -> None:
+    """Where all objects look alike the same cosine says less; unknown parts teach nothing."""
+    plain, alike = SimilarityCalibration(), SimilarityCalibration()
+    alike.add(np.full(200, 0.95), np.full(200, np.nan), False)
+    assert alike.logit(0.92, 0.92) < plain.logit(0.92, 0.92)
+    np.testing.assert_array_equal(alike.moments[:, :, 1], plain.moments[:, :, 1])
+    alike.add(np.full(200, 0.99), np.full(200, 0.99), True)
+    assert alike.logit(0.99, 0.99) > 0 > alike.logit(0.93, 0.9)
+
+
+def test_match_probability_equals_brute_force() -> None:
+    """o / (1 + o + the largest other o of the row or the column), one pair after the other."""
+    logit = np.random.default_rng(4).normal(0, 2, (4, 5))
+    logit[1, 2] = -np.inf
+    for prior in (1.0, 1.8):
+        odds = prior * np.exp(logit)
+        expected = np.empty((4, 5))
+        for i, j in np.ndindex(4, 5):
+            others = np.concatenate([np.delete(odds[i], j), np.delete(odds[:, j], i)])
+            expected[i, j] = odds[i, j] / (odds[i, j] + 1 + others.max())
+        np.testing.assert_allclose(match_probability(logit, prior), expected)
+    np.testing.assert_array_equal(match_probability(logit), match_probability(logit, 1.8))
+
+
+@pytest.mark.parametrize(
+    ("logit", "expected"),
+    [
+        ([[0.0]], [[0.5]]),  # alone: as likely as none
+        ([[0.0, 0.0]], [[1 / 3, 1 / 3]]),  # two that fit equally well: in doubt
+        ([[5.0], [5.0]], [[0.4983, 0.4983]]),
+        ([[-np.inf]], [[0.0]]),
+    ],
+)
+def test_match_probability_of_single_pairs(logit, expected) -> None:
+    found = match_probability(np.array(logit), 1.0)
+    np.testing.assert_allclose(found, np.reshape(expected, found.shape), atol=1e-4)
+
+
+# ---- Places in 3D ----
+
+CAMERA = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+SIZE = (640, 480)
+
+
+def view_at(x: float, turn_deg: float = 0.0) -> np.ndarray:
+    """img_from_world (3, 4) of a camera at (x, 0, 0), turned to the right."""
+    a = np.radians(turn_deg)
+    turn = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
+    return CAMERA.K @ np.c_[turn, turn @ [-x, 0, 0]]
+
+
+def ball(
+    x: float, half_axes: tuple[float, ...] = (0.2, 0.2, 0.2), z: float = 4.0
+) -> quadrics.Ellipsoids:
+    return quadrics.Ellipsoids(np.array([[x, 0.1, z]]), np.array([half_axes]), np.eye(3)[None])
+
+
+def outline(thing: quadrics.Ellipsoids, view: np.ndarray) -> np.ndarray:
+    """Box (4,) of the image of points sampled on the surface."""
+    rng = np.random.default_rng(0)
+    sphere = unit(rng, 20000, 3)
+    points = thing.center_in_world[0] + sphere * thing.half_axes[0]
+    seen = np.c_[points, np.ones(len(points))] @ view.T
+    xy = seen[:, :2] / seen[:, 2:]
+    return np.concatenate([xy.min(0), xy.max(0)])
+
+
+def mapped(
+    things: list[quadrics.Ellipsoids], views: list[np.ndarray], step: int = 5
+) -> EllipsoidMap:
+    places, identity = EllipsoidMap(), np.arange(len(things))
+    for i, view in enumerate(views):
+        places.add(step * i, identity, np.stack([outline(t, view) for t in things]), view)
+    places.refit(SIZE)
+    return places
+
+
+WALK = [view_at(x) for x in np.linspace(-1.1, 1.1, 12)]
+
+
+def test_places_are_found_and_projected() -> None:
+    """In a view that was not used the boxes are those of the things themselves."""
+    things = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
+    places = mapped(things, WALK)
+    assert places.known[:3].tolist() == [True, True, False]
+    found = places.project(view_at(0.3, 8), SIZE, 0.5)
+    for box, thing in zip(found[:2], things, strict=True):
+        x1, y1, x2, y2 = outline(thing, view_at(0.3, 8))
+        np.testing.assert_allclose(box, [(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], atol=3)
+    assert np.isnan(found[2:]).all()
+
+
+def test_places_out_of_view_are_not_projected() -> None:
+    """Half out to the left: its part in the image, if as much as asked for; behind: nothing."""
+    places = mapped([ball(0)], WALK)
+    x1, y1, x2, y2 = outline(ball(0), view_at(0, 33.5))
+    assert x1 < -10 and x2 > 20
+    inside = x2 / (x2 - x1)
+    found = places.project(view_at(0, 33.5), SIZE, inside - 0.1)[0]
+    np.testing.assert_allclose(found, [x2 / 2, (y1 + y2) / 2, x2, y2 - y1], atol=4)
+    assert np.isnan(places.project(view_at(0, 33.5), SIZE, inside + 0.1)[0]).all()
+    for turn in (90, 180):
+        assert np.isnan(places.project(view_at(0, turn), SIZE, 0.0)[0]).all()
+
+
+@pytest.mark.parametrize(("length", "known"), [(0.2, True), (2.0, False)])
+def test_a_needle_is_no_place(length: float, known: bool) -> None:
+    """Half-seen things give ellipsoids that reach beyond the camera: they tell nothing."""
+    assert bool(mapped([ball(0, (length, 0.1, 0.1))], WALK).known[0]) is known
+
+
+@pytest.mark.parametrize(("walked", "known"), [(0.0, False), (0.05, False), (0.4, True)])
+def test_without_parallax_there_is_no_place(walked: float, known: bool) -> None:
+    """A ball at 4 m and a camera that turns, and walks 0, 0.7 or 5.7 degrees of parallax."""
+    xs = np.linspace(-walked / 2, walked / 2, 12)
+    views = [view_at(x, turn) for x, turn in zip(xs, np.linspace(-10, 10, 12), strict=True)]
+    assert bool(mapped([ball(0)], views).known[0]) is known
+
+
+def test_a_place_is_forgotten_when_its_views_contradict_each_other() -> None:
+    places = mapped([ball(0)], WALK)
+    assert places.known[0]
+    wrong = np.array([[0.0, 0, 20, 20], [600, 400, 640, 480]])
+    for i in range(60):
+        places.add(100 + 20 * i, one(), wrong[[i % 2]], view_at(0.01 * i))
+        places.refit(SIZE)
+    assert not places.known[0]
+
+
+def test_a_fit_waits_for_new_views() -> None:
+    """Three views at least, and more than a quarter of them new."""
+    places = EllipsoidMap()
+    told = []
+    for i, view in enumerate(WALK):
+        places.add(5 * i, one(), outline(ball(0), view)[None], view)
+        told.append(places.refit(SIZE))
+    assert np.flatnonzero(told).tolist() == [2, 4, 6, 9]  # with 3, 5, 7 and 10 views
+    assert not EllipsoidMap().refit(SIZE)
+
+
+def test_views_are_few_and_spread_over_the_whole_life() -> None:
+    places = EllipsoidMap()
+    for frame in range(1000):
+        places.add(frame, one(), np.full((1, 4), float(frame)), np.full((3, 4), float(frame)))
+    held = places.frame[0] >= 0
+    frames = np.sort(places.frame[0][held])
+    assert 8 <= len(frames) <= 16
+    assert frames[0] < 100 and frames[-1] > 850 and np.diff(frames).max() < 200
+    np.testing.assert_array_equal(places.boxes[0, held, 0], places.frame[0, held])
+    np.testing.assert_array_equal(places.img_from_world[0, held, 0, 0], places.frame[0, held])
+
+
+def test_the_first_views_are_five_frames_apart() -> None:
+    places = EllipsoidMap()
+    for frame in range(23):
+        places.add(frame, np.array([0, 1][: 1 + (frame > 7)]), np.ones((2, 4))[: 1 + (frame > 7)],
+                   np.eye(3, 4))  # fmt: skip
+    assert sorted(f for f in places.frame[0].tolist() if f >= 0) == [0, 5, 10, 15, 20]
+    assert sorted(f for f in places.frame[1].tolist() if f >= 0) == [8, 13, 18]

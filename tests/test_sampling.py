@@ -1,0 +1,190 @@
+"""Samples of a feature map for foreground and background, against masks and maps that are known."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from reobj.identity.sampling import (
+    inside_object,
+    occupancy_map,
+    pool_cells,
+    sample_parts,
+)
+
+LAYOUT = rt.SamplingLayout(context=0.5, samples=4, foreground_cells=3, background_cells=4)
+
+
+def boxes(*xyxy: tuple[float, ...], masks: np.ndarray | None = None) -> rt.Detections:
+    n = len(xyxy)
+    return rt.Detections(np.array(xyxy, float), np.full(n, 0.9), np.zeros(n, np.int64), masks)
+
+
+def samples(detections: rt.Detections, layout: rt.SamplingLayout = LAYOUT) -> list[SimpleNamespace]:
+    """Of foreground, grown and wider boxes: index, weight (N, k, k, S), share, others (N, k, k), on
+    a map of a quarter of an image of 400 x 200.
+    """
+    rows = np.arange(len(detections))
+    occupied = occupancy_map(detections, (200, 400), (50, 100), layout.object_score)
+    both = sample_parts(detections, [rows, rows], (200, 400), occupied, layout)
+    values = {"index": both.index, "weight": both.weight}
+    values |= {"share": both.share[:, 0], "others": both.share[:, 1]}
+    near, parts = layout.background_cells**2, []
+    for part, some in ((0, slice(None)), (1, slice(near)), (1, slice(near, None))):
+        cut = {name: both.split(value)[part][:, some] for name, value in values.items()}
+        side = math.isqrt(cut["share"].shape[1])
+        cut = {n: v.reshape(len(rows), side, side, *v.shape[2:]) for n, v in cut.items()}
+        parts.append(SimpleNamespace(**cut))
+    return parts[: 2 + (layout.surround_scale > 0)]
+
+
+def masks_at(mask: np.ndarray, part: SimpleNamespace) -> np.ndarray:
+    row, column = np.divmod(part.index[0], 100)
+    return np.asarray(mask[row * 4 + 2, column * 4 + 2])
+
+
+def test_foreground_is_the_inscribed_ellipse_and_background_the_rest() -> None:
+    fore, back = samples(boxes((100, 50, 200, 150)))
+    assert fore.weight.mean() == pytest.approx(np.pi / 4, abs=0.03)
+    assert back.weight.mean() == pytest.approx(1 - np.pi / 16, abs=0.03)
+    row, column = np.divmod(back.index[0][back.weight[0]], 100)
+    assert column.min() * 4 >= 48 and column.max() * 4 <= 250  # grown by half a box on every side
+    assert column.min() * 4 <= 56 and column.max() * 4 >= 240
+    assert row.min() <= 2 and row.max() >= 47  # rows 0..200
+    assert fore.share.shape == (1, 3, 3) and back.share.shape == (1, 4, 4)
+    assert back.others.mean() < 0.02  # the rim of its own outline, drawn on the coarse map
+
+
+def test_masks_of_all_objects_are_no_background() -> None:
+    masks = np.zeros((2, 200, 400), bool)
+    masks[0, 50:150, 100:150] = masks[1, :, 200:] = True
+    fore, back = samples(boxes((100, 50, 200, 150), (200, 0, 400, 200), masks=masks))
+    left = fore.index[0] % 100 < 37  # the mask is the left half of the box
+    np.testing.assert_array_equal(fore.weight[0], left)
+    right = back.index[0] % 100 >= 50
+    assert not (back.weight[0] & right).any()
+    assert not (back.weight[0] & masks_at(masks[0], back)).any()
+    assert back.weight[0][~right & ~masks_at(masks[0], back)].all()
+    np.testing.assert_allclose(back.others[0][:, 3], 1.0)
+
+
+@pytest.mark.parametrize(("score", "hides"), [(0.29, False), (0.3, True)])
+def test_only_confident_objects_hide_the_background_of_others(score: float, hides: bool) -> None:
+    masks = np.zeros((2, 200, 400), bool)
+    masks[0, 50:150, 100:200] = masks[1, :, 200:] = True
+    found = rt.Detections(
+        np.array([[100.0, 50, 200, 150], [200, 0, 400, 200]]), np.array([0.9, score]),
+        np.zeros(2, np.int64), masks,
+    )  # fmt: skip
+    _, back = samples(found)
+    right = back.index[0] % 100 >= 50
+    assert back.weight[0][right].any() is np.bool_(not hides)
+    assert bool(back.others[0][:, 3].any()) is hides
+    strict = samples(found, rt.SamplingLayout(object_score=0.95))[1]  # the own outline goes too
+    assert strict.weight[0][strict.index[0] % 100 >= 50].all()
+
+
+def test_a_mask_without_any_pixel_is_no_mask() -> None:
+    masks = np.zeros((2, 200, 400), bool)
+    masks[1, :40, :40] = True
+    xyxy = ((100, 50, 200, 150), (0, 0, 50, 50))
+    with_mask, without = samples(boxes(*xyxy, masks=masks))[0], samples(boxes(xyxy[0]))[0]
+    np.testing.assert_array_equal(with_mask.weight[0], without.weight[0])
+    occupied = occupancy_map(boxes(*xyxy, masks=masks), (200, 400), (200, 400))
+    assert occupied[:, 60:].mean() == pytest.approx(np.pi / 4 * 100**2 / (200 * 340), rel=0.05)
+
+
+def test_occupancy_is_drawn_at_the_scale_of_the_map() -> None:
+    occupied = occupancy_map(boxes((100, 50, 200, 150)), (200, 400), (50, 100))
+    y, x = np.mgrid[:50, :100] + 0.5
+    inside = ((x * 4 - 150) / 50) ** 2 + ((y * 4 - 100) / 50) ** 2
+    assert occupied[inside < 0.7].all() and not occupied[inside > 1.4].any()
+    assert not occupancy_map(rt.Detections.empty(), (200, 400), (50, 100)).any()
+
+
+def test_points_inside_an_object() -> None:
+    """Centre, corner of the box (not of the ellipse), and the same by a mask of the corner."""
+    at = np.array([[50.0, 11.0], [40.0, 21.0]])  # x, y of two points
+    centre, half = np.array([[50.0], [40.0]]), np.array([[40.0], [20.0]])
+    rows, found = np.zeros(2, np.int64), boxes((10, 20, 90, 60))
+    assert inside_object(found, rows, at, centre, half).tolist() == [True, False]
+    mask = np.zeros((1, 200, 400), bool)
+    mask[0, 21, 11] = True
+    masked = boxes((10, 20, 90, 60), masks=mask)
+    assert inside_object(masked, rows, at, centre, half).tolist() == [False, True]
+
+
+def test_the_margin_has_a_least_size() -> None:
+    """A tenth of the longer side of the image, 40 px on every side of a box of 10."""
+    layout = rt.SamplingLayout(context=0.5, min_margin=0.1, samples=4)
+    _, near = samples(boxes((100, 100, 110, 110)))
+    _, far = samples(boxes((100, 100, 110, 110)), layout)
+    assert np.ptp(near.index % 100) * 4 <= 20 and 76 <= np.ptp(far.index % 100) * 4 <= 92
+
+
+def test_the_wider_box_holds_other_objects_but_not_the_own() -> None:
+    masks = np.zeros((2, 200, 400), bool)
+    masks[0, 80:120, 180:220] = masks[1, :, 240:] = True
+    found = boxes((180, 80, 220, 120), (240, 0, 400, 200), masks=masks)
+    layout = rt.SamplingLayout(
+        context=0.5, samples=4, surround_scale=1.5, surround_min_margin=0.2, surround_cells=5
+    )
+    _, _, wide = samples(found, layout)
+    column = wide.index[0] % 100
+    assert (column.min() * 4, column.max() * 4) == (104, 292)  # 200 -+ (20 + .2 * 400), 4 px a cell
+    assert wide.weight[0][column > 60].all()
+    assert not (wide.weight[0] & masks_at(masks[0], wide)).any()
+    assert wide.share.shape == (1 + 1, 5, 5) and wide.share[0, 2, 2] == 0
+    np.testing.assert_allclose(wide.others[0][:, 4], 1.0)
+
+
+def test_cells_are_means_of_the_samples_that_count() -> None:
+    """On a map that holds its own columns and rows; the foreground reads only the first channel."""
+    layout = rt.SamplingLayout(
+        context=0.5, samples=4, surround_scale=1.0, surround_cells=5, foreground_channels=1
+    )
+    found = boxes((100, 50, 200, 150), (120, 60, 150, 90))
+    rows, occupied = [np.array([1]), np.array([0, 1])], np.zeros((50, 100), bool)
+    both = sample_parts(found, rows, (200, 400), occupied, layout)
+    y, x = np.mgrid[:50, :100].astype(np.float32)
+    fore, back = pool_cells(np.stack([x, y], -1), both, layout)
+    assert fore.shape == (1, 4, 3) and back.shape == (2, 16 + 25, 4)
+    np.testing.assert_allclose(fore[0, :, 0].reshape(2, 2).mean(0), [32, 35.5], atol=0.6)
+    first = np.where(both.weight[4], np.divmod(both.index[4], 100), np.nan)  # of the grown box
+    np.testing.assert_allclose(back[0, 0, 1::-1], np.nanmean(first, 1), rtol=1e-5)
+    assert fore[0, 0, 1] == both.weight[0].mean()
+    assert back[1, 20, 2] == both.weight[4 + 41 + 20].mean()
+
+
+def test_cells_where_no_sample_counts_are_zero() -> None:
+    found = boxes((900, 900, 950, 950))
+    rows = [np.array([0])] * 2
+    both = sample_parts(found, rows, (200, 400), np.zeros((50, 100), bool), LAYOUT)
+    fore, back = pool_cells(np.ones((50, 100, 3), np.float32), both, LAYOUT)
+    assert not fore.any() and not back.any()
+
+
+@pytest.mark.parametrize("box", [(-50, -50, 20, 20), (395, 190, 600, 400), (900, 900, 950, 950)])
+def test_samples_out_of_the_image_do_not_count(box: tuple[float, ...]) -> None:
+    for part in samples(boxes(box)):
+        assert part.index.min() >= 0 and part.index.max() < 5000
+        assert part.share.max() <= 1
+    fore, back = samples(boxes(box))
+    inside = max(0, min(box[2], 400) - max(box[0], 0)) * max(0, min(box[3], 200) - max(box[1], 0))
+    assert fore.weight.mean() <= inside / (box[2] - box[0]) / (box[3] - box[1]) + 0.05
+    assert box[0] != 900 or not (fore.weight.any() or back.weight.any())
+
+
+def test_layouts_of_older_models_are_understood() -> None:
+    old = {"size_px": 320, "reach": 0.05, "wide": 1.5, "wide_reach": 0.1, "wide_cells": 3}
+    layout = rt.SamplingLayout(neighbours=0.1).updated({"layout": old})
+    assert layout == rt.SamplingLayout(
+        size_px=320, min_margin=0.05, surround_scale=1.5, surround_min_margin=0.1,
+        surround_cells=3, neighbours=0.1,
+    )  # fmt: skip
+    assert rt.SamplingLayout().updated({"layout": {"min_margin": 0.2}}).min_margin == 0.2
+    assert rt.SamplingLayout().updated({}) == rt.SamplingLayout()

@@ -1,0 +1,300 @@
+"""Weights: found, verified, downloaded whole or not at all; onnxruntime sessions."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import http.server
+import os
+import sys
+import threading
+import urllib.parse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import reobj_track as rt
+from reobj.sources import weights
+
+SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+needs_shared = pytest.mark.skipif(
+    not (SHARED / "models").is_dir(), reason="no weights: set REOBJ_SHARED"
+)
+BLOB = np.random.default_rng(0).integers(0, 256, 300_000, dtype=np.uint8).tobytes()
+SHA256 = hashlib.sha256(BLOB).hexdigest()
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    """Serves BLOB; `server.mode` says how badly."""
+
+    server: Any
+
+    def do_GET(self) -> None:
+        mode = self.server.mode
+        self.server.asked.append((self.path, self.headers.get("Range")))
+        if mode == "404":
+            self.send_error(404)
+            return
+        body = BLOB[::-1] if mode == "wrong" else BLOB + b"more" * (mode == "long")
+        self.send_response(200)
+        if mode != "cut without a length":
+            self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        with contextlib.suppress(OSError):  # who stops reading
+            self.wfile.write(body[: 100_000 if mode.startswith("cut") else None])
+
+    def log_message(self, *args: Any) -> None:
+        pass
+
+
+@pytest.fixture()
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A server on 127.0.0.1 with the weights "toy", and an empty cache folder."""
+    made: Any = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    made.mode, made.asked = "good", []
+    threading.Thread(target=made.serve_forever, args=(0.01,), daemon=True).start()
+    url = f"http://127.0.0.1:{made.server_port}/toy.onnx"
+    toy = weights.Weights("toy", "detector", "toy_416.onnx", url, SHA256, len(BLOB), "MIT")
+    monkeypatch.setattr(weights, "WEIGHTS", (toy,))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("REOBJ_MODELS", raising=False)
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    made.folder = tmp_path / "reobj_track"
+    made.target = made.folder / "toy_416.onnx"
+    yield made
+    made.shutdown()
+    made.server_close()
+
+
+# ---- Download ------------------------------------------------------------------------------------
+
+
+def test_a_download_is_announced_verified_and_done_once(
+    server: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert rt.model_path("toy") == server.target and server.target.read_bytes() == BLOB
+    for shown in ("0.3 MB", "licence MIT", "http://127.0.0.1", "sha256 " + SHA256):
+        assert shown in caplog.text
+    by_name, by_file = rt.model_path("toy"), rt.model_path("toy_416.onnx", offline=True)
+    assert by_name == by_file == server.target
+    assert server.asked == [("/toy.onnx", None)]
+    assert list(server.folder.iterdir()) == [server.target]
+
+
+def test_another_file_than_expected_is_not_kept(server: Any) -> None:
+    for server.mode, body in (("wrong", BLOB[::-1]), ("long", BLOB + b"more" * 1)):
+        found = hashlib.sha256(body).hexdigest()
+        with pytest.raises(rt.ReobjError, match=f"sha256 is {found}, expected {SHA256}: not kept"):
+            rt.model_path("toy")
+        assert list(server.folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("mode", ["cut", "cut without a length"])
+def test_a_cut_download_leaves_nothing_and_starts_again(server: Any, mode: str) -> None:
+    server.mode = mode
+    expected = r"cut after 100000 of 300000 bytes.: run again"
+    with pytest.raises(rt.ReobjError, match=expected) as caught:
+        rt.model_path("toy")
+    assert "\n" not in str(caught.value) and list(server.folder.iterdir()) == []
+    server.mode = "good"
+    assert rt.model_path("toy").read_bytes() == BLOB
+    assert server.asked == [("/toy.onnx", None)] * 2  # the whole file, not a range of it
+
+
+def test_ctrl_c_leaves_nothing(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(self: Any, n: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(weights.Progress, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        rt.model_path("toy")
+    assert list(server.folder.iterdir()) == []
+
+
+def test_404_names_url_and_hash(server: Any) -> None:
+    server.mode = "404"
+    expected = r"toy.onnx: download failed .HTTP Error 404.*sha256.*put it at"
+    with pytest.raises(rt.ReobjError, match=expected):
+        rt.model_path("toy")
+    assert list(server.folder.iterdir()) == []
+
+
+def test_no_network_says_what_to_do(server: Any) -> None:
+    server.shutdown()
+    server.server_close()
+    with pytest.raises(rt.ReobjError) as caught:
+        rt.model_path("toy")
+    url = weights.WEIGHTS[0].url
+    for part in ("download failed", "refused", url, SHA256, str(server.target), "REOBJ_MODELS"):
+        assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_offline_forbids_the_download(server: Any) -> None:
+    expected = "model toy is not here and --offline forbids the download.*REOBJ_MODELS"
+    with pytest.raises(rt.ReobjError, match=expected):
+        rt.model_path("toy", offline=True)
+    assert server.asked == [] and not server.folder.exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = Path.open
+
+    def on_a_full_disk(path: Path, mode: str = "r", **options: Any) -> Any:
+        return opened(Path("/dev/full") if mode == "wb" else path, mode, **options)
+
+    monkeypatch.setattr(Path, "open", on_a_full_disk)
+    with pytest.raises(
+        rt.ReobjError, match=r"download failed .*No space left on device.*run again"
+    ):
+        rt.model_path("toy")
+    assert list(server.folder.iterdir()) == []
+
+
+# ---- Folders and states --------------------------------------------------------------------------
+
+
+def test_own_folder_comes_first_and_may_be_read_only(
+    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "toy_416.onnx").write_bytes(BLOB)
+    (own / "mine.onnx").write_bytes(b"anything")
+    monkeypatch.setenv("REOBJ_MODELS", str(own))
+    assert rt.model_path("toy") == own / "toy_416.onnx"
+    for name in ("mine", "mine.onnx"):  # unknown to the table: not verified
+        assert rt.model_path(name) == own / "mine.onnx"
+    assert server.asked == []
+    monkeypatch.setenv("REOBJ_MODELS", "/proc/none")  # nothing can be written there
+    assert rt.model_path("toy") == server.target
+    monkeypatch.setenv("REOBJ_MODELS", str(own))  # now in both
+    assert rt.model_path("toy") == own / "toy_416.onnx"
+    (own / "toy_416.onnx").unlink()
+    server.target.unlink()
+    assert rt.model_path("toy") == own / "toy_416.onnx"  # downloads go there too
+
+
+@pytest.mark.parametrize(
+    ("platform", "variable", "expected"),
+    [
+        ("linux", "", "home/.cache"),
+        ("darwin", "", "home/Library/Caches"),
+        ("win32", "", "home/AppData/Local"),
+        ("win32", "LOCALAPPDATA", "local"),
+        ("linux", "XDG_CACHE_HOME", "local"),
+    ],
+)
+def test_the_cache_of_each_platform(
+    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    platform: str, variable: str, expected: str,
+) -> None:  # fmt: skip
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    if variable:
+        monkeypatch.setenv(variable, str(tmp_path / "local"))
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    monkeypatch.setattr(sys, "platform", platform)
+    assert rt.model_path("toy") == tmp_path / expected / "reobj_track" / "toy_416.onnx"
+
+
+def test_a_changed_file_is_refused_but_not_deleted(server: Any) -> None:
+    rt.model_path("toy")
+    server.target.write_bytes(b"changed")
+    for name in ("toy", "toy_416.onnx"):
+        with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
+            rt.model_path(name)
+    assert rt.model_path(server.target) == server.target  # by its path: as it is
+    assert [row.state for row in rt.list_models()] == ["wrong sha256"]
+    assert server.target.read_bytes() == b"changed"
+
+
+def test_a_file_of_that_name_is_taken_as_it_is(
+    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "toy").write_bytes(b"mine")
+    assert rt.model_path("toy") == Path("toy") and server.asked == []
+
+
+def test_states_and_unknown_names(server: Any) -> None:
+    (row,) = rt.list_models()
+    assert (row.weights.name, row.state, row.path) == ("toy", "missing", None)
+    assert server.asked == []  # to list is not to fetch
+    rt.model_path("toy")
+    (row,) = rt.list_models()
+    assert (row.state, row.path) == ("verified", server.target)
+    expected = r"model yolo99: no such file, nor one of the known names \(toy\)"
+    with pytest.raises(rt.ReobjError, match=expected):
+        rt.model_path("yolo99")
+
+
+def test_nowhere_to_write(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/none")
+    with pytest.raises(rt.ReobjError, match=r"cannot write to /proc/none.*: set REOBJ_MODELS"):
+        rt.model_path("toy")
+    assert server.asked == []
+
+
+# ---- The table -----------------------------------------------------------------------------------
+
+
+def test_table_of_weights() -> None:
+    names = [row.name for row in weights.WEIGHTS]
+    assert len(set(names)) == len(names) and rt.DetectConfig().model in names
+    for row in weights.WEIGHTS:
+        assert len(row.sha256) == 64 and row.size > 0 and row.role in ("detector", "backbone")
+        if row.url:
+            assert "AGPL" not in row.licence
+            assert urllib.parse.urlparse(row.url).scheme == "https"
+            assert len(row.url.split("/raw/")[1].split("/")[0]) == 40  # pinned at a commit
+        else:
+            assert (weights.own_models() / row.file).stat().st_size == row.size
+
+
+def test_what_comes_along_needs_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("REOBJ_MODELS", raising=False)
+    assert rt.model_path("reobj", offline=True).parent == weights.own_models()
+
+
+@needs_shared
+def test_table_agrees_with_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
+    for row in rt.list_models():
+        assert row.state == "verified" and row.path, row
+        assert row.path.stat().st_size == row.weights.size
+
+
+# ---- Sessions ------------------------------------------------------------------------------------
+
+
+def test_a_model_is_loaded_with_its_metadata() -> None:
+    session = weights.onnx_session(weights.own_models() / "reobj.onnx", threads=1)
+    assert session.get_session_options().intra_op_num_threads == 1
+    metadata = weights.onnx_metadata(session)
+    assert isinstance(metadata, dict) and metadata
+
+
+def test_no_onnx_file_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.onnx").write_bytes(b"no model")
+    with pytest.raises(rt.ReobjError, match=r"a.onnx: onnxruntime cannot load it") as caught:
+        weights.onnx_session(tmp_path / "a.onnx")
+    assert "\n" not in str(caught.value)
+
+
+def test_onnxruntime_is_asked_for_when_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(rt.ReobjError, match="pip install onnxruntime"):
+        weights.onnx_session(Path("any.onnx"))
+
+
+def test_imagenet_constants_are_those_of_torchvision() -> None:
+    np.testing.assert_allclose(np.divide(weights.IMAGENET_MEAN, 255), [0.485, 0.456, 0.406])
+    np.testing.assert_allclose(np.divide(weights.IMAGENET_STD, 255), [0.229, 0.224, 0.225])
