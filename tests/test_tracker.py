@@ -949,3 +949,172 @@ def test_a_missed_track_of_known_place_waits_where_that_is_seen_now() -> None:
         tracker.update(rt.Detections.empty(), cam_from_world=pose, camera=CAMERA)
     walk(tracker, [pose])
     assert tracker.latest.tracklet_id.tolist() == before
+
+
+# ---- Appearance: where it is compared, and what is kept of it ----
+
+
+def test_rivals_are_embedded_in_one_pass() -> None:
+    """Two boxes beside a track: both are asked for, also the one that would not be matched."""
+    tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
+    image = np.zeros((300, 400, 3), np.uint8)
+    for _ in range(12):
+        tracker.update(rows((100, 100, 150, 150)), image)
+    tracker.update(rows((103, 100, 153, 150), (92, 100, 142, 150)), image)
+    assert embedder.asked[-1] == (12, [0, 1])
+
+
+def test_two_classes_around_one_thing_are_no_rivals() -> None:
+    tracker, embedder = counted(rt.TrackerConfig(camera_motion=False))
+    image = np.zeros((300, 400, 3), np.uint8)
+    for _ in range(12):
+        tracker.update(rows((100, 100, 150, 150)), image)
+    before = len(embedder.asked)
+    tracker.update(rows((101, 100, 151, 150), (100, 101, 150, 151, 0.9, CUP)), image)
+    assert len(embedder.asked) == before
+
+
+def test_what_was_refused_is_not_matched_by_overlap_alone() -> None:
+    """A box around two tracks, like neither: it begins a track of its own."""
+    views = unit(np.random.default_rng(31), 3)
+    tracker = rt.Tracker()
+    for _ in range(12):
+        both = rows((100, 100, 150, 150), (104, 100, 154, 150))
+        tracker.update(both, embeddings=views[:2])
+    found = update(tracker, rows((88, 87, 165, 164)), embeddings=views[2:])
+    assert found.tracklet_id.tolist() == [3]
+
+
+@pytest.mark.parametrize(("shift", "same"), [(20, True), (32, False)])
+def test_a_costly_match_is_none(shift: int, same: bool) -> None:
+    """A track without an embedding: what lies beside it in the gate, but far out, is not it."""
+    view, tracker = unit(np.random.default_rng(32), 1), rt.Tracker()
+    known, new = (300, 300, 350, 350), (100, 20, 110, 270)
+    for _ in range(4):
+        tracker.update(rows(known), embeddings=view)
+    before = update(tracker, rows(known, new), embeddings=view.repeat(2, 0)).tracklet_id[1]
+    moved = (100 + shift, 20, 110 + shift, 270)
+    after = update(tracker, rows(known, moved), embeddings=view.repeat(2, 0)).tracklet_id[1]
+    assert (after == before) == same
+
+
+def test_embedding_of_a_track_is_a_running_mean() -> None:
+    """A fifth of the new one, four fifths of what it was."""
+    first, second = np.eye(2, 8)
+    tracker = rt.Tracker(rt.TrackerConfig(embed_every=1))
+    for view in (first, second):
+        tracker.update(rows((0, 0, 50, 50)), embeddings=view[None])
+    expected = (0.8 * first + 0.2 * second) / np.hypot(0.8, 0.2)
+    np.testing.assert_allclose(tracker.state.embedding[0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("weight", [0.5, 0.9])
+def test_foreground_has_its_share_of_the_appearance(weight: float) -> None:
+    """A cosine of two fused rows is that share of the foregrounds' cosine, plus the rest."""
+    tracker = rt.Tracker(rt.TrackerConfig(foreground_weight=weight, embed_every=1))
+    both = rt.Embeddings(np.eye(2, 3), np.ones((2, 1)))  # unlike objects, one background
+    tracker.update(rows((0, 0, 50, 50), (90, 0, 140, 50)), embeddings=both)
+    index, fused = tracker.latest_embeddings()
+    assert index.tolist() == [0, 1] and fused.shape == (2, 4)
+    assert fused[0] @ fused[1] == pytest.approx(1 - weight, abs=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "pairs"), [(CHAIR, 2), (CUP, 0)])
+def test_side_by_side_objects_of_a_class_calibrate(kind: int, pairs: int) -> None:
+    """Each of two chairs is compared with the other; a chair and a cup say nothing."""
+    views = unit(np.random.default_rng(33), 2)
+    tracker = rt.Tracker(rt.TrackerConfig(n_init=1, embed_every=1))
+    both = rows((0, 0, 50, 50), (90, 0, 140, 50, 0.9, kind))
+    counts = []
+    for _ in range(3):
+        tracker.update(both, embeddings=views)
+        different, same = tracker.match_calibration.moments[:, 0, 0]
+        counts.append((different - 10, same - 10))  # beyond the prior's
+    assert counts == [(0, 0), (pairs, 2), (2 * pairs, 4)]
+
+
+# ---- Identities by place ----
+
+
+def test_an_object_like_another_one_elsewhere_is_new() -> None:
+    """It equals the first ball, which is out of view, in a place where that cannot be."""
+    views = unit(np.random.default_rng(34), 2)[[0, 1, 0]]
+    tracker = rt.Tracker()
+    for pose in PAST + [pose_at(0.5, 62.0)] * 6:
+        found, which = balls_seen(pose)
+        tracks = tracker.update(
+            found, embeddings=views[which], cam_from_world=pose, camera=CAMERA
+        )
+    assert which.tolist() == [2] and tracks.track_id.tolist() == [3]
+
+
+def test_without_appearance_the_place_names_an_object() -> None:
+    """The detector is blind for longer than tracks wait; tracks are new, identities are not."""
+    tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
+    walk(tracker, PAST)
+    for _ in range(10):
+        tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
+    assert len(tracker.state.mean) == 0
+    assert walk(tracker, [PAST[-1]] * 4)[-1] == {0: 1, 1: 2}
+    assert tracker.latest.tracklet_id.tolist() == [3, 4]
+
+
+# ---- The whole state ----
+
+
+def everything(tracker: rt.Tracker) -> dict[str, np.ndarray]:
+    """All that a tracker knows and shows."""
+    parts: dict[str, Any] = {
+        name: getattr(tracker, name) for name in ("frame_number", "last_seen", "identity_class")
+    }
+    for part in ("state", "gallery", "places", "reid_calibration", "match_calibration"):
+        owner = getattr(tracker, part)
+        names = getattr(owner, "ARRAYS", getattr(owner, "__slots__", ()))
+        parts |= {f"{part}.{name}": getattr(owner, name) for name in names}
+    return {name: np.asarray(value) for name, value in parts.items()}
+
+
+def filled() -> rt.Tracker:
+    """A tracker that has seen the balls with poses and appearance, without images."""
+    views, tracker = unit(np.random.default_rng(35), 3), rt.Tracker()
+    for pose in PAST + AWAY[:10]:
+        found, which = balls_seen(pose)
+        noise = 0.1 * unit(np.random.default_rng(len(which)), len(which))
+        view = views[which] + noise
+        tracker.update(found, embeddings=view, cam_from_world=pose, camera=CAMERA)
+    return tracker
+
+
+def test_everything_is_saved(tmp_path: Path) -> None:
+    tracker = filled()
+    tracker.save(tmp_path / "state.npz")
+    loaded = rt.Tracker.load(tmp_path / "state.npz")
+    mine, theirs = everything(tracker), everything(loaded)
+    assert len(mine) > 20 and mine.keys() == theirs.keys()
+    for name, value in mine.items():
+        np.testing.assert_array_equal(value, theirs[name], err_msg=name)
+    for pose in AWAY[10:20]:  # without an image the turn since the last pose counts
+        for one in (tracker, loaded):
+            one.update(rt.Detections.empty(), cam_from_world=pose, camera=CAMERA)
+        np.testing.assert_array_equal(tracker.state.mean, loaded.state.mean)
+
+
+def test_the_first_turn_after_loading_counts(tmp_path: Path) -> None:
+    """A tracked box of unknown place (no parallax) is where the camera's turn takes it."""
+    tracker, box = rt.Tracker(), rows((300, 200, 340, 260))
+    for _ in range(4):
+        tracker.update(box, cam_from_world=pose_at(0), camera=CAMERA)
+    tracker.save(tmp_path / "state.npz")
+    loaded = rt.Tracker.load(tmp_path / "state.npz")
+    loaded.update(rt.Detections.empty(), cam_from_world=pose_at(0, 10.0), camera=CAMERA)
+    assert loaded.state.mean[0, 0, 0] == pytest.approx(320 - 500 * np.tan(np.radians(10)), abs=2)
+
+
+def test_reset_forgets_everything() -> None:
+    tracker = filled()
+    assert tracker.places.known.any() and tracker.gallery.count.any()
+    tracker.reset()
+    mine, fresh = everything(tracker), everything(rt.Tracker())
+    for name, value in fresh.items():
+        np.testing.assert_array_equal(mine[name], value, err_msg=name)
+    assert len(tracker.latest) == 0 and tracker.latest_embeddings()[0].tolist() == []
