@@ -780,6 +780,16 @@ def test_tracks_wait_for_coast_frames(gap: int, same: bool) -> None:
     assert (update(tracker, rows((100, 100, 150, 150))).tracklet_id == 1).tolist() == [same]
 
 
+def test_tracks_are_given_up_one_by_one() -> None:
+    """One is lost a frame later than the other, and is given up a frame later."""
+    tracker, counts = rt.Tracker(rt.TrackerConfig(coast_frames=5)), []
+    both = rows((100, 100, 150, 150), (300, 100, 350, 150))
+    for found in [both] * 4 + [both[:1]] + [both[:0]] * 6:
+        tracker.update(found)
+        counts.append(len(tracker.state.mean))
+    assert counts == [2] * 9 + [1, 0]
+
+
 @pytest.mark.parametrize(("score", "found"), [(0.09, []), (0.11, [1])])
 def test_scores_below_the_low_one_continue_nothing(score: float, found: list[int]) -> None:
     tracker = rt.Tracker()
@@ -795,7 +805,8 @@ def test_scores_below_the_low_one_continue_nothing(score: float, found: list[int
         (22, 0.3, CHAIR, 0, True),  # IoU .39: enough for a faint box
         (30, 0.3, CHAIR, 0, False),  # IoU .25
         (22, 0.9, CUP, 0, True),  # enough for a change of class
-        (30, 0.9, CUP, 0, False),
+        (22, 0.9, CUP, 15, True),
+        (30, 0.9, CUP, 15, False),
         (30, 0.9, CHAIR, 0, True),
     ],
 )
