@@ -78,6 +78,7 @@ class Detections:
 
     @staticmethod
     def empty() -> Detections:
+        """Make the detections of a frame without any."""
         return Detections(np.empty((0, 4)), np.empty(0), np.empty(0, np.int64))
 
     @staticmethod

@@ -126,6 +126,31 @@ def test_a_right_return_is_not_split() -> None:
     assert objects_of(found, table.detection_index) == [[0]] and events == []
 
 
+def test_boxes_that_no_solid_explains_are_not_split_off() -> None:
+    """The return has boxes at random: a solid of its own would be no better than the joint one."""
+    poses = walk()
+    table = table_of(poses)
+    late = table.frame >= 100
+    table = table[(table.detection_index == 0) & ((table.frame < 50) | late & (table.frame < 112))]
+    late, xyxy = table.frame >= 100, table.xyxy.copy()
+    shift = np.random.default_rng(0).uniform(-1.5, 1.5, 12) * (xyxy[late, 2] - xyxy[late, 0])
+    xyxy[late] += shift[:, None] * [1, 0, 1, 0]
+    one = np.ones(len(table), np.int64)
+    table = dataclasses.replace(table, xyxy=xyxy, track_id=one, tracklet_id=1 + late)
+    found, events = linked(table, poses)
+    assert np.unique(found.track_id).tolist() == [1] and events == []
+
+
+def test_a_poor_fit_alone_splits_nothing() -> None:
+    """A thing on a chair went by the chair's identity: two solids would be better, but they are
+    in one place.
+    """
+    table, poses = stacked()
+    one = np.ones(len(table), np.int64)
+    found, events = linked(dataclasses.replace(table, track_id=one), poses)
+    assert np.unique(found.track_id).tolist() == [1] and events == []
+
+
 @pytest.mark.parametrize("slips", [[60], [40, 80], []])
 def test_a_tracklet_that_slipped_is_cut_by_place(slips: list[int]) -> None:
     """The tracker goes on with another chair without missing a frame; else nothing is cut."""
