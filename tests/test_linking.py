@@ -204,9 +204,7 @@ def test_only_classes_that_the_detector_confuses_are_joined(every: int, objects:
     table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
     late = (table.frame > 70).astype(np.int64)
     class_id = np.where((late == 1) & (table.frame % every != 0), CUP, CHAIR)
-    table = dataclasses.replace(
-        table, track_id=1 + late, tracklet_id=1 + late, class_id=class_id
-    )
+    table = dataclasses.replace(table, track_id=1 + late, tracklet_id=1 + late, class_id=class_id)
     found, _ = linked(table, poses)
     assert len(np.unique(found.track_id)) == objects
 
@@ -302,7 +300,7 @@ APART, LAST_TWO, FIRST_LAST = ((0, 40, 80), (0, 40, 40), (0, 40, 0))
         (APART, {(0, 1): 0.99, (1, 2): 0.99, (0, 2): 0.98}, 200, [1, 1, 1]),
         (LAST_TWO, {(0, 1): 0.99, (0, 2): 0.6, (1, 2): 0.6}, 200, [1, 1, 2]),  # the better of two
         (LAST_TWO, {(0, 1): 0.985, (0, 2): 0.984, (1, 2): 0.98}, 200, [1, 2, 3]),  # equal rivals
-        (LAST_TWO, {(0, 1): 0.99, (0, 2): 0.984, (1, 2): 0.98}, 5, [1, 1, 2]),  # two boxes on one
+        (LAST_TWO, {(0, 1): 0.985, (0, 2): 0.984, (1, 2): 0.98}, 5, [1, 1, 2]),  # two boxes on one
         (FIRST_LAST, {(0, 1): 0.985, (1, 2): 0.984, (0, 2): 0.98}, 200, [1, 3, 2]),
     ],
 )

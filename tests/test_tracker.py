@@ -575,7 +575,7 @@ HOME = [pose_at(0.5 - 0.01 * i, 180 - 3.0 * i) for i in range(61)]
 
 @pytest.mark.parametrize("posed", [True, False])
 def test_with_poses_objects_are_known_by_their_place(posed: bool) -> None:
-    """No appearance at all: the camera turns away for 100 frames and comes back from another spot."""
+    """No appearance: the camera turns away for 100 frames and comes back from another spot."""
     seen = walk(rt.Tracker(), PAST + AWAY + HOME, posed)
     before, after = seen[49], seen[-1]
     assert sorted(before) == sorted(after) == [0, 1]
@@ -666,9 +666,7 @@ def test_another_class_speaks_against_one_object(kind: int, expected: list[int])
         ((72, 170, 138, 280), False),  # in the same place, but of another shape
     ],
 )
-def test_without_appearance_boxes_must_be_of_a_shape(
-    box: tuple[float, ...], same: bool
-) -> None:
+def test_without_appearance_boxes_must_be_of_a_shape(box: tuple[float, ...], same: bool) -> None:
     tracker = rt.Tracker()
     for _ in range(5):
         tracker.update(rows((100, 100, 110, 350)))
@@ -1053,9 +1051,7 @@ def test_an_object_like_another_one_elsewhere_is_new() -> None:
     tracker = rt.Tracker()
     for pose in PAST + [pose_at(0.5, 62.0)] * 6:
         found, which = balls_seen(pose)
-        tracks = tracker.update(
-            found, embeddings=views[which], cam_from_world=pose, camera=CAMERA
-        )
+        tracks = tracker.update(found, embeddings=views[which], cam_from_world=pose, camera=CAMERA)
     assert which.tolist() == [2] and tracks.track_id.tolist() == [3]
 
 

@@ -82,7 +82,9 @@ def test_detections_are_selected_with_their_masks() -> None:
     [
         rt.Detections(np.zeros((2, 4)), np.ones(1), np.zeros(2, np.int64)),
         rt.Detections(np.zeros((2, 4)), np.ones(2), np.zeros(3, np.int64)),
-        rt.Detections(np.zeros((1, 4)), np.ones(1), np.zeros(1, np.int64), np.zeros((2, 3, 3), bool)),
+        rt.Detections(
+            np.zeros((1, 4)), np.ones(1), np.zeros(1, np.int64), np.zeros((2, 3, 3), bool)
+        ),
         [[0, 0, np.nan, 1, 0.5, 1]],
     ],
 )
