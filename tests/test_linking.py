@@ -254,7 +254,24 @@ def test_faint_boxes_say_nothing_about_a_place() -> None:
     score = np.where(ids == 2, 0.4, 0.9)
     table = dataclasses.replace(table, track_id=ids, tracklet_id=ids, score=score)
     for min_score, objects in ((0.3, 1), (0.5, 2)):
-        found, _ = linked(table, poses, min_score=min_score)
+        found, events = linked(table, poses, min_score=min_score)
+        assert len(np.unique(found.track_id)) == objects
+        assert len(events) == 2 - objects
+
+
+def test_another_thing_in_the_same_place_is_another_object() -> None:
+    """Someone has put another chair there: what looks so unlike is never joined by place."""
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.detection_index == 0) & ((table.frame < 55) | (table.frame >= 65))]
+    ids = 1 + (table.frame >= 65)
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
+    for cosine, objects in ((-0.9, 2), (0.0, 1)):
+        both = np.array([[1, 0], [cosine, np.sqrt(1 - cosine**2)]])
+        own = both[ids - 1]
+        seen = (rt.Embeddings(own, own), np.arange(len(table)))
+        fit = fitter(rt.ObjectsConfig(), poses, NAMES)
+        found, _ = link(table, NAMES, *seen, poses, fit)
         assert len(np.unique(found.track_id)) == objects
 
 
@@ -298,6 +315,7 @@ APART, LAST_TWO, FIRST_LAST = ((0, 40, 80), (0, 40, 40), (0, 40, 0))
         (APART, {(0, 1): 0.4}, 200, [1, 2, 3]),  # rather another object
         ((0, 0, 80), {(0, 1): 0.99}, 200, [1, 2, 3]),  # seen together
         (APART, {(0, 1): 0.99, (1, 2): 0.99, (0, 2): 0.98}, 200, [1, 1, 1]),
+        (APART, {(0, 1): 0.93, (1, 2): 0.9, (0, 2): 0.7}, 200, [1, 1, 1]),  # through a third
         (LAST_TWO, {(0, 1): 0.99, (0, 2): 0.6, (1, 2): 0.6}, 200, [1, 1, 2]),  # the better of two
         (LAST_TWO, {(0, 1): 0.985, (0, 2): 0.984, (1, 2): 0.98}, 200, [1, 2, 3]),  # equal rivals
         (LAST_TWO, {(0, 1): 0.985, (0, 2): 0.984, (1, 2): 0.98}, 5, [1, 1, 2]),  # two boxes on one
@@ -371,6 +389,23 @@ def test_what_similarity_means_is_learnt_from_the_video(common: float, objects: 
     views += np.random.default_rng(2).normal(0, 0.03, views.shape)
     found, _ = linked(table, None, views / np.linalg.norm(views, axis=1, keepdims=True))
     assert len(np.unique(found.track_id)) == objects
+
+
+def test_views_of_a_tracklet_tell_how_much_one_object_varies() -> None:
+    """Appearance turns by .9 degrees a frame: within a tracklet as much as until the return.
+
+    (Views of the same moment would tell nothing: they are all alike.)
+    """
+    table = table_of(walk())
+    table = table[(table.frame < 40) | (table.frame >= 80)]
+    chair = table.detection_index
+    ids = 1 + chair + 3 * (table.frame >= 80)
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
+    angle, views = np.radians(0.9) * table.frame, np.zeros((len(table), 6))
+    views[np.arange(len(table)), 2 * chair] = np.cos(angle)
+    views[np.arange(len(table)), 2 * chair + 1] = np.sin(angle)
+    found, _ = linked(table, None, views)
+    assert objects_of(found, chair) == [[0], [1], [2]]
 
 
 def test_identities_are_numbered_by_first_appearance() -> None:
