@@ -182,7 +182,7 @@ class ConvBlock(nn.Module):
     """re-OBJ: maps (N, C, 7, 7) of one crop to unit rows.
 
     Two crops have one each, and their rows make one: stacked maps in a common block were worse by
-    3 points of Rank-1 on the validation rooms (docs/reidentification.md).
+    3 points of Rank-1 on the validation rooms (docs/appearance.md).
     """
 
     def __init__(self, channels: int, width: int, inner: int = 64) -> None:
