@@ -88,7 +88,10 @@ class Detections:
         >>> Detections.from_array([[0, 0, 10, 20, 0.9, 56]]).class_id
         array([56])
         """
-        rows = np.asarray(rows, np.float64).reshape(-1, 6) if np.size(rows) else np.empty((0, 6))
+        rows = np.asarray(rows, np.float64) if np.size(rows) else np.empty((0, 6))
+        if rows.ndim != 2 or rows.shape[1] != 6:
+            expected = "(N, 6): x1, y1, x2, y2, confidence, class"
+            raise ReobjError(f"detections of shape {rows.shape}, expected {expected}")
         return Detections(rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64))
 
     @staticmethod

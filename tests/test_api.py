@@ -10,6 +10,7 @@ import importlib.util
 import inspect
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -151,7 +152,15 @@ def test_arrays_in_and_out() -> None:
 
 def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
     """Any function of an image serves as detector; `latest` has the tentative tracks too."""
-    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=3, every=2))
+    read: list[int] = []
+
+    class Noting(rt.Video):
+        def __iter__(self) -> Iterator[rt.Frame]:
+            for frame in super().__iter__():
+                read.append(frame.index)
+                yield frame
+
+    video = Noting(ROOM / "room.mp4", rt.InputConfig(start=3, every=2))
     asked, tracker = [], rt.Tracker()
 
     def detector(image: np.ndarray) -> list[list[float]]:
@@ -166,7 +175,7 @@ def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
         if len(seen) == 4:
             break
     assert seen == [(3, 1, 1), (5, 1, 2), (7, 1, 2), (9, 2, 2)]
-    assert asked == [(480, 640, 3)] * 4
+    assert asked == [(480, 640, 3)] * 4 and read == [3, 5, 7, 9]
 
 
 def test_track_takes_paths_and_brings_an_embedder(monkeypatch: pytest.MonkeyPatch) -> None:

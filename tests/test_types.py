@@ -93,6 +93,13 @@ def test_detections_that_do_not_fit_are_refused(wrong: object) -> None:
         as_detections(wrong)
 
 
+@pytest.mark.parametrize("shape", [(2, 5), (6, 5), (6,), (1, 2, 6)])
+def test_rows_of_another_width_are_refused(shape: tuple[int, ...]) -> None:
+    """Six rows of five numbers are not five rows of six."""
+    with pytest.raises(rt.ReobjError, match=r"expected \(N, 6\)"):
+        rt.Detections.from_array(np.ones(shape))
+
+
 # ---- Tables of tracks ----
 
 
