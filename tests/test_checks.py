@@ -62,3 +62,10 @@ def test_wrong_poses_are_named(kind, mistake):
 def test_check_needs_tracks():
     assert check_poses(supplied(motion("orbit")), []) is None
     assert check_poses(supplied(motion("orbit")), [(np.array([1, 2]), np.ones((2, 2)))]) is None
+
+
+def test_what_fits_within_a_degree_is_beyond_doubt():
+    """A camera that moves by a centimetre: the other direction fits better, and means nothing."""
+    cams = motion("still")
+    for seed in range(5):
+        assert check_poses(supplied(invert_rigid(cams)), box_tracks(cams, 0, seed)) is None

@@ -39,7 +39,7 @@ def test_the_spacing_follows_the_flow(walk):
 
 
 def test_sharp_frames_are_preferred():
-    images, _ = textured_room(40, 0.08, size=(320, 240))
+    images, _ = textured_room(40, 0.08)
     blurred = [cv2.GaussianBlur(im, (0, 0), 1.5) if i % 2 else im for i, im in enumerate(images)]
     inner = rows(blurred)[1:-1]
     assert len(inner) >= 3 and all(row % 2 == 0 for row in inner)

@@ -48,79 +48,91 @@ def truth_of(model, poses):
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     """Eight views of a corner of a room, their true poses, folder, messages, model."""
-    images, truth = textured_room(8, 0.3, -1)
+    images, truth = textured_room(8, 0.45, -3, size=(320, 240))
     folder = tmp_path_factory.mktemp("mapping")
     return images, truth, folder, *run(folder, images)
 
 
 def test_a_walk_is_reconstructed_with_its_focal_length(walk):
-    images, truth, folder, messages, model = walk
+    _, truth, folder, messages, model = walk
     assert messages == [] and model.names == tuple(f"{i:03d}.jpg" for i in range(8))
     assert ate_percent(model.cam_from_world, truth_of(model, truth)) < 1.0
-    assert model.cameras[0].K[0, 0] == pytest.approx(0.9 * 480, rel=0.03)
+    assert model.cameras[0].K[0, 0] == pytest.approx(0.9 * 320, rel=0.03)
     assert len(model.points) > 300 and (folder / "pycolmap.log").stat().st_size > 0
 
 
 def test_points_have_the_colour_of_their_pixels(walk):
     images, _, _, _, model = walk
-    rows, first = np.unique(model.obs_point, return_index=True)
-    x, y = np.floor(model.obs_xy[first]).astype(int).T
-    pixels = np.array(images)[model.obs_image[first], y, x, ::-1]
-    np.testing.assert_array_equal(model.colors[rows], pixels)
+    x, y = np.floor(model.obs_xy).astype(int).T
+    pixels = np.array(images)[model.obs_image, y, x, ::-1]
+    same = (pixels == model.colors[model.obs_point]).all(1)  # (M,)
+    assert set(model.obs_point[same]) == set(range(len(model.points)))
 
 
 def test_the_same_seed_gives_the_same_bytes(walk, tmp_path):
-    """Also with another camera as a start; another seed gives other bytes."""
-    images, _, folder, _, model = walk
+    images, _, folder, *_ = walk
     for seed, same in ((0, True), (7, False)):
         run(tmp_path / str(seed), images, seed=seed)
         found = (tmp_path / str(seed) / "sparse" / "points3D.bin").read_bytes()
         assert ((folder / "sparse" / "points3D.bin").read_bytes() == found) == same
 
 
-def test_the_focal_guess_is_where_calibration_starts(tmp_path):
-    """With little parallax it is kept, and said so; the first guess that calibrates wins."""
-    images, _ = textured_room(5, 0.06)
-    messages, model = run(tmp_path / "weak", images, guesses=[1.1])
-    assert model is None or model.cameras[0].K[0, 0] == pytest.approx(1.1 * 480)
-    assert "little parallax" in messages[0] or "no camera poses" in messages[0]
+def test_calibration_starts_from_the_focal_guess_and_leaves_it(walk, tmp_path):
+    """Other bits, the same focal length."""
+    images, _, _, _, model = walk
+    messages, other = run(tmp_path, images, guesses=[1.1])
+    assert messages == [] and (other.cam_from_world != model.cam_from_world).any()
+    assert other.cameras[0].K[0, 0] == pytest.approx(model.cameras[0].K[0, 0], rel=0.01)
+
+
+def arc(count, half_rad):
+    """cam_from_world (F, 3, 4) of a camera that looks inward from an arc."""
+    cams = np.zeros((count, 3, 4))
+    for i, a in enumerate(np.linspace(-half_rad, half_rad, count)):
+        c, s = np.cos(a), np.sin(a)
+        cams[i] = [[c, 0, -s, -8 * a], [0, 1, 0, 0.05 * i], [s, 0, c, 0]]
+    return cams
+
+
+def test_with_little_parallax_the_guess_is_kept_and_said(tmp_path):
+    world = DotWorld(count=1200)
+    messages, model = run(tmp_path, [world.image(c) for c in arc(8, 0.15)], guesses=[1.0])
+    assert "little parallax" in messages[0] and "taken as 1 x" in messages[0]
+    assert len(messages) == 1 and model.cameras[0].K[0, 0] == 480
 
 
 def test_a_given_camera_is_kept(walk, tmp_path):
     images, truth, *_ = walk
-    camera = rt.Camera("OPENCV", 960, 720, (864.0, 864.0, 480.0, 360.0, 0, 0, 0, 0))
-    messages, model = run(tmp_path, images, size=(960, 720), camera=camera)
+    camera = rt.Camera("OPENCV", 640, 480, (576.0, 576.0, 320.0, 240.0, 0, 0, 0, 0))
+    messages, model = run(tmp_path, images, size=(640, 480), camera=camera)
     assert messages == [] and model.cameras[0] == camera
     assert ate_percent(model.cam_from_world, truth_of(model, truth)) < 1.0
-    assert model.obs_xy.max() > 500  # native pixels
+    assert model.obs_xy.max() > 340  # native pixels
 
 
 def test_boxes_of_moving_things_hold_no_features(walk, tmp_path):
     """The left half, given in pixels of frames twice as large."""
     images = walk[0]
-    boxes = [np.array([[0, 0, 480.0, 720]])] * len(images)
-    _, model = run(tmp_path, images, boxes, size=(960, 720))
-    assert len(model.obs_xy) > 300 and model.obs_xy[:, 0].min() > 470
+    boxes = [np.array([[0, 0, 320.0, 480]])] * len(images)
+    _, model = run(tmp_path, images, boxes, size=(640, 480))
+    assert len(model.obs_xy) > 300 and model.obs_xy[:, 0].min() > 310
 
 
 def test_features_lie_where_the_dots_are(tmp_path):
-    """Dots at exactly known places: observations are off by far less than half a pixel."""
+    """Dots at exactly known places. OpenCV's SIFT is off by a quarter of a pixel (it halves the
+    coordinates of an image that it has doubled); COLMAP's half pixel is another matter.
+    """
     world = DotWorld(count=500)
-    angle = np.linspace(-0.1, 0.1, 6)
-    cams = np.zeros((6, 3, 4))
-    for i, a in enumerate(angle):
-        cams[i] = [[np.cos(a), 0, -np.sin(a), -8 * a], [0, 1, 0, 0.05 * i],
-                   [np.sin(a), 0, np.cos(a), 0]]  # fmt: skip
+    cams = arc(6, 0.1)
     _, model = run(tmp_path, [world.image(c) for c in cams], camera=world.camera)
     off = []
     for image, name in enumerate(model.names):
         xy, _ = world.project(cams[int(name[:3])])
         for seen in model.obs_xy[model.obs_image == image]:
-            step = xy - seen
-            nearest = np.linalg.norm(step, axis=1).argmin()
-            off.append(step[nearest])
-    off = np.array(off)
-    assert len(off) > 100 and (np.abs(np.median(off, axis=0)) < 0.1).all()
+            nearest = np.linalg.norm(xy - seen, axis=1).argmin()
+            off.append(seen - xy[nearest])
+    assert len(off) > 100
+    np.testing.assert_allclose(np.median(off, axis=0), 0.25, atol=0.1)
 
 
 # ---- Refusals ------------------------------------------------------------------------------------
@@ -129,12 +141,12 @@ def test_features_lie_where_the_dots_are(tmp_path):
 REFUSED = {
     "two images": (lambda: textured_room(2, 0.5)[0], "only 2 different views"),
     "noise": (
-        lambda: list(np.random.default_rng(0).integers(0, 255, (12, 240, 320, 3), np.uint8)),
+        lambda: list(np.random.default_rng(0).integers(0, 255, (6, 240, 320, 3), np.uint8)),
         "no two keyframes|keyframes connect",
     ),
-    "turn on the spot": (lambda: textured_room(12, 0, 4, size=(320, 240))[0], "mere turn"),
+    "turn on the spot": (lambda: textured_room(8, 0, 4, size=(320, 240))[0], "mere turn"),
     "turn with little motion": (
-        lambda: textured_room(12, 0.005, 4, size=(320, 240))[0],
+        lambda: textured_room(8, 0.005, 4, size=(320, 240))[0],
         "mere turn",
     ),
 }
@@ -149,15 +161,16 @@ def test_what_has_no_depth_is_refused_and_the_message_says_what_helps(tmp_path, 
 
 
 def test_a_turn_is_refused_with_a_given_camera_too(tmp_path):
-    images = textured_room(12, 0, 4, size=(320, 240))[0]
+    images = textured_room(6, 0, 4, size=(320, 240))[0]
     camera = rt.Camera("PINHOLE", 320, 240, (288.0, 288.0, 160.0, 120.0))
     messages, model = run(tmp_path, images, camera=camera)
-    assert model is None and "mere turn" in messages[0] or "no two keyframes" in messages[0]
+    assert model is None
+    assert "mere turn" in messages[0] or "no two keyframes" in messages[0]
 
 
 def test_images_that_do_not_connect_are_refused(walk, tmp_path):
     rng = np.random.default_rng(0)
-    noise = list(rng.integers(0, 255, (10, 360, 480, 3), np.uint8))
+    noise = list(rng.integers(0, 255, (10, 240, 320, 3), np.uint8))
     messages, model = run(tmp_path, walk[0] + noise)
     assert model is None and "of 18 keyframes connect" in messages[0]
 
@@ -174,9 +187,8 @@ def test_the_child_is_found_from_anywhere(walk, tmp_path, monkeypatch):
     (tmp_path / "theirs" / "reobj" / "__init__.py").write_text("raise SystemExit(4)")
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "theirs"))
-    for folder in (tmp_path / "out", Path("out")):  # also a relative one
-        messages, model = run(folder, walk[0])
-        assert messages == [] and len(model.names) == 8
+    messages, model = run(Path("out"), walk[0])  # a relative folder
+    assert messages == [] and len(model.names) == 8
 
 
 def test_the_users_pythonpath_reaches_the_child(walk, tmp_path, monkeypatch):
@@ -197,7 +209,7 @@ def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
         "import numpy as np; from pathlib import Path; from reobj.files import Progress;"
         "from reobj.poses import mapping; images = list(np.load('images.npy'));"
         "print(mapping.__file__, mapping.reconstruct(images, list('abcdefgh'),"
-        "[np.empty((0, 4))] * 8, (480, 360), camera=None, focal_guesses=[0.8], seed=0,"
+        "[np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guesses=[0.8], seed=0,"
         "work_dir=Path('out'), progress=Progress))"
     )
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
