@@ -1,4 +1,4 @@
-"""Check supplied poses against the tracks: are they inverted, or in other axes?
+"""Check supplied poses against the tracks: whether they are inverted, or in other axes.
 
 It names a likely mistake and changes nothing; the poses' accuracy is not judged here.
 """
