@@ -23,6 +23,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -32,6 +33,8 @@ ROOM = Path(__file__).resolve().parent / "room"
 CAMERA = "492.756788421,492.756788421,320,240"
 K = np.array([[492.756788421, 0, 320], [0, 492.756788421, 240], [0, 0, 1]])
 Entry = dict[str, Any]
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) / 2
 
 
@@ -51,7 +54,7 @@ def run(folder: Path, detections: Path, **options: int) -> Entry:
     return data
 
 
-def fitted(data: Entry, near: rt.Array, reach: float) -> list[Entry]:
+def fitted(data: Entry, near: Array, reach: float) -> list[Entry]:
     """Fitted chairs and tables around a place, with their rotation as a matrix."""
     kept = [o for o in data["objects"] if o["center"] and o["class"] in ("chair", "dining table")]
     for o in kept:
@@ -59,11 +62,11 @@ def fitted(data: Entry, near: rt.Array, reach: float) -> list[Entry]:
     return [o for o in kept if np.hypot(*(np.array(o["center"][:2]) - near)) < reach]
 
 
-def footprint(o: Entry, size: str) -> rt.Array:
+def footprint(o: Entry, size: str) -> Array:
     """(5, 2) outline of a solid from above."""
     turn = np.array(o["world_from_obj"])
     flat = np.column_stack([CORNERS, np.zeros(5)]) * np.array(o[size])
-    outline: rt.Array = (flat @ turn.T + np.array(o["center"]))[:, :2]
+    outline: Array = (flat @ turn.T + np.array(o["center"]))[:, :2]
     return outline
 
 
@@ -107,38 +110,46 @@ def draw_views(path: Path, work: Path) -> None:
     plt.close(figure)
 
 
-def project(points: rt.Array, index: int) -> rt.Array:
+def project(points: Array, index: int) -> Array:
     """(N, 2) pixels of world points (N, 3) in a frame."""
     row = np.loadtxt(ROOM / "poses.txt")[index]
     turn = Rotation.from_quat(row[4:]).as_matrix()
     camera = (points - row[1:4]) @ turn @ K.T
-    pixels: rt.Array = camera[:, :2] / camera[:, 2:]
+    pixels: Array = camera[:, :2] / camera[:, 2:]
     return pixels
 
 
-def outline(o: Entry, size: str, index: int) -> rt.Array:
+def outline(o: Entry, size: str, index: int) -> Array:
     """Convex outline in a frame of a box-shaped solid."""
     half = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T / 2 * np.array(o[size])
     corners = half @ np.array(o["world_from_obj"]).T + np.array(o["center"])
     return np.asarray(cv2.convexHull(project(corners, index).astype(np.float32))[:, 0], np.float64)
 
 
-def image_of(index: int) -> rt.Image:
+def image_of(index: int) -> Image:
     """A frame of the clip."""
     video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=index, stop=index + 1))
     return next(iter(video)).image
 
 
-def most_hidden(work: Path) -> tuple[int, Entry, rt.Array]:
+def box_iou(box: Array, others: Array) -> Array:
+    """Overlap (N,) of a box (4,) with others (N, 4), xyxy."""
+    corner = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    inter = corner.clip(0).prod(1)
+    areas = np.prod(box[2:] - box[:2]) + (others[:, 2:] - others[:, :2]).prod(1)
+    return np.asarray(inter / (areas - inter), np.float64)
+
+
+def most_hidden(work: Path) -> tuple[int, Entry, Array]:
     """Frame, true chair and detected box where least of a chair's true outline is in its box."""
-    truth = rt.read_mot_rows(ROOM / "gt_mot.txt")
+    truth = np.loadtxt(ROOM / "gt_mot.txt", delimiter=",")
     true = {o["id"]: o for o in true_objects() if o["class"] == "chair"}
-    found = rt.read_mot_rows(work / "views240" / "tracks.txt")
+    found = np.loadtxt(work / "views240" / "tracks.txt", delimiter=",")
     best: tuple[float, Any] = (1.0, None)
     for row in truth[np.isin(truth[:, 1], list(true))]:
         there = found[found[:, 0] == row[0]]
         corners = np.hstack([there[:, 2:4], there[:, 2:4] + there[:, 4:6]])
-        iou = rt.box_iou(np.hstack([row[2:4], row[2:4] + row[4:6]])[None], corners)[0]
+        iou = box_iou(np.hstack([row[2:4], row[2:4] + row[4:6]]), corners)
         whole = outline(true[int(row[1])], "size_m", int(row[0]) - 1)
         inside = whole.min() > 5 and (whole.max(0) < [635, 475]).all()
         if inside and iou.max(initial=0) > 0.6:
@@ -173,7 +184,7 @@ def draw_hidden(path: Path, work: Path) -> None:
     cv2.imwrite(str(path), image[top : top + 240, left : left + 320])
 
 
-def around(points: rt.Array) -> rt.Array:
+def around(points: Array) -> Array:
     """(4,) box around points (N, 2)."""
     return np.hstack([points.min(0), points.max(0)])
 
@@ -181,7 +192,7 @@ def around(points: rt.Array) -> rt.Array:
 def carry_away(work: Path) -> None:
     """Move a chair by a metre in the second half, by its boxes alone, and say what comes out."""
     video = rt.Video(ROOM / "room.mp4")
-    rows = rt.read_mot_rows(ROOM / "gt_mot.txt")
+    rows = np.loadtxt(ROOM / "gt_mot.txt", delimiter=",")
     chair = next(o for o in true_objects() if o["class"] == "chair")
     mine = rows[rows[:, 1] == chair["id"]]
     moved = chair | {"center": np.add(chair["center"], [1.0, 0.3, 0])}

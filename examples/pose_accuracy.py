@@ -35,10 +35,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 
+Array = npt.NDArray[Any]
 ROOT = Path(__file__).resolve().parent.parent
 HEADER = (
     "| clip | with pose | error median / rmse / max, % | median, cm | turn, deg | "
@@ -75,7 +78,7 @@ def clips(data: Path, rooms: list[Path]) -> dict[str, Clip]:
 
 
 def refine_together(
-    model: Any, objects: Sequence[dict[str, rt.Array]], loss_px: float = 0.5
+    model: Any, objects: Sequence[dict[str, Array]], loss_px: float = 0.5
 ) -> tuple[Any, float, float, int]:
     """Adjust the cameras of a COLMAP model with the objects as landmarks beside its points: each
     object is one more point, seen in the centres of its boxes.
@@ -88,11 +91,12 @@ def refine_together(
         reprojection error; the points' mean reprojection error (px) without and with the objects;
         number of objects used (0: refused).
     """
-    pc = rt._pycolmap()
+    import pycolmap as pc
+
     joint = pc.Reconstruction()
-    rt._sfm_adjust(model, loss_px, False, False)
+    adjust(model, loss_px)
     joint.add_camera_with_trivial_rig(model.camera(1))
-    seen: list[list[tuple[int, rt.Array]]] = [[] for _ in objects]
+    seen: list[list[tuple[int, Array]]] = [[] for _ in objects]
     for i in model.reg_image_ids():
         old = model.image(i)
         mine = [(o, boxes[old.name]) for o, boxes in enumerate(objects) if old.name in boxes]
@@ -110,8 +114,13 @@ def refine_together(
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         cams = np.array([joint.image(i).cam_from_world().matrix() for i, _ in views])
         track = pc.Track([pc.TrackElement(i, int(at[0])) for i, at in views])
-        added.append(joint.add_point3D(rt._meet(cams, rays)[2], track, np.zeros(3, np.uint8)))
-    rt._sfm_adjust(joint, loss_px, False, False)
+        turn, shift = cams[:, :, :3], cams[:, :, 3]
+        # the point nearest to all rays: sum_i R_i' (I - d_i d_i') (R_i X + t_i) = 0
+        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # (n, 3, 3)
+        normal = np.einsum("nji,njk,nkl->il", turn, across, turn)
+        point = np.linalg.solve(normal, -np.einsum("nji,njk,nk->i", turn, across, shift))
+        added.append(joint.add_point3D(point, track, np.zeros(3, np.uint8)))
+    adjust(joint, loss_px)
     for object_point in added:
         joint.delete_point3D(object_point)
     error = []
@@ -120,6 +129,22 @@ def refine_together(
         error.append(float(one.compute_mean_reprojection_error()))
     better = bool(added) and error[1] <= 1.001 * error[0]
     return joint if better else model, error[0], error[1], len(added) if better else 0
+
+
+def adjust(model: Any, loss_px: float) -> None:
+    """Bundle adjustment of cameras and points with a robust loss; intrinsics stay."""
+    import pycolmap as pc
+
+    options, chosen = pc.BundleAdjustmentOptions(), pc.BundleAdjustmentConfig()
+    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
+    options.ceres.loss_function_type = pc.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = loss_px
+    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.num_threads = 1
+    for i in model.reg_image_ids():
+        chosen.add_image(i)
+    chosen.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pc.create_default_bundle_adjuster(options, chosen, model).solve()
 
 
 def main() -> int:
@@ -165,11 +190,10 @@ def rows(name: str, clip: Clip, args: argparse.Namespace) -> Iterator[str]:
     seconds = time.monotonic() - started
     kib = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, -1))
     end = f"{len(poses.frame) / seconds:.1f} | {kib / 1000:.0f} |"
-    rt.save_poses(work / "poses.npz", poses)
     truth = None
     if clip.truth is not None:
-        given = rt.PosesConfig(camera=clip.camera)
-        truth = rt.read_poses(clip.truth, video, given)
+        path = as_tum(clip.truth, work, video) if "c2w" in clip.truth.name else clip.truth
+        truth = rt.read_poses(path, video, camera=clip.camera)
     yield row(name, poses, truth, clip.metric) + end
     for message in poses.messages:
         print(f"{name}: {message}", file=sys.stderr)
@@ -177,6 +201,33 @@ def rows(name: str, clip: Clip, args: argparse.Namespace) -> Iterator[str]:
         dense = metric_like(dense_reference(clip.source, video, args.out / "dense"), truth)
         yield row("redkitchen-sfm", poses, dense, True) + " | |"
         yield row("(dense to Kinect)", dense, truth, True) + " | |"
+
+
+def as_tum(path: Path, folder: Path, video: rt.Video) -> Path:
+    """Write rows of 16 numbers (world_from_cam, one row a frame) as TUM rows."""
+    world_from_cam = np.loadtxt(path).reshape(-1, 4, 4)
+    xyzw = Rotation.from_matrix(world_from_cam[:, :3, :3]).as_quat()
+    seconds = [frame.time_s for frame in video]
+    tum = folder / "truth.txt"
+    np.savetxt(tum, np.column_stack([seconds, world_from_cam[:, :3, 3], xyzw]))
+    return tum
+
+
+def world_from_cam(poses: rt.Poses, rows: Array) -> tuple[Array, Array]:
+    """Centres (n, 3) and orientations (n, 3, 3) of the cameras in some rows."""
+    cams = poses.cam_from_world[rows]
+    turn = np.swapaxes(cams[:, :, :3], 1, 2)
+    return -(turn @ cams[:, :, 3:])[:, :, 0], turn
+
+
+def similarity(a: Array, b: Array) -> tuple[float, Array, Array]:
+    """Scale, rotation and shift that bring points a (N, 3) closest to b (Umeyama, PAMI 1991)."""
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    u, singular, vt = np.linalg.svd(b0.T @ a0)
+    sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u * sign @ vt
+    scale = float((singular * sign).sum() / (a0**2).sum())
+    return scale, rotation, b.mean(0) - scale * rotation @ a.mean(0)
 
 
 def row(name: str, found: rt.Poses, truth: rt.Poses | None, metric: bool) -> str:
@@ -195,12 +246,12 @@ def row(name: str, found: rt.Poses, truth: rt.Poses | None, metric: bool) -> str
 def score(found: rt.Poses, truth: rt.Poses) -> dict[str, float]:
     """Compare cameras after a similarity alignment: see the columns in the head of this file."""
     both = found.known & truth.known
-    a, b = (rt.invert_rigid(poses.cam_from_world[both]) for poses in (found, truth))  # (F, 3, 4)
-    scale, rotation, shift = rt.similarity(a[:, :, 3], b[:, :, 3])
-    error = np.linalg.norm(scale * a[:, :, 3] @ rotation.T + shift - b[:, :, 3], axis=1)  # (F,)
-    turn = np.swapaxes(rotation @ a[:, :, :3], 1, 2) @ b[:, :, :3]
+    (a, turn_a), (b, turn_b) = (world_from_cam(poses, both) for poses in (found, truth))
+    scale, rotation, shift = similarity(a, b)
+    error = np.linalg.norm(scale * a @ rotation.T + shift - b, axis=1)  # (F,)
+    turn = np.swapaxes(rotation @ turn_a, 1, 2) @ turn_b
     cosine = np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)
-    share = 100 / float(np.linalg.norm(np.ptp(b[:, :, 3], axis=0)))
+    share = 100 / float(np.linalg.norm(np.ptp(b, axis=0)))
     status = found.status[both]
     ratio = float("nan")
     if (status == "pnp").any() and (status == "keyframe").any():
@@ -218,9 +269,9 @@ def score(found: rt.Poses, truth: rt.Poses) -> dict[str, float]:
 def metric_like(poses: rt.Poses, truth: rt.Poses) -> rt.Poses:
     """Scale a reconstruction to the units of poses that are metric."""
     both = poses.known & truth.known
-    a, b = (rt.invert_rigid(p.cam_from_world[both])[:, :, 3] for p in (poses, truth))
+    (a, _), (b, _) = (world_from_cam(p, both) for p in (poses, truth))
     cams = poses.cam_from_world.copy()
-    cams[:, :, 3] *= rt.similarity(a, b)[0]
+    cams[:, :, 3] *= similarity(a, b)[0]
     return dataclasses.replace(poses, cam_from_world=cams)
 
 
@@ -251,7 +302,7 @@ def dense_reference(images: Path, video: rt.Video, folder: Path) -> rt.Poses:
         (folder / "part").mkdir()
         best.write(folder / "part")
         (folder / "part").replace(folder / "model")
-    return rt.read_poses(folder / "model", video, rt.PosesConfig())
+    return rt.read_poses(folder / "model", video)
 
 
 if __name__ == "__main__":

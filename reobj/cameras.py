@@ -1,4 +1,10 @@
-"""Cameras and poses: intrinsics, rigid transforms, the pycolmap adapter, TUM and COLMAP."""
+"""Cameras: intrinsics, poses of a video, rigid transforms, viewing rays, pycolmap's models.
+
+Conventions: `cam_from_world` maps world points into the camera (x right, y down, z forward, as
+OpenCV and COLMAP have it); pixels are COLMAP's, the centre of the first pixel is (0.5, 0.5).
+How poses are found or read is the business of `reobj.poses`; here is what they are, and how they
+are written (npz, TUM, COLMAP).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +26,7 @@ from reobj.types import Array, BoolArray, IntArray, ReobjError
 
 
 def import_pycolmap() -> Any:
-    """Import pycolmap without its log on stderr and without its handler of SIGTERM."""
+    """Import pycolmap when it is needed: without its log on stderr, and SIGTERM still ends us."""
     if "pycolmap" in sys.modules:
         return sys.modules["pycolmap"]
     handler = signal.getsignal(signal.SIGTERM)
@@ -34,7 +40,13 @@ def import_pycolmap() -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A COLMAP camera: model, size in pixels, parameters in its order (centre of pixel 0 at .5)."""
+    """Intrinsics as COLMAP has them.
+
+    Attributes:
+        model: COLMAP's name of the camera model: PINHOLE, OPENCV, SIMPLE_RADIAL, ...
+        width, height: of the images, pixels.
+        params: in the model's order: focal length(s), principal point, distortion.
+    """
 
     model: str
     width: int
@@ -43,14 +55,14 @@ class Camera:
 
     @property
     def K(self) -> Array:
-        """(3, 3) pinhole part of the intrinsics."""
+        """Calibration matrix (3, 3) without the distortion."""
         one_focal = self.model.startswith("SIMPLE_") or self.model in ("RADIAL", "RADIAL_FISHEYE")
         fx, fy, cx, cy = (self.params[0], *self.params[:3]) if one_focal else self.params[:4]
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def undistort(self, xy: Array) -> Array:
-        """Map (..., 2) pixels to those of an ideal pinhole camera with the same K; NaN stays."""
-        camera = pycolmap_camera(self, (self.width, self.height))
+        """Map pixels (..., 2) to those of a pinhole camera with the same K; NaN stays NaN."""
+        camera = self.to_pycolmap()
         flat = np.asarray(xy, np.float64).reshape(-1, 2)
         ideal = np.full_like(flat, np.nan)
         good = np.isfinite(flat).all(1)
@@ -59,18 +71,27 @@ class Camera:
             ideal[good] = rays @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
 
+    def to_pycolmap(self) -> Any:
+        """Return the same camera as `pycolmap.Camera` with id 1."""
+        intrinsics = dataclasses.asdict(self) | {"params": list(self.params)}
+        return import_pycolmap().Camera(camera_id=1, **intrinsics)
 
-def pycolmap_camera(camera: Camera, size: tuple[int, int]) -> Any:
-    """Make pycolmap's camera, for images of another size."""
-    facts = {"model": camera.model, "width": camera.width, "height": camera.height}
-    made = import_pycolmap().Camera(camera_id=1, params=list(camera.params), **facts)
-    if (camera.width, camera.height) != size:
+    def resized(self, size: tuple[int, int]) -> Camera:
+        """Return the camera of the same images resized to (w, h), distortion included."""
+        if (self.width, self.height) == size:
+            return self
+        made = self.to_pycolmap()
         made.rescale(*size)
-    return made
+        return Camera(self.model, *size, tuple(made.params.tolist()))
 
 
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
-    """Read `fx,fy,cx,cy[,k1,k2,p1,p2]`, native pixels, as a PINHOLE or OPENCV camera; "": None.
+    """Parse `fx,fy,cx,cy[,k1,k2,p1,p2]`, pixels of frames of size (w, h).
+
+    Returns:
+        a PINHOLE camera, an OPENCV camera if there is distortion; None of an empty text.
+    Raises:
+        ReobjError: other text, or numbers that do not belong to frames of that size.
 
     >>> parse_camera("500,500,320,240", (640, 480)).model
     'PINHOLE'
@@ -89,10 +110,16 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     )
 
 
+MAX_OFF_CENTRE = 0.2  # of the principal point from the middle, over the size (chosen: wide)
+PLAUSIBLE_FOCAL = (0.1, 10.0)  # over the longer side: fisheye to telephoto (chosen: wide)
+
+
 def checked_camera(camera: Camera, where: str) -> Camera:
-    """Refuse intrinsics that belong to another image size."""
+    """Return the camera; refuse intrinsics that belong to images of another size."""
     size, centre, focal = np.array([camera.width, camera.height]), camera.K[:2, 2], camera.K[0, 0]
-    if (np.abs(centre - size / 2) > 0.2 * size).any() or not 0.1 < focal / size.max() < 10:
+    low, high = PLAUSIBLE_FOCAL
+    off_centre = (np.abs(centre - size / 2) > MAX_OFF_CENTRE * size).any()
+    if off_centre or not low < focal / size.max() < high:
         raise ReobjError(
             f"{where}: focal length {focal:.0f} px and centre ({centre[0]:.0f}, {centre[1]:.0f}) "
             f"do not fit frames of {size[0]}x{size[1]} as they are read (rotated? resized?)"
@@ -101,7 +128,7 @@ def checked_camera(camera: Camera, where: str) -> Camera:
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """The pinhole part of a camera for images resized by `scale`."""
+    """Return the pinhole part of a camera for images resized by `scale`, without distortion."""
     K = camera.K
     params = (K[0, 0] * scale, K[1, 1] * scale, K[0, 2] * scale, K[1, 2] * scale)
     return Camera("PINHOLE", round(camera.width * scale), round(camera.height * scale), params)
@@ -109,10 +136,10 @@ def scaled_camera(camera: Camera, scale: float) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Cameras of a video.
+    """Camera poses of a video.
 
     Attributes:
-        camera: intrinsics at the frames' native size.
+        camera: intrinsics at the frames' native size, the same for all frames.
         frame: (F,) source frame numbers, ascending, one for every frame that was read.
         time_s: (F,) seconds.
         cam_from_world: (F, 3, 4), NaN where there is no pose.
@@ -146,7 +173,7 @@ _POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors
 
 
 def save_poses(path: Path, poses: Poses) -> None:
-    """Write poses as npz, atomically."""
+    """Write poses as npz, whole or not at all."""
     facts = {
         "camera": dataclasses.asdict(poses.camera),
         "source": poses.source,
@@ -174,13 +201,14 @@ def load_poses(path: Path) -> Poses:
 
 
 def invert_rigid(b_from_a: Array) -> Array:
-    """Return a_from_b (..., 3, 4) of a rigid b_from_a (..., 3, 4)."""
+    """Invert rigid transforms: a_from_b (..., 3, 4) of b_from_a (..., 3, 4)."""
+    # x_b = R x_a + t  <=>  x_a = R' x_b - R' t
     rotation = np.swapaxes(b_from_a[..., :3], -1, -2)
     return np.concatenate([rotation, -rotation @ b_from_a[..., 3:]], -1)
 
 
 def quat_wxyz_from_matrix(rotation: Array) -> Array:
-    """Unit quaternions (N, 4), w first and >= 0, of rotation matrices (N, 3, 3)."""
+    """Return unit quaternions (N, 4) wxyz, w >= 0, of rotation matrices (N, 3, 3)."""
     if not len(rotation):
         return np.empty((0, 4))
     xyzw = Rotation.from_matrix(rotation).as_quat(canonical=True)
@@ -188,13 +216,18 @@ def quat_wxyz_from_matrix(rotation: Array) -> Array:
 
 
 def place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
-    """Rows (n,) of frames in the poses, and whether these have a pose there."""
+    """Find the rows of frames (n,) in the poses.
+
+    Returns:
+        place: (n,) row of each in `poses`, meaningless where it has none. known: (n,) True where
+        the frame has a pose.
+    """
     place = np.searchsorted(poses.frame, frame).clip(0, len(poses.frame) - 1)
     return place, np.asarray((poses.frame[place] == frame) & poses.known[place], bool)
 
 
 def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
-    """Boxes (N, 4) whose edges go through their undistorted middles; at the border they stay."""
+    """Undistort boxes (N, 4) by the middles of their edges; edges at the image border stay."""
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
     edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) middles
@@ -207,35 +240,48 @@ def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
 
 
 def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:
-    """Unit vectors (N, 3) in world axes from the camera to the centres of boxes (N, 4); one
-    (3, 4) matrix for all or one each, NaN: unknown.
+    """Return the viewing rays of the centres of boxes: unit vectors (N, 3) in world axes.
+
+    Args:
+        xyxy: (N, 4) undistorted pixels. img_from_world: K @ cam_from_world, (3, 4) for all or
+            (N, 3, 4) one each; NaN where unknown, and so is the ray then.
     """
+    # x ~ A X + a: the ray through x runs along A^-1 x (Hartley & Zisserman 2004, eq. 6.14)
     center = np.column_stack([(xyxy[:, :2] + xyxy[:, 2:]) / 2, np.ones(len(xyxy))])  # (N, 3)
     ray = (np.linalg.inv(img_from_world[..., :3]) @ center[..., None])[..., 0]
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 
 
 def angle_deg(a: Array, b: Array) -> Array:
-    """Degrees between unit vectors (..., 3)."""
+    """Return the angles in degrees between unit vectors (..., 3)."""
     return np.asarray(np.degrees(np.arccos((a * b).sum(-1).clip(-1, 1))))
 
 
 def triangulate_rays(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, Array, Array]:
-    """World directions (n, 3) of unit rays, camera centres (n, 3), point (3,) nearest to all."""
+    """Triangulate one point from the viewing rays of n cameras.
+
+    Args:
+        cam_from_world: (n, 3, 4). rays_in_cam: (n, 3) unit vectors.
+    Returns:
+        ray: (n, 3) unit vectors in world axes. centre: (n, 3) of the cameras in world. point: (3,)
+        in world, with the least sum of squared distances from the rays (of parallel rays the one
+        nearest to the origin).
+    """
     world_from_cam = invert_rigid(cam_from_world)
     ray = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam)
     centre = world_from_cam[:, :, 3]
-    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3) sum_i (I - d d') (X - c) = 0
+    # sum_i (I - d_i d_i') (X - c_i) = 0
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]  # (n, 3, 3)
     point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centre), rcond=1e-9)[0]
     return ray, centre, point
 
 
-CV_FROM_GL = np.diag([1.0, -1.0, -1.0])
-NO_SCALE = "units: arbitrary"
+CV_FROM_GL = np.diag([1.0, -1.0, -1.0])  # axes of a camera: OpenGL has y up and z backward
+NO_SCALE = "units: arbitrary"  # in the head of our TUM files, for `reobj.poses.readers`
 
 
 def write_tum(path: Path, poses: Poses) -> None:
-    """Write the known poses as TUM rows: world_from_cam, seconds, quaternion xyzw."""
+    """Write the known poses as TUM rows: seconds, world_from_cam, quaternion xyzw."""
     world_from_cam = invert_rigid(poses.cam_from_world[poses.known])
     xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
@@ -247,7 +293,9 @@ def write_tum(path: Path, poses: Poses) -> None:
 
 
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
-    """Write a COLMAP text model of all known poses and points, unless pycolmap's own is there.
+    """Write a COLMAP text model of all known poses and points, without observations.
+
+    A binary model that pycolmap wrote of the same reconstruction stays: it has the observations.
 
     Args:
         image_names: (F,) name of every frame of `poses`.
@@ -275,20 +323,27 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class SparseModel:
-    """A COLMAP model as arrays; images by ascending id."""
+    """A COLMAP model as arrays: R registered images by ascending id, N points, M observations.
+
+    Attributes:
+        names: (R,) of the images. cameras: (R,) of each image. cam_from_world: (R, 3, 4).
+        points: (N, 3) in world. colors: (N, 3) RGB. track_length: (N,) observations of each.
+        obs_image, obs_point: (M,) row of the image and of the point. obs_xy: (M, 2) pixels.
+    """
 
     names: tuple[str, ...]
-    cameras: list[Camera]  # (R,) of each image
-    cam_from_world: Array  # (R, 3, 4)
-    points: Array  # (N, 3)
-    colors: npt.NDArray[np.uint8]  # (N, 3) RGB
-    track_length: IntArray  # (N,)
-    obs_image: IntArray  # (M,) row of the image
-    obs_point: IntArray  # (M,) row of the point
-    obs_xy: Array  # (M, 2) COLMAP pixels
+    cameras: list[Camera]
+    cam_from_world: Array
+    points: Array
+    colors: npt.NDArray[np.uint8]
+    track_length: IntArray
+    obs_image: IntArray
+    obs_point: IntArray
+    obs_xy: Array
 
 
-def read_model(folder: Path) -> SparseModel:
+def read_sparse_model(folder: Path) -> SparseModel:
+    """Read a COLMAP model, binary or text, by pycolmap."""
     model = import_pycolmap().Reconstruction(str(folder))
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     points = sorted(model.points3D.items())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import difflib
+import textwrap
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
@@ -81,10 +82,15 @@ def config_from_args(config: C, args: argparse.Namespace) -> C:
     return config
 
 
+NAME_WIDTH, LINE_WIDTH = 32, 120  # columns of the list of options
+
+
 def list_options(config: Any) -> str:
-    """Return a line for every option: name, default and meaning."""
+    """Return the list of all options, one below the other: name, default and meaning."""
     lines = []
     for name, f in every_option(config).items():
         default = str(f.default) if len(str(f.default)) < 12 else f"{str(f.default)[:9]}..."
-        lines.append(f"{f'{name}={default}':<32} {f.metadata['help']}")
+        text = textwrap.wrap(f.metadata["help"], LINE_WIDTH - NAME_WIDTH - 1)
+        lines.append(f"{f'{name}={default}':<{NAME_WIDTH}} {text[0]}")
+        lines += [" " * (NAME_WIDTH + 1) + more for more in text[1:]]
     return "\n".join(lines)

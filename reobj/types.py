@@ -78,6 +78,7 @@ class Detections:
 
     @staticmethod
     def empty() -> Detections:
+        """Make the detections of a frame without any."""
         return Detections(np.empty((0, 4)), np.empty(0), np.empty(0, np.int64))
 
     @staticmethod
@@ -87,7 +88,10 @@ class Detections:
         >>> Detections.from_array([[0, 0, 10, 20, 0.9, 56]]).class_id
         array([56])
         """
-        rows = np.asarray(rows, np.float64).reshape(-1, 6) if np.size(rows) else np.empty((0, 6))
+        rows = np.asarray(rows, np.float64) if np.size(rows) else np.empty((0, 6))
+        if rows.ndim != 2 or rows.shape[1] != 6:
+            expected = "(N, 6): x1, y1, x2, y2, confidence, class"
+            raise ReobjError(f"detections of shape {rows.shape}, expected {expected}")
         return Detections(rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64))
 
     @staticmethod
@@ -102,8 +106,7 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Embeddings:
-    """Two-part appearance of detections: rows of unit length for the object and for what surrounds
-    it.
+    """Two-part appearance of detections: rows of unit length for object and surroundings.
 
     Attributes:
         foreground: (D, E1); background: (D, E2), E2 may be 0.
@@ -288,8 +291,9 @@ def rows_by(group: IntArray) -> list[IntArray]:
 
 
 def widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Pad the second axis of a with zeros to the width of b (classes or embeddings seen for the
-    first time).
+    """Pad the second axis of a with zeros to the width of b.
+
+    (For classes or embeddings that are seen for the first time.)
     """
     if a.ndim != 2 or a.shape[1] >= b.shape[1]:
         return a

@@ -1,11 +1,16 @@
-"""The four ways to call the tracker from Python, their types, and the examples in docstrings."""
+"""The public names, the ways to call the tracker from Python, their types, and the examples in
+docstrings.
+"""
 
 from __future__ import annotations
 
 import doctest
+import importlib
 import importlib.util
+import inspect
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -15,11 +20,57 @@ import four_ways
 import numpy as np
 import pytest
 
-import quadrics
 import reobj_track as rt
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOM = ROOT / "examples" / "room"
+DETECTIONS = ROOM / "detections.npz"
+
+
+# ---- Public names ----
+
+
+def test_public_names_are_few_sorted_and_documented() -> None:
+    assert 35 <= len(rt.__all__) <= 45
+    assert rt.__all__ == sorted(set(rt.__all__))
+    for name in set(rt.__all__) - {"COCO_NAMES", "__version__"}:
+        assert inspect.getdoc(getattr(rt, name)), name
+        assert not name.startswith("_"), name
+
+
+def help_lines(thing: Any) -> int:
+    """Lines that were written for a reader: signatures and docstrings, of public methods too.
+
+    (`help` itself adds thirty lines to every dataclass: dunder methods and descriptors.)
+    """
+    count = 2 + len((inspect.getdoc(thing) or "").splitlines())
+    if inspect.isclass(thing):
+        own = {n: v for n, v in vars(thing).items() if not n.startswith("_")}
+        parts = [getattr(v, "__func__", v) for v in own.values()]
+        public = [v for v in parts if inspect.isfunction(v) or isinstance(v, property)]
+        count += sum(2 + len((inspect.getdoc(v) or "").splitlines()) for v in public)
+    return count
+
+
+def test_help_fits_on_a_few_screens() -> None:
+    module = len((rt.__doc__ or "").splitlines())
+    assert module + sum(help_lines(getattr(rt, name)) for name in rt.__all__) <= 700
+
+
+def test_every_public_method_has_a_docstring() -> None:
+    missing = [
+        f"{name}.{method}"
+        for name in rt.__all__
+        if inspect.isclass(getattr(rt, name))
+        for method, value in vars(getattr(rt, name)).items()
+        if not method.startswith("_")
+        and (inspect.isfunction(value) or isinstance(value, property | staticmethod | classmethod))
+        and not inspect.getdoc(value)
+    ]
+    assert missing == []
+
+
+# ---- The ways to call it ----
 
 
 @dataclass
@@ -39,21 +90,21 @@ class Duck:
 
 
 @pytest.fixture(scope="module")
-def short() -> tuple[rt.Video, rt.RecordedDetections]:
-    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=12))
-    return video, rt.read_detections(ROOM / "detections.npz", video)
+def short() -> rt.Video:
+    return rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=12))
 
 
-def test_all_ways_give_the_same_identities(
-    short: tuple[rt.Video, rt.RecordedDetections], monkeypatch: pytest.MonkeyPatch
+def test_all_online_ways_give_the_same_identities(
+    short: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Masks steer the appearance, so arrays, which have none, may differ in detail elsewhere."""
     if importlib.util.find_spec("supervision") is None:
         stand_in = ModuleType("supervision")
         stand_in.Detections = Duck  # type: ignore[attr-defined]
         monkeypatch.setitem(sys.modules, "supervision", stand_in)
-    results = [way(*short) for way in four_ways.WAYS]
-    assert len(results) == 4 and sum(map(len, results[0])) > 30
+    *online, _chain = four_ways.WAYS  # the last one decides after the video
+    results = [way(short) for way in online]
+    assert len(results) == 3 and sum(map(len, results[0])) > 30
     for found in results[1:]:
         assert [list(f) for f in found] == [list(f) for f in results[0]]
 
@@ -99,29 +150,77 @@ def test_arrays_in_and_out() -> None:
         tracker.update(np.zeros((2, 5)))
 
 
-def test_generator_over_a_video(short: tuple[rt.Video, rt.RecordedDetections]) -> None:
-    video, recorded = short
+def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
+    """Any function of an image serves as detector; `latest` has the tentative tracks too."""
+    read: list[int] = []
+
+    class Noting(rt.Video):
+        def __iter__(self) -> Iterator[rt.Frame]:
+            for frame in super().__iter__():
+                read.append(frame.index)
+                yield frame
+
+    video = Noting(ROOM / "room.mp4", rt.InputConfig(start=3, every=2))
+    asked, tracker = [], rt.Tracker()
+
+    def detector(image: np.ndarray) -> list[list[float]]:
+        asked.append(image.shape)
+        return [[0, 0, 50, 50, 0.9, 1], [100, 0, 150, 50, 0.9, 1]][: len(asked)]
+
     seen = []
-    numbers = iter(range(12))
-
-    def detector(image: rt.Image) -> rt.Detections:
-        assert image.shape == (480, 640, 3)
-        return recorded.at(next(numbers))
-
-    for frame, tracks in rt.track(video, detections=detector):
-        seen.append((frame.index, len(tracks)))
-        if frame.index == 7:
-            break  # as lazy as a generator should be
-    assert [i for i, _ in seen] == list(range(8)) and seen[-1][1] > 5
-    assert next(numbers) == 8
+    for frame, tracks in rt.track(video, detector, tracker):
+        assert frame.image.shape == (480, 640, 3)
+        assert set(tracks.frame.tolist()) == {frame.index}
+        seen.append((frame.index, len(tracks), len(tracker.latest)))
+        if len(seen) == 4:
+            break
+    assert seen == [(3, 1, 1), (5, 1, 2), (7, 1, 2), (9, 2, 2)]
+    assert asked == [(480, 640, 3)] * 4 and read == [3, 5, 7, 9]
 
 
-def test_generator_takes_paths_and_options() -> None:
-    config = rt.Config(input=rt.InputConfig(every=2, stop=8), embed=rt.EmbedConfig(model="none"))
-    found = [
-        f.index for f, _ in rt.track(ROOM / "room.mp4", config, detections=ROOM / "detections.npz")
-    ]
-    assert found == [0, 2, 4, 6]
+def test_track_takes_paths_and_brings_an_embedder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recorded detections are asked by the source's frame numbers."""
+    made = []
+
+    class Stub:
+        def __call__(self, frame: Any, detections: Any, rows: np.ndarray) -> rt.Embeddings:
+            return rt.Embeddings(np.eye(1, 8).repeat(len(rows), 0), np.empty((len(rows), 0)))
+
+    def tracker(config: Any = None, embedder: Any = None) -> rt.Tracker:
+        made.append(embedder)
+        return Tracker(config, embedder)
+
+    Tracker = rt.Tracker
+    monkeypatch.setattr(rt, "Embedder", Stub)
+    monkeypatch.setattr(rt, "Tracker", tracker)
+    first = next(rt.track(ROOM / "room.mp4", DETECTIONS))
+    assert first[0].index == 0 and len(first[1]) > 3
+    assert [type(embedder) for embedder in made] == [Stub]
+    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=20, stop=21))
+    recorded = rt.read_detections(DETECTIONS, video)
+    (_, later), *rest = rt.track(video, DETECTIONS, Tracker())
+    assert rest == [] and len(later) == (recorded.at(20).score >= 0.5).sum()
+
+
+def test_track_hands_poses_to_the_tracker() -> None:
+    """Those of the frame by its number, with the camera at the size of the frames."""
+    video = rt.Video(ROOM / "room.mp4", rt.InputConfig(start=2, every=3, stop=9, max_size=320))
+    camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    frame = np.array([2, 8])
+    cams = np.arange(24.0).reshape(2, 3, 4)
+    poses = rt.Poses(camera, frame, frame / 30, cams, np.array(["supplied"] * 2), "user")
+    given = []
+
+    class Noting(rt.Tracker):
+        def update(self, *args: Any, **known: Any) -> rt.Tracks:
+            given.append(known)
+            return rt.Tracks.empty()
+
+    list(rt.track(video, lambda image: [], Noting(), poses=poses))
+    assert [k["cam_from_world"] is None for k in given] == [False, True, False]
+    np.testing.assert_array_equal([given[0]["cam_from_world"], given[2]["cam_from_world"]], cams)
+    small = rt.Camera("PINHOLE", 320, 240, (250.0, 250.0, 160.0, 120.0))
+    assert [k["camera"] for k in given] == [small] * 3
 
 
 # ---- Types ----
@@ -129,13 +228,17 @@ def test_generator_takes_paths_and_options() -> None:
 GOOD = """
 from collections.abc import Iterator
 import numpy as np
+import numpy.typing as npt
 import reobj_track as rt
 tracker: rt.Tracker = rt.Tracker(rt.TrackerConfig(n_init=1), embedder=None)
 tracks: rt.Tracks = tracker.update(np.zeros((0, 6)), None)
-rows: rt.Array = tracks.to_array()
-ids: rt.IntArray = tracks.track_id
-pairs: Iterator[tuple[rt.Frame, rt.Tracks]] = rt.track("a.mp4", detections="det.txt")
-result: rt.RunResult = rt.run("a.mp4", "out", rt.Config(), tracks="corrected.xml")
+rows: npt.NDArray[np.float64] = tracks.to_array()
+ids: npt.NDArray[np.int64] = tracks.track_id
+pairs: Iterator[tuple[rt.Frame, rt.Tracks]] = rt.track("a.mp4", "det.txt", tracker)
+result: rt.Result = rt.run("a.mp4", "out", rt.Config(), tracks="corrected.xml")
+found: rt.Object = rt.Result.load("out").objects[0]
+name: str = found.class_name
+size: npt.NDArray[np.float64] | None = found.size_m
 own: rt.Detections = rt.Detections.from_array([[0, 0, 1, 1, 0.5, 0]])
 """
 BAD = {
@@ -143,6 +246,8 @@ BAD = {
     "for frame in rt.track('a.mp4'): frame.image": 'no attribute "image"',
     "rt.TrackerConfig(n_int=1)": "Unexpected keyword argument",
     "rt.Tracker().update()": "Missing positional argument",
+    "rt.Result.load('out').objects[0].centre": 'no attribute "centre"',
+    "rt.box_iou": "does not explicitly export",  # a room's own name
 }
 
 
@@ -162,13 +267,19 @@ def test_types(tmp_path: Path) -> None:
 
 # ---- Docstrings ----
 
-WITH_EXAMPLE = ("Detections.from_array", "Tracker", "Tracks.to_array", "track")
+WITH_EXAMPLE = ("Detections.from_array", "Tracker", "track")  # where users look
 
 
-def test_docstring_examples_run_and_are_where_users_look() -> None:
+def test_docstring_examples_of_all_rooms_run() -> None:
+    paths = [ROOT / "reobj_track.py", ROOT / "quadrics.py", *(ROOT / "reobj").rglob("*.py")]
+    names = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in sorted(paths)]
     finder, runner = doctest.DocTestFinder(), doctest.DocTestRunner()
-    examples = {t.name: t for m in (rt, quadrics) for t in finder.find(m) if t.examples}
+    examples = {}
+    for name in names:
+        module = importlib.import_module(name.removesuffix(".__init__"))
+        examples |= {t.name: t for t in finder.find(module) if t.examples}
     for test in examples.values():
         runner.run(test)
-    assert runner.failures == 0 and runner.tries >= 4
-    assert {f"reobj_track.{name}" for name in WITH_EXAMPLE} <= set(examples)
+    assert runner.failures == 0 and runner.tries >= 6
+    found = {name.rpartition("reobj_track.")[2].rpartition("types.")[2] for name in examples}
+    assert set(WITH_EXAMPLE) <= found

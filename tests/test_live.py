@@ -9,7 +9,7 @@ import live_ar
 import numpy as np
 import pytest
 
-import reobj_track as rt
+from reobj.sources.detection_files import read_mot_rows
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -30,7 +30,7 @@ def test_objects_stand_where_they_are(tmp_path: Path, capsys: pytest.CaptureFixt
     ]
     assert len(objects) >= 8
     assert np.median(miss) < 0.15  # m
-    assert rt.read_mot_rows(tmp_path / "tracks.txt")[:, 0].max() == 60
+    assert read_mot_rows(tmp_path / "tracks.txt")[:, 0].max() == 60
     assert (tmp_path / "objects.ply").stat().st_size > 1000
     assert "ms" in capsys.readouterr().out
 
@@ -41,7 +41,7 @@ def test_a_session_goes_on_from_its_state(tmp_path: Path) -> None:
     found = []
     for name in ("first", "second"):
         assert live_ar.main(["-o", str(tmp_path / name), *state]) == 0
-        rows = rt.read_mot_rows(tmp_path / name / "tracks.txt")
+        rows = read_mot_rows(tmp_path / name / "tracks.txt")
         last = rows[rows[:, 0] == 40]
         found.append({tuple(r[2:6].round()): int(r[1]) for r in last})
     assert len(found[0]) > 5

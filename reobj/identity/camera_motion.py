@@ -45,8 +45,9 @@ class CameraMotion:
         self.residual_flow = np.empty((0, 4))
 
     def __call__(self, image: Image) -> Array:
-        """Estimate new_from_old (3, 3) between the previous image and this one (H, W, 3) BGR, in
-        pixels of `image`; the identity for a first image and after a change of size.
+        """Estimate new_from_old (3, 3) between the previous image and this one (H, W, 3) BGR.
+
+        In pixels of `image`; the identity for a first image and after a change of size.
         """
         shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
         small = resized(image, [round(side * shrink) for side in image.shape[1::-1]])

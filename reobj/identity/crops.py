@@ -180,8 +180,9 @@ class CropEmbedder(Embedder):
         return np.asarray(joint.reshape(len(maps), -1), np.float64)
 
     def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
-        """Return the corners (N, 2) low and high of the grown boxes, whole pixels; they may lie
-        beyond the frame.
+        """Return the corners (N, 2) low and high of the grown boxes, whole pixels.
+
+        They may lie beyond the frame.
         """
         box = cxcywh_from_xyxy(xyxy)  # (N, 4)
         layout, surround = self.layout, self.layout.surround_scale > 0

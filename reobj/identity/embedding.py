@@ -167,8 +167,8 @@ class Embedder:
         """Turn cells (M, ...) and (N, ...) into foreground (M, E1) and background (N, E2)."""
         if self.trained:
             return self.backbone.embed(fore, back)
-        near = self.layout.background_cells**2  # the rest is of the wider box
-        boxes = (back[:, :near], back[:, near:])[: 1 + (self.layout.surround_scale > 0)]
+        count = self.layout.background_cells**2  # the rest is of the wider box
+        boxes = (back[:, :count], back[:, count:])[: 1 + (self.layout.surround_scale > 0)]
         return _hellinger_rows(fore), np.concatenate([_hellinger_rows(b) for b in boxes], 1)
 
 

@@ -36,11 +36,11 @@ def fill_gaps(tracks: Tracks, image_size: tuple[int, int], max_gap: int) -> Trac
         for i in np.flatnonzero((missing > 0) & (missing <= max_gap)):
             if box_iou(rows.xyxy[i : i + 1], rows.xyxy[i + 1 : i + 2])[0, 0] < MIN_END_IOU:
                 continue
-            near = np.abs(rows.frame - rows.frame[i]) <= (WINDOW + missing[i]) * step
-            at = (rows.frame[near] - rows.frame[near][0]) // step
-            box = smooth_boxes(at, rows.xyxy[near])  # (F, 4) of every frame of the window
+            window = np.abs(rows.frame - rows.frame[i]) <= (WINDOW + missing[i]) * step
+            at = (rows.frame[window] - rows.frame[window][0]) // step
+            box = smooth_boxes(at, rows.xyxy[window])  # (F, 4) of every frame of the window
             number = rows.frame[i] + step * np.arange(1, missing[i] + 1)
-            filled = box[(number - rows.frame[near][0]) // step]
+            filled = box[(number - rows.frame[window][0]) // step]
             filled = filled.clip(0, np.tile(image_size, 2))
             one = np.ones(len(number), np.int64)
             ids = (one * identity, one * rows.tracklet_id[i])

@@ -433,9 +433,10 @@ def _agglomerate(
     Returns:
         group of each, (G,).
     """
-    odds, banned, apart = np.where(banned, 0, np.exp(log_odds)), banned.copy(), distinct.copy()
+    odds, banned = np.where(banned, 0, np.exp(log_odds)), banned.copy()
+    distinct = distinct.copy()
     np.fill_diagonal(odds, 0)
-    np.fill_diagonal(apart, False)
+    np.fill_diagonal(distinct, False)
     least = probability / (1 - probability)  # odds against all rivals and another object
     i, j = np.nonzero(np.triu(odds >= least, 1))
     pairs = np.column_stack([i, j])[np.argsort(-odds[i, j], kind="stable")]
@@ -444,14 +445,14 @@ def _agglomerate(
         joined = False
         for a, b in group[pairs]:
             a, b = group[a], group[b]
-            rival = max(odds[a, apart[b]].max(initial=0), odds[b, apart[a]].max(initial=0))
+            rival = max(odds[a, distinct[b]].max(initial=0), odds[b, distinct[a]].max(initial=0))
             if odds[a, b] < least * (1 + rival):
                 continue
             odds[a] = odds[:, a] = np.maximum(odds[a], odds[b])
             banned[a] = banned[:, a] = banned[a] | banned[b]
-            apart[a] = apart[:, a] = apart[a] | apart[b]
+            distinct[a] = distinct[:, a] = distinct[a] | distinct[b]
             odds[b] = odds[:, b] = odds[a, a] = odds[a, banned[a]] = odds[banned[a], a] = 0
-            apart[b] = apart[:, b] = apart[a, a] = False
+            distinct[b] = distinct[:, b] = distinct[a, a] = False
             group[group == b], joined = a, True
     return np.unique(group, return_inverse=True)[1]
 

@@ -59,8 +59,9 @@ class SamplingLayout:
     crop_px: int = 224
 
     def updated(self, metadata: dict[str, Any]) -> SamplingLayout:
-        """Replace what a model's metadata state under `layout`, also by the names of earlier
-        versions.
+        """Replace what a model's metadata state under `layout`.
+
+        They may use the names of earlier versions.
         """
         stated = metadata.get("layout", {})
         return dataclasses.replace(self, **{_EARLIER_NAMES.get(k, k): v for k, v in stated.items()})
@@ -72,8 +73,10 @@ _EARLIER_NAMES = {"reach": "min_margin", "wide": "surround_scale",
 
 @dataclass(frozen=True, slots=True)
 class PartSamples:
-    """Samples of a feature map: S in each of K cells, first the cells of M foregrounds, then those
-    of N backgrounds (of each the grown box, then the wider one).
+    """Samples of a feature map: S in each of K cells.
+
+    First the cells of M foregrounds, then those of N backgrounds (of each the grown box, then the
+    wider one).
 
     Attributes:
         index: (K, S) flat index into the map. weight: (K, S) bool, samples that count.
@@ -181,8 +184,9 @@ def pool_cells(
 def inside_object(
     detections: Detections, rows: IntArray, at: Array, centre: Array, half: Array
 ) -> BoolArray:
-    """Test whether points lie on their detection: in its mask, else in the ellipse inscribed in its
-    box.
+    """Test whether points lie on their detection.
+
+    That is in its mask, else in the ellipse inscribed in its box.
 
     Args:
         rows: (...) detection of each point. at: (2, ...) x, y of the points, pixels.

@@ -1,4 +1,9 @@
-"""Keyframes by optical flow."""
+"""Keyframes of a video by optical flow, and the points that are followed from frame to frame.
+
+A keyframe is taken where the picture has moved far enough from the last one that a reconstruction
+learns from it. `follow_points` (Lucas-Kanade) is shared with `localize`. Nothing here knows of
+cameras in 3D.
+"""
 
 from __future__ import annotations
 
@@ -14,57 +19,75 @@ from reobj.files import Progress
 from reobj.sources.video import shrunk
 from reobj.types import Array, BoolArray, Image
 
-CACHE_MB = 1000  # gray images kept in memory; beyond it the video is read twice
+CACHE_MB = 1000.0  # of gray images kept in memory: 3200 of 640x480 (chosen)
 
 
 @dataclass(frozen=True, slots=True)
-class WorkImage:
-    """One frame at working size: place in the video, source frame number, time, BGR, gray."""
+class ResizedFrame:
+    """One frame, resized for the pose step.
 
-    place: int
+    Attributes:
+        row: 0, 1, ... in the order of reading: its row in `Poses`. frame: number in the source.
+        bgr: (h, w, 3). gray: (h, w).
+    """
+
+    row: int
     frame: int
     time_s: float
     bgr: Image
     gray: Image
 
 
-class WorkVideo:
-    """A video at working size; gray images are kept up to `cache_mb`, else it is read again."""
+class ResizedVideo:
+    """A video whose frames are resized to a longer side of at most `size_px`.
 
-    def __init__(self, video: Any, size_px: int) -> None:
-        self.video, self.size_px, self.used_mb = video, size_px, 0.0
+    Attributes:
+        frames, times_s: numbers and times of the frames, known after `first_pass`.
+    """
+
+    def __init__(self, video: Any, size_px: int, cache_mb: float = CACHE_MB) -> None:
+        self.video, self.size_px, self.cache_mb = video, size_px, cache_mb
         self.frames: list[int] = []
-        self.times: list[float] = []
+        self.times_s: list[float] = []
         self.cache: list[Image] = []
+        self.used_mb = 0.0
 
-    def __iter__(self) -> Iterator[WorkImage]:
-        for place, frame in enumerate(self.video):
+    def __iter__(self) -> Iterator[ResizedFrame]:
+        for row, frame in enumerate(self.video):
             bgr = shrunk(frame.image, self.size_px)
             gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-            yield WorkImage(place, frame.index, frame.time_s, bgr, gray)
+            yield ResizedFrame(row, frame.index, frame.time_s, bgr, gray)
 
-    def first_pass(self, line: Progress) -> Iterator[WorkImage]:
-        for work in self:
-            self.frames.append(work.frame)
-            self.times.append(work.time_s)
-            self.used_mb += work.gray.nbytes / 1e6
-            self.cache = [] if self.used_mb > CACHE_MB else self.cache
-            self.cache.append(work.gray)
+    def first_pass(self, line: Progress) -> Iterator[ResizedFrame]:
+        """Iterate, and keep numbers, times and (as far as they fit) the gray images."""
+        for frame in self:
+            self.frames.append(frame.frame)
+            self.times_s.append(frame.time_s)
+            self.used_mb += frame.gray.nbytes / 1e6
+            self.cache = [] if self.used_mb > self.cache_mb else self.cache
+            self.cache.append(frame.gray)
             line.step()
-            yield work
+            yield frame
         line.close()
 
     def grays(self) -> Iterator[Image]:
-        kept = self.used_mb <= CACHE_MB
-        return iter(self.cache) if kept else (work.gray for work in self)
+        """Iterate over the gray images once more: from memory, or reading the video again."""
+        kept = self.used_mb <= self.cache_mb
+        return iter(self.cache) if kept else (frame.gray for frame in self)
 
 
-KLT_WINDOW_PX = 15  # Lucas-Kanade window on the working image
-KLT_ERROR_PX = 1.0  # forward-backward error of a followed point
+KLT_WINDOW_PX = 15  # side of the Lucas-Kanade window (chosen; OpenCV's default: 21)
+KLT_ERROR_PX = 1.0  # largest forward-backward error (Kalal et al., ICPR 2010; chosen)
 
 
 def follow_points(old: Image, new: Image, xy: Array) -> tuple[Array, BoolArray]:
-    """Follow points (N, 2) (OpenCV pixels) into the next image; kept: those that come back."""
+    """Follow points into the next image by Lucas-Kanade, there and back.
+
+    Args:
+        old, new: (h, w) gray. xy: (N, 2) in `old`, OpenCV pixels (centre of the first: 0, 0).
+    Returns:
+        xy: (N, 2) in `new`. kept: (N,) True for points that come back to where they started.
+    """
     if not len(xy):
         return xy, np.zeros(0, bool)
     start, window = xy.astype(np.float32).reshape(-1, 1, 2), (KLT_WINDOW_PX,) * 2
@@ -76,66 +99,79 @@ def follow_points(old: Image, new: Image, xy: Array) -> tuple[Array, BoolArray]:
     return ahead[:, 0].astype(np.float64), kept
 
 
-CORNERS = 300  # corners followed to choose keyframes
-MIN_CORNERS = 20  # with fewer corners a frame counts as textureless
+CORNERS = 300  # followed from a keyframe (chosen)
+CORNER_QUALITY = 0.01  # of the best corner's (OpenCV's usual value)
+CORNER_SPACING = 1 / 80  # between two corners, over the longer side (chosen)
+MIN_CORNERS = 20  # with fewer an image counts as textureless (chosen)
 
 
-class _FlowSinceKeyframe:
-    """Corners of a keyframe followed from frame to frame."""
+class _KeyframeFlow:
+    """Optical flow since a keyframe: its corners, followed from frame to frame."""
 
-    def __init__(self, key: WorkImage) -> None:
-        self.place, self.gray = key.place, key.gray
-        self.start = self.at = self.corners(key.gray)
+    def __init__(self, key: ResizedFrame) -> None:
+        self.row, self.gray = key.row, key.gray
+        self.start = self.at = self._corners(key.gray)  # (N, 2) there and in the last frame
         self.count = len(self.start)
 
-    def corners(self, gray: Image) -> Array:
-        found = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(gray.shape) / 80)
+    def _corners(self, gray: Image) -> Array:
+        spacing = max(gray.shape) * CORNER_SPACING
+        found = cv2.goodFeaturesToTrack(gray, CORNERS, CORNER_QUALITY, spacing)
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
-    def step(self, gray: Image) -> tuple[float, float]:
-        """Follow into the next frame: median flow since the keyframe over the width, share left."""
-        if self.count < MIN_CORNERS:  # textureless: a keyframe as soon as there is more
-            return 0.0, float(len(self.corners(gray)) < MIN_CORNERS)
+    def update(self, gray: Image) -> tuple[float, float]:
+        """Follow the corners into the next frame.
+
+        Returns:
+            the median flow since the keyframe over the image's width, and the share of the corners
+            that is left. Of a textureless keyframe nothing is left once a frame has texture.
+        """
+        if self.count < MIN_CORNERS:
+            return 0.0, float(len(self._corners(gray)) < MIN_CORNERS)
         ahead, kept = follow_points(self.gray, gray, self.at)
         self.start, self.at, self.gray = self.start[kept], ahead[kept], gray
         flow = np.linalg.norm(self.at - self.start, axis=1)
         return float(np.median(flow)) / gray.shape[1] if kept.any() else 0.0, len(flow) / self.count
 
 
-MAX_FLOW = 0.12  # new keyframe at this median flow since the last, over the width
-MIN_FLOW = 0.015  # share of the width that counts as motion
-MIN_RATIO = 0.55  # new keyframe when fewer of the corners than this survive
-MAX_INTERVAL = 60  # new keyframe after this many frames if the camera moved at all
-SHARP_WINDOW = 0.7  # from this share of max_flow on the sharpest frame is taken
+MAX_FLOW = 0.12  # median flow that makes a keyframe, over the width (chosen)
+MIN_FLOW = 0.015  # flow that counts as motion, over the width (chosen: 10 px of 640)
+MIN_CORNERS_LEFT = 0.55  # share of the corners below which a new keyframe is due (chosen)
+MAX_INTERVAL = 60  # frames after which any motion makes a keyframe (chosen: 2 s)
+SHARP_WINDOW = 0.7  # share of the flow threshold from which on frames compete in sharpness (chosen)
 
 
 def pick_keyframes(
-    works: Iterable[WorkImage], max_keyframes: int, max_flow: float = MAX_FLOW
-) -> list[WorkImage]:
+    frames: Iterable[ResizedFrame], max_keyframes: int, max_flow: float = MAX_FLOW
+) -> list[ResizedFrame]:
     """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
-    When there are more than `max_keyframes`, every second one is dropped and the spacing doubles:
+    When there are more than `max_keyframes`, every second one is dropped and the thresholds double:
     one pass, bounded memory, the same choice every time.
+
+    Args:
+        max_flow: median flow since the last keyframe, over the width, that makes the next one.
     """
-    keys: list[WorkImage] = []
-    again: deque[WorkImage] = deque()  # frames behind a chosen one, to be looked at again
-    window: list[WorkImage] = []
-    stream, work, track, wider, flow = iter(works), None, None, 1, 0.0
-    while (following := again.popleft() if again else next(stream, None)) is not None:
-        work = following
+    keys: list[ResizedFrame] = []
+    replay: deque[ResizedFrame] = deque()  # frames after a chosen one that were followed already
+    window: list[ResizedFrame] = []  # frames near the threshold
+    stream, last, track, wider, flow = iter(frames), None, None, 1, 0.0
+    while (frame := replay.popleft() if replay else next(stream, None)) is not None:
+        last = frame
         if track is None:
-            keys, track = [work], _FlowSinceKeyframe(work)
+            keys, track = [frame], _KeyframeFlow(frame)
             continue
-        flow, left = track.step(work.gray)
+        flow, left = track.update(frame.gray)
         if flow >= SHARP_WINDOW * wider * max_flow:
-            window.append(work)
-        late = work.place - track.place >= wider * MAX_INTERVAL and flow > MIN_FLOW
-        if late or flow > wider * max_flow or left < MIN_RATIO**wider:
-            best = max(window or [work], key=lambda w: cv2.Laplacian(w.gray, cv2.CV_32F).var())
-            again.extendleft(w for w in reversed(window) if w.place > best.place)
+            window.append(frame)
+        late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
+        if late or flow > wider * max_flow or left < MIN_CORNERS_LEFT**wider:
+            best = max(window or [frame], key=lambda f: cv2.Laplacian(f.gray, cv2.CV_32F).var())
+            replay.extendleft(f for f in reversed(window) if f.row > best.row)
             keys.append(best)
             if len(keys) > max_keyframes:
                 keys, wider = keys[::2], 2 * wider
-            window, track = [], _FlowSinceKeyframe(best)
+            window, track = [], _KeyframeFlow(best)
     moved = flow > MIN_FLOW or len(keys) == 1
-    return [*keys, work] if work is not None and work.place > keys[-1].place and moved else keys
+    if last is None or last.row == keys[-1].row or not moved:
+        return keys
+    return [*keys[: max(max_keyframes - 1, 1)], last]

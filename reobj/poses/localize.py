@@ -1,4 +1,7 @@
-"""Poses of the frames between the keyframes: points followed from both sides, PnP."""
+"""Poses of the frames between the keyframes: 3D points followed from both sides, PnP, gaps.
+
+Needs a reconstruction of the keyframes (`mapping`); changes nothing in it.
+"""
 
 from __future__ import annotations
 
@@ -10,106 +13,157 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from reobj.cameras import Camera, SparseModel, import_pycolmap, invert_rigid, pycolmap_camera
+from reobj.cameras import Camera, SparseModel, import_pycolmap, invert_rigid
 from reobj.files import Progress
-from reobj.poses.keyframes import WorkVideo, follow_points
+from reobj.poses.keyframes import ResizedVideo, follow_points
 from reobj.types import Array, BoolArray, Image, IntArray
-
-MAX_RUN = 1000  # frames held at once between two keyframes
-MAX_STEP_RATIO = 5.0  # refuse PnP poses this many median steps from neighbours
 
 
 def locate_between(
-    model: SparseModel, places: IntArray, video: WorkVideo, seed: int, line: Progress
+    model: SparseModel, key_rows: IntArray, video: ResizedVideo, seed: int, line: Progress
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Locate every frame by PnP from points followed from the keyframes before and after it.
 
     Args:
-        places: (R,) place in the video of each registered keyframe, ascending.
+        model: of the keyframes, native pixels. key_rows: (R,) row of each of its images in the
+            video, ascending.
     Returns:
-        cam_from_world (F, 3, 4), NaN where PnP was refused, and status (F,); see `Poses`.
+        cam_from_world: (F, 3, 4), NaN where PnP was refused or the camera jumped. status: (F,) as
+        in `Poses`.
     """
     count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
-    cam_from_world[places], status[places] = model.cam_from_world, "keyframe"
-    for before, after, run in _segments(places, video.grays(), MAX_RUN):
+    cam_from_world[key_rows], status[key_rows] = model.cam_from_world, "keyframe"
+    for before, after, run in _segments(key_rows, video.grays()):
         images = [gray for _, gray in run]
-        ahead = _follow(model, before, images)
-        back = _follow(model, after, images[::-1])[::-1]
-        for (place, gray), (rows_a, xy_a), (rows_b, xy_b) in zip(run, ahead, back, strict=True):
-            if status[place] == "none":
-                points, xy = model.points[np.r_[rows_a, rows_b]], np.r_[xy_a, xy_b]
+        ahead = _follow_model_points(model, before, images)
+        back = _follow_model_points(model, after, images[::-1])[::-1]
+        for (row, gray), (seen_a, xy_a), (seen_b, xy_b) in zip(run, ahead, back, strict=True):
+            if status[row] == "none":
+                points, xy = model.points[np.r_[seen_a, seen_b]], np.r_[xy_a, xy_b]
                 found = absolute_pose(xy, points, camera, gray.shape[1], seed)
                 if found is not None:
-                    cam_from_world[place], status[place] = found, "pnp"
+                    cam_from_world[row], status[row] = found, "pnp"
         line.step(len(run) - 1)
     line.close()
-    jump = _jumps(cam_from_world, MAX_STEP_RATIO) & (status == "pnp")
+    jump = _detours(cam_from_world) & (status == "pnp")
     cam_from_world[jump], status[jump] = np.nan, "none"
     return cam_from_world, status
 
 
+MAX_RUN = 1000  # frames held in memory between two keyframes (chosen: .3 GB of 640x480)
+
+
 def _segments(
-    places: IntArray, grays: Iterator[Image], longest: int
+    key_rows: IntArray, grays: Iterator[Image]
 ) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
     """Cut the video at the registered keyframes.
 
-    Yields rows of the keyframes before and after (-1: none), and (place, image) of both and of all
-    between. Of stretches without a keyframe that are longer than `longest`, the middle is left out.
+    Yields:
+        the image of the model before and after (-1: none), and (row, gray image) of both and of all
+        frames between them. Of a stretch longer than MAX_RUN the middle is left out.
     """
-    row_of = {int(place): row for row, place in enumerate(places)}
-    before, run = -1, deque[tuple[int, Image]](maxlen=longest)
-    for place, gray in enumerate(grays):
-        run.append((place, gray))
-        row = row_of.get(place, -1)
-        if row >= 0 or (before >= 0 and len(run) == longest):
-            yield before, row, list(run)
-            before, run = row, deque([(place, gray)], maxlen=longest)
+    image_of = {int(row): image for image, row in enumerate(key_rows)}
+    before, run = -1, deque[tuple[int, Image]](maxlen=MAX_RUN)
+    for row, gray in enumerate(grays):
+        run.append((row, gray))
+        image = image_of.get(row, -1)
+        if image >= 0 or (before >= 0 and len(run) == MAX_RUN):
+            yield before, image, list(run)
+            before, run = image, deque([(row, gray)], maxlen=MAX_RUN)
     if before >= 0:
         yield before, -1, list(run)
 
 
-PNP_POINTS = 200  # 3D points tracked from each keyframe into the frames between
+PNP_POINTS = 200  # followed from each keyframe, those with the longest tracks first (chosen)
 
 
-def _follow(model: SparseModel, row: int, images: list[Image]) -> list[tuple[IntArray, Array]]:
-    """Follow the longest-seen 3D points of a keyframe (row; -1: none) through the images.
+def _follow_model_points(
+    model: SparseModel, image: int, grays: list[Image]
+) -> list[tuple[IntArray, Array]]:
+    """Follow the 3D points that an image of the model sees (-1: none) through gray images.
 
     Returns:
-        per image: rows of `model.points` (n,) and their native pixels (n, 2), COLMAP convention.
+        per gray image, the first being the keyframe itself: rows (n,) of `model.points` and their
+        native pixels (n, 2).
     """
-    seen = np.flatnonzero(model.obs_image == row)
+    seen = np.flatnonzero(model.obs_image == image)
     longest = np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")
     seen = seen[longest[:PNP_POINTS]]
-    scale = np.array(images[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
-    rows, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5  # OpenCV: centres at 0
-    followed = [(rows, model.obs_xy[seen])]
-    for old, new in itertools.pairwise(images):
+    scale = np.array(grays[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
+    # COLMAP has the centre of the first pixel at (.5, .5), OpenCV at (0, 0)
+    points, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5
+    followed = [(points, model.obs_xy[seen])]
+    for old, new in itertools.pairwise(grays):
         ahead, kept = follow_points(old, new, xy)
-        rows, xy = rows[kept], ahead[kept]
-        followed.append((rows, (xy + 0.5) / scale))
+        points, xy = points[kept], ahead[kept]
+        followed.append((points, (xy + 0.5) / scale))
     return followed
 
 
-def _jumps(cam_from_world: Array, ratio: float) -> BoolArray:
-    """Mark frames whose centre is a detour: far from both neighbours, which are near each other."""
+PNP_MIN_INLIERS = 15  # of an accepted pose (chosen; COLMAP registers images from 30 on)
+PNP_MIN_RATIO = 0.5  # of inliers among the followed points (chosen; COLMAP: .25 of raw matches)
+PNP_ERROR_PX = 4.0  # of an inlier, pixels of the resized image (chosen; COLMAP: 12)
+
+
+def absolute_pose(
+    xy: Array, points: Array, camera: Camera, resized_width: int, seed: int
+) -> Array | None:
+    """Estimate the pose of a frame from 3D points and their pixels (PnP, RANSAC, refinement).
+
+    Args:
+        xy: (n, 2) native pixels, COLMAP's. points: (n, 3) in world. resized_width: pixels of the
+            image in which the points were found; the error allowed is counted in its pixels.
+    Returns:
+        cam_from_world (3, 4); None with too few inliers or an inlier behind the camera.
+    """
+    if len(xy) < PNP_MIN_INLIERS:
+        return None
+    error_px = PNP_ERROR_PX * camera.width / resized_width
+    ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
+    found = import_pycolmap().estimate_and_refine_absolute_pose(
+        xy, points, camera.to_pycolmap(), estimation_options={"ransac": ransac}
+    )
+    if found is None or found["num_inliers"] < max(PNP_MIN_INLIERS, PNP_MIN_RATIO * len(xy)):
+        return None
+    pose: Array = found["cam_from_world"].matrix()
+    depth = points[found["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
+    return pose if np.isfinite(pose).all() and (depth > 0).all() else None
+
+
+MAX_DETOUR_STEPS = 5.0  # of a PnP pose, in usual steps of the camera (chosen)
+
+
+def _detours(cam_from_world: Array) -> BoolArray:
+    """Mark frames (F,) whose centre is far from both neighbours, while these are near each other.
+
+    The detour over a centre, compared with the way past it, counts in steps: the distance of the
+    neighbours or the median step of the path, whichever is longer.
+    """
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
-    jump = np.zeros(len(cam_from_world), bool)
+    detour = np.zeros(len(cam_from_world), bool)
     if len(known) > 2:
         centre = invert_rigid(cam_from_world[known])[:, :, 3]  # (N, 3)
         step = np.linalg.norm(np.diff(centre, axis=0), axis=1)  # (N-1,)
         direct = np.linalg.norm(centre[2:] - centre[:-2], axis=1)  # (N-2,)
         usual = np.maximum(direct, np.median(step))
-        jump[known[1:-1]] = step[1:] + step[:-1] - direct > ratio * usual
-    return jump
+        detour[known[1:-1]] = step[1:] + step[:-1] - direct > MAX_DETOUR_STEPS * usual
+    return detour
 
 
 def fill_gaps(
     frame: IntArray, cam_from_world: Array, status: npt.NDArray[np.str_], max_gap: int
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate over at most `max_gap` lost frames: rotation by slerp, camera centre on a line.
+    """Interpolate the poses of at most `max_gap` lost frames in a row, never beyond the ends.
 
-    (Interpolating t of cam_from_world instead would bend the path.)
+    The rotation is interpolated by slerp and the camera's centre along a line; the translation of
+    cam_from_world on a line would bend the path.
+
+    Args:
+        frame: (F,) source numbers: frames that were not read count too. cam_from_world: (F, 3, 4),
+            NaN where lost. status: (F,) as in `Poses`.
+    Returns:
+        copies of cam_from_world and status, the latter "interpolated" where filled.
     """
     filled, status = cam_from_world.copy(), status.copy()
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
@@ -123,29 +177,3 @@ def fill_gaps(
             filled[a + 1 : b] = invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
             status[a + 1 : b] = "interpolated"
     return filled, status
-
-
-PNP_MIN_INLIERS = 15  # accept a PnP pose with at least this many inliers
-PNP_MIN_RATIO = 0.5  # and at least this share of inliers
-PNP_ERROR_PX = 4.0  # PnP inlier threshold on the working image
-
-
-def absolute_pose(
-    xy: Array, points: Array, camera: Camera, work_width: int, seed: int
-) -> Array | None:
-    """PnP from native pixels (n, 2) of world points (n, 3): cam_from_world (3, 4); None if it is
-    not to be trusted.
-    """
-    if len(xy) < PNP_MIN_INLIERS:
-        return None
-    error_px = PNP_ERROR_PX * camera.width / work_width
-    ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
-    made = pycolmap_camera(camera, (camera.width, camera.height))
-    options = {"estimation_options": {"ransac": ransac}}
-    found = import_pycolmap().estimate_and_refine_absolute_pose(xy, points, made, **options)
-    least = max(PNP_MIN_INLIERS, PNP_MIN_RATIO * len(xy))
-    if found is None or found["num_inliers"] < least:
-        return None
-    pose: Array = found["cam_from_world"].matrix()
-    depth = points[found["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
-    return pose if np.isfinite(pose).all() and (depth > 0).all() else None

@@ -1,0 +1,284 @@
+"""Cameras: intrinsics against pycolmap, rigid transforms, rays, files that pycolmap reads."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pose_worlds import PINHOLE, SIZE, some_cameras, supplied
+from scipy.spatial.transform import Rotation
+
+import reobj_track as rt
+from reobj.cameras import (
+    angle_deg,
+    invert_rigid,
+    load_poses,
+    parse_camera,
+    place_of,
+    quat_wxyz_from_matrix,
+    read_sparse_model,
+    save_poses,
+    scaled_camera,
+    triangulate_rays,
+    undistort_boxes,
+    viewing_rays,
+    write_colmap,
+    write_tum,
+)
+
+DISTORTED = {
+    "SIMPLE_PINHOLE": (500.0, 320.0, 240.0),
+    "PINHOLE": (500.0, 480.0, 330.0, 250.0),
+    "SIMPLE_RADIAL": (500.0, 320.0, 240.0, -0.05),
+    "RADIAL": (500.0, 325.0, 245.0, -0.1, 0.02),
+    "OPENCV": (500.0, 480.0, 330.0, 250.0, -0.1, 0.02, 0.001, -0.002),
+    "OPENCV_FISHEYE": (400.0, 390.0, 330.0, 250.0, 0.01, 0.002, 0.0, 0.0),
+}
+
+
+# ---- Intrinsics ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_undistorted_pixels_are_those_of_a_pinhole_with_the_same_k(model):
+    """Rays -> pixels by pycolmap's own camera -> undistorted -> K^-1: the rays again."""
+    pycolmap = pytest.importorskip("pycolmap")
+    params = DISTORTED[model]
+    theirs = pycolmap.Camera(model=model, width=640, height=480, params=list(params))
+    rays = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 20, 2))
+    rays[..., 1] *= 0.7
+    pixels = np.array(theirs.img_from_cam(np.insert(rays.reshape(-1, 2), 2, 1, 1)))
+    camera = rt.Camera(model, *SIZE, params)
+    np.testing.assert_allclose(camera.K, theirs.calibration_matrix())
+    xy = pixels.reshape(2, 20, 2)
+    xy[1, 3] = np.nan
+    ideal = camera.undistort(xy)
+    back = np.insert(ideal, 2, 1, 2) @ np.linalg.inv(camera.K).T
+    np.testing.assert_allclose(np.delete(back[..., :2].reshape(-1, 2), 23, 0),
+                               np.delete(rays.reshape(-1, 2), 23, 0), atol=1e-6)  # fmt: skip
+    assert np.isnan(ideal[1, 3]).all()
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_a_resized_camera_sees_the_same_rays(model):
+    pycolmap = pytest.importorskip("pycolmap")
+    camera = rt.Camera(model, *SIZE, DISTORTED[model])
+    small = camera.resized((320, 240))
+    assert (small.width, small.height, small.model) == (320, 240, model)
+    rays = np.array([[0.1, -0.2, 1], [0.3, 0.2, 1]])
+    made = pycolmap.Camera(model=model, width=320, height=240, params=list(small.params))
+    pixels = np.array(camera.to_pycolmap().img_from_cam(rays))
+    np.testing.assert_allclose(made.img_from_cam(rays), pixels / 2, atol=1e-9)
+    assert camera.resized(SIZE) == camera
+
+
+def test_a_camera_is_parsed():
+    assert parse_camera("", SIZE) is None and parse_camera("  ", SIZE) is None
+    pinhole = parse_camera("500,510,320,240", SIZE)
+    assert pinhole == rt.Camera("PINHOLE", *SIZE, (500, 510, 320, 240))
+    opencv = parse_camera("500,510,320,240,-.1,.02", SIZE)
+    assert opencv == rt.Camera("OPENCV", *SIZE, (500, 510, 320, 240, -0.1, 0.02, 0, 0))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1,2,3",  # too few
+        "1,2,3,4,5,6,7,8,9",  # too many
+        "a,b,c,d",
+        "-5,5,320,240",
+        "500,nan,320,240",
+        "500,500,900,240",  # centre of another size
+        "500,500,320,400",
+        "50,50,320,240",  # focal length of no lens
+        "7000,7000,320,240",
+    ],
+)
+def test_a_wrong_camera_is_refused(text):
+    with pytest.raises(rt.ReobjError, match="--camera"):
+        parse_camera(text, SIZE)
+
+
+def test_a_scaled_camera_is_a_pinhole():
+    camera = scaled_camera(rt.Camera("OPENCV", *SIZE, DISTORTED["OPENCV"]), 0.5)
+    assert camera == rt.Camera("PINHOLE", 320, 240, (250, 240, 165, 125))
+
+
+def test_boxes_are_undistorted_by_the_middles_of_their_edges():
+    camera = rt.Camera("OPENCV", *SIZE, DISTORTED["OPENCV"])
+    boxes = np.array([[100, 80, 200, 300.0], [0, 50, 640, 480]])
+    found = undistort_boxes(boxes, camera)
+    x1, y1, x2, y2 = boxes[0]
+    middles = [(x1, (y1 + y2) / 2), ((x1 + x2) / 2, y1), (x2, (y1 + y2) / 2), ((x1 + x2) / 2, y2)]
+    ideal = camera.undistort(np.array(middles))
+    np.testing.assert_allclose(found[0], [ideal[0, 0], ideal[1, 1], ideal[2, 0], ideal[3, 1]])
+    np.testing.assert_array_equal(found[1, [0, 2, 3]], [0, 640, 480])  # at the image border
+    assert abs(found[0] - boxes[0]).min() > 0.1 and found[1, 1] != 50
+    assert undistort_boxes(boxes, PINHOLE) is boxes and not len(undistort_boxes(boxes[:0], camera))
+
+
+# ---- Rigid transforms and rays -------------------------------------------------------------------
+
+
+def test_an_inverted_transform_maps_back():
+    cams = some_cameras()
+    points = np.random.default_rng(0).normal(size=(6, 3))
+    in_cam = np.einsum("fij,fj->fi", cams[:, :, :3], points) + cams[:, :, 3]
+    back = invert_rigid(cams)
+    np.testing.assert_allclose(np.einsum("fij,fj->fi", back[:, :, :3], in_cam) + back[:, :, 3],
+                               points)  # fmt: skip
+    full = np.vstack([cams[1], [0, 0, 0, 1]])
+    np.testing.assert_allclose(invert_rigid(cams[1]), np.linalg.inv(full)[:3], atol=1e-12)
+
+
+def test_quaternions_have_w_first_and_positive():
+    half = np.sqrt(0.5)
+    about_x = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])  # by 90 deg
+    found = quat_wxyz_from_matrix(np.array([np.eye(3), about_x, about_x.T]))
+    np.testing.assert_allclose(found, [[1, 0, 0, 0], [half, half, 0, 0], [half, -half, 0, 0]])
+    many = Rotation.random(50, rng=np.random.default_rng(0))
+    assert (quat_wxyz_from_matrix(many.as_matrix())[:, 0] >= 0).all()
+    assert quat_wxyz_from_matrix(np.empty((0, 3, 3))).shape == (0, 4)
+
+
+def test_rays_point_from_the_camera_to_what_the_box_is_around():
+    cams, points = some_cameras(), np.array([[0.3, -0.2, 4.0], [-1, 0.5, 5]])
+    K = PINHOLE.K
+    for cam in cams:
+        in_cam = points @ cam[:, :3].T + cam[:, 3]
+        centre = in_cam @ K.T
+        centre = centre[:, :2] / centre[:, 2:]
+        half = np.array([30, 20])
+        boxes = np.hstack([centre - half, centre + half])
+        toward = points - invert_rigid(cam)[:, 3]
+        rays = viewing_rays(boxes, K @ cam)
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        np.testing.assert_allclose(rays, toward, atol=1e-12)
+    one_each = viewing_rays(np.tile(boxes[:1], (len(cams), 1)), K @ cams)
+    np.testing.assert_allclose(one_each[-1], rays[0])
+    assert np.isnan(viewing_rays(boxes, np.full((3, 4), np.nan))).all()
+
+
+def test_triangulated_rays_meet_in_the_point():
+    cams, point = some_cameras(), np.array([0.4, 0.1, 3.0])
+    in_cam = cams[:, :, :3] @ point + cams[:, :, 3]
+    rays = in_cam / np.linalg.norm(in_cam, axis=1, keepdims=True)
+    ray, centre, found = triangulate_rays(cams, rays)
+    np.testing.assert_allclose(found, point, atol=1e-9)
+    np.testing.assert_allclose(centre, [-c[:, :3].T @ c[:, 3] for c in cams], atol=1e-12)
+    np.testing.assert_allclose(np.cross(ray, point - centre), 0, atol=1e-9)
+
+
+def test_the_nearest_point_of_two_skew_rays_is_halfway():
+    cams = np.tile(np.eye(4)[:3], (2, 1, 1))
+    cams[1, :, 3] = [0, -1, -5]  # centre (0, 1, 5)
+    _, _, point = triangulate_rays(cams, np.array([[0, 0, 1.0], [1, 0, 0]]))
+    np.testing.assert_allclose(point, [0, 0.5, 5], atol=1e-9)
+
+
+def test_angles_are_in_degrees():
+    x, y = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+    np.testing.assert_allclose(angle_deg(np.array([x, x, x]), np.array([x, y, -x])), [0, 90, 180])
+
+
+# ---- Poses and their files -----------------------------------------------------------------------
+
+
+def lossy(**changes):
+    cams = some_cameras()
+    cams[2] = np.nan
+    frame = np.array([3, 4, 5, 8, 9, 10])
+    return dataclasses.replace(supplied(cams), frame=frame, **changes)
+
+
+def test_frames_are_found_among_the_poses():
+    place, known = place_of(lossy(), np.array([8, 5, 6, 3, 99, 0]))
+    assert known.tolist() == [True, False, False, True, False, False]
+    assert place[known].tolist() == [3, 0]
+
+
+@pytest.mark.parametrize("up", [None, [0, 0.6, 0.8]])
+def test_poses_are_kept_as_npz(tmp_path, up):
+    status = np.array(["keyframe", "pnp", "none", "interpolated", "pnp", "keyframe"])
+    poses = lossy(
+        up_in_world=None if up is None else np.array(up),
+        metric=up is not None,
+        status=status,
+        points=np.arange(6.0).reshape(2, 3),
+        colors=np.arange(6, dtype=np.uint8).reshape(2, 3),
+        messages=("one", "two"),
+    )
+    save_poses(tmp_path / "poses.npz", poses)
+    back = load_poses(tmp_path / "poses.npz")
+    for field in dataclasses.fields(rt.Poses):
+        np.testing.assert_array_equal(getattr(back, field.name), getattr(poses, field.name))
+    assert back.camera == poses.camera and back.known.tolist() == [1, 1, 0, 1, 1, 1]
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_tum_rows_are_seconds_centre_and_quaternion_xyzw(tmp_path, metric):
+    poses = lossy(metric=metric)
+    write_tum(tmp_path / "poses.txt", poses)
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    known = poses.cam_from_world[poses.known]
+    np.testing.assert_allclose(rows[:, 0], poses.time_s[poses.known], atol=1e-9)
+    centre = [-cam[:, :3].T @ cam[:, 3] for cam in known]
+    np.testing.assert_allclose(rows[:, 1:4], centre, atol=1e-8)
+    turn = Rotation.from_quat(rows[:, 4:]).as_matrix()  # world_from_cam
+    np.testing.assert_allclose(turn, known[:, :, :3].swapaxes(1, 2), atol=1e-8)
+    assert ("units: metres" in (tmp_path / "poses.txt").read_text()) == metric
+
+
+def test_pycolmap_reads_our_text_model(tmp_path):
+    pytest.importorskip("pycolmap")
+    points, colors = np.arange(6.0).reshape(2, 3), np.array([[1, 2, 3], [4, 5, 250]], np.uint8)
+    poses = lossy(points=points, colors=colors)
+    (tmp_path / "images.bin").write_bytes(b"of an older run")
+    write_colmap(tmp_path, poses, [f"{i:04d}.jpg" for i in range(6)])
+    model = read_sparse_model(tmp_path)
+    assert model.names == ("0000.jpg", "0001.jpg", "0003.jpg", "0004.jpg", "0005.jpg")
+    np.testing.assert_allclose(model.cam_from_world, poses.cam_from_world[poses.known], atol=1e-12)
+    assert set(model.cameras) == {PINHOLE}
+    np.testing.assert_array_equal(model.points, points)
+    np.testing.assert_array_equal(model.colors, colors)
+
+
+def test_pycolmaps_own_model_is_not_overwritten(tmp_path):
+    (tmp_path / "images.bin").write_bytes(b"with observations")
+    write_colmap(tmp_path, lossy(source="pycolmap"), [""] * 6)
+    assert [p.name for p in tmp_path.iterdir()] == ["images.bin"]
+
+
+def test_observations_of_a_sparse_model_are_those_of_pycolmap(tmp_path):
+    """Project the points of pycolmap's synthetic scene: they fall on their observations."""
+    pycolmap = pytest.importorskip("pycolmap")
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 5, 40
+    truth = pycolmap.synthesize_dataset(options)
+    truth.write_binary(str(tmp_path))
+    model = read_sparse_model(tmp_path)
+    assert len(model.names) == 5 and len(model.points) == 40
+    camera = model.cameras[0].to_pycolmap()
+    cams = model.cam_from_world[model.obs_image]
+    in_cam = np.einsum("mij,mj->mi", cams[:, :, :3], model.points[model.obs_point]) + cams[:, :, 3]
+    np.testing.assert_allclose(camera.img_from_cam(in_cam), model.obs_xy, atol=1e-6)
+    np.testing.assert_array_equal(np.bincount(model.obs_point), model.track_length)
+
+
+def test_import_loads_no_pycolmap():
+    code = "import sys, reobj_track; sys.exit('pycolmap' in sys.modules)"
+    folder = Path(rt.__file__).parent
+    assert subprocess.run([sys.executable, "-c", code], cwd=folder, check=False).returncode == 0
+
+
+def test_pycolmap_leaves_the_signal_that_ends_us():
+    code = (
+        "import signal; from reobj.cameras import import_pycolmap; import_pycolmap();"
+        "assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL"
+    )
+    folder = Path(rt.__file__).parent
+    assert subprocess.run([sys.executable, "-c", code], cwd=folder, check=False).returncode == 0

@@ -1,0 +1,202 @@
+"""The whole chain from a video to the pose of every frame, and its options."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pose_worlds import FakeVideo, ate_percent, blank, textured_room
+
+import reobj_track as rt
+
+pytest.importorskip("pycolmap")
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+ROOM = Path(__file__).resolve().parents[1] / "examples" / "room"
+
+
+def config(**changes):
+    return dataclasses.replace(rt.PosesConfig(), **changes)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    images, truth = textured_room(30, 0.08, size=(320, 240))
+    folder, few = tmp_path_factory.mktemp("walk"), config(max_keyframes=12)
+    return FakeVideo(images), truth, folder, rt.estimate_poses(FakeVideo(images), few, folder)
+
+
+def test_a_walk_gets_a_pose_for_every_frame(walk):
+    video, truth, folder, poses = walk
+    assert poses.known.all() and poses.source == "pycolmap" and not poses.metric
+    assert set(poses.status) == {"keyframe", "pnp"} and not poses.messages
+    assert poses.frame.tolist() == list(range(30))
+    np.testing.assert_allclose(poses.time_s, np.arange(30) / 30)
+    assert ate_percent(poses.cam_from_world, truth) < 1.0
+    assert len(poses.points) > 300 and poses.colors.any() and len(poses.colors) == len(poses.points)
+    assert (poses.camera.width, poses.camera.height) == video.size
+    assert sorted(p.name for p in folder.iterdir()) == ["pycolmap.log", "sparse"]
+
+
+def test_the_sparse_model_holds_the_keyframes(walk):
+    video, _, folder, poses = walk
+    back = rt.read_poses(folder / "sparse", video)
+    keys = poses.status == "keyframe"
+    np.testing.assert_array_equal(back.known, keys)
+    np.testing.assert_allclose(back.cam_from_world[keys], poses.cam_from_world[keys], atol=1e-9)
+    np.testing.assert_allclose(back.camera.params, poses.camera.params)
+
+
+# ---- Options -------------------------------------------------------------------------------------
+
+
+def seen_job(monkeypatch, video, folder, **changes):
+    """What `estimate_poses` hands to the reconstruction."""
+    seen = {}
+
+    def record(images, names, boxes, size, **options):
+        seen.update(images=images, names=names, boxes=boxes, size=size, **options)
+        return ["stopped here"]
+
+    monkeypatch.setattr("reobj.poses.estimate.reconstruct", record)
+    boxes = changes.pop("boxes", None)
+    poses = rt.estimate_poses(video, config(**changes), folder, boxes_to_mask=boxes)
+    assert poses.messages == ("stopped here",)
+    return seen
+
+
+def test_options_arrive_at_the_reconstruction(walk, tmp_path, monkeypatch):
+    video = walk[0]
+    seen = seen_job(monkeypatch, video, tmp_path)
+    assert seen["images"][0].shape == (240, 320, 3) and seen["size"] == (320, 240)
+    assert (seen["camera"], seen["focal_guesses"], seen["seed"]) == (None, [0.8], 0)
+    assert len(seen["images"]) > 8 and all(boxes.shape == (0, 4) for boxes in seen["boxes"])
+    mask = lambda frame: np.full((2, 4), float(frame))  # noqa: E731
+    changed = seen_job(monkeypatch, video, tmp_path, size_px=160, max_keyframes=8, seed=3,
+                       camera="288,288,160,120", boxes=mask)  # fmt: skip
+    assert changed["images"][0].shape == (120, 160, 3) and len(changed["images"]) <= 8
+    assert changed["camera"].params[0] == 288 and changed["seed"] == 3
+    assert changed["focal_guesses"] == []
+    numbers = [int(name.removesuffix(".jpg").split("_")[1]) for name in changed["names"]]
+    assert [boxes[0, 0] for boxes in changed["boxes"]] == numbers
+
+
+@pytest.fixture
+def reconstructed(walk, monkeypatch):
+    """The keyframes' reconstruction is that of `walk` and takes no time."""
+
+    def copy(*args, work_dir, **options):
+        shutil.copytree(walk[2] / "sparse", work_dir / "sparse")
+        (work_dir / "mapping").mkdir()
+        return []
+
+    monkeypatch.setattr("reobj.poses.estimate.reconstruct", copy)
+    return walk
+
+
+def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
+    seeds = []
+
+    def note(model, key_rows, video, seed, line):
+        seeds.append(seed)
+        count = len(video.frames)
+        return np.full((count, 3, 4), np.nan), np.full(count, "none")
+
+    monkeypatch.setattr("reobj.poses.estimate.locate_between", note)
+    poses = rt.estimate_poses(reconstructed[0], config(seed=4), tmp_path)
+    assert seeds == [4] and "30 of 30 frames have no pose (frames 0-29)" in poses.messages[0]
+
+
+@pytest.mark.parametrize("max_gap, filled", [(2, True), (1, False)])
+def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max_gap, filled):
+    video, _, _, poses = reconstructed
+    cams, status = poses.cam_from_world.copy(), poses.status.copy()
+    cams[11:13], status[11:13] = np.nan, "none"
+    monkeypatch.setattr("reobj.poses.estimate.locate_between", lambda *a: (cams, status))
+    found = rt.estimate_poses(video, config(max_gap=max_gap), tmp_path)
+    assert found.known.all() == filled and (found.status[11] == "interpolated") == filled
+    assert bool(found.messages) != filled
+    if not filled:
+        assert "2 of 30 frames have no pose (frames 11-12)" in found.messages[0]
+
+
+# ---- Failures ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "images, message",
+    [
+        (textured_room(1, 0)[0], "only 1 different view"),
+        ([np.zeros((240, 320, 3), np.uint8)] * 30, "only 2 different views"),  # black
+        (textured_room(1, 0)[0] * 30, "only 2 different views"),  # still
+    ],
+)
+def test_failures_are_no_crash_and_say_what_helps(tmp_path, images, message):
+    poses = rt.estimate_poses(FakeVideo(images), config(), tmp_path)
+    assert not poses.known.any() and poses.source == "none" and set(poses.status) == {"none"}
+    assert len(poses.frame) == len(images) and poses.cam_from_world.shape == (len(images), 3, 4)
+    assert message in poses.messages[0] and "--poses" in poses.messages[0]
+    assert poses.camera.K[0, 0] == pytest.approx(0.8 * images[0].shape[1])
+
+
+def test_empty_video_and_live_camera_are_refused(tmp_path):
+    with pytest.raises(rt.ReobjError, match="no frame"):
+        rt.estimate_poses(FakeVideo([]), config(), tmp_path)
+    video = blank(3)
+    video.is_live = True
+    with pytest.raises(rt.ReobjError, match="live"):
+        rt.estimate_poses(video, config(), tmp_path)
+
+
+# ---- EXIF ----------------------------------------------------------------------------------------
+
+
+def photo_with_exif(path, image, focal_35mm):
+    """Write a JPEG whose EXIF says FocalLengthIn35mmFilm."""
+    number = struct.pack("<H", 1)
+    tiff = b"II*\0\x08\0\0\0" + number + struct.pack("<HHII", 0x8769, 4, 1, 26) + bytes(4)
+    tiff += number + struct.pack("<HHIHH", 0xA405, 3, 1, focal_35mm, 0) + bytes(4)
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    head = b"Exif\0\0" + tiff
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(head) + 2) + head + data[2:])
+
+
+@pytest.mark.parametrize("focal_35mm", [48, 0])
+def test_the_exif_focal_length_is_tried_before_the_usual_guess(tmp_path, monkeypatch, focal_35mm):
+    """COLMAP: 48 mm of a film whose diagonal is 43.27 mm."""
+    images = textured_room(3, 0.5)[0]
+    photo_with_exif(tmp_path / "0.jpg", images[0], focal_35mm)
+    video = FakeVideo(images, files=[tmp_path / "0.jpg"])
+    guesses = seen_job(monkeypatch, video, tmp_path / "work")["focal_guesses"]
+    exif = 48 / np.hypot(36, 24) * np.hypot(480, 360) / 480
+    assert guesses == ([pytest.approx(exif, rel=1e-3), 0.8] if focal_35mm else [0.8])
+
+
+# ---- Recordings ----------------------------------------------------------------------------------
+
+
+def test_living_room(tmp_path):
+    folder = SHARED / "livingroom13" / "images"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not here")
+    files = sorted(folder.glob("*.jpg"))
+    video = FakeVideo([cv2.imread(str(f)) for f in files], [f.name for f in files])
+    poses = rt.estimate_poses(video, rt.PosesConfig(), tmp_path)
+    assert poses.known.all() and 0.4 < poses.camera.params[0] / 1920 < 0.6
+
+
+def test_rendered_room_against_its_truth(tmp_path):
+    if not (ROOM / "room.mp4").exists() or not (ROOM / "camera.txt").exists():
+        pytest.skip("examples/room/room.mp4 is not here")
+    video = rt.Video(ROOM / "room.mp4", rt.InputConfig())
+    poses = rt.estimate_poses(video, rt.PosesConfig(), tmp_path)
+    camera = ",".join((ROOM / "camera.txt").read_text().split()[4:])
+    truth = rt.read_poses(ROOM / "poses.txt", video, camera=camera)
+    both = poses.known & truth.known
+    error = ate_percent(poses.cam_from_world[both], truth.cam_from_world[both])
+    assert both.mean() > 0.95 and error < 0.6
+    assert poses.camera.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)

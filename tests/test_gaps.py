@@ -1,0 +1,154 @@
+"""Gaps of tracks, filled after the video: against filterpy's smoother and simulated truth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+import reobj_track as rt
+from reobj.identity.gaps import fill_gaps, smooth_boxes
+from reobj.views import gather_views
+
+SIZE = (640, 480)
+
+
+def moving(frames: np.ndarray, start: tuple[float, ...], step: tuple[float, ...]) -> np.ndarray:
+    """Boxes (F, 4) cx, cy, w, h of constant velocity, as corners."""
+    box = np.array(start) + frames[:, None] * np.array(step)
+    return np.concatenate([box[:, :2] - box[:, 2:] / 2, box[:, :2] + box[:, 2:] / 2], 1)
+
+
+def table(frames: np.ndarray, xyxy: np.ndarray, identity: int = 1) -> rt.Tracks:
+    """One identity, a tracklet of 20 frames each, one detection a frame."""
+    one = np.ones(len(frames), np.int64)
+    tracklet = 10 * identity + frames // 20
+    return rt.Tracks(
+        frames, identity * one, tracklet, xyxy, 0.9 * one, 7 * one, np.arange(len(one))
+    )
+
+
+def joined(*parts: rt.Tracks) -> rt.Tracks:
+    names = [f.name for f in dataclasses.fields(rt.Tracks)]
+    whole = rt.Tracks(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+    return whole[np.argsort(whole.frame, kind="stable")]
+
+
+ALL = np.arange(40)
+BOXES = moving(ALL, (100, 200, 60, 90), (4, -1, 0.5, 0.8))
+
+
+@pytest.mark.parametrize("every", [1, 2, 7])
+def test_a_gap_is_filled_with_what_was_there(every: int) -> None:
+    """Exact boxes of constant velocity: the filled ones are the true ones, whatever the stride."""
+    seen = np.delete(ALL, [17, 18, 19])
+    filled = fill_gaps(table(every * seen, BOXES[seen]), SIZE, 3)
+    assert filled.frame.tolist() == (every * ALL).tolist()
+    np.testing.assert_allclose(filled.xyxy, BOXES, atol=0.05)
+    new = filled.score == 0
+    assert filled.frame[new].tolist() == [every * i for i in (17, 18, 19)]
+    assert filled.detection_index[new].tolist() == [-1] * 3
+    assert filled.track_id[new].tolist() == [1] * 3 and filled.class_id[new].tolist() == [7] * 3
+    assert (filled.score[~new] == 0.9).all()
+    before = np.flatnonzero(new)[0] - 1
+    assert (filled.tracklet_id[new] == filled.tracklet_id[before]).all()
+    np.testing.assert_array_equal(filled.xyxy[~new], BOXES[seen])  # what was seen stays
+
+
+def test_noise_is_smoothed_better_than_by_a_line_between_both_ends() -> None:
+    """Box after box with 3 px of noise, gaps of 4: nearer to the truth, over 60 tracks."""
+    rng, error = np.random.default_rng(0), {"rts": [], "line": []}
+    for _ in range(60):
+        seen = np.delete(ALL, [18, 19, 20, 21])
+        noisy = BOXES[seen] + rng.normal(0, 3, (len(seen), 4))
+        filled = fill_gaps(table(seen, noisy), SIZE, 5)
+        truth = BOXES[18:22]
+        error["rts"].append(filled.xyxy[filled.score == 0] - truth)
+        share = np.arange(1, 5)[:, None] / 5
+        error["line"].append((1 - share) * noisy[17] + share * noisy[18] - truth)
+    rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in error.items()}
+    assert rms["rts"] < 0.9 * rms["line"] < 3
+
+
+def test_smoother_equals_filterpy() -> None:
+    """Its own batch filter and RTS smoother, with the noise of the tracker over the mean side."""
+    rng = np.random.default_rng(1)
+    at = np.array([0, 1, 2, 5, 6, 9])
+    xyxy = BOXES[at] + rng.normal(0, 3, (6, 4))
+    box = np.column_stack([(xyxy[:, :2] + xyxy[:, 2:]) / 2, xyxy[:, 2:] - xyxy[:, :2]])
+    side = np.median(np.sqrt(box[:, 2] * box[:, 3]))
+    for axis in range(4):  # each coordinate by itself: a filter of two states
+        kf = KalmanFilter(dim_x=2, dim_z=1)
+        kf.x = np.array([[box[0, axis]], [0.0]])
+        kf.F, kf.H = np.array([[1, 1], [0, 1.0]]), np.array([[1, 0.0]])
+        kf.P = np.diag([0.05 * side, 0.2 * side]) ** 2
+        kf.Q, kf.R = np.diag([0.05 * side, side / 80]) ** 2, np.array([[(0.05 * side) ** 2]])
+        measured = [None] * 10
+        for i, value in zip(at, box[:, axis], strict=True):
+            measured[i] = np.array([[value]])
+        mean, cov, _, _ = kf.batch_filter(measured)
+        expected = kf.rts_smoother(mean, cov)[0][:, 0, 0]
+        found = smooth_boxes(at, xyxy)
+        middle, size = (found[:, :2] + found[:, 2:]) / 2, found[:, 2:] - found[:, :2]
+        np.testing.assert_allclose(np.c_[middle, size][:, axis], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.parametrize(("max_gap", "filled"), [(0, 0), (3, 0), (4, 4), (5, 4)])
+def test_only_gaps_of_so_many_frames(every: int, max_gap: int, filled: int) -> None:
+    seen = np.delete(ALL, [10, 11, 12, 13])
+    found = fill_gaps(table(every * seen, BOXES[seen]), SIZE, max_gap)
+    assert (found.score == 0).sum() == filled
+
+
+@pytest.mark.parametrize(("jump", "filled"), [(38, True), (52, False)])
+def test_what_moved_far_in_the_gap_is_not_guessed(jump: float, filled: bool) -> None:
+    """Boxes of 80 px, that overlap after the gap by .36 and by .21."""
+    boxes = moving(ALL, (100, 200, 80, 80), (0, 0, 0, 0))
+    boxes[20:, [0, 2]] += jump
+    seen = np.delete(ALL, [20])
+    assert (fill_gaps(table(seen, boxes[seen]), SIZE, 5).score == 0).any() == filled
+
+
+def test_gaps_belong_to_one_identity() -> None:
+    """One is gone for good, another begins in its place; a third has no gap. Rows stay ordered."""
+    still = moving(ALL, (100, 200, 60, 90), (0, 0, 0, 0))
+    other = moving(ALL, (400, 200, 60, 90), (0, 0, 0, 0))
+    whole = joined(
+        table(ALL[:10], still[:10], 1), table(ALL[13:], still[13:], 2), table(ALL, other, 3)
+    )
+    filled = fill_gaps(whole, SIZE, 5)
+    assert len(filled) == len(whole) and (np.diff(filled.frame) >= 0).all()
+    gap = np.delete(ALL, [30])
+    filled = fill_gaps(joined(whole, table(gap, still[gap] + 200, 4)), SIZE, 5)
+    assert filled.track_id[filled.score == 0].tolist() == [4]
+    assert (np.diff(filled.frame) >= 0).all()
+
+
+def test_boxes_stay_in_the_image() -> None:
+    """It leaves half the image and comes back: the guess ends at the border."""
+    boxes = moving(ALL, (640, 30, 100, 90), (0, 0, 0, 0))
+    seen = np.delete(ALL, [15, 16])
+    filled = fill_gaps(table(seen, boxes[seen]), SIZE, 5)
+    new = filled.xyxy[filled.score == 0]
+    np.testing.assert_allclose(new, [[590, 0, 640, 75]] * 2, atol=1e-6)
+
+
+def test_nothing_to_fill() -> None:
+    assert len(fill_gaps(rt.Tracks.empty(), SIZE, 5)) == 0
+    one = table(ALL[:1], BOXES[:1])
+    assert len(fill_gaps(one, SIZE, 5)) == 1
+
+
+def test_filled_rows_shape_no_ellipsoid_and_no_place() -> None:
+    """Their score is 0: what fits and links by views leaves them out, at any min_score above."""
+    seen = np.delete(ALL, [17, 18, 19])
+    filled = fill_gaps(table(seen, BOXES[seen]), SIZE, 5)
+    camera = rt.Camera("PINHOLE", *SIZE, (500.0, 500.0, 320.0, 240.0))
+    pose = np.repeat(np.eye(3, 4)[None], len(ALL), 0)
+    poses = rt.Poses(camera, ALL, ALL / 30, pose, np.full(len(ALL), "supplied"), "user")
+    views = gather_views(filled, poses, np.zeros(len(filled), np.int64), 1, 0.01)
+    unseen = ALL[~np.isfinite(views.boxes[:, 0, 0])]
+    assert unseen.tolist() == [17, 18, 19]

@@ -1,0 +1,417 @@
+"""From tracklets to objects: joins and splits by appearance and by place in 3D."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import quadrics
+import reobj_track as rt
+from reobj.identity.linking import link
+from reobj.objects import fitter
+
+SIZE = (640, 480)
+CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
+NAMES = rt.COCO_NAMES
+PERSON, CHAIR, CUP = 0, 56, 41
+
+
+def looking_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """cam_from_world (3, 4) of a camera at `eye` in a world with z up."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.c_[rotation, -rotation @ eye]
+
+
+def walk(frames: int = 120, arc_deg: float = 120.0) -> rt.Poses:
+    """An arc around the origin at 3.5 m, z up, metres."""
+    angles = np.radians(np.linspace(-arc_deg / 2, arc_deg / 2, frames))
+    eyes = np.stack([3.5 * np.sin(angles), -3.5 * np.cos(angles), np.full(frames, 1.6)], 1)
+    poses = np.stack([looking_at(eye, np.array([0, 0, 0.4])) for eye in eyes])
+    status, up = np.array(["supplied"] * frames), np.array([0, 0, 1.0])
+    frame = np.arange(frames)
+    return rt.Poses(CAMERA, frame, frame / 30, poses, status, "user", True, up)
+
+
+def chair_solids() -> quadrics.Ellipsoids:
+    """Three equal chairs in a row and nothing else."""
+    centers = np.array([[-1.1, 0, 0.41], [0, 0.1, 0.41], [1.1, 0, 0.41]])
+    cos, sin = np.cos([0.2, 1.1, -0.5]), np.sin([0.2, 1.1, -0.5])
+    turn = np.tile(np.eye(3), (3, 1, 1))
+    turn[:, :2, :2] = np.moveaxis(np.array([[cos, -sin], [sin, cos]]), 2, 0)
+    return quadrics.Ellipsoids(centers, np.tile([0.28, 0.3, 0.41], (3, 1)), turn)
+
+
+def table_of(poses: rt.Poses, solids: quadrics.Ellipsoids | None = None) -> rt.Tracks:
+    """Noisy boxes of the solids (the chairs), one tracklet each; rows ordered by frame.
+
+    `detection_index` tells which solid a row shows.
+    """
+    solids = solids or chair_solids()
+    boxes = quadrics.solid_boxes(solids, "box", poses.camera.K @ poses.cam_from_world)  # (F, O, 4)
+    boxes = boxes + np.random.default_rng(0).normal(0, 1.0, boxes.shape)
+    frame, obj = np.divmod(np.arange(boxes.shape[0] * len(solids)), len(solids))
+    n = len(frame)
+    xyxy, score = boxes.reshape(-1, 4), np.full(n, 0.9)
+    return rt.Tracks(frame, obj + 1, obj + 1, xyxy, score, np.full(n, CHAIR), obj)
+
+
+def views_of(table: rt.Tracks, chair: np.ndarray, twins: float) -> np.ndarray:
+    """Noisy embeddings (N, 12) of the true chairs (N,), with this cosine between chairs 0 and 1."""
+    own = np.eye(3, 12)
+    own[1] = twins * own[0] + np.sqrt(1 - twins**2) * own[1]
+    rows = own[chair] + np.random.default_rng(1).normal(0, 0.03, (len(table), 12))
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+
+def linked(
+    table: rt.Tracks, poses: rt.Poses | None, views: np.ndarray | None = None, **known: object
+) -> tuple[rt.Tracks, list[rt.LinkEvent]]:
+    """`link` with the fit of a run; views: (N, E) embeddings of all rows, default none."""
+    seen = (rt.Embeddings.empty(), np.empty(0, np.int64))
+    if views is not None:
+        seen = (rt.Embeddings(views, np.empty((len(table), 0))), np.arange(len(table)))
+    fit = None if poses is None else fitter(rt.ObjectsConfig(), poses, NAMES)
+    return link(table, NAMES, *seen, poses, fit, **known)  # type: ignore[arg-type]
+
+
+def kinds(events: list[rt.LinkEvent], kept: bool = True) -> set[str]:
+    return {e.kind for e in events if e.kept == kept}
+
+
+def objects_of(table: rt.Tracks, truth: np.ndarray) -> list[list[int]]:
+    """The true things in each object, by identity."""
+    return [np.unique(truth[table.track_id == i]).tolist() for i in np.unique(table.track_id)]
+
+
+# ---- By place ----
+
+
+def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
+    """Each chair's track is cut in two with a gap; the halves are found again, the twins stay
+    apart.
+    """
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.frame < 40) | (table.frame >= 80)]
+    ids = table.track_id + 3 * (table.frame >= 80)
+    found, events = linked(dataclasses.replace(table, track_id=ids, tracklet_id=ids), poses)
+    assert objects_of(found, table.detection_index) == [[0], [1], [2]]
+    assert kinds(events) == {"join"} and kinds(events, kept=False) == set()
+    assert sorted(e.tracklets for e in events) == [(1, 4), (2, 5), (3, 6)]
+    assert all(e.place_iou is not None and e.place_iou > 0.5 for e in events)
+
+
+def test_a_wrong_return_is_split_by_its_place() -> None:
+    """The tracker took the third chair for the first one that came back: two places."""
+    poses = walk()
+    table, chair = table_of(poses), table_of(poses).detection_index
+    table = table[((chair == 0) & (table.frame < 50)) | ((chair == 2) & (table.frame > 70))]
+    one = np.ones(len(table), np.int64)
+    found, events = linked(dataclasses.replace(table, track_id=one), poses)
+    assert objects_of(found, table.detection_index) == [[0], [2]]
+    assert [(e.kind, e.tracklets) for e in events] == [("split", (1, 3))]
+
+
+def test_a_right_return_is_not_split() -> None:
+    """The same chair from two sides: the joint solid explains both visits."""
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
+    found, events = linked(table, poses)
+    assert objects_of(found, table.detection_index) == [[0]] and events == []
+
+
+def test_boxes_that_no_solid_explains_are_not_split_off() -> None:
+    """The return has boxes at random: a solid of its own would be no better than the joint one."""
+    poses = walk()
+    table = table_of(poses)
+    late = table.frame >= 100
+    table = table[(table.detection_index == 0) & ((table.frame < 50) | late & (table.frame < 112))]
+    late, xyxy = table.frame >= 100, table.xyxy.copy()
+    shift = np.random.default_rng(0).uniform(-1.5, 1.5, 12) * (xyxy[late, 2] - xyxy[late, 0])
+    xyxy[late] += shift[:, None] * [1, 0, 1, 0]
+    one = np.ones(len(table), np.int64)
+    table = dataclasses.replace(table, xyxy=xyxy, track_id=one, tracklet_id=1 + late)
+    found, events = linked(table, poses)
+    assert np.unique(found.track_id).tolist() == [1] and events == []
+
+
+def test_a_poor_fit_alone_splits_nothing() -> None:
+    """A thing on a chair went by the chair's identity: two solids would be better, but they are
+    in one place.
+    """
+    table, poses = stacked()
+    one = np.ones(len(table), np.int64)
+    found, events = linked(dataclasses.replace(table, track_id=one), poses)
+    assert np.unique(found.track_id).tolist() == [1] and events == []
+
+
+@pytest.mark.parametrize("slips", [[60], [40, 80], []])
+def test_a_tracklet_that_slipped_is_cut_by_place(slips: list[int]) -> None:
+    """The tracker goes on with another chair without missing a frame; else nothing is cut."""
+    poses = walk()
+    table = table_of(poses)
+    table = table[table.detection_index == np.searchsorted(slips, table.frame, "right")]
+    one = np.ones(len(table), np.int64)
+    found, events = linked(dataclasses.replace(table, track_id=one, tracklet_id=one), poses)
+    truth = np.searchsorted(slips, table.frame, "right") + 1
+    assert len(np.unique(found.track_id)) == len(slips) + 1
+    assert (found.track_id == truth).mean() > 0.9
+    assert ("split" in kinds(events)) == bool(slips)
+
+
+@pytest.mark.parametrize(("gap", "cut"), [(7, True), (4, False)])
+def test_a_tracklet_may_be_another_object_after_a_gap(gap: int, cut: bool) -> None:
+    """For its last five frames, too few to be found by their place, it is on another chair."""
+    poses = walk()
+    table, last = table_of(poses), 70 + gap
+    first = (table.detection_index == 0) & (table.frame < 70)
+    after = (table.detection_index == 2) & (table.frame >= last) & (table.frame < last + 5)
+    table = table[first | after]
+    one = np.ones(len(table), np.int64)
+    found, _ = linked(dataclasses.replace(table, track_id=one, tracklet_id=one), poses)
+    assert (objects_of(found, table.detection_index) == [[0], [2]]) == cut
+
+
+def test_objects_seen_together_are_never_joined() -> None:
+    """Two tracks of one chair in the same frames (a double detection) stay two: the evidence says
+    so. By place and by appearance.
+    """
+    poses = walk()
+    table = table_of(poses)
+    half = table[table.detection_index == 0]
+    order = np.argsort(np.tile(half.frame, 2), kind="stable")
+    ids = np.repeat([1, 2], len(half))[order]
+    double = dataclasses.replace(half[order % len(half)], track_id=ids, tracklet_id=ids)
+    same = views_of(double, 0 * ids, 0.5)
+    for known in ((poses, None), (None, same), (poses, same)):
+        found, events = linked(double, *known)
+        assert np.unique(found.track_id).tolist() == [1, 2] and kinds(events) == set()
+
+
+@pytest.mark.parametrize(
+    ("every", "objects"),  # every n-th late box is still called a chair, the others a cup
+    [(10**6, 2), (3, 1)],
+)
+def test_only_classes_that_the_detector_confuses_are_joined(every: int, objects: int) -> None:
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
+    late = (table.frame > 70).astype(np.int64)
+    class_id = np.where((late == 1) & (table.frame % every != 0), CUP, CHAIR)
+    table = dataclasses.replace(table, track_id=1 + late, tracklet_id=1 + late, class_id=class_id)
+    found, _ = linked(table, poses)
+    assert len(np.unique(found.track_id)) == objects
+
+
+def stacked() -> tuple[rt.Tracks, rt.Poses]:
+    """A chair for 95 frames, then what stands on it, of its class and half its height."""
+    poses = walk()
+    solids = quadrics.Ellipsoids(
+        np.array([[0, 0, 0.41], [0, 0, 0.65]]),
+        np.array([[0.28, 0.3, 0.41], [0.18, 0.18, 0.18]]),
+        np.eye(3)[None].repeat(2, 0),
+    )
+    table = table_of(poses, solids)
+    return table[table.detection_index == (table.frame >= 95)], poses
+
+
+def test_a_join_whose_solid_does_not_explain_both_is_undone() -> None:
+    """Their places overlap enough for a try, but one solid cannot be as large as both."""
+    table, poses = stacked()
+    found, events = linked(table, poses)
+    assert [(e.kind, e.tracklets, e.kept) for e in events] == [("join", (1, 2), False)]
+    assert events[0].place_iou is not None and 0.25 < events[0].place_iou < 0.5
+    assert objects_of(found, table.detection_index) == [[0], [1]]
+
+
+def test_what_moves_stays_as_the_tracker_has_it() -> None:
+    """The same rows as chairs are joined by place and by appearance; as persons they are not."""
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
+    ids = 1 + (table.frame >= 80)
+    for known in ((poses, None), (None, views_of(table, 0 * ids, 0.5))):
+        for kind, objects in ((CHAIR, 1), (PERSON, 2)):
+            rows = dataclasses.replace(
+                table, track_id=ids, tracklet_id=ids, class_id=np.full(len(ids), kind)
+            )
+            found, _ = linked(rows, *known, moving=("person", "dog"))
+            assert len(np.unique(found.track_id)) == objects
+
+
+def test_faint_boxes_say_nothing_about_a_place() -> None:
+    """The return of a chair has faint boxes: below `min_score` it is not recognised by place."""
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
+    ids = 1 + (table.frame >= 80)
+    score = np.where(ids == 2, 0.4, 0.9)
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids, score=score)
+    for min_score, objects in ((0.3, 1), (0.5, 2)):
+        found, events = linked(table, poses, min_score=min_score)
+        assert len(np.unique(found.track_id)) == objects
+        assert len(events) == 2 - objects
+
+
+def test_another_thing_in_the_same_place_is_another_object() -> None:
+    """Someone has put another chair there: what looks so unlike is never joined by place."""
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.detection_index == 0) & ((table.frame < 55) | (table.frame >= 65))]
+    ids = 1 + (table.frame >= 65)
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
+    for cosine, objects in ((-0.9, 2), (0.0, 1)):
+        both = np.array([[1, 0], [cosine, np.sqrt(1 - cosine**2)]])
+        own = both[ids - 1]
+        seen = (rt.Embeddings(own, own), np.arange(len(table)))
+        fit = fitter(rt.ObjectsConfig(), poses, NAMES)
+        found, _ = link(table, NAMES, *seen, poses, fit)
+        assert len(np.unique(found.track_id)) == objects
+
+
+# ---- By appearance ----
+
+
+@pytest.mark.parametrize(
+    ("tracker", "twins", "objects", "expected"),
+    [
+        ([1, 2, 3, 4, 5, 6], 0.5, 3, {"join"}),  # all came back under new identities
+        ([1, 2, 3, 2, 1, 3], 0.5, 3, {"join", "split"}),  # two were taken for each other
+        ([1, 2, 3, 1, 2, 3], 0.5, 3, set()),  # right already
+        ([1, 2, 3, 4, 5, 3], 0.999, 5, set()),  # twins that nothing tells apart stay apart
+    ],
+)
+def test_appearance_alone_decides_without_poses(
+    tracker: list[int], twins: float, objects: int, expected: set[str]
+) -> None:
+    """Three chairs, each seen before frame 40 and after frame 80; what the tracker made of them."""
+    table = table_of(walk())
+    table = table[(table.frame < 40) | (table.frame >= 80)]
+    chair = table.detection_index
+    piece = chair + 3 * (table.frame >= 80)
+    ids = np.array(tracker)[piece]
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=piece + 1)
+    found, events = linked(table, None, views_of(table, chair, twins))
+    assert len(np.unique(found.track_id)) == objects
+    assert kinds(events) == expected
+    assert all(e.place_iou is None and e.kept for e in events)
+    assert all(len(things) == 1 for things in objects_of(found, chair))
+
+
+# Frames of tracklets 0, 1, 2: all apart, or two of them at once; then also where.
+APART, LAST_TWO, FIRST_LAST = ((0, 40, 80), (0, 40, 40), (0, 40, 0))
+
+
+@pytest.mark.parametrize(
+    ("first", "cosine", "beside", "group"),
+    [
+        (APART, {(0, 1): 0.99}, 200, [1, 1, 2]),  # alike
+        (APART, {(0, 1): 0.4}, 200, [1, 2, 3]),  # rather another object
+        ((0, 0, 80), {(0, 1): 0.99}, 200, [1, 2, 3]),  # seen together
+        (APART, {(0, 1): 0.99, (1, 2): 0.99, (0, 2): 0.98}, 200, [1, 1, 1]),
+        (APART, {(0, 1): 0.93, (1, 2): 0.9, (0, 2): 0.7}, 200, [1, 1, 1]),  # through a third
+        (LAST_TWO, {(0, 1): 0.99, (0, 2): 0.6, (1, 2): 0.6}, 200, [1, 1, 2]),  # the better of two
+        (LAST_TWO, {(0, 1): 0.985, (0, 2): 0.984, (1, 2): 0.98}, 200, [1, 2, 3]),  # equal rivals
+        (LAST_TWO, {(0, 1): 0.985, (0, 2): 0.984, (1, 2): 0.98}, 5, [1, 1, 2]),  # two boxes on one
+        (FIRST_LAST, {(0, 1): 0.985, (1, 2): 0.984, (0, 2): 0.98}, 200, [1, 3, 2]),
+    ],
+)
+def test_the_most_similar_are_joined_first_against_their_rivals(
+    first: tuple[int, ...], cosine: dict[tuple[int, int], float], beside: int, group: list[int]
+) -> None:
+    """Three tracklets of ten frames; those at once stand so many pixels from each other."""
+    gram = np.eye(3)
+    for (i, j), value in cosine.items():
+        gram[i, j] = gram[j, i] = value
+    values, vectors = np.linalg.eigh(gram)
+    own = np.pad(vectors * np.sqrt(values.clip(0)), ((0, 0), (0, 3)))  # unit rows of these cosines
+    frame = np.concatenate([np.arange(10) + f for f in first])
+    piece = np.repeat(np.arange(3), 10)
+    left = 100.0 + beside * piece
+    xyxy = np.column_stack([left, 0 * left, left + 100, 0 * left + 100])
+    order = np.argsort(frame, kind="stable")
+    kind = np.full(30, CHAIR)
+    table = rt.Tracks(frame, piece + 1, piece + 1, xyxy, np.full(30, 0.9), kind, piece)[order]
+    found, _ = linked(table, None, own[piece[order]])
+    names = [int(found.track_id[table.detection_index == i][0]) for i in range(3)]
+    assert names == group
+
+
+def test_views_from_another_side_say_less() -> None:
+    """The first and the last views of the chairs, on an arc of 120 degrees around them: with
+    cameras the evidence of every join by appearance is weaker.
+    """
+    poses = walk()
+    table = table_of(poses)
+    table = table[(table.frame < 15) | (table.frame >= 105)]
+    ids = table.tracklet_id + 3 * (table.frame > 60)
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
+    views = views_of(table, table.detection_index, 0.3)
+    odds = []
+    for known in (None, poses):
+        _, events = linked(table, known, views)
+        odds.append([e.appearance_log_odds for e in events if e.place_iou is None])
+        assert len(odds[-1]) == 3
+    assert (np.array(odds[1]) < 0.7 * np.array(odds[0])).all()
+
+
+def test_a_misnamed_piece_does_not_ban_the_return_of_its_tracklet() -> None:
+    """A gap within the second tracklet of a chair, before it the detector says cup."""
+    table = table_of(walk())
+    table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
+    late = (table.frame >= 80).astype(np.int64)
+    class_id = np.where((late == 1) & (table.frame < 84), CUP, CHAIR)
+    table = dataclasses.replace(table, track_id=1 + late, tracklet_id=1 + late, class_id=class_id)
+    table = table[(table.frame < 84) | (table.frame > 93)]
+    found, _ = linked(table, None, views_of(table, table.detection_index, 0.5))
+    assert np.unique(found.track_id).tolist() == [1]
+
+
+@pytest.mark.parametrize(("common", "objects"), [(0.0, 3), (0.9, 6)])
+def test_what_similarity_means_is_learnt_from_the_video(common: float, objects: int) -> None:
+    """The returns are .8 alike: enough where the chairs side by side are not alike at all, too
+    little where these are .7 alike.
+    """
+    table = table_of(walk())
+    table = table[(table.frame < 40) | (table.frame >= 80)]
+    chair = table.detection_index
+    ids = 1 + chair + 3 * (table.frame >= 80)
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
+    own = np.sqrt(common) * np.eye(1, 40) + np.sqrt(1 - common) * np.eye(3, 40, 1)[chair]
+    visit = np.eye(6, 40, 10)[ids - 1]  # what changed until the return
+    views = np.sqrt(0.8) * own + np.sqrt(0.2) * visit
+    views += np.random.default_rng(2).normal(0, 0.03, views.shape)
+    found, _ = linked(table, None, views / np.linalg.norm(views, axis=1, keepdims=True))
+    assert len(np.unique(found.track_id)) == objects
+
+
+def test_views_of_a_tracklet_tell_how_much_one_object_varies() -> None:
+    """Appearance turns by .9 degrees a frame: within a tracklet as much as until the return.
+
+    (Views of the same moment would tell nothing: they are all alike.)
+    """
+    table = table_of(walk())
+    table = table[(table.frame < 40) | (table.frame >= 80)]
+    chair = table.detection_index
+    ids = 1 + chair + 3 * (table.frame >= 80)
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
+    angle, views = np.radians(0.9) * table.frame, np.zeros((len(table), 6))
+    views[np.arange(len(table)), 2 * chair] = np.cos(angle)
+    views[np.arange(len(table)), 2 * chair + 1] = np.sin(angle)
+    found, _ = linked(table, None, views)
+    assert objects_of(found, chair) == [[0], [1], [2]]
+
+
+def test_identities_are_numbered_by_first_appearance() -> None:
+    """Also where nothing is joined or split; no rows stay no rows."""
+    table = table_of(walk(12))
+    found, events = linked(dataclasses.replace(table, track_id=9 - table.track_id), None)
+    assert found.track_id.tolist() == table.track_id.tolist() and events == []
+    nothing, events = linked(rt.Tracks.empty(), None)
+    assert len(nothing) == 0 and events == []

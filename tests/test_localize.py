@@ -1,0 +1,179 @@
+"""Frames between keyframes: PnP, followed points, jumps, gaps, against exactly drawn worlds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pose_worlds import DotWorld, FakeVideo, look_at, sideways, some_cameras, turn_deg
+
+import reobj_track as rt
+from reobj.cameras import SparseModel, invert_rigid
+from reobj.files import Progress
+from reobj.poses.keyframes import ResizedVideo
+from reobj.poses.localize import absolute_pose, fill_gaps, locate_between
+
+pytest.importorskip("pycolmap")
+
+
+def centres(cams):
+    return invert_rigid(cams)[..., 3]
+
+
+# ---- PnP -----------------------------------------------------------------------------------------
+
+OPENCV = rt.Camera("OPENCV", 640, 480, (500.0, 490.0, 322.0, 238.0, -0.1, 0.02, 0.001, -0.001))
+
+
+def seen_points(count, wrong=0, noise_px=0.3, seed=0, camera=OPENCV):
+    """A pose, points, and their pixels by pycolmap's camera; the first `wrong` are outliers."""
+    rng, pose = np.random.default_rng(seed), some_cameras()[4]
+    in_cam = np.column_stack([rng.uniform(-1.2, 1.2, (count, 2)), rng.uniform(2, 6, count)])
+    points = (in_cam - pose[:, 3]) @ pose[:, :3]
+    xy = np.array(camera.to_pycolmap().img_from_cam(in_cam)).reshape(-1, 2)
+    xy += rng.normal(0, noise_px, xy.shape)
+    xy[:wrong] = rng.uniform([0, 0], [640, 480], (wrong, 2))
+    return pose, points, xy
+
+
+def test_a_pose_is_found_among_outliers():
+    pose, points, xy = seen_points(80, wrong=30)
+    found = absolute_pose(xy, points, OPENCV, 640, 0)
+    assert turn_deg(found[None], pose[None]) < 0.1
+    assert np.linalg.norm(centres(found) - centres(pose)) < 0.01
+
+
+@pytest.mark.parametrize(
+    "count, wrong, found",
+    [(15, 0, True), (14, 0, False), (60, 25, True), (60, 40, False)],  # 15 inliers, half of all
+)
+def test_a_pose_needs_inliers(count, wrong, found):
+    _, points, xy = seen_points(count, wrong, noise_px=0.1)
+    assert (absolute_pose(xy, points, OPENCV, 640, 0) is not None) == found
+
+
+def test_the_error_is_counted_in_pixels_of_the_resized_image():
+    """6 px of noise at 640: too much at full size, 1.5 px of an image a quarter as wide."""
+    _, points, xy = seen_points(200, noise_px=6)
+    assert absolute_pose(xy, points, OPENCV, 640, 0) is None
+    assert absolute_pose(xy, points, OPENCV, 160, 0) is not None
+
+
+def test_the_seed_decides_the_samples():
+    _, points, xy = seen_points(60, wrong=10, noise_px=2.5)
+    first, again, *others = (
+        absolute_pose(xy, points, OPENCV, 640, seed) for seed in (0, 0, *range(1, 10))
+    )
+    np.testing.assert_array_equal(first, again)
+    assert any((other != first).any() for other in others)
+
+
+# ---- Frames between keyframes of a known model ---------------------------------------------------
+
+WORLD = DotWorld()
+
+
+def true_model(cams, key_rows, native=1):
+    """What a perfect reconstruction of the keyframes holds, pixels `native` times as fine."""
+    obs = []
+    for image, row in enumerate(key_rows):
+        xy, seen = WORLD.project(cams[row])
+        obs += [(image, point, *(native * xy[point])) for point in np.flatnonzero(seen)]
+    table, count = np.array(obs), len(WORLD.points)
+    camera = WORLD.camera.resized((native * 480, native * 360))
+    point = table[:, 1].astype(np.int64)
+    return SparseModel(
+        tuple(map(str, key_rows)),
+        [camera] * len(key_rows),
+        cams[key_rows],
+        WORLD.points,
+        np.zeros((count, 3), np.uint8),
+        np.bincount(point, minlength=count),
+        table[:, 0].astype(np.int64),
+        point,
+        table[:, 2:],
+    )
+
+
+def locate(cams, key_rows, images=None, native=1, seed=0):
+    images = [WORLD.image(c) for c in cams] if images is None else images
+    resized = ResizedVideo(FakeVideo(images), 480)
+    list(resized.first_pass(Progress("test")))
+    model = true_model(cams, key_rows, native)
+    return locate_between(model, np.array(key_rows), resized, seed, Progress("test"))
+
+
+@pytest.mark.parametrize("native", [1, 2])
+def test_frames_between_before_and_behind_keyframes_are_located(native):
+    """Half a pixel would turn the cameras by .07 deg: the centre of a pixel is where it should."""
+    cams = sideways(14)
+    found, status = locate(cams, [2, 7, 11], native=native)
+    expected = ["keyframe" if i in (2, 7, 11) else "pnp" for i in range(14)]
+    assert status.tolist() == expected
+    assert np.median(turn_deg(found, cams)) < 0.02 and turn_deg(found, cams).max() < 0.04
+    assert np.linalg.norm(centres(found) - centres(cams), axis=1).max() < 0.004
+
+
+def test_frames_without_the_points_are_lost():
+    cams = sideways(9)
+    images = [WORLD.image(c) for c in cams]
+    images[3:6] = [np.full_like(images[0], 128)] * 3
+    _, status = locate(cams, [0, 8], images)
+    assert status.tolist() == ["keyframe", "pnp", "pnp", *["none"] * 3, "pnp", "pnp", "keyframe"]
+
+
+@pytest.mark.parametrize("aside, status", [(0.0, "pnp"), (0.03, "pnp"), (0.3, "none")])
+def test_a_frame_far_from_both_neighbours_is_refused(aside, status):
+    """Steps are 2 cm: drawn 3 cm aside a frame is a shake of the hand, drawn 30 cm a jump."""
+    cams = sideways(11)
+    moved = cams.copy()
+    moved[5, :, 3] -= cams[5, :, :3] @ [0, aside, 0]
+    found, seen = locate(cams, [0, 10], [WORLD.image(c) for c in moved])
+    assert seen.tolist() == ["keyframe", *["pnp"] * 4, status, *["pnp"] * 4, "keyframe"]
+    assert np.isnan(found[5]).all() == (status == "none")
+    if status == "pnp":
+        np.testing.assert_allclose(centres(found[5]), centres(moved[5]), atol=0.004)
+
+
+def test_where_a_camera_turns_back_is_no_jump():
+    """The neighbours of the farthest frame are at one place; it is a usual step away."""
+    cams = sideways(6, step=0.04)
+    there_and_back = cams[[0, 1, 2, 3, 2, 1, 0]]
+    _, status = locate(there_and_back, [0, 6])
+    assert status.tolist() == ["keyframe", *["pnp"] * 5, "keyframe"]
+
+
+# ---- Gaps ----------------------------------------------------------------------------------------
+
+
+def with_gaps(cams, lost):
+    cams = cams.copy()
+    cams[lost] = np.nan
+    return cams, np.where(np.isnan(cams[:, 0, 0]), "none", "pnp").astype("<U12")
+
+
+def test_gaps_are_filled_on_a_line_and_never_beyond():
+    path = np.linspace([0, 0, 0], [1, 0.2, 0.1], 11)
+    cams = np.array([look_at(c, c + np.array([0.1, 4, -1])) for c in path])
+    lost, status = with_gaps(cams, [0, 1, 4, 5, 6])
+    filled, new = fill_gaps(np.arange(11), lost, status, 3)
+    np.testing.assert_allclose(filled[2:], cams[2:], atol=1e-9)  # straight and without turning
+    expected = ["none"] * 2 + ["pnp"] * 2 + ["interpolated"] * 3 + ["pnp"] * 4
+    assert np.isnan(filled[:2]).all() and new.tolist() == expected
+    untouched, _ = fill_gaps(np.arange(11), lost, status, 2)
+    assert np.isnan(untouched[4:7]).all()
+    sparse, _ = fill_gaps(10 * np.arange(11), lost, status, 3)  # every 10th frame: 39 are missing
+    assert np.isnan(sparse[4:7]).all() and np.isnan(lost[4:7]).all()
+
+
+def test_a_turning_camera_keeps_its_centre_on_the_line_and_turns_evenly():
+    """A quarter turn while walking: half way it has turned by half, at half of the way."""
+    cams = np.zeros((5, 3, 4))
+    for i in range(5):
+        angle = np.radians(22.5 * i)
+        c, s = np.cos(angle), np.sin(angle)
+        cams[i, :, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+        cams[i, :, 3] = -cams[i, :, :3] @ [i, 2 * i, 0]
+    filled, _ = fill_gaps(np.arange(5), *with_gaps(cams, [1, 2, 3]), 3)
+    np.testing.assert_allclose(filled, cams, atol=1e-9)
+    uneven, _ = fill_gaps(np.array([0, 1, 4]), *with_gaps(cams[[0, 1, 4]], [1]), 3)
+    np.testing.assert_allclose(uneven[1], cams[1], atol=1e-9)

@@ -1,0 +1,278 @@
+"""Reconstruction of keyframes: accuracy, refusals, the child process, a killed run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pose_accuracy
+import pytest
+from pose_worlds import DotWorld, ate_percent, textured_room
+
+import reobj_track as rt
+from reobj.cameras import read_sparse_model
+from reobj.files import Progress
+from reobj.poses.mapping import reconstruct
+
+pycolmap = pytest.importorskip("pycolmap")
+
+
+def run(folder, images, boxes=None, size=None, camera=None, guesses=(0.8,), seed=0, progress=None):
+    """Reconstruct; messages, and the model or None."""
+    messages = reconstruct(
+        images,
+        [f"{i:03d}.jpg" for i in range(len(images))],
+        [np.empty((0, 4))] * len(images) if boxes is None else boxes,
+        size or images[0].shape[1::-1],
+        camera=camera,
+        focal_guesses=[] if camera else list(guesses),
+        seed=seed,
+        work_dir=folder,
+        progress=progress or Progress,
+    )
+    sparse = folder / "sparse"
+    return messages, read_sparse_model(sparse) if sparse.exists() else None
+
+
+def truth_of(model, poses):
+    return poses[[int(name[:3]) for name in model.names]]
+
+
+# ---- What comes out ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """Eight views of a corner of a room, their true poses, folder, messages, model."""
+    images, truth = textured_room(8, 0.45, -3, size=(320, 240))
+    folder = tmp_path_factory.mktemp("mapping")
+    return images, truth, folder, *run(folder, images)
+
+
+def test_a_walk_is_reconstructed_with_its_focal_length(walk):
+    _, truth, folder, messages, model = walk
+    assert messages == [] and model.names == tuple(f"{i:03d}.jpg" for i in range(8))
+    assert ate_percent(model.cam_from_world, truth_of(model, truth)) < 1.0
+    assert model.cameras[0].K[0, 0] == pytest.approx(0.9 * 320, rel=0.03)
+    assert len(model.points) > 300 and (folder / "pycolmap.log").stat().st_size > 0
+
+
+def test_points_have_the_colour_of_their_pixels(walk):
+    images, _, _, _, model = walk
+    x, y = np.floor(model.obs_xy).astype(int).T
+    pixels = np.array(images)[model.obs_image, y, x, ::-1]
+    same = (pixels == model.colors[model.obs_point]).all(1)  # (M,)
+    assert set(model.obs_point[same]) == set(range(len(model.points)))
+
+
+def test_the_same_seed_gives_the_same_bytes(walk, tmp_path):
+    images, _, folder, *_ = walk
+    for seed, same in ((0, True), (7, False)):
+        run(tmp_path / str(seed), images, seed=seed)
+        found = (tmp_path / str(seed) / "sparse" / "points3D.bin").read_bytes()
+        assert ((folder / "sparse" / "points3D.bin").read_bytes() == found) == same
+
+
+def test_calibration_starts_from_the_focal_guess_and_leaves_it(walk, tmp_path):
+    """Other bits, the same focal length."""
+    images, _, _, _, model = walk
+    messages, other = run(tmp_path, images, guesses=[1.1])
+    assert messages == [] and (other.cam_from_world != model.cam_from_world).any()
+    assert other.cameras[0].K[0, 0] == pytest.approx(model.cameras[0].K[0, 0], rel=0.01)
+
+
+def arc(count, half_rad):
+    """cam_from_world (F, 3, 4) of a camera that looks inward from an arc."""
+    cams = np.zeros((count, 3, 4))
+    for i, a in enumerate(np.linspace(-half_rad, half_rad, count)):
+        c, s = np.cos(a), np.sin(a)
+        cams[i] = [[c, 0, -s, -8 * a], [0, 1, 0, 0.05 * i], [s, 0, c, 0]]
+    return cams
+
+
+def test_with_little_parallax_the_guess_is_kept_and_said(tmp_path):
+    world = DotWorld(count=1200)
+    messages, model = run(tmp_path, [world.image(c) for c in arc(8, 0.15)], guesses=[1.0])
+    assert "little parallax" in messages[0] and "taken as 1 x" in messages[0]
+    assert len(messages) == 1 and model.cameras[0].K[0, 0] == 480
+
+
+def test_a_given_camera_is_kept(walk, tmp_path):
+    images, truth, *_ = walk
+    camera = rt.Camera("OPENCV", 640, 480, (576.0, 576.0, 320.0, 240.0, 0, 0, 0, 0))
+    messages, model = run(tmp_path, images, size=(640, 480), camera=camera)
+    assert messages == [] and model.cameras[0] == camera
+    assert ate_percent(model.cam_from_world, truth_of(model, truth)) < 1.0
+    assert model.obs_xy.max() > 340  # native pixels
+
+
+def test_boxes_of_moving_things_hold_no_features(walk, tmp_path):
+    """The left half, given in pixels of frames twice as large."""
+    images = walk[0]
+    boxes = [np.array([[0, 0, 320.0, 480]])] * len(images)
+    _, model = run(tmp_path, images, boxes, size=(640, 480))
+    assert len(model.obs_xy) > 300 and model.obs_xy[:, 0].min() > 310
+
+
+def test_features_lie_where_the_dots_are(tmp_path):
+    """Dots at exactly known places. OpenCV's SIFT is off by a quarter of a pixel (it halves the
+    coordinates of an image that it has doubled); COLMAP's half pixel is another matter.
+    """
+    world = DotWorld(count=500)
+    cams = arc(6, 0.1)
+    _, model = run(tmp_path, [world.image(c) for c in cams], camera=world.camera)
+    off = []
+    for image, name in enumerate(model.names):
+        xy, _ = world.project(cams[int(name[:3])])
+        for seen in model.obs_xy[model.obs_image == image]:
+            nearest = np.linalg.norm(xy - seen, axis=1).argmin()
+            off.append(seen - xy[nearest])
+    assert len(off) > 100
+    np.testing.assert_allclose(np.median(off, axis=0), 0.25, atol=0.1)
+
+
+# ---- Refusals ------------------------------------------------------------------------------------
+
+# images, word of the message
+REFUSED = {
+    "two images": (lambda: textured_room(2, 0.5)[0], "only 2 different views"),
+    "noise": (
+        lambda: list(np.random.default_rng(0).integers(0, 255, (6, 240, 320, 3), np.uint8)),
+        "no two keyframes|keyframes connect",
+    ),
+    "turn on the spot": (lambda: textured_room(8, 0, 4, size=(320, 240))[0], "mere turn"),
+    "turn with little motion": (
+        lambda: textured_room(8, 0.005, 4, size=(320, 240))[0],
+        "mere turn",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_has_no_depth_is_refused_and_the_message_says_what_helps(tmp_path, name):
+    images, message = REFUSED[name]
+    messages, model = run(tmp_path, images())
+    assert model is None and len(messages) == 1 and "--poses" in messages[0]
+    assert any(part in messages[0] for part in message.split("|")), messages
+
+
+def test_a_turn_is_refused_with_a_given_camera_too(tmp_path):
+    images = textured_room(6, 0, 4, size=(320, 240))[0]
+    camera = rt.Camera("PINHOLE", 320, 240, (288.0, 288.0, 160.0, 120.0))
+    messages, model = run(tmp_path, images, camera=camera)
+    assert model is None
+    assert "mere turn" in messages[0] or "no two keyframes" in messages[0]
+
+
+def test_images_that_do_not_connect_are_refused(walk, tmp_path):
+    rng = np.random.default_rng(0)
+    noise = list(rng.integers(0, 255, (10, 240, 320, 3), np.uint8))
+    messages, model = run(tmp_path, walk[0] + noise)
+    assert model is None and "of 18 keyframes connect" in messages[0]
+
+
+# ---- The child process ---------------------------------------------------------------------------
+
+
+def test_the_child_is_found_from_anywhere(walk, tmp_path, monkeypatch):
+    """Other working directory with modules of the same names, and a PYTHONPATH of the user's."""
+    for name in ("reobj", "numpy", "pycolmap"):
+        (tmp_path / "here" / name).mkdir(parents=True)
+        (tmp_path / "here" / name / "__init__.py").write_text("raise SystemExit(3)")
+    (tmp_path / "theirs" / "reobj").mkdir(parents=True)
+    (tmp_path / "theirs" / "reobj" / "__init__.py").write_text("raise SystemExit(4)")
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "theirs"))
+    messages, model = run(Path("out"), walk[0])  # a relative folder
+    assert messages == [] and len(model.names) == 8
+
+
+def test_the_users_pythonpath_reaches_the_child(walk, tmp_path, monkeypatch):
+    """Where pycolmap lies in it, it must."""
+    note = tmp_path / "note"
+    (tmp_path / "sitecustomize.py").write_text(f"open({str(note)!r}, 'w').write('was here')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    run(tmp_path / "out", walk[0][:3])
+    assert note.read_text() == "was here"
+
+
+def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
+    """The package copied to a site folder, imported from there, in a process of its own."""
+    package = Path(rt.__file__).parent / "reobj"
+    shutil.copytree(package, tmp_path / "site" / "reobj")
+    np.save(tmp_path / "images.npy", np.array(walk[0]))
+    code = (
+        "import numpy as np; from pathlib import Path; from reobj.files import Progress;"
+        "from reobj.poses import mapping; images = list(np.load('images.npy'));"
+        "print(mapping.__file__, mapping.reconstruct(images, list('abcdefgh'),"
+        "[np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guesses=[0.8], seed=0,"
+        "work_dir=Path('out'), progress=Progress))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
+    command = [sys.executable, "-P", "-c", code]
+    result = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert str(tmp_path / "site") in result.stdout and result.stdout.strip().endswith("[]")
+    assert (tmp_path / "out" / "sparse" / "images.bin").exists()
+
+
+def test_an_aborted_child_is_reported(walk, tmp_path, monkeypatch):
+    script = tmp_path / "abort.sh"
+    script.write_text("#!/bin/sh\nkill -ABRT $$\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    messages, model = run(tmp_path, walk[0])
+    assert model is None and "signal 6" in messages[0] and "pycolmap.log" in messages[0]
+
+
+def test_a_killed_run_goes_on_where_it_stopped(walk, tmp_path):
+    """The second run takes features and matches from the first and ends with the same bytes."""
+    images, _, folder, *_ = walk
+    started = []
+
+    def note(stage, total):
+        started.append(stage)
+        if stage == "mapping" and started.count("mapping") == 1:
+            raise KeyboardInterrupt
+        return Progress(stage, total)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, images, progress=note)
+    assert started == ["features", "match", "mapping"]
+    run(tmp_path, images, progress=note)
+    assert started[3:] == ["match", "mapping"]
+    sparse = [f / "sparse" / "points3D.bin" for f in (tmp_path, folder)]
+    assert sparse[0].read_bytes() == sparse[1].read_bytes()
+    started.append("mapping")
+    run(tmp_path, images, seed=1, progress=note)  # other input: from the start
+    assert "features" in started[6:]
+
+
+# ---- Experiment of examples/pose_accuracy.py -----------------------------------------------------
+
+
+@pytest.mark.parametrize("noise_px, used", [(0, 4), (150, 0)])
+def test_objects_as_landmarks_never_worsen_the_points(walk, noise_px, used):
+    rng = np.random.default_rng(0)
+    model = pycolmap.Reconstruction(str(walk[2] / "sparse"))
+    longest = sorted(model.points3D.values(), key=lambda p: -p.track.length())[:4]
+    objects = [
+        {
+            model.image(e.image_id).name: np.tile(
+                model.image(e.image_id).point2D(e.point2D_idx).xy + rng.normal(0, noise_px, 2), 2
+            )
+            + np.array([-20, -15, 20, 15])
+            for e in point.track.elements
+        }
+        for point in longest
+    ]
+    adjusted, alone, together, count = pose_accuracy.refine_together(model, objects)
+    assert count == used and (adjusted is model) == (used == 0)
+    if used:
+        assert together <= 1.001 * alone and adjusted.num_points3D() == model.num_points3D()
+    assert pose_accuracy.refine_together(model, [])[0] is model

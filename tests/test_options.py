@@ -1,0 +1,816 @@
+"""Options: how many, how they are set, and that every one is obeyed where it is read.
+
+`SHOWN` has one check for each option: it sets the option and sees the effect. A new option without
+a check fails here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quadrics
+import reobj.poses.estimate as estimate
+import reobj.poses.stage as stage
+import reobj.sources.detectors as detectors
+import reobj_track as rt
+from reobj.cameras import load_poses, save_poses, write_colmap
+from reobj.options import every_option, list_options, with_option
+from reobj.sources.weights import own_models
+
+CHAIR = 56
+CAMERA_TEXT = "300,300,160,120"
+CAMERA = rt.Camera("PINHOLE", 320, 240, (300.0, 300.0, 160.0, 120.0))
+
+
+# ---- How many, and their list ----
+
+
+def test_options_are_few_enough_to_read() -> None:
+    sections = [f for f in dataclasses.fields(rt.Config) if f.default is dataclasses.MISSING]
+    solver = dataclasses.fields(quadrics.FitConfig)
+    assert len(every_option(rt.Config())) + len(sections) + len(solver) <= 60
+    assert len(solver) == 8
+
+
+def test_the_list_of_options_fits_two_screens(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as done:
+        rt.main(["--options"])
+    lines = capsys.readouterr().out.splitlines()
+    assert done.value.code == 0
+    assert len(lines) <= 100 and max(map(len, lines)) <= 120
+    named = [line.partition("=")[0] for line in lines if not line.startswith(" ")]
+    assert named == list(every_option(rt.Config()))
+
+
+def test_every_option_says_what_it_does() -> None:
+    """In words, with its default; and no two flags are the same."""
+    options = every_option(rt.Config())
+    assert all(len(f.metadata["help"].split()) >= 2 for f in options.values())
+    flags = [f.metadata["flag"] for f in options.values() if f.metadata["flag"]]
+    assert len(set(flags)) == len(flags) and all(flag.startswith("--") for flag in flags)
+    text = list_options(rt.Config())
+    assert "tracker.coast_frames=30 " in text and "detect.model=deimv2-f" in text
+
+
+# ---- How they are set ----
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[rt.Config]:
+    """The configurations that reach `run`, which does nothing."""
+    configs: list[rt.Config] = []
+
+    def noted(source: str, out: str, config: rt.Config, **_: Any) -> Any:
+        configs.append(config)
+        return SimpleNamespace(summary=lambda: "")
+
+    monkeypatch.setattr(rt, "run", noted)
+    return configs
+
+
+def value_of(config: rt.Config, name: str) -> Any:
+    section, _, field = name.rpartition(".")
+    return getattr(getattr(config, section) if section else config, field)
+
+
+def other_value(default: Any) -> Any:
+    """A value that is not the default, of its type."""
+    if isinstance(default, bool):
+        return not default
+    return f"{default}x" if isinstance(default, str) else type(default)(default + 3)
+
+
+@pytest.mark.parametrize("name", every_option(rt.Config()))
+def test_set_changes_one_option(name: str, seen: list[rt.Config]) -> None:
+    wanted = other_value(value_of(rt.Config(), name))
+    assert rt.main(["run", "a.mp4", "-o", "out", "--set", f"{name}={wanted}"]) == 0
+    for other in every_option(rt.Config()):
+        expected = wanted if other == name else value_of(rt.Config(), other)
+        assert value_of(seen[0], other) == expected
+        assert type(value_of(seen[0], other)) is type(expected)
+
+
+def test_flags_set_their_options(seen: list[rt.Config]) -> None:
+    """Every flag of `run`, all at once; `track` knows none of cameras and objects."""
+    flags = {n: f for n, f in every_option(rt.Config()).items() if f.metadata["flag"]}
+    words, wanted = [], {}
+    for name, f in flags.items():
+        wanted[name] = other_value(f.default)
+        words += [f.metadata["flag"]] + ([] if f.default is False else [str(wanted[name])])
+    assert rt.main(["run", "a.mp4", "-o", "out", *words]) == 0
+    assert {name: value_of(seen[0], name) for name in flags} == wanted
+    assert len(flags) >= 12
+    with pytest.raises(SystemExit):
+        rt.main(["track", "a.mp4", "-o", "out", "--priors", "p.json"])
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("true", True), ("On", True), ("1", True), ("no", False), ("off", False), ("FALSE", False)],
+)
+def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> None:
+    assert rt.main(["run", "a.mp4", "-o", "out", "--set", f"output.overlay={text}"]) == 0
+    assert seen[0].output.overlay is value
+
+
+@pytest.mark.parametrize(
+    ("item", "expected"),
+    [
+        ("tracker.coast_frame=3", "no such option; did you mean tracker.coast_frames?"),
+        ("traker.n_init=3", "no such option; did you mean tracker.n_init?"),
+        ("quite.else=3", "no such option; did you mean"),
+        ("input=3", "no such option; did you mean"),
+        ("tracker.n_init=three", "expected =INT, found 'three'"),
+        ("tracker.n_init=2.5", "expected =INT, found '2.5'"),
+        ("tracker.high_score=much", "expected =FLOAT, found 'much'"),
+        ("output.overlay=maybe", "expected =BOOL, found 'maybe'"),
+        ("tracker.n_init", "expected =INT, found None"),
+    ],
+)
+def test_a_wrong_set_is_one_line(
+    item: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rt.main(["run", "a.mp4", "-o", "out", "--set", item]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and expected in said and f"--set {item.partition('=')[0]}" in said
+
+
+# ---- Every one is obeyed ----
+
+
+class Lab:
+    """Small inputs, and configurations with the option under test changed."""
+
+    def __init__(self, name: str, path: Path, patch: pytest.MonkeyPatch, room: Path) -> None:
+        self.name, self.path, self.patch, self.room = name, path, patch, room
+
+    def config(self, value: Any, **others: Any) -> rt.Config:
+        """The option set to this value; others as section__field=value."""
+        config = with_option(rt.Config(), self.name, value)
+        for name, other in others.items():
+            config = with_option(config, name.replace("__", "."), other)
+        return config
+
+    def tracker(self, value: Any) -> rt.Tracker:
+        return rt.Tracker(self.config(value).tracker)
+
+    def frames(self, value: Any) -> list[int]:
+        """Numbers of the frames that are read of a folder of six images."""
+        folder = images(self.path / "images", 6)
+        return [frame.index for frame in rt.Video(folder, self.config(value).input)]
+
+    def refit(self, value: Any, **others: Any) -> rt.Result:
+        """Link, fit and write again what the room's folder holds."""
+        config = self.config(value, output__overlay=False, output__scene=False)
+        for name, other in others.items():
+            config = with_option(config, name.replace("__", "."), other)
+        out = self.path / f"out-{value}".replace("/", "_")
+        shutil.copytree(self.room, out)
+        return rt.refit(out, config)
+
+    def caught(self, module: Any, function: str, parameter: str) -> list[Any]:
+        """Values that reach a parameter of a function, which is called all the same."""
+        real, values = getattr(module, function), []
+        signature = inspect.signature(real)
+
+        def noted(*args: Any, **known: Any) -> Any:
+            bound = signature.bind(*args, **known)
+            bound.apply_defaults()
+            values.append(bound.arguments[parameter])
+            return real(*args, **known)
+
+        self.patch.setattr(module, function, noted)
+        return values
+
+
+SHOWN: dict[str, Callable[[Lab], None]] = {}
+
+
+def shows(name: str) -> Callable[[Callable[[Lab], None]], Callable[[Lab], None]]:
+    def register(check: Callable[[Lab], None]) -> Callable[[Lab], None]:
+        SHOWN[name] = check
+        return check
+
+    return register
+
+
+def images(folder: Path, count: int, size: tuple[int, int] = (320, 240)) -> Path:
+    """Images with texture, all the same."""
+    folder.mkdir()
+    noise = np.random.default_rng(0).integers(0, 256, (size[1] // 8, size[0] // 8, 3), np.uint8)
+    picture = cv2.resize(noise, size, interpolation=cv2.INTER_CUBIC)
+    for i in range(count):
+        cv2.imwrite(str(folder / f"{i:04d}.jpg"), picture)
+    return folder
+
+
+def rows(*boxes: tuple[float, ...]) -> rt.Detections:
+    """Detections from x1, y1, x2, y2[, score] tuples."""
+    table = [(*box[:4], box[4] if len(box) > 4 else 0.9, CHAIR) for box in boxes]
+    return rt.Detections.from_array(table)
+
+
+def test_every_option_is_shown_to_be_obeyed() -> None:
+    assert set(SHOWN) == set(every_option(rt.Config()))
+
+
+@pytest.mark.parametrize("name", every_option(rt.Config()))
+def test_option_is_obeyed(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: Path
+) -> None:
+    SHOWN[name](Lab(name, tmp_path, monkeypatch, room))
+
+
+# ---- input ----
+
+
+@shows("input.every")
+def _(lab: Lab) -> None:
+    assert lab.frames("4") == [0, 4]
+
+
+@shows("input.start")
+def _(lab: Lab) -> None:
+    assert lab.frames("4") == [4, 5]
+
+
+@shows("input.stop")
+def _(lab: Lab) -> None:
+    assert lab.frames("2") == [0, 1]
+
+
+@shows("input.max_size")
+def _(lab: Lab) -> None:
+    video = rt.Video(images(lab.path / "images", 1), lab.config("80").input)
+    assert [frame.image.shape for frame in video] == [(60, 80, 3)]
+
+
+# ---- detect ----
+
+
+class Session:
+    """An onnxruntime session of the YOLOv8 layout for images of 64 px; it always sees these."""
+
+    BOXES = ((32, 32, 20, 20, 0.9, 1), (35, 32, 20, 20, 0.5, 1), (10, 10, 8, 8, 0.05, 0))
+
+    def __init__(self, *_: Any) -> None:
+        self.table = np.zeros((1, 4 + 3, 64 + 16 + 4), np.float32)
+        for i, (*box, score, kind) in enumerate(self.BOXES):
+            self.table[0, :4, i], self.table[0, 4 + kind, i] = box, score
+
+    def get_inputs(self) -> list[Any]:
+        return [SimpleNamespace(name="images", shape=[1, 3, 64, 64], type="tensor(float)")]
+
+    def get_outputs(self) -> list[Any]:
+        return [SimpleNamespace(name="out")]
+
+    def get_modelmeta(self) -> Any:
+        names = "{0: 'mouse', 1: 'chair', 2: 'dog'}"
+        return SimpleNamespace(custom_metadata_map={"names": names})
+
+    def run(self, *_: Any) -> list[np.ndarray]:
+        return [self.table]
+
+
+def by_network(lab: Lab, value: Any) -> tuple[rt.Detections, tuple[str, ...]]:
+    """What an ONNX detector finds with the option set, in 64 px of grey."""
+    lab.patch.setattr(detectors, "onnx_session", Session)
+    model = lab.path / "model.onnx"
+    model.touch()
+    detector = rt.OnnxDetector(model, lab.config(value).detect)
+    return detector(np.full((64, 64, 3), 128, np.uint8)), detector.class_names
+
+
+def by_file(lab: Lab, value: Any) -> tuple[rt.Detections, tuple[str, ...]]:
+    """What recorded detections hold for frame 0 with the option set: two chairs and a mouse."""
+    table = lab.path / "det.csv"
+    table.write_text("frame,x1,y1,x2,y2,score,class\n" + "".join(
+        f"0,{x - w / 2},{y - h / 2},{x + w / 2},{y + h / 2},{score},{('mouse', 'chair')[kind]}\n"
+        for x, y, w, h, score, kind in Session.BOXES
+    ))  # fmt: skip
+    folder = lab.path / "images"
+    video = rt.Video(folder if folder.exists() else images(folder, 1))
+    recorded = rt.read_detections(table, video, lab.config(value).detect)
+    return recorded.at(0), recorded.class_names
+
+
+@shows("detect.model")
+def _(lab: Lab) -> None:
+    with pytest.raises(rt.ReobjError, match="no-such-model"):
+        rt.OnnxDetector("", lab.config("no-such-model").detect)
+    video = rt.Video(images(lab.path / "images", 1))
+    with pytest.raises(rt.ReobjError, match="no-such-model"):
+        rt.open_detections(video, lab.config("no-such-model").detect)
+
+
+@shows("detect.min_score")
+def _(lab: Lab) -> None:
+    for find in (by_network, by_file):
+        for value, scores in ((0.01, [0.9, 0.5, 0.05]), (0.1, [0.9, 0.5]), (0.6, [0.9])):
+            expected = [s for s in scores if find is by_file or s != 0.5]  # NMS drops that one
+            assert find(lab, value)[0].score.tolist() == pytest.approx(expected)
+
+
+@shows("detect.nms_iou")
+def _(lab: Lab) -> None:
+    """Two chairs overlap by .74."""
+    assert [len(by_network(lab, value)[0]) for value in (0.7, 0.8)] == [1, 2]
+
+
+@shows("detect.classes")
+def _(lab: Lab) -> None:
+    assert len(by_file(lab, "chair")[0]) == 2
+    assert len(by_network(lab, "chair")[0]) == 1
+    for find in (by_network, by_file):
+        assert len(find(lab, "mouse")[0]) == 0  # it is below min_score
+    assert len(by_network(lab, "dog")[0]) == 0
+
+
+@shows("detect.class_names")
+def _(lab: Lab) -> None:
+    names = lab.path / "names.txt"
+    names.write_text("mouse\nstool\nchair\n")
+    found, known = by_network(lab, str(names))
+    assert known == ("mouse", "stool", "chair") and found.class_id.tolist() == [1]
+    found, known = by_file(lab, str(names))
+    assert known == ("mouse", "stool", "chair") and found.class_id.tolist() == [2, 2]
+    source = rt.open_detections(
+        rt.Video(lab.path / "images"), lab.config(str(names)).detect, lambda image: []
+    )
+    assert source.class_names == ("mouse", "stool", "chair")
+
+
+@shows("detect.max_detections")
+def _(lab: Lab) -> None:
+    assert by_file(lab, 1)[0].score.tolist() == [0.9]
+    lab.patch.setattr(Session, "BOXES", tuple((10 + 12 * i, 9, 8, 8, 0.9, 1) for i in range(4)))
+    assert [len(by_network(lab, value)[0]) for value in (3, 9)] == [3, 4]
+
+
+# ---- embed, threads, offline: what reaches the networks of a run ----
+
+
+def run_on_nothing(lab: Lab, value: Any) -> None:
+    """Track six images in which nothing is found."""
+    folder, out = lab.path / "images", lab.path / "out"
+    config = lab.config(value, output__overlay=False, output__scene=False)
+    rt.run(images(folder, 6), out, config, detections=lambda image: [], in_3d=False)
+
+
+@shows("embed.model")
+def _(lab: Lab) -> None:
+    models = lab.caught(rt, "make_embedder", "model")
+    embedders = lab.caught(rt, "Tracker", "embedder")
+    run_on_nothing(lab, "none")
+    assert models == ["none"] and embedders == [None]
+
+
+@shows("embed.head")
+def _(lab: Lab) -> None:
+    """Another head of the network; one that is not there is refused by its name."""
+    heads = lab.caught(rt, "make_embedder", "head")
+    with pytest.raises(rt.ReobjError, match=r"no-such-head\.onnx"):
+        run_on_nothing_with_backbone(lab)
+    assert heads == ["no-such-head.onnx"]
+
+
+def run_on_nothing_with_backbone(lab: Lab) -> None:
+    """The network of our weights by its file, without the metadata that names its head."""
+    lab.patch.setattr("reobj.identity.embedding.onnx_metadata", lambda session: {})
+    config = lab.config("no-such-head.onnx", embed__model=str(own_models() / "reobj.onnx"))
+    rt.run(images(lab.path / "images", 2), lab.path / "out", config, detections=lambda image: [],
+           in_3d=False)  # fmt: skip
+
+
+@shows("threads")
+def _(lab: Lab) -> None:
+    """Those of OpenCV, of the detector and of the embedder."""
+    counts: list[int] = []
+    lab.patch.setattr(cv2, "setNumThreads", counts.append)
+    detector = lab.caught(rt, "open_detections", "threads")
+    embedder = lab.caught(rt, "make_embedder", "threads")
+    run_on_nothing(lab, 3)
+    assert counts[:1] == [3] and detector[:1] == [3] and embedder == [3]
+
+
+@shows("offline")
+def _(lab: Lab) -> None:
+    detector = lab.caught(rt, "open_detections", "offline")
+    embedder = lab.caught(rt, "make_embedder", "offline")
+    run_on_nothing(lab, True)
+    assert detector[:1] == [True] and embedder == [True]
+    lab.patch.setenv("REOBJ_MODELS", str(lab.path / "nowhere"))
+    lab.patch.setenv("XDG_CACHE_HOME", str(lab.path / "nowhere"))
+    lab.patch.setenv("HOME", str(lab.path))
+    with pytest.raises(rt.ReobjError, match="offline forbids the download"):
+        rt.run(lab.path / "images", lab.path / "other", lab.config(True), in_3d=False)
+
+
+# ---- tracker ----
+
+
+def track(tracker: rt.Tracker, *frames: rt.Detections, **known: Any) -> rt.Tracks:
+    """Track frame after frame: those of the last one, with the tentative tracks."""
+    for found in frames:
+        tracker.update(found, **known)
+    return tracker.latest
+
+
+BOX, ASIDE, FAR = (100, 100, 200, 200), (115, 100, 215, 200), (400, 100, 500, 200)
+NOTHING = rt.Detections.empty()
+
+
+@shows("tracker.high_score")
+def _(lab: Lab) -> None:
+    """Of a fair box on the track and a clear one aside the first to be matched goes on."""
+    fair, clear = (*BOX, 0.5), (*ASIDE, 0.9)
+    found = {v: track(lab.tracker(v), *[rows(BOX)] * 4, rows(fair, clear)) for v in (0.4, 0.6)}
+    index = {v: t.detection_index[t.track_id == 1].tolist() for v, t in found.items()}
+    assert index == {0.4: [0], 0.6: [1]}
+
+
+@shows("tracker.low_score")
+def _(lab: Lab) -> None:
+    for value, count in ((0.2, 1), (0.3, 0)):
+        found = track(lab.tracker(value), *[rows(BOX)] * 4, rows((*BOX, 0.25)))
+        assert len(found) == count
+
+
+@shows("tracker.new_score")
+def _(lab: Lab) -> None:
+    for value, count in ((0.6, 1), (0.8, 0)):
+        assert len(track(lab.tracker(value), rows((*BOX, 0.7)))) == count
+
+
+@shows("tracker.n_init")
+def _(lab: Lab) -> None:
+    for value in (2, 5):
+        tracker = lab.tracker(value)
+        track(tracker, rows(BOX))
+        ids = [track(tracker, rows(BOX, FAR)).track_id[1] for _ in range(6)]
+        assert ids == [0] * (value - 1) + [2] * (7 - value)
+
+
+@shows("tracker.coast_frames")
+def _(lab: Lab) -> None:
+    for value in (4, 9):
+        tracker = lab.tracker(value)
+        track(tracker, *[rows(BOX)] * 4)
+        alive = [len(track(tracker, NOTHING)) or len(tracker.state.mean) for _ in range(12)]
+        assert alive == [1] * value + [0] * (12 - value)
+
+
+@shows("tracker.remember")
+def _(lab: Lab) -> None:
+    for value, identity in ((True, 1), (False, 2)):
+        tracker, view = lab.tracker(value), np.eye(1, 8)
+        track(tracker, *[rows(BOX)] * 12, embeddings=view)
+        track(tracker, *[NOTHING] * 40)
+        assert track(tracker, *[rows(FAR)] * 4, embeddings=view).track_id.tolist() == [identity]
+
+
+def spread(tracker: rt.Tracker) -> np.ndarray:
+    """Variances of position and velocity after a second without a detection."""
+    track(tracker, *[rows(BOX)] * 4, *[NOTHING] * 25)
+    return np.asarray(tracker.state.cov[0, 0])
+
+
+@shows("tracker.std_position")
+def _(lab: Lab) -> None:
+    small, large = spread(lab.tracker(0.02)), spread(lab.tracker(0.2))
+    assert large[0] > 4 * small[0]
+
+
+@shows("tracker.std_velocity")
+def _(lab: Lab) -> None:
+    small, large = spread(lab.tracker(0.001)), spread(lab.tracker(0.1))
+    assert large[2] > 10 * small[2]
+
+
+@shows("tracker.appearance_weight")
+def _(lab: Lab) -> None:
+    """Two swap places, by their looks: who believes the places alone does not notice."""
+    views = np.eye(2, 8)
+    for value, ids in ((0.0, [1, 2]), (0.8, [2, 1])):
+        tracker = lab.tracker(value)
+        track(tracker, *[rows(BOX, (108, 100, 208, 200))] * 5, embeddings=views)
+        both = rows((101, 100, 201, 200), (107, 100, 207, 200))
+        assert track(tracker, both, embeddings=views[::-1]).track_id.tolist() == ids
+
+
+@shows("tracker.foreground_weight")
+def _(lab: Lab) -> None:
+    """Share of the foreground in a fused row, and in what two rows have in common."""
+    for value in (0.2, 0.9):
+        tracker = lab.tracker(value)
+        both = rt.Embeddings(np.eye(2, 3), np.ones((2, 1)))
+        tracker.update(rows(BOX, FAR), embeddings=both)
+        _, fused = tracker.latest_embeddings()
+        assert fused[0] @ fused[1] == pytest.approx(1 - value, abs=1e-6)
+
+
+@shows("tracker.embed_every")
+def _(lab: Lab) -> None:
+    for value in (3, 7):
+        asked = []
+
+        def embedder(frame: Any, detections: Any, index: np.ndarray) -> rt.Embeddings:
+            asked.append(tracker.frame_number)  # noqa: B023
+            return rt.Embeddings(np.eye(1, 8), np.empty((1, 0)))
+
+        tracker = rt.Tracker(lab.config(value).tracker, embedder)  # type: ignore[arg-type]
+        track(tracker, *[rows(BOX)] * 22, frame=np.zeros((300, 600, 3), np.uint8))
+        assert asked == list(range(0, 22, value))
+
+
+@shows("tracker.return_probability")
+def _(lab: Lab) -> None:
+    """A return that is rather alike: enough for one who asks for little."""
+    for value, identity in ((0.05, 1), (0.95, 2)):
+        tracker = lab.tracker(value)
+        track(tracker, *[rows(BOX)] * 12, embeddings=np.eye(1, 8))
+        track(tracker, *[NOTHING] * 40)
+        view = np.array([[0.8, 0.6, 0, 0, 0, 0, 0, 0]])
+        assert track(tracker, *[rows(FAR)] * 4, embeddings=view).track_id.tolist() == [identity]
+
+
+@shows("tracker.camera_motion")
+def _(lab: Lab) -> None:
+    """The image moves 40 px to the right; the track goes with it, or stays."""
+    image = cv2.imread(str(images(lab.path / "images", 1) / "0000.jpg"))
+    for value, shift in ((True, 40), (False, 0)):
+        tracker = lab.tracker(value)
+        track(tracker, *[rows(BOX)] * 4, frame=image)
+        track(tracker, NOTHING, frame=np.roll(image, 40, 1))
+        assert tracker.state.mean[0, 0, 0] == pytest.approx(150 + shift, abs=2)
+
+
+# ---- poses ----
+
+
+def tum_file(path: Path, poses: np.ndarray) -> str:
+    """Write cam_from_world (F, 3, 4) as TUM rows at 30 Hz."""
+    turn = Rotation.from_matrix(poses[:, :, :3]).inv()
+    centre = -np.einsum("fij,fj->fi", turn.as_matrix(), poses[:, :, 3])
+    np.savetxt(path, np.c_[np.arange(len(poses)) / 30, centre, turn.as_quat()])
+    return str(path)
+
+
+def arc(count: int) -> np.ndarray:
+    """cam_from_world (F, 3, 4) on an arc of 90 degrees around the origin, z up, 3.5 m off."""
+    angle = np.radians(np.linspace(-45, 45, count))
+    eye = np.stack([3.5 * np.sin(angle), -3.5 * np.cos(angle), np.full(count, 1.6)], 1)
+    forward = [0, 0, 0.4] - eye
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    turn = np.stack([right, np.cross(forward, right), forward], 1)  # (F, 3, 3)
+    return np.concatenate([turn, -turn @ eye[:, :, None]], 2)
+
+
+@shows("poses.mode")
+def _(lab: Lab) -> None:
+    """none: no cameras; auto: reconstructed; else a file."""
+    video = rt.Video(images(lab.path / "images", 4))
+    path = tum_file(lab.path / "cams.txt", arc(4))
+    config = lab.config(path, poses__camera=CAMERA_TEXT)
+    found = stage.supplied_poses(video, config.poses)
+    assert found is not None and found.known.all() and found.source == "user"
+    for mode in ("auto", "none"):
+        assert stage.supplied_poses(video, lab.config(mode).poses) is None
+    asked = lab.caught(rt, "reconstruct_cached", "video")
+    for mode, count in (("none", 0), ("auto", 1)):
+        config = lab.config(mode, embed__model="none", output__overlay=False, output__scene=False)
+        rt.run(video.source, lab.path / mode, config, detections=lambda image: [])
+        assert len(asked) == count
+
+
+@shows("poses.fmt")
+def _(lab: Lab) -> None:
+    video = rt.Video(images(lab.path / "images", 4))
+    path = tum_file(lab.path / "cams.dat", arc(4))
+    options = {"poses__mode": path, "poses__camera": CAMERA_TEXT}
+    assert stage.supplied_poses(video, lab.config("tum", **options).poses) is not None
+    for fmt in ("transforms", "nonsense"):
+        with pytest.raises(rt.ReobjError, match=r"JSON|format nonsense"):
+            stage.supplied_poses(video, lab.config(fmt, **options).poses)
+
+
+@shows("poses.camera")
+def _(lab: Lab) -> None:
+    """Of supplied poses and of a reconstruction."""
+    video = rt.Video(images(lab.path / "images", 4))
+    path = tum_file(lab.path / "cams.txt", arc(4))
+    found = stage.supplied_poses(video, lab.config(CAMERA_TEXT, poses__mode=path).poses)
+    assert found is not None and found.camera == CAMERA
+    with pytest.raises(rt.ReobjError, match="no intrinsics"):
+        stage.supplied_poses(video, lab.config("", poses__mode=path).poses)
+    poses = rt.estimate_poses(video, lab.config(CAMERA_TEXT).poses, lab.path / "work")
+    assert poses.camera == CAMERA
+
+
+@shows("poses.size_px")
+def _(lab: Lab) -> None:
+    sizes: list[tuple[int, ...]] = []
+
+    def noted(works: Any, *args: Any) -> Any:
+        sizes.extend(work.gray.shape for work in works)
+        raise KeyboardInterrupt
+
+    lab.patch.setattr(estimate, "pick_keyframes", noted)
+    video = rt.Video(images(lab.path / "images", 2))
+    with pytest.raises(KeyboardInterrupt):
+        rt.estimate_poses(video, lab.config(160).poses, lab.path / "work")
+    assert sizes == [(120, 160)] * 2
+
+
+@shows("poses.max_keyframes")
+def _(lab: Lab) -> None:
+    most = lab.caught(estimate, "pick_keyframes", "max_keyframes")
+    video = rt.Video(images(lab.path / "images", 2))
+    rt.estimate_poses(video, lab.config(7).poses, lab.path / "work")
+    assert set(most) == {7}
+
+
+def reconstructed(lab: Lab, value: Any) -> rt.Poses:
+    """Poses of 9 frames of which a model holds frames 0, 4 and 8; what is between has no points."""
+    folder = lab.path / "images"
+    video = rt.Video(folder if folder.exists() else images(folder, 9))
+    keys = np.array([0, 4, 8])
+
+    def made(*args: Any, **known: Any) -> list[str]:
+        bound = signature.bind(*args, **known).arguments
+        seeds.append(bound["seed"])
+        found = rt.Poses(CAMERA, keys, keys / 30, arc(9)[keys], np.full(3, "keyframe"), "user")
+        work = Path(bound["work_dir"])
+        (work / "mapping").mkdir(parents=True, exist_ok=True)
+        write_colmap(work / "sparse", found, [video.names[k] for k in keys])
+        return []
+
+    signature, seeds = inspect.signature(estimate.reconstruct), []
+    lab.patch.setattr(estimate, "reconstruct", made)
+    between = lab.caught(estimate, "locate_between", "seed")
+    poses = rt.estimate_poses(video, lab.config(value).poses, lab.path / f"work{value}")
+    lab.patch.undo()
+    lab.seeds = seeds + between  # type: ignore[attr-defined]
+    return poses
+
+
+@shows("poses.max_gap")
+def _(lab: Lab) -> None:
+    for value, count in ((2, 0), (3, 6)):
+        assert (reconstructed(lab, value).status == "interpolated").sum() == count
+
+
+@shows("poses.seed")
+def _(lab: Lab) -> None:
+    """It reaches the mapper and PnP."""
+    reconstructed(lab, 11)
+    assert lab.seeds == [11, 11]  # type: ignore[attr-defined]
+
+
+# ---- objects ----
+
+
+SOLIDS = quadrics.Ellipsoids(
+    np.array([[-0.5, 0, 0.41], [0.6, 0.3, 0.41]]),
+    np.tile([0.28, 0.3, 0.41], (2, 1)),
+    np.eye(3)[None].repeat(2, 0),
+)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output folder of a run: two chairs in 24 frames with poses.
+
+    The first is missed in frames 9 to 11; the second is away in frames 12 to 17, and comes back
+    under another identity with faint boxes.
+    """
+    base = tmp_path_factory.mktemp("room")
+    poses = arc(24)
+    boxes = quadrics.solid_boxes(SOLIDS, "box", CAMERA.K @ poses)  # (F, 2, 4)
+    lines = ["frame,x1,y1,x2,y2,score,class"]
+    for f, k in np.ndindex(24, 2):
+        if not (9 <= f <= 11 if k == 0 else 12 <= f <= 17):
+            score = 0.5 if k and f > 17 else 0.9
+            lines.append(f"{f},{','.join(map(str, boxes[f, k]))},{score},chair")
+    (base / "det.csv").write_text("\n".join(lines) + "\n")
+    path = tum_file(base / "cams.txt", poses)
+    config = rt.Config(
+        embed=rt.EmbedConfig(model="none"),
+        tracker=rt.TrackerConfig(coast_frames=4, remember=False),
+        poses=rt.PosesConfig(mode=path, camera=CAMERA_TEXT),
+        output=rt.OutputConfig(overlay=False, scene=False),
+    )
+    source = images(base / "images", 24)
+    rt.run(source, base / "out", config, detections=base / "det.csv")
+    return base / "out"
+
+
+@shows("objects.priors")
+def _(lab: Lab) -> None:
+    """Chairs of twice the size make the scale of a world without one twice as large."""
+    last = shutil.copytree(lab.room, lab.path / "room") / "cache" / "last-poses.npz"
+    save_poses(last, dataclasses.replace(load_poses(last), metric=False))
+    lab.room = lab.path / "room"
+    table = json.loads((Path(quadrics.__file__).with_name("priors.json")).read_text())
+    entry = {"chair": table["chair"]}
+    typical = entry["chair"]["size_m"]
+    key = next(k for k, v in typical.items() if k not in ("log_std", "corr") and len(v) == 3)
+    scales = []
+    for factor in (1, 2):
+        typical[key] = [factor * side for side in typical[key]]
+        path = lab.path / f"priors{factor}.json"
+        path.write_text(json.dumps(entry))
+        scale = lab.refit(str(path)).world.scale
+        assert scale is not None and scale.source == "priors"
+        scales.append(scale.value)
+    assert scales[1] / scales[0] == pytest.approx(2, rel=0.02)
+
+
+@shows("objects.known_size")
+def _(lab: Lab) -> None:
+    scale = lab.refit("chair=1.64m").world.scale
+    assert scale is not None and scale.source == "known_size"
+    assert scale.value == pytest.approx(2, rel=0.05)  # the true chairs are .82 units high
+
+
+@shows("objects.support")
+def _(lab: Lab) -> None:
+    for value in ("cylinder", "ellipsoid"):
+        assert {found.support for found in lab.refit(value).objects} == {value}
+
+
+@shows("objects.up")
+def _(lab: Lab) -> None:
+    up = lab.refit("0,0.6,0.8").world.up_in_world
+    assert up is not None
+    np.testing.assert_allclose(up, [0, 0.6, 0.8], atol=1e-6)
+
+
+@shows("objects.link")
+def _(lab: Lab) -> None:
+    assert [len(lab.refit(value).objects) for value in (True, False)] == [2, 3]
+
+
+@shows("objects.min_views")
+def _(lab: Lab) -> None:
+    """One chair is seen in 21 frames, the other in 18."""
+    for value, located in ((18, 2), (19, 1), (21, 1), (22, 0)):
+        assert sum(found.located for found in lab.refit(value).objects) == located
+
+
+@shows("objects.min_score")
+def _(lab: Lab) -> None:
+    """Boxes of score .5 are views up to there."""
+    for value, views in ((0.5, [21, 18]), (0.6, [21, 12, 0])):
+        assert [found.views for found in lab.refit(value).objects] == views
+
+
+@shows("objects.moving")
+def _(lab: Lab) -> None:
+    for value, reason in (("person,chair", "objects of this class move"), ("person", "")):
+        found = lab.refit(value).objects
+        assert {o.reason == "objects of this class move" for o in found} == {bool(reason)}
+
+
+# ---- output ----
+
+
+@shows("output.overlay")
+def _(lab: Lab) -> None:
+    for value in (True, False):
+        config = lab.config(value, output__scene=False)
+        out = shutil.copytree(lab.room, lab.path / f"out{value}")
+        rt.refit(out, config)
+        assert (out / "overlay.mp4").exists() == value
+
+
+@shows("output.scene")
+def _(lab: Lab) -> None:
+    for value in (True, False):
+        config = lab.config(value, output__overlay=False)
+        out = shutil.copytree(lab.room, lab.path / f"out{value}")
+        rt.refit(out, config)
+        assert (out / "scene.html").exists() == value
+
+
+@shows("output.fill_gaps")
+def _(lab: Lab) -> None:
+    """Three frames in which the first chair was missed; the second was away for six."""
+    for value, count in ((0, 0), (2, 0), (3, 3), (6, 9)):
+        result = lab.refit(value)
+        assert (result.tracks.score == 0).sum() == count
+        assert [found.views for found in result.objects] == [21, 18]

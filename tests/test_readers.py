@@ -1,0 +1,411 @@
+"""Poses made elsewhere: every format reads back, damage is refused, frames are found."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from pose_worlds import FOCAL, FRAMES, SIZE, blank, some_cameras, supplied
+from scipy.spatial.transform import Rotation
+
+import reobj_track as rt
+from reobj.cameras import invert_rigid, write_colmap, write_tum
+
+CAMERA = f"{FOCAL},{FOCAL},320,240"
+K = [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]]
+NAMES = [f"{i:04d}.jpg" for i in range(FRAMES)]
+
+
+GL = np.diag([1.0, -1, -1, 1])
+
+
+def full(matrix):
+    return np.concatenate([matrix, np.tile([[[0, 0, 0, 1.0]]], (len(matrix), 1, 1))], 1)
+
+
+def as_tum(folder, cams):
+    w = invert_rigid(cams)
+    q = Rotation.from_matrix(w[:, :, :3]).as_quat()
+    rows = [[i / 30, *w[i, :, 3], *q[i]] for i in range(len(w))]
+    return text(folder / "poses.txt", rows, "# t tx ty tz qx qy qz qw\n")
+
+
+def as_record3d(folder, cams):
+    w = full(invert_rigid(cams)) @ GL
+    q = Rotation.from_matrix(w[:, :3, :3]).as_quat()
+    data = {"w": 640, "h": 480, "K": [FOCAL, 0, 0, 0, FOCAL, 0, 320, 240, 1],
+            "poses": [[*q[i], *w[i, :3, 3]] for i in range(len(w))]}  # fmt: skip
+    return text(folder / "metadata", json.dumps(data))
+
+
+def as_scannet(folder, cams):
+    (folder / "pose").mkdir()
+    (folder / "intrinsic").mkdir()
+    text(
+        folder / "intrinsic" / "intrinsic_color.txt",
+        [[FOCAL, 0, 319.5], [0, FOCAL, 239.5], [0, 0, 1]],
+    )
+    for i, w in enumerate(full(invert_rigid(cams))):
+        text(folder / "pose" / f"{i}.txt", w)
+    return folder
+
+
+def transforms(cams, names, **more):
+    frames = [
+        {"file_path": n, "transform_matrix": (w @ GL).tolist()}
+        for n, w in zip(names, cams, strict=True)
+    ]
+    return json.dumps({"frames": frames, "w": 640, "h": 480, **more})
+
+
+def as_instant_ngp(folder, cams):
+    angle = 2 * np.arctan(320 / FOCAL)
+    names = [f"images/{i:04d}.jpg" for i in range(len(cams))]
+    return text(
+        folder / "transforms.json",
+        transforms(full(invert_rigid(cams)), names, camera_angle_x=angle),
+    )
+
+
+def as_nerfstudio(folder, cams):
+    applied = np.array([[0, 1.0, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0.5]])
+    turned = full(applied[None]) @ full(invert_rigid(cams))
+    names = [f"./images/{i:04d}.jpg" for i in range(len(cams))]
+    more = {
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": 320.0,
+        "cy": 240.0,
+        "applied_transform": applied.tolist(),
+    }
+    return text(folder / "transforms.json", transforms(turned, names, **more)).parent
+
+
+def as_colmap_text(folder, cams):
+    return model(folder / "sparse" / "0", cams).parents[1]
+
+
+def image_rows(folder):
+    return [line for line in (folder / "images.txt").read_text().splitlines() if line]
+
+
+def as_colmap_poses_only(folder, cams):
+    """Without the blank lines of observations."""
+    model(folder, cams)
+    text(folder / "images.txt", "\n".join(image_rows(folder)))
+    return folder / "images.txt"
+
+
+def as_colmap_without_points(folder, cams):
+    """Without the blank lines and without points3D.txt."""
+    as_colmap_poses_only(folder, cams)
+    (folder / "points3D.txt").unlink()
+    return folder
+
+
+def as_colmap_with_observations(folder, cams):
+    """With observations, of points that points3D.txt does not hold."""
+    model(folder, cams)
+    rows = [f"{row}\n1.5 2.5 -1 3.5 4.5 7" for row in image_rows(folder)]
+    text(folder / "images.txt", "# comment\n" + "\n".join(rows))
+    return folder
+
+
+def as_colmap_binary(folder, cams):
+    pycolmap = pytest.importorskip("pycolmap")
+    model(folder / "text", cams)
+    pycolmap.Reconstruction(str(folder / "text")).write_binary(str(folder))
+    return folder
+
+
+def model(folder, cams):
+    """Write our own COLMAP text model, with two points that no image observes."""
+    points = np.arange(6.0).reshape(2, 3)
+    extra = {"points": points, "colors": np.array([[9, 8, 7], [250, 0, 1]], np.uint8)}
+    write_colmap(folder, dataclasses.replace(supplied(cams), **extra), NAMES[: len(cams)])
+    return folder
+
+
+def text(path, rows, head=""):
+    if not isinstance(rows, str):
+        rows = head + "".join(
+            " ".join(repr(float(v)) for v in np.ravel(row)) + "\n" for row in rows
+        )
+    path.write_text(rows)
+    return path
+
+
+# writer, metric, up in world
+FORMATS = [
+    (as_tum, True, None), (as_record3d, True, (0, 1, 0)), (as_scannet, True, (0, 0, 1)),
+    (as_instant_ngp, False, None), (as_nerfstudio, False, None), (as_colmap_text, False, None),
+    (as_colmap_poses_only, False, None), (as_colmap_without_points, False, None),
+    (as_colmap_with_observations, False, None), (as_colmap_binary, False, None),
+]  # fmt: skip
+
+
+def read(path, video=None, **options):
+    return rt.read_poses(path, video or blank(FRAMES, NAMES), **options)
+
+
+@pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
+def test_every_format_reads_back_the_same(tmp_path, write, metric, up):
+    cams = some_cameras()
+    poses = read(write(tmp_path, cams), camera=CAMERA if write is as_tum else "")
+    np.testing.assert_allclose(poses.cam_from_world, cams, atol=1e-9)
+    np.testing.assert_allclose(poses.camera.K, K, atol=1e-9)
+    assert poses.known.all() and poses.metric == metric and set(poses.status) == {"supplied"}
+    np.testing.assert_array_equal(poses.up_in_world, up)
+
+
+@pytest.mark.parametrize("fmt", ["tum", "transforms", "scannet", "record3d", "colmap"])
+def test_the_format_is_obeyed(tmp_path, fmt):
+    """A name that says nothing is read as TUM unless another format is given."""
+    write = {"tum": as_tum, "transforms": as_instant_ngp, "scannet": as_scannet,
+             "record3d": as_record3d, "colmap": as_colmap_text}[fmt]  # fmt: skip
+    path = write(tmp_path, some_cameras())
+    if path.is_file():
+        path = path.rename(tmp_path / "cameras.dat")
+    np.testing.assert_allclose(read(path, fmt=fmt, camera=CAMERA).cam_from_world, some_cameras())
+    other = "record3d" if fmt == "transforms" else "transforms"
+    with pytest.raises(rt.ReobjError):
+        read(path, fmt=other, camera=CAMERA)
+
+
+def test_the_given_camera_replaces_the_files(tmp_path):
+    poses = read(as_record3d(tmp_path, some_cameras()), camera="510,505,322,238,.1,0,0,0")
+    assert poses.camera == rt.Camera("OPENCV", *SIZE, (510, 505, 322, 238, 0.1, 0, 0, 0))
+
+
+@pytest.mark.parametrize("write", [as_colmap_text, as_colmap_binary])
+def test_colmap_points_come_along_in_the_order_of_their_numbers(tmp_path, write):
+    path = write(tmp_path, some_cameras())
+    if write is as_colmap_text:
+        points = path / "sparse" / "0" / "points3D.txt"
+        points.write_text("\n".join(reversed(points.read_text().splitlines())) + "\n")
+    poses = read(path)
+    np.testing.assert_array_equal(poses.points, np.arange(6).reshape(2, 3))
+    np.testing.assert_array_equal(poses.colors, [[9, 8, 7], [250, 0, 1]])
+
+
+def test_own_files_read_back(tmp_path):
+    cams = some_cameras()
+    cams[2] = np.nan
+    poses = dataclasses.replace(supplied(cams), source="pycolmap")
+    write_tum(tmp_path / "poses.txt", poses)
+    back = read(tmp_path / "poses.txt", camera=CAMERA)
+    np.testing.assert_allclose(back.cam_from_world, cams, atol=1e-8)
+    assert not back.metric  # our header says that the scale is unknown
+    assert "5 of 6" in back.messages[0]
+
+
+# ---- Negative cases: where, what was found, what was expected, what to do ------------------------
+
+
+def edit(path, line, change):
+    lines = path.read_text().splitlines()
+    lines[line] = change(lines[line])
+    path.write_text("\n".join(lines) + "\n")
+
+
+def word(index, value):
+    return lambda line: " ".join(value if i == index else w for i, w in enumerate(line.split()))
+
+
+def drop_last(line):
+    return " ".join(line.split()[:-1])
+
+
+def edit_json(path, change):
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def mirror(numbers):
+    m = np.array(numbers, float).reshape(4, 4)
+    m[:3, 0] *= -1
+    return m.tolist()
+
+
+def edit_frame(path, **changes):
+    edit_json(path, lambda data: data["frames"][1].update(changes))
+
+
+def mirror_frame(path):
+    edit_json(
+        path,
+        lambda d: d["frames"][1].update(
+            transform_matrix=mirror(d["frames"][1]["transform_matrix"])
+        ),
+    )
+
+
+def rename_frames(path):
+    edit_json(path, lambda data: [frame.update(file_path="a.png") for frame in data["frames"]])
+
+
+def transpose(path):
+    text(path, np.loadtxt(path).T)
+
+
+NGP, COLOR = "transforms.json", "intrinsic/intrinsic_color.txt"
+ONLY, IMAGES, CAMERAS = as_colmap_poses_only, "images.txt", "cameras.txt"
+# writer, file, how it is damaged, what the message must hold
+DAMAGED = [
+    (as_tum, "poses.txt", lambda p: edit(p, 2, drop_last), "line 3: 7 numbers"),
+    (as_tum, "poses.txt", lambda p: edit(p, 3, word(7, "0.1")), "line 4: the quaternion"),
+    (as_tum, "poses.txt", lambda p: edit(p, 3, word(2, "nan")), "line 4: a number is not finite"),
+    (as_tum, "poses.txt", lambda p: edit(p, 3, word(2, "abc")), "line 4: .*not a row of numbers"),
+    (as_tum, "poses.txt", lambda p: p.write_text("# nothing\n"), "no poses in it"),
+    (as_tum, "poses.txt", lambda p: p.write_bytes(b"\xff\xfe\x00\x81"), "cannot be read as text"),
+    (as_scannet, "pose/1.txt", lambda p: edit(p, 1, word(0, "3.0")), "1.txt: .*no rotation"),
+    (as_scannet, "pose/1.txt", transpose, "1.txt: .*row-major"),
+    (
+        as_scannet,
+        "pose/2.txt",
+        lambda p: edit(p, 1, drop_last),
+        "2.txt, line 2: 3 numbers; expected 4 rows",
+    ),
+    (as_scannet, "pose/2.txt", lambda p: edit(p, 1, word(0, "x")), "2.txt, line 2: .*not a row"),
+    (as_scannet, "pose/2.txt", lambda p: text(p, mirror(np.loadtxt(p))), "2.txt: .*mirrored"),
+    (as_scannet, COLOR, lambda p: p.unlink(), "--camera"),
+    (as_scannet, COLOR, lambda p: edit(p, 0, word(2, "648")), "do not fit"),
+    (as_instant_ngp, NGP, lambda p: p.write_text(p.read_text()[:50]), "not valid JSON"),
+    (as_instant_ngp, NGP, lambda p: p.write_text("[1]"), "expected an object"),
+    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.pop("frames")), "no `frames`"),
+    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.pop("camera_angle_x")), "--camera"),
+    (as_instant_ngp, NGP, lambda p: edit_frame(p, transform_matrix=[1, 2]), "transform_matrix"),
+    (as_instant_ngp, NGP, mirror_frame, r"frames\[1\]: .*mirrored"),
+    (as_instant_ngp, NGP, lambda p: edit_frame(p, fl_x=900.0), "several different cameras"),
+    (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.update(w=480, h=640)), "rotated"),
+    (as_instant_ngp, NGP, rename_frames, "none of its"),
+    (as_record3d, "metadata", lambda p: edit_json(p, lambda d: d.pop("K")), "no Record3D metadata"),
+    (ONLY, IMAGES, lambda p: edit(p, 1, drop_last), "images.txt, line 2: expected IMAGE_ID"),
+    (ONLY, IMAGES, lambda p: edit(p, 1, word(1, "2.0")), "images.txt, line 2: the quaternion"),
+    (ONLY, IMAGES, lambda p: edit(p, 1, word(3, "nan")), "images.txt, line 2: .*finite"),
+    (ONLY, IMAGES, lambda p: edit(p, 1, word(3, "x")), "images.txt, line 2: .*not a row"),
+    (ONLY, IMAGES, lambda p: edit(p, 1, word(8, "7")), "images.txt, line 2: no camera 7"),
+    (ONLY, IMAGES, lambda p: p.write_text(""), "images.txt: no images in it"),
+    (ONLY, IMAGES, lambda p: p.write_bytes(bytes(range(256))), "cannot be read as text"),
+    (ONLY, CAMERAS, lambda p: edit(p, 0, drop_last), "cameras.txt, line 1: expected CAM"),
+    (ONLY, CAMERAS, lambda p: edit(p, 0, word(2, "x")), "cameras.txt, line 1: expected CAM"),
+    (ONLY, CAMERAS, lambda p: edit(p, 0, word(1, "MAGIC")), "cameras.txt, line 1: expected CAM"),
+    (ONLY, CAMERAS, lambda p: edit(p, 0, word(5, "nan")), "cameras.txt, line 1: expected CAM"),
+    (ONLY, CAMERAS, lambda p: p.write_text("# x\n\nwhat is this\n"), "line 3: expected CAM"),
+    (ONLY, CAMERAS, lambda p: p.write_bytes(bytes(range(256))), "cannot be read as text"),
+    (ONLY, CAMERAS, lambda p: p.unlink(), "cameras.txt: cannot be read"),
+    (ONLY, "points3D.txt", lambda p: edit(p, 0, drop_last), "points3D.txt, line 1: expected POINT"),
+    (as_colmap_binary, "images.bin", lambda p: p.write_bytes(p.read_bytes()[:30]), "not a COLMAP"),
+]
+
+
+@pytest.mark.parametrize("write, file, damage, message", DAMAGED)
+def test_damaged_files_are_refused_in_one_clear_line(tmp_path, write, file, damage, message):
+    path = write(tmp_path, some_cameras())
+    damage(tmp_path / file)
+    with pytest.raises(rt.ReobjError, match=message) as refused:
+        read(path, camera=CAMERA if write is as_tum else "")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_binary_model_of_zero_images_is_refused(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap.Reconstruction().write_binary(str(tmp_path))
+    with pytest.raises(rt.ReobjError, match="no registered image"):
+        read(tmp_path)
+
+
+def test_missing_unknown_and_without_intrinsics(tmp_path):
+    with pytest.raises(rt.ReobjError, match="no such file"):
+        read(tmp_path / "no.txt")
+    with pytest.raises(rt.ReobjError, match="--camera"):
+        read(as_tum(tmp_path, some_cameras()))
+    with pytest.raises(rt.ReobjError, match=r"no images\.bin"):
+        read(tmp_path)
+    with pytest.raises(rt.ReobjError, match="unknown; known are auto, colmap"):
+        read(tmp_path, fmt="xyz")
+    with pytest.raises(rt.ReobjError, match="no frame"):
+        read(as_record3d(tmp_path, some_cameras()), blank(0))
+
+
+# ---- Which pose belongs to which frame -----------------------------------------------------------
+
+
+def test_lost_scannet_frames_have_no_pose(tmp_path):
+    path = as_scannet(tmp_path, some_cameras())
+    text(tmp_path / "pose" / "3.txt", np.full((4, 4), -np.inf))
+    poses = read(path, blank(FRAMES))
+    assert poses.known.tolist() == [True, True, True, False, True, True]
+    assert poses.status[3] == "none" and "none for 3" in poses.messages[0]
+
+
+@pytest.mark.parametrize(
+    "stamps, known",
+    [
+        ([0, 1 / 30, 2 / 30, 3 / 30, 4 / 30, 5 / 30], [0, 1, 2, 3, 4, 5]),
+        ([0.010, 0.045, 0.2], [0, 1]),  # within half a frame; the last is beyond the video's end
+        ([0.0, 0.0167, 0.0333, 0.05, 0.0667], [0, 1, 2]),  # twice the rate
+        (
+            [100 + i / 30 for i in range(6)],
+            [0, 1, 2, 3, 4, 5],
+        ),  # another clock, one a frame: in order
+    ],
+)
+def test_time_stamps_are_matched_within_half_a_frame(tmp_path, stamps, known):
+    cams = some_cameras(len(stamps))
+    path = as_tum(tmp_path, cams)
+    for i, stamp in enumerate(stamps):
+        edit(path, i + 1, word(0, repr(stamp)))
+    poses = read(path, blank(FRAMES), camera=CAMERA)
+    assert np.flatnonzero(poses.known).tolist() == known
+
+
+def test_time_stamps_of_another_clock_are_refused_when_counts_differ(tmp_path):
+    path = as_tum(tmp_path, some_cameras(4))
+    for i in range(4):
+        edit(path, i + 1, word(0, str(1000.0 + i)))
+    with pytest.raises(rt.ReobjError, match="none of its 4 poses belongs to a frame"):
+        read(path, blank(FRAMES), camera=CAMERA)
+
+
+def test_numbers_in_names_are_frame_numbers_for_a_video(tmp_path):
+    cams = some_cameras(3)
+    names = ["f_0001.png", "f_0003.png", "f_0005.png"]
+    text(tmp_path / "transforms.json", transforms(full(invert_rigid(cams)), names, fl_x=FOCAL))
+    poses = read(tmp_path, blank(FRAMES))
+    assert np.flatnonzero(poses.known).tolist() == [1, 3, 5]
+    text(
+        tmp_path / "transforms.json",
+        transforms(full(invert_rigid(cams)), ["1.png", "2.png", "6.png"], fl_x=FOCAL),
+    )
+    poses = read(tmp_path, blank(FRAMES))
+    assert np.flatnonzero(poses.known).tolist() == [
+        0,
+        1,
+        5,
+    ]  # no 0 and one more than frames: counted from 1
+
+
+def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
+    names = [f"{i:04d}.jpg" for i in range(FRAMES)]
+    more = {"fl_x": 2 * FOCAL, "cx": 640, "cy": 480, "w": 1280, "h": 960}
+    text(
+        tmp_path / "transforms.json",
+        transforms(full(invert_rigid(some_cameras())), names, **more),
+    )
+    poses = read(tmp_path, blank(FRAMES, names))
+    np.testing.assert_allclose(poses.camera.K, [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]])
+
+
+def test_slightly_different_focal_lengths_are_one_camera(tmp_path):
+    """Autofocus: the median of what lies within two percent; more are several cameras."""
+    path = as_instant_ngp(tmp_path, some_cameras())
+    for i, focal in enumerate([500, 508, 501, 502, 503, 504]):
+        edit_json(path, lambda d, i=i, focal=focal: d["frames"][i].update(fl_x=focal))
+    assert read(path).camera.K[0, 0] == 503
+    edit_json(path, lambda d: d["frames"][1].update(fl_x=511))
+    with pytest.raises(rt.ReobjError, match="several different cameras"):
+        read(path)
