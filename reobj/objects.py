@@ -199,7 +199,8 @@ def describe_world(
     if fits is not None:
         value, sigma = round(fits.scale.value, 6), round(fits.scale.rel_sigma, 4)
         scale = quadrics.Scale(value, sigma, fits.scale.source)
-        up, up_source = fits.up if fits.up.any() else up, fits.up_source
+        if fits.up.any():
+            up, up_source = fits.up, fits.up_source
     return World(
         "m" if poses.metric else "arbitrary",
         poses.source,
