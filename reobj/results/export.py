@@ -189,6 +189,8 @@ def export_glb(result: Result, path: Path) -> None:
     if poses is not None and poses.known.sum() > 1:
         centers = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
         scene.add_geometry(trimesh.load_path(centers), "cameras", "cameras", transform=world)
+    if not scene.geometry:
+        raise ReobjError(f"{path}: nothing to show in 3D: no solids and no cameras here, see `run`")
     with atomic(path) as part:
         part.write_bytes(scene.export(file_type="glb"))
 
