@@ -57,10 +57,13 @@ def tracks_of(poses: rt.Poses, noise_px: float = 1.0) -> rt.Tracks:
 
 
 def fitted(
-    tracks: rt.Tracks, poses: rt.Poses | None, config: rt.ObjectsConfig | None = None
+    tracks: rt.Tracks,
+    poses: rt.Poses | None,
+    config: rt.ObjectsConfig | None = None,
+    names: tuple[str, ...] = rt.COCO_NAMES,
 ) -> rt.Result:
     """The result of tracks whose identities are right: fitted and described, nothing linked."""
-    config, names, fits, views = config or rt.ObjectsConfig(), rt.COCO_NAMES, None, None
+    config, fits, views = config or rt.ObjectsConfig(), None, None
     if poses is not None:
         classes = object_classes(tracks)
         group = np.searchsorted(list(classes), tracks.track_id)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -12,8 +13,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from conftest import ROOM
+from scipy.spatial.transform import Rotation
 
+import quadrics
 import reobj_track as rt
+from reobj.results.evaluation import (
+    ABSENT,
+    IGNORED,
+    SCORED,
+    LabelledBoxes,
+    drop_ignored,
+    identity_map,
+    labelled,
+    read_true_solids,
+    return_ranks,
+    score_objects,
+    score_report,
+    score_tracks,
+    visits,
+)
+from reobj.results.result import VideoInfo
+from reobj.results.workspace import Workspace
+from reobj.types import Embeddings
 
 ROOT = Path(rt.__file__).resolve().parent
 # TrackEval 1.3.0 on `drifting(seed)` (numbers kept so that something is checked without it)
@@ -167,15 +189,15 @@ def test_equals_published_scores(name: str, published: dict[str, float]) -> None
 # ---- By hand ----
 
 
-def boxes(*rows: tuple[float, ...]) -> rt.LabelledBoxes:
+def boxes(*rows: tuple[float, ...]) -> LabelledBoxes:
     """Rows frame, id, x; all boxes are 10 x 10."""
-    return rt.labelled(np.array([[f, i, x, 0, 10, 10, 1] for f, i, x in rows], float))
+    return labelled(np.array([[f, i, x, 0, 10, 10, 1] for f, i, x in rows], float))
 
 
 def test_a_switch_halves_the_identity() -> None:
     truth = boxes(*((f, 1, 0) for f in range(4)))
     found = boxes((0, 5, 0), (1, 5, 0), (2, 6, 0), (3, 6, 0))
-    mine = rt.score_tracks(truth, found)
+    mine = score_tracks(truth, found)
     assert mine["IDSW"] == 1 and mine["MOTA"] == 0.75 and mine["IDF1"] == 0.5
     assert mine["DetA"] == 1 and mine["AssA"] == 0.5 and mine["ids_per_object"] == 2
 
@@ -184,54 +206,233 @@ def test_returns_keep_their_identity_or_not() -> None:
     """Object 1 is away for 40 frames twice: first recognised, then taken for a newcomer."""
     truth = boxes(*((f, 1, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 2, 50))
     found = boxes(*((f, 5 if f < 84 else 6, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 7, 50))
-    assert rt.visits(truth).tolist() == [0, 0, 1, 1, 2, 2, 0]
-    mine = rt.score_tracks(truth, found)
+    assert visits(truth).tolist() == [0, 0, 1, 1, 2, 2, 0]
+    mine = score_tracks(truth, found)
     assert mine["returns"] == 2 and mine["returns_kept"] == 0.5
 
 
 @pytest.mark.parametrize(
-    ("look", "ranks"),
+    ("embedding", "ranks"),
     [
         ([[1, 0], [0, 1], [0.9, 0.1]], [1]),  # like its own first view
         ([[1, 0], [0, 1], [0.1, 0.9]], [2]),  # like the other object
-        ([[1, 0], [np.nan, np.nan], [0.1, 0.9]], [1]),  # the other one has no look
+        ([[1, 0], [np.nan, np.nan], [0.1, 0.9]], [1]),  # the other one has none
         ([[np.nan, np.nan], [0, 1], [0.1, 0.9]], []),  # its own first view has none: no query
     ],
 )
-def test_rank_of_a_return(look: list[list[float]], ranks: list[int]) -> None:
+def test_rank_of_a_return(embedding: list[list[float]], ranks: list[int]) -> None:
     truth = boxes((0, 1, 0), (0, 2, 50), (50, 1, 90))
-    assert rt.return_ranks(truth, truth, np.array(look)).tolist() == ranks
+    assert return_ranks(truth, truth, np.array(embedding)).tolist() == ranks
 
 
-def test_eval_ranks_the_looks_that_the_folder_holds(tmp_path: Path) -> None:
+def tracked_folder(out: Path, result: rt.Result, config: rt.InputConfig | None = None) -> None:
+    """What `track` leaves in an output folder, of a video of one black frame."""
+    out.mkdir(parents=True)
+    cv2.imwrite(str(out.parent / "0.png"), np.zeros((480, 640, 3), np.uint8))
+    space = Workspace(out)
+    video = rt.Video(out.parent / "0.png")
+    video.config = config or rt.InputConfig()
+    space.bind(video)
+    space.save_last(result, result.poses)
+    result.save(out)
+
+
+def cups(frame: list[int], obj: list[int]) -> rt.Result:
+    """Cups of 10 x 10 pixels, 50 apart, one detection a frame and cup."""
+    number, ids = np.array(frame), np.array(obj)
+    x = 50.0 * (ids - 1)
+    xyxy = np.stack([x, 0 * x, x + 10, 0 * x + 10], 1)
+    cup, n = np.full(len(ids), 41), len(ids)
+    tracks = rt.Tracks(number, ids, ids, xyxy, np.ones(n), cup, np.zeros(n, np.int64))
+    objects = [rt.Object(i, "cup", 1.0, "rejected", "flat") for i in sorted({*obj})]
+    return rt.Result(tracks, rt.COCO_NAMES, VideoInfo("a", 640, 480, 30.0), objects)
+
+
+def truth_of(path: Path, result: rt.Result) -> Path:
+    """The tracks as MOTChallenge truth, frames from 1."""
+    tracks = result.tracks
+    sizes = tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]
+    one = np.ones(len(tracks))
+    rows = np.c_[tracks.frame + 1, tracks.track_id, tracks.xyxy[:, :2], sizes, one]
+    return write(path, rows)
+
+
+def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None:
     """Two cups, one comes back twice: once like itself, once like the other (Rank-1 .5)."""
-    frame, obj = np.array([0, 0, 40, 80]), np.array([1, 2, 1, 1])
-    xyxy = np.array([[x, 0, x + 10, 10] for x in (0, 50, 0, 0)], float)
-    cup = np.full(4, 41)
-    table = rt.TrackTable(frame, obj, obj, xyxy, np.ones(4), cup, np.zeros(4, np.int64))
-    look = np.array([[1, 0], [0, 1], [0.9, 0.1], [0.1, 0.9]], np.float16)
-    track = rt.TrackResult(table, rt.COCO_NAMES, look=look, look_row=np.arange(4))
-    track.save(tmp_path / "cache" / "last-tracks.npz")
-    rt.write_mot(tmp_path / "tracks.txt", table)
-    true = np.c_[frame + 1, obj, xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2], np.ones(4)]
-    gt = write(tmp_path / "gt.txt", true)
-    ranks = rt.evaluate(tmp_path, gt)["ranks"]
-    assert ranks == {"queries": 2, "rank1": 0.5, "rank5": 1.0, "rank20": 1.0, "rank50": 1.0}
+    result = cups([0, 0, 40, 80], [1, 2, 1, 1])
+    fused = np.array([[1, 0, 0], [0, 1, 0], [0.9, 0.1, 0], [0.1, 0.9, 0]], np.float16)
+    result.embeddings = Embeddings(fused[:, :2], fused[:, 2:])
+    result.embedding_row = np.arange(4)
+    tracked_folder(tmp_path / "out", result)
+    gt = truth_of(tmp_path / "gt.txt", result)
+    scores = rt.evaluate(str(tmp_path / "out"), str(gt))
+    share = {"queries": 2, "rank1": 0.5, "rank5": 1.0, "rank20": 1.0, "rank50": 1.0}
+    assert scores["ranks"] == share and scores["tracks"]["all"]["HOTA"] == 1
+    assert "2 queries: Rank-1 0.500, Rank-5 1.000" in score_report(scores)
+
+
+def test_rows_without_an_embedding_are_no_queries(tmp_path: Path) -> None:
+    """Only rows 0 and 2 were embedded: nothing else is in the gallery."""
+    result = cups([0, 0, 40, 80], [1, 2, 1, 1])
+    result.embeddings = Embeddings(np.eye(2, dtype=np.float16), np.empty((2, 0), np.float16))
+    result.embedding_row = np.array([0, 2])
+    tracked_folder(tmp_path / "out", result)
+    ranks = rt.evaluate(tmp_path / "out", truth_of(tmp_path / "gt.txt", result))["ranks"]
+    assert ranks["queries"] == 1 and ranks["rank1"] == 1
+
+
+def test_the_best_view_of_every_object_counts() -> None:
+    """Gallery: two views of object 1, one good; two views of object 2, both middling."""
+    truth = boxes((0, 1, 0), (1, 1, 0), (0, 2, 50), (1, 2, 50), (50, 1, 90), (51, 1, 90))
+    angle = np.radians([90, 12, 30, 20, 0, 0])
+    embedding = np.stack([np.cos(angle), np.sin(angle)], 1)
+    assert return_ranks(truth, truth, embedding).tolist() == [1, 1]
+    angle[1] = np.radians(25)  # now one view of object 2 is nearer
+    embedding = np.stack([np.cos(angle), np.sin(angle)], 1)
+    assert return_ranks(truth, truth, embedding).tolist() == [2, 2]
+
+
+def test_only_the_first_frames_of_a_return_are_queries() -> None:
+    frames = [*range(3), *range(50, 80)]
+    truth = boxes(*((f, 1, 0) for f in frames))
+    assert len(return_ranks(truth, truth, np.tile([1.0, 0], (len(frames), 1)))) == 10
+
+
+def test_frames_that_were_not_read_do_not_count(tmp_path: Path) -> None:
+    """--start 2 --stop 8 --every 2 read frames 2, 4, 6; the truth has 0 to 9, counted from 1."""
+    truth = cups(list(range(10)), [1] * 10)
+    found = cups([2, 4, 6], [1] * 3)
+    gt = truth_of(tmp_path / "gt.txt", truth)
+    tracked_folder(tmp_path / "out", found, rt.InputConfig(every=2, start=2, stop=8))
+    score = rt.evaluate(tmp_path / "out", gt)["tracks"]["all"]
+    assert score["recall"] == score["precision"] == score["HOTA"] == 1
+    tracked_folder(tmp_path / "all" / "out", found)
+    assert rt.evaluate(tmp_path / "all/out", gt)["tracks"]["all"]["recall"] == 0.3
+
+
+def test_eval_of_the_example_room(room: Path, tmp_path: Path) -> None:
+    """The files of a run against the room's truth: frames and classes go together."""
+    scores = rt.evaluate(room, ROOM / "gt_mot.txt", ROOM / "gt_objects.json")
+    mine = scores["tracks"]["all"]
+    assert mine["IDF1"] > 0.75 and mine["precision"] > 0.85  # a frame beside it costs 0.1 and more
+    objects = scores["objects"]
+    assert objects["found"] >= 8 and objects["o3d_median"] > 0.4
+    assert objects["center_error_median"] < 0.06 and objects["scale_error"] == 0
+    assert f"3D: true {objects['true']}, found {objects['found']}" in score_report(scores)
+
+
+def test_scores_by_class(tmp_path: Path) -> None:
+    """Truth of nine columns: one chair (56) is found as a cup, one cup as a cup."""
+    gt = np.array([[1, 1, 0, 0, 10, 10, 1, 56, 1], [1, 2, 50, 0, 10, 10, 1, 41, 1]])
+    result = cups([0, 0], [1, 2])
+    tracked_folder(tmp_path / "out", result)
+    gt_file = write(tmp_path / "gt.txt", gt)
+    scores = rt.evaluate(tmp_path / "out", gt_file)["tracks"]
+    assert sorted(scores) == ["all", "chair", "cup"]
+    assert [scores[k]["recall"] for k in ("all", "chair", "cup")] == [0.5, 0, 1]
+    assert [scores[k]["precision"] for k in ("all", "cup")] == [0.5, 0.5]
+    one = rt.evaluate(tmp_path / "out", gt_file, classes=["chair"])["tracks"]
+    assert list(one) == ["all"] and one["all"]["recall"] == 0
+    (tmp_path / "gt_mot_format.json").write_text('{"classes": {"56": "cup", "41": "cup"}}')
+    assert rt.evaluate(tmp_path / "out", gt_file)["tracks"]["all"]["recall"] == 1
+
+
+def test_zero_marked_truth_is_left_out(tmp_path: Path) -> None:
+    """Files of ten columns (MOT15) and of seven: column 7 is the flag, there are no classes."""
+    rows = [[1, 1, 0, 0, 10, 10, 1, -1, -1, -1], [1, 2, 50, 0, 10, 10, 0, -1, -1, -1]]
+    for width in (7, 10):
+        gt = write(tmp_path / "gt.txt", np.array(rows)[:, :width])
+        mine = score(gt, write(tmp_path / "pr.txt", np.array(rows)[:1]))
+        assert mine["gt_objects"] == 1 and mine["recall"] == 1
+    assert rt.evaluate(tmp_path / "pr.txt", gt)["ranks"] == {}
+
+
+def test_results_on_ignored_truth_are_dropped() -> None:
+    """The better overlap decides whose a box is; one on nothing stays."""
+    truth = boxes((0, 1, 0), (0, 2, 4), (0, 3, 90))
+    role = np.array([SCORED, IGNORED, ABSENT])
+    truth = LabelledBoxes(truth.frame, truth.identity, truth.xyxy, truth.name, role)
+    found = boxes((0, 7, 0), (0, 8, 5), (0, 9, 90), (0, 10, 300), (1, 8, 5))
+    kept = drop_ignored(truth, found)
+    assert list(zip(kept.frame.tolist(), kept.identity.tolist(), strict=True)) == [
+        (0, 7), (0, 9), (0, 10), (1, 8),
+    ]  # fmt: skip
+
+
+def test_identities_are_mapped_one_to_one_by_common_frames() -> None:
+    truth = boxes(*((f, 1, 0) for f in range(10)), *((f, 2, 50) for f in range(10)), (0, 3, 200))
+    found = boxes(*((f, 5, 0) for f in range(6)), *((f, 6, 0) for f in range(6, 10)),
+                  *((f, 5, 50) for f in range(6, 10)), *((f, 7, 50) for f in range(3)))  # fmt: skip
+    assert identity_map(truth, found) == {1: 5, 2: 7, 3: None}
+    mine = score_tracks(truth, found)
+    assert mine["IDR"] == pytest.approx(9 / 21) and mine["IDP"] == pytest.approx(9 / 17)
+    assert mine["IDF1"] == pytest.approx(18 / 38)
+
+
+@pytest.mark.parametrize(
+    ("shift", "share"),  # of 19 thresholds; IoU of two squares of side 10 shifted by s px is
+    [(0, 1), (2, 13 / 19), (5, 6 / 19), (9, 1 / 19)],  # (10 - s) / (10 + s)
+)
+def test_hota_counts_the_thresholds_that_the_overlap_passes(shift: float, share: float) -> None:
+    truth, found = boxes((0, 1, 0), (1, 1, 0)), boxes((0, 5, shift), (1, 5, shift))
+    mine = score_tracks(truth, found)
+    hit = np.mean([(10 - shift) / (10 + shift) >= k * 0.05 - 1e-9 for k in range(1, 20)])
+    assert hit == pytest.approx(share)
+    assert mine["HOTA"] == pytest.approx(share) and mine["AssA"] == pytest.approx(share)
+
+
+def test_mota_counts_misses_false_boxes_and_switches() -> None:
+    truth = boxes(*((f, 1, 0) for f in range(10)))
+    found = boxes(*((f, 5 if f < 5 else 6, 0) for f in range(8)), (0, 9, 300), (1, 9, 300))
+    mine = score_tracks(truth, found)
+    assert mine["IDSW"] == 1 and mine["MOTA"] == pytest.approx(1 - (2 + 2 + 1) / 10)
+    assert mine["recall"] == 0.8 and mine["precision"] == 0.8 and mine["Frag"] == 0
+
+
+def test_a_match_is_kept_while_it_overlaps() -> None:
+    """A better box beside it does not take the object over (no switch): CLEAR MOT's rule."""
+    truth = boxes((0, 1, 0), (1, 1, 0))
+    found = boxes((0, 5, 0), (1, 5, 3), (1, 6, 0))
+    assert score_tracks(truth, found)["IDSW"] == 0
+    assert score_tracks(truth, boxes((0, 5, 0), (1, 5, 6), (1, 6, 0)))["IDSW"] == 1  # IoU .25
+
+
+def test_a_gap_is_a_fragment() -> None:
+    truth = boxes(*((f, i, 60 * i) for f in range(6) for i in (1, 2)))
+    found = boxes(*((f, i, 60 * i) for f in range(6) for i in (1, 2) if (i, f) != (1, 3)))
+    mine = score_tracks(truth, found)
+    assert mine["Frag"] == 1 and mine["IDSW"] == 0
+
+
+def test_a_return_is_kept_if_any_visit_before_had_its_identity() -> None:
+    """Visits of object 1: identities 5, 6, 5 (kept), 7 (lost), 6 (kept)."""
+    names, starts = (5, 6, 5, 7, 6), (0, 50, 100, 150, 200)
+    frames = [(s + k, n) for s, n in zip(starts, names, strict=True) for k in range(3)]
+    truth = boxes(*((f, 1, 0) for f, _ in frames))
+    mine = score_tracks(truth, boxes(*((f, n, 0) for f, n in frames)))
+    assert mine["returns"] == 4 and mine["returns_kept"] == 0.5
+
+
+def test_a_visit_ends_after_thirty_frames() -> None:
+    frames = (0, 30, 60, 91, 92)
+    assert visits(boxes(*((f, 1, 0) for f in frames))).tolist() == [0, 0, 0, 1, 1]
+    unordered = boxes((91, 1, 0), (0, 2, 0), (0, 1, 0), (40, 2, 0))
+    assert visits(unordered).tolist() == [1, 0, 0, 1]
 
 
 def test_nothing_found_and_nothing_true() -> None:
-    some, none = boxes((0, 1, 0), (1, 1, 0)), rt.labelled(np.empty((0, 7)))
-    assert rt.score_tracks(some, none)["HOTA"] == 0
-    assert rt.score_tracks(none, some)["precision"] == 0
-    assert rt.score_tracks(none, none)["IDF1"] == 0
-    assert rt.score_tracks(some, some)["HOTA"] == 1
+    some, none = boxes((0, 1, 0), (1, 1, 0)), labelled(np.empty((0, 7)))
+    assert score_tracks(some, none)["HOTA"] == 0
+    assert score_tracks(none, some)["precision"] == 0
+    assert score_tracks(none, none)["IDF1"] == 0
+    assert score_tracks(some, some)["HOTA"] == 1
 
 
 def test_classes_never_match_each_other() -> None:
     rows = np.array([[1, 1, 0, 0, 10, 10, 1]], float)
-    chair, cup, any_class = (rt.labelled(rows, n) for n in ("chair", "cup", ""))
-    assert rt.score_tracks(chair, cup)["recall"] == 0
-    assert rt.score_tracks(chair, any_class)["recall"] == 1
+    chair, cup, any_class = (labelled(rows, n) for n in ("chair", "cup", ""))
+    assert score_tracks(chair, cup)["recall"] == 0
+    assert score_tracks(chair, any_class)["recall"] == 1
 
 
 def test_mot17_distractors_swallow_what_they_match(tmp_path: Path) -> None:
@@ -302,37 +503,132 @@ def test_failure_gallery_names_the_error_and_its_cause(tmp_path: Path) -> None:
 
 # ---- Objects in 3D ----
 
+TURN = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()  # ours from the true world
+SHIFT = np.array([1.0, 2.0, 3.0])
+TRUE = {"id": 4, "center": [0.5, 0.2, 1.0], "half_axes": [0.2, 0.3, 0.4],
+        "world_from_obj": Rotation.from_rotvec([0, 0, 0.7]).as_matrix().tolist()}  # fmt: skip
 
-def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
-    """Our world is half as large and turned: after the alignment by cameras nothing is wrong."""
-    rng = np.random.default_rng(3)
-    centers = rng.uniform(-2, 2, (12, 3))  # of the cameras, true world
-    turn = rt.Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
-    ours = 0.5 * centers @ turn.T + [1, 2, 3]
+
+def half_sized(tmp_path: Path, source: str = "pycolmap") -> tuple[rt.Result, Path, Path]:
+    """A result in a world of half the size, turned and shifted; true solids and true poses."""
+    centers = np.random.default_rng(3).uniform(-2, 2, (12, 3))  # of the cameras, true world
+    ours = 0.5 * centers @ TURN.T + SHIFT
     pose = np.concatenate([np.tile(np.eye(3), (12, 1, 1)), -ours[:, :, None]], 2)
     camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
     frame = np.arange(12)
-    poses = rt.Poses(camera, frame, frame / 10, pose, np.full(12, "pnp"), "pycolmap")
+    poses = rt.Poses(camera, frame, frame / 10, pose, np.full(12, "pnp"), source)
     c2w = np.tile(np.eye(4), (12, 1, 1))
     c2w[:, :3, 3] = centers
     np.savetxt(tmp_path / "poses_c2w.txt", c2w.reshape(12, 16))
-    (tmp_path / "cache").mkdir()
-    rt.save_poses(tmp_path / "cache" / "last-poses.npz", poses)
-    table = rt.TrackTable(*(np.empty(0, np.int64) for _ in range(3)), np.empty((0, 4)),
-                          np.empty(0), np.empty(0, np.int64), np.empty(0, np.int64))  # fmt: skip
-    rt.TrackResult(table, ("chair",)).save(tmp_path / "cache/last-tracks.npz")
-    true = {"id": 4, "center": [0.5, 0.2, 1.0], "half_axes": [0.2, 0.3, 0.4],
-            "world_from_obj": np.eye(3).tolist()}  # fmt: skip
-    (tmp_path / "gt_objects.json").write_text(json.dumps({"objects": [true]}))
-    quat = rt.quat_wxyz_from_matrix(turn[None])[0].tolist()
-    center = (0.5 * turn @ np.array(true["center"]) + [1, 2, 3]).tolist()
-    mine = {"id": 9, "class": "chair", "status": "ok", "center": center, "quat_wxyz": quat,
-            "half_axes": [0.1, 0.15, 0.2]}  # fmt: skip
-    world = {"scale": {"metres_per_unit": 2.2}}
-    (tmp_path / "objects.json").write_text(json.dumps({"objects": [mine], "world": world}))
-    files = tmp_path, tmp_path / "gt_objects.json", tmp_path / "poses_c2w.txt"
-    found = rt.score_objects(*files, {4: 9, 5: 7})
+    (tmp_path / "gt_objects.json").write_text(json.dumps({"objects": [TRUE]}))
+    xyzw = Rotation.from_matrix(TURN @ np.array(TRUE["world_from_obj"])).as_quat()
+    mine = rt.Object(
+        9, "chair", 1.0, "ok", "", "ellipsoid", 0.5 * TURN @ np.array(TRUE["center"]) + SHIFT,
+        np.array([0.1, 0.15, 0.2]), np.roll(xyzw, 1), np.array([0.2, 0.3, 0.4]),
+    )  # fmt: skip
+    world = rt.World("arbitrary", source, 12, 0, 12, scale=quadrics.Scale(2.2, 0.1, "priors"))
+    tracks, video = rt.Tracks.empty(), VideoInfo("a", 640, 480, 30.0)
+    result = rt.Result(tracks, ("chair",), video, [mine], world, poses)
+    return result, tmp_path / "gt_objects.json", tmp_path / "poses_c2w.txt"
+
+
+def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
+    """Our world is half as large and turned: after the alignment by cameras nothing is wrong."""
+    found = score_objects(*half_sized(tmp_path), {4: 9, 5: 7})
     assert found["o3d_found"] == pytest.approx(1, abs=5e-3)
     assert found["o3d_all"] == pytest.approx(0.5, abs=5e-3)  # the second true object has no solid
     assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
+    assert found["size_error_median"] == pytest.approx(0, abs=1e-9)
     assert found["scale_error"] == pytest.approx(0.1)
+    assert (found["true"], found["found"]) == (2, 1)
+    assert {k: found["objects"][0][k] for k in ("id", "object", "class")} == {
+        "id": 4, "object": 9, "class": "chair",
+    }  # fmt: skip
+
+
+def test_errors_are_in_units_of_the_truth(tmp_path: Path) -> None:
+    """Half a unit off in ours is one in the truth; twice the volume is 26 % in size."""
+    result, *files = half_sized(tmp_path)
+    off = TURN @ np.array([0.5, 0, 0])
+    (o,) = result.objects
+    moved = dataclasses.replace(o, center=o.center + off, half_axes=o.half_axes * [2, 1, 1])
+    result.objects = [moved]
+    found = score_objects(result, *files, {4: 9})
+    assert found["center_error_median"] == pytest.approx(1.0)
+    assert found["size_error_median"] == pytest.approx(2 ** (1 / 3) - 1)
+    assert found["o3d_all"] < 0.01  # .4 + .4 m along x: they hardly touch
+
+
+@pytest.mark.parametrize("pairs", [{4: None}, {4: 8}, {}])
+def test_objects_that_the_identities_do_not_say_are_not_found(
+    tmp_path: Path, pairs: dict[int, int | None]
+) -> None:
+    assert score_objects(*half_sized(tmp_path), pairs)["found"] == 0
+
+
+def test_rejected_objects_are_not_found(tmp_path: Path) -> None:
+    result, *files = half_sized(tmp_path)
+    result.objects = [dataclasses.replace(result.objects[0], status="rejected")]
+    assert score_objects(result, *files, {4: 9}) == {"true": 1, "found": 0, "o3d_all": 0.0}
+
+
+def test_supplied_cameras_are_in_the_true_world_already(tmp_path: Path) -> None:
+    result, solids, _ = half_sized(tmp_path, "user")
+    found = score_objects(result, solids, None, {4: 9})
+    truth, ours = np.array(TRUE["center"]), result.objects[0].center
+    assert found["center_error_median"] == pytest.approx(np.linalg.norm(truth - ours))
+
+
+def test_true_cameras_may_be_tum_rows(tmp_path: Path) -> None:
+    """Rows belong to frames by time; frames without a row are not used."""
+    result, solids, path = half_sized(tmp_path)
+    c2w = np.loadtxt(path).reshape(-1, 4, 4)
+    rows = np.c_[np.arange(12) / 10 + 0.01, c2w[:, :3, 3], np.tile([0, 0, 0, 1], (12, 1))]
+    rows[3, 0], rows[3, 1] = 0.345, 99  # between two frames: of none
+    np.savetxt(tmp_path / "tum.txt", rows[::-1])
+    found = score_objects(result, solids, tmp_path / "tum.txt", {4: 9})
+    assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2 3\n4 5 6\n", "3 columns; expected TUM"),
+        ("a b c\n", "expected TUM"),
+        ("0 0 0 0 0 0 0 1\n" * 2, "poses in common; 3 or more"),
+    ],
+)
+def test_bad_true_cameras(tmp_path: Path, text: str, message: str) -> None:
+    result, solids, path = half_sized(tmp_path)
+    path.write_text(text)
+    with pytest.raises(rt.ReobjError, match=message):
+        score_objects(result, solids, path, {4: 9})
+
+
+def test_3d_needs_cameras(tmp_path: Path) -> None:
+    result, solids, path = half_sized(tmp_path)
+    with pytest.raises(rt.ReobjError, match="give --gt-poses"):
+        score_objects(result, solids, None, {4: 9})
+    result.poses = None
+    with pytest.raises(rt.ReobjError, match="no cameras here"):
+        score_objects(result, solids, path, {4: 9})
+
+
+def test_true_solids_in_both_forms(tmp_path: Path) -> None:
+    """Half axes, or extents with axes `R`; the visible part counts; a sheet is 1 cm thick."""
+    R = Rotation.from_rotvec([0, 0, 0.5]).as_matrix().tolist()
+    box = {"id": 1, "center": [1, 2, 3], "size": [2.0, 4.0, 0.0], "R": R, "visible_part": {
+        "center": [1, 2, 4], "size": [2.0, 1.0, 0.0], "R": R}}  # fmt: skip
+    (tmp_path / "o.json").write_text(json.dumps({"objects": [box, TRUE]}))
+    ids, solids = read_true_solids(tmp_path / "o.json")
+    assert ids == [1, 4]
+    np.testing.assert_allclose(solids.center_in_world, [[1, 2, 4], TRUE["center"]])
+    np.testing.assert_allclose(solids.half_axes, [[1, 0.5, 0.005], [0.2, 0.3, 0.4]])
+    np.testing.assert_allclose(solids.world_from_obj, [R, TRUE["world_from_obj"]])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"objects": [{"id": 1}]}', '{"objects": [3]}'])
+def test_bad_true_solids(tmp_path: Path, text: str) -> None:
+    (tmp_path / "o.json").write_text(text)
+    with pytest.raises(rt.ReobjError, match=r"o\.json"):
+        read_true_solids(tmp_path / "o.json")

@@ -217,7 +217,9 @@ def test_bad_tracks(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize("to", EXPORTS)
 def test_same_folder_same_bytes(room: Path, tmp_path: Path, to: str) -> None:
     if to in ("glb", "rrd"):
-        pytest.importorskip({"glb": "trimesh", "rrd": "rerun"}[to], reason="pip install '.[viewer]'")
+        pytest.importorskip(
+            {"glb": "trimesh", "rrd": "rerun"}[to], reason="pip install '.[viewer]'"
+        )
     if to == "rrd":
         pytest.skip("rerun numbers the chunks of a file at random")
     paths = [tmp_path / "1", tmp_path / "2"]

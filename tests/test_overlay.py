@@ -59,7 +59,7 @@ def test_labels_stay_in_the_image(corner: tuple[float, float]) -> None:
     image = grey()
     box = (*corner, corner[0] + 60, corner[1] + 60)
     draw_tracks(image, one_row(box), {3: "3 dining table"}, 1.0)
-    x1, y1, x2, y2 = drawn_in(image[:20], object_color(3))
+    x1, y1, x2, _ = drawn_in(image[:20], object_color(3))
     assert x2 - x1 > 80 and x1 >= 0 and x2 <= 200 and y1 <= 4
 
 
@@ -201,7 +201,10 @@ def conic_pixels(result: rt.Result, folder: Path, count: int) -> tuple[list[np.n
 def test_ellipses_lie_where_the_objects_are(chairs: rt.Result, tmp_path: Path) -> None:
     """The first object is rejected: the others keep their own places and colours."""
     result = dataclasses.replace(chairs)
-    result.objects = [dataclasses.replace(chairs.objects[0], status="rejected"), *chairs.objects[1:]]
+    result.objects = [
+        dataclasses.replace(chairs.objects[0], status="rejected"),
+        *chairs.objects[1:],
+    ]
     pictures, _ = conic_pixels(result, tmp_path, 2)
     poses = walk()
     solids = chair_solids()

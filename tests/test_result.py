@@ -84,9 +84,7 @@ def test_objects_are_typed(saved: Path) -> None:
     np.testing.assert_allclose(found.center, chair_solids().center_in_world[2], atol=0.03)
 
 
-def test_ellipsoids_of_a_loaded_result_are_those_of_the_fit(
-    chairs: rt.Result, saved: Path
-) -> None:
+def test_ellipsoids_of_a_loaded_result_are_those_of_the_fit(chairs: rt.Result, saved: Path) -> None:
     ours, theirs = chairs.ellipsoids(), rt.Result.load(saved).ellipsoids()
     np.testing.assert_allclose(theirs.center_in_world, ours.center_in_world, atol=1e-5)
     np.testing.assert_allclose(theirs.half_axes, ours.half_axes, atol=1e-5)
@@ -319,7 +317,13 @@ def old_objects(out: Path) -> dict[str, object]:
     """Turn objects.json into one of 0.1.0: links have `look`."""
     data = json.loads((out / "objects.json").read_text())
     data["reobj_track"] = "0.1.0"
-    link = {"kind": "join", "tracklets": [1, 2], "place_iou": 0.5, "look": 0.8695702475, "kept": True}
+    link = {
+        "kind": "join",
+        "tracklets": [1, 2],
+        "place_iou": 0.5,
+        "look": 0.8695702475,
+        "kept": True,
+    }
     data["world"]["links"] = [link]
     (out / "objects.json").write_text(json.dumps(data))
     return data
@@ -342,7 +346,7 @@ def old_tracks(out: Path) -> None:
     columns["object_id"] = columns.pop("track_id")
     np.savez_compressed(out / "cache/last-tracks.npz", **columns, fixed=False, split=0,
                         look=np.zeros((0, 0), np.float16), look_row=np.zeros(0, np.int64),
-                        class_names=np.array(rt.COCO_NAMES), messages=np.array([], str))  # fmt: skip
+                        class_names=np.array(rt.COCO_NAMES), messages=np.array([]))  # fmt: skip
 
 
 def test_objects_of_an_old_folder_load(saved: Path) -> None:

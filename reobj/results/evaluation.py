@@ -396,7 +396,9 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     centers = _true_centers(truth_poses, poses)  # (F, 3)
     use = poses.known & np.isfinite(centers).all(1)
     ours = invert_rigid(poses.cam_from_world[use])[:, :, 3]  # (f, 3)
-    true_from_ours = import_pycolmap().estimate_sim3d(ours, centers[use])  # Umeyama, PAMI 1991
+    true_from_ours = None
+    if use.sum() >= 3:  # Umeyama, PAMI 1991
+        true_from_ours = import_pycolmap().estimate_sim3d(ours, centers[use])
     if true_from_ours is None:
         raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
     turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
