@@ -1,4 +1,4 @@
-"""From views to solids, and what is said of each object: simulated chairs, and fits made by hand."""
+"""From views to solids, and what is said of them: simulated chairs, and fits made by hand."""
 
 from __future__ import annotations
 

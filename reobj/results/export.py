@@ -47,7 +47,7 @@ def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
 
 
 def _frames_read(result: Result) -> tuple[list[int], list[str]]:
-    """List the frames that were read, or where nothing tells, those with a track.
+    """List the frames that were read or have a track (filled gaps), ascending.
 
     Returns:
         source frame numbers, and the image names by frame number ([]: a video, or it is gone).
@@ -57,12 +57,13 @@ def _frames_read(result: Result) -> tuple[list[int], list[str]]:
         with contextlib.suppress(ReobjError):  # moved or deleted since: most exports need none
             video = Video(*Workspace.open(result.out).source)
     names = video.names if video is not None else []
+    read = np.empty(0, np.int64)
     if result.poses is not None:
-        return result.poses.frame.tolist(), names
-    if video is None or not video.frame_count:
-        return np.unique(result.tracks.frame).tolist(), names
-    config, count = video.config, video.frame_count
-    return list(range(config.start, min(config.stop or count, count), config.every)), names
+        read = result.poses.frame
+    elif video is not None and video.frame_count:
+        config, count = video.config, video.frame_count
+        read = np.arange(config.start, min(config.stop or count, count), config.every)
+    return np.union1d(read, result.tracks.frame).tolist(), names
 
 
 def export_coco_vid(result: Result, path: Path) -> None:
