@@ -371,7 +371,7 @@ def test_identities_are_mapped_one_to_one_by_common_frames() -> None:
 
 @pytest.mark.parametrize(
     ("shift", "share"),  # of 19 thresholds; IoU of two squares of side 10 shifted by s px is
-    [(0, 1), (2, 13 / 19), (5, 6 / 19), (9, 1 / 19)],  # (10 - s) / (10 + s)
+    [(0, 1), (2, 13 / 19), (5, 6 / 19), (6, 5 / 19), (9, 1 / 19)],  # (10 - s) / (10 + s)
 )
 def test_hota_counts_the_thresholds_that_the_overlap_passes(shift: float, share: float) -> None:
     truth, found = boxes((0, 1, 0), (1, 1, 0)), boxes((0, 5, shift), (1, 5, shift))
@@ -379,6 +379,15 @@ def test_hota_counts_the_thresholds_that_the_overlap_passes(shift: float, share:
     hit = np.mean([(10 - shift) / (10 + shift) >= k * 0.05 - 1e-9 for k in range(1, 20)])
     assert hit == pytest.approx(share)
     assert mine["HOTA"] == pytest.approx(share) and mine["AssA"] == pytest.approx(share)
+
+
+def test_hota_prefers_the_identity_that_fits_the_whole_object() -> None:
+    """Identity 5 covers the object in 6 frames, 6 in five of these; but 5 has 94 false boxes."""
+    truth = boxes(*((f, 1, 0) for f in range(10)))
+    found = boxes(*((f, 5, -2) for f in range(6)), *((f, 6, 2) for f in range(5)),
+                  *((f, 5, 500) for f in range(10, 104)))  # fmt: skip
+    share = (5 * 5 / 10 + 1 / 109) / 6  # of 6 true positives, 5 are identity 6's
+    assert score_tracks(truth, found)["AssA"] == pytest.approx(13 / 19 * share)
 
 
 def test_mota_counts_misses_false_boxes_and_switches() -> None:
@@ -474,7 +483,8 @@ def test_command_line_prints_a_table_and_refuses_other_files(
     assert "IDF1" in text and "Rank-k: no embeddings here" in text
     (tmp_path / "bad.txt").write_text("not a table\n")
     assert rt.main(["eval", str(files[0]), "--gt", str(tmp_path / "bad.txt")]) == 2
-    assert "no MOTChallenge file" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "bad.txt, line 1: " in error and len(error.splitlines()) == 1
 
 
 def test_failure_gallery_names_the_error_and_its_cause(tmp_path: Path) -> None:
