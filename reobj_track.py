@@ -1102,6 +1102,8 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.objects = describe_objects(tracks, class_names, result.fits, views, own)
     gap = 0 if result.identities_given else config.output.fill_gaps
     result.tracks, result.out = fill_gaps(tracks, video.size, gap), workspace.out
+    detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
+    result.embedding_row = detected[result.embedding_row]
     result.world = describe_world(poses, result.fits, events)
     result.seconds["objects"] = time.monotonic() - started
     result.warnings += poses.messages if poses is not None else ()

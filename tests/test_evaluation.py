@@ -422,6 +422,16 @@ def test_a_return_is_kept_if_any_visit_before_had_its_identity() -> None:
     assert mine["returns"] == 4 and mine["returns_kept"] == 0.5
 
 
+@pytest.mark.parametrize(("frames_of_5", "kept"), [(1, 0), (2, 1)])
+def test_the_main_identity_of_a_visit_counts(frames_of_5: int, kept: float) -> None:
+    """Away for long, then three frames under the old identity 5 or a new one."""
+    names = [5, 5, *[5] * frames_of_5, *[9] * (3 - frames_of_5)]
+    frames = (0, 1, 50, 51, 52)
+    truth = boxes(*((f, 1, 0) for f in frames))
+    found = boxes(*((f, n, 0) for f, n in zip(frames, names, strict=True)))
+    assert score_tracks(truth, found)["returns_kept"] == kept
+
+
 def test_a_visit_ends_after_thirty_frames() -> None:
     frames = (0, 30, 60, 91, 92)
     assert visits(boxes(*((f, 1, 0) for f in frames))).tolist() == [0, 0, 0, 1, 1]

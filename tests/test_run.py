@@ -22,6 +22,7 @@ import quadrics
 import reobj
 import reobj_track as rt
 from reobj.results.result import validate_objects
+from reobj.results.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 12
@@ -213,6 +214,22 @@ def test_gaps_are_filled_as_far_as_the_option_says(
         mot = np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")
         assert len(mot) == rows and (mot[:, 6] == 0).sum() == rows - 18
         assert {o.frames_seen for o in rt.Result.load(tmp_path / "out").objects} == {9}
+
+
+def test_embeddings_keep_their_rows_where_gaps_are_filled(
+    clip: Path, detections: Path, tmp_path: Path
+) -> None:
+    lines = detections.read_text().splitlines(keepends=True)
+    detections.write_text("".join(x for x in lines if x.split(",")[0] not in ("4", "5")))
+    output = rt.OutputConfig(overlay=False, scene=False)
+    config = rt.Config(output=output, tracker=rt.TrackerConfig(embed_every=2))
+    result = rt.run(clip, tmp_path / "out", config, detections=detections, in_3d=False)
+    before = Workspace.open(tmp_path / "out").load_last()
+    assert len(result.tracks) == len(before.tracks) + 4
+    ours, own = (r.tracks[r.embedding_row] for r in (result, before))
+    assert len(own) == len(result.embeddings.foreground) > 8
+    np.testing.assert_array_equal(ours.frame, own.frame)
+    np.testing.assert_array_equal(ours.xyxy, own.xyxy)
 
 
 # ---- Resume and output folder ----
