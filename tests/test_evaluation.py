@@ -260,8 +260,8 @@ def truth_of(path: Path, result: rt.Result) -> Path:
 def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None:
     """Two cups, one comes back twice: once like itself, once like the other (Rank-1 .5)."""
     result = cups([0, 0, 40, 80], [1, 2, 1, 1])
-    fused = np.array([[1, 0, 0], [0, 1, 0], [0.9, 0.1, 0], [0.1, 0.9, 0]], np.float16)
-    result.embeddings = Embeddings(fused[:, :2], fused[:, 2:])
+    fused = np.array([[1, 1, 0], [1, 0, 1], [1, 0.9, 0.1], [1, 0.1, 0.9]], np.float16)
+    result.embeddings = Embeddings(fused[:, :1], fused[:, 1:])  # the background tells
     result.embedding_row = np.arange(4)
     tracked_folder(tmp_path / "out", result)
     gt = truth_of(tmp_path / "gt.txt", result)
@@ -279,6 +279,15 @@ def test_rows_without_an_embedding_are_no_queries(tmp_path: Path) -> None:
     tracked_folder(tmp_path / "out", result)
     ranks = rt.evaluate(tmp_path / "out", truth_of(tmp_path / "gt.txt", result))["ranks"]
     assert ranks["queries"] == 1 and ranks["rank1"] == 1
+
+
+def test_objects_of_other_classes_are_not_in_the_gallery() -> None:
+    """A cup looks just as the chair that comes back, which has changed."""
+    truth = boxes((0, 1, 0), (0, 2, 50), (0, 3, 90), (50, 1, 0))
+    embedding = np.array([[0.8, 0.6], [1, 0], [0, 1], [1, 0]])
+    for names, rank in ((["chair", "cup", "chair", "chair"], 1), (["chair"] * 4, 2)):
+        named = dataclasses.replace(truth, name=np.array(names))
+        assert return_ranks(named, named, embedding).tolist() == [rank]
 
 
 def test_the_best_view_of_every_object_counts() -> None:

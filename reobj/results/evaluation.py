@@ -232,9 +232,7 @@ def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
     return {"returns": len(kept), "returns_kept": sum(kept) / max(len(kept), 1)}
 
 
-QUERY_FRAMES = (
-    10  # first ones of a return, whose boxes are queries; chosen: the tracker's n_init, x 3
-)
+QUERY_FRAMES = 10  # first ones of a return, whose boxes are queries; chosen: .3 s of video
 
 
 def return_ranks(
@@ -405,7 +403,7 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
 
 
-SAME_TIME_S = 0.02  # of a frame and its true pose; chosen: less than half a frame at 25 Hz
+SAME_TIME_S = 0.02  # of a frame and its true pose; chosen: half a frame at 25 Hz
 
 
 def _true_centers(path: Path, poses: Poses) -> Array:

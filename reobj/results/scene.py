@@ -147,7 +147,7 @@ def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) ->
         part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
 
 
-SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .3 MB of the page)
+SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .4 MB of the page)
 
 
 def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
