@@ -54,6 +54,7 @@ def test_coco_vid_holds_every_row(room: Path, tmp_path: Path) -> None:
     data, rows = json.loads(path.read_text()), mot(room / "tracks.txt")
     frame_of = {i["id"]: i["frame_id"] for i in data["images"]}
     assert sorted(frame_of.values()) == list(range(0, 120, 3))  # also those without any object
+    assert sorted(frame_of) == list(range(1, 41)) and data["annotations"][0]["id"] == 1
     assert {i["video_id"] for i in data["images"]} == {v["id"] for v in data["videos"]} == {1}
     found = np.array(
         [[frame_of[a["image_id"]] + 1, a["instance_id"], *a["bbox"]] for a in data["annotations"]]

@@ -269,9 +269,9 @@ def test_three_views_are_enough(count: int, status: str) -> None:
 
 
 def test_unseen_frames_do_not_count_as_views() -> None:
-    """In one frame with a pose the object has no box: no view, no outlier, no overlap of 0."""
-    fits, views = a_fit(4, inlier=np.array([[True], [True], [True], [False]]))
-    views.boxes[3] = np.nan
+    """In five of eight frames the object has no box: no view, no outlier, no overlap of 0."""
+    fits, views = a_fit(8, inlier=np.arange(8)[:, None] < 3)
+    views.boxes[3:] = np.nan
     three = np.arange(3)
     tracks = rt.Tracks(three, three * 0 + 1, three * 0 + 1, views.boxes[:3, 0], np.ones(3),
                        three * 0, three)  # fmt: skip

@@ -222,6 +222,23 @@ def test_ellipses_lie_where_the_objects_are(chairs: rt.Result, tmp_path: Path) -
             assert (np.abs(hue).max(1) < 60).any(), number
 
 
+def test_ellipses_of_large_videos_are_shrunk(chairs: rt.Result, tmp_path: Path) -> None:
+    """The same walk with a camera of three times the pixels; the overlay has twice as many."""
+    small = walk(1).camera
+    large = rt.Camera("PINHOLE", 1920, 1440, tuple(3 * p for p in small.params))
+    result = dataclasses.replace(chairs, poses=dataclasses.replace(chairs.poses, camera=large))
+    result.tracks = rt.Tracks.empty()
+    video = rt.Video(frames(tmp_path / "f", 1, (1920, 1440)))
+    (picture,), _ = overlay_of(result, video, tmp_path / "o.mp4")
+    assert picture.shape == (960, 1280, 3)
+    dual_c, _ = quadrics.project(chairs.fits.ellipsoids.dual_quadrics(),
+                                 small.K @ chairs.poses.cam_from_world[:1])  # fmt: skip
+    expected = 2 * quadrics.boxes_from_dual_conics(dual_c)[0]  # (3, 4)
+    y, x = np.nonzero(np.abs(picture.astype(int) - 127).max(2) > 40)
+    bounds = [x.min(), y.min(), x.max(), y.max()]
+    np.testing.assert_allclose(bounds, [*expected[:, :2].min(0), *expected[:, 2:].max(0)], atol=4)
+
+
 def test_priors_are_drawn_only_while_the_object_is_seen(chairs: rt.Result, tmp_path: Path) -> None:
     result = dataclasses.replace(chairs)
     result.objects = [dataclasses.replace(o, status="prior_dominated") for o in chairs.objects]

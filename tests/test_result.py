@@ -37,7 +37,8 @@ def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> Non
                                 messages=("a gap",))  # fmt: skip
     links = (rt.LinkEvent("join", (1, 4), 0.5, 1.25, True),
              rt.LinkEvent("split", (3, 2), None, -0.75, False))  # fmt: skip
-    world = dataclasses.replace(chairs.world, links=links)
+    scale = quadrics.Scale(0.5, 0.125, "priors")
+    world = dataclasses.replace(chairs.world, links=links, scale=scale)
     rejected = rt.Object(4, "cup", 0.5, "rejected", "no reason", None, tracklet_ids=[7, 9],
                          visits=[[0, 3], [5, 5]])  # fmt: skip
     before = copy_of(chairs, poses=poses, world=world, warnings=["take care"])

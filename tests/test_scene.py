@@ -531,6 +531,38 @@ def test_pictures_show_different_views() -> None:
     assert set(tracks.track_id[diverse_rows(tracks, found, None, 30)]) == {3}
 
 
+def test_views_from_other_sides_are_shown() -> None:
+    """The camera stands still for 21 frames, then it looks from three other sides, a frame each."""
+    poses = poses_of_walk()
+    tracks = tracks_of_walk(poses)
+    found = rt.Object(3, "suitcase", 1.0, "ok", "", center=np.array(CENTERS[2]))
+    cams = np.repeat(poses.cam_from_world[:1], FRAMES, 0)
+    eyes = np.array([[4.0, 0, 1], [0, 4, 1], [0, 0, 5]]) + found.center
+    cams[-3:, :, 3] = -np.einsum("fij,fj->fi", cams[-3:, :, :3], eyes)
+    still = dataclasses.replace(poses, cam_from_world=cams)
+    own = np.flatnonzero(tracks.track_id == 3)
+    tracks.xyxy[own] = [0, 0, 50, 50]  # equally good
+    late = [(tracks.frame[diverse_rows(tracks, found, p, 4)] > 20).sum() for p in (still, None)]
+    assert late[0] >= 2 and late[1] == 1  # by time alone: the last one
+
+
+def test_boxes_are_drawn_in_small_frames(tmp_path: Path) -> None:
+    """A frame of 960 px is shown with 320, and its boxes too."""
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((720, 960, 3), np.uint8))
+    zero, one = np.zeros(1, np.int64), np.ones(1, np.int64)
+    box = np.array([[300.0, 300, 600, 600]])
+    result = fitted(rt.Tracks(zero, one, one, box, np.ones(1), zero, zero), None)
+    video = rt.Video(tmp_path / "0.png")
+    pictures = Pictures(result, video)
+    for frame in video:
+        pictures.take(frame)
+    ((_, text),) = pictures.frames
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (240, 320, 3)
+    x = np.flatnonzero(image[150].max(1) > 80)
+    np.testing.assert_allclose([x.min(), x.max()], [100, 200], atol=2)
+
+
 def test_the_best_picture_comes_first() -> None:
     tracks = tracks_of_walk(poses_of_walk())
     own = np.flatnonzero(tracks.track_id == 3)

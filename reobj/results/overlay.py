@@ -133,10 +133,8 @@ class Overlay:
     def __init__(self, result: Result, path: Path, video: Video) -> None:
         width, height = video.size
         shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
-        self.size = (
-            int(width * shrink) // 2 * 2,
-            int(height * shrink) // 2 * 2,
-        )  # codecs want even
+        # codecs want even sides
+        self.size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
         self.scale, self.tracks = self.size[0] / width, result.tracks
         self.ids = [o.id for o in result.located]
         self.sure = {o.id for o in result.located if o.status == "ok"}
