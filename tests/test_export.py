@@ -65,6 +65,20 @@ def test_coco_vid_holds_every_row(room: Path, tmp_path: Path) -> None:
     assert classes == {o["id"]: o["class"] for o in objects(room)}
 
 
+def test_a_filled_gap_may_lie_in_a_frame_that_was_not_read(
+    chairs: rt.Result, tmp_path: Path
+) -> None:
+    """The poses have the frames that could be read; frame 5 could not, but has boxes."""
+    poses = chairs.poses
+    cut = {k: np.delete(getattr(poses, k), 5, 0) for k in ("frame", "time_s", "cam_from_world",
+                                                           "status")}  # fmt: skip
+    result = dataclasses.replace(chairs, poses=dataclasses.replace(poses, **cut))
+    EXPORTS["coco-vid"][1](result, tmp_path / "a.json")
+    data = json.loads((tmp_path / "a.json").read_text())
+    assert [i["frame_id"] for i in data["images"]] == list(range(40))
+    assert len(data["annotations"]) == 120
+
+
 def test_coco_vid_in_pycocotools(room: Path, tmp_path: Path) -> None:
     coco = pytest.importorskip("pycocotools.coco", reason="pip install pycocotools")
     path = tmp_path / "a.json"
