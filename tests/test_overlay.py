@@ -292,3 +292,12 @@ def test_a_film_that_lost_frames_is_an_error(tmp_path: Path) -> None:
 def test_a_film_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="cannot write"):
         VideoWriter(tmp_path / "nowhere" / "o.mp4", 30, (64, 48))
+
+
+def test_sides_are_even(tmp_path: Path) -> None:
+    """Most players refuse odd ones."""
+    video = rt.Video(frames(tmp_path / "f", 1, (321, 241)))
+    result = rt.Result(rt.Tracks.empty(), (), VideoInfo("f", 321, 241, 30.0))
+    overlay = Overlay(result, tmp_path / "o.mp4", video)
+    overlay.close(False)
+    assert overlay.size == (320, 240) and overlay.scale == pytest.approx(320 / 321)
