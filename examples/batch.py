@@ -19,8 +19,8 @@ and those that were killed in the middle go on from their cache. A crash of a wo
 (--retries), bad input is not. On a cluster the files must lie on storage that all nodes share.
 
 Written: results/NAME/..., as `run` does, with its messages in batch.log; results/batch.log, a line
-an event; results/summary.csv, a line a video (summary.parquet too where pyarrow is installed). Exit
-code: 0 all finished, 1 some failed, 2 bad manifest, 130 interrupted.
+an event; results/summary.csv, a line a video. Exit code: 0 all finished, 1 some failed, 2 bad
+manifest, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
+from reobj.files import atomic
+from reobj.sources.video import source_fingerprint
 
 ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = ("path", "out", "detections", "poses", "tracks", "options", "command")
@@ -103,7 +105,7 @@ def make_item(row: dict[str, str], folder: Path, results: Path) -> Item:
     given = [part for k in FILES if k in paths for part in (f"--{k}", paths[k])]
     argv = (row.get("command", "run"), paths["path"], "-o", out, *given,
             *shlex.split(row.get("options", "")))  # fmt: skip
-    inputs = {k: rt.source_fingerprint(path) for k, path in paths.items()}
+    inputs = {k: source_fingerprint(path) for k, path in paths.items()}
     text = json.dumps([rt.__version__, inputs, argv])
     return Item(name, paths["path"], out, argv, hashlib.sha256(text.encode()).hexdigest())
 
@@ -122,6 +124,7 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
     """Run one video in a worker, unless a worker that was killed since has finished it."""
     sys.path.insert(0, root)
     import reobj_track as rt
+    from reobj.files import atomic
 
     if done := finished(item):
         return done
@@ -140,8 +143,8 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
         last = (out / "batch.log").read_text().strip().splitlines() or [""]
         return {"status": "failed", "error": last[-1].removeprefix("error: ")}
     result = {"status": "done", "error": "", "seconds": round(time.monotonic() - started, 1)}
-    result |= facts(out)
-    with rt.atomic(out / MARKER) as part:
+    result |= facts(rt.Result.load(out))
+    with atomic(out / MARKER) as part:
         part.write_text(json.dumps({"key": item.key, "argv": item.argv, "result": result}))
     return result
 
@@ -157,18 +160,16 @@ def call(rt: Any, argv: Sequence[str]) -> int:
         raise
 
 
-def facts(out: Path) -> dict[str, Any]:
+def facts(found: rt.Result) -> dict[str, Any]:
     """The figures of a finished folder that the summary shows."""
-    data = json.loads((out / "objects.json").read_text())
-    world, status = data["world"], [o["status"] for o in data["objects"]]
-    counts = {s: status.count(s) for s in ("ok", "prior_dominated", "rejected")}
+    status = [o.status for o in found.objects]
     return {
-        "frames": data["video"]["tracked_frames"],
-        "frames_with_pose": world.get("registered_frames", 0),
+        "frames": len(set(found.tracks.frame.tolist())),
+        "frames_with_pose": found.world.registered_frames,
         "objects": len(status),
-        "metres_per_unit": (world.get("scale") or {}).get("metres_per_unit"),
-        "warnings": len(data["warnings"]),
-        **counts,
+        **{s: status.count(s) for s in ("ok", "prior_dominated", "rejected")},
+        "metres_per_unit": found.world.scale.value if found.world.scale else None,
+        "warnings": len(found.warnings),
     }
 
 
@@ -231,16 +232,10 @@ class Batch:
                      "attempts": self.attempts[item.name]}  # fmt: skip
             row = known | self.rows.get(item.name, {})
             rows.append({k: row.get(k) for k in SUMMARY})
-        with rt.atomic(self.results / "summary.csv") as part, part.open("w", newline="") as file:
+        with atomic(self.results / "summary.csv") as part, part.open("w", newline="") as file:
             writer = csv.DictWriter(file, SUMMARY, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
-        with contextlib.suppress(ImportError):
-            import pyarrow as pa
-            import pyarrow.parquet as pq
-
-            with rt.atomic(self.results / "summary.parquet") as part:
-                pq.write_table(pa.Table.from_pylist(rows), part)
 
 
 def connect(address: str, workers: int, cpus: int) -> Any:

@@ -152,8 +152,8 @@ def make_stream(
     frame = np.r_[f, clutter]
     order = np.argsort(frame, kind="stable")
     visit = paths.visit[f, o]
-    look = embeddings(rng, o, visit, dim, *COSINES.get(kind, (0.88, 0.31, 0.88)))
-    look = np.r_[look, unit(rng.normal(size=(len(clutter), dim)))]
+    embedding = embeddings(rng, o, visit, dim, *COSINES.get(kind, (0.88, 0.31, 0.88)))
+    embedding = np.r_[embedding, unit(rng.normal(size=(len(clutter), dim)))]
     all_box = np.r_[measured, np.c_[places * SIZE, 40 + 120 * sizes]]
     xyxy = np.c_[all_box[:, :2] - all_box[:, 2:] / 2, all_box[:, :2] + all_box[:, 2:] / 2]
     g, k = np.nonzero(paths.seen)
@@ -162,8 +162,8 @@ def make_stream(
     pad = -np.ones(len(clutter), np.int64)
     return Stream(
         frames, frame[order], xyxy[order], np.r_[score, rng.uniform(0.3, 0.7, len(clutter))][order],
-        np.zeros(len(frame), np.int64), look[order], np.r_[o, pad][order], np.r_[visit, pad][order],
-        truth,
+        np.zeros(len(frame), np.int64), embedding[order],
+        np.r_[o, pad][order], np.r_[visit, pad][order], truth,
     )  # fmt: skip
 
 
@@ -186,12 +186,12 @@ def embeddings(
 ) -> Array:  # fmt: skip
     """Unit rows (N, dim) with these mean cosines within a visit, between objects, across visits."""
     objects = int(owner.max(initial=0)) + 1
-    noise = 1 / within - 1  # squared length of the noise on a look of length 1
+    noise = 1 / within - 1  # squared length of the noise on an embedding of length 1
     shift = max(1 / across**2 / (1 + noise) - 1 - noise, 0.0)
     common = between * (1 + noise)
     own, moved = (unit(rng.normal(size=(objects, dim))) for _ in range(2))
-    look = np.sqrt(common) * unit(rng.normal(size=dim)) + np.sqrt(1 - common) * own  # (O, dim)
-    rows = look[owner] + np.sqrt(shift) * moved[owner] * (visit == 1)[:, None]
+    embedding = np.sqrt(common) * unit(rng.normal(size=dim)) + np.sqrt(1 - common) * own  # (O, dim)
+    rows = embedding[owner] + np.sqrt(shift) * moved[owner] * (visit == 1)[:, None]
     return unit(rows + np.sqrt(noise / dim) * rng.normal(size=rows.shape))
 
 
@@ -204,9 +204,9 @@ def _ours(**options: Any) -> Step:
 
     tracker = rt.Tracker(rt.TrackerConfig(**options))
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
         found = rt.Detections(xyxy, score, class_id)
-        tracks = tracker.update(found, embeddings=look if look.shape[1] else None)
+        tracks = tracker.update(found, embeddings=embedding if embedding.shape[1] else None)
         return tracks.detection_index, tracks.track_id
 
     return step
@@ -218,12 +218,12 @@ def _deepsort(min_score: float = 0.3, **options: Any) -> Step:
 
     tracker = DeepSort(embedder=None, **options)
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
         rows = np.flatnonzero(score >= min_score)
         ltwh = np.c_[xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
         raw = [(ltwh[i].tolist(), float(score[i]), int(class_id[i])) for i in rows]
-        looks = [look[i] for i in rows] if look.shape[1] else [np.ones(1) for _ in rows]
-        tracks = tracker.update_tracks(raw, embeds=looks, others=rows.tolist())
+        embeds = [embedding[i] for i in rows] if embedding.shape[1] else [np.ones(1) for _ in rows]
+        tracks = tracker.update_tracks(raw, embeds=embeds, others=rows.tolist())
         # only detections of this frame: predicted boxes of the frame after are not counted
         good = [t for t in tracks if t.is_confirmed() and t.time_since_update == 0]
         return [t.get_det_supplementary() for t in good], [int(t.track_id) for t in good]
@@ -237,7 +237,7 @@ def _roboflow(name: str) -> Step:
 
     tracker = getattr(trackers, name)()
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
         rows = {"row": np.arange(len(xyxy))}
         found = tracker.update(sv.Detections(xyxy, None, score, class_id, data=rows))
         good = found.tracker_id >= 0 if len(found) else np.zeros(0, bool)
@@ -258,9 +258,11 @@ def _norfair(memory: int | None = None) -> Step:
         reid_hit_counter_max=memory or 30, initialization_delay=3,
     )  # fmt: skip
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, look: Array) -> tuple[Any, Any]:
+    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
         corners = xyxy.reshape(-1, 2, 2)
-        found = [norfair.Detection(b, data=i, embedding=look[i]) for i, b in enumerate(corners)]
+        found = [
+            norfair.Detection(b, data=i, embedding=embedding[i]) for i, b in enumerate(corners)
+        ]
         tracks = tracker.update(found)
         good = [t for t in tracks if t.last_detection in found]
         return [t.last_detection.data for t in good], [t.id for t in good]
@@ -336,7 +338,7 @@ class Clock:
         self.calls: dict[str, int] = {}
 
     def wrap(self, owner: Any, name: str, label: str, count: Callable[..., int]) -> None:
-        """Time a method or function of `owner`; `count` says of how many its arguments are."""
+        """Time a method or function of `owner`; `count`: of how many objects a call is."""
         plain = getattr(owner, name)
 
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -357,12 +359,13 @@ def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
     import cv2
 
     import reobj_track as rt
+    from reobj.identity.embedding import Backbone
 
     cv2.setNumThreads(1)
     detector, embedder = rt.OnnxDetector(threads=1), rt.Embedder(threads=1)
     tracker, clock = rt.Tracker(embedder=embedder), Clock()
-    clock.wrap(embedder, "_features", "map", lambda *_: 1)
-    clock.wrap(embedder._net, "embed", "head", lambda *_: 1)
+    clock.wrap(Backbone, "__call__", "map", lambda *_: 1)
+    clock.wrap(Backbone, "embed", "head", lambda *_: 1)
     clock.wrap(rt.Embedder, "__call__", "all", lambda *args: len(args[3]))
     rows, embedded = [], []
     for frame in rt.Video(source, rt.InputConfig(stop=frames)):
@@ -408,13 +411,13 @@ def embedding_table(sources: list[str], frames: int) -> str:
 def scores(stream: Stream, identity: IntArray, until: int) -> dict[str, float]:
     """Identity scores of the first frames (objects count while in view, detected or not)."""
     sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(ROOT)))
-    import reobj_track as rt
+    from reobj.results.evaluation import labelled, score_tracks
 
     kept = identity > 0
     truth = stream.truth[stream.truth[:, 0] <= until]
     xyxy = stream.xyxy[kept]
     rows = np.c_[stream.frame[kept] + 1, identity[kept], xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
-    return rt.score_tracks(rt.labelled(truth), rt.labelled(rows))
+    return score_tracks(labelled(truth), labelled(rows))
 
 
 def recovery(stream: Stream, identity: IntArray) -> tuple[float, float]:

@@ -15,8 +15,8 @@ is, by the tracker's appearance alone, most like an earlier view of the same obj
 Returns: share of these returns that the tracker itself gave the identity of the visits before.
 
 Appearance networks (folder REOBJ_MODELS): persons osnet_x0_25_msmt17.onnx, rooms
-mobilenetv2_feat.onnx (ImageNet, as DeepSORT's own embedder), one crop a box; "own look" are the
-features of our embedder. Without images no tracker has appearance.
+mobilenetv2_feat.onnx (ImageNet, as DeepSORT's own embedder), one crop a box; "own embedding" is our
+embedder's. Without images no tracker has appearance.
 DeepSORT is deep-sort-realtime 1.3.2 (PyPI), whose gallery of a lost track fills up with copies of
 the last view; `tuned` is max_age 1000, position-only gate, cosine distance .35.
 """
@@ -29,7 +29,6 @@ import csv
 import functools
 import hashlib
 import html
-import inspect
 import os
 import re
 import shutil
@@ -47,9 +46,20 @@ from benchmark import PEERS, TUNED, Array, IntArray, Stream, run_tracker, table
 
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
 import reobj_track as rt
+from reobj.files import atomic
+from reobj.results.evaluation import (
+    LabelledBoxes,
+    labelled,
+    read_truth,
+    return_ranks,
+    score_tracks,
+)
+from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own_models
+from reobj.types import Image
 
 Run = tuple[IntArray, float]  # identity of every detection (N,), 0 for none; CPU seconds
-Looks = tuple[list[Array], float]  # embeddings of every frame's detections; CPU seconds
+Embedded = tuple[list[Array], float]  # embeddings of every frame's detections; CPU seconds
 KITCHEN = ("chair", "dining table", "cup")  # what redkitchen's truth knows
 
 
@@ -64,10 +74,13 @@ def digest(*parts: Any) -> str:
     return total.hexdigest()[:12]
 
 
-SOURCE = digest(Path(rt.__file__), Path(rt.__file__).with_name("quadrics.py"))  # our own rows
-_LOOK = (rt.EmbedConfig, rt.Embedder, rt._colour_features, rt._direction_bins, rt.part_samples)
-EMBEDDER = digest(  # what the own look depends on
-    [inspect.getsource(x) for x in _LOOK], *sorted(rt.own_models().glob("*.*"))
+CODE = Path(rt.__file__).parent
+SOURCE = digest(
+    *(CODE / f"{m}.py" for m in ("reobj_track", "quadrics")), *sorted(CODE.glob("reobj/**/*.py"))
+)  # what our own rows depend on
+EMBEDDER = digest(  # what our own embedding depends on
+    *(CODE / f"reobj/identity/{m}.py" for m in ("embedding", "sampling")),
+    *sorted(own_models().glob("*.onnx")),
 )
 
 
@@ -80,7 +93,7 @@ class Sequence:
     name: str
     group: str
     detections: list[rt.Detections]
-    truth: rt.LabelledBoxes
+    truth: LabelledBoxes
     images: Path | None
     every: int = 1
 
@@ -100,8 +113,8 @@ def split_frames(frame: IntArray, rows: Array, count: int) -> list[rt.Detections
 
 def mot_sequence(name: str, det: Path, gt: Path, images: Path | None = None) -> Sequence:
     """A MOTChallenge sequence: pedestrians, class 0."""
-    truth = rt.read_truth(gt, rt.COCO_NAMES, 0.0)
-    rows = rt.read_mot_rows(det)
+    truth = read_truth(gt, rt.COCO_NAMES, 0.0)
+    rows = read_mot_rows(det)
     frames = int(max(truth.frame.max(), rows[:, 0].max()))
     boxes = np.c_[rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6], rows[:, 6].clip(0, 1), 0 * rows[:, 0]]
     found = split_frames(rows[:, 0].astype(np.int64) - 1, boxes, frames)
@@ -124,7 +137,7 @@ def mot_sequences(folder: Path) -> list[Sequence]:
 
 def kitchen_sequence(folder: Path) -> Sequence:
     """A recording with detections_yolov8s.csv and gt_mot.txt of some classes."""
-    truth = rt.read_truth(folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
+    truth = read_truth(folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
     truth = truth[np.isin(truth.name, KITCHEN)]
     rows = np.loadtxt(folder / "detections_yolov8s.csv", delimiter=",")
     rows = rows[np.isin(rows[:, 6], [rt.COCO_NAMES.index(n) for n in KITCHEN])]
@@ -138,7 +151,7 @@ def room_sequence(folder: Path) -> Sequence:
     video = rt.Video(folder / "room.mp4")
     recorded = rt.read_detections(folder / "detections.npz", video)
     found = [recorded.at(f) for f in range(len(list(video)))]
-    truth = rt.read_truth(folder / "gt_mot.txt", recorded.class_names, 0.0)
+    truth = read_truth(folder / "gt_mot.txt", recorded.class_names, 0.0)
     return Sequence(folder.name, "rooms", found, truth, folder / "room.mp4")
 
 
@@ -172,63 +185,63 @@ class CropNet:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.session = rt.onnx_session(path, 1)
+        self.session = onnx_session(path, 1)
         entry = self.session.get_inputs()[0]
         self.name, shape = entry.name, entry.shape
         self.size = tuple(s if isinstance(s, int) else 128 for s in shape[:1:-1])  # width, height
 
-    def __call__(self, image: rt.Image, found: rt.Detections) -> Array:
+    def __call__(self, image: Image, found: rt.Detections) -> Array:
         crops = []
         for x1, y1, x2, y2 in found.xyxy.round().astype(int):
             part = image[max(y1, 0) : max(y2, y1 + 1, 1), max(x1, 0) : max(x2, x1 + 1, 1)]
             part = part if part.size else image[-1:, -1:]
-            crops.append(cv2.resize(part, self.size)[..., ::-1] / 255.0)
+            crops.append(cv2.resize(part, self.size)[..., ::-1])
         if not crops:
             return np.empty((0, 0))
-        batch = (np.array(crops) - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+        batch = (np.array(crops, np.float64) - IMAGENET_MEAN) / IMAGENET_STD
         feed = {self.name: batch.transpose(0, 3, 1, 2).astype(np.float32)}
         out = self.session.run(None, feed)[0].astype(np.float64)
         out = out.mean((2, 3)) if out.ndim == 4 else out
         return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
 
-def own_look(image: rt.Image, found: rt.Detections, embedder: rt.Embedder) -> Array:
+def own_embedding(image: Image, found: rt.Detections, embedder: rt.Embedder) -> Array:
     """Our embedder's foreground and background side by side."""
     if not len(found):
         return np.empty((0, 0))
-    look = embedder(image, found)
-    parts = [look.foreground, look.background]
+    both = embedder(image, found)
+    parts = [both.foreground, both.background]
     return np.asarray(np.concatenate(parts, 1) / np.sqrt(2))
 
 
 def embed_all(seq: Sequence, net: Any) -> tuple[list[Array], float]:
     """Embeddings of every frame's detections, and CPU seconds."""
-    looks, seconds = [], 0.0
+    embedded, seconds = [], 0.0
     for frame, found in zip(seq.video(), seq.detections, strict=True):
         started = time.process_time()
-        looks.append(net(frame.image, found))
+        embedded.append(net(frame.image, found))
         seconds += time.process_time() - started
-    width = max((x.shape[1] for x in looks if x.ndim == 2), default=0)
-    return [x if len(x) else np.empty((0, width)) for x in looks], seconds
+    width = max((x.shape[1] for x in embedded if x.ndim == 2), default=0)
+    return [x if len(x) else np.empty((0, width)) for x in embedded], seconds
 
 
 # ---- Running and scoring -----------------------------------------------------------------------
 
 
-def stream_of(seq: Sequence, looks: list[Array] | None) -> Stream:
+def stream_of(seq: Sequence, embedded: list[Array] | None) -> Stream:
     """The same detections in the benchmark's form."""
     count = [len(d) for d in seq.detections]
     frame = np.repeat(np.arange(len(count)), count)
     fields = ("xyxy", "score", "class_id")
     box, score, cls = (np.concatenate([getattr(d, k) for d in seq.detections]) for k in fields)
-    look = np.empty((len(frame), 0)) if looks is None else np.concatenate(looks)
+    rows = np.empty((len(frame), 0)) if embedded is None else np.concatenate(embedded)
     none = np.zeros(len(frame), np.int64)
-    return Stream(len(count), frame, box, score, cls, look, none, none, np.empty((0, 9)))
+    return Stream(len(count), frame, box, score, cls, rows, none, none, np.empty((0, 9)))
 
 
-def peer_run(name: str, seq: Sequence, venvs: Path, looks: list[Array] | None) -> Run:
+def peer_run(name: str, seq: Sequence, venvs: Path, embedded: list[Array] | None) -> Run:
     """Run a peer once for every class, as its users do: identities (N,) and CPU seconds."""
-    stream = stream_of(seq, looks)
+    stream = stream_of(seq, embedded)
     identity, seconds = np.zeros(len(stream.frame), np.int64), 0.0
     for cls in np.unique(stream.class_id):
         rows = np.flatnonzero(stream.class_id == cls)
@@ -241,17 +254,17 @@ def peer_run(name: str, seq: Sequence, venvs: Path, looks: list[Array] | None) -
 
 
 def ours(
-    seq: Sequence, looks: list[Array] | None, config: rt.TrackerConfig | None = None
+    seq: Sequence, embedded: list[Array] | None, config: rt.TrackerConfig | None = None
 ) -> tuple[IntArray, float]:
-    """Our tracker alone, frame by frame, its own embedder unless looks are given."""
-    embedder = rt.Embedder() if seq.images is not None and looks is None else None
+    """Our tracker alone, frame by frame, its own embedder unless embeddings are given."""
+    embedder = rt.Embedder() if seq.images is not None and embedded is None else None
     tracker = rt.Tracker(config, embedder)
     identity, seconds = [], 0.0
     frames = iter(seq.video()) if seq.images is not None else None
     for f, found in enumerate(seq.detections):
         image = None if frames is None else next(frames).image
         started = time.process_time()
-        tracks = tracker.update(found, image, embeddings=None if looks is None else looks[f])
+        tracks = tracker.update(found, image, embeddings=None if embedded is None else embedded[f])
         seconds += time.process_time() - started
         ids = np.zeros(len(found), np.int64)
         ids[tracks.detection_index] = tracks.track_id
@@ -266,21 +279,19 @@ def whole_chain(seq: Sequence, out: Path, poses: str) -> Run:
     config = rt.Config(
         input=rt.InputConfig(every=seq.every),
         poses=rt.PosesConfig(mode=poses),
-        output=rt.OutputConfig(overlay=False),
+        output=rt.OutputConfig(overlay=False, scene=False, fill_gaps=0),  # detections only
     )
     result = rt.run(
         seq.images, out / seq.name, config, detections=lambda image: next(at), overwrite=True
     )
     first = np.cumsum([0, *(len(d) for d in seq.detections)])
     identity = np.zeros(first[-1], np.int64)
-    row = first[result.table.frame // seq.every] + result.table.detection_index
-    identity[row] = result.table.object_id
+    row = first[result.tracks.frame // seq.every] + result.tracks.detection_index
+    identity[row] = result.tracks.track_id
     return identity, result.seconds["track"] + result.seconds["objects"]
 
 
-def result_boxes(
-    seq: Sequence, identity: IntArray, stream: Stream | None = None
-) -> rt.LabelledBoxes:
+def result_boxes(seq: Sequence, identity: IntArray, stream: Stream | None = None) -> LabelledBoxes:
     """Detections with an identity; the class of an identity is the one with the most score."""
     stream = stream or stream_of(seq, None)
     kept = np.flatnonzero(identity > 0)
@@ -292,15 +303,15 @@ def result_boxes(
     )
     xyxy = stream.xyxy[kept]
     rows = np.c_[stream.frame[kept] + 1, identity[kept], xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
-    return rt.labelled(rows, names)
+    return labelled(rows, names)
 
 
-def joined(parts: list[rt.LabelledBoxes]) -> rt.LabelledBoxes:
+def joined(parts: list[LabelledBoxes]) -> LabelledBoxes:
     """Several sequences as one: frames and identities shifted apart."""
     shifted = [replace(p, frame=p.frame + 10**6 * i, identity=p.identity + 10**6 * i)
                for i, p in enumerate(parts)]  # fmt: skip
     names = ("frame", "identity", "xyxy", "name", "role")
-    return rt.LabelledBoxes(*(np.concatenate([getattr(p, k) for p in shifted]) for k in names))
+    return LabelledBoxes(*(np.concatenate([getattr(p, k) for p in shifted]) for k in names))
 
 
 def cached(path: Path, make: Callable[[], Run]) -> Run:
@@ -309,7 +320,7 @@ def cached(path: Path, make: Callable[[], Run]) -> Run:
         with np.load(path) as data:
             return data["identity"], float(data["seconds"])
     identity, seconds = make()
-    with rt.atomic(path) as part, part.open("wb") as file:
+    with atomic(path) as part, part.open("wb") as file:
         np.savez_compressed(file, identity=identity, seconds=seconds)
     return identity, seconds
 
@@ -321,44 +332,48 @@ def networks(seq: Sequence) -> dict[str, Any]:
     person = seq.group.startswith("pedestrians")
     file = "osnet_x0_25_msmt17.onnx" if person else "mobilenetv2_feat.onnx"
     path = Path(os.environ.get("REOBJ_MODELS", "models")) / file
-    own = functools.partial(own_look, embedder=rt.Embedder())
+    own = functools.partial(own_embedding, embedder=rt.Embedder())
     nets = {file.split("_")[0]: CropNet(path)} if path.exists() else {}
-    return nets | {"own look": own}
+    return nets | {"own embedding": own}
 
 
-def look_ranks(seq: Sequence, looks: Callable[[], Looks]) -> Run:
-    """Ranks of the right object by appearance alone (`rt.return_ranks`); seconds of embedding."""
-    stream = stream_of(seq, looks()[0])
+def appearance_ranks(seq: Sequence, embedded: Callable[[], Embedded]) -> Run:
+    """Ranks of the right object by appearance alone (`return_ranks`); seconds of embedding."""
+    stream = stream_of(seq, embedded()[0])
     found = result_boxes(seq, 1 + np.arange(len(stream.frame)), stream)
-    return rt.return_ranks(seq.truth, found, stream.embedding), looks()[1]
+    return return_ranks(seq.truth, found, stream.embedding), embedded()[1]
 
 
-def with_looks(make: Callable[[list[Array]], Run], looks: Callable[[], Looks]) -> Run:
+def with_embeddings(make: Callable[[list[Array]], Run], embedded: Callable[[], Embedded]) -> Run:
     """A tracker's run on embeddings that are only computed now."""
-    return make(looks()[0])
+    return make(embedded()[0])
 
 
 def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], Run]]]:
     """For every tracker: what its result depends on, and how to make it.
 
-    `look NAME` gives the ranks of the returns in place of identities, and the time of embedding.
+    `appearance NAME` gives the ranks of the returns in place of identities, and the time of
+    embedding.
     """
     part, source = functools.partial, SOURCE + EMBEDDER
     result: dict[str, tuple[str, Callable[[], Run]]] = {"ours": (source, part(ours, seq, None))}
     deepsorts = ["deepsort", "deepsort-tuned"] if args.peers else []
     nets = networks(seq)
     for name, net in nets.items():
-        looks = functools.cache(part(embed_all, seq, net))
-        key = str(net.path) if name != "own look" else EMBEDDER
-        result[f"look {name}"] = (key, part(look_ranks, seq, looks))
-        if name != "own look":
-            result[f"ours, {name}"] = (source + key, part(with_looks, part(ours, seq), looks))
+        embedded = functools.cache(part(embed_all, seq, net))
+        key = str(net.path) if name != "own embedding" else EMBEDDER
+        result[f"appearance {name}"] = (key, part(appearance_ranks, seq, embedded))
+        if name != "own embedding":
+            result[f"ours, {name}"] = (
+                source + key,
+                part(with_embeddings, part(ours, seq), embedded),
+            )
         for peer in deepsorts:
             run = part(peer_run, peer, seq, args.peers)
-            result[f"{peer}, {name}"] = (key + str(TUNED), part(with_looks, run, looks))
+            result[f"{peer}, {name}"] = (key + str(TUNED), part(with_embeddings, run, embedded))
     for peer in PEERS if args.peers else ():
         if peer.startswith("rf-") or (peer in deepsorts and not nets):
-            label = f"{peer}, no look" if peer in deepsorts else peer
+            label = f"{peer}, no appearance" if peer in deepsorts else peer
             result[label] = (str(TUNED), part(peer_run, peer, seq, args.peers, None))
     if seq.images is not None and seq.group.startswith("rooms"):
         chain = args.out / "chain"
@@ -399,13 +414,17 @@ def report(found: dict[str, dict[str, Run]], seqs: list[Sequence]) -> list[dict[
     """One row for each tracker and sequence, and for each group of sequences together."""
     rows = []
     for label, members in sets_of(seqs).items():
-        for tracker in [t for t in found[members[0].name] if not t.startswith("look ")]:
+        for tracker in [t for t in found[members[0].name] if not t.startswith("appearance ")]:
             runs = [found[s.name] for s in members]
             boxes = [result_boxes(s, r[tracker][0]) for s, r in zip(members, runs, strict=True)]
-            score = rt.score_tracks(joined([s.truth for s in members]), joined(boxes))
+            score = score_tracks(joined([s.truth for s in members]), joined(boxes))
             name = tracker.partition(", ")[2]
-            look = "look own look" if tracker == "ours" or "whole" in name else f"look {name}"
-            ranks = [r[look] for r in runs if look in r]
+            by = (
+                "appearance own embedding"
+                if tracker == "ours" or "whole" in name
+                else f"appearance {name}"
+            )
+            ranks = [r[by] for r in runs if by in r]
             seconds = sum(r[tracker][1] for r in runs)
             seconds += 0 if tracker == "ours" or "whole" in name else sum(s for _, s in ranks)
             first = np.concatenate([k for k, _ in ranks]) == 1 if ranks else np.empty(0)
@@ -480,7 +499,7 @@ def write_page(rows: list[dict[str, Any]], out: Path) -> None:
             line = "".join(f"<td>{html.escape(c)}</td>" for c in cells(row))
             parts.append(f"<tr class={row['tracker'][:4]}>{line}</tr>")
         parts.append("</table>")
-    with rt.atomic(out / "compare.html") as part:
+    with atomic(out / "compare.html") as part:
         part.write_text("\n".join(parts))
 
 
@@ -552,7 +571,7 @@ def main() -> int:
     seqs = [thinned(seq, args.every) for seq in seqs]
     found = {s.name: variants(s, args) for s in seqs}
     rows = report(found, seqs)
-    with rt.atomic(args.out / "compare.csv") as part, part.open("w", newline="") as file:
+    with atomic(args.out / "compare.csv") as part, part.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)

@@ -4,7 +4,7 @@
     python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg [--classes chair,cup]
 
 An error is a true object that carries, for some frames, an identity that does not stand for it
-(`rt.identity_map`): either a second identity of its own (split), or the identity of another object
+(`identity_map`): either a second identity of its own (split), or the identity of another object
 (taken for). The errors with the most frames come first. For each: the object with its right
 identity, the first frame of the error, and the object that the identity stands for. Thick: the
 object in question, its identity in the colour of the identity; white: the truth. Prints a Markdown
@@ -14,7 +14,6 @@ table with the causes that can be read off boxes, scores and classes.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,8 +24,17 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
+from reobj.results.evaluation import (
+    LabelledBoxes,
+    identity_map,
+    matched_rows,
+    read_result,
+    read_truth,
+)
+from reobj.results.workspace import Workspace
+from reobj.sources.detection_files import read_mot_rows
+from reobj.types import Array, Image, IntArray, box_iou
 
-IntArray = npt.NDArray[np.int64]
 WIDTH_PX, CAPTION_PX = 300, 22
 
 
@@ -34,12 +42,12 @@ WIDTH_PX, CAPTION_PX = 300, 22
 class Case:
     """Everything about one run: truth, result, which rows of both show one object, scores."""
 
-    truth: rt.LabelledBoxes
-    found: rt.LabelledBoxes
+    truth: LabelledBoxes
+    found: LabelledBoxes
     truth_row: IntArray  # (M,) matched rows
     found_row: IntArray  # (M,)
-    visibility: rt.Array  # (N,) of the truth, NaN where the file does not say
-    score: rt.Array  # of the result's rows
+    visibility: Array  # (N,) of the truth, NaN where the file does not say
+    score: Array  # of the result's rows
     seen_as: npt.NDArray[np.str_]  # class of each detection, "" where unknown
 
 
@@ -62,21 +70,37 @@ class Error:
 
 def read_case(out: Path, gt: Path, classes: list[str]) -> Case:
     """Read an output folder of `run` or `track` and its truth."""
-    track = rt.Workspace(out).recall()[0]
-    truth, rows = rt.read_truth(gt, track.class_names, 0.0), rt.read_mot_rows(gt)
+    tracked = Workspace.open(out).load_last()  # before linking: with the class of each detection
+    truth, rows = read_truth(gt, tracked.class_names, 0.0), read_mot_rows(gt)
     visibility = rows[:, 8] if rows.shape[1] == 9 else np.full(len(rows), np.nan)
-    found, score = rt.read_result(out), rt.read_mot_rows(out / "tracks.txt")[:, 6]
-    seen_as = np.array(track.class_names)[track.table.class_id]  # rows are those of tracks.txt
+    found, score = read_result(out), rt.Result.load(out).tracks.score
+    seen_as = detected_classes(found, tracked)
     if classes:
         use, keep = np.isin(truth.name, [*classes, ""]), np.isin(found.name, [*classes, ""])
         truth, visibility = truth[use], visibility[use]
         found, score, seen_as = found[keep], score[keep], seen_as[keep]
-    return Case(truth, found, *rt.matched_rows(truth, found), visibility, score, seen_as)
+    return Case(truth, found, *matched_rows(truth, found), visibility, score, seen_as)
+
+
+def detected_classes(found: LabelledBoxes, tracked: rt.Result) -> npt.NDArray[np.str_]:
+    """Class of the detection of each row, "" where a gap was filled without one."""
+    names, tracks = np.array([*tracked.class_names, ""]), tracked.tracks
+    class_id = np.full(len(found), -1)
+    for frame in np.unique(found.frame):
+        rows, there = (
+            np.flatnonzero(found.frame == frame),
+            np.flatnonzero(tracks.frame + 1 == frame),
+        )
+        if len(there):
+            iou = box_iou(found.xyxy[rows], tracks.xyxy[there])
+            good = iou.max(1) > 0.98  # tracks.txt rounds boxes
+            class_id[rows[good]] = tracks.class_id[there[iou[good].argmax(1)]]
+    return np.asarray(names[class_id], np.str_)
 
 
 def find_errors(case: Case) -> list[Error]:
     """All errors, those with the most frames first."""
-    stands = rt.identity_map(case.truth, case.found)
+    stands = identity_map(case.truth, case.found)
     owner = {v: k for k, v in stands.items() if v is not None}
     true, wrong = case.truth.identity[case.truth_row], case.found.identity[case.found_row]
     errors = []
@@ -120,7 +144,7 @@ def causes(case: Case, error: Error, size: tuple[int, int]) -> str:
         f"{100 * case.visibility[g]:.0f} % visible": case.visibility[g] < 0.6,
         "low scores": np.median(case.score[case.found_row[error.pairs[:5]]]) < 0.5,
         f"seen as {case.seen_as[p]}": bool(name) and case.seen_as[p] != name,
-        "overlaps its twin": len(twins) and rt.box_iou(box[None], twins).max() > 0.2,
+        "overlaps its twin": len(twins) and box_iou(box[None], twins).max() > 0.2,
     }
     return "; ".join(text for text, true in facts.items() if true)
 
@@ -161,7 +185,7 @@ def colour(identity: int) -> tuple[int, int, int]:
     return b, g, r
 
 
-def still(case: Case, image: rt.Image, frame: int, true: int, caption: str) -> rt.Image:
+def still(case: Case, image: Image, frame: int, true: int, caption: str) -> Image:
     """One frame, all identities thin, the object in question thick, the truth white."""
     scale = WIDTH_PX / image.shape[1]
     canvas = np.asarray(cv2.resize(image, None, fx=scale, fy=scale), np.uint8)
@@ -180,7 +204,7 @@ def still(case: Case, image: rt.Image, frame: int, true: int, caption: str) -> r
     return canvas
 
 
-def put(image: rt.Image, text: str, at: tuple[int, int], bgr: tuple[int, int, int]) -> None:
+def put(image: Image, text: str, at: tuple[int, int], bgr: tuple[int, int, int]) -> None:
     """Small text on a dark plate."""
     font = cv2.FONT_HERSHEY_SIMPLEX
     (width, height), low = cv2.getTextSize(text, font, 0.38, 1)
@@ -189,7 +213,7 @@ def put(image: rt.Image, text: str, at: tuple[int, int], bgr: tuple[int, int, in
     cv2.putText(image, text, at, font, 0.38, bgr, 1, cv2.LINE_AA)
 
 
-def strip(name: str, case: Case, error: Error, video: rt.Video) -> tuple[rt.Image, str]:
+def strip(name: str, case: Case, error: Error, video: rt.Video) -> tuple[Image, str]:
     """A row of stills, and the line of the table; name: of the run."""
     plan = panels(case, error)
     wanted = {f for f, _, _ in plan}
@@ -221,8 +245,7 @@ def main() -> int:
     try:
         for out, gt in zip(args.out, args.gt, strict=True):
             case = read_case(out, gt, classes)
-            source = json.loads((out / "cache" / "source.json").read_text())
-            video = rt.Video(source["source"], rt.InputConfig(**source["input"]))
+            video = rt.Video(*Workspace.open(out).source)
             found += [(out.name, case, error, video) for error in find_errors(case)]
         found.sort(key=lambda item: -len(item[2].pairs))
         strips = [strip(*item) for item in found[: args.limit]]

@@ -4,13 +4,15 @@
     python examples/four_ways.py                 # all four; the supervision one if it is installed
     python examples/four_ways.py --frames 240
 
-Every way gives the same identities: the last line of each says how many.
+The first three decide online and give the same identities; the last one is the whole chain, which
+may join and split tracks after the video, and returns objects.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,40 +24,40 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 
 ROOM = Path(__file__).resolve().parent / "room"
+DETECTIONS = ROOM / "detections.npz"  # or a function image -> detections, or an ONNX detector
 Identities = list[npt.NDArray[np.int64]]  # of every frame
 
 
-def update(video: rt.Video, recorded: rt.RecordedDetections) -> Identities:
-    """1. Our own types: `Tracker.update(detections, frame)`, once a frame."""
-    tracker = rt.Tracker(embedder=rt.Embedder())
+def loop(video: rt.Video) -> Identities:
+    """1. The loop: `rt.track` yields every frame with the tracks that were decided in it."""
     found = []
-    for frame in video:
-        detections: rt.Detections = recorded.at(frame.index)
-        tracks: rt.Tracks = tracker.update(detections, frame.image)
+    for _frame, tracks in rt.track(video, DETECTIONS):
         found.append(tracks.track_id)  # beside it: xyxy, score, class_id, detection_index
     return found
 
 
-def arrays(video: rt.Video, recorded: rt.RecordedDetections) -> Identities:
-    """2. Arrays, as boxmot: (N, 6) x1 y1 x2 y2 score class in; (M, 8) with id and row out."""
+def arrays(video: rt.Video) -> Identities:
+    """2. Arrays, a frame at a time: (N, 6) x1 y1 x2 y2 score class in, (M, 8) with ids out."""
+    detect = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
     tracker = rt.Tracker(embedder=rt.Embedder())
     found = []
     for frame in video:
-        known = recorded.at(frame.index)
+        known = detect(frame)
         rows = np.column_stack([known.xyxy, known.score, known.class_id])  # (N, 6)
         out = tracker.update(rows, frame.image).to_array()  # (M, 8)
         found.append(out[:, 4].astype(np.int64))
     return found
 
 
-def supervision(video: rt.Video, recorded: rt.RecordedDetections) -> Identities:
+def supervision(video: rt.Video) -> Identities:
     """3. supervision's Detections in, the tracked ones out with `tracker_id`, masks and data."""
     import supervision as sv
 
+    detect = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
     tracker = rt.Tracker(embedder=rt.Embedder())
     found = []
     for frame in video:
-        known = recorded.at(frame.index)
+        known = detect(frame)
         given: Any = sv.Detections(
             xyxy=known.xyxy, mask=known.masks, confidence=known.score, class_id=known.class_id
         )
@@ -64,21 +66,21 @@ def supervision(video: rt.Video, recorded: rt.RecordedDetections) -> Identities:
     return found
 
 
-def generator(video: rt.Video, recorded: rt.RecordedDetections) -> Identities:
-    """4. A generator over a video; a detector of yours takes the place of the file."""
-    found = []
-    for frame, tracks in rt.track(video, detections=ROOM / "detections.npz"):
-        assert frame.image.shape[:2] == (video.working_size[1], video.working_size[0])
-        found.append(tracks.track_id)
-    return found
+def chain(video: rt.Video) -> Identities:
+    """4. The whole chain: identities, cameras and one solid for each object, typed."""
+    config = rt.Config(input=video.config, output=rt.OutputConfig(overlay=False, scene=False))
+    with tempfile.TemporaryDirectory() as out:
+        result = rt.run(video.source, out, config, detections=DETECTIONS)
+    for found in result.objects:
+        if found.center is not None and found.size_m is not None and found.status == "ok":
+            width, depth, height = found.size_m
+            print(f"  {found.class_name} {found.id} at {found.center.round(2)} (world units): "
+                  f"{width:.2f} x {depth:.2f} x {height:.2f} m")  # fmt: skip
+    tracks = result.tracks
+    return [tracks.track_id[tracks.frame == frame] for frame in np.unique(tracks.frame)]
 
 
-WAYS: tuple[Callable[[rt.Video, rt.RecordedDetections], Identities], ...] = (
-    update,
-    arrays,
-    supervision,
-    generator,
-)
+WAYS: tuple[Callable[[rt.Video], Identities], ...] = (loop, arrays, supervision, chain)
 
 
 def main() -> int:
@@ -87,10 +89,9 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=60, help="frames of the clip (default: 60)")
     args = parser.parse_args()
     video = rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=args.frames))
-    recorded = rt.read_detections(ROOM / "detections.npz", video)
     for way in WAYS:
         try:
-            found = np.concatenate(way(video, recorded))
+            found = np.concatenate(way(video))
         except ModuleNotFoundError as error:
             print(f"{way.__name__}: {error}; pip install supervision")
             continue

@@ -17,7 +17,6 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,25 +25,17 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
 import reobj_track as rt
+from reobj.files import atomic
+from reobj.results.result import write_mot, write_ply
 
 ROOM = Path(__file__).resolve().parent / "room"
-Detect = Callable[[rt.Frame], rt.Detections]
-
-
-def detect_with(args: argparse.Namespace, video: rt.Video) -> tuple[Detect, tuple[str, ...]]:
-    """Recorded detections, or the ONNX detector; and the names of their classes."""
-    if args.detector:
-        detector = rt.OnnxDetector(args.detector)
-        return lambda frame: detector(frame.image), detector.class_names
-    recorded = rt.read_detections(args.detections, video)
-    return lambda frame: recorded.at(frame.index), recorded.class_names
 
 
 def live(
-    args: argparse.Namespace, video: rt.Video, detect: Detect
-) -> tuple[rt.Tracker, rt.TrackTable, list[tuple[float, float]]]:
+    args: argparse.Namespace, video: rt.Video, detect: rt.DetectionSource
+) -> tuple[rt.Tracker, rt.Tracks, list[tuple[float, float]]]:
     """Track frame by frame; also the seconds of each frame, in detector and in tracker."""
-    poses = rt.read_poses(args.poses, video, rt.PosesConfig(camera=args.camera))
+    poses = rt.read_poses(args.poses, video, camera=args.camera)
     pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
     embedder = None if args.embed == "none" else rt.Embedder(args.embed)
     resume = args.state is not None and args.state.exists()
@@ -58,7 +49,7 @@ def live(
         started = time.perf_counter()
         detections = detect(frame)
         detected = time.perf_counter()
-        step = tracker.step(
+        tracker.update(
             detections,
             frame.image,
             cam_from_world=pose_of.get(frame.index),  # None: the device lost itself
@@ -66,12 +57,12 @@ def live(
         )
         seconds.append((detected - started, time.perf_counter() - detected))
         frames.append(frame.index)
-        steps.append(step)
+        steps.append(tracker.latest)
         if len(frames) % 50 == 0:
             print(f"frame {frame.index}: {facts(tracker, seconds[-50:])}", flush=True)
     if args.state is not None:
         tracker.save(args.state)
-    return tracker, rt.TrackTable.from_steps(frames, steps, 1.0), seconds
+    return tracker, rt.Tracks.concatenate(frames, steps), seconds
 
 
 def facts(tracker: rt.Tracker, seconds: list[tuple[float, float]]) -> str:
@@ -84,7 +75,9 @@ def facts(tracker: rt.Tracker, seconds: list[tuple[float, float]]) -> str:
     )
 
 
-def objects_of(tracker: rt.Tracker, names: tuple[str, ...]) -> tuple[Any, list[dict[str, Any]]]:
+def objects_of(
+    tracker: rt.Tracker, names: tuple[str, ...]
+) -> tuple[quadrics.Ellipsoids, list[dict[str, Any]]]:
     """Ellipsoids of the objects of known place, and one entry each for the JSON file."""
     known = np.flatnonzero(tracker.places.known[: len(tracker.last_seen)])
     solids, _ = quadrics.Ellipsoids.from_dual_quadrics(tracker.places.dual_q[known])
@@ -114,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--detections", type=Path, default=ROOM / "detections.npz")
     parser.add_argument("--detector", help="ONNX detector in place of recorded detections")
     parser.add_argument(
-        "--embed", default="colour", help="appearance, as of `run`; none: place only"
+        "--embed", default="reobj", help="appearance: a model, as of `run`; none: place only"
     )
     parser.add_argument("--frames", type=int, default=0, help="stop after so many (0: all)")
     parser.add_argument(
@@ -124,17 +117,18 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         video = rt.Video(args.video)
-        detect, names = detect_with(args, video)
-        tracker, table, seconds = live(args, video, detect)
+        recorded = None if args.detector else args.detections
+        detect = rt.open_detections(video, rt.DetectConfig(model=args.detector or ""), recorded)
+        tracker, tracks, seconds = live(args, video, detect)
     except rt.ReobjError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    solids, entries = objects_of(tracker, names)
+    solids, entries = objects_of(tracker, detect.class_names)
     args.out.mkdir(parents=True, exist_ok=True)
-    rt.write_mot(args.out / "tracks.txt", table[table.object_id > 0])
-    with rt.atomic(args.out / "live_objects.json") as part:
+    write_mot(args.out / "tracks.txt", tracks)
+    with atomic(args.out / "live_objects.json") as part:
         part.write_text(json.dumps(entries, indent=1))
-    rt.write_ply(args.out / "objects.ply", solids, [e["id"] for e in entries], 3)
+    write_ply(args.out / "objects.ply", solids, [e["id"] for e in entries])
     print(f"{len(seconds)} frames: {facts(tracker, seconds)}")
     return 0
 

@@ -65,7 +65,7 @@ from reobj.files import atomic
 from reobj.identity.crops import flat_maps
 from reobj.identity.reid import RETURN_ODDS, SimilarityCalibration, match_probability
 from reobj.results.evaluation import ABSENT, SCORED, read_truth
-from reobj.sources.detection_files import NO_RUNS, rle_decode, rle_encode
+from reobj.sources.masks import NO_RUNS, rle_decode, rle_encode
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session
 from reobj.types import Array, BoolArray, Image, IntArray
 

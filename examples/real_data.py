@@ -16,11 +16,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
+from reobj.results.evaluation import read_result, read_truth, score_tracks
+from reobj.results.workspace import Workspace
 
+ANNOTATED = ("chair", "dining table", "cup")
 HEADER = (
     "| recording | frames | with pose | camera error | tracker ids | objects | ellipsoids | IDF1 | "
     "track s | poses s | objects s |\n|---|---|---|---|---|---|---|---|---|---|---|"
@@ -53,10 +55,10 @@ def row(recording: Path, out: Path, detector: str) -> str:
     detections = None if detector or not recorded.exists() else recorded
     config = rt.Config(detect=rt.DetectConfig(model=detector or rt.DetectConfig().model))
     result = rt.run(source, out, config, detections=detections)
-    tracker_ids = len(np.unique(rt.Workspace(out).recall()[0].table.object_id))
+    tracker_ids = len(np.unique(Workspace.open(out).load_last().tracks.track_id))
     poses = result.poses
     located = f"{poses.known.sum()} of {len(poses.frame)}" if poses is not None else "-"
-    ellipsoids = sum(o["status"] != "rejected" for o in result.objects)
+    ellipsoids = sum(o.located for o in result.objects)
     seconds = [f"{result.seconds.get(k, float('nan')):.0f}" for k in ("track", "poses", "objects")]
     cells = [
         recording.name,
@@ -94,39 +96,17 @@ def align(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.asarray(scale * a @ rotation.T + target.mean(0))
 
 
-def identity_score(recording: Path, result: rt.RunResult) -> str:
-    """IDF1 against `gt_mot.txt`, over the classes that are annotated there (Ristani et al., 2016).
+def identity_score(recording: Path, result: rt.Result) -> str:
+    """IDF1 against `gt_mot.txt`, over the classes that redkitchen annotates (Ristani et al., 2016).
 
-    Detections of a class are compared with the annotations of that class at IoU .5; objects that
-    the recording does not annotate are left out by keeping the classes chair, dining table and cup.
+    Boxes are compared within a class, at IoU .5.
     """
     path = recording / "gt_mot.txt"
-    if not path.exists():
+    if not path.exists() or result.out is None:
         return "-"
-    truth = np.loadtxt(path, delimiter=",")
-    classes = rt.object_classes(result.table)
-    found = total = 0.0
-    for number, name in ((1, "chair"), (2, "dining table"), (3, "cup")):
-        wanted = rt.COCO_NAMES.index(name)
-        rows = np.isin(result.table.object_id, [o for o, c in classes.items() if c == wanted])
-        gt, table = truth[truth[:, 7] == number], result.table[rows]
-        found += 2 * identity_matches(gt, table)
-        total += len(gt) + len(table)
-    return f"{found / total:.3f}"
-
-
-def identity_matches(gt: np.ndarray, table: rt.TrackTable) -> float:
-    """Number of boxes whose identity agrees under the best one-to-one map of identities (IDTP)."""
-    gt_ids, gt_row = np.unique(gt[:, 1], return_inverse=True)
-    ids, row_of = np.unique(table.object_id, return_inverse=True)
-    hits = np.zeros((len(gt_ids), len(ids)))
-    for frame in np.unique(table.frame):
-        a, b = np.flatnonzero(gt[:, 0] == frame + 1), np.flatnonzero(table.frame == frame)
-        boxes = np.c_[gt[a, 2:4], gt[a, 2:4] + gt[a, 4:6]]
-        i, j = np.nonzero(rt.box_iou(boxes, table.xyxy[b]) >= 0.5)
-        np.add.at(hits, (gt_row[a[i]], row_of[b[j]]), 1)
-    best = linear_sum_assignment(-hits)
-    return float(hits[best].sum())
+    truth, found = read_truth(path, rt.COCO_NAMES, 0.0), read_result(result.out)
+    truth, found = (boxes[np.isin(boxes.name, ANNOTATED)] for boxes in (truth, found))
+    return f"{score_tracks(truth, found)['IDF1']:.3f}"
 
 
 if __name__ == "__main__":

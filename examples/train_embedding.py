@@ -58,7 +58,7 @@ import render_room as rr  # noqa: E402
 
 import reobj_track as rt  # noqa: E402
 from reobj.identity.sampling import PartSamples, occupancy_map, sample_parts  # noqa: E402
-from reobj.sources.detection_files import RecordedDetections, read_npz  # noqa: E402
+from reobj.sources.recorded import RecordedDetections, read_npz  # noqa: E402
 from reobj.types import Array, Image, IntArray, box_iou  # noqa: E402
 
 try:

@@ -117,6 +117,23 @@ def test_finished_means_same_files_and_options(tmp_path: Path) -> None:
     assert batch.finished(first) is None and not (tmp_path / "a" / batch.MARKER).exists()
 
 
+def test_the_summary_says_what_the_run_found(tmp_path: Path) -> None:
+    """With the true cameras of the clip, which are in metres."""
+    row = {"path": str(ROOM / "room.mp4"), "detections": str(ROOM / "detections.npz"),
+           "poses": str(ROOM / "poses.txt"),
+           "options": "--stop 30 --camera 492.757,492.757,320,240 --set output.overlay=false "
+           "--set output.scene=false"}  # fmt: skip
+    result = batch.run_item(batch.make_item(row, tmp_path, tmp_path), str(ROOT))
+    assert result["status"] == "done", result["error"]
+    data = json.loads((tmp_path / "room/objects.json").read_text())
+    status = [o["status"] for o in data["objects"]]
+    assert (result["frames"], result["frames_with_pose"]) == (30, 30)
+    assert result["metres_per_unit"] == 1.0 and result["warnings"] == len(data["warnings"])
+    kinds = ("ok", "prior_dominated", "rejected")
+    assert [result[kind] for kind in kinds] == [status.count(kind) for kind in kinds]
+    assert result["ok"] >= 3 and result["objects"] == len(status)
+
+
 def wait_for(path: Path, process: subprocess.Popen[str]) -> str:
     while not path.exists() or not path.read_text():
         assert process.poll() is None, process.communicate()[1]

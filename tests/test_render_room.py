@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 
@@ -199,7 +200,9 @@ def check_detections(path: Path, frames: int, size: tuple[int, int]) -> None:
     assert sums == {size[0] * size[1]}
 
 
-def test_command_line_writes_everything(tmp_path: Path) -> None:
+def test_command_line_writes_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = functools.partial(rr.RoomConfig, light_rays=1)  # 10: most of the time is light
+    monkeypatch.setattr(rr, "RoomConfig", quick)
     options = ["--size", "160x120", "--frames", "3", "--seed", "3", "--texels", "40"]
     assert rr.main(["-o", str(tmp_path), *options]) == 0
     check_detections(tmp_path / "detections.npz", 3, (160, 120))
