@@ -978,7 +978,7 @@ def run(
     if poses is not None:
         check_directions(poses, result.tracks)
     elif in_3d and not video.is_live:
-        moving = np.isin(np.array([*result.class_names, ""]), config.objects.moving.split(","))
+        moving = np.isin(np.array([*result.class_names, ""]), config.objects.moving_classes)
         rows, started = result.tracks[moving[result.tracks.class_id]], time.monotonic()
         poses, model = reconstruct_cached(video, config.poses, workspace, rows)
         seconds["poses"] = time.monotonic() - started
@@ -1086,7 +1086,7 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     if not result.identities_given and own.link:
         tracks, events = link(
             tracks, class_names, result.embeddings, result.embedding_row,
-            poses if located else None, fit, moving=own.moving.split(","),
+            poses if located else None, fit, moving=own.moving_classes,
             min_score=own.min_score, min_views=own.min_views,
         )  # fmt: skip
     elif not result.identities_given:
@@ -1100,6 +1100,8 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.objects = describe_objects(tracks, class_names, result.fits, views, own)
     gap = 0 if result.identities_given else config.output.fill_gaps
     result.tracks, result.out = fill_gaps(tracks, video.size, gap), workspace.out
+    detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
+    result.embedding_row = detected[result.embedding_row]
     result.world = describe_world(poses, result.fits, events)
     result.seconds["objects"] = time.monotonic() - started
     result.warnings += poses.messages if poses is not None else ()

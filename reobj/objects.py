@@ -1,6 +1,7 @@
 """Objects: one solid and ellipsoid each from all its boxes, and its description.
 
-The geometry is `quadrics.fit_objects`; which rows are one object is `identity/linking.py`'s.
+The geometry is that of `quadrics.fit_objects`; identity/linking.py decides which rows are one
+object.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from reobj.views import Views
 
 @dataclass(frozen=True, slots=True)
 class ObjectsConfig:
-    """From tracks and cameras to one solid and ellipsoid per object."""
+    """Fit one solid and its ellipsoid to every object, from tracks and cameras."""
 
     priors: str = option(
         "", "size priors, JSON (default: the priors.json that comes along)", "--priors"
@@ -42,15 +43,24 @@ class ObjectsConfig:
     min_score: float = option(0.3, "boxes below this score do not shape the ellipsoid")
     moving: str = option(
         "person,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe",
-        "classes that move: they are tracked, but get no ellipsoid",
+        "classes that move, comma-separated: they are tracked, but get no ellipsoid",
     )
+
+    @property
+    def moving_classes(self) -> tuple[str, ...]:
+        """Names in `moving`."""
+        return tuple(filter(None, (name.strip() for name in self.moving.split(","))))
 
 
 Fit = Callable[[Views, list[int]], quadrics.ObjectFits]  # of the groups of views, their classes
 
 
 def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> Fit:
-    """Bind priors, scale and gravity to `quadrics.fit_objects`."""
+    """Bind priors, known sizes, gravity and the kind of solid to `quadrics.fit_objects`.
+
+    Raises:
+        ReobjError, QuadricsError: an option cannot be read, or there are no such priors.
+    """
     priors = quadrics.load_priors(config.priors or None)
     known = parse_known_size(config.known_size)
     up = parse_up(config.up) if config.up else poses.up_in_world
@@ -86,8 +96,8 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     per_metre = {"m": 1, "cm": 100, "mm": 1000}
     sizes: dict[str | int, tuple[str | int, float]] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
-        found = re.fullmatch(r"(.+?)\s*=\s*([0-9.]+)\s*(m|cm|mm)", item)
-        if found is None:
+        found = re.fullmatch(r"(.+?)\s*=\s*([0-9]*\.?[0-9]+|[0-9]+\.)\s*(m|cm|mm)", item)
+        if found is None or float(found[2]) == 0:
             expected = "CATEGORY=HEIGHT in m, cm or mm, such as door=2.0m"
             raise ReobjError(f"--known-size {item!r}: expected {expected}")
         sizes[found[1]] = ("h", float(found[2]) / per_metre[found[3]])
@@ -101,12 +111,14 @@ def describe_objects(
     views: Views | None,
     config: ObjectsConfig,
 ) -> list[Object]:
-    """Describe every identity of the tracks: its class, visits, and its solid where it has one.
+    """Describe every identity of the tracks: class, visits, and its solid or why it has none.
 
     Args:
         fits, views: of the identities in ascending order; None without cameras.
+    Returns:
+        one `Object` an identity, by id.
     """
-    objects, moving, iou = [], config.moving.split(","), np.empty(0)
+    objects, moving, iou = [], config.moving_classes, np.empty(0)
     if fits is not None and views is not None:
         seen = (views.boxes, views.img_from_world, views.image_size)
         iou = quadrics.reprojection_iou(fits, *seen)  # (V, O)
@@ -138,7 +150,7 @@ def _with_solid(
     moving: Sequence[str],
     min_views: int,
 ) -> Object:
-    """Add the i-th solid, its uncertainty and its evidence; or the reason why it is rejected."""
+    """Add solid i, its uncertainty and its evidence, or the reason why it is rejected."""
     seen = np.isfinite(views.boxes[:, i, 0])
     count = int(seen.sum())
     support: str | None = str(fits.support[i])
@@ -150,7 +162,8 @@ def _with_solid(
         status, reason, support = "rejected", f"{seen_in}; {min_views} are needed", None
     solid: dict[str, Any] = {}
     if status != "rejected":
-        scale, sigma2 = fits.scale, np.diag(fits.cov[i])[3:6] + fits.scale.rel_sigma**2
+        scale = fits.scale
+        sigma2 = np.diag(fits.cov[i])[3:6] + scale.rel_sigma**2  # of log sizes in metres: both
         rotation = fits.ellipsoids.world_from_obj[i : i + 1]
         values = {
             "center": fits.ellipsoids.center_in_world[i],
@@ -178,7 +191,7 @@ def _with_solid(
 def describe_world(
     poses: Poses | None, fits: quadrics.ObjectFits | None, events: Sequence[LinkEvent]
 ) -> World:
-    """Describe what is known about the world: units, gravity, scale, frames, joins and splits."""
+    """Describe the world of the poses: units, gravity, scale, frames, joins and splits."""
     if poses is None:
         return World(links=tuple(events))
     scale, up = None, poses.up_in_world
@@ -186,7 +199,8 @@ def describe_world(
     if fits is not None:
         value, sigma = round(fits.scale.value, 6), round(fits.scale.rel_sigma, 4)
         scale = quadrics.Scale(value, sigma, fits.scale.source)
-        up, up_source = fits.up if fits.up.any() else up, fits.up_source
+        if fits.up.any():
+            up, up_source = fits.up, fits.up_source
     return World(
         "m" if poses.metric else "arbitrary",
         poses.source,

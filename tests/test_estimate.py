@@ -169,8 +169,10 @@ def photo_with_exif(path, image, focal_35mm):
 def test_the_exif_focal_length_is_tried_before_the_usual_guess(tmp_path, monkeypatch, focal_35mm):
     """COLMAP: 48 mm of a film whose diagonal is 43.27 mm."""
     images = textured_room(3, 0.5)[0]
-    photo_with_exif(tmp_path / "0.jpg", images[0], focal_35mm)
-    video = FakeVideo(images, files=[tmp_path / "0.jpg"])
+    (tmp_path / "photos").mkdir()
+    for i, image in enumerate(images):
+        photo_with_exif(tmp_path / "photos" / f"{i}.jpg", image, focal_35mm)
+    video = rt.Video(tmp_path / "photos")
     guesses = seen_job(monkeypatch, video, tmp_path / "work")["focal_guesses"]
     exif = 48 / np.hypot(36, 24) * np.hypot(480, 360) / 480
     assert guesses == ([pytest.approx(exif, rel=1e-3), 0.8] if focal_35mm else [0.8])

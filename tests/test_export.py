@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -14,26 +14,19 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from conftest import CAMERA, FEW, ROOM
 from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
+from reobj.results.export import EXPORTS
+from reobj.types import object_color
 
-ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
-CAMERA = "492.756788421,492.756788421,320,240"
+NO_PICTURES = ("--set", "output.overlay=0", "--set", "output.scene=0")
+CORNERS = {"xtl", "ytl", "xbr", "ybr"}  # of a box in CVAT's XML
 
 
 def cli(*args: object) -> int:
     return rt.main([str(a) for a in args])
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every third frame of the first half of the example room, with its true cameras."""
-    out = tmp_path_factory.mktemp("room") / "out"
-    args = ("--detections", ROOM / "detections.npz", "--poses", ROOM / "poses.txt")
-    few = ("--every", 3, "--stop", 120, "--set", "output.overlay=false")
-    assert cli("run", ROOM / "room.mp4", "-o", out, *args, "--camera", CAMERA, *few) == 0
-    return out
 
 
 def mot(path: Path) -> np.ndarray:
@@ -61,6 +54,7 @@ def test_coco_vid_holds_every_row(room: Path, tmp_path: Path) -> None:
     data, rows = json.loads(path.read_text()), mot(room / "tracks.txt")
     frame_of = {i["id"]: i["frame_id"] for i in data["images"]}
     assert sorted(frame_of.values()) == list(range(0, 120, 3))  # also those without any object
+    assert sorted(frame_of) == list(range(1, 41)) and data["annotations"][0]["id"] == 1
     assert {i["video_id"] for i in data["images"]} == {v["id"] for v in data["videos"]} == {1}
     found = np.array(
         [[frame_of[a["image_id"]] + 1, a["instance_id"], *a["bbox"]] for a in data["annotations"]]
@@ -71,8 +65,22 @@ def test_coco_vid_holds_every_row(room: Path, tmp_path: Path) -> None:
     assert classes == {o["id"]: o["class"] for o in objects(room)}
 
 
+def test_a_filled_gap_may_lie_in_a_frame_that_was_not_read(
+    chairs: rt.Result, tmp_path: Path
+) -> None:
+    """The poses have the frames that could be read; frame 5 could not, but has boxes."""
+    poses = chairs.poses
+    cut = {k: np.delete(getattr(poses, k), 5, 0) for k in ("frame", "time_s", "cam_from_world",
+                                                           "status")}  # fmt: skip
+    result = dataclasses.replace(chairs, poses=dataclasses.replace(poses, **cut))
+    EXPORTS["coco-vid"][1](result, tmp_path / "a.json")
+    data = json.loads((tmp_path / "a.json").read_text())
+    assert [i["frame_id"] for i in data["images"]] == list(range(40))
+    assert len(data["annotations"]) == 120
+
+
 def test_coco_vid_in_pycocotools(room: Path, tmp_path: Path) -> None:
-    coco = pytest.importorskip("pycocotools.coco")
+    coco = pytest.importorskip("pycocotools.coco", reason="pip install pycocotools")
     path = tmp_path / "a.json"
     rt.export(room, "coco-vid", path)
     data = coco.COCO(str(path))
@@ -88,10 +96,10 @@ def test_coco_vid_as_detections_and_as_tracks(room: Path, tmp_path: Path) -> Non
     rows = mot(room / "tracks.txt")
     found = rt.read_detections(path, video, rt.DetectConfig(min_score=0))
     assert len(found) == len(rows) and set(found.frame) == set(rows[:, 0].astype(int) - 1)
-    track = rt.read_tracks(path, video)
-    assert track.fixed and not track.messages
+    tracks, _, messages = rt.read_tracks(path, video)
+    assert not messages
     np.testing.assert_array_equal(
-        np.column_stack([track.table.frame + 1, track.table.object_id]),
+        np.column_stack([tracks.frame + 1, tracks.track_id]),
         rows[np.lexsort((rows[:, 1], rows[:, 0])), :2],
     )
 
@@ -112,7 +120,7 @@ def test_cvat_has_what_its_importer_reads(room: Path, tmp_path: Path) -> None:
         shown = []
         for box in track:
             assert box.tag == "box" and box.attrib["keyframe"] == "1"
-            assert {"frame", "outside", "occluded", *rt.CVAT_BOX} <= set(box.attrib)
+            assert {"frame", "outside", "occluded", *CORNERS} <= set(box.attrib)
             frame = int(box.attrib["frame"])
             if box.attrib["outside"] == "0":
                 inside.append((frame + 1, number + 1))
@@ -128,8 +136,7 @@ def test_cvat_unchanged_gives_the_same_objects(room: Path, tmp_path: Path) -> No
     path, again = tmp_path / "a.xml", tmp_path / "again"
     rt.export(room, "cvat", path)
     args = ("--poses", ROOM / "poses.txt", "--camera", CAMERA, "--tracks", path)
-    few = ("--every", 3, "--stop", 120, "--set", "output.overlay=false")
-    assert cli("run", ROOM / "room.mp4", "-o", again, *args, *few) == 0
+    assert cli("run", ROOM / "room.mp4", "-o", again, *args, *FEW, *NO_PICTURES) == 0
     assert groups(mot(again / "tracks.txt")) == groups(mot(room / "tracks.txt"))
     before, after = ({o["id"]: o for o in objects(out)} for out in (room, again))
     assert {i: o["class"] for i, o in before.items()} == {i: o["class"] for i, o in after.items()}
@@ -158,8 +165,6 @@ def edited(room: Path, path: Path) -> tuple[int, int]:
 @pytest.mark.parametrize("kind", ["xml", "zip"])
 def test_corrected_identities_are_taken(room: Path, tmp_path: Path, kind: str) -> None:
     """`objects OUT --tracks`: what the user says stands, whatever the linker would think."""
-    import shutil
-
     out, path = tmp_path / "out", tmp_path / "corrected.xml"
     shutil.copytree(room, out)
     a, b = edited(out, path)
@@ -171,7 +176,7 @@ def test_corrected_identities_are_taken(room: Path, tmp_path: Path, kind: str) -
     moved = np.flatnonzero(rows[:, 1] == b)[4:]
     rows[moved, 1] = a
     for _ in range(2):  # and it stands when the objects are fitted again without --tracks
-        assert cli("objects", out, *(("--tracks", path) if path else ())) == 0
+        assert cli("objects", out, *(("--tracks", path) if path else ()), *NO_PICTURES) == 0
         found = mot(out / "tracks.txt")
         assert sorted(map(tuple, found[:, :2])) == sorted(map(tuple, rows[:, :2]))
         path = None
@@ -181,15 +186,13 @@ def test_corrected_identities_are_taken(room: Path, tmp_path: Path, kind: str) -
 
 
 def test_corrected_mot_keeps_the_classes(room: Path, tmp_path: Path) -> None:
-    import shutil
-
     out = tmp_path / "out"
     shutil.copytree(room, out)
     rows = mot(out / "tracks.txt")
     rows[:, 1] += 100  # other numbers are kept too
     np.savetxt(tmp_path / "t.txt", rows, delimiter=",", fmt="%g")
     before = objects(out)
-    assert cli("objects", out, "--tracks", tmp_path / "t.txt") == 0
+    assert cli("objects", out, "--tracks", tmp_path / "t.txt", *NO_PICTURES) == 0
     after = objects(out)
     assert [(o["id"] + 100, o["class"]) for o in before] == [(o["id"], o["class"]) for o in after]
     status = [(o["status"], a["status"]) for o, a in zip(before, after, strict=True)]
@@ -223,90 +226,35 @@ def test_bad_tracks(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert not (tmp_path / "out" / "tracks.txt").exists()
 
 
-# ---- Boxer CSV ----
-
-
-def read_boxer(path: Path) -> dict[int, list[dict[str, object]]]:
-    """As Boxer's read_obb_csv: split at commas, fixed columns, wxyz, full extents, by time."""
-    lines = path.read_text().split("\n")
-    assert lines[0] == rt.BOXER_COLUMNS
-    timed = defaultdict(list)
-    for line in filter(None, lines[1:]):
-        e = line.split(",")
-        assert len(e) == 15
-        numbers = np.array([float(x) for x in e[1:11]])
-        turn = Rotation.from_quat(np.roll(numbers[3:7], -1)).as_matrix()
-        half = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8) * numbers[7:, None] / 2
-        corners = (turn @ half).T + numbers[:3]
-        timed[int(e[0])].append({"name": e[11], "id": int(e[12]), "corners": corners})
-        assert int(e[13]) >= 0 and 0 <= float(e[14]) <= 1
-    return timed
-
-
-def test_boxer_csv_is_the_same_solid_with_z_up(room: Path, tmp_path: Path) -> None:
-    """Corners as Boxer makes them, in metres, lie where objects.json has them, turned upright."""
-    path = tmp_path / "b.csv"
-    assert cli("export", room, "--to", "boxer", "-o", path) == 0
-    (boxes,) = read_boxer(path).values()
-    data = json.loads((room / "objects.json").read_text())
-    kept = [o for o in data["objects"] if o["status"] != "rejected"]
-    assert [b["id"] for b in boxes] == [o["id"] for o in kept]
-    up, scale = np.array(data["world"]["up_in_world"]), data["world"]["scale"]["metres_per_unit"]
-    for box, o in zip(boxes, kept, strict=True):
-        own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
-        half = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8) * np.array(o["size"])[:, None]
-        corners = scale * ((own @ half / 2).T + o["center"])
-        np.testing.assert_allclose(box["corners"][:, 2], corners @ up, atol=1e-4)  # z is up
-        spread = [np.linalg.norm(c[:, None] - c, axis=-1) for c in (box["corners"], corners)]
-        np.testing.assert_allclose(*spread, atol=1e-4)  # the same solid
-        assert box["name"] == o["class"]
-
-
-def test_boxer_without_scale_or_up_says_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    entry = {"id": 1, "class": "a,b", "status": "ok", "score": 0.5, "center": [1, 2, 3],
-             "quat_wxyz": [1, 0, 0, 0], "size": [1, 1, 2]}  # fmt: skip
-    world = {"up_in_world": None, "scale": {"metres_per_unit": None, "source": "none"}}
-    data = {"world": world, "objects": [entry, {"status": "rejected"}]}
-    table = rt.TrackTable.from_steps([], [], 1.0)
-    rt.export_boxer(rt.Saved(tmp_path, data, table, ("a,b",), None, None), tmp_path / "b.csv")
-    assert "scale is unknown" in caplog.text and "up is unknown" in caplog.text
-    ((box,),) = read_boxer(tmp_path / "b.csv").values()
-    np.testing.assert_allclose(box["corners"].mean(0), [1, 2, 3])
-    assert box["name"] == "a b"
-
-
-@pytest.mark.parametrize("a", [[0, 0, 1], [0, 0, -1], [0, -1, 0], [0.6, 0, 0.8], [-3, 2, 1]])
-def test_turn_onto(a: list[float]) -> None:
-    turn = rt.turn_onto(np.array(a, float), np.array([0.0, 0, 1]))
-    np.testing.assert_allclose(turn @ a, [0, 0, np.linalg.norm(a)], atol=1e-12)
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turn) > 0
-
-
 # ---- What every export must do ----
 
 
-@pytest.mark.parametrize("to", rt.EXPORTS)
+@pytest.mark.parametrize("to", EXPORTS)
 def test_same_folder_same_bytes(room: Path, tmp_path: Path, to: str) -> None:
     if to in ("glb", "rrd"):
-        pytest.importorskip({"glb": "trimesh", "rrd": "rerun"}[to])
-        pytest.skip("other packages' writers: tested with them")
+        pytest.importorskip(
+            {"glb": "trimesh", "rrd": "rerun"}[to], reason="pip install '.[viewer]'"
+        )
+    if to == "rrd":
+        pytest.skip("rerun numbers the chunks of a file at random")
     paths = [tmp_path / "1", tmp_path / "2"]
     assert [rt.export(room, to, path) for path in paths] == paths
     assert paths[0].read_bytes() == paths[1].read_bytes() != b""
 
 
-def test_track_only_folder(room: Path, tmp_path: Path) -> None:
-    """Without cameras: the 2D formats work, the 3D ones are empty, nothing fails."""
+def test_track_only_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without cameras: the 2D formats work, the 3D ones say what is missing."""
     args = ("--detections", ROOM / "detections.npz", "--stop", 20, "-o", tmp_path / "out")
-    assert cli("track", ROOM / "room.mp4", *args, "--set", "output.overlay=false") == 0
-    for to in ("coco-vid", "cvat", "boxer"):
+    assert cli("track", ROOM / "room.mp4", *args, *NO_PICTURES) == 0
+    for to in ("coco-vid", "cvat"):
         assert cli("export", tmp_path / "out", "--to", to) == 0
     assert len(json.loads((tmp_path / "out/coco_vid.json").read_text())["images"]) == 20
-    with (tmp_path / "out/boxer_3dbbs.csv").open() as file:
-        assert len(list(csv.reader(file))) == 1
+    capsys.readouterr()
+    pytest.importorskip("trimesh", reason="pip install '.[viewer]'")
+    assert cli("export", tmp_path / "out", "--to", "glb") == 2
+    error = capsys.readouterr().err
+    assert "nothing to show in 3D" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "out/objects.glb").exists()
 
 
 def test_a_video_without_objects(
@@ -314,11 +262,11 @@ def test_a_video_without_objects(
 ) -> None:
     """Empty files of the right form, and no complaint."""
     (tmp_path / "det.csv").write_text("frame,x1,y1,x2,y2,score,class\n")
-    out, few = tmp_path / "out", ("--stop", 3, "--set", "output.overlay=false")
-    args = ("--detections", tmp_path / "det.csv", "-o", out)
-    assert cli("track", ROOM / "room.mp4", *args, *few) == 0
+    out = tmp_path / "out"
+    args = ("--detections", tmp_path / "det.csv", "-o", out, "--stop", 3)
+    assert cli("track", ROOM / "room.mp4", *args, *NO_PICTURES) == 0
     capsys.readouterr()
-    for to in ("coco-vid", "cvat", "boxer"):
+    for to in ("coco-vid", "cvat"):
         assert cli("export", out, "--to", to) == 0
     assert capsys.readouterr().err == "" and not list(recwarn)
     data = json.loads((out / "coco_vid.json").read_text())
@@ -327,8 +275,6 @@ def test_a_video_without_objects(
 
 
 def test_the_video_may_be_gone(room: Path, tmp_path: Path) -> None:
-    import shutil
-
     out = tmp_path / "out"
     shutil.copytree(room, out)
     source = json.loads((out / "cache/source.json").read_text())
@@ -348,57 +294,120 @@ def test_export_of_no_output_folder(tmp_path: Path, capsys: pytest.CaptureFixtur
 # ---- GLB, rerun, COLMAP ----
 
 
-def upright(out: Path, axis: list[float]) -> tuple[np.ndarray, float, list[dict[str, object]]]:
-    """Rotation of the world's up onto an axis, metres per unit, and the objects with a solid."""
+def located(out: Path) -> tuple[dict[str, object], list[dict[str, object]]]:
+    """The world of an output folder, and its objects with a solid."""
     data = json.loads((out / "objects.json").read_text())
-    turn = rt.turn_onto(np.array(data["world"]["up_in_world"]), np.array(axis))
-    kept = [o for o in data["objects"] if o["status"] != "rejected"]
-    return turn, data["world"]["scale"]["metres_per_unit"], kept
+    return data["world"], [o for o in data["objects"] if o["status"] != "rejected"]
+
+
+def nodes_of(path: Path) -> dict[str, tuple[np.ndarray, object]]:
+    """Vertices (P, 3) in the file's world and the mesh of every node, read by trimesh."""
+    trimesh = pytest.importorskip("trimesh", reason="pip install '.[viewer]'")
+    scene, found = trimesh.load(path), {}
+    for name in scene.graph.nodes_geometry:
+        matrix, key = scene.graph[name]
+        mesh = scene.geometry[key]
+        found[name] = (mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], mesh)
+    return found
+
+
+def in_glb(result: rt.Result, path: Path) -> dict[str, tuple[np.ndarray, object]]:
+    EXPORTS["glb"][1](result, path)
+    return nodes_of(path)
+
+
+def test_glb_stands_upright_in_metres(chairs: rt.Result, tmp_path: Path) -> None:
+    """Our world is tilted and its unit is half a metre: in the file y is up, chairs .82 m high."""
+    tilt = Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()
+    ellipsoids = chairs.ellipsoids()
+    objects = [
+        dataclasses.replace(
+            o, center=tilt @ c / 0.5, half_axes=h / 0.5,
+            quat_wxyz=np.roll(Rotation.from_matrix(tilt @ r).as_quat(), 1),
+        )
+        for o, c, h, r in zip(chairs.objects, ellipsoids.center_in_world, ellipsoids.half_axes,
+                              ellipsoids.world_from_obj, strict=True)
+    ]  # fmt: skip
+    scale = chairs.world.scale._replace(value=0.5)
+    world = dataclasses.replace(chairs.world, up_in_world=tilt @ [0, 0, 1], scale=scale)
+    result = dataclasses.replace(chairs, objects=objects, world=world, fits=None, poses=None)
+    nodes = in_glb(result, tmp_path / "a.glb")
+    assert sorted(nodes) == ["chair 1", "chair 2", "chair 3"]
+    for vertices, _ in nodes.values():
+        low, high = vertices.min(0), vertices.max(0)
+        assert high[1] - low[1] == pytest.approx(0.82, rel=0.08)  # y is up
+        assert low[1] == pytest.approx(0, abs=0.06) and (high - low)[[0, 2]].max() < 0.75
+    middle = np.array([nodes[f"chair {i}"][0].mean(0) for i in (1, 2, 3)])
+    apart = np.linalg.norm(np.diff(middle, axis=0), axis=1)
+    np.testing.assert_allclose(apart, np.hypot(1.1, 0.1), atol=0.05)
 
 
 def test_glb_in_trimesh(room: Path, tmp_path: Path) -> None:
-    """Every ellipsoid is a named node in its place and colour, y up, in metres."""
-    trimesh = pytest.importorskip("trimesh")
-    scene = trimesh.load(rt.export(room, "glb", tmp_path / "a.glb"))
-    turn, scale, kept = upright(room, [0.0, 1, 0])
+    """Every ellipsoid is a named node in its place and colour, with the facts of its object."""
+    nodes = nodes_of(rt.export(room, "glb", tmp_path / "a.glb"))
+    world, kept = located(room)
+    up, scale = np.array(world["up_in_world"]), world["scale"]["metres_per_unit"]
     names = {f"{o['class']} {o['id']}" for o in kept}
-    assert names <= set(scene.graph.nodes_geometry) and len(names) == len(kept) > 5
+    assert {n for n in nodes if n not in ("points", "cameras")} == names and len(names) > 5
+    centers = {}
     for o in kept:
-        matrix, mesh = scene.graph[f"{o['class']} {o['id']}"]
-        points = scene.geometry[mesh].vertices @ matrix[:3, :3].T + matrix[:3, 3]  # (P, 3)
+        vertices, mesh = nodes[f"{o['class']} {o['id']}"]
         own = Rotation.from_quat(np.roll(o["quat_wxyz"], -1)).as_matrix()
-        inside = ((points / scale @ turn - o["center"]) @ own) / o["half_axes"]
-        np.testing.assert_allclose(np.linalg.norm(inside, axis=1), 1, atol=1e-3)
-        red, green, blue = rt.object_color(int(o["id"]))[::-1]
-        color = scene.geometry[mesh].visual.material.baseColorFactor[:3]
-        np.testing.assert_allclose(
-            (color / 255) ** (1 / 2.2), np.divide((red, green, blue), 255), atol=0.03
-        )
+        bound = scale * np.linalg.norm((own * o["half_axes"]).T @ up)  # half height along up
+        assert np.ptp(vertices[:, 1]) / 2 == pytest.approx(bound, rel=0.02)
+        spread = np.linalg.eigvalsh(np.cov((vertices - vertices.mean(0)).T))
+        np.testing.assert_allclose(np.sqrt(3 * spread), scale * np.sort(o["half_axes"]), rtol=0.03)
+        centers[o["id"]] = vertices.mean(0)
+        facts = mesh.metadata.get("extras", mesh.metadata)
+        assert {k: facts[k] for k in ("id", "class", "status", "support", "size_m")} == {
+            k: o[k] for k in ("id", "class", "status", "support", "size_m")
+        }
+        color = mesh.visual.to_color().vertex_colors if hasattr(mesh.visual, "to_color") else None
+        color = mesh.visual.vertex_colors if color is None else color
+        np.testing.assert_allclose(color[0, :3], object_color(o["id"])[::-1], atol=3)
+    found = np.array([centers[o["id"]] for o in kept])
+    truth = scale * np.array([o["center"] for o in kept])
+    spread = [np.linalg.norm(c[:, None] - c, axis=-1) for c in (found, truth)]
+    np.testing.assert_allclose(*spread, atol=1e-3)  # the same arrangement
+    np.testing.assert_allclose(found[:, 1], truth @ up, atol=1e-3)  # not mirrored in height
 
 
-def test_glb_follows_the_specification(room: Path, tmp_path: Path) -> None:
-    """Sizes, alignment, and cameras that look along -z from where poses.txt has them."""
-    raw = rt.export(room, "glb", tmp_path / "a.glb").read_bytes()
-    assert raw[:4] == b"glTF" and np.frombuffer(raw[4:12], "<u4").tolist() == [2, len(raw)]
-    length = int(np.frombuffer(raw[12:16], "<u4")[0])
-    gltf = json.loads(raw[20 : 20 + length])
-    assert length % 4 == 0 and gltf["buffers"][0]["byteLength"] == len(raw) - 28 - length
-    assert all(v["byteOffset"] % 4 == 0 for v in gltf["bufferViews"])
-    cameras = [n for n in gltf["nodes"] if n["name"].startswith("camera ")]
-    tum = np.loadtxt(room / "poses.txt")
-    np.testing.assert_allclose([n["translation"] for n in cameras], tum[:, 1:4], atol=1e-5)
-    forward = Rotation.from_quat([n["rotation"] for n in cameras]).apply([0, 0, -1])
-    np.testing.assert_allclose(forward, Rotation.from_quat(tum[:, 4:]).apply([0, 0, 1]), atol=1e-5)
+def test_glb_shows_points_and_the_path_of_the_cameras(chairs: rt.Result, tmp_path: Path) -> None:
+    """z is up in the walk: the file has x, z, -y, or that turned around y."""
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    colors = np.tile(np.array([[200, 30, 10]], np.uint8), (50, 1))
+    poses = dataclasses.replace(chairs.poses, points=points, colors=colors)
+    nodes = in_glb(dataclasses.replace(chairs, poses=poses), tmp_path / "a.glb")
+    np.testing.assert_allclose(np.sort(nodes["points"][0][:, 1]), np.sort(points[:, 2]), atol=1e-4)
+    assert tuple(nodes["points"][1].colors[0][:3]) == (200, 30, 10)
+    path = nodes["cameras"][0]
+    np.testing.assert_allclose(path[:, 1], 1.6, atol=1e-4)  # the walk's height
+    np.testing.assert_allclose(np.linalg.norm(path[:, [0, 2]], axis=1), 3.5, atol=1e-4)
 
 
-def test_glb_without_cameras_or_objects(tmp_path: Path) -> None:
-    """Identities only: a file that opens, with nothing in it."""
-    out = tmp_path / "out"
-    args = ("--detections", ROOM / "detections.npz", "--stop", 3, "--set", "output.overlay=false")
-    assert cli("track", ROOM / "room.mp4", "-o", out, *args) == 0
-    raw = rt.export(out, "glb").read_bytes()
-    gltf = json.loads(raw[20 : 20 + int(np.frombuffer(raw[12:16], "<u4")[0])])
-    assert [n["name"] for n in gltf["nodes"]] == ["world"] and "meshes" not in gltf
+def test_glb_without_scale_or_up_says_so(
+    chairs: rt.Result, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scale = chairs.world.scale._replace(value=7.0, source="none")
+    world = dataclasses.replace(chairs.world, up_in_world=None, scale=scale)
+    nodes = in_glb(dataclasses.replace(chairs, world=world), tmp_path / "a.glb")
+    assert "scale is unknown" in caplog.text and "up is unknown" in caplog.text
+    np.testing.assert_allclose(nodes["chair 1"][0].mean(0), [-1.1, 0, 0.41], atol=0.04)
+
+
+@pytest.mark.parametrize(("to", "package"), [("glb", "trimesh"), ("rrd", "rerun")])
+def test_a_missing_package_is_named(
+    room: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    to: str,
+    package: str,
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    assert cli("export", room, "--to", to) == 2
+    error = capsys.readouterr().err
+    assert "pip install" in error and package in error and len(error.splitlines()) == 1
+    assert not list(room.glob("*.glb")) and not list(room.glob("*.rrd"))
 
 
 def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
@@ -409,7 +418,8 @@ def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
     found = defaultdict(list)
     for chunk in RrdReader(rt.export(room, "rrd", tmp_path / "a.rrd")).stream().to_chunks():
         found[chunk.entity_path] += chunk.to_record_batch().to_pylist()
-    _, scale, kept = upright(room, [0.0, 0, 1])
+    world, kept = located(room)
+    scale = world["scale"]["metres_per_unit"]
     for o in kept:
         (row,) = found[f"/world/objects/{str(o['class']).replace(' ', chr(92) + ' ')}/{o['id']}"]
         half, center = scale * np.array([o["half_axes"]]), scale * np.array([o["center"]])
@@ -423,14 +433,6 @@ def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
     assert sum(boxes) == len(mot(room / "tracks.txt"))
     (points,) = found["/world/points"] or [{"Points3D:positions": []}]
     assert isinstance(points["Points3D:positions"], list)
-
-
-def test_rrd_without_rerun_says_what_to_install(
-    room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    assert cli("export", room, "--to", "rrd") == 2
-    assert "pip install" in capsys.readouterr().err and not (room / "scene.rrd").exists()
 
 
 def test_colmap_opens_sparse(room: Path) -> None:

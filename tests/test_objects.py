@@ -1,4 +1,4 @@
-"""From tracks and cameras to objects: linking, fitting, files."""
+"""From views to solids, and what is said of them: simulated chairs, and fits made by hand."""
 
 from __future__ import annotations
 
@@ -6,445 +6,305 @@ import dataclasses
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
-
-SIZE = (640, 480)
-CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
-NAMES = rt.COCO_NAMES
-CHAIR, CUP = 56, 41
+from reobj.objects import describe_objects, describe_world, fitter, parse_known_size, parse_up
+from reobj.views import Views, gather_views
 
 
-def looking_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """cam_from_world (3, 4) of a camera at `eye` in a world with z up."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.c_[rotation, -rotation @ eye]
+def options(**changes: object) -> rt.ObjectsConfig:
+    return dataclasses.replace(rt.ObjectsConfig(), **changes)  # type: ignore[arg-type]
 
 
-def walk(frames: int = 120, arc_deg: float = 120.0) -> rt.Poses:
-    """An arc around the origin at 3.5 m, z up, metres."""
-    angles = np.radians(np.linspace(-arc_deg / 2, arc_deg / 2, frames))
-    eyes = np.stack([3.5 * np.sin(angles), -3.5 * np.cos(angles), np.full(frames, 1.6)], 1)
-    poses = np.stack([looking_at(eye, np.array([0, 0, 0.4])) for eye in eyes])
-    status = np.array(["supplied"] * frames)
-    return rt.Poses(
-        CAMERA,
-        np.arange(frames),
-        np.arange(frames) / 30,
-        poses,
-        status,
-        "user",
-        True,
-        np.array([0, 0, 1.0]),
-    )
+# ---- Where objects are, against the truth ----
 
 
-def chair_solids() -> quadrics.Ellipsoids:
-    """Three equal chairs in a row and nothing else."""
-    centers = np.array([[-1.1, 0, 0.41], [0, 0.1, 0.41], [1.1, 0, 0.41]])
-    turn = np.array(
-        [
-            [[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]
-            for a in (0.2, 1.1, -0.5)
-        ]
-    )
-    return quadrics.Ellipsoids(centers, np.tile([0.28, 0.3, 0.41], (3, 1)), turn)
-
-
-def table_of(poses: rt.Poses, seed: int = 0) -> rt.TrackTable:
-    """Noisy boxes of the chairs, one tracklet a chair; rows ordered by frame."""
-    boxes = quadrics.solid_boxes(
-        chair_solids(), "box", poses.camera.K @ poses.cam_from_world
-    )  # (F, 3, 4)
-    boxes = boxes + np.random.default_rng(seed).normal(0, 1.0, boxes.shape)
-    frame, obj = np.divmod(np.arange(boxes.shape[0] * 3), 3)
-    n = len(frame)
-    return rt.TrackTable(
-        frame, obj + 1, obj + 1, boxes.reshape(-1, 4), np.full(n, 0.9), np.full(n, CHAIR), obj
-    )
-
-
-def linked(
-    table: rt.TrackTable, poses: rt.Poses | None, look: np.ndarray | None = None
-) -> rt.RunResult:
-    """`make_objects`; look: (N, E) of the rows, default none."""
-    seen = {} if look is None else {"look": look, "look_row": np.arange(len(table))}
-    track = rt.TrackResult(table, NAMES, **seen)  # type: ignore[arg-type]
-    return rt.make_objects(track, poses, rt.Config(), Path("unused"), {})
-
-
-# ---- Linking ----
-
-
-def test_a_chair_that_came_back_under_a_new_identity_is_joined() -> None:
-    """Each chair's track is cut in two with a gap; the halves are found again, the twins stay
-    apart.
-    """
-    poses = walk()
-    table = table_of(poses)
-    table = table[(table.frame < 40) | (table.frame >= 80)]
-    late = table.frame >= 80
-    table = rt.TrackTable(
-        table.frame,
-        table.object_id + 3 * late,
-        table.tracklet_id + 3 * late,
-        *(getattr(table, name) for name in ("xyxy", "score", "class_id", "detection_index")),
-    )
-    result = linked(table, poses)
-    truth = table.detection_index  # the true chair
-    pairs = {(t, o) for t, o in zip(truth.tolist(), result.table.object_id.tolist(), strict=True)}
-    assert len(pairs) == 3 and len(result.objects) == 3
-    assert {e["kind"] for e in result.world["links"]} == {"join"}
-
-
-def test_a_wrong_return_is_split_by_its_place() -> None:
-    """The tracker took the third chair for the first one that came back: two places."""
-    poses = walk()
-    table = table_of(poses)
-    table = table[
-        ((table.detection_index == 0) & (table.frame < 50))
-        | ((table.detection_index == 2) & (table.frame > 70))
-    ]
-    one = np.ones(len(table), np.int64)
-    table = rt.TrackTable(
-        table.frame,
-        one,
-        table.tracklet_id,
-        table.xyxy,
-        table.score,
-        table.class_id,
-        table.detection_index,
-    )
-    result = linked(table, poses)
-    assert len(result.objects) == 2
-    assert [e["kind"] for e in result.world["links"]] == ["split"]
-
-
-@pytest.mark.parametrize("slips", [[60], [40, 80], []])
-def test_a_tracklet_that_slipped_is_cut_by_place(slips: list[int]) -> None:
-    """The tracker goes on with another chair without missing a frame; else nothing is cut."""
-    poses = walk()
-    table = table_of(poses)
-    chair = np.array([0, 1, 2])[np.searchsorted(slips, table.frame, "right")]
-    table = table[table.detection_index == chair]
-    one = np.ones(len(table), np.int64)
-    result = linked(dataclasses.replace(table, object_id=one, tracklet_id=one), poses)
-    assert len(result.objects) == len(slips) + 1
-    truth = np.searchsorted(slips, table.frame, "right") + 1
-    assert (result.table.object_id == truth).mean() > 0.9
-    assert ("split" in {e["kind"] for e in result.world["links"]}) == bool(slips)
-
-
-def test_objects_seen_together_are_never_joined() -> None:
-    """Two tracks of one chair in the same frames (a double detection) stay two: the evidence says
-    so.
-    """
-    poses = walk()
-    table = table_of(poses)
-    first = table[table.detection_index == 0]
-    double = rt.TrackTable(
-        *(
-            np.concatenate([getattr(first, f), getattr(first, f)])
-            for f in (
-                "frame",
-                "object_id",
-                "tracklet_id",
-                "xyxy",
-                "score",
-                "class_id",
-                "detection_index",
-            )
-        )
-    )
-    half = len(first)
-    ids = np.repeat([1, 2], half)
-    order = np.argsort(double.frame, kind="stable")
-    double = rt.TrackTable(
-        double.frame, ids, ids, double.xyxy, double.score, double.class_id, double.detection_index
-    )[order]
-    assert len(linked(double, poses).objects) == 2
-
-
-@pytest.mark.parametrize(
-    ("every", "classes"),  # every n-th late box is still called a chair, the others a cup
-    [(10**6, ["chair", "cup"]), (3, ["chair"])],
-)
-def test_only_classes_that_the_detector_confuses_are_joined(every: int, classes: list[str]) -> None:
-    poses = walk()
-    table = table_of(poses)
-    table = table[(table.detection_index == 0) & ((table.frame < 50) | (table.frame > 70))]
-    late = (table.frame > 70).astype(np.int64)
-    cup = (late == 1) & (table.frame % every != 0)
-    class_id = np.where(cup, CUP, CHAIR)
-    table = dataclasses.replace(table, object_id=1 + late, tracklet_id=1 + late, class_id=class_id)
-    assert [o["class"] for o in linked(table, poses).objects] == classes
-
-
-@pytest.mark.parametrize(
-    ("near", "banned", "apart", "group"),
-    [
-        ([(0, 1, 3.0)], [], [], [0, 0, 1]),  # alike
-        ([(0, 1, 0.9)], [], [], [0, 1, 2]),  # rather another object
-        ([(0, 1, 3.0)], [(0, 1)], [(0, 1)], [0, 1, 2]),  # seen together
-        ([(0, 1, 3.0), (1, 2, 3.0)], [], [], [0, 0, 0]),  # through a third
-        ([(0, 1, 4.0), (1, 2, 2.0)], [(0, 2)], [(0, 2)], [0, 0, 1]),  # the better one of two twins
-        ([(0, 1, 3.0), (1, 2, 2.9)], [(0, 2)], [(0, 2)], [0, 1, 2]),  # twins about as near: apart
-        ([(0, 1, 3.0), (1, 2, 2.9)], [(0, 2)], [], [0, 0, 1]),  # two boxes on one are no rivals
-    ],
-)
-def test_most_alike_are_joined_first(
-    near: list[tuple[int, int, float]],
-    banned: list[tuple[int, int]],
-    apart: list[tuple[int, int]],
-    group: list[int],
-) -> None:
-    matrix, no = np.full((3, 3), -np.inf), np.zeros((2, 3, 3), bool)
-    for i, j, ratio in near:
-        matrix[i, j] = matrix[j, i] = np.log(ratio)
-    for k, pairs in enumerate((banned, apart)):
-        for i, j in pairs:
-            no[k, i, j] = no[k, j, i] = True
-    assert rt._most_alike_first(matrix, no[0], no[1], 0.5).tolist() == group
-
-
-def looks_of(table: rt.TrackTable, chair: np.ndarray, twins: float) -> np.ndarray:
-    """Noisy looks (N, 12) of the true chairs (N,), with this cosine between chairs 0 and 1."""
-    own = np.eye(3, 12)
-    own[1] = twins * own[0] + np.sqrt(1 - twins**2) * own[1]
-    rows = own[chair] + np.random.default_rng(1).normal(0, 0.03, (len(table), 12))
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-
-
-@pytest.mark.parametrize(
-    ("tracker", "twins", "objects", "kinds"),
-    [
-        ([1, 2, 3, 4, 5, 6], 0.5, 3, {"join"}),  # all came back under new identities
-        ([1, 2, 3, 2, 1, 3], 0.5, 3, {"join", "split"}),  # two were taken for each other
-        ([1, 2, 3, 1, 2, 3], 0.5, 3, set()),  # right already
-        ([1, 2, 3, 4, 5, 3], 0.999, 5, set()),  # twins that nothing tells apart stay apart
-    ],
-)
-def test_looks_alone_decide_without_poses(
-    tracker: list[int], twins: float, objects: int, kinds: set[str]
-) -> None:
-    """Three chairs, each seen before frame 40 and after frame 80; what the tracker made of them."""
-    table = table_of(walk())
-    table = table[(table.frame < 40) | (table.frame >= 80)]
-    chair, visit = table.detection_index, (table.frame >= 80).astype(np.int64)
-    piece = chair + 3 * visit
-    ids = np.array(tracker)[piece]
-    table = dataclasses.replace(table, object_id=ids, tracklet_id=piece + 1)
-    result = linked(table, None, looks_of(table, chair, twins))
-    assert len(result.objects) == objects
-    assert {e["kind"] for e in result.world["links"]} == kinds
-    assert all(e["place_iou"] is None and e["kept"] for e in result.world["links"])
-    found = result.table.object_id
-    assert all(len({*chair[found == o].tolist()}) == 1 for o in np.unique(found))
-
-
-def test_looks_from_another_side_say_less() -> None:
-    """The first and the last views of the chairs, on an arc of 120 degrees around them."""
-    poses = walk()
-    table = table_of(poses)
-    table = table[(table.frame < 15) | (table.frame >= 105)]
-    table = dataclasses.replace(table, tracklet_id=table.tracklet_id + 3 * (table.frame > 60))
-    look = looks_of(table, table.detection_index, 0.3)
-    track = rt.TrackResult(table, NAMES, look=look, look_row=np.arange(len(table)))
-    near, posed = (rt.Linker(track, p, None, rt.ObjectsConfig()).near for p in (None, poses))
-    assert (np.abs(posed)[:3, 3:] < np.abs(near)[:3, 3:]).all()
-    assert (np.diag(posed[:3, 3:]) < 0.7 * np.diag(near[:3, 3:])).all()
-
-
-def test_a_misnamed_piece_does_not_ban_the_return_of_its_tracklet() -> None:
-    """A gap within the second tracklet of a chair, before it the detector says cup."""
-    table = table_of(walk())
-    table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
-    late = (table.frame >= 80).astype(np.int64)
-    class_id = np.where((late == 1) & (table.frame < 84), CUP, CHAIR)
-    table = dataclasses.replace(table, object_id=1 + late, tracklet_id=1 + late, class_id=class_id)[
-        (table.frame < 84) | (table.frame > 93)
-    ]
-    result = linked(table, None, looks_of(table, table.detection_index, 0.5))
-    assert [o["class"] for o in result.objects] == ["chair"]
-
-
-# ---- Fitting ----
-
-
-def test_objects_come_out_where_they_are() -> None:
-    poses = walk()
-    result = linked(table_of(poses), poses)
-    truth = chair_solids()
-    for entry, center in zip(result.objects, truth.center_in_world, strict=True):
-        assert entry["status"] == "ok"
-        np.testing.assert_allclose(entry["center"], center, atol=0.03)
-        np.testing.assert_allclose(sorted(entry["size"]), sorted([0.56, 0.6, 0.82]), rtol=0.08)
-        assert entry["support"] == "box"
-        assert entry["reprojection_iou_median"] > 0.9
+def test_objects_come_out_where_they_are(chairs: rt.Result) -> None:
+    for found, center in zip(chairs.objects, chair_solids().center_in_world, strict=True):
+        assert (found.status, found.class_name, found.support) == ("ok", "chair", "box")
+        np.testing.assert_allclose(found.center, center, atol=0.03)
+        np.testing.assert_allclose(np.sort(found.size), [0.56, 0.6, 0.82], rtol=0.08)
+        np.testing.assert_allclose(found.size_m, found.size)  # the world is in metres
+        assert found.reprojection_iou_median > 0.9 and found.views == found.frames_seen == 40
+        angle = np.radians(found.parallax_deg)
+        assert np.radians(90) < angle < np.radians(150)  # an arc of 120 degrees around the middle
 
 
 def test_without_poses_objects_are_the_tracks() -> None:
-    result = linked(table_of(walk()), walk())
-    flat = rt.make_objects(
-        rt.TrackResult(table_of(walk()), NAMES),
-        None,
-        rt.Config(),
-        Path("x"),
-        {},
-    )
-    assert [o["id"] for o in flat.objects] == [o["id"] for o in result.objects] == [1, 2, 3]
-    assert all(o["center"] is None and o["reason"] == "no camera poses" for o in flat.objects)
+    tracks = tracks_of(walk(8))
+    tracks = with_columns(tracks, tracklet_id=tracks.track_id + 10 * (tracks.frame > 4))
+    result = fitted(tracks, None)
+    assert [o.id for o in result.objects] == [1, 2, 3]
+    for found in result.objects:
+        assert (found.status, found.reason) == ("rejected", "no camera poses")
+        assert found.center is None and found.size_m is None and found.views == 0
+        assert found.tracklet_ids == [found.id, found.id + 10] and found.frames_seen == 8
+        assert found.visits == [[0, 4], [5, 7]] and found.score == 0.9
+    assert result.world.units is None and result.world.to_json()["registered_frames"] == 0
 
 
-def test_frames_without_pose_are_left_out() -> None:
+def test_visits_are_in_the_order_of_time() -> None:
+    """A later tracklet may have the smaller number."""
+    tracks = tracks_of(walk(8))
+    tracks = with_columns(tracks, tracklet_id=np.where(tracks.frame > 4, 1, 7))
+    assert fitted(tracks, None).objects[0].visits == [[0, 4], [5, 7]]
+
+
+def test_views_are_frames_with_a_pose() -> None:
     poses = walk()
-    poses.cam_from_world[10:50] = np.nan
-    result = linked(table_of(poses), poses)
-    assert [o["views"] for o in result.objects] == [80, 80, 80]
-    assert result.world["registered_frames"] == 80
+    poses.cam_from_world[10:20] = np.nan
+    result = fitted(tracks_of(poses), poses)
+    assert [(o.views, o.frames_seen) for o in result.objects] == [(30, 40)] * 3
+    assert (result.world.registered_frames, result.world.frames) == (30, 40)
 
 
-def test_moving_classes_get_no_ellipsoid() -> None:
-    poses = walk()
-    table = table_of(poses)
-    table = rt.TrackTable(
-        table.frame,
-        table.object_id,
-        table.tracklet_id,
-        table.xyxy,
-        table.score,
-        np.zeros(len(table), np.int64),
-        table.detection_index,
-    )
-    assert {o["reason"] for o in linked(table, poses).objects} == {"objects of this class move"}
-
-
-def test_too_few_views_are_rejected_with_the_reason() -> None:
-    poses = walk()
-    table = table_of(poses)
-    result = linked(table[table.frame < 2], poses)
-    assert {o["status"] for o in result.objects} == {"rejected"}
-    assert "seen in 2 frames" in result.objects[0]["reason"]
-
-
-def test_boxes_are_undistorted_but_border_edges_stay() -> None:
-    camera = rt.Camera("SIMPLE_RADIAL", 640, 480, (520.0, 320.0, 240.0, 0.2))
-    boxes = np.array([[400.0, 300, 600, 450], [0, 100, 200, 480]])
-    ideal = rt._undistort_boxes(boxes, camera)
-    assert (
-        ideal[0, 2:] < boxes[0, 2:]
-    ).all()  # positive k pushes points outwards: the ideal ones lie inwards
-    assert ideal[1, 0] == 0 and ideal[1, 3] == 480
-
-
-# ---- Files ----
-
-
-def written(tmp_path: Path) -> rt.RunResult:
-    for i in range(120):
-        cv2.imwrite(str(tmp_path / f"{i:04d}.jpg"), np.full((480, 640, 3), 90, np.uint8))
-    poses = walk()
-    result = linked(table_of(poses), poses)
-    result.out, result.poses = tmp_path / "out", poses
-    (tmp_path / "out").mkdir()
-    rt.write_results(result, rt.Video(tmp_path), rt.Config())
-    return result
-
-
-def test_written_files(tmp_path: Path) -> None:
-    result = written(tmp_path)
-    out = tmp_path / "out"
-    assert rt.validate_objects(out / "objects.json") == []
-    mot = np.loadtxt(out / "tracks.txt", delimiter=",")
-    np.testing.assert_array_equal(mot[:, 0], result.table.frame + 1)
-    np.testing.assert_allclose(mot[:, 2:4] + mot[:, 4:6], result.table.xyxy[:, 2:], atol=0.02)
-    capture = cv2.VideoCapture(str(out / "overlay.mp4"))
-    assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 120
-    ok, frame = capture.read()
-    assert ok and frame.shape == (480, 640, 3)
-    assert frame.std() > 5  # something was drawn on the grey frames
-    assert not [p for p in out.rglob("*") if p.name.startswith(".part-")]
-
-
-def test_projected_ellipse_lies_in_the_box(tmp_path: Path) -> None:
-    """The drawn ellipse of an inscribed ellipsoid stays within the box of the solid."""
-    poses = walk()
-    solids = chair_solids()
-    img_from_world = poses.camera.K @ poses.cam_from_world[:1]
-    dual_c, visible = quadrics.project(solids.dual_quadrics(), img_from_world)
-    boxes = quadrics.solid_boxes(solids, "box", img_from_world)[0]
-    for conic, box in zip(dual_c[0], boxes, strict=True):
-        (x, y), (major, minor), angle = rt._ellipse_of_dual_conic(conic)  # type: ignore[misc]
-        turn, phase = np.radians(angle), np.linspace(0, 2 * np.pi, 100)
-        edge = np.stack([major / 2 * np.cos(phase), minor / 2 * np.sin(phase)])
-        outline = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ edge + [
-            [x + 0.5],
-            [y + 0.5],
-        ]
-        assert (outline[0] >= box[0] - 0.5).all() and (outline[0] <= box[2] + 0.5).all()
-        assert (outline[1] >= box[1] - 0.5).all() and (outline[1] <= box[3] + 0.5).all()
-    assert visible.all()
-
-
-def test_ply_is_a_closed_mesh_at_the_right_place(tmp_path: Path) -> None:
-    solids = chair_solids()
-    rt.write_ply(tmp_path / "o.ply", solids, [1, 2, 3], 2)
-    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
-    mesh = trimesh.load(tmp_path / "o.ply")
-    assert mesh.is_watertight and mesh.is_winding_consistent
-    volume = 4 / 3 * np.pi * solids.half_axes.prod(1).sum()
-    assert mesh.volume == pytest.approx(volume, rel=0.05)
-    np.testing.assert_allclose(mesh.bounds[:, 2], [0, 0.82], atol=0.01)
+# ---- Options ----
 
 
 @pytest.mark.parametrize(
-    ("change", "fault"),
+    ("moving", "status"),
+    [("chair", "rejected"), ("person, chair", "rejected"), ("person", "ok"), ("", "ok")],
+)
+def test_classes_that_move_get_no_ellipsoid(moving: str, status: str) -> None:
+    poses = walk(20)
+    result = fitted(tracks_of(poses), poses, options(moving=moving))
+    assert {o.status for o in result.objects} == {status}
+    if status == "rejected":
+        found = result.objects[0]
+        assert found.reason == "objects of this class move"
+        assert found.center is None and found.size is None and found.support is None
+
+
+@pytest.mark.parametrize(("min_views", "rejected"), [(4, False), (5, True)])
+def test_min_views_is_the_number_that_is_needed(min_views: int, rejected: bool) -> None:
+    poses = walk(40)
+    tracks = tracks_of(poses)
+    tracks = tracks[np.isin(tracks.frame, [0, 13, 26, 39])]
+    found = fitted(tracks, poses, options(min_views=min_views)).objects[0]
+    assert (found.status == "rejected") == rejected
+    assert ("seen in 4 frames with a camera pose; 5 are needed" in found.reason) == rejected
+
+
+def test_boxes_below_min_score_do_not_shape_the_ellipsoid() -> None:
+    """Three of four boxes are twice as high, of score .25."""
+    poses = walk(40)
+    tracks = tracks_of(poses)
+    weak = tracks.frame % 4 != 0
+    tracks.xyxy[weak, 1] -= np.diff(tracks.xyxy[weak][:, [1, 3]])[:, 0]
+    tracks = with_columns(tracks, score=np.where(weak, 0.25, 0.9))
+    height = {}
+    for min_score in (0.3, 0.2):
+        result = fitted(tracks, poses, options(min_score=min_score))
+        height[min_score] = np.median([o.size.max() for o in result.objects if o.located])
+        assert {o.views for o in result.objects} == {10 if min_score == 0.3 else 40}
+    assert height[0.3] == pytest.approx(0.82, rel=0.1)
+    assert abs(height[0.2] - 0.82) > 0.1
+
+
+def test_known_size_sets_the_scale() -> None:
+    """A world of half the size and without metric poses: the chairs' .82 m say so."""
+    poses = walk()
+    tracks = tracks_of(poses)
+    poses = dataclasses.replace(poses, metric=False)
+    poses.cam_from_world[:, :, 3] *= 0.5
+    result = fitted(tracks, poses, options(known_size="chair=82cm"))
+    assert result.world.units == "arbitrary" and result.world.scale is not None
+    assert result.world.scale.source == "known_size"
+    assert result.world.scale.value == pytest.approx(2, rel=0.05)
+    for found in result.objects:
+        np.testing.assert_allclose(found.size_m, 2 * found.size, rtol=0.05)
+        np.testing.assert_allclose(np.sort(found.size_m), [0.56, 0.6, 0.82], rtol=0.1)
+
+
+def test_priors_support_and_up_are_obeyed(tmp_path: Path) -> None:
+    """What the config names is what the fit gets: other priors, another solid, another up."""
+    poses = dataclasses.replace(walk(20), up_in_world=None)
+    tracks = tracks_of(poses)
+    tilted = np.array([0, 0.1, 1]) / np.hypot(0.1, 1)
+    given = options(support="cylinder", up=",".join(map(str, 3 * tilted)))
+    result = fitted(tracks, poses, given)
+    assert {o.support for o in result.objects} == {"cylinder"}
+    assert result.world.up_source == "given"
+    np.testing.assert_allclose(result.world.up_in_world, tilted, atol=1e-5)
+
+    own = Path(quadrics.__file__).with_name("priors.json")
+    small = json.loads(own.read_text().replace('"chair"', '"armchair of a doll"'))
+    (tmp_path / "priors.json").write_text(json.dumps(small))
+    few = tracks[tracks.frame < 3]  # hardly any parallax: the prior decides the depth
+    sizes = [fitted(few, poses, options(priors=p)).objects[0].size_rel_sigma.max()
+             for p in ("", str(tmp_path / "priors.json"))]  # fmt: skip
+    assert sizes[1] > 1.2 * sizes[0]  # an unknown category says less of the size
+
+
+@pytest.mark.parametrize("text", ["north", "0,0,0", "1,2", "1,2,nan", "1,2,3,4"])
+def test_up_that_is_no_direction(text: str) -> None:
+    with pytest.raises(rt.ReobjError, match="expected a direction"):
+        parse_up(text)
+
+
+def test_up_is_scaled_to_unit_length() -> None:
+    np.testing.assert_allclose(parse_up("0, -3,4"), [0, -0.6, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("text", "sizes"),
     [
-        ({"status": "fine"}, "status: expected one of"),  # unknown status
-        ({"center": [1, 2]}, "center: expected 3 entries"),  # wrong length
-        ({"id": "one"}, "id: expected int, found str"),  # wrong type
-        ({"id": 2}, "id 2 occurs twice"),
-        ({"half_axes": None, "center": None}, "center: missing although"),
+        ("", {}),
+        ("chair=0.82m,door=2m", {"chair": ("h", 0.82), "door": ("h", 2.0)}),
+        (" dining table = 75 cm ,", {"dining table": ("h", 0.75)}),  # names with blanks
+        ("cup=95mm", {"cup": ("h", 0.095)}),
     ],
 )
-def test_validate_finds_faults(tmp_path: Path, change: dict[str, object], fault: str) -> None:
-    poses = walk()
-    result = linked(table_of(poses), poses)
-    result.objects[0] |= change
-    data = {
-        "format": "reobj-objects",
-        "version": 1,
-        "video": {},
-        "world": {},
-        "conventions": {},
-        "objects": result.objects,
-    }
-    (tmp_path / "objects.json").write_text(json.dumps(data))
-    faults = rt.validate_objects(tmp_path / "objects.json")
-    assert any(fault in line for line in faults), faults
+def test_known_sizes(text: str, sizes: dict[str, tuple[str, float]]) -> None:
+    assert parse_known_size(text) == sizes
 
 
-def test_validate_refuses_what_is_no_json(tmp_path: Path) -> None:
-    (tmp_path / "x.json").write_text("{")
-    with pytest.raises(rt.ReobjError, match="not valid JSON"):
-        rt.validate_objects(tmp_path / "x.json")
-
-
-def test_quaternions_rotate_like_their_matrices() -> None:
-    rotation = chair_solids().world_from_obj
-    w, x, y, z = rt.quat_wxyz_from_matrix(rotation).T
-    first_column = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
-    np.testing.assert_allclose(first_column, rotation[:, :, 0], atol=1e-12)
-
-
-@pytest.mark.parametrize("text", ["door", "door=tall", "door=2furlongs", "=2m"])
+@pytest.mark.parametrize(
+    "text", ["door", "door=tall", "door=2furlongs", "=2m", "door=1.2.3m", "door=.m", "door=0m"]
+)
 def test_known_size_that_cannot_be_read(text: str) -> None:
     with pytest.raises(rt.ReobjError, match="--known-size"):
-        rt.parse_known_size(text)
+        parse_known_size(text)
+
+
+def test_fitter_names_classes_beyond_the_names() -> None:
+    """A class without a name has no category, and is no error."""
+    poses = walk(10)
+    tracks = with_columns(tracks_of(poses), class_id=7)
+    views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.3)
+    assert len(fitter(rt.ObjectsConfig(), poses, ("cup",))(views, [7, 7, 7])) == 3
+    assert {o.class_name for o in describe_objects(tracks, (), None, None, rt.ObjectsConfig())} == {
+        "object"
+    }
+
+
+# ---- What is said of a fit, made by hand ----
+
+TURN = Rotation.from_euler("zyx", [70, 20, -40], degrees=True)
+
+
+def a_fit(count: int = 4, **changes: object) -> tuple[quadrics.ObjectFits, Views]:
+    """One object fitted in `count` frames of a camera that stands still, and its exact boxes."""
+    half = np.array([[0.2, 0.3, 0.4]])
+    solids = quadrics.Ellipsoids(np.array([[0.1, -0.2, 5.0]]), half, TURN.as_matrix()[None])
+    img_from_world = np.tile(walk(1).camera.K @ np.eye(3, 4), (count, 1, 1))
+    boxes = quadrics.solid_boxes(solids, "box", img_from_world)
+    cov = np.diag([1, 1, 1, 0.01, 0.04, 0.09, 1, 1, 1.0])[None]
+    facts: dict[str, object] = {
+        "ellipsoids": solids, "size": 2 * half, "cov": cov, "support": np.array(["box"]),
+        "inlier": np.ones((count, 1), bool), "rms_px": np.ones(1), "status": np.array(["ok"]),
+        "reason": [""], "parallax_deg": np.array([31.23456]), "prior_share": np.ones((1, 3)),
+        "scale": quadrics.Scale(2.5, 0.2, "priors"), "up": np.array([0, 0, 1.0]),
+        "up_source": "objects",
+    }  # fmt: skip
+    views = Views(np.arange(count), boxes, np.ones((count, 1)), img_from_world, SIZE)
+    return quadrics.ObjectFits(**facts | changes), views  # type: ignore[arg-type]
+
+
+def described(count: int = 4, config: rt.ObjectsConfig | None = None, **changes: object) -> object:
+    fits, views = a_fit(count, **changes)
+    one, zero = np.ones(count, np.int64), np.zeros(count, np.int64)
+    score = np.linspace(0.4, 0.8, count)
+    tracks = rt.Tracks(np.arange(count), one, one, views.boxes[:, 0], score, zero, zero)
+    (found,) = describe_objects(tracks, ("lamp",), fits, views, config or rt.ObjectsConfig())
+    return found
+
+
+def test_sizes_are_in_metres_and_know_the_error_of_the_scale() -> None:
+    found = described()
+    np.testing.assert_allclose(found.size, [0.4, 0.6, 0.8])
+    np.testing.assert_allclose(found.size_m, [1.0, 1.5, 2.0])  # 2.5 m a unit
+    expected = np.sqrt([0.01 + 0.04, 0.04 + 0.04, 0.09 + 0.04])  # of the size, of the scale
+    np.testing.assert_allclose(found.size_rel_sigma, expected, rtol=1e-5)
+    np.testing.assert_allclose(found.center, [0.1, -0.2, 5.0])
+    np.testing.assert_allclose(found.half_axes, [0.2, 0.3, 0.4])
+    assert np.shape(found.cov) == (9, 9) and found.cov[4, 4] == 0.04
+
+
+def test_without_a_scale_there_are_no_metres() -> None:
+    found = described(scale=quadrics.Scale(1.0, 0.0, "none"))
+    assert found.size_m is None and found.size is not None
+
+
+def test_quaternion_is_world_from_object_w_first() -> None:
+    w, x, y, z = described().quat_wxyz
+    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), TURN.as_matrix(),
+                               atol=1e-5)  # fmt: skip
+
+
+def test_evidence_of_a_fit() -> None:
+    inlier = np.array([[True], [False], [True], [True]])
+    found = described(inlier=inlier)
+    assert (found.views, found.frames_seen, found.dropped_boxes) == (4, 4, 1)
+    assert found.parallax_deg == 31.23 and found.reprojection_iou_median == 1.0
+    assert found.score == 0.6 and found.class_name == "lamp" and found.reason == ""
+
+
+def test_numbers_that_are_unknown_are_none() -> None:
+    """JSON knows no NaN."""
+    found = described(parallax_deg=np.array([np.nan]))
+    assert found.parallax_deg is None
+    json.dumps(found.to_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize("status", ["ok", "prior_dominated", "rejected"])
+def test_only_rejected_objects_have_no_solid(status: str) -> None:
+    found = described(status=np.array([status]), reason=["so it is"])
+    assert (found.status, found.reason) == (status, "so it is")
+    assert found.located == (status != "rejected") == (found.center is not None)
+    assert (found.cov is None) == (found.half_axes is None) == (not found.located)
+    assert found.support == "box"
+
+
+@pytest.mark.parametrize(("count", "status"), [(2, "rejected"), (3, "ok")])
+def test_three_views_are_enough(count: int, status: str) -> None:
+    found = described(count)
+    assert found.status == status and found.views == count
+    assert ("seen in 2 frames with a camera pose; 3 are needed" == found.reason) == (count == 2)
+
+
+def test_unseen_frames_do_not_count_as_views() -> None:
+    """In five of eight frames the object has no box: no view, no outlier, no overlap of 0."""
+    fits, views = a_fit(8, inlier=np.arange(8)[:, None] < 3)
+    views.boxes[3:] = np.nan
+    three = np.arange(3)
+    tracks = rt.Tracks(three, three * 0 + 1, three * 0 + 1, views.boxes[:3, 0], np.ones(3),
+                       three * 0, three)  # fmt: skip
+    (found,) = describe_objects(tracks, ("lamp",), fits, views, rt.ObjectsConfig())
+    assert (found.views, found.dropped_boxes, found.reprojection_iou_median) == (3, 0, 1.0)
+
+
+def test_world_of_a_fit() -> None:
+    poses = walk(6)
+    poses.cam_from_world[1] = np.nan
+    status = np.array(["supplied", "none", "interpolated", *["supplied"] * 3])
+    poses = dataclasses.replace(poses, metric=False, status=status)
+    fits, _ = a_fit(scale=quadrics.Scale(2.123456789, 0.123456789, "priors"))
+    event = rt.LinkEvent("join", (1, 2), 0.5, 1.0, True)
+    world = describe_world(poses, fits, [event])
+    assert (world.units, world.source) == ("arbitrary", "user")
+    assert (world.registered_frames, world.interpolated_frames, world.frames) == (5, 1, 6)
+    assert world.scale == (2.123457, 0.1235, "priors") and world.links == (event,)
+    assert world.up_source == "objects" and world.up_in_world.tolist() == [0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("fit_knows", "poses_know", "up", "source"),
+    [(True, True, [0, 0, 1], "objects"), (False, True, [1, 0, 0], "poses"),
+     (False, False, None, "none")],
+)  # fmt: skip
+def test_up_is_the_fits_or_the_poses(
+    fit_knows: bool, poses_know: bool, up: list[float] | None, source: str
+) -> None:
+    poses = dataclasses.replace(walk(3), up_in_world=np.array([1.0, 0, 0]) if poses_know else None)
+    changes = {} if fit_knows else {"up": np.zeros(3), "up_source": "none"}
+    world = describe_world(poses, a_fit(**changes)[0], [])
+    assert (None if world.up_in_world is None else world.up_in_world.tolist()) == up
+    assert world.up_source == source
+    flat = describe_world(poses, None, [])
+    assert flat.scale is None and flat.up_source == ("poses" if poses_know else "none")

@@ -18,11 +18,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from simulated import fitted, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
+from reobj.cameras import invert_rigid
+from reobj.results.result import VideoInfo
+from reobj.results.scene import Pictures, diverse_rows, write_pictures, write_scene
+from reobj.types import object_color
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = (
@@ -189,7 +195,7 @@ def poses_of_walk() -> rt.Poses:
     )
 
 
-def tracks_of_walk(poses: rt.Poses) -> rt.TrackResult:
+def tracks_of_walk(poses: rt.Poses) -> rt.Tracks:
     """Boxes of the objects in every frame; the second one is out of sight for a while."""
     n = len(CENTERS)
     half = np.tile([0.3, 0.25, 0.4], (n, 1))
@@ -202,25 +208,24 @@ def tracks_of_walk(poses: rt.Poses) -> rt.TrackResult:
     frame, obj = frame[keep], obj[keep]
     tracklet = obj + 1 + n * ((obj == 1) & (frame > 8))
     score = np.full(len(frame), 0.9)
-    table = rt.TrackTable(frame, obj + 1, tracklet, boxes[frame, obj], score, obj, obj)
-    return rt.TrackResult(table, NAMES, ("a <b>warning</b>",))
+    return rt.Tracks(frame, obj + 1, tracklet, boxes[frame, obj], score, obj, obj)
 
 
-def write_page(folder: Path, in_3d: bool = True, config: rt.Config | None = None) -> Path:
+def write_page(folder: Path, in_3d: bool = True, scene: bool = True) -> Path:
     """An output folder with the page of the small scene."""
-    import cv2
-
     folder.mkdir(parents=True)
     rng = np.random.default_rng(1)
     (folder / "frames").mkdir()
     for i in range(FRAMES):
         image = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8), (0, 0), 3)
         cv2.imwrite(str(folder / f"frames/{i:03d}.png"), image)
-    video, config = rt.Video(folder / "frames"), config or rt.Config()
-    poses = poses_of_walk()
-    tracks = tracks_of_walk(poses)
-    space = rt.Workspace(folder / "out")
-    rt._finish_objects(video, space, tracks, poses if in_3d else None, config, {})
+    video, poses = rt.Video(folder / "frames"), poses_of_walk()
+    result = fitted(tracks_of_walk(poses), poses if in_3d else None, names=NAMES)
+    result.warnings.append("a <b>warning</b>")
+    link = rt.LinkEvent("join", (2, 6), 0.123456, 1.98765, True)
+    result.world = dataclasses.replace(result.world, links=(link,))
+    result.save(folder / "out")
+    write_pictures(result, folder / "out", video, overlay=False, scene=scene)
     return folder / "out/scene.html"
 
 
@@ -235,6 +240,14 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_page(tmp_path_factory.mktemp("scene") / "a")
 
 
+class Facts:
+    """Stands in for a video where only its facts are asked for."""
+
+    config, fps, scale, source, is_live = rt.InputConfig(), 30.0, 1.0, "a.mp4", False
+    size = (WIDTH, HEIGHT)
+
+
+VIDEO: Any = Facts()
 SCREENSHOTS = Path(__file__).resolve().parent.parent / "build/screenshots"
 
 
@@ -286,13 +299,18 @@ def test_rejected_objects_are_listed_with_their_reason(browser: Browser, page: P
 def test_merges_and_splits_are_told(browser: Browser, page: Path) -> None:
     browser.open(page)
     data = data_of(page)
-    assert [link["kind"] for link in data["links"]] == ["join"] or data["links"] == []
-    browser.eval("""S.links.push({kind: "join", tracklets: [1, 3], place_iou: 0.2, look: 0.9,
-        kept: false}, {kind: "split", tracklets: [1, 1], place_iou: 0, look: 1, kept: true})""")
+    assert data["links"] == [{"kind": "join", "tracklets": [2, 6], "place_iou": 0.12,
+                              "appearance_log_odds": 1.99, "kept": True}]  # fmt: skip
+    browser.eval("""S.links.push(
+        {kind: "join", tracklets: [1, 3], place_iou: 0.2, appearance_log_odds: 0.9, kept: false},
+        {kind: "split", tracklets: [1, 1], place_iou: 0, appearance_log_odds: 1, kept: true})""")
     browser.eval("select(S.objects[0])")
     text = browser.eval("$('panel').innerText")
     assert "tracklets 1 (object 1), 3 (object 3): overlap of places 0.2" in text
     assert "tried and undone" in text and "parts of tracklets 1 (object 1) show different" in text
+    assert "undefined" not in text and "NaN" not in text
+    browser.eval("select(S.objects[1])")
+    assert "overlap of places 0.12, likeness 1.99" in browser.eval("$('panel').innerText")
 
 
 def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
@@ -425,69 +443,73 @@ def test_no_name_can_leave_the_data(page: Path) -> None:
 def test_the_page_holds_the_scene(page: Path) -> None:
     data, poses = data_of(page), poses_of_walk()
     found = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(-1, 3, 4)
-    np.testing.assert_allclose(found, rt.invert_rigid(poses.cam_from_world), atol=1e-6)
+    np.testing.assert_allclose(found, invert_rigid(poses.cam_from_world), atol=1e-6)
     points = np.frombuffer(base64.b64decode(data["points"]), "<f4").reshape(-1, 3)
     np.testing.assert_allclose(points, poses.points, atol=1e-6)
     assert data["objects"][1]["seen"] == [0, 8, 15, 23] and data["up"] == [0, 0, 1]
     assert [tuple(o["color"]) for o in data["objects"]] == [
-        rt.object_color(i)[::-1] for i in (1, 2, 3, 4)
+        object_color(i)[::-1] for i in (1, 2, 3, 4)
     ]
+    assert data["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
+    assert data["steps"] == {"frame": list(range(24)), "seconds": pytest.approx(1 / 30)}
+    assert "cov" not in data["objects"][0] and data["why_flat"] == ""
+
+
+def test_the_data_are_strict_json(page: Path) -> None:
+    """Browsers refuse NaN and Infinity; frame 5 has no pose."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    text = page.read_text().split('id="data">')[1].split("</script>")[0]
+    json.loads(text, parse_constant=refuse)
+    assert "<" not in text  # no name can end the script
 
 
 def test_scene_can_be_switched_off(tmp_path: Path) -> None:
-    config = rt.Config(output=rt.OutputConfig(scene=False))
-    assert not write_page(tmp_path / "off", config=config).exists()
+    assert not write_page(tmp_path / "off", scene=False).exists()
 
 
 def test_three_minutes_stay_below_ten_megabytes(tmp_path: Path) -> None:
     """5,400 frames, 50 objects, 100,000 points, and pictures that do not compress at all."""
     frames, objects = 5400, 50
     rng = np.random.default_rng(0)
-    walk = poses_of_walk()
+    at = poses_of_walk()
     frame, obj = (a.ravel() for a in np.mgrid[:frames, :objects])
     corner = rng.uniform(0, 100, (len(frame), 2))
     box = np.hstack([corner, corner + rng.uniform(30, 130, (len(frame), 2))])
     score = np.full(len(frame), 0.9)
-    table = rt.TrackTable(frame, obj + 1, obj + 1, box, score, 0 * obj, obj)
+    tracks = rt.Tracks(frame, obj + 1, obj + 1, box, score, 0 * obj, obj)
     poses = dataclasses.replace(
-        walk,
+        at,
         frame=np.arange(frames),
         time_s=np.arange(frames) / 30,
-        cam_from_world=np.repeat(walk.cam_from_world, frames // FRAMES, 0),
+        cam_from_world=np.repeat(at.cam_from_world, frames // FRAMES, 0),
         status=np.full(frames, "pnp"),
         points=rng.normal(size=(100_000, 3)),
         colors=rng.integers(0, 255, (100_000, 3)).astype(np.uint8),
     )
-    entries = rt._object_entries(table, ("chair",), None, None, rt.ObjectsConfig())
-    result = rt.RunResult(tmp_path, table, ("chair",), entries, poses, None, {}, [])
-    result.world = rt._world_entry(poses, None, [])
-    config = rt.Config()
-    import cv2
-
+    result = dataclasses.replace(fitted(tracks, None, names=("chair",)), poses=poses)
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     video = rt.Video(tmp_path / "0.png")
-    pictures = rt.Pictures(result, video, config.output)
+    pictures = Pictures(result, video)
     noise = rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     for index in sorted({*frame[pictures.wanted].tolist(), *pictures.whole}):
         pictures.take(rt.Frame(int(index), index / 30, noise))
-    rt.write_scene(result, pictures, video, config)
+    write_scene(result, pictures, tmp_path / "scene.html", video)
     assert 2e6 < (tmp_path / "scene.html").stat().st_size < 10e6
 
 
 def test_pictures_show_the_object(tmp_path: Path) -> None:
     """Crops and frames of a video that is read at half its size: the green box is in place."""
-    import cv2
-
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[60:120, 200:280] = (0, 255, 0)
     cv2.imwrite(str(tmp_path / "0.png"), image)
     zero, one = np.zeros(1, np.int64), np.ones(1, np.int64)
     box = np.array([[200.0, 60, 280, 120]])
-    table = rt.TrackTable(zero, one, one, box, np.ones(1), zero, zero)
-    entries = rt._object_entries(table, ("chair",), None, None, rt.ObjectsConfig())
-    result = rt.RunResult(tmp_path, table, ("chair",), entries, None, None, {}, [])
+    result = fitted(rt.Tracks(zero, one, one, box, np.ones(1), zero, zero), None)
     video = rt.Video(tmp_path / "0.png", rt.InputConfig(max_size=WIDTH // 2))
-    pictures = rt.Pictures(result, video, rt.OutputConfig())
+    pictures = Pictures(result, video)
     for frame in video:
         pictures.take(frame)
     jpeg = [np.frombuffer(base64.b64decode(d), np.uint8) for d in
@@ -502,18 +524,138 @@ def test_pictures_show_the_object(tmp_path: Path) -> None:
 def test_pictures_show_different_views() -> None:
     """The views chosen of an object are spread over time and directions, not neighbours."""
     poses = poses_of_walk()
-    entry = {"id": 3, "center": list(CENTERS[2])}
-    table = tracks_of_walk(poses).table
-    frames = np.sort(table.frame[rt.diverse_rows(table, entry, poses, 4)])
-    assert len(frames) == 4 and np.diff(frames).min() >= 4
-    assert set(table.object_id[rt.diverse_rows(table, entry, None, 30)]) == {3}
+    tracks = tracks_of_walk(poses)
+    found = rt.Object(3, "suitcase", 1.0, "ok", "", center=np.array(CENTERS[2]))
+    frames = np.sort(tracks.frame[diverse_rows(tracks, found, poses, 4)])
+    assert len(frames) == 4 and np.diff(frames).min() >= 4 and 5 not in frames
+    assert set(tracks.track_id[diverse_rows(tracks, found, None, 30)]) == {3}
 
 
-def test_up_is_guessed_from_level_cameras() -> None:
-    """Pitch and yaw do not matter, only that the horizon is level; z is up in the walk."""
+def test_views_from_other_sides_are_shown() -> None:
+    """The camera stands still for 21 frames, then it looks from three other sides, a frame each."""
     poses = poses_of_walk()
-    np.testing.assert_allclose(
-        rt.guessed_up(poses.cam_from_world[poses.known]), [0, 0, 1], atol=1e-6
-    )
-    up = rt.guessed_up(poses.cam_from_world[:1])  # one camera: its own up, pitched
-    assert up[2] > 0.9 and up[2] < 1
+    tracks = tracks_of_walk(poses)
+    found = rt.Object(3, "suitcase", 1.0, "ok", "", center=np.array(CENTERS[2]))
+    cams = np.repeat(poses.cam_from_world[:1], FRAMES, 0)
+    eyes = np.array([[4.0, 0, 1], [0, 4, 1], [0, 0, 5]]) + found.center
+    cams[-3:, :, 3] = -np.einsum("fij,fj->fi", cams[-3:, :, :3], eyes)
+    still = dataclasses.replace(poses, cam_from_world=cams)
+    own = np.flatnonzero(tracks.track_id == 3)
+    tracks.xyxy[own] = [0, 0, 50, 50]  # equally good
+    late = [(tracks.frame[diverse_rows(tracks, found, p, 4)] > 20).sum() for p in (still, None)]
+    assert late[0] >= 2 and late[1] == 1  # by time alone: the last one
+
+
+def test_boxes_are_drawn_in_small_frames(tmp_path: Path) -> None:
+    """A frame of 960 px is shown with 320, and its boxes too."""
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((720, 960, 3), np.uint8))
+    zero, one = np.zeros(1, np.int64), np.ones(1, np.int64)
+    box = np.array([[300.0, 300, 600, 600]])
+    result = fitted(rt.Tracks(zero, one, one, box, np.ones(1), zero, zero), None)
+    video = rt.Video(tmp_path / "0.png")
+    pictures = Pictures(result, video)
+    for frame in video:
+        pictures.take(frame)
+    ((_, text),) = pictures.frames
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (240, 320, 3)
+    x = np.flatnonzero(image[150].max(1) > 80)
+    np.testing.assert_allclose([x.min(), x.max()], [100, 200], atol=2)
+
+
+def test_the_best_picture_comes_first() -> None:
+    tracks = tracks_of_walk(poses_of_walk())
+    own = np.flatnonzero(tracks.track_id == 3)
+    tracks.xyxy[own[7]] = [0, 0, 300, 200]  # the largest box
+    found = rt.Object(3, "suitcase", 1.0, "rejected", "")
+    assert diverse_rows(tracks, found, None, 3)[0] == own[7]
+    weak = with_columns(tracks, score=np.where(np.arange(len(tracks)) == own[7], 0.01, 0.9))
+    assert diverse_rows(weak, found, None, 3)[0] != own[7]
+
+
+def test_pictures_are_cut_of_wanted_frames_only() -> None:
+    """Each picture has the number of the frame that it was cut from, and is there once."""
+    tracks = tracks_of_walk(poses_of_walk())
+    pictures = Pictures(fitted(tracks, None, names=NAMES), VIDEO)
+    rows = pictures.wanted
+    wanted = set(zip(tracks.frame[rows].tolist(), tracks.track_id[rows].tolist(), strict=True))
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    for index in range(FRAMES):
+        pictures.take(rt.Frame(index, index / 30, image))
+    cut = [(f, i) for i, crops in pictures.crops.items() for f, _ in crops]
+    assert set(cut) == wanted and len(cut) == len(wanted) and {i for _, i in cut} == {1, 2, 3, 4}
+    assert all(4 <= len(crops) <= 8 for crops in pictures.crops.values())
+    assert [f for f, _ in pictures.frames] == list(range(FRAMES))
+
+
+def test_up_is_guessed_from_level_cameras(tmp_path: Path) -> None:
+    """Without objects or poses that tell: the cameras of the walk are level, z is up."""
+    poses = dataclasses.replace(poses_of_walk(), up_in_world=None)
+    result = rt.Result(tracks_of_walk(poses), NAMES, VideoInfo("a", WIDTH, HEIGHT, 25.0))
+    result.poses, result.world = poses, rt.World("m", "user", 23, 0, 24)
+    write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
+    data = data_of(tmp_path / "a.html")
+    np.testing.assert_allclose(data["up"], [0, 0, 1], atol=0.05)
+    assert data["facts"].endswith("units: m · up is guessed from the cameras")
+
+
+def test_long_videos_are_thinned(tmp_path: Path) -> None:
+    """4,000 frames: the slider has every third one, and plays as long as the video."""
+    poses = walk(4000)
+    tracks = tracks_of(poses, 0.0)
+    result = dataclasses.replace(fitted(tracks[tracks.frame < 9], None), poses=poses)
+    result.tracks = tracks[np.isin(tracks.frame, [30, 31, 32, 33, 300])]
+    write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
+    data = data_of(tmp_path / "a.html")
+    assert data["steps"]["frame"] == list(range(0, 4000, 3))
+    assert data["steps"]["seconds"] * 1334 == pytest.approx(4000 / 30)
+    assert data["objects"][0]["seen"] == [10, 11, 100, 100]
+    assert len(base64.b64decode(data["poses"])) == 1334 * 48
+
+
+class Source:
+    """A video that counts how often its frames are read, and can be interrupted."""
+
+    def __init__(self, video: Any, live: bool = False) -> None:
+        self.config, self.size, self.scale, self.fps = (
+            getattr(video, name) for name in ("config", "size", "scale", "fps")
+        )
+        self.video, self.is_live, self.source, self.expected = video, live, "a.mp4", FRAMES
+        self.read, self.stop_at = 0, -1
+
+    def __iter__(self) -> Iterator[rt.Frame]:
+        assert not self.is_live, "it cannot be read again"
+        for frame in self.video:
+            self.read += 1
+            if self.read == self.stop_at:
+                raise KeyboardInterrupt
+            yield frame
+
+
+def test_one_pass_writes_both_and_leaves_nothing_half(tmp_path: Path) -> None:
+    """Interrupted in the middle: no film, no page. Else each frame is read once for both."""
+    write_page(tmp_path / "a", scene=False)
+    out, source = tmp_path / "a/out", Source(rt.Video(tmp_path / "a/frames"))
+    result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
+    source.stop_at = 10
+    with pytest.raises(KeyboardInterrupt):
+        write_pictures(result, out, source)  # type: ignore[arg-type]
+    made = {p.name for p in out.iterdir()}
+    assert not made & {"overlay.mp4", "scene.html"} and not [n for n in made if n[0] == "."]
+    source.read, source.stop_at = 0, -1
+    write_pictures(result, out, source)  # type: ignore[arg-type]
+    assert source.read == FRAMES
+    assert {"overlay.mp4", "scene.html"} <= {p.name for p in out.iterdir()}
+    source.read = 0
+    write_pictures(result, out, source, overlay=False, scene=False)  # type: ignore[arg-type]
+    assert source.read == 0
+
+
+def test_a_live_source_has_a_page_without_pictures(tmp_path: Path) -> None:
+    result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
+    result.warnings.append("a live source cannot be read twice: identities only")
+    write_pictures(result, tmp_path, Source(VIDEO, live=True))  # type: ignore[arg-type]
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.html"]
+    data = data_of(tmp_path / "scene.html")
+    assert data["thumbs"] == [] and "identities only" in data["why_flat"]
+    assert [o["crops"] for o in data["objects"]] == [[]] * 4

@@ -135,7 +135,7 @@ def _frame_name(video: Any, number: int) -> str:
 
 def _exif_focal(video: Any) -> float:
     """Read the focal length over the longer side from the first photo's EXIF; 0: there is none."""
-    for path in getattr(video, "files", [])[:1]:
+    for path in video.files[:1]:
         with contextlib.suppress(ValueError, RuntimeError):  # formats that pycolmap cannot read
             camera = import_pycolmap().infer_camera_from_image(str(path))
             if camera.has_prior_focal_length:

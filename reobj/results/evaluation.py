@@ -1,9 +1,11 @@
-"""Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k, O3D."""
+"""Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k of returns, O3D of solids.
+
+Start at `evaluate`; `score_tracks` scores any two sets of `LabelledBoxes`. Writes nothing.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,11 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj import __version__
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
+from reobj.files import load_json
 from reobj.results.result import Result
 from reobj.results.workspace import LAST_TRACKS, Workspace
 from reobj.sources.detection_files import read_mot_rows
@@ -34,15 +36,17 @@ from reobj.types import (
 )
 
 SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
-MOT_DISTRACTORS = (2, 7, 8, 12)  # on a vehicle, static, distractor, reflection (MOT16 and later)
+MATCH_IOU = 0.5 - 1e-12  # of a box and its truth, but for HOTA (MOTChallenge); .5 itself is enough
+TINY = 1e-12  # of scores and unions: not zero
 
 
 @dataclass(frozen=True, slots=True)
 class LabelledBoxes:
-    """Boxes with identities of a whole video, truth or result (N rows, any order).
+    """Boxes of a whole video with identities and classes: truth, or what is to be scored.
 
-    Attributes:
-        frame, identity: (N,); xyxy: (N, 4); name: (N,) class names, "" matches every class.
+    Attributes (N rows in any order):
+        frame: (N,) from 1, as in MOTChallenge files. identity: (N,). xyxy: (N, 4) native pixels.
+        name: (N,) class names; "" matches every class.
         role: (N,) SCORED, IGNORED or ABSENT; all SCORED in a result.
     """
 
@@ -60,7 +64,7 @@ class LabelledBoxes:
 
 
 def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
-    """MOTChallenge rows with class names and roles (scalars or (N,))."""
+    """Make labelled boxes of MOTChallenge rows (N, 6+); name, role: one for all rows, or (N,)."""
     n, box = len(rows), rows[:, 2:6]
     xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
     whole = rows[:, :2].astype(np.int64)
@@ -68,12 +72,16 @@ def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
     return LabelledBoxes(whole[:, 0], whole[:, 1], xyxy, names, np.asarray(roles, np.int64))
 
 
-def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) -> LabelledBoxes:
-    """Read a MOTChallenge gt.txt.
+MOT_DISTRACTORS = (2, 7, 8, 12)  # on a vehicle, static, distractor, reflection (MOT16 and later)
 
-    Column 7 is the flag (0: does not count). Column 8 is a class only in files of nine columns: of
-    MOT16 and later where seqinfo.ini stands beside the gt folder; else as `gt_mot_format.json`
-    beside the file names them, else an index into class_names. Column 9 is the visibility.
+
+def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) -> LabelledBoxes:
+    """Read true boxes from a MOTChallenge gt.txt.
+
+    Column 7 is a flag (0: the row does not count). Column 8 is a class only in files of nine
+    columns: of MOT16 and later if seqinfo.ini stands beside the gt folder; else as
+    `gt_mot_format.json` beside the file names it, else an index into class_names. Column 9 is the
+    visibility; rows below min_visibility are IGNORED.
     """
     rows = read_mot_rows(path)
     flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
@@ -88,27 +96,32 @@ def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) ->
     known = path.with_name("gt_mot_format.json")
     names = {str(i): n for i, n in enumerate(class_names)}
     if known.exists():
-        names = json.loads(known.read_text()).get("classes", names)
+        names = load_json(known).get("classes", names)
     return labelled(rows, [names.get(str(n), str(n)) for n in number], hidden * IGNORED)
 
 
 def read_result(out: Path) -> LabelledBoxes:
-    """Read the identities of an output folder of `run`, with classes; or of a tracks.txt."""
+    """Read boxes, identities and classes of an output folder; or, without classes, a tracks.txt."""
     if not out.is_dir():
         return labelled(read_mot_rows(out))
     result = Result.load(out)
-    tracks, names = result.tracks, np.array([*result.class_names, ""], str)
+    tracks, names = result.tracks, np.array([*result.class_names, ""], str)  # -1: unknown
     role = np.full(len(tracks), SCORED)
     return LabelledBoxes(
         tracks.frame + 1, tracks.track_id, tracks.xyxy, names[tracks.class_id], role
     )
 
 
-_Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), their IoU (g, p)
+_Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), IoU (g, p)
 
 
 def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
-    """One step a frame; IoU is 0 between different classes."""
+    """Pair truth and result frame by frame.
+
+    Returns:
+        for every frame with either, by number: rows of the truth (g,) and of the result (p,), and
+        their IoU (g, p), 0 between different classes.
+    """
     frames = np.union1d(truth.frame, found.frame)
     rows = []
     for boxes in (truth, found):
@@ -123,17 +136,17 @@ def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
 
 
 def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
-    """Assignment of the largest total score, without pairs of score 0."""
+    """Assign rows to columns of the largest total score, without pairs of score 0."""
     rows, columns = linear_sum_assignment(-score)
-    good = score[rows, columns] > 1e-12
+    good = score[rows, columns] > TINY
     return rows[good], columns[good]
 
 
 def drop_ignored(truth: LabelledBoxes, found: LabelledBoxes) -> LabelledBoxes:
-    """Results without those whose best truth is an ignored row (as MOTChallenge does)."""
+    """Drop results that are matched to an ignored row of the truth, as MOTChallenge does."""
     keep = np.ones(len(found), bool)
     for g, p, iou in _frame_steps(truth, found) if (truth.role == IGNORED).any() else ():
-        a, b = _best_pairs(np.where(iou >= 0.5, iou, 0))
+        a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
         keep[p[b]] &= truth.role[g[a]] != IGNORED
     return found[keep]
 
@@ -141,7 +154,12 @@ def drop_ignored(truth: LabelledBoxes, found: LabelledBoxes) -> LabelledBoxes:
 def _numbered(
     truth: LabelledBoxes, found: LabelledBoxes
 ) -> tuple[IntArray, IntArray, list[_Step], IntArray, IntArray]:
-    """Identities (G,) and (P,), steps with their numbers in place of rows, boxes of each."""
+    """Number the identities of truth and result.
+
+    Returns:
+        true identities (G,) and found ones (P,), the steps with their numbers in place of rows, and
+        how many boxes each has, (G,) and (P,).
+    """
     truth = truth[truth.role == SCORED]
     gt_ids, gt, gt_size = np.unique(truth.identity, return_inverse=True, return_counts=True)
     ids, pr, pr_size = np.unique(found.identity, return_inverse=True, return_counts=True)
@@ -150,20 +168,29 @@ def _numbered(
 
 
 def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
-    """HOTA, CLEAR MOT and identity scores, and identities per real object, as TrackEval has them.
+    """Compute HOTA, CLEAR MOT and identity scores as TrackEval does, and scores of our own.
 
-    `ids_per_object`: different identities that were matched at IoU .5 to a real object, mean over
-    the objects that were matched at all.
+    Returns:
+        shares in [0, 1] and counts by name. Ours: `ids_per_object`, identities matched at IoU .5 to
+        a true object, mean over the objects that were matched at all; `returns`, true objects that
+        came back (see `visits`), and `returns_kept`, the share of them that kept an identity.
     Ref: Luiten et al., IJCV 2021; Bernardin & Stiefelhagen, 2008; Ristani et al., 2016.
     """
-    gt_ids, ids, steps, gt, pr = _numbered(truth, drop_ignored(truth, found))
+    found = drop_ignored(truth, found)
+    gt_ids, ids, steps, gt, pr = _numbered(truth, found)
     result = _hota(steps, gt, pr) | _clear(steps, gt, pr) | _identity(steps, gt, pr)
-    result |= _returns(truth, drop_ignored(truth, found))
+    result |= _returns(truth, found)
     return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
 
 
-def visits(truth: LabelledBoxes, away: int = 30) -> IntArray:
-    """Visit of each true box (N,), from 0: a new one after `away` frames without the object."""
+AWAY_FRAMES = 30  # without a box, after which an object has left; chosen: about a second
+
+
+def visits(truth: LabelledBoxes, away: int = AWAY_FRAMES) -> IntArray:
+    """Number the visits of each object: (N,) visit of each box, from 0.
+
+    A new one begins where the next box of an object is more than `away` frames later.
+    """
     order = np.lexsort((truth.frame, truth.identity))
     new = np.append(True, np.diff(truth.identity[order]) != 0)[: len(order)]
     late = np.append(False, np.diff(truth.frame[order]) > away)[: len(order)] & ~new
@@ -174,10 +201,14 @@ def visits(truth: LabelledBoxes, away: int = 30) -> IntArray:
 
 
 def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, IntArray]:
-    """Rows of truth and result that show one object (M,): best pairs of IoU >= .5 a frame."""
+    """Match truth and result frame by frame, at IoU >= .5 and of the largest total IoU.
+
+    Returns:
+        rows of the truth that count and of the result, (M,) each, pair by pair.
+    """
     pairs = [np.empty((2, 0), np.int64)]
     for g, p, iou in _frame_steps(truth, found):
-        a, b = _best_pairs(np.where(iou >= 0.5 - 1e-12, iou, 0))
+        a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
         pairs.append(np.stack([g[a], p[b]]))
     rows = np.concatenate(pairs, 1)
     scored = truth.role[rows[0]] == SCORED
@@ -185,9 +216,9 @@ def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, 
 
 
 def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
-    """Returns of true objects (see `visits`) and the share that kept an identity of before.
+    """Count returns of true objects, and the share whose main identity they had on a visit before.
 
-    The main identity of the visit counts; visits without any match are left out.
+    Visits without any match are left out.
     """
     visit = visits(truth)
     g, p = matched_rows(truth, found)
@@ -201,18 +232,22 @@ def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
     return {"returns": len(kept), "returns_kept": sum(kept) / max(len(kept), 1)}
 
 
+QUERY_FRAMES = 10  # first ones of a return, whose boxes are queries; chosen: .3 s of video
+
+
 def return_ranks(
     truth: LabelledBoxes, found: LabelledBoxes, embedding: npt.NDArray[Any]
 ) -> IntArray:
-    """Rank the right object by appearance alone, for the first views of every return.
+    """Rank the right object by cosine similarity alone, for the first views of every return.
 
-    A query is a box of the first 10 frames of a return (see `visits`), the gallery all boxes before
-    the return of objects of its class; an object's best view counts. Rank-k: share of ranks <= k.
+    A query is a box of the first frames of a return (see `visits`); its gallery are all boxes of
+    earlier frames whose objects have its class; of each object the most similar box counts.
+    Rank-k is the share of ranks <= k.
 
     Args:
         embedding: (N, E) unit rows, one for each row of `found`; NaN where there is none.
     Returns:
-        ranks from 1, (Q,).
+        (Q,) ranks from 1.
     """
     visit = visits(truth)
     g, p = matched_rows(truth, found)
@@ -220,25 +255,25 @@ def return_ranks(
     g, p = g[use], p[use]
     ranks = []
     for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
-        start, me = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
+        start, own = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
         known = np.flatnonzero(truth.frame[g] < start)
         known = known[truth.name[g[known]] == truth.name[g[rows[0]]]]
         ids, of = np.unique(truth.identity[g[known]], return_inverse=True)
-        if me in ids:
-            first = rows[truth.frame[g[rows]] < start + 10]
+        if own in ids:
+            first = rows[truth.frame[g[rows]] < start + QUERY_FRAMES]
             best = np.full((len(ids), len(first)), -np.inf)
             np.maximum.at(best, of, embedding[p[known]] @ embedding[p[first]].T)
-            ranks.append(1 + (best > best[ids == me]).sum(0))
+            ranks.append(1 + (best > best[ids == own]).sum(0))
     return np.concatenate(ranks) if ranks else np.empty(0, np.int64)
 
 
 def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
-    """HOTA and its parts, mean over the IoU thresholds .05 to .95."""
-    align = np.zeros((len(gt_size), len(pr_size)))  # (G, P) soft number of frames in common
+    """Compute HOTA, detection and association accuracy, each the mean over IoU .05 to .95."""
+    align = np.zeros((len(gt_size), len(pr_size)))  # (G, P) soft number of common frames
     for g, p, iou in steps:
         union = iou.sum(0)[None] + iou.sum(1)[:, None] - iou
-        align[g[:, None], p[None]] += iou / np.maximum(union, 1e-12)
-    align /= np.maximum(gt_size[:, None] + pr_size[None] - align, 1e-12)
+        align[g[:, None], p[None]] += iou / np.maximum(union, TINY)
+    align /= np.maximum(gt_size[:, None] + pr_size[None] - align, TINY)  # soft Jaccard index
     pairs = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
     for g, p, iou in steps:
         a, b = _best_pairs(align[g[:, None], p[None]] * iou)
@@ -247,17 +282,18 @@ def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[
     parts = []
     for alpha in np.arange(0.05, 0.99, 0.05):
         hit = iou_all >= alpha - 1e-12
-        together = np.zeros_like(align)
-        np.add.at(together, (g_all[hit], p_all[hit]), 1)
-        jaccard = together / np.maximum(gt_size[:, None] + pr_size[None] - together, 1)
-        ass = (together * jaccard).sum() / max(hit.sum(), 1)
+        common = np.zeros_like(align)  # (G, P) TPA
+        np.add.at(common, (g_all[hit], p_all[hit]), 1)
+        jaccard = common / np.maximum(gt_size[:, None] + pr_size[None] - common, 1)
+        # AssA = sum over TP of TPA / (TPA + FPA + FNA), over |TP|; DetA = |TP| / (|TP| + FP + FN)
+        ass = (common * jaccard).sum() / max(hit.sum(), 1)
         det = hit.sum() / max(gt_size.sum() + pr_size.sum() - hit.sum(), 1)
         parts.append((math.sqrt(ass * det), det, ass))
     return dict(zip(("HOTA", "DetA", "AssA"), np.mean(parts, 0).tolist(), strict=True))
 
 
 def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
-    """MOTA, switches, fragments at IoU .5; a match of the last frame is kept while it overlaps."""
+    """Compute CLEAR MOT at IoU .5; a match of the frame before is kept while it overlaps."""
     last = np.full(len(gt_size), -1)  # identity of the last match ever
     before = last.copy()  # and of the match in the last frame with truth
     switches = hits = 0
@@ -266,8 +302,8 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
     for g, p, iou in steps:
         if not len(g) or not len(p):
             continue  # as TrackEval: a frame without either does not end a match
-        kept = 1000.0 * (before[g][:, None] == p[None])
-        a, b = _best_pairs(np.where(iou >= 0.5 - 1e-12, kept + iou, 0))
+        kept = 1000.0 * (before[g][:, None] == p[None])  # outweighs any sum of IoU
+        a, b = _best_pairs(np.where(iou >= MATCH_IOU, kept + iou, 0))
         g, p = g[a], p[b]
         switches += int(((last[g] >= 0) & (last[g] != p)).sum())
         hits += len(g)
@@ -288,16 +324,20 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
 
 
 def _identity_pairs(steps: Sequence[_Step], shape: tuple[int, ...]) -> tuple[Any, Any, Array]:
-    """Best one-to-one map of true to found identities, and their frames in common, (K,) each."""
+    """Map true to found identities one to one, for the most frames in common.
+
+    Returns:
+        numbers of true and of found identities and their frames in common, (K,) each.
+    """
     common = np.zeros(shape)
     for g, p, iou in steps:
-        common[g[:, None], p[None]] += iou >= 0.5 - 1e-12
+        common[g[:, None], p[None]] += iou >= MATCH_IOU
     a, b = _best_pairs(common)
     return a, b, common[a, b]
 
 
 def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
-    """Identity precision, recall and F1 under the best one-to-one map of identities."""
+    """Compute F1, precision and recall of identities under the best one-to-one map."""
     right = float(_identity_pairs(steps, (len(gt_size), len(pr_size)))[2].sum())
     gt, pr = int(gt_size.sum()), int(pr_size.sum())
     shares = (2 * right / max(gt + pr, 1), right / max(pr, 1), right / max(gt, 1))
@@ -305,11 +345,14 @@ def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> d
 
 
 def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | None]:
-    """True identity -> the found identity that stands for it (most frames, one to one), or None."""
+    """Map every true identity to the found one of the most common frames, one to one, or None."""
     gt_ids, ids, steps, *_ = _numbered(truth, found)
     a, b, _ = _identity_pairs(steps, (len(gt_ids), len(ids)))
     pairs: dict[int, int | None] = dict.fromkeys(gt_ids.tolist())
     return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
+
+
+MIN_HALF_AXIS = 0.005  # world units of the truth, metres: a sheet is taken as 1 cm thick (chosen)
 
 
 def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
@@ -317,20 +360,27 @@ def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
 
     Where an object has a `visible_part`, that is the truth: no camera saw the rest.
     """
-    entries = json.loads(path.read_text())["objects"]
-    seen = [e | e.get("visible_part", {}) for e in entries]
-    half = [np.array(e["size"]) / 2 if "R" in e else np.array(e["half_axes"]) for e in seen]
-    turn = np.array([e["R"] if "R" in e else e["world_from_obj"] for e in seen])  # (O, 3, 3)
-    center = np.array([e["center"] for e in seen], np.float64)
-    half_axes = np.maximum(np.array(half), 0.005)  # (O, 3) a sheet is taken as 1 cm thick
-    return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, turn[:, :3, :3])
+    try:
+        entries = load_json(path)["objects"]
+        seen = [e | e.get("visible_part", {}) for e in entries]
+        half = [np.array(e["size"]) / 2 if "R" in e else np.array(e["half_axes"]) for e in seen]
+        axes = [np.array(e["R"] if "R" in e else e["world_from_obj"])[:3, :3] for e in seen]
+        center = np.array([e["center"] for e in seen], np.float64).reshape(-1, 3)
+        half_axes = np.maximum(np.array(half, np.float64).reshape(-1, 3), MIN_HALF_AXIS)
+        rotation = np.array(axes, np.float64).reshape(-1, 3, 3)
+        return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, rotation)
+    except (IndexError, KeyError, TypeError, AttributeError) as error:
+        expected = "objects with id, center, size and R, or half_axes and world_from_obj"
+        raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
 
 
 def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, Array, Array]:
-    """Find the similarity that brings our world onto the truth's, from the camera centres.
+    """Align our world with the truth's by a similarity of the camera centres.
 
     Poses that the user supplied are in the truth's world already.
 
+    Args:
+        truth_poses: TUM, or a 4x4 world_from_cam a line; None is enough for supplied poses.
     Returns:
         scale, rotation (3, 3) and shift (3,): x_in_truth = scale * rotation @ x_in_ours + shift.
     """
@@ -344,21 +394,35 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     centers = _true_centers(truth_poses, poses)  # (F, 3)
     use = poses.known & np.isfinite(centers).all(1)
     ours = invert_rigid(poses.cam_from_world[use])[:, :, 3]  # (f, 3)
-    true_from_ours = import_pycolmap().estimate_sim3d(ours, centers[use])  # Umeyama, PAMI 1991
+    true_from_ours = None
+    if use.sum() >= 3:  # Umeyama, PAMI 1991
+        true_from_ours = import_pycolmap().estimate_sim3d(ours, centers[use])
     if true_from_ours is None:
         raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
     turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
     return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
 
 
+SAME_TIME_S = 0.02  # of a frame and its true pose; chosen: half a frame at 25 Hz
+
+
 def _true_centers(path: Path, poses: Poses) -> Array:
-    """Read camera centres (F, 3) of the poses' frames: TUM by time, or a 4x4 c2w a line."""
-    table = np.loadtxt(path, ndmin=2)
+    """Read camera centres (F, 3) of the poses' frames, NaN where unknown.
+
+    TUM rows belong to the frame of their time; of 4x4 world_from_cam, row n belongs to frame n.
+    """
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise ReobjError(f"{path}: {error}; expected TUM rows or 16 numbers a line") from error
     if table.shape[1] == 16:
         frame = poses.frame.clip(0, len(table) - 1)
         return np.where((frame == poses.frame)[:, None], table[frame][:, 3:12:4], np.nan)
+    if table.shape[1] != 8:
+        found = f"{table.shape[1]} columns"
+        raise ReobjError(f"{path}: {found}; expected TUM rows of 8 numbers, or 16 numbers a line")
     nearest = np.abs(table[:, :1] - poses.time_s[None]).argmin(0)  # (F,)
-    far = np.abs(table[nearest, 0] - poses.time_s) > 0.02
+    far = np.abs(table[nearest, 0] - poses.time_s) > SAME_TIME_S
     return np.where(far[:, None], np.nan, table[nearest, 1:4])
 
 
@@ -368,33 +432,37 @@ def score_objects(
     """Score the ellipsoids against the true ones: O3D (volume IoU), centre and size errors.
 
     Args:
-        pairs: every true identity -> found identity or None (`identity_map`): an object counts as
-            found only if the identities say so; `o3d_all` gives 0 to those without ellipsoid.
+        solids: gt_objects.json. truth_poses: as in `align_with_truth`.
+        pairs: found identity of every true one, or None (`identity_map`): an object counts as found
+            only if the identities say so.
+    Returns:
+        counts and errors by name, centre errors in units of the truth; `o3d_all` counts 0 for every
+        true object without ellipsoid; `scale_error`: of our metres per unit, relative.
     """
     ids, truth = read_true_solids(solids)
     scale, turn, shift = align_with_truth(result, truth_poses)
-    located = {o.id: o for o in result.objects if o.located}
-    rows = [i for i, t in enumerate(ids) if pairs.get(t) in located]
-    mine = [located[pairs[ids[i]] or 0] for i in rows]
-    if not mine:
+    located, ours = result.located, result.ellipsoids()
+    row_of = {o.id: row for row, o in enumerate(located)}
+    rows = [i for i, t in enumerate(ids) if pairs.get(t) in row_of]  # of the truth
+    if not rows:
         return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
-    center = np.array([o.center for o in mine], np.float64) @ (scale * turn).T + shift  # (n, 3)
-    quat = np.array([o.quat_wxyz for o in mine], np.float64)
-    axes = turn @ Rotation.from_quat(quat[:, [1, 2, 3, 0]]).as_matrix()
-    half_axes = scale * np.array([o.half_axes for o in mine], np.float64)
-    found = quadrics.Ellipsoids(center, half_axes, axes)
+    own = np.array([row_of[pairs[ids[i]] or 0] for i in rows])  # of ours
+    center = ours.center_in_world[own] @ (scale * turn).T + shift  # (n, 3)
+    axes = turn @ ours.world_from_obj[own]
+    found = quadrics.Ellipsoids(center, scale * ours.half_axes[own], axes)
     goal = truth[np.array(rows)]
     o3d = quadrics.volume_overlap(found, goal)  # (n,)
-    error = np.linalg.norm(center - goal.center_in_world, axis=1)
-    size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3
+    error = np.linalg.norm(center - goal.center_in_world, axis=1)  # (n,) units of the truth
+    size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3  # (n,) mean side
     claimed = result.world.scale.value if result.world.scale is not None else None
     each = [
-        {"id": ids[i], "object": o.id, "class": o.class_name, "o3d": a, "center_error": b}
-        for i, o, a, b in zip(rows, mine, o3d.tolist(), error.tolist(), strict=True)
-    ]
+        {"id": ids[i], "object": located[j].id, "class": located[j].class_name, "o3d": a,
+         "center_error": b}
+        for i, j, a, b in zip(rows, own.tolist(), o3d.tolist(), error.tolist(), strict=True)
+    ]  # fmt: skip
     return {
         "true": len(pairs),
-        "found": len(mine),
+        "found": len(rows),
         "o3d_found": float(o3d.mean()),
         "o3d_median": float(np.median(o3d)),
         "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
@@ -406,14 +474,14 @@ def score_objects(
 
 
 _COLUMNS = "HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split()
+_COUNTS = ("IDSW", "Frag", "ids_per_object")  # the others are shares
 
 
 def score_table(scores: dict[str, dict[str, float]]) -> str:
     """Format one line for each name, shares in per cent."""
     lines = [f"{'':<14}" + "".join(f"{c[:7]:>8}" for c in _COLUMNS)]
     for name, score in scores.items():
-        unit = {"IDSW": 1, "Frag": 1, "ids_per_object": 1}
-        cells = [score[c] * unit.get(c, 100) for c in _COLUMNS]
+        cells = [score[c] * (1 if c in _COUNTS else 100) for c in _COLUMNS]
         lines.append(f"{name[:14]:<14}" + "".join(f"{cell:8.2f}" for cell in cells))
     return "\n".join(lines)
 
@@ -435,29 +503,34 @@ def score_report(scores: dict[str, Any]) -> str:
 
 
 def evaluate(
-    out: Path,
-    gt: Path,
-    solids: Path | None = None,
-    truth_poses: Path | None = None,
+    out: str | Path,
+    gt: str | Path,
+    solids: str | Path | None = None,
+    truth_poses: str | Path | None = None,
     classes: Sequence[str] = (),
     min_visibility: float = 0.0,
 ) -> dict[str, Any]:
-    """Score an output folder of `run` (or a tracks.txt) against ground truth.
+    """Score an output folder of `run`, or a tracks.txt, against ground truth.
+
+    Truth of frames that --start, --stop and --every left out does not count.
 
     Args:
-        gt: MOTChallenge gt.txt. solids: gt_objects.json; truth_poses: TUM or a 4x4 c2w a line.
-        classes: only these. min_visibility: truth that is less visible is ignored.
+        gt: MOTChallenge gt.txt. solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam
+            a line. classes: only these. min_visibility: truth that is less visible is ignored.
     Returns:
         {"tracks": scores by class, "ranks": Rank-k of the returns, "objects": scores in 3D}.
+    Raises:
+        ReobjError: a file is missing or of another form, or a class is in none of them.
     """
-    names: Sequence[str] = COCO_NAMES
-    found, tracked = read_result(out), None
+    out, names, tracked = Path(out), COCO_NAMES, None
+    found = read_result(out)
     if (out / LAST_TRACKS).exists():
-        tracked = Workspace(out).load_last()
+        workspace = Workspace.open(out)
+        tracked = workspace.load_last()
         names = tracked.class_names
-    truth = read_truth(gt, names, min_visibility)
+    truth = read_truth(Path(gt), names, min_visibility)
     if tracked is not None:
-        truth = truth[_was_read(truth.frame - 1, Workspace(out).source[1])]
+        truth = truth[_was_read(truth.frame - 1, workspace.source[1])]
     wanted = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
     unknown = set(classes) - set(truth.name) - set(found.name)
     if unknown:
@@ -471,21 +544,22 @@ def evaluate(
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
     result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
     if solids is not None:
-        pairs = identity_map(truth, found)
-        result["objects"] = score_objects(Result.load(out), solids, truth_poses, pairs)
+        pairs, poses = identity_map(truth, found), Path(truth_poses) if truth_poses else None
+        result["objects"] = score_objects(Result.load(out), Path(solids), poses, pairs)
     return result
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
-    """Score appearance alone: the share of returns whose object is among the k most similar.
+    """Compute Rank-k of the returns by appearance alone (`return_ranks`), k = 1, 5, 20, 50.
 
-    Empty where nothing was embedded (--embed none).
+    Returns:
+        number of queries and shares; {} where nothing was embedded (--embed none).
     """
     embeddings, tracks = tracked.embeddings, tracked.tracks[tracked.embedding_row]
     if not embeddings.foreground.size:
         return {}
     identity = np.arange(len(tracks))
-    names = np.array(tracked.class_names)[tracks.class_id]
+    names = np.array([*tracked.class_names, ""])[tracks.class_id]  # -1: unknown
     role = np.full(len(tracks), SCORED)
     found = LabelledBoxes(tracks.frame + 1, identity, tracks.xyxy, names, role)
     fused = np.concatenate([embeddings.foreground, embeddings.background], 1)

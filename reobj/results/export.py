@@ -1,4 +1,7 @@
-"""Files for other tools: COCO-VID, CVAT, GLB, rerun; from an output folder."""
+"""Files for other tools, from an output folder: COCO-VID, CVAT, GLB, rerun.
+
+Start at `export`. A writer takes a `Result` and a path; `EXPORTS` lists them.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reobj import __version__
-from reobj.cameras import invert_rigid
+from reobj.cameras import invert_rigid, quat_wxyz_from_matrix
 from reobj.files import atomic
 from reobj.results.result import Result
 from reobj.results.workspace import Workspace
@@ -31,6 +34,9 @@ def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
         path: default: OUT/ and the format's own name.
     Returns:
         The file written.
+    Raises:
+        ReobjError: no such format, no output folder, one of another version, or the format's
+            package is missing.
     """
     if to not in EXPORTS:
         raise ReobjError(f"no export called {to!r}; there are {', '.join(EXPORTS)}")
@@ -41,7 +47,7 @@ def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
 
 
 def _frames_read(result: Result) -> tuple[list[int], list[str]]:
-    """List the frames that were read (where nothing tells, those with a track), and file names.
+    """List the frames that were read or have a track (filled gaps), ascending.
 
     Returns:
         source frame numbers, and the image names by frame number ([]: a video, or it is gone).
@@ -49,14 +55,15 @@ def _frames_read(result: Result) -> tuple[list[int], list[str]]:
     video = None
     if result.out is not None and (result.out / "cache" / "source.json").is_file():
         with contextlib.suppress(ReobjError):  # moved or deleted since: most exports need none
-            video = Video(*Workspace(result.out).source)
+            video = Video(*Workspace.open(result.out).source)
     names = video.names if video is not None else []
+    read = np.empty(0, np.int64)
     if result.poses is not None:
-        return result.poses.frame.tolist(), names
-    if video is None or not video.frame_count:
-        return np.unique(result.tracks.frame).tolist(), names
-    config, count = video.config, video.frame_count
-    return list(range(config.start, min(config.stop or count, count), config.every)), names
+        read = result.poses.frame
+    elif video is not None and video.frame_count:
+        config, count = video.config, video.frame_count
+        read = np.arange(config.start, min(config.stop or count, count), config.every)
+    return np.union1d(read, result.tracks.frame).tolist(), names
 
 
 def export_coco_vid(result: Result, path: Path) -> None:
@@ -94,8 +101,10 @@ def export_coco_vid(result: Result, path: Path) -> None:
 
 
 def export_cvat(result: Result, path: Path) -> None:
-    """Write "CVAT for video 1.1": a track an object, every box a keyframe, `outside` where a visit
-    ends. CVAT numbers tracks from 0 in the order of the file: track 0 is object 1.
+    """Write "CVAT for video 1.1": one track an object, every box a keyframe.
+
+    `outside` marks the frame after each visit. CVAT numbers tracks from 0 in the order of the file:
+    track 0 is object 1.
 
     Source: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
     """
@@ -134,13 +143,14 @@ def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> N
 
 
 def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
-    """Return metres per unit (1 if unknown) and the rotation (3, 3) that brings up onto this axis.
+    """Measure the world for a viewer; warns of what is unknown.
 
-    What is unknown is said.
+    Returns:
+        metres per unit (1 if unknown), and the rotation (3, 3) that brings up onto `up_axis`.
     """
     scale, up = result.world.scale, result.world.up_in_world
     metres = scale.value if scale is not None and scale.source != "none" else None
-    if any(o.located for o in result.objects):
+    if result.located:
         if not metres:
             log.warning("the scale is unknown: %s is not in metres; give --known-size", path)
         if up is None:
@@ -150,9 +160,10 @@ def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[floa
 
 
 def export_glb(result: Result, path: Path) -> None:
-    """Write binary glTF 2.0: a named mesh an object, its facts in `extras`; points; camera path.
+    """Write binary glTF 2.0 with trimesh: a mesh an object, the sparse points, the camera path.
 
-    y is up, units are metres if the scale is known. Needs trimesh.
+    The nodes are called "CLASS ID", each mesh has facts of its object in `extras`. y is up, units
+    are metres if the scale is known.
     """
     try:
         import trimesh
@@ -162,17 +173,16 @@ def export_glb(result: Result, path: Path) -> None:
     world, poses = np.eye(4), result.poses
     world[:3, :3] = scale * turn
     scene: Any = trimesh.Scene()
-    for o in result.objects:
-        if o.center is None or o.half_axes is None or o.quat_wxyz is None:
-            continue
+    ellipsoids = result.ellipsoids()
+    columns = ellipsoids.world_from_obj * ellipsoids.half_axes[:, None]  # (O, 3, 3)
+    for o, axes, center in zip(result.located, columns, ellipsoids.center_in_world, strict=True):
         mesh, name = trimesh.creation.icosphere(subdivisions=3), f"{o.class_name} {o.id}"
         mesh.visual.face_colors = [*object_color(o.id)[::-1], 255]
         entry = o.to_json()
         mesh.metadata = {k: entry[k] for k in ("id", "class", "status", "support", "size_m")}
-        world_from_obj = np.eye(4)
-        rotation = Rotation.from_quat(np.roll(o.quat_wxyz, -1)).as_matrix()
-        world_from_obj[:3, :3], world_from_obj[:3, 3] = rotation * o.half_axes, o.center
-        scene.add_geometry(mesh, name, name, transform=world @ world_from_obj)
+        world_from_sphere = np.eye(4)
+        world_from_sphere[:3, :3], world_from_sphere[:3, 3] = axes, center
+        scene.add_geometry(mesh, name, name, transform=world @ world_from_sphere)
     if poses is not None and len(poses.points):
         make_cloud: Any = trimesh.PointCloud
         cloud = make_cloud(poses.points, colors=poses.colors)
@@ -180,13 +190,16 @@ def export_glb(result: Result, path: Path) -> None:
     if poses is not None and poses.known.sum() > 1:
         centers = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
         scene.add_geometry(trimesh.load_path(centers), "cameras", "cameras", transform=world)
+    if not scene.geometry:
+        raise ReobjError(f"{path}: nothing to show in 3D: no solids and no cameras here, see `run`")
     with atomic(path) as part:
         part.write_bytes(scene.export(file_type="glb"))
 
 
 def export_rrd(result: Result, path: Path) -> None:
-    """Write a recording for the rerun viewer: z up, in metres if the scale is known; ellipsoids,
-    points, and on the timeline `frame` the camera and the boxes it sees. Needs rerun-sdk.
+    """Write a recording for the rerun viewer with rerun-sdk: ellipsoids, points and, on the
+    timeline `frame`, the camera and the boxes it sees. z is up, units are metres if the scale is
+    known.
     """
     try:
         import rerun as rr
@@ -202,14 +215,16 @@ def export_rrd(result: Result, path: Path) -> None:
         rec.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Horizontal(*views)))
         rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
-        for o in result.objects:
-            if o.center is not None and o.half_axes is not None and o.quat_wxyz is not None:
-                solid = rr.Ellipsoids3D(
-                    half_sizes=scale * o.half_axes[None], labels=[names[o.id]],
-                    centers=scale * o.center[None], quaternions=[np.roll(o.quat_wxyz, -1)],
-                    fill_mode="solid", colors=[object_color(o.id)[::-1]],
-                )  # fmt: skip
-                rec.log(["world", "objects", o.class_name, str(o.id)], solid, static=True)
+        ellipsoids = result.ellipsoids()
+        xyzw = np.roll(quat_wxyz_from_matrix(ellipsoids.world_from_obj), -1, 1)  # (O, 4)
+        for i, o in enumerate(result.located):
+            solid = rr.Ellipsoids3D(
+                half_sizes=scale * ellipsoids.half_axes[i : i + 1], labels=[names[o.id]],
+                centers=scale * ellipsoids.center_in_world[i : i + 1],
+                quaternions=xyzw[i : i + 1], fill_mode="solid",
+                colors=[object_color(o.id)[::-1]],
+            )  # fmt: skip
+            rec.log(["world", "objects", o.class_name, str(o.id)], solid, static=True)
         if result.poses is not None:
             cloud = rr.Points3D(scale * result.poses.points, colors=result.poses.colors)
             rec.log("world/points", cloud, static=True)

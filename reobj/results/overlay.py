@@ -1,6 +1,6 @@
-"""overlay.mp4: boxes, identities and back-projected ellipsoids of every frame.
+"""overlay.mp4: boxes, identities and back-projected ellipsoids drawn over every frame.
 
-A sink under the one loop over the video (`write_pictures` in scene.py).
+`Overlay` is a sink under the one loop over the video (`write_pictures` in scene.py).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 import quadrics
 from reobj.results.result import Result
-from reobj.sources.video import Video
+from reobj.sources.video import IMAGE_FPS, Video
 from reobj.types import Array, BoolArray, Frame, Image, Tracks, object_color
 
 
@@ -42,27 +42,34 @@ def _draw_label(image: Image, text: str, x: int, y: int, color: tuple[int, int, 
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, 1, cv2.LINE_AA)
 
 
+MAX_AXIS = 4  # image sides; longer ellipses are of objects beside the camera and only confuse
+
+
 def draw_ellipses(
     image: Image, dual_c: Array, drawn: BoolArray, object_id: Sequence[int], seen: set[int]
 ) -> None:
-    """Draw projected ellipsoids: the back-projection of the fit, thin for objects not in `seen`.
+    """Draw the outlines of projected ellipsoids, in place.
 
     Args:
-        dual_c: (O, 3, 3) dual conics in pixels of `image`; drawn: (O,) which ones.
+        dual_c: (O, 3, 3) dual conics in pixels of `image`. drawn: (O,) which ones to draw.
+        object_id: (O,). seen: identities with a box in this frame; the others are drawn thin.
     """
     for conic, wanted, obj in zip(dual_c, drawn, object_id, strict=True):
-        shape = _ellipse_of_dual_conic(conic) if wanted else None
-        if shape is not None and max(shape[1]) < 4 * max(image.shape):
+        shape = ellipse_of_dual_conic(conic) if wanted else None
+        if shape is not None and max(shape[1]) < MAX_AXIS * max(image.shape):
             cv2.ellipse(image, shape, object_color(obj), 2 if obj in seen else 1, cv2.LINE_AA)
 
 
-def _ellipse_of_dual_conic(
+def ellipse_of_dual_conic(
     dual_c: Array,
 ) -> tuple[tuple[float, float], tuple[float, float], float] | None:
-    """Read an ellipse off its dual conic C* = [S - mm', -m; -m', -1]; None where it is none.
+    """Convert a dual conic C* (3, 3) to the ellipse that cv2.ellipse draws, None if it is none.
+
+    C* = [S - m m', -m; -m', -1] up to scale: m is the centre, the eigenvalues of S are the squared
+    half axes.
 
     Returns:
-        centre, full axes, angle in degrees, as cv2.ellipse wants them.
+        centre in OpenCV's pixels, full axes, angle of the first axis from x towards y in degrees.
     """
     conic = dual_c / -dual_c[2, 2]
     center = -conic[:2, 2]
@@ -76,7 +83,11 @@ def _ellipse_of_dual_conic(
 
 
 class VideoWriter:
-    """MP4 writer that appears under its name only when it is complete."""
+    """Write an MP4 file that appears under its name only when it is complete.
+
+    Attributes:
+        path: of the file. part: of what is written of it. count: frames so far.
+    """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
         self.path, self.part = path, path.with_name(f".part-{path.name}")
@@ -84,9 +95,10 @@ class VideoWriter:
         self.writer = cv2.VideoWriter(str(self.part), fourcc, fps, size)
         if not self.writer.isOpened():
             raise OSError(f"{path}: OpenCV cannot write this video")
-        self.size, self.count = size, 0
+        self.count = 0
 
     def write(self, image: Image) -> None:
+        """Append one frame."""
         self.writer.write(image)
         self.count += 1
 
@@ -106,25 +118,29 @@ class VideoWriter:
         return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
 
 
-OVERLAY_SIZE_PX = 1280  # longer side: HD; larger videos are shrunk
+OVERLAY_SIZE_PX = 1280  # longer side; larger videos are shrunk (chosen: HD, so that it plays)
 
 
 class Overlay:
     """Write overlay.mp4 frame by frame.
 
     Ellipsoids that rest on a prior are drawn only while their object is detected.
+
+    Attributes:
+        size: (w, h) of the pictures, even. scale: of their pixels per native pixel.
     """
 
     def __init__(self, result: Result, path: Path, video: Video) -> None:
         width, height = video.size
         shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
+        # codecs want even sides
         self.size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
         self.scale, self.tracks = self.size[0] / width, result.tracks
-        located = [o for o in result.objects if o.located]
-        self.ids, self.sure = [o.id for o in located], {o.id for o in located if o.status == "ok"}
+        self.ids = [o.id for o in result.located]
+        self.sure = {o.id for o in result.located if o.status == "ok"}
         self.labels = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         self.outlines = _project_all(result, self.scale)
-        fps = max(1.0, (video.fps or 30.0) / video.config.every)
+        fps = max(1.0, (video.fps or IMAGE_FPS) / video.config.every)
         self.writer = VideoWriter(path, fps, self.size)
 
     def take(self, frame: Frame) -> None:
@@ -147,18 +163,16 @@ class Overlay:
 
 
 def _project_all(result: Result, scale: float) -> dict[int, tuple[Array, BoolArray]]:
-    """Project the located objects' ellipsoids into every frame with a pose.
+    """Project the ellipsoids of the located objects into every frame with a pose.
 
     Returns:
         by frame number: dual conics (O, 3, 3) in scaled pixels, and visible (O,).
     """
-    poses, fits = result.poses, result.fits
-    if poses is None or fits is None:
+    poses = result.poses
+    if poses is None or not result.located or not poses.known.any():
         return {}
-    ellipsoids = fits.ellipsoids[np.array([o.located for o in result.objects], bool)]
-    img_from_world = (
-        np.diag([scale, scale, 1.0]) @ poses.camera.K @ poses.cam_from_world[poses.known]
-    )
-    dual_c, visible = quadrics.project(ellipsoids.dual_quadrics(), img_from_world)
+    scaled = np.diag([scale, scale, 1.0])
+    img_from_world = scaled @ poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
+    dual_c, visible = quadrics.project(result.ellipsoids().dual_quadrics(), img_from_world)
     frames = poses.frame[poses.known].tolist()
     return dict(zip(frames, zip(dual_c, visible, strict=True), strict=True))

@@ -1,6 +1,7 @@
-"""What a run found, typed: objects, their world, tracks and cameras; its files, and their reading.
+"""Result of a run, typed: objects, their world, tracks and cameras; writes and reads its files.
 
-The pictures (overlay.mp4, scene.html) need the video and have rooms of their own.
+Start at `Result`. Nothing is computed here; the pictures (overlay.mp4, scene.html) need the video
+and have rooms of their own.
 """
 
 from __future__ import annotations
@@ -18,11 +19,20 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Poses, load_poses, write_tum
-from reobj.files import atomic, load_json, load_npz, save_npz, without_password
+from reobj.cameras import Poses, load_poses, save_poses, write_tum
+from reobj.files import (
+    atomic,
+    load_json,
+    load_npz,
+    numbers,
+    rounded,
+    save_npz,
+    without_password,
+)
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
 from reobj.types import (
@@ -39,7 +49,9 @@ from reobj.types import (
 FORMAT = "reobj-objects"
 FORMAT_VERSION = 1  # of objects.json
 LAST_POSES = "cache/last-poses.npz"  # in an output folder
-STALE = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html")  # of earlier runs
+STALE = (  # files of an earlier run, which another run may not write; cameras.csv: before 0.2
+    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html",
+)  # fmt: skip
 CONVENTIONS = {
     "pose": "cam_from_world",
     "camera_axes": "x right, y down, z forward",
@@ -50,6 +62,7 @@ CONVENTIONS = {
     "ellipsoid": "inscribed in a box or cylinder",
     "cov": "9x9: center, log half axes, rotation vector in object axes",
 }
+EVIDENCE_DIGITS = 4  # of overlaps and log odds in the links; chosen: a box is measured to 1 in 100
 _JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
 
 
@@ -104,7 +117,7 @@ class Object:
 
     @staticmethod
     def from_json(entry: dict[str, Any]) -> Object:
-        """Read an entry of objects.json; what it has besides is ignored."""
+        """Read an entry of objects.json; unknown keys are ignored."""
         values = {f.name: entry[_JSON_KEYS.get(f.name, f.name)] for f in dataclasses.fields(Object)}
         for name in ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov"):
             values[name] = None if values[name] is None else np.array(values[name], np.float64)
@@ -113,7 +126,7 @@ class Object:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """What is known about the world that the objects stand in.
+    """Units, gravity and scale of the world that the objects stand in, and how they were linked.
 
     Attributes:
         units: "m", "arbitrary", or None without cameras. source: of the poses.
@@ -142,7 +155,11 @@ class World:
                 "rel_sigma": self.scale.rel_sigma,
                 "source": self.scale.source,
             }
-        return values | {"links": [dataclasses.asdict(event) for event in self.links]}
+        links = [dataclasses.asdict(event) for event in self.links]
+        for link in links:
+            link["place_iou"] = rounded(link["place_iou"], EVIDENCE_DIGITS)
+            link["appearance_log_odds"] = rounded(link["appearance_log_odds"], EVIDENCE_DIGITS)
+        return values | {"links": links}
 
     @staticmethod
     def from_json(entry: dict[str, Any]) -> World:
@@ -159,7 +176,7 @@ class World:
 
 @dataclass(frozen=True, slots=True)
 class VideoInfo:
-    """Which video a result is of: its path without password, native size in pixels, frame rate."""
+    """Path of a result's video, without password; native size in pixels; frame rate in Hz."""
 
     path: str
     width: int
@@ -174,7 +191,7 @@ class VideoInfo:
 
 @dataclass(slots=True, eq=False)
 class Result:
-    """What was found in a video: tracks, cameras, objects.
+    """Tracks, cameras and objects of a video.
 
     Attributes:
         tracks: all rows of the video in native pixels, with the objects' identities.
@@ -203,26 +220,49 @@ class Result:
     warnings: list[str] = field(default_factory=list)
     out: Path | None = None
 
+    @property
+    def located(self) -> list[Object]:
+        """Objects that have a solid, by id."""
+        return [o for o in self.objects if o.located]
+
+    def ellipsoids(self) -> quadrics.Ellipsoids:
+        """Return the ellipsoids of the `located` objects, in their order, in world."""
+        found = self.located
+        if self.fits is not None:  # with all digits
+            return self.fits.ellipsoids[np.array([o.located for o in self.objects], bool)]
+        center, half_axes = (
+            np.array([getattr(o, name) for o in found], np.float64).reshape(-1, 3)
+            for name in ("center", "half_axes")
+        )
+        wxyz = np.array([o.quat_wxyz for o in found], np.float64).reshape(-1, 4)
+        axes = (
+            Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix() if found else np.empty((0, 3, 3))
+        )
+        return quadrics.Ellipsoids(center, half_axes, axes)
+
     def save(self, out: str | Path) -> None:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
 
-        Each file appears only when it is complete; those of an earlier run are removed.
+        Each file appears only when it is complete. Those of an earlier run are removed,
+        pictures too: `write_pictures` makes new ones from the video.
         """
         self.out = out = Path(out)
-        for name in STALE:
+        for name in (*STALE, *([LAST_POSES] if self.poses is None else ())):
             (out / name).unlink(missing_ok=True)
         write_mot(out / "tracks.txt", self.tracks)
         self._write_objects(out / "objects.json")
-        if self.poses is not None and self.poses.known.any():
-            write_tum(out / "poses.txt", self.poses)
-        if self.fits is not None:
-            located = np.array([o.located for o in self.objects], bool)
-            ids = [o.id for o in self.objects if o.located]
-            write_ply(out / "objects.ply", self.fits.ellipsoids[located], ids)
+        if self.poses is not None:
+            save_poses(out / LAST_POSES, self.poses)
+            if self.poses.known.any():
+                write_tum(out / "poses.txt", self.poses)
+        if self.fits is not None or self.located:
+            write_ply(out / "objects.ply", self.ellipsoids(), [o.id for o in self.located])
 
     @staticmethod
     def load(out: str | Path) -> Result:
         """Read what `save` wrote; without the fits and the embeddings.
+
+        Boxes come as tracks.txt has them, to .01 px, with the class of their object.
 
         Raises:
             ReobjError: no `run` or `track` finished there, or another version wrote the folder.
@@ -235,8 +275,9 @@ class Result:
             objects = [Object.from_json(entry) for entry in data["objects"]]
             world = World.from_json(data["world"])
             facts = {f.name: data["video"][f.name] for f in dataclasses.fields(VideoInfo)}
-        except (KeyError, TypeError, ValueError) as error:
-            raise ReobjError(f"{out / 'objects.json'}: {_written_by(out)} ({error!r})") from error
+            warnings = [str(text) for text in data.get("warnings", ())]
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ReobjError(f"{out / 'objects.json'}: {written_by(out)} ({error!r})") from error
         names = tuple(dict.fromkeys(o.class_name for o in objects))
         class_of = {o.id: names.index(o.class_name) for o in objects}
         rows = read_mot_rows(out / "tracks.txt")
@@ -246,8 +287,7 @@ class Result:
         corners = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], 1)  # (N, 4)
         frame = rows[:, 0].astype(np.int64) - 1
         tracks = Tracks(frame, ids, ids, corners, rows[:, 6], classes, unknown)
-        poses = load_poses(out / LAST_POSES) if (out / LAST_POSES).is_file() else None
-        warnings = list(data.get("warnings", ()))
+        poses = load_last_poses(out)
         return Result(
             tracks, names, VideoInfo(**facts), objects, world, poses, warnings=warnings, out=out
         )
@@ -258,7 +298,7 @@ class Result:
         embedded: Sequence[tuple[IntArray, Floats]],
         foreground_width: int,
     ) -> None:
-        """Keep the embeddings of a tracker for those rows of the tracks that have one.
+        """Take over a tracker's embeddings, for the rows of the tracks that have one.
 
         Args:
             frames: source frame numbers. embedded: of each, detection indices (n,) and their fused
@@ -277,7 +317,7 @@ class Result:
         self.embedding_row = row[row >= 0]
 
     def save_tracked(self, path: Path) -> None:
-        """Write what tracking found, before anything is linked or fitted, as npz."""
+        """Write tracks and embeddings, before anything is linked or fitted, as npz."""
         columns = {f.name: getattr(self.tracks, f.name) for f in dataclasses.fields(Tracks)}
         columns |= {name: getattr(self.embeddings, name) for name in ("foreground", "background")}
         facts = {"class_names": self.class_names, "warnings": self.warnings,
@@ -300,7 +340,7 @@ class Result:
                 warnings=list(facts["warnings"]),
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise ReobjError(f"{path}: {_written_by(path.parent.parent)} ({error!r})") from error
+            raise ReobjError(f"{path}: {written_by(path.parent.parent)} ({error!r})") from error
 
     def summary(self) -> str:
         """Return the table that `run` prints: object, class, frames, size with sigma, status."""
@@ -356,26 +396,36 @@ class Result:
 
 
 def significant(values: Array) -> Array:
-    """Round to six significant digits: far below any accuracy, and stable text."""
-    rounded = [float(f"{v:.6g}") for v in np.ravel(values)]
-    return np.array(rounded, np.float64).reshape(np.shape(values))
+    """Round an array to six significant digits, as its text in objects.json has them."""
+    return np.array(numbers(values), np.float64).reshape(np.shape(values))
 
 
 def _plain(value: Any) -> Any:
-    """Return arrays as nested lists, anything else as it is."""
+    """Convert an array to nested lists; anything else stays as it is."""
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-def _written_by(out: Path) -> str:
-    """Say which version wrote an output folder that this one cannot read."""
+def written_by(out: Path) -> str:
+    """Say why a file in an output folder cannot be read, by the version that objects.json names."""
     data: dict[str, Any] = {}
     with contextlib.suppress(ReobjError):
         data = load_json(out / "objects.json")
-    wrote = data.get("reobj_track", "of before 0.2") if isinstance(data, dict) else "unknown"
-    return (
-        f"written by reobj_track {wrote}, this is {__version__}: run again into another folder, or "
-        "with --overwrite"
-    )
+    wrote = data.get("reobj_track") if isinstance(data, dict) else None
+    if wrote == __version__:
+        return "is damaged: run the video again"
+    by = f"written by reobj_track {wrote or 'before 0.2'}, this is {__version__}"
+    return f"{by}: run the video again"
+
+
+def load_last_poses(out: Path) -> Poses | None:
+    """Read the latest poses of an output folder, None if it has none."""
+    path = out / LAST_POSES
+    if not path.is_file():
+        return None
+    try:
+        return load_poses(path)
+    except (KeyError, TypeError) as error:
+        raise ReobjError(f"{path}: {written_by(out)} ({error!r})") from error
 
 
 def validate_objects(path: Path) -> list[str]:

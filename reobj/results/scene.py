@@ -1,4 +1,7 @@
-"""scene.html: one self-contained page of objects, cameras, points and pictures."""
+"""scene.html: one self-contained page of objects, cameras, points and pictures.
+
+`write_pictures` is the one loop over the video that makes the overlay and the pictures of the page.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +19,24 @@ from reobj.cameras import Poses, invert_rigid
 from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.results.overlay import Overlay, draw_tracks
 from reobj.results.result import Object, Result, World, significant
-from reobj.sources.video import Video, shrunk
+from reobj.sources.video import IMAGE_FPS, Video, shrunk
 from reobj.types import Frame, Image, IntArray, Tracks, object_color
 
+# Chosen so that the page of a video of three minutes with 50 objects stays below 10 MB.
 SCENE_CROPS = 8  # pictures of each object in scene.html
 SCENE_MAX_CROPS = 480  # and of all objects together
 SCENE_CROP_PX = 112  # longer side of these pictures
 SCENE_FRAMES = 60  # video frames in scene.html, shown beside the time slider
 SCENE_FRAME_PX = 320  # longer side of these frames
+JPEG_QUALITY = 80
+CROP_MARGIN = 0.1  # of the box's sides, on every side: shows what the object stands on
 
 
 class Pictures:
-    """Small JPEGs for the scene page, cut while the video is read: objects and whole frames.
+    """Cut small JPEGs for the scene page while the video is read: objects and whole frames.
 
     Attributes:
+        wanted: rows of the tracks to cut, in their order. whole: numbers of the frames to keep.
         crops: [frame number, base64] of each object's pictures, by identity, by time.
         frames: [frame number, base64] of whole frames with their boxes.
     """
@@ -50,11 +57,11 @@ class Pictures:
         self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
 
     def take(self, frame: Frame) -> None:
-        """Cut what is wanted from this frame."""
+        """Cut the wanted boxes from this frame, and keep it if it is wanted as a whole."""
         rows = self.wanted[self.tracks.frame[self.wanted] == frame.index]
         height, width = frame.image.shape[:2]
         for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
-            margin = 0.1 * (box[2:] - box[:2])
+            margin = CROP_MARGIN * (box[2:] - box[:2])
             x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
             x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
             if x1 < x2 and y1 < y2:
@@ -70,14 +77,15 @@ class Pictures:
 
 def _jpeg(image: Image, size_px: int) -> str:
     """Encode a small JPEG as base64."""
-    data = cv2.imencode(".jpg", shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    data = cv2.imencode(".jpg", shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return base64.b64encode(data.tobytes()).decode()
 
 
 def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int) -> IntArray:
-    """Choose rows (<= count,) of the views of one object that differ most.
+    """Choose the most different views of one object, (n,) rows of the tracks, n <= count.
 
-    In time and, where there are cameras, in viewing direction; large boxes of good score first.
+    The best box comes first (large, of good score), then whatever is farthest from the chosen ones
+    in time and, where there are cameras, in viewing direction.
     """
     rows = np.flatnonzero(tracks.track_id == found.id)
     frame, box = tracks.frame[rows], tracks.xyxy[rows]
@@ -101,11 +109,11 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
 
 
 def scene_frames(result: Result) -> IntArray:
-    """Return the frames that the time slider of the page goes through, before thinning."""
+    """List the frames that the time slider of the page goes through, before thinning."""
     return np.unique(result.tracks.frame) if result.poses is None else result.poses.frame
 
 
-SCENE_STEPS = 1500  # positions of the time slider; of longer videos every n-th frame
+SCENE_STEPS = 1500  # positions of the time slider; of longer videos every n-th frame (chosen)
 
 
 def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) -> None:
@@ -116,7 +124,7 @@ def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) ->
     """
     frames = scene_frames(result)
     steps = frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]  # (S,)
-    seconds = video.config.every / (video.fps or 30.0) * len(frames) / max(1, len(steps))
+    seconds = video.config.every / (video.fps or IMAGE_FPS) * len(frames) / max(1, len(steps))
     world = result.world.to_json()
     data = {
         "title": Path(str(video.source)).name,
@@ -139,11 +147,11 @@ def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) ->
         part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
 
 
-SCENE_POINTS = 20000  # sparse points shown; of more every n-th
+SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .4 MB of the page)
 
 
 def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
-    """Return the cameras of the steps, the sparse points and the upward direction."""
+    """Collect the cameras of the steps, the sparse points and the upward direction."""
     poses, up = result.poses, result.world.up_in_world
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
@@ -166,8 +174,8 @@ def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
 def _scene_object(
     found: Object, tracks: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
-    """Return an object for the page: its entry of objects.json, colour, pictures, and the steps in
-    which it is seen (first, last, first, last ...).
+    """Describe an object for the page: its entry of objects.json without covariance, its colour,
+    pictures, and the steps in which it is seen (first, last, first, last ...).
     """
     seen = np.isin(steps, tracks.frame[tracks.track_id == found.id])
     runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
@@ -180,7 +188,7 @@ def _scene_object(
 
 
 def _why_flat(result: Result) -> str:
-    """Say why the page has nothing to show in 3D; "" when it has."""
+    """Say why the page has nothing to show in 3D; "" if it has."""
     if result.poses is not None and result.poses.known.any():
         return ""
     reasons = [w for w in result.warnings if "pose" in w or "identities only" in w]
@@ -188,7 +196,7 @@ def _why_flat(result: Result) -> str:
 
 
 def _scene_facts(world: World) -> str:
-    """Say in one line what is known of cameras and scale."""
+    """Summarise cameras and scale in one line, for the head of the page."""
     if not world.registered_frames:
         return ""
     facts = [f"cameras of {world.registered_frames} of {world.frames} frames"]
@@ -204,9 +212,10 @@ def _scene_facts(world: World) -> str:
 def write_pictures(
     result: Result, out: Path, video: Video, overlay: bool = True, scene: bool = True
 ) -> None:
-    """Read the video once and write overlay.mp4 and scene.html; a live source has no second pass.
+    """Write overlay.mp4 and scene.html in one pass over the video.
 
-    Each file appears only when it is complete.
+    Each file appears only when it is complete. A live source cannot be read again: no overlay then,
+    and a page without pictures.
     """
     film = Overlay(result, out / "overlay.mp4", video) if overlay and not video.is_live else None
     pictures = Pictures(result, video) if scene else None

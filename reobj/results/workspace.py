@@ -1,4 +1,7 @@
-"""The output folder: which video it belongs to, and the stages' results under a hash of inputs."""
+"""Output folder: bound to one video, with the stages' results kept under a hash of their inputs.
+
+What the files of a result hold is the business of result.py; what a stage computes, of its room.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +13,28 @@ from pathlib import Path
 from typing import Any
 
 from reobj import __version__
-from reobj.cameras import Poses, load_poses, save_poses
+from reobj.cameras import Poses, save_poses
 from reobj.files import atomic, load_json
-from reobj.results.result import LAST_POSES, Result
+from reobj.results.result import LAST_POSES, STALE, Result, load_last_poses, written_by
 from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.types import ReobjError
 
-LAST_TRACKS = "cache/last-tracks.npz"
+LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
+SOURCE = "cache/source.json"
 
 
 class Workspace:
-    """The output folder: what belongs to which inputs and options.
+    """Keep the results of a video's stages in an output folder.
 
     Every stage keeps its result in OUT/cache under a hash of its inputs and options: a killed run
     resumes, a changed option recomputes what depends on it.
 
+    Attributes:
+        out: the folder. cache: OUT/cache, made here; it may be deleted, then all is computed again.
+
     Raises:
-        ReobjError: the folder is a file, or holds something else and `overwrite` is False.
+        ReobjError: the folder is a file, or holds something else and `overwrite` is False; a
+            sparse/ that is not ours is never overwritten.
     """
 
     def __init__(self, out: str | Path, overwrite: bool = False) -> None:
@@ -52,31 +60,48 @@ class Workspace:
         return Workspace(out)
 
     def bind(self, video: Video, overwrite: bool = False) -> None:
-        """Bind the folder to one video, so that results of two videos never mix."""
-        path, source = self.cache / "source.json", Path(str(video.source))
+        """Bind the folder to one video, so that results of two videos never mix.
+
+        Raises:
+            ReobjError: it is bound to another video, or that one was changed since, and `overwrite`
+                is False; with it the other's results are removed.
+        """
+        path, source = self.out / SOURCE, Path(str(video.source))
         fingerprint = {
             "source": str(source.absolute()) if source.exists() else str(video.source),
             "content": source_fingerprint(video.source),
             "input": dataclasses.asdict(video.config),
         }
-        if path.exists() and not overwrite:
+        if path.exists():
             old = load_json(path)
-            if old["content"] != fingerprint["content"]:
-                raise ReobjError(
-                    f"{self.out}: holds the results of {old['source']}, not of {video.source}; "
-                    "choose another -o, or say --overwrite"
-                )
+            old = old if isinstance(old, dict) else {}
+            if old.get("content") != fingerprint["content"]:
+                if not overwrite:
+                    raise ReobjError(
+                        f"{self.out}: holds the results of {old.get('source', 'another video')}, "
+                        f"not of {video.source}; choose another -o, or say --overwrite"
+                    )
+                for name in (*STALE, "tracks.txt", "objects.json", LAST_TRACKS, LAST_POSES):
+                    (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
             part.write_text(json.dumps(fingerprint))
 
     @property
     def source(self) -> tuple[str, InputConfig]:
         """The video that the folder is bound to, and the options that it was read with."""
-        facts = load_json(self.cache / "source.json")
-        return str(facts["source"]), InputConfig(**facts["input"])
+        path = self.out / SOURCE
+        facts = load_json(path)
+        try:
+            return str(facts["source"]), InputConfig(**facts["input"])
+        except (KeyError, TypeError) as error:
+            raise ReobjError(f"{path}: {written_by(self.out)} ({error!r})") from error
 
     def path(self, stage: str, *key: Any) -> Path:
-        """Return the file of a stage's result for this key (configs and strings)."""
+        """Return the file for a stage's result under a key: its inputs and options.
+
+        Args:
+            key: strings and configs; with the version of this package they make the name.
+        """
         text = json.dumps([__version__, key], sort_keys=True, default=dataclasses.asdict)
         return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
@@ -90,20 +115,24 @@ class Workspace:
 
     @property
     def last_tracks(self) -> Result | None:
-        """The latest tracks as the tracker had them, None if there are none."""
+        """The latest tracks as the tracker had them, before linking; None if there are none."""
         path = self.out / LAST_TRACKS
         return Result.load_tracked(path) if path.exists() else None
 
     def load_last(self) -> Result:
-        """Return the latest tracks as the tracker had them, with the poses."""
-        tracked, poses = self.last_tracks, self.out / LAST_POSES
+        """Return the latest tracks as the tracker had them, before linking, with the poses."""
+        tracked = self.last_tracks
         if tracked is None:
             raise ReobjError(f"{self.out}: no tracks here; make them first with `run` or `track`")
-        tracked.poses = load_poses(poses) if poses.exists() else None
+        tracked.poses = load_last_poses(self.out)
         return tracked
 
     def publish_model(self, model: Path | None) -> None:
         """Make OUT/sparse a copy of a COLMAP model; None: remove that of an earlier run."""
-        shutil.rmtree(self.out / "sparse", ignore_errors=True)
+        path, part = self.out / "sparse", self.out / ".part-sparse"
+        shutil.rmtree(part, ignore_errors=True)  # of a run that was killed here
         if model is not None and model.is_dir():
-            shutil.copytree(model, self.out / "sparse")
+            shutil.copytree(model, part)
+        shutil.rmtree(path, ignore_errors=True)
+        if part.is_dir():
+            part.replace(path)

@@ -61,7 +61,7 @@ class Video:
 
     Attributes:
         source: what was given, without a URL's password.
-        names: file names of images by frame number, [] for videos.
+        files, names: paths and file names of images by frame number, [] for videos.
         is_live: a camera or stream, which cannot be read twice.
         read, dropped: wanted frames of a live source so far, and those of them never yielded.
         size: (w, h) of the source in px, after rotation by its metadata.
@@ -81,8 +81,8 @@ class Video:
         self.read = self.dropped = 0
         self._opened: Any = None  # capture of a live source, until it is iterated
         self._is_url = bool(STREAM_URL.match(self._address))
-        self._files = [] if self._is_url else _image_files(self.source)
-        self.names = [path.name for path in self._files]
+        self.files = [] if self._is_url else _image_files(self.source)
+        self.names = [path.name for path in self.files]
         self.is_live = self._is_url or (self.source.isdigit() and not Path(self.source).exists())
         self.size, self.fps, self.frame_count = self._probe()
         if 0 < self.frame_count <= self.config.start:
@@ -106,10 +106,10 @@ class Video:
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
         decoded = self._from_live() if self.is_live else self._from_capture()
-        if self._files:
+        if self.files:
             stop = min(self.config.stop or self.frame_count, self.frame_count)
             numbers = range(self.config.start, stop, self.config.every)
-            decoded = ((i, i / IMAGE_FPS, _read_image(self._files[i])) for i in numbers)
+            decoded = ((i, i / IMAGE_FPS, _read_image(self.files[i])) for i in numbers)
         for index, time_s, image in decoded:
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 self.skipped.append(index)
@@ -232,9 +232,9 @@ class Video:
         Returns:
             (w, h) in px, frame rate in Hz, and number of frames (0: unknown).
         """
-        images: Iterator[Image | None] = map(_read_image, self._files)
-        fps, count = IMAGE_FPS, len(self._files)
-        if not self._files:
+        images: Iterator[Image | None] = map(_read_image, self.files)
+        fps, count = IMAGE_FPS, len(self.files)
+        if not self.files:
             capture = self._open()
             images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
             fps = float(capture.get(cv2.CAP_PROP_FPS))

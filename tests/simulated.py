@@ -1,0 +1,82 @@
+"""Simulated chairs seen by a known camera: tracks and cameras with a truth, for several tests."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+import quadrics
+import reobj_track as rt
+from reobj.objects import describe_objects, describe_world, fitter
+from reobj.results.result import VideoInfo
+from reobj.types import object_classes
+from reobj.views import gather_views
+
+SIZE = (640, 480)
+CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
+CHAIR, CUP = rt.COCO_NAMES.index("chair"), rt.COCO_NAMES.index("cup")
+
+
+def looking_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """cam_from_world (3, 4) of a camera at `eye` in a world with z up."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.c_[rotation, -rotation @ eye]
+
+
+def walk(frames: int = 40, arc_deg: float = 120.0, camera: rt.Camera = CAMERA) -> rt.Poses:
+    """An arc around the origin at 3.5 m, z up, metres."""
+    angles = np.radians(np.linspace(-arc_deg / 2, arc_deg / 2, frames))
+    eyes = np.stack([3.5 * np.sin(angles), -3.5 * np.cos(angles), np.full(frames, 1.6)], 1)
+    poses = np.stack([looking_at(eye, np.array([0, 0, 0.4])) for eye in eyes])
+    number = np.arange(frames)
+    up, status = np.array([0, 0, 1.0]), np.full(frames, "supplied")
+    return rt.Poses(camera, number, number / 30, poses, status, "user", True, up)
+
+
+def chair_solids() -> quadrics.Ellipsoids:
+    """Three chairs of .56 x .6 x .82 m in a row."""
+    centers = np.array([[-1.1, 0, 0.41], [0, 0.1, 0.41], [1.1, 0, 0.41]])
+    turn = [[[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]
+            for a in (0.2, 1.1, -0.5)]  # fmt: skip
+    return quadrics.Ellipsoids(centers, np.tile([0.28, 0.3, 0.41], (3, 1)), np.array(turn))
+
+
+def tracks_of(poses: rt.Poses, noise_px: float = 1.0) -> rt.Tracks:
+    """Noisy boxes of the chairs, one tracklet a chair, by frame; detection_index: the chair."""
+    img_from_world = poses.camera.K @ poses.cam_from_world
+    boxes = quadrics.solid_boxes(chair_solids(), "box", img_from_world)  # (F, 3, 4)
+    boxes = boxes + np.random.default_rng(0).normal(0, noise_px, boxes.shape)
+    row, chair = np.divmod(np.arange(boxes.shape[0] * 3), 3)
+    n = len(row)
+    columns = (boxes.reshape(-1, 4), np.full(n, 0.9), np.full(n, CHAIR), chair)
+    return rt.Tracks(poses.frame[row], chair + 1, chair + 1, *columns)
+
+
+def fitted(
+    tracks: rt.Tracks,
+    poses: rt.Poses | None,
+    config: rt.ObjectsConfig | None = None,
+    names: tuple[str, ...] = rt.COCO_NAMES,
+) -> rt.Result:
+    """The result of tracks whose identities are right: fitted and described, nothing linked."""
+    config, fits, views = config or rt.ObjectsConfig(), None, None
+    if poses is not None:
+        classes = object_classes(tracks)
+        group = np.searchsorted(list(classes), tracks.track_id)
+        views = gather_views(tracks, poses, group, len(classes), config.min_score)
+        fits = fitter(config, poses, names)(views, list(classes.values()))
+    objects = describe_objects(tracks, names, fits, views, config)
+    video = VideoInfo("walk.mp4", *SIZE, 30.0)
+    world = describe_world(poses, fits, [])
+    return rt.Result(tracks, names, video, objects, world, poses, fits)
+
+
+def with_columns(tracks: rt.Tracks, **columns: object) -> rt.Tracks:
+    """The tracks with other columns; a number counts for all rows."""
+    n = len(tracks)
+    arrays = {k: np.full(n, v) if np.isscalar(v) else v for k, v in columns.items()}
+    return dataclasses.replace(tracks, **arrays)  # type: ignore[arg-type]

@@ -1,0 +1,663 @@
+"""Scores against published ones, against TrackEval, and against cases worked out by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import ROOM
+from scipy.spatial.transform import Rotation
+
+import quadrics
+import reobj_track as rt
+from reobj.results.evaluation import (
+    ABSENT,
+    IGNORED,
+    SCORED,
+    LabelledBoxes,
+    drop_ignored,
+    identity_map,
+    labelled,
+    read_true_solids,
+    return_ranks,
+    score_objects,
+    score_report,
+    score_tracks,
+    visits,
+)
+from reobj.results.result import VideoInfo
+from reobj.results.workspace import Workspace
+from reobj.types import Embeddings
+
+ROOT = Path(rt.__file__).resolve().parent
+# TrackEval 1.3.0 on `drifting(seed)` (numbers kept so that something is checked without it)
+STORED = {
+    0: {
+        "HOTA": 0.40494081862197734,
+        "DetA": 0.4993655294235794,
+        "AssA": 0.3293713465268212,
+        "MOTA": 0.5418502202643172,
+        "IDSW": 17.0,
+        "Frag": 77.0,
+        "IDF1": 0.5214521452145214,
+        "IDP": 0.5208791208791209,
+        "IDR": 0.5220264317180616,
+    },
+    1: {
+        "HOTA": 0.3811787079108761,
+        "DetA": 0.5044888330442157,
+        "AssA": 0.28848344082415034,
+        "MOTA": 0.5310492505353319,
+        "IDSW": 20.0,
+        "Frag": 80.0,
+        "IDF1": 0.4755700325732899,
+        "IDP": 0.48237885462555063,
+        "IDR": 0.4689507494646681,
+    },
+}
+TRACKEVAL = """
+import contextlib, io, json, sys
+import numpy as np
+from trackeval.metrics import CLEAR, HOTA, Identity
+
+def overlap(a, b):
+    a, b = (np.c_[x[:, 2:4], x[:, 2:4] + x[:, 4:6]] for x in (a, b))
+    side = np.minimum(a[:, None, 2:], b[None, :, 2:]) - np.maximum(a[:, None, :2], b[None, :, :2])
+    inter = side.clip(0).prod(-1)
+    area = [(x[:, 2:] - x[:, :2]).prod(1) for x in (a, b)]
+    return inter / np.maximum(area[0][:, None] + area[1][None] - inter, 1e-12)
+
+gt, pr = (np.loadtxt(p, delimiter=",", ndmin=2) for p in sys.argv[1:])
+gt = gt[gt[:, 6] != 0]
+frames = np.union1d(gt[:, 0], pr[:, 0])
+ids = [{k: i for i, k in enumerate(np.unique(x[:, 1]))} for x in (gt, pr)]
+steps = [(gt[gt[:, 0] == f], pr[pr[:, 0] == f]) for f in frames]
+data = {
+    "num_gt_dets": len(gt), "num_tracker_dets": len(pr), "num_gt_ids": len(ids[0]),
+    "num_tracker_ids": len(ids[1]), "num_timesteps": len(frames),
+    "gt_ids": [np.array([ids[0][i] for i in g[:, 1]], int) for g, _ in steps],
+    "tracker_ids": [np.array([ids[1][i] for i in p[:, 1]], int) for _, p in steps],
+    "similarity_scores": [overlap(g, p) for g, p in steps],
+}
+with contextlib.redirect_stdout(io.StringIO()):
+    h, c, i = (m.eval_sequence(data) for m in (HOTA(), CLEAR(), Identity()))
+found = {k: float(np.mean(h[k])) for k in ("HOTA", "DetA", "AssA")}
+found |= {k: float(c[k]) for k in ("MOTA", "IDSW", "Frag")}
+print(json.dumps(found | {k: float(i[k]) for k in ("IDF1", "IDP", "IDR")}))
+"""
+
+
+def drifting(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """True and found MOTChallenge rows: misses, switches, swaps, false boxes, unmarked truth."""
+    rng = np.random.default_rng(seed)
+    gt, pr = [], []
+    for obj in range(8):
+        start, here = rng.integers(0, 20), rng.uniform(0, 500, 2)
+        name = 10 + obj
+        for frame in range(start, start + 60):
+            here = here + rng.normal(0, 2, 2)
+            flag = float(not (obj == 7 and frame < 30))  # zero-marked as in MOT15
+            gt.append([frame + 1, obj + 1, *here, 60, 90, flag, -1, -1, -1])
+            name = name + 20 if rng.random() < 0.03 else name
+            if rng.random() < 0.85:
+                pr.append([frame + 1, name, *(here + rng.normal(0, 9, 2)), 60, 90, 0.9, -1, -1, -1])
+    for k in range(40):
+        junk = [rng.integers(1, 80), 900 + k // 5, *rng.uniform(0, 500, 2)]
+        pr.append([*junk, 60, 90, 0.5, -1, -1, -1])
+    rows = np.array(pr)
+    _, first = np.unique(rows[:, :2], axis=0, return_index=True)  # an identity once a frame
+    return np.array(gt), rows[first]
+
+
+def write(path: Path, rows: np.ndarray) -> Path:
+    np.savetxt(path, rows, delimiter=",", fmt="%.6f")
+    return path
+
+
+def score(gt: Path, found: Path) -> dict[str, float]:
+    return rt.evaluate(found, gt)["tracks"]["all"]
+
+
+# ---- Against others ----
+
+
+@pytest.mark.parametrize("seed", STORED)
+def test_equals_the_stored_numbers_of_trackeval(tmp_path: Path, seed: int) -> None:
+    gt, pr = drifting(seed)
+    mine = score(write(tmp_path / "gt.txt", gt), write(tmp_path / "pr.txt", pr))
+    assert {k: mine[k] for k in STORED[seed]} == pytest.approx(STORED[seed], abs=1e-9)
+
+
+def trackeval_python(folder: Path) -> str:
+    """Interpreter with TrackEval 1.3.0, in a venv of its own (it pulls opencv-python)."""
+    given = os.environ.get("REOBJ_TRACKEVAL_PYTHON")
+    if given:
+        return given
+    venv.create(folder, with_pip=True)
+    python = folder / ("Scripts" if os.name == "nt" else "bin") / "python"
+    command = [python, "-m", "pip", "install", "-q", "trackeval==1.3.0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    if done.returncode:
+        pytest.skip(f"TrackEval cannot be installed here: {done.stderr.strip()[-200:]}")
+    return str(python)
+
+
+@pytest.mark.skipif(
+    not (os.environ.get("REOBJ_TRACKEVAL_PYTHON") or os.environ.get("REOBJ_SLOW")),
+    reason="makes a venv with TrackEval: set REOBJ_SLOW=1, or REOBJ_TRACKEVAL_PYTHON to its python",
+)
+def test_equals_trackeval(tmp_path: Path) -> None:
+    python = trackeval_python(tmp_path / "venv")
+    for seed in range(5):
+        gt, pr = drifting(seed)
+        files = write(tmp_path / "gt.txt", gt), write(tmp_path / "pr.txt", pr)
+        command = [python, "-c", TRACKEVAL, *map(str, files)]
+        text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        theirs = json.loads(text.splitlines()[-1])
+        mine = score(*files)
+        assert {k: mine[k] for k in theirs} == pytest.approx(theirs, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "published"),  # py-motmetrics' README
+    [
+        ("TUD-Campus", {"IDF1": 55.8, "IDP": 73.0, "IDR": 45.1, "recall": 58.2, "precision": 94.1,
+                        "IDSW": 7, "Frag": 7, "MOTA": 52.6}),
+        ("TUD-Stadtmitte", {"IDF1": 64.5, "recall": 60.9, "precision": 94.0, "IDSW": 7, "Frag": 6,
+                            "MOTA": 56.4}),
+    ],
+)  # fmt: skip
+def test_equals_published_scores(name: str, published: dict[str, float]) -> None:
+    data = os.environ.get("REOBJ_DATA", Path(rt.__file__).resolve().parent.parent / "shared/data")
+    folder = Path(data) / "mot" / "metrics_check" / name
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there (py-motmetrics' example, not redistributed)")
+    mine = score(folder / "gt.txt", folder / "test.txt")
+    for key, value in published.items():
+        share = 1 if key in ("IDSW", "Frag") else 100
+        assert round(share * mine[key], 1) == pytest.approx(value, abs=0.051), key
+
+
+# ---- By hand ----
+
+
+def boxes(*rows: tuple[float, ...]) -> LabelledBoxes:
+    """Rows frame, id, x; all boxes are 10 x 10."""
+    return labelled(np.array([[f, i, x, 0, 10, 10, 1] for f, i, x in rows], float))
+
+
+def test_a_switch_halves_the_identity() -> None:
+    truth = boxes(*((f, 1, 0) for f in range(4)))
+    found = boxes((0, 5, 0), (1, 5, 0), (2, 6, 0), (3, 6, 0))
+    mine = score_tracks(truth, found)
+    assert mine["IDSW"] == 1 and mine["MOTA"] == 0.75 and mine["IDF1"] == 0.5
+    assert mine["DetA"] == 1 and mine["AssA"] == 0.5 and mine["ids_per_object"] == 2
+
+
+def test_returns_keep_their_identity_or_not() -> None:
+    """Object 1 is away for 40 frames twice: first recognised, then taken for a newcomer."""
+    truth = boxes(*((f, 1, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 2, 50))
+    found = boxes(*((f, 5 if f < 84 else 6, 0) for f in (0, 1, 42, 43, 84, 85)), (0, 7, 50))
+    assert visits(truth).tolist() == [0, 0, 1, 1, 2, 2, 0]
+    mine = score_tracks(truth, found)
+    assert mine["returns"] == 2 and mine["returns_kept"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("embedding", "ranks"),
+    [
+        ([[1, 0], [0, 1], [0.9, 0.1]], [1]),  # like its own first view
+        ([[1, 0], [0, 1], [0.1, 0.9]], [2]),  # like the other object
+        ([[1, 0], [np.nan, np.nan], [0.1, 0.9]], [1]),  # the other one has none
+        ([[np.nan, np.nan], [0, 1], [0.1, 0.9]], []),  # its own first view has none: no query
+    ],
+)
+def test_rank_of_a_return(embedding: list[list[float]], ranks: list[int]) -> None:
+    truth = boxes((0, 1, 0), (0, 2, 50), (50, 1, 90))
+    assert return_ranks(truth, truth, np.array(embedding)).tolist() == ranks
+
+
+def tracked_folder(out: Path, result: rt.Result, config: rt.InputConfig | None = None) -> None:
+    """What `track` leaves in an output folder, of a video of one black frame."""
+    out.mkdir(parents=True)
+    cv2.imwrite(str(out.parent / "0.png"), np.zeros((480, 640, 3), np.uint8))
+    space = Workspace(out)
+    video = rt.Video(out.parent / "0.png")
+    video.config = config or rt.InputConfig()
+    space.bind(video)
+    space.save_last(result, result.poses)
+    result.save(out)
+
+
+def cups(frame: list[int], obj: list[int]) -> rt.Result:
+    """Cups of 10 x 10 pixels, 50 apart, one detection a frame and cup."""
+    number, ids = np.array(frame), np.array(obj)
+    x = 50.0 * (ids - 1)
+    xyxy = np.stack([x, 0 * x, x + 10, 0 * x + 10], 1)
+    cup, n = np.full(len(ids), 41), len(ids)
+    tracks = rt.Tracks(number, ids, ids, xyxy, np.ones(n), cup, np.zeros(n, np.int64))
+    objects = [rt.Object(i, "cup", 1.0, "rejected", "flat") for i in sorted({*obj})]
+    return rt.Result(tracks, rt.COCO_NAMES, VideoInfo("a", 640, 480, 30.0), objects)
+
+
+def truth_of(path: Path, result: rt.Result) -> Path:
+    """The tracks as MOTChallenge truth, frames from 1."""
+    tracks = result.tracks
+    sizes = tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]
+    one = np.ones(len(tracks))
+    rows = np.c_[tracks.frame + 1, tracks.track_id, tracks.xyxy[:, :2], sizes, one]
+    return write(path, rows)
+
+
+def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None:
+    """Two cups, one comes back twice: once like itself, once like the other (Rank-1 .5)."""
+    result = cups([0, 0, 40, 80], [1, 2, 1, 1])
+    fused = np.array([[1, 1, 0], [1, 0, 1], [1, 0.9, 0.1], [1, 0.1, 0.9]], np.float16)
+    result.embeddings = Embeddings(fused[:, :1], fused[:, 1:])  # the background tells
+    result.embedding_row = np.arange(4)
+    tracked_folder(tmp_path / "out", result)
+    gt = truth_of(tmp_path / "gt.txt", result)
+    scores = rt.evaluate(str(tmp_path / "out"), str(gt))
+    share = {"queries": 2, "rank1": 0.5, "rank5": 1.0, "rank20": 1.0, "rank50": 1.0}
+    assert scores["ranks"] == share and scores["tracks"]["all"]["HOTA"] == 1
+    assert "2 queries: Rank-1 0.500, Rank-5 1.000" in score_report(scores)
+
+
+def test_rows_without_an_embedding_are_no_queries(tmp_path: Path) -> None:
+    """Only rows 0 and 2 were embedded: nothing else is in the gallery."""
+    result = cups([0, 0, 40, 80], [1, 2, 1, 1])
+    result.embeddings = Embeddings(np.eye(2, dtype=np.float16), np.empty((2, 0), np.float16))
+    result.embedding_row = np.array([0, 2])
+    tracked_folder(tmp_path / "out", result)
+    ranks = rt.evaluate(tmp_path / "out", truth_of(tmp_path / "gt.txt", result))["ranks"]
+    assert ranks["queries"] == 1 and ranks["rank1"] == 1
+
+
+def test_objects_of_other_classes_are_not_in_the_gallery() -> None:
+    """A cup looks just as the chair that comes back, which has changed."""
+    truth = boxes((0, 1, 0), (0, 2, 50), (0, 3, 90), (50, 1, 0))
+    embedding = np.array([[0.8, 0.6], [1, 0], [0, 1], [1, 0]])
+    for names, rank in ((["chair", "cup", "chair", "chair"], 1), (["chair"] * 4, 2)):
+        named = dataclasses.replace(truth, name=np.array(names))
+        assert return_ranks(named, named, embedding).tolist() == [rank]
+
+
+def test_the_best_view_of_every_object_counts() -> None:
+    """Gallery: two views of object 1, one good; two views of object 2, both middling."""
+    truth = boxes((0, 1, 0), (1, 1, 0), (0, 2, 50), (1, 2, 50), (50, 1, 90), (51, 1, 90))
+    angle = np.radians([90, 12, 30, 20, 0, 0])
+    embedding = np.stack([np.cos(angle), np.sin(angle)], 1)
+    assert return_ranks(truth, truth, embedding).tolist() == [1, 1]
+    angle[1] = np.radians(25)  # now one view of object 2 is nearer
+    embedding = np.stack([np.cos(angle), np.sin(angle)], 1)
+    assert return_ranks(truth, truth, embedding).tolist() == [2, 2]
+
+
+def test_only_the_first_frames_of_a_return_are_queries() -> None:
+    frames = [*range(3), *range(50, 80)]
+    truth = boxes(*((f, 1, 0) for f in frames))
+    assert len(return_ranks(truth, truth, np.tile([1.0, 0], (len(frames), 1)))) == 10
+
+
+def test_frames_that_were_not_read_do_not_count(tmp_path: Path) -> None:
+    """--start 2 --stop 8 --every 2 read frames 2, 4, 6; the truth has 0 to 9, counted from 1."""
+    truth = cups(list(range(10)), [1] * 10)
+    found = cups([2, 4, 6], [1] * 3)
+    gt = truth_of(tmp_path / "gt.txt", truth)
+    tracked_folder(tmp_path / "out", found, rt.InputConfig(every=2, start=2, stop=8))
+    score = rt.evaluate(tmp_path / "out", gt)["tracks"]["all"]
+    assert score["recall"] == score["precision"] == score["HOTA"] == 1
+    tracked_folder(tmp_path / "all" / "out", found)
+    assert rt.evaluate(tmp_path / "all/out", gt)["tracks"]["all"]["recall"] == 0.3
+
+
+def test_eval_of_the_example_room(room: Path, tmp_path: Path) -> None:
+    """The files of a run against the room's truth: frames and classes go together."""
+    scores = rt.evaluate(room, ROOM / "gt_mot.txt", ROOM / "gt_objects.json")
+    mine = scores["tracks"]["all"]
+    assert mine["IDF1"] > 0.75 and mine["precision"] > 0.85  # a frame beside it costs 0.1 and more
+    objects = scores["objects"]
+    assert objects["found"] >= 8 and objects["o3d_median"] > 0.4
+    assert objects["center_error_median"] < 0.06 and objects["scale_error"] == 0
+    assert f"3D: true {objects['true']}, found {objects['found']}" in score_report(scores)
+
+
+def test_scores_by_class(tmp_path: Path) -> None:
+    """Truth of nine columns: one chair (56) is found as a cup, one cup as a cup."""
+    gt = np.array([[1, 1, 0, 0, 10, 10, 1, 56, 1], [1, 2, 50, 0, 10, 10, 1, 41, 1]])
+    result = cups([0, 0], [1, 2])
+    tracked_folder(tmp_path / "out", result)
+    gt_file = write(tmp_path / "gt.txt", gt)
+    scores = rt.evaluate(tmp_path / "out", gt_file)["tracks"]
+    assert sorted(scores) == ["all", "chair", "cup"]
+    assert [scores[k]["recall"] for k in ("all", "chair", "cup")] == [0.5, 0, 1]
+    assert [scores[k]["precision"] for k in ("all", "cup")] == [0.5, 0.5]
+    one = rt.evaluate(tmp_path / "out", gt_file, classes=["chair"])["tracks"]
+    assert list(one) == ["all"] and one["all"]["recall"] == 0
+    (tmp_path / "gt_mot_format.json").write_text('{"classes": {"56": "cup", "41": "cup"}}')
+    assert rt.evaluate(tmp_path / "out", gt_file)["tracks"]["all"]["recall"] == 1
+
+
+def test_zero_marked_truth_is_left_out(tmp_path: Path) -> None:
+    """Files of ten columns (MOT15) and of seven: column 7 is the flag, there are no classes."""
+    rows = [[1, 1, 0, 0, 10, 10, 1, -1, -1, -1], [1, 2, 50, 0, 10, 10, 0, -1, -1, -1]]
+    for width in (7, 10):
+        gt = write(tmp_path / "gt.txt", np.array(rows)[:, :width])
+        mine = score(gt, write(tmp_path / "pr.txt", np.array(rows)[:1]))
+        assert mine["gt_objects"] == 1 and mine["recall"] == 1
+    assert rt.evaluate(tmp_path / "pr.txt", gt)["ranks"] == {}
+
+
+def test_results_on_ignored_truth_are_dropped() -> None:
+    """The better overlap decides whose a box is; one on nothing stays."""
+    truth = boxes((0, 1, 0), (0, 2, 4), (0, 3, 90))
+    role = np.array([SCORED, IGNORED, ABSENT])
+    truth = LabelledBoxes(truth.frame, truth.identity, truth.xyxy, truth.name, role)
+    found = boxes((0, 7, 0), (0, 8, 5), (0, 9, 90), (0, 10, 300), (1, 8, 5))
+    kept = drop_ignored(truth, found)
+    assert list(zip(kept.frame.tolist(), kept.identity.tolist(), strict=True)) == [
+        (0, 7), (0, 9), (0, 10), (1, 8),
+    ]  # fmt: skip
+
+
+def test_identities_are_mapped_one_to_one_by_common_frames() -> None:
+    truth = boxes(*((f, 1, 0) for f in range(10)), *((f, 2, 50) for f in range(10)), (0, 3, 200))
+    found = boxes(*((f, 5, 0) for f in range(6)), *((f, 6, 0) for f in range(6, 10)),
+                  *((f, 5, 50) for f in range(6, 10)), *((f, 7, 50) for f in range(3)))  # fmt: skip
+    assert identity_map(truth, found) == {1: 5, 2: 7, 3: None}
+    mine = score_tracks(truth, found)
+    assert mine["IDR"] == pytest.approx(9 / 21) and mine["IDP"] == pytest.approx(9 / 17)
+    assert mine["IDF1"] == pytest.approx(18 / 38)
+
+
+@pytest.mark.parametrize(
+    ("shift", "share"),  # of 19 thresholds; IoU of two squares of side 10 shifted by s px is
+    [(0, 1), (2, 13 / 19), (5, 6 / 19), (6, 5 / 19), (9, 1 / 19)],  # (10 - s) / (10 + s)
+)
+def test_hota_counts_the_thresholds_that_the_overlap_passes(shift: float, share: float) -> None:
+    truth, found = boxes((0, 1, 0), (1, 1, 0)), boxes((0, 5, shift), (1, 5, shift))
+    mine = score_tracks(truth, found)
+    hit = np.mean([(10 - shift) / (10 + shift) >= k * 0.05 - 1e-9 for k in range(1, 20)])
+    assert hit == pytest.approx(share)
+    assert mine["HOTA"] == pytest.approx(share) and mine["AssA"] == pytest.approx(share)
+
+
+def test_hota_prefers_the_identity_that_fits_the_whole_object() -> None:
+    """Identity 5 covers the object in 6 frames, 6 in five of these; but 5 has 94 false boxes."""
+    truth = boxes(*((f, 1, 0) for f in range(10)))
+    found = boxes(*((f, 5, -2) for f in range(6)), *((f, 6, 2) for f in range(5)),
+                  *((f, 5, 500) for f in range(10, 104)))  # fmt: skip
+    share = (5 * 5 / 10 + 1 / 109) / 6  # of 6 true positives, 5 are identity 6's
+    assert score_tracks(truth, found)["AssA"] == pytest.approx(13 / 19 * share)
+
+
+def test_mota_counts_misses_false_boxes_and_switches() -> None:
+    truth = boxes(*((f, 1, 0) for f in range(10)))
+    found = boxes(*((f, 5 if f < 5 else 6, 0) for f in range(8)), (0, 9, 300), (1, 9, 300))
+    mine = score_tracks(truth, found)
+    assert mine["IDSW"] == 1 and mine["MOTA"] == pytest.approx(1 - (2 + 2 + 1) / 10)
+    assert mine["recall"] == 0.8 and mine["precision"] == 0.8 and mine["Frag"] == 0
+
+
+def test_a_match_is_kept_while_it_overlaps() -> None:
+    """A better box beside it does not take the object over (no switch): CLEAR MOT's rule."""
+    truth = boxes((0, 1, 0), (1, 1, 0))
+    found = boxes((0, 5, 0), (1, 5, 3), (1, 6, 0))
+    assert score_tracks(truth, found)["IDSW"] == 0
+    assert score_tracks(truth, boxes((0, 5, 0), (1, 5, 6), (1, 6, 0)))["IDSW"] == 1  # IoU .25
+
+
+def test_a_gap_is_a_fragment() -> None:
+    truth = boxes(*((f, i, 60 * i) for f in range(6) for i in (1, 2)))
+    found = boxes(*((f, i, 60 * i) for f in range(6) for i in (1, 2) if (i, f) != (1, 3)))
+    mine = score_tracks(truth, found)
+    assert mine["Frag"] == 1 and mine["IDSW"] == 0
+
+
+def test_a_return_is_kept_if_any_visit_before_had_its_identity() -> None:
+    """Visits of object 1: identities 5, 6, 5 (kept), 7 (lost), 6 (kept)."""
+    names, starts = (5, 6, 5, 7, 6), (0, 50, 100, 150, 200)
+    frames = [(s + k, n) for s, n in zip(starts, names, strict=True) for k in range(3)]
+    truth = boxes(*((f, 1, 0) for f, _ in frames))
+    mine = score_tracks(truth, boxes(*((f, n, 0) for f, n in frames)))
+    assert mine["returns"] == 4 and mine["returns_kept"] == 0.5
+
+
+@pytest.mark.parametrize(("frames_of_5", "kept"), [(1, 0), (2, 1)])
+def test_the_main_identity_of_a_visit_counts(frames_of_5: int, kept: float) -> None:
+    """Away for long, then three frames under the old identity 5 or a new one."""
+    names = [5, 5, *[5] * frames_of_5, *[9] * (3 - frames_of_5)]
+    frames = (0, 1, 50, 51, 52)
+    truth = boxes(*((f, 1, 0) for f in frames))
+    found = boxes(*((f, n, 0) for f, n in zip(frames, names, strict=True)))
+    assert score_tracks(truth, found)["returns_kept"] == kept
+
+
+def test_a_visit_ends_after_thirty_frames() -> None:
+    frames = (0, 30, 60, 91, 92)
+    assert visits(boxes(*((f, 1, 0) for f in frames))).tolist() == [0, 0, 0, 1, 1]
+    unordered = boxes((91, 1, 0), (0, 2, 0), (0, 1, 0), (40, 2, 0))
+    assert visits(unordered).tolist() == [1, 0, 0, 1]
+
+
+def test_nothing_found_and_nothing_true() -> None:
+    some, none = boxes((0, 1, 0), (1, 1, 0)), labelled(np.empty((0, 7)))
+    assert score_tracks(some, none)["HOTA"] == 0
+    assert score_tracks(none, some)["precision"] == 0
+    assert score_tracks(none, none)["IDF1"] == 0
+    assert score_tracks(some, some)["HOTA"] == 1
+
+
+def test_classes_never_match_each_other() -> None:
+    rows = np.array([[1, 1, 0, 0, 10, 10, 1]], float)
+    chair, cup, any_class = (labelled(rows, n) for n in ("chair", "cup", ""))
+    assert score_tracks(chair, cup)["recall"] == 0
+    assert score_tracks(chair, any_class)["recall"] == 1
+
+
+def test_mot17_distractors_swallow_what_they_match(tmp_path: Path) -> None:
+    """Class 8 is a distractor, class 3 (car) is not: a box on the car is false."""
+    (tmp_path / "seqinfo.ini").touch()
+    (tmp_path / "gt").mkdir()
+    person, distractor, car = (1, 0, 1, 1), (2, 50, 0, 8), (3, 90, 0, 3)  # id, x, flag, class
+    gt = [[1, i, x, 0, 10, 10, f, c, 1] for i, x, f, c in (person, distractor, car)]
+    pr = [[1, i, x, 0, 10, 10, 1, -1, -1, -1] for i, x in ((1, 0), (2, 50), (3, 90))]
+    truth = write(tmp_path / "gt" / "gt.txt", np.array(gt))
+    files = truth, write(tmp_path / "pr.txt", np.array(pr))
+    mine = score(*files)
+    assert mine["gt_objects"] == 1 and mine["identities"] == 2 and mine["precision"] == 0.5
+
+
+def test_barely_visible_truth_is_ignored(tmp_path: Path) -> None:
+    gt = np.array([[1, 1, 0, 0, 10, 10, 1, 56, 0.9], [1, 2, 50, 0, 10, 10, 1, 56, 0.1]])
+    pr = np.array([[1, i, x, 0, 10, 10, 1, -1, -1, -1] for i, x in ((1, 0), (2, 50))])
+    files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
+    assert rt.evaluate(*files)["tracks"]["all"]["gt_objects"] == 2
+    strict = rt.evaluate(*files, min_visibility=0.3)["tracks"]["all"]
+    assert strict["gt_objects"] == 1 and strict["precision"] == 1
+
+
+def test_unknown_class_is_refused(tmp_path: Path) -> None:
+    gt, pr = drifting(0)
+    files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
+    with pytest.raises(rt.ReobjError, match="chiar"):
+        rt.evaluate(*files, classes=["chiar"])
+
+
+def test_command_line_prints_a_table_and_refuses_other_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gt, pr = drifting(0)
+    files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
+    assert rt.main(["eval", str(files[0]), "--gt", str(files[1])]) == 0
+    text = capsys.readouterr().out
+    assert "IDF1" in text and "Rank-k: no embeddings here" in text
+    (tmp_path / "bad.txt").write_text("not a table\n")
+    assert rt.main(["eval", str(files[0]), "--gt", str(tmp_path / "bad.txt")]) == 2
+    error = capsys.readouterr().err
+    assert "bad.txt, line 1: " in error and len(error.splitlines()) == 1
+
+
+def test_failure_gallery_names_the_error_and_its_cause(tmp_path: Path) -> None:
+    """One object, away for 5 frames, comes back at the border under a second identity."""
+    frames = [*range(10), *range(15, 19)]
+    (tmp_path / "images").mkdir()
+    for i in range(20):
+        cv2.imwrite(str(tmp_path / "images" / f"{i:04d}.png"), np.full((48, 64, 3), 90, np.uint8))
+    x = np.where(np.array(frames) < 15, 20.0, 0.0)
+    gt = [[f + 1, 1, a, 9, 20, 30, 1] for f, a in zip(frames, x, strict=True)]
+    det = [[f + 1, -1, a, 9, 20, 30, 0.9] for f, a in zip(frames, x, strict=True)]
+    gt_file, out = write(tmp_path / "gt.txt", np.array(gt)), tmp_path / "out"
+    images, boxes_file = str(tmp_path / "images"), str(write(tmp_path / "det.txt", np.array(det)))
+    assert rt.main(["track", images, "--detections", boxes_file, "-o", str(out)]) == 0
+    text = (out / "tracks.txt").read_text().splitlines()
+    text[10:] = [",".join([line.split(",")[0], "2", *line.split(",")[2:]]) for line in text[10:]]
+    (out / "tracks.txt").write_text("\n".join(text))
+    command = [sys.executable, ROOT / "examples" / "failure_gallery.py", out, "--gt", gt_file]
+    command += ["-o", tmp_path / "gallery.png"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True)
+    error = "object 1: a second identity (id 2, right 1), 4 frames from 16"
+    assert f"| {error} | out of view for 5 frames; cut by the border |" in done.stdout
+    picture = cv2.imread(str(tmp_path / "gallery.png"))
+    assert picture is not None and picture.shape[1] == 900
+
+
+# ---- Objects in 3D ----
+
+TURN = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()  # ours from the true world
+SHIFT = np.array([1.0, 2.0, 3.0])
+TRUE = {"id": 4, "center": [0.5, 0.2, 1.0], "half_axes": [0.2, 0.3, 0.4],
+        "world_from_obj": Rotation.from_rotvec([0, 0, 0.7]).as_matrix().tolist()}  # fmt: skip
+
+
+def half_sized(tmp_path: Path, source: str = "pycolmap") -> tuple[rt.Result, Path, Path]:
+    """A result in a world of half the size, turned and shifted; true solids and true poses."""
+    centers = np.random.default_rng(3).uniform(-2, 2, (12, 3))  # of the cameras, true world
+    ours = 0.5 * centers @ TURN.T + SHIFT
+    pose = np.concatenate([np.tile(np.eye(3), (12, 1, 1)), -ours[:, :, None]], 2)
+    camera = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+    frame = np.arange(12)
+    poses = rt.Poses(camera, frame, frame / 10, pose, np.full(12, "pnp"), source)
+    c2w = np.tile(np.eye(4), (12, 1, 1))
+    c2w[:, :3, 3] = centers
+    np.savetxt(tmp_path / "poses_c2w.txt", c2w.reshape(12, 16))
+    (tmp_path / "gt_objects.json").write_text(json.dumps({"objects": [TRUE]}))
+    xyzw = Rotation.from_matrix(TURN @ np.array(TRUE["world_from_obj"])).as_quat()
+    mine = rt.Object(
+        9, "chair", 1.0, "ok", "", "ellipsoid", 0.5 * TURN @ np.array(TRUE["center"]) + SHIFT,
+        np.array([0.1, 0.15, 0.2]), np.roll(xyzw, 1), np.array([0.2, 0.3, 0.4]),
+    )  # fmt: skip
+    world = rt.World("arbitrary", source, 12, 0, 12, scale=quadrics.Scale(2.2, 0.1, "priors"))
+    tracks, video = rt.Tracks.empty(), VideoInfo("a", 640, 480, 30.0)
+    result = rt.Result(tracks, ("chair",), video, [mine], world, poses)
+    return result, tmp_path / "gt_objects.json", tmp_path / "poses_c2w.txt"
+
+
+def test_solids_are_compared_in_the_true_world(tmp_path: Path) -> None:
+    """Our world is half as large and turned: after the alignment by cameras nothing is wrong."""
+    found = score_objects(*half_sized(tmp_path), {4: 9, 5: 7})
+    assert found["o3d_found"] == pytest.approx(1, abs=5e-3)
+    assert found["o3d_all"] == pytest.approx(0.5, abs=5e-3)  # the second true object has no solid
+    assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
+    assert found["size_error_median"] == pytest.approx(0, abs=1e-9)
+    assert found["scale_error"] == pytest.approx(0.1)
+    assert (found["true"], found["found"]) == (2, 1)
+    assert {k: found["objects"][0][k] for k in ("id", "object", "class")} == {
+        "id": 4, "object": 9, "class": "chair",
+    }  # fmt: skip
+
+
+def test_errors_are_in_units_of_the_truth(tmp_path: Path) -> None:
+    """Half a unit off in ours is one in the truth; twice the volume is 26 % in size."""
+    result, *files = half_sized(tmp_path)
+    off = TURN @ np.array([0.5, 0, 0])
+    (o,) = result.objects
+    moved = dataclasses.replace(o, center=o.center + off, half_axes=o.half_axes * [2, 1, 1])
+    result.objects = [moved]
+    found = score_objects(result, *files, {4: 9})
+    assert found["center_error_median"] == pytest.approx(1.0)
+    assert found["size_error_median"] == pytest.approx(2 ** (1 / 3) - 1)
+    assert found["o3d_all"] < 0.01  # .4 + .4 m along x: they hardly touch
+
+
+@pytest.mark.parametrize("pairs", [{4: None}, {4: 8}, {}])
+def test_objects_that_the_identities_do_not_say_are_not_found(
+    tmp_path: Path, pairs: dict[int, int | None]
+) -> None:
+    assert score_objects(*half_sized(tmp_path), pairs)["found"] == 0
+
+
+def test_rejected_objects_are_not_found(tmp_path: Path) -> None:
+    result, *files = half_sized(tmp_path)
+    result.objects = [dataclasses.replace(result.objects[0], status="rejected")]
+    assert score_objects(result, *files, {4: 9}) == {"true": 1, "found": 0, "o3d_all": 0.0}
+
+
+def test_supplied_cameras_are_in_the_true_world_already(tmp_path: Path) -> None:
+    result, solids, _ = half_sized(tmp_path, "user")
+    found = score_objects(result, solids, None, {4: 9})
+    truth, ours = np.array(TRUE["center"]), result.objects[0].center
+    assert found["center_error_median"] == pytest.approx(np.linalg.norm(truth - ours))
+
+
+def test_true_cameras_may_be_tum_rows(tmp_path: Path) -> None:
+    """Rows belong to frames by time; frames without a row are not used."""
+    result, solids, path = half_sized(tmp_path)
+    c2w = np.loadtxt(path).reshape(-1, 4, 4)
+    rows = np.c_[np.arange(12) / 10 + 0.01, c2w[:, :3, 3], np.tile([0, 0, 0, 1], (12, 1))]
+    rows[3, 0], rows[3, 1] = 0.345, 99  # between two frames: of none
+    np.savetxt(tmp_path / "tum.txt", rows[::-1])
+    found = score_objects(result, solids, tmp_path / "tum.txt", {4: 9})
+    assert found["center_error_median"] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 2 3\n4 5 6\n", "3 columns; expected TUM"),
+        ("a b c\n", "expected TUM"),
+        ("0 0 0 0 0 0 0 1\n" * 2, "poses in common; 3 or more"),
+    ],
+)
+def test_bad_true_cameras(tmp_path: Path, text: str, message: str) -> None:
+    result, solids, path = half_sized(tmp_path)
+    path.write_text(text)
+    with pytest.raises(rt.ReobjError, match=message):
+        score_objects(result, solids, path, {4: 9})
+
+
+def test_3d_needs_cameras(tmp_path: Path) -> None:
+    result, solids, path = half_sized(tmp_path)
+    with pytest.raises(rt.ReobjError, match="give --gt-poses"):
+        score_objects(result, solids, None, {4: 9})
+    result.poses = None
+    with pytest.raises(rt.ReobjError, match="no cameras here"):
+        score_objects(result, solids, path, {4: 9})
+
+
+def test_true_solids_in_both_forms(tmp_path: Path) -> None:
+    """Half axes, or extents with axes `R`; the visible part counts; a sheet is 1 cm thick."""
+    R = Rotation.from_rotvec([0, 0, 0.5]).as_matrix().tolist()
+    box = {"id": 1, "center": [1, 2, 3], "size": [2.0, 4.0, 0.0], "R": R, "visible_part": {
+        "center": [1, 2, 4], "size": [2.0, 1.0, 0.0], "R": R}}  # fmt: skip
+    (tmp_path / "o.json").write_text(json.dumps({"objects": [box, TRUE]}))
+    ids, solids = read_true_solids(tmp_path / "o.json")
+    assert ids == [1, 4]
+    np.testing.assert_allclose(solids.center_in_world, [[1, 2, 4], TRUE["center"]])
+    np.testing.assert_allclose(solids.half_axes, [[1, 0.5, 0.005], [0.2, 0.3, 0.4]])
+    np.testing.assert_allclose(solids.world_from_obj, [R, TRUE["world_from_obj"]])
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"objects": [{"id": 1}]}', '{"objects": [3]}'])
+def test_bad_true_solids(tmp_path: Path, text: str) -> None:
+    (tmp_path / "o.json").write_text(text)
+    with pytest.raises(rt.ReobjError, match=r"o\.json"):
+        read_true_solids(tmp_path / "o.json")

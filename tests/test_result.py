@@ -1,0 +1,409 @@
+"""What a run found, written and read again; every file is read by somebody else's reader too."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_columns
+
+import quadrics
+import reobj_track as rt
+from reobj.results.result import VideoInfo, validate_objects, write_mot, write_ply
+
+
+def copy_of(result: rt.Result, **changes: object) -> rt.Result:
+    return dataclasses.replace(result, **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def saved(chairs: rt.Result, tmp_path: Path) -> Path:
+    out = tmp_path / "out"
+    copy_of(chairs).save(out)
+    return out
+
+
+# ---- Written, then read ----
+
+
+def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> None:
+    poses = dataclasses.replace(chairs.poses, points=np.eye(3), colors=np.eye(3, dtype=np.uint8),
+                                messages=("a gap",))  # fmt: skip
+    links = (rt.LinkEvent("join", (1, 4), 0.5, 1.25, True),
+             rt.LinkEvent("split", (3, 2), None, -0.75, False))  # fmt: skip
+    scale = quadrics.Scale(0.5, 0.125, "priors")
+    world = dataclasses.replace(chairs.world, links=links, scale=scale)
+    rejected = rt.Object(4, "cup", 0.5, "rejected", "no reason", None, tracklet_ids=[7, 9],
+                         visits=[[0, 3], [5, 5]])  # fmt: skip
+    before = copy_of(chairs, poses=poses, world=world, warnings=["take care"])
+    before.objects = [*chairs.objects, rejected]
+    before.fits = None
+    before.save(tmp_path)
+    after = rt.Result.load(tmp_path)
+    assert after.out == before.out == tmp_path
+    assert len(after.objects) == 4
+    for ours, theirs in zip(before.objects, after.objects, strict=True):
+        for f in dataclasses.fields(rt.Object):
+            a, b = getattr(ours, f.name), getattr(theirs, f.name)
+            assert type(a) is type(b), f.name
+            np.testing.assert_array_equal(a, b, f.name)
+    for f in dataclasses.fields(rt.World):
+        np.testing.assert_array_equal(
+            getattr(before.world, f.name), getattr(after.world, f.name), f.name
+        )
+    assert after.world.links == links and isinstance(after.world.scale, quadrics.Scale)
+    assert after.video == before.video and after.warnings == ["take care"]
+    for f in dataclasses.fields(rt.Poses):
+        np.testing.assert_array_equal(getattr(poses, f.name), getattr(after.poses, f.name), f.name)
+    np.testing.assert_array_equal(after.tracks.frame, before.tracks.frame)
+    np.testing.assert_array_equal(after.tracks.track_id, before.tracks.track_id)
+    np.testing.assert_allclose(after.tracks.xyxy, before.tracks.xyxy, atol=0.0101)
+    np.testing.assert_allclose(after.tracks.score, before.tracks.score, atol=1e-4)
+    assert {after.class_names[c] for c in after.tracks.class_id} == {"chair"}
+
+
+def test_what_is_loaded_saves_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    rt.Result.load(saved).save(again)
+    for name in ("tracks.txt", "objects.json", "poses.txt", "cache/last-poses.npz"):
+        assert (again / name).read_bytes() == (saved / name).read_bytes(), name
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
+    a, b = (trimesh.load(out / "objects.ply") for out in (saved, again))
+    np.testing.assert_allclose(a.vertices, b.vertices, atol=1e-5)
+
+
+def test_objects_are_typed(saved: Path) -> None:
+    found = rt.Result.load(saved).objects[2]
+    assert (found.id, found.class_name, found.status, found.located) == (3, "chair", "ok", True)
+    assert found.center.shape == found.size_m.shape == (3,) and found.center.dtype == np.float64
+    np.testing.assert_allclose(found.center, chair_solids().center_in_world[2], atol=0.03)
+
+
+def test_ellipsoids_of_a_loaded_result_are_those_of_the_fit(chairs: rt.Result, saved: Path) -> None:
+    ours, theirs = chairs.ellipsoids(), rt.Result.load(saved).ellipsoids()
+    np.testing.assert_allclose(theirs.center_in_world, ours.center_in_world, atol=1e-5)
+    np.testing.assert_allclose(theirs.half_axes, ours.half_axes, atol=1e-5)
+    np.testing.assert_allclose(theirs.world_from_obj, ours.world_from_obj, atol=1e-5)
+
+
+def test_ellipsoids_leave_rejected_objects_out(chairs: rt.Result) -> None:
+    result = copy_of(chairs)
+    first = dataclasses.replace(result.objects[0], status="rejected")
+    result.objects = [first, *result.objects[1:]]
+    assert [o.id for o in result.located] == [2, 3]
+    np.testing.assert_array_equal(
+        result.ellipsoids().center_in_world, chairs.fits.ellipsoids.center_in_world[1:]
+    )
+    assert len(rt.Result(result.tracks, (), result.video).ellipsoids()) == 0
+
+
+def test_rows_of_a_class_get_that_of_their_object(chairs: rt.Result, tmp_path: Path) -> None:
+    """tracks.txt has no classes; of a result without poses and objects nothing is missed."""
+    tracks = chairs.tracks[chairs.tracks.track_id < 3]
+    tracks = with_columns(tracks, class_id=np.where(tracks.track_id == 1, CHAIR, CUP))
+    fitted(tracks, None).save(tmp_path)
+    after = rt.Result.load(tmp_path)
+    assert after.poses is None and after.world.scale is None and after.world.units is None
+    assert [after.class_names[c] for c in after.tracks.class_id] == [
+        rt.COCO_NAMES[c] for c in tracks.class_id
+    ]
+    assert not (tmp_path / "poses.txt").exists() and not (tmp_path / "objects.ply").exists()
+
+
+def test_an_empty_result(tmp_path: Path) -> None:
+    rt.Result(rt.Tracks.empty(), (), VideoInfo("a.mp4", 64, 48, 25.0)).save(tmp_path)
+    after = rt.Result.load(tmp_path)
+    assert len(after.tracks) == 0 == len(after.objects) and after.poses is None
+    assert validate_objects(tmp_path / "objects.json") == []
+    assert "distinct objects: none" in after.summary()
+
+
+def test_files_of_an_earlier_run_go(chairs: rt.Result, saved: Path) -> None:
+    stale = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html")
+    for name in stale:
+        (saved / name).write_text("old")
+    (saved / "notes.txt").write_text("mine")
+    fitted(chairs.tracks, None).save(saved)
+    assert not [name for name in stale if (saved / name).exists()]
+    assert (saved / "notes.txt").exists() and rt.Result.load(saved).poses is None
+
+
+def test_evidence_is_rounded_to_four_digits() -> None:
+    links = (rt.LinkEvent("join", (1, 2), 0.123456, -9.87654321, True),
+             rt.LinkEvent("join", (1, 3), None, 0.00004, False))  # fmt: skip
+    written = rt.World(links=links).to_json()["links"]
+    assert [e["place_iou"] for e in written] == [0.1235, None]
+    assert [e["appearance_log_odds"] for e in written] == [-9.8765, 0.0]
+    again = rt.World.from_json(json.loads(json.dumps({"links": written})))
+    assert again.to_json()["links"] == written and again.links[0].tracklets == (1, 2)
+
+
+# ---- The files, as others read them ----
+
+
+def test_tracks_are_motchallenge_rows(tmp_path: Path) -> None:
+    tracks = tracks_of(walk(4), 0.0)
+    write_mot(tmp_path / "t.txt", tracks)
+    rows = np.loadtxt(tmp_path / "t.txt", delimiter=",")
+    assert rows.shape == (12, 10) and (rows[:, 7:] == -1).all()
+    np.testing.assert_array_equal(rows[:, 0], tracks.frame + 1)  # frames from 1
+    np.testing.assert_array_equal(rows[:, 1], tracks.track_id)
+    np.testing.assert_allclose(rows[:, 2:4], tracks.xyxy[:, :2], atol=0.006)
+    np.testing.assert_allclose(rows[:, 2:4] + rows[:, 4:6], tracks.xyxy[:, 2:], atol=0.011)
+    assert (rows[:, 6] == 0.9).all()
+
+
+def test_cameras_are_tum_rows(saved: Path) -> None:
+    tum, poses = np.loadtxt(saved / "poses.txt"), walk()
+    np.testing.assert_allclose(tum[:, 0], poses.time_s, atol=1e-6)
+    rotation = Rotation.from_quat(tum[:, 4:]).as_matrix()  # world_from_cam
+    np.testing.assert_allclose(rotation, poses.cam_from_world[:, :, :3].transpose(0, 2, 1),
+                               atol=1e-6)  # fmt: skip
+    world = np.einsum("fij,fj->fi", poses.cam_from_world[:, :, :3], tum[:, 1:4])
+    np.testing.assert_allclose(world, -poses.cam_from_world[:, :, 3], atol=1e-6)
+
+
+def test_ply_is_a_closed_mesh_at_the_right_place(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
+    solids = chair_solids()
+    write_ply(tmp_path / "o.ply", solids, [1, 2, 3])
+    mesh = trimesh.load(tmp_path / "o.ply")
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    volume = 4 / 3 * np.pi * solids.half_axes.prod(1).sum()
+    assert mesh.volume == pytest.approx(volume, rel=0.05)  # > 0: the normals point outwards
+    np.testing.assert_allclose(mesh.bounds[:, 2], [0, 0.82], atol=0.01)
+    for part in mesh.split():
+        row = np.linalg.norm(solids.center_in_world - part.centroid, axis=1).argmin()
+        local = (part.vertices - solids.center_in_world[row]) @ solids.world_from_obj[row]
+        radius = np.linalg.norm(local / solids.half_axes[row], axis=1)
+        np.testing.assert_allclose(radius, 1, atol=1e-3)
+    assert len(np.unique(mesh.visual.vertex_colors, axis=0)) == 3
+
+
+def test_ply_has_the_located_objects_only(chairs: rt.Result, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
+    result = copy_of(chairs)
+    middle = dataclasses.replace(result.objects[1], status="rejected", center=None)
+    result.objects = [result.objects[0], middle, result.objects[2]]
+    result.save(tmp_path)
+    x = sorted(part.centroid[0] for part in trimesh.load(tmp_path / "objects.ply").split())
+    np.testing.assert_allclose(x, [-1.1, 1.1], atol=0.05)
+
+
+def test_objects_json_says_what_it_means(saved: Path) -> None:
+    data = json.loads((saved / "objects.json").read_text())
+    assert validate_objects(saved / "objects.json") == []
+    assert data["reobj_track"] == rt.__version__ and data["video"]["tracked_frames"] == 40
+    assert data["conventions"]["quaternion"] == "wxyz, world_from_obj"
+    entry = data["objects"][0]
+    assert entry["class"] == "chair" and entry["tracks"] == [1] and entry["frames"] == [[0, 39]]
+    w, x, y, z = entry["quat_wxyz"]
+    axes = Rotation.from_quat([x, y, z, w]).as_matrix()
+    corner = np.array(entry["center"]) + axes @ np.array(entry["size"]) / 2
+    true = chair_solids()
+    local = np.abs(true.world_from_obj[0].T @ (corner - true.center_in_world[0]))
+    np.testing.assert_allclose(np.sort(local), np.sort(true.half_axes[0]), atol=0.06)
+
+
+def test_summary_is_the_table_that_run_prints(chairs: rt.Result, saved: Path) -> None:
+    result = copy_of(chairs, out=saved, seconds={"track": 1.25})
+    result.objects = [*chairs.objects[:2], dataclasses.replace(
+        chairs.objects[2], status="rejected", reason="too far", size=None, size_m=None,
+        size_rel_sigma=None)]  # fmt: skip
+    text = result.summary()
+    assert re.search(r"1  chair +40 +1 +0\.\d\d x 0\.\d\d x 0\.\d\d +\d+ %  ok$", text, re.M)
+    assert re.search(r"3  chair +40 +1 +- +-  rejected \(too far\)$", text, re.M)
+    assert "width x depth x height, m" in text and "distinct objects: 3 chair" in text
+    assert "cameras: 40 of 40 frames (user)" in text and "seconds: track 1.2" in text
+    assert f"look at: {saved / 'objects.json'}" in text
+
+
+# ---- The schema ----
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"status": "fine"}, "objects[0].status"),  # unknown status
+        ({"center": [1, 2]}, "objects[0].center"),  # wrong length
+        ({"id": "one"}, "objects[0].id"),  # wrong type
+        ({"support": "sphere"}, "objects[0].support"),
+        ({"center": None}, "objects[0].center"),  # though it is not rejected
+        ({"views": -1}, "objects[0].views"),
+        ({"cov": [[1.0] * 9] * 8}, "objects[0].cov"),
+    ],
+)
+def test_validate_finds_faults(saved: Path, change: dict[str, object], fault: str) -> None:
+    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
+    data = json.loads((saved / "objects.json").read_text())
+    data["objects"][0] |= change
+    (saved / "objects.json").write_text(json.dumps(data))
+    (line,) = validate_objects(saved / "objects.json")
+    assert fault in line and "objects.json" in line
+
+
+@pytest.mark.parametrize("key", ["format", "world", "objects"])
+def test_validate_misses_nothing_that_must_be_there(saved: Path, key: str) -> None:
+    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
+    data = json.loads((saved / "objects.json").read_text())
+    del data[key]
+    (saved / "objects.json").write_text(json.dumps(data))
+    assert key in validate_objects(saved / "objects.json")[0]
+
+
+def test_validate_refuses_what_is_no_json(tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(rt.ReobjError, match="not valid JSON"):
+        validate_objects(tmp_path / "x.json")
+
+
+# ---- Tracks and embeddings, as the tracker had them ----
+
+
+def embedded_result() -> rt.Result:
+    """Three frames of chairs; some detections were embedded, one of them was never confirmed."""
+    result = fitted(tracks_of(walk(3)), None)
+    row = np.arange(6, dtype=np.float32).reshape(2, 3)
+    embedded = [(np.array([2, 0]), row), (np.empty(0, np.int64), np.empty((0, 0), np.float32)),
+                (np.array([1, 9]), row + 6)]  # fmt: skip
+    result.keep_embeddings([0, 1, 2], embedded, 2)
+    return result
+
+
+def test_embeddings_belong_to_their_rows() -> None:
+    """Frame 0 has chairs 2 and 0, frame 2 chair 1; detection 9 is in no track."""
+    result = embedded_result()
+    rows = result.tracks[result.embedding_row]
+    assert rows.frame.tolist() == [0, 0, 2] and rows.detection_index.tolist() == [2, 0, 1]
+    np.testing.assert_array_equal(result.embeddings.foreground, [[0, 1], [3, 4], [6, 7]])
+    np.testing.assert_array_equal(result.embeddings.background, [[2], [5], [8]])
+    assert result.embeddings.foreground.dtype == np.float16
+
+
+def test_without_a_width_all_is_foreground() -> None:
+    result = fitted(tracks_of(walk(2)), None)
+    result.keep_embeddings([0], [(np.array([1]), np.ones((1, 3), np.float32))], 0)
+    assert result.embeddings.foreground.shape == (1, 3)
+    assert result.embeddings.background.shape == (1, 0)
+    result.keep_embeddings([0, 1], [(np.empty(0, np.int64), np.empty((0, 0), np.float32))] * 2, 0)
+    assert result.embeddings.foreground.shape == (0, 0) and len(result.embedding_row) == 0
+
+
+def test_tracked_is_read_as_it_was(tmp_path: Path) -> None:
+    before = embedded_result()
+    before.warnings, before.identities_given = ["dark"], True
+    before.save_tracked(tmp_path / "a.npz")
+    after = rt.Result.load_tracked(tmp_path / "a.npz")
+    for f in dataclasses.fields(rt.Tracks):
+        a, b = getattr(before.tracks, f.name), getattr(after.tracks, f.name)
+        np.testing.assert_array_equal(a, b, f.name)
+        assert a.dtype == b.dtype
+    np.testing.assert_array_equal(after.embeddings.foreground, before.embeddings.foreground)
+    np.testing.assert_array_equal(after.embeddings.background, before.embeddings.background)
+    np.testing.assert_array_equal(after.embedding_row, before.embedding_row)
+    assert after.class_names == rt.COCO_NAMES and after.video == before.video
+    assert after.warnings == ["dark"] and after.identities_given and after.objects == []
+
+
+# ---- Folders of version 0.1.0 ----
+
+
+def old_objects(out: Path) -> dict[str, object]:
+    """Turn objects.json into one of 0.1.0: links have `look`."""
+    data = json.loads((out / "objects.json").read_text())
+    data["reobj_track"] = "0.1.0"
+    link = {
+        "kind": "join",
+        "tracklets": [1, 2],
+        "place_iou": 0.5,
+        "look": 0.8695702475,
+        "kept": True,
+    }
+    data["world"]["links"] = [link]
+    (out / "objects.json").write_text(json.dumps(data))
+    return data
+
+
+def old_poses(out: Path) -> None:
+    """Write last-poses.npz as 0.1.0 did: facts beside the arrays, covariances, parts."""
+    poses = walk()
+    arrays = {k: getattr(poses, k) for k in ("frame", "time_s", "cam_from_world", "status")}
+    facts = {"camera": {"model": "PINHOLE"}, "source": "user", "metric": True, "up": None}
+    np.savez_compressed(out / "cache/last-poses.npz", **arrays, points=poses.points,
+                        colors=poses.colors, cov=np.zeros((0, 6, 6)), parts=0,
+                        facts=json.dumps(facts))  # fmt: skip
+
+
+def old_tracks(out: Path) -> None:
+    """Write last-tracks.npz as 0.1.0 did: object_id, look, no facts."""
+    tracks = tracks_of(walk())
+    columns = {f.name: getattr(tracks, f.name) for f in dataclasses.fields(rt.Tracks)}
+    columns["object_id"] = columns.pop("track_id")
+    np.savez_compressed(out / "cache/last-tracks.npz", **columns, fixed=False, split=0,
+                        look=np.zeros((0, 0), np.float16), look_row=np.zeros(0, np.int64),
+                        class_names=np.array(rt.COCO_NAMES), messages=np.array([]))  # fmt: skip
+
+
+def test_objects_of_an_old_folder_load(saved: Path) -> None:
+    old_objects(saved)
+    (saved / "cache/last-poses.npz").unlink()
+    (link,) = rt.Result.load(saved).world.links
+    assert link == rt.LinkEvent("join", (1, 2), 0.5, 0.8695702475, True)
+
+
+COMMANDS: dict[str, Callable[[Path], tuple[object, ...]]] = {
+    "export": lambda out: ("export", out, "--to", "cvat"),
+    "eval": lambda out: ("eval", out, "--gt", out / "tracks.txt"),
+    "objects": lambda out: ("objects", out),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_old_folder_says_who_wrote_it(
+    saved: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old_objects(saved)
+    old_poses(saved)
+    old_tracks(saved)
+    assert rt.main([str(a) for a in COMMANDS[command](saved)]) == 2
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1 and error.startswith("error: ")
+    assert "written by reobj_track 0.1.0" in error and f"this is {rt.__version__}" in error
+    assert "run the video again" in error
+
+
+@pytest.mark.parametrize("command", ["export", "eval"])
+def test_objects_of_another_form_say_who_wrote_them(
+    saved: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = json.loads((saved / "objects.json").read_text())
+    for changed in (data | {"reobj_track": "9.9", "objects": [{"id": 1}]},
+                    data | {"reobj_track": "9.9", "world": None},
+                    [data]):  # fmt: skip
+        (saved / "objects.json").write_text(json.dumps(changed))
+        assert rt.main([str(a) for a in COMMANDS[command](saved)]) == 2
+        error = capsys.readouterr().err
+        assert len(error.splitlines()) == 1 and "written by reobj_track" in error
+        assert ("9.9" in error) == isinstance(changed, dict)
+
+
+def test_a_damaged_file_of_this_version_is_no_other_version(saved: Path) -> None:
+    np.savez(saved / "cache/last-poses.npz", frame=np.arange(3))
+    with pytest.raises(rt.ReobjError, match=r"last-poses\.npz: is damaged: run the video again"):
+        rt.Result.load(saved)
+    (saved / "cache/last-poses.npz").write_bytes(b"PK")
+    with pytest.raises(rt.ReobjError, match=r"last-poses\.npz: damaged"):
+        rt.Result.load(saved)
+
+
+@pytest.mark.parametrize("missing", ["objects.json", "tracks.txt"])
+def test_no_output_folder(saved: Path, missing: str) -> None:
+    (saved / missing).unlink()
+    with pytest.raises(rt.ReobjError, match="make them first with `run`"):
+        rt.Result.load(saved)

@@ -1,0 +1,94 @@
+"""Boxes of groups in frames with a pose, against pycolmap and by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pycolmap
+import pytest
+from simulated import CAMERA, SIZE, tracks_of, walk, with_columns
+
+import reobj_track as rt
+from reobj.views import gather_views
+
+
+def one_box_each(frames: list[int], box: tuple[float, ...] = (10, 20, 60, 90)) -> rt.Tracks:
+    """A box in each of some frames, of one object."""
+    n = len(frames)
+    one, zero = np.ones(n, np.int64), np.zeros(n, np.int64)
+    xyxy = np.tile(np.array(box, float), (n, 1))
+    return rt.Tracks(np.array(frames), one, one, xyxy, np.full(n, 0.9), zero, zero)
+
+
+def test_every_box_lies_in_its_frame_and_group() -> None:
+    """Frames of the source that are not consecutive, groups in another order than the rows."""
+    poses = walk(4)
+    poses = dataclasses.replace(poses, frame=np.array([5, 7, 9, 11]))
+    tracks = one_box_each([5, 9, 9])
+    tracks.xyxy[:, 0] = [1, 2, 3]
+    views = gather_views(tracks, poses, np.array([1, 1, 0]), 2, 0.0)
+    assert views.frame.tolist() == [5, 7, 9, 11] and views.boxes.shape == (4, 2, 4)
+    nan = np.nan
+    np.testing.assert_array_equal(views.boxes[:, :, 0], [[nan, 1], [nan, nan], [3, 2], [nan, nan]])
+    np.testing.assert_array_equal(views.score, [[0, 0.9], [0, 0], [0.9, 0.9], [0, 0]])
+    assert views.image_size == SIZE
+
+
+def test_frames_without_a_pose_are_no_views() -> None:
+    poses = walk(5)
+    poses.cam_from_world[2] = np.nan
+    tracks = one_box_each([0, 1, 2, 3, 99])
+    views = gather_views(tracks, poses, np.zeros(5, np.int64), 1, 0.0)
+    assert views.frame.tolist() == [0, 1, 3, 4]
+    assert np.isfinite(views.boxes[:, 0, 0]).tolist() == [True, True, True, False]
+    known = poses.cam_from_world[[0, 1, 3, 4]]
+    np.testing.assert_allclose(views.img_from_world, CAMERA.K @ known)
+
+
+@pytest.mark.parametrize(
+    ("min_score", "seen"), [(0.0, 3), (0.3, 3), (0.31, 2), (0.9, 1), (0.95, 0)]
+)
+def test_boxes_below_the_score_are_no_views(min_score: float, seen: int) -> None:
+    tracks = with_columns(one_box_each([0, 1, 2]), score=np.array([0.3, 0.5, 0.9]))
+    views = gather_views(tracks, walk(3), np.zeros(3, np.int64), 1, min_score)
+    assert np.isfinite(views.boxes[:, 0, 0]).sum() == (views.score > 0).sum() == seen
+
+
+def test_boxes_are_undistorted_as_pycolmap_does() -> None:
+    """Each edge goes through its undistorted middle; edges at the border of the image stay."""
+    params = (520.0, 320.0, 240.0, 0.2)
+    poses = walk(2, camera=rt.Camera("SIMPLE_RADIAL", *SIZE, params))
+    inner, border = (400.0, 300, 600, 450), (0.0, 100, 200, 480)
+    tracks = one_box_each([0, 1])
+    tracks.xyxy[:] = [inner, border]
+    views = gather_views(tracks, poses, np.zeros(2, np.int64), 1, 0.0)
+    model = pycolmap.Camera(model="SIMPLE_RADIAL", width=640, height=480, params=list(params))
+
+    def ideal(x: float, y: float) -> np.ndarray:
+        return 520 * np.asarray(model.cam_from_img(np.array([[x, y]])))[0] + [320, 240]
+
+    x1, y1, x2, y2 = inner
+    x, y = (x1 + x2) / 2, (y1 + y2) / 2
+    expected = [ideal(x1, y)[0], ideal(x, y1)[1], ideal(x2, y)[0], ideal(x, y2)[1]]
+    np.testing.assert_allclose(views.boxes[0, 0], expected, atol=1e-6)
+    assert (views.boxes[0, 0] < inner).all()  # the lens pushes points outwards
+    assert views.boxes[1, 0, 0] == 0 and views.boxes[1, 0, 3] == 480
+    assert views.boxes[1, 0, 2] > 200  # left of the middle: outwards is to the left
+
+
+def test_no_tracks_make_empty_views() -> None:
+    views = gather_views(rt.Tracks.empty(), walk(3), np.empty(0, np.int64), 0, 0.0)
+    assert views.boxes.shape == (3, 0, 4) and views.score.shape == (3, 0)
+
+
+def test_cameras_of_views_project_like_the_poses() -> None:
+    poses = walk(6)
+    tracks = tracks_of(poses, 0.0)
+    views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.0)
+    pose = pycolmap.Rigid3d(poses.cam_from_world[4])
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=list(CAMERA.params))
+    point = np.array([0.3, 0.2, 0.5])
+    x, y, z = views.img_from_world[4] @ [*point, 1]
+    expected = np.ravel(camera.img_from_cam(pose * point))
+    np.testing.assert_allclose([x / z, y / z], expected, atol=1e-9)

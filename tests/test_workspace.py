@@ -1,0 +1,222 @@
+"""The output folder: what may be written where, what is found again, what never mixes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from simulated import fitted, tracks_of, walk
+
+import reobj_track as rt
+from reobj.results.workspace import Workspace
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> rt.Video:
+    return rt.Video(frames(tmp_path / "frames", 90))
+
+
+def frames(folder: Path, grey: int) -> Path:
+    """A folder of two frames."""
+    folder.mkdir()
+    for i in range(2):
+        cv2.imwrite(str(folder / f"{i}.png"), np.full((48, 64, 3), grey, np.uint8))
+    return folder
+
+
+# ---- Whose folder it is ----
+
+
+def test_a_folder_of_others_is_not_written_into(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(rt.ReobjError, match=r"not made by reobj_track.*--overwrite"):
+        Workspace(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+    Workspace(tmp_path, overwrite=True)
+    assert (tmp_path / "thesis.tex").read_text() == "precious"
+    Workspace(tmp_path)  # it is ours now
+
+
+def test_a_model_of_others_is_never_lost(tmp_path: Path) -> None:
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(rt.ReobjError, match="sparse/ of its own"):
+        Workspace(tmp_path, overwrite=True)
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("")
+    for overwrite in (False, True):
+        with pytest.raises(rt.ReobjError, match="is a file"):
+            Workspace(tmp_path / "out", overwrite)
+
+
+def test_new_and_empty_folders_are_taken(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    for out in (tmp_path / "empty", tmp_path / "a" / "b"):
+        assert Workspace(out).cache.is_dir()
+
+
+def test_only_folders_of_earlier_runs_are_opened(tmp_path: Path) -> None:
+    with pytest.raises(rt.ReobjError, match="make one with `run`"):
+        Workspace.open(tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
+    Workspace(tmp_path / "out")
+    with pytest.raises(rt.ReobjError, match="no tracks here"):
+        Workspace.open(tmp_path / "out").load_last()
+
+
+# ---- One video a folder ----
+
+
+def test_results_of_two_videos_never_mix(video: rt.Video, tmp_path: Path) -> None:
+    """Another video needs --overwrite, and then nothing of the first one is left."""
+    space = Workspace(tmp_path / "out")
+    space.bind(video)
+    poses = walk(2)
+    result = fitted(tracks_of(poses), poses)
+    space.save_last(result, poses)
+    result.save(space.out)
+    (space.out / "overlay.mp4").write_text("of the first video")
+    other = rt.Video(frames(tmp_path / "other", 10))
+    with pytest.raises(rt.ReobjError, match=r"frames, not of .*other.*--overwrite"):
+        space.bind(other)
+    assert space.last_tracks is not None and space.source[0] == str(tmp_path / "frames")
+    space.bind(other, overwrite=True)
+    assert space.source[0] == str(tmp_path / "other") and space.last_tracks is None
+    left = sorted(str(p.relative_to(space.out)) for p in space.out.rglob("*"))
+    assert left == ["cache", "cache/source.json"]
+
+
+def test_a_changed_video_is_another_one(video: rt.Video, tmp_path: Path) -> None:
+    space = Workspace(tmp_path / "out")
+    space.bind(video)
+    cv2.imwrite(str(tmp_path / "frames/2.png"), np.zeros((48, 64, 3), np.uint8))
+    with pytest.raises(rt.ReobjError, match="holds the results of"):
+        space.bind(rt.Video(tmp_path / "frames"))
+
+
+def test_the_same_video_with_other_options_is_the_same_video(
+    video: rt.Video, tmp_path: Path
+) -> None:
+    space = Workspace(tmp_path / "out")
+    space.bind(video)
+    space.save_last(fitted(tracks_of(walk(2)), None), None)
+    config = rt.InputConfig(every=2, start=1, max_size=32)
+    space.bind(rt.Video(tmp_path / "frames", config))
+    assert space.source == (str(tmp_path / "frames"), config)
+    assert space.last_tracks is not None
+
+
+def test_the_source_is_found_from_anywhere(
+    video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    space = Workspace("out")
+    space.bind(rt.Video("frames"))
+    assert space.source[0] == str(tmp_path / "frames")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"source": "a", "input": {"evry": 1}}'])
+def test_a_damaged_binding_is_said(tmp_path: Path, text: str) -> None:
+    space = Workspace(tmp_path)
+    (space.cache / "source.json").write_text(text)
+    with pytest.raises(rt.ReobjError, match=r"source\.json"):
+        _ = space.source
+
+
+# ---- The cache ----
+
+
+def test_a_stage_is_found_again_under_the_same_inputs_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = Workspace(tmp_path)
+    config = rt.TrackerConfig()
+    path = space.path("tracks", "video", config)
+    assert path == Workspace(tmp_path).path("tracks", "video", rt.TrackerConfig())
+    assert path.parent == space.cache and path.name.startswith("tracks-")
+    others = [
+        space.path("poses", "video", config),
+        space.path("tracks", "another video", config),
+        space.path("tracks", "video"),
+        *(space.path("tracks", "video", dataclasses.replace(config, **{f.name: 99}))
+          for f in dataclasses.fields(config)),
+    ]  # fmt: skip
+    monkeypatch.setattr("reobj.results.workspace.__version__", "9.9")
+    others.append(space.path("tracks", "video", config))
+    assert len({path, *others}) == 1 + len(others)
+
+
+def test_the_latest_tracks_and_poses_are_kept(tmp_path: Path) -> None:
+    space, poses = Workspace(tmp_path), walk(3)
+    result = fitted(tracks_of(poses), None)
+    space.save_last(result, poses)
+    again = space.load_last()
+    np.testing.assert_array_equal(again.tracks.xyxy, result.tracks.xyxy)
+    np.testing.assert_array_equal(again.poses.cam_from_world, poses.cam_from_world)
+    space.save_last(result, None)  # a later run in 2D
+    assert space.load_last().poses is None
+    assert not [p for p in space.out.rglob("*") if p.name.startswith(".part-")]
+
+
+def test_the_published_model_is_a_copy(tmp_path: Path) -> None:
+    space = Workspace(tmp_path / "out")
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).write_text(name)
+        space.publish_model(tmp_path / name)
+        assert [p.name for p in (space.out / "sparse").iterdir()] == [name]
+    shutil.rmtree(tmp_path / "b")
+    assert (space.out / "sparse/b").read_text() == "b"
+    space.publish_model(tmp_path / "b")  # a failed reconstruction has none
+    assert not (space.out / "sparse").exists()
+    space.publish_model(tmp_path / "a")
+    space.publish_model(None)
+    assert sorted(p.name for p in space.out.iterdir()) == ["cache"]
+
+
+def test_a_model_is_published_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = Workspace(tmp_path / "out")
+    (tmp_path / "model").mkdir()
+    for name in ("1", "2"):
+        (tmp_path / "model" / name).write_text("first")
+    space.publish_model(tmp_path / "model")
+
+    def interrupted(source: Path, target: Path) -> None:
+        target.mkdir()
+        (target / "1").write_text("second")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(shutil, "copytree", interrupted)
+        space.publish_model(tmp_path / "model")
+    assert [(space.out / "sparse" / n).read_text() for n in ("1", "2")] == ["first", "first"]
+    space.publish_model(tmp_path / "model")
+    assert sorted(p.name for p in space.out.iterdir()) == ["cache", "sparse"]
+
+
+def test_the_binding_is_written_whole_or_not_at_all(
+    video: rt.Video, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = Workspace(tmp_path / "out")
+    space.bind(video)
+    before = (space.cache / "source.json").read_bytes()
+
+    def full(path: Path, text: str) -> None:
+        path.write_bytes(text.encode()[:10])
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        space.bind(rt.Video(tmp_path / "frames", rt.InputConfig(every=2)))
+    assert (space.cache / "source.json").read_bytes() == before
+    assert json.loads(before)["input"]["every"] == 1
+    assert [p.name for p in space.cache.iterdir()] == ["source.json"]
