@@ -104,7 +104,7 @@ def export_cvat(result: Result, path: Path) -> None:
     """Write "CVAT for video 1.1": one track an object, every box a keyframe.
 
     `outside` marks the frame after each visit. CVAT numbers tracks from 0 in the order of the file:
-    track 0 is object 1.
+    track 0 is object 1. Filled gaps are left out: corrected by hand they would count as detections.
 
     Source: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
     """
@@ -124,7 +124,7 @@ def export_cvat(result: Result, path: Path) -> None:
     following = dict(itertools.pairwise(frames))
     for identity, class_id in object_classes(tracks).items():
         facts = {"id": str(identity - 1), "label": result.class_names[class_id], "source": "auto"}
-        rows = tracks[tracks.track_id == identity]
+        rows = tracks[(tracks.track_id == identity) & (tracks.score > 0)]
         _cvat_boxes(ET.SubElement(root, "track", facts), rows, following)
     ET.indent(root)
     with atomic(path) as part:
@@ -197,9 +197,10 @@ def export_glb(result: Result, path: Path) -> None:
 
 
 def export_rrd(result: Result, path: Path) -> None:
-    """Write a recording for the rerun viewer with rerun-sdk: ellipsoids, points and, on the
-    timeline `frame`, the camera and the boxes it sees. z is up, units are metres if the scale is
-    known.
+    """Write a recording for the rerun viewer with rerun-sdk.
+
+    Ellipsoids, points and, on the timeline `frame`, the camera and the boxes it sees; z is up,
+    units are metres if the scale is known.
     """
     try:
         import rerun as rr

@@ -174,8 +174,10 @@ def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
 def _scene_object(
     found: Object, tracks: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
-    """Describe an object for the page: its entry of objects.json without covariance, its colour,
-    pictures, and the steps in which it is seen (first, last, first, last ...).
+    """Describe an object for the page.
+
+    Its entry of objects.json without covariance, its colour, its pictures, and the steps in which
+    it is seen (first, last, first, last ...).
     """
     seen = np.isin(steps, tracks.frame[tracks.track_id == found.id])
     runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
