@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from simulated import looking_at
 
 import quadrics
 import reobj_track as rt
@@ -16,15 +17,6 @@ SIZE = (640, 480)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
 NAMES = rt.COCO_NAMES
 PERSON, CHAIR, CUP = 0, 56, 41
-
-
-def looking_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """cam_from_world (3, 4) of a camera at `eye` in a world with z up."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.c_[rotation, -rotation @ eye]
 
 
 def walk(frames: int = 120, arc_deg: float = 120.0) -> rt.Poses:
