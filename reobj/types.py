@@ -131,7 +131,8 @@ class Tracks:
         track_id: identity, from 1; 0 while a track is still tentative.
         tracklet_id: uninterrupted piece of track, from 1; an identity that returns has several.
         xyxy, score, class_id: of the detection; in the table of a video in native pixels.
-        detection_index: row of the detection in what was handed to the tracker; -1: unknown.
+        detection_index: row of the detection in what was handed to the tracker; -1: unknown, or a
+            filled gap (score 0).
     """
 
     frame: IntArray
@@ -176,7 +177,7 @@ class Tracks:
         return table[table.track_id > 0]
 
     def with_identities(self, track_id: IntArray) -> Tracks:
-        """The same rows with other identities, renumbered 1, 2, ... by first appearance."""
+        """Return the rows with other identities, renumbered 1, 2, ... by first appearance."""
         _, first, inverse = np.unique(track_id, return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
         rank[np.argsort(first)] = np.arange(1, len(first) + 1)
@@ -247,7 +248,7 @@ def as_detections(found: Any) -> Detections:
 
 
 def object_classes(table: Tracks) -> dict[int, int]:
-    """Class of each object: the one with the largest sum of scores."""
+    """Return the class of each object: the one with the largest sum of scores."""
     objects, row = np.unique(table.track_id, return_inverse=True)
     classes, column = np.unique(table.class_id, return_inverse=True)
     votes = np.zeros((len(objects), len(classes)))
@@ -257,14 +258,14 @@ def object_classes(table: Tracks) -> dict[int, int]:
 
 
 def class_shares(table: Tracks, group: IntArray, count: int) -> Array:
-    """Share of every class in the scores of each group of rows, (count, C)."""
+    """Return the share of every class in the scores of each group of rows, (count, C)."""
     votes = np.zeros((count, int(table.class_id.max(initial=0)) + 1))
     np.add.at(votes, (group, table.class_id.clip(0)), table.score)
     return np.asarray(votes / np.maximum(votes.sum(1, keepdims=True), 1e-9))
 
 
 def box_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
-    """Intersection over union of every box in a (A, 4) with every box in b (B, 4): (A, B)."""
+    """Return the intersection over union (A, B) of boxes a (A, 4) with boxes b (B, 4)."""
     a, b = a_xyxy[:, None], b_xyxy[None]  # (A, 1, 4), (1, B, 4)
     overlap = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])  # (A, B, 2)
     inter = overlap.clip(0).prod(-1)  # (A, B)
@@ -273,18 +274,18 @@ def box_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
 
 
 def cxcywh_from_xyxy(xyxy: Array) -> Array:
-    """Centre and size of boxes (N, 4)."""
+    """Convert boxes (N, 4) from corners to centre and size."""
     return np.concatenate([(xyxy[:, :2] + xyxy[:, 2:]) / 2, xyxy[:, 2:] - xyxy[:, :2]], 1)
 
 
 def xyxy_from_cxcywh(box: Array) -> Array:
-    """Corners (N, 4) of boxes given by centre and size (N, 4+)."""
+    """Convert boxes (N, 4+) from centre and size to corners (N, 4)."""
     half = box[:, 2:4] / 2
     return np.concatenate([box[:, :2] - half, box[:, :2] + half], 1)
 
 
 def rows_by(group: IntArray) -> list[IntArray]:
-    """Row numbers of each distinct value, in the order of the values."""
+    """List the row numbers of each distinct value, in the order of the values."""
     order = np.argsort(group, kind="stable")
     _, starts = np.unique(group[order], return_index=True)
     return np.split(order, starts[1:]) if len(group) else []
@@ -307,7 +308,7 @@ def unit_rows(rows: npt.NDArray[Any]) -> Array:
 
 
 def object_color(object_id: int) -> tuple[int, int, int]:
-    """A BGR colour for an identity, well apart from its neighbours (golden-angle hues)."""
+    """Return the BGR colour of an identity, well apart from its neighbours (golden-angle hues)."""
     hue = object_id * 0.381966 % 1.0
     color = (round(hue * 179), 200 - 60 * (object_id % 2), 255 - 45 * (object_id // 2 % 2))
     hsv = np.array([[color]], np.uint8)

@@ -82,7 +82,7 @@ def _rays_of_track(poses: Poses, frame: IntArray, xy: Array) -> tuple[IntArray, 
 
 
 def _residual_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
-    """Median angle of rays (n, 3) to their nearest point or, if that fits better, to infinity."""
+    """Return the median angle of rays (n, 3) to their nearest point or, if less, to infinity."""
     ray, centre, point = triangulate_rays(cam_from_world, rays_in_cam)
     toward = np.stack([point - centre, np.broadcast_to(ray.mean(0), ray.shape)])  # (2, n, 3)
     cosine = (ray * toward).sum(2) / np.maximum(np.linalg.norm(toward, axis=2), 1e-12)  # (2, n)
