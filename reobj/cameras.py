@@ -148,6 +148,11 @@ class Poses:
         metric: True when world units are metres.
         up_in_world: (3,) unit vector against gravity, or None if unknown.
         points: (N, 3) sparse points in world; colors (N, 3) uint8 RGB.
+        visibility: (M, 2) which points were observed in which frames: row of the frame, row of the
+            point.
+        part: (F,) rigid part of the path that each frame belongs to, 0 the largest. Every part has
+            a world and a scale of its own: nothing is known of how two of them lie to each other.
+            A frame without a pose counts to the part of the nearest frame that has one.
         messages: what the user should know (spans without poses and what helps).
     """
 
@@ -161,7 +166,35 @@ class Poses:
     up_in_world: Array | None = None
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    part: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     messages: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.part) != len(self.frame):
+            object.__setattr__(self, "part", np.zeros(len(self.frame), np.int64))
+
+    @property
+    def part_count(self) -> int:
+        """Number of parts, at least 1."""
+        return int(self.part.max(initial=0)) + 1
+
+    def of_part(self, part: int) -> Poses:
+        """Return one part alone: its frames, poses and points in its world, and no messages."""
+        rows = np.flatnonzero(self.part == part)
+        row_of = np.full(len(self.frame), -1)
+        row_of[rows] = np.arange(len(rows))
+        seen = self.visibility[np.isin(self.visibility[:, 0], rows)]
+        kept = np.unique(seen[:, 1]) if self.part_count > 1 else np.arange(len(self.points))
+        return dataclasses.replace(
+            self,
+            **{k: getattr(self, k)[rows] for k in ("frame", "time_s", "cam_from_world", "status")},
+            points=self.points[kept],
+            colors=self.colors[kept],
+            visibility=np.column_stack([row_of[seen[:, 0]], np.searchsorted(kept, seen[:, 1])]),
+            part=np.zeros(len(rows), np.int64),
+            messages=(),
+        )
 
     @property
     def known(self) -> BoolArray:
@@ -169,7 +202,9 @@ class Poses:
         return np.asarray(np.isfinite(self.cam_from_world).all((1, 2)), bool)
 
 
-_POSE_ARRAYS = ("frame", "time_s", "cam_from_world", "status", "points", "colors")
+_POSE_ARRAYS = (
+    "frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part"
+)  # fmt: skip
 
 
 def save_poses(path: Path, poses: Poses) -> None:

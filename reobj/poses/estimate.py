@@ -109,7 +109,8 @@ def estimate_poses(
     cam_from_world, status = fill_gaps(frame, cam_from_world, status, config.max_gap)
     shutil.rmtree(work_dir / "mapping")
     found = (model.cameras[0], frame, time_s, cam_from_world, status, "pycolmap")
-    poses = Poses(*found, points=model.points, colors=model.colors)
+    seen = np.column_stack([key_rows[model.obs_image], model.obs_point])
+    poses = Poses(*found, points=model.points, colors=model.colors, visibility=seen)
     messages += _lost_frames(frame, poses.known)
     return dataclasses.replace(poses, messages=tuple(messages))
 
