@@ -16,7 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from reobj.cameras import Camera, Poses, import_pycolmap, parse_camera, read_sparse_model
+from reobj.cameras import (
+    Camera,
+    Poses,
+    SparseModel,
+    import_pycolmap,
+    parse_camera,
+    read_sparse_model,
+)
 from reobj.files import Progress, spans
 from reobj.poses.keyframes import MAX_FLOW, MIN_FLOW, ResizedFrame, ResizedVideo, pick_keyframes
 from reobj.poses.localize import fill_gaps, locate_between
@@ -44,7 +51,7 @@ class PosesConfig:
         "--camera",
     )
     size_px: int = option(640, "longer side to which frames are shrunk for the reconstruction, px")
-    max_keyframes: int = option(150, "most keyframes; a longer way takes wider steps")
+    max_keyframes: int = option(400, "most keyframes; a longer way takes wider steps")
     max_gap: int = option(
         15, "most lost frames in a row that are interpolated (and marked `interpolated`)"
     )
@@ -78,56 +85,134 @@ def estimate_poses(
     camera, resized = parse_camera(config.camera, size), ResizedVideo(video, config.size_px)
     line = progress("keyframes", video.expected)
     keys = _enough_keyframes(resized, config.max_keyframes, line)
-    images, names = [key.bgr for key in keys], [_frame_name(video, key.frame) for key in keys]
-    boxes = [
-        np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4))
-        for k in keys
-    ]
-    messages = reconstruct(
-        images,
-        names,
-        boxes,
-        size,
-        camera=camera,
-        focal_guesses=[] if camera else [*filter(None, [_exif_focal(video)]), FOCAL_GUESS],
-        seed=config.seed,
-        work_dir=work_dir,
-        progress=progress,
-    )
+    focal = _exif_focal(video) or FOCAL_GUESS
+
+    def mapped(keys: list[ResizedFrame]) -> tuple[list[SparseModel], list[str]]:
+        found = reconstruct(
+            [key.bgr for key in keys],
+            [key.row + 1 for key in keys],
+            [_frame_name(video, key.frame) for key in keys],
+            [
+                np.empty((0, 4)) if boxes_to_mask is None
+                else np.reshape(boxes_to_mask(key.frame), (-1, 4))
+                for key in keys
+            ],
+            size,
+            camera=camera,
+            focal_guess=focal,
+            seed=config.seed,
+            work_dir=work_dir,
+            progress=progress,
+        )  # fmt: skip
+        return [read_sparse_model(model) for model in found.models], found.messages
+
+    row_of = {_frame_name(video, number): row for row, number in enumerate(resized.frames)}
+    models, messages = mapped(keys)
+    part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
+    more = rows_around_breaks([key.row for key in keys], part_rows)
+    if models and more:  # the same again with more keyframes where it broke
+        wanted = set(more)
+        extra = [frame for frame in resized if frame.row in wanted]
+        keys = sorted([*keys, *extra], key=lambda key: key.row)
+        models, messages = mapped(keys)
+        part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
+    shutil.rmtree(work_dir / "mapping", ignore_errors=True)
     frame, time_s = np.array(resized.frames, np.int64), np.array(resized.times_s, np.float64)
-    if not (work_dir / "sparse").exists():
-        shutil.rmtree(work_dir / "mapping", ignore_errors=True)
+    if not models:
         guess = (FOCAL_GUESS * max(size), size[0] / 2, size[1] / 2)
         camera = camera or Camera("SIMPLE_PINHOLE", *size, guess)
         nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
         return Poses(camera, frame, time_s, nothing, none, "none", messages=tuple(messages))
-    model = read_sparse_model(work_dir / "sparse")
-    row_of = {_frame_name(video, number): row for row, number in enumerate(resized.frames)}
-    key_rows = np.array([row_of[name] for name in model.names])
     line = progress("pnp", len(frame))
-    cam_from_world, status = locate_between(model, key_rows, resized, config.seed, line)
-    cam_from_world, status = fill_gaps(frame, cam_from_world, status, config.max_gap)
-    shutil.rmtree(work_dir / "mapping")
-    found = (model.cameras[0], frame, time_s, cam_from_world, status, "pycolmap")
-    seen = np.column_stack([key_rows[model.obs_image], model.obs_point])
-    poses = Poses(*found, points=model.points, colors=model.colors, visibility=seen)
+    poses = _locate_all(models, part_rows, resized, config, line)
+    messages += _breaks(poses)
     messages += _lost_frames(frame, poses.known)
     return dataclasses.replace(poses, messages=tuple(messages))
+
+
+def _locate_all(
+    models: list[SparseModel],
+    part_rows: list[IntArray],
+    video: ResizedVideo,
+    config: PosesConfig,
+    line: Progress,
+) -> Poses:
+    """Locate all frames in the parts of the reconstruction, each in the first that explains it.
+
+    Args:
+        part_rows: row of each image of each model in the video.
+    """
+    frame, time_s = np.array(video.frames, np.int64), np.array(video.times_s, np.float64)
+    cam_from_world = np.full((len(frame), 3, 4), np.nan)
+    status, part = np.full(len(frame), "none", "<U12"), np.full(len(frame), -1)
+    seen, first = [], 0
+    for number, (model, rows) in enumerate(zip(models, part_rows, strict=True)):
+        cameras, found = locate_between(model, rows, video, config.seed, line)
+        cameras, found = fill_gaps(frame, cameras, found, config.max_gap)
+        mine = (found != "none") & (part < 0)
+        mine |= np.isin(np.arange(len(frame)), rows)  # its own keyframes
+        cam_from_world[mine], status[mine], part[mine] = cameras[mine], found[mine], number
+        seen.append(np.column_stack([rows[model.obs_image], first + model.obs_point]))
+        first += len(model.points)
+    known = np.flatnonzero(part >= 0)
+    nearest = np.abs(known[:, None] - np.arange(len(frame))).argmin(0)  # (F,)
+    return Poses(
+        models[0].cameras[0],
+        frame,
+        time_s,
+        cam_from_world,
+        status,
+        "pycolmap",
+        points=np.concatenate([model.points for model in models]),
+        colors=np.concatenate([model.colors for model in models]),
+        visibility=np.concatenate(seen),
+        part=part[known[nearest]],
+    )
 
 
 MIN_KEYFRAMES = 40  # below, the spacing is halved as long as there is motion (chosen)
 
 
 def _enough_keyframes(video: ResizedVideo, most: int, line: Progress) -> list[ResizedFrame]:
-    """Pick keyframes, at half the flow for as long as they are fewer than MIN_KEYFRAMES."""
+    """Pick keyframes, at half the flow for as long as they are fewer than MIN_KEYFRAMES.
+
+    Of so few pictures all are taken: they are photos, with wide steps.
+    """
     keys, max_flow = pick_keyframes(video.first_pass(line), most), MAX_FLOW
-    wanted = min(MIN_KEYFRAMES, len(video.frames), most // 2)  # thinning leaves half of them
+    if not keys:
+        raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
+    if len(video.frames) <= MIN_KEYFRAMES:
+        return list(video)
+    wanted = min(MIN_KEYFRAMES, most // 2)  # thinning leaves half of them
     while len(keys) < wanted and max_flow > 2 * MIN_FLOW:
         max_flow /= 2
         keys = pick_keyframes(video, most, max_flow)
-    if not keys:
-        raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
     return keys
+
+
+MAX_EXTRA = 8  # keyframes added between two where the reconstruction broke (chosen)
+
+
+def rows_around_breaks(key_rows: list[int], part_rows: list[IntArray]) -> list[int]:
+    """Choose frames for more keyframes where a reconstruction broke.
+
+    A break is between two keyframes of different parts, or without one; the steps on its two sides
+    are filled too.
+
+    Args:
+        key_rows: rows of all keyframes, ascending. part_rows: of those of each part.
+    Returns:
+        rows of frames that are no keyframes yet, ascending.
+    """
+    part_of = {int(row): part for part, rows in enumerate(part_rows) for row in rows}
+    parts = [part_of.get(row, -1) for row in key_rows]
+    broken = [k for k in range(len(parts) - 1) if parts[k] != parts[k + 1] or parts[k] < 0]
+    steps = {s for k in broken for s in (k - 1, k, k + 1) if 0 <= s < len(key_rows) - 1}
+    rows: set[int] = set()
+    for a, b in ((key_rows[s], key_rows[s + 1]) for s in sorted(steps)):
+        count = min(MAX_EXTRA, b - a - 1)
+        rows |= set(np.linspace(a, b, count + 2).round().astype(int)[1:-1].tolist())
+    return sorted(rows - set(key_rows))
 
 
 def _frame_name(video: Any, number: int) -> str:
@@ -142,6 +227,24 @@ def _exif_focal(video: Any) -> float:
             if camera.has_prior_focal_length:
                 return float(camera.mean_focal_length() / max(camera.width, camera.height))
     return 0.0
+
+
+def _breaks(poses: Poses) -> list[str]:
+    """Say where the reconstruction broke, what was done and what helps; [] if it is one part."""
+    if poses.part_count < 2:
+        return []
+    located = np.flatnonzero(poses.known)
+    step = int(np.median(np.diff(poses.frame)))
+    parts = [
+        spans(poses.frame[located[poses.part[located] == k]].tolist(), step)
+        for k in range(poses.part_count)
+    ]
+    listed = "; ".join(f"part {k + 1}: frames {text}" for k, text in enumerate(parts))
+    return [
+        f"the reconstruction broke into {len(parts)} parts ({listed}): between them too few points "
+        "were seen from both sides, also with more keyframes there. Each part has a frame and a "
+        "scale of its own; more overlap, slower turns, --camera, or --poses help"
+    ]
 
 
 def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:

@@ -1,0 +1,155 @@
+"""Features and matches of keyframes, in a pycolmap database.
+
+RootSIFT by OpenCV, pairs in sequence and by retrieval, matching and verification by pycolmap. What
+was done before is not done again, so that keyframes can be added.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from reobj.cameras import import_pycolmap
+from reobj.poses.child import send_progress
+from reobj.types import Array, Image
+
+
+def extract_features(
+    database: Path, images: Any, ids: Sequence[int], boxes: Sequence[Array], camera: Any
+) -> None:
+    """Write keyframes and their RootSIFT features into a database, those that it does not have.
+
+    Args:
+        images: (K, h, w, 3) BGR. ids: of each, above 0. boxes: (M, 4) xyxy of each, pixels of the
+            images: no features there. camera: `pycolmap.Camera` with id 1, of all images.
+    """
+    pc, threads = import_pycolmap(), cv2.getNumThreads()
+    with contextlib.closing(pc.Database.open(str(database))) as db, ThreadPoolExecutor(2) as pool:
+        if not db.exists_camera(1):
+            db.write_camera(camera, use_camera_id=True)
+            rig = pc.Rig(rig_id=1)
+            rig.add_ref_sensor(camera.sensor_id)
+            db.write_rig(rig, use_rig_id=True)
+        todo = [k for k, number in enumerate(ids) if not db.exists_descriptors(number)]
+        cv2.setNumThreads(1)
+        found = pool.map(lambda k: _root_sift(images[k], np.array(boxes[k])), todo)
+        for done, (k, (xy, descriptors)) in enumerate(zip(todo, found, strict=True), 1):
+            if not db.exists_image(ids[k]):
+                image = pc.Image(name=f"{ids[k]:06d}", camera_id=1, image_id=ids[k])
+                db.write_image(image, use_image_id=True)
+                frame = pc.Frame(frame_id=ids[k], rig_id=1)
+                frame.add_data_id(image.data_id)
+                db.write_frame(frame, use_frame_id=True)
+            if not db.exists_keypoints(ids[k]):
+                db.write_keypoints(ids[k], xy)
+            sift = pc.FeatureDescriptors(pc.FeatureExtractorType.SIFT, descriptors)
+            db.write_descriptors(ids[k], sift)
+            send_progress("features", done, len(todo))
+        cv2.setNumThreads(threads)
+
+
+SIFT_FEATURES = 2000  # a keyframe, the strongest (chosen; 4096 was slower and no better)
+SIFT_CONTRAST = 0.02  # contrast threshold (chosen; OpenCV's default: .04)
+SIFT_CONTRAST_LOW = 0.007  # the same for plain walls, where that finds too few (chosen)
+SIFT_FEW = 500  # features that are too few (chosen)
+
+
+def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]:
+    """Detect features outside the boxes and describe them by RootSIFT.
+
+    Args:
+        boxes: (M, 4) xyxy, pixels of the image.
+    Returns:
+        xy: (N, 2) COLMAP pixels. descriptors: (N, 128).
+    Ref: Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012.
+    """
+    gray = cv2.cvtColor(np.ascontiguousarray(bgr), cv2.COLOR_BGR2GRAY)
+    mask = np.full(gray.shape, 255, np.uint8)
+    for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
+        mask[math.floor(y1) : math.ceil(y2), math.floor(x1) : math.ceil(x2)] = 0
+    for contrast in (SIFT_CONTRAST, SIFT_CONTRAST_LOW):
+        sift: Any = cv2.SIFT.create(nfeatures=SIFT_FEATURES, contrastThreshold=contrast)
+        keypoints, found = sift.detectAndCompute(gray, mask)
+        if len(keypoints) >= SIFT_FEW:
+            break
+    if found is None or not len(keypoints):
+        return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
+    # OpenCV has the centre of the first pixel at (0, 0), COLMAP at (.5, .5)
+    xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(0.5)  # (N, 2)
+    root = np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-9)) * 512
+    return xy, np.minimum(root, 255).astype(np.uint8)
+
+
+MAX_EXHAUSTIVE = 30  # keyframes of which all pairs are matched (chosen: 435 pairs)
+OFFSETS = [1 << k for k in range(12)]  # of more, pairs so far apart (COLMAP: quadratic overlap)
+MATCH_CHUNK = 100  # pairs between two lines of progress (chosen)
+
+
+def match_features(database: Path, ids: Sequence[int], seed: int) -> None:
+    """Match and verify all pairs of a few keyframes, else sequential pairs and retrieved ones.
+
+    COLMAP skips the pairs that are matched already.
+
+    Args:
+        ids: of the keyframes, in the order of time.
+    """
+    pc, listed, count = import_pycolmap(), database.parent / "pairs.txt", len(ids)
+    with contextlib.closing(pc.Database.open(str(database))) as db:
+        descriptors = [np.asarray(db.read_descriptors(number).data) for number in ids]
+    pairs = set(itertools.combinations(range(count), 2))
+    if count > MAX_EXHAUSTIVE:
+        pairs = {(i, i + offset) for offset in OFFSETS for i in range(count - offset)}
+        pairs |= set(_pairs_from_retrieval(descriptors, seed))
+    ordered = sorted((ids[i], ids[j]) for i, j in pairs)
+    for start in range(0, len(ordered), MATCH_CHUNK):
+        chunk = ordered[start : start + MATCH_CHUNK]
+        listed.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in chunk))
+        pc.match_image_pairs(
+            str(database),
+            pairing_options={"match_list_path": str(listed)},
+            verification_options={"ransac": {"random_seed": seed}},  # else two runs differ
+            device=pc.Device.cpu,
+        )
+        send_progress("match", start + len(chunk), len(ordered))
+
+
+RETRIEVED_PAIRS = 6  # most similar keyframes matched with each, to close loops (chosen)
+VISUAL_WORDS = 64  # of a VLAD vector (its paper: 16-256)
+WORD_SAMPLE = 20000  # descriptors clustered into words, at least (chosen: time)
+
+
+def _pairs_from_retrieval(descriptors: list[Image], seed: int) -> list[tuple[int, int]]:
+    """Find the pairs of keyframes with the most similar VLAD vectors.
+
+    Args:
+        descriptors: (n, 128) of each keyframe.
+    Ref: Jegou et al., CVPR 2010.
+    """
+    features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
+    sample = features[:: max(1, len(features) // WORD_SAMPLE)]
+    if len(sample) < VISUAL_WORDS:
+        return []
+    cv2.setRNGSeed(seed)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
+    start = cv2.KMEANS_PP_CENTERS
+    words = cv2.kmeans(sample, VISUAL_WORDS, np.empty(0), stop, 1, start)[2]  # (W, 128)
+    vlad = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sums of residuals
+    for sums, found in zip(vlad, descriptors, strict=True):
+        # argmin |d - w|^2 = argmax d'w - |w|^2 / 2
+        nearest = (found @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
+        np.add.at(sums, nearest, found - words[nearest])
+    vlad /= np.maximum(np.linalg.norm(vlad, axis=2, keepdims=True), 1e-9)
+    flat = vlad.reshape(len(vlad), -1)
+    similarity, at = flat @ flat.T, np.arange(len(flat))  # (K, K)
+    similarity[np.abs(at[:, None] - at) <= 2] = -np.inf  # matched already
+    best = np.argsort(-similarity, axis=1, kind="stable")[:, :RETRIEVED_PAIRS]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
