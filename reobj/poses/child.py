@@ -24,7 +24,10 @@ def run_child(
     # -P: not the modules of the working directory; the package's own folder comes first
     command = [sys.executable, "-P", "-m", module, str(folder)]
     paths = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+        "OPENBLAS_NUM_THREADS": "1",  # pairs of images are matched side by side
+    }
     line: Progress | None = None
     with (
         open(log_path, "wb") as errors,

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components, maximum_flow, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow, minimum_spanning_tree
 
 from reobj.cameras import import_pycolmap
 from reobj.types import Array, BoolArray, IntArray
@@ -101,9 +101,14 @@ EXPLAINED_PX = 4.0  # largest distance from the epipolar line (COLMAP's filter_m
 MIN_MATCHES = 30  # verified matches of neighbours that can contradict (COLMAP registers from 30)
 MIN_EXPLAINED = 0.5  # share of them that the model must explain (measured: right .64-1, wrong 0-.4)
 MIN_BRIDGE = 30  # points that tie two groups of images (COLMAP registers one image from 30 on)
-MIN_BRIDGE_SHARE = 0.2  # of the points that neighbours usually share (measured: right .5-3, wrong
-# .05-.15)
 MIN_GROUP = 3  # images; fewer that hang on few points are left to be located by PnP
+WEAKEST_CUTS = 3  # whose missing points are counted (chosen: time)
+BORDER_IMAGES = 10  # of each side of a cut, those that share the most points (chosen: time)
+NEAR_VIEW_DEG = 30.0  # turn of a view up to which a point is found again (SIFT: Lowe 2004, fig. 9)
+NEAR_VIEW_SCALE = 2.0  # change of distance up to which it is (an octave; chosen)
+MIN_SEEN = 0.03  # share of such points that must be found again (measured: right .065-.5, wrong
+# 0-.007); and how many must be expected so that none says something:
+MIN_EXPECTED = 100
 
 
 def consistent_groups(model: Any, pairs: MatchedPairs, order: Sequence[int]) -> list[IntArray]:
@@ -117,36 +122,58 @@ def consistent_groups(model: Any, pairs: MatchedPairs, order: Sequence[int]) -> 
         ids of the images of each group, the largest group first; images that hang on by too little
         are in none.
     """
-    ids, seen = _visibility(model)
-    shared = np.asarray((seen @ seen.T).todense(), np.float64)  # (R, R) points of two images
-    np.fill_diagonal(shared, 0)
-    contradicted = _contradicted_neighbours(model, pairs, ids, order)
-    todo, groups = [np.arange(len(ids))], []
+    views = _read_views(model)
+    contradicted = _contradicted_neighbours(model, pairs, views.ids, order)
+    todo, groups = [np.arange(len(views.ids))], []
     while todo:
         rows = todo.pop()
-        side = _contradiction_cut(shared, rows, contradicted)
+        side = _contradiction_cut(views, rows, contradicted)
         if side is None:
-            side = _weakest_cut(shared, seen, rows)
+            side = _weak_cut(views, rows)
         if side is None:
-            groups.append(ids[rows])
+            groups.append(views.ids[rows])
             continue
         todo += [rows[s] for s in (side, ~side) if s.sum() >= MIN_GROUP]
     return sorted(groups, key=lambda g: (-len(g), int(g[0])))
 
 
-def _visibility(model: Any) -> tuple[IntArray, Any]:
-    """Return the image ids (R,) of a model, ascending, and who sees which point: (R, N) sparse."""
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """A model as arrays: R images, N points.
+
+    Attributes:
+        ids: (R,) of the images, ascending. cam_from_world: (R, 3, 4).
+        img_from_cam: (3, 3), without distortion. size: (w, h).
+        xyz: (N, 3) points. seen: (R, N) sparse, 1 where an image observes a point.
+    """
+
+    ids: IntArray
+    cam_from_world: Array
+    img_from_cam: Array
+    size: tuple[int, int]
+    xyz: Array
+    seen: Any
+
+
+def _read_views(model: Any) -> _Views:
     ids = np.array(sorted(model.reg_image_ids()), np.int64)
     row = {int(i): r for r, i in enumerate(ids)}
-    points = sorted(model.point3D_ids())
-    observed = [
+    points = [model.point3D(i) for i in sorted(model.point3D_ids())]
+    observed = {
         (row[element.image_id], column)
-        for column, p in enumerate(points)
-        for element in model.point3D(p).track.elements
-    ]
-    at = np.array(sorted(set(observed)), np.int64).reshape(-1, 2)
-    shape = (len(ids), len(points))
-    return ids, sparse.csr_matrix((np.ones(len(at)), (at[:, 0], at[:, 1])), shape)
+        for column, point in enumerate(points)
+        for element in point.track.elements
+    }
+    at = np.array(sorted(observed), np.int64).reshape(-1, 2)
+    camera = model.camera(next(iter(model.cameras)))
+    return _Views(
+        ids,
+        np.array([model.image(int(i)).cam_from_world().matrix() for i in ids]).reshape(-1, 3, 4),
+        np.array(camera.calibration_matrix()),
+        (camera.width, camera.height),
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        sparse.csr_matrix((np.ones(len(at)), at.T), (len(ids), len(points))),
+    )
 
 
 def explained_share(model: Any, pairs: MatchedPairs, rows: IntArray) -> Array:
@@ -196,7 +223,7 @@ def _contradicted_neighbours(
     return np.array([[row[a], row[b]] for a, b in wrong.tolist()], np.int64).reshape(-1, 2)
 
 
-def _contradiction_cut(shared: Array, rows: IntArray, contradicted: IntArray) -> BoolArray | None:
+def _contradiction_cut(views: _Views, rows: IntArray, contradicted: IntArray) -> BoolArray | None:
     """Separate the first two contradicting images among `rows` where the fewest points are shared.
 
     Returns:
@@ -205,53 +232,90 @@ def _contradiction_cut(shared: Array, rows: IntArray, contradicted: IntArray) ->
     where = {int(r): k for k, r in enumerate(rows)}
     for a, b in contradicted.tolist():
         if a in where and b in where:
-            capacity = sparse.csr_matrix(shared[np.ix_(rows, rows)].astype(np.int32))
-            flow = maximum_flow(capacity, where[a], where[b]).flow
-            left = capacity - flow
+            capacity = sparse.csr_matrix(_shared_points(views.seen[rows]).astype(np.int32))
+            left = capacity - maximum_flow(capacity, where[a], where[b]).flow
             left.eliminate_zeros()
-            label = _reachable(left, where[a])
-            return label
+            reached = breadth_first_order(left, where[a], return_predecessors=False)
+            return np.isin(np.arange(len(rows)), reached)
     return None
 
 
-def _reachable(graph: Any, start: int) -> BoolArray:
-    """Mark the nodes (R,) that are reached from `start` along positive edges."""
-    order = sparse.csgraph.breadth_first_order(graph.maximum(0), start, return_predecessors=False)
-    found = np.zeros(graph.shape[0], bool)
-    found[order] = True
-    return found
+def _shared_points(seen: Any) -> Array:
+    """Count the points (R, R) that two images share, 0 on the diagonal."""
+    shared = np.asarray((seen @ seen.T).todense(), np.float64)
+    np.fill_diagonal(shared, 0)
+    return shared
 
 
-def _weakest_cut(shared: Array, seen: Any, rows: IntArray) -> BoolArray | None:
-    """Find the two groups of images that the fewest points tie together, if these are too few.
+def _weak_cut(views: _Views, rows: IntArray) -> BoolArray | None:
+    """Find two groups of images that too little ties together.
 
-    Candidates are the cuts of the spanning tree of most shared points. A point ties two groups in
-    scale too if it is seen twice in one of them.
+    Candidates are the cuts of the spanning tree of most shared points. A point ties two groups,
+    and their scales, if it is seen in both and twice in one. Too few are few points, or few of
+    those that should be found again: near views of a place that share nothing are two places.
 
     Returns:
         (R,) True on one side, None if all holds together.
     """
-    own = shared[np.ix_(rows, rows)]
-    loose = np.flatnonzero(own.max(1, initial=0) <= 0)
-    if len(loose):
-        return np.asarray(np.isin(np.arange(len(rows)), loose[:1]))
-    tree = minimum_spanning_tree(sparse.csr_matrix(np.where(own > 0, 1 / np.maximum(own, 1), 0)))
-    count, label = connected_components(tree, directed=False)
-    if count > 1:
-        return np.asarray(label == 0)
-    edges = tree.tocoo()
-    usual = float(np.median(own[edges.row, edges.col])) if edges.nnz else 0.0
-    needed = max(MIN_BRIDGE, MIN_BRIDGE_SHARE * usual)
-    visible, dense = seen[rows], tree.toarray()
-    weakest, cut = needed, None
-    for a, b in zip(edges.row, edges.col, strict=True):
-        weight, dense[a, b] = dense[a, b], 0
-        side = connected_components(sparse.csr_matrix(dense), directed=False)[1]
-        dense[a, b] = weight
-        side = np.asarray(side == side[a])
-        one, other = (np.asarray(visible[s].sum(0)).ravel() for s in (side, ~side))  # (N,)
-        bridge = ((one > 0) & (other > 0) & (one + other > 2)).sum()
-        least = needed if min(side.sum(), (~side).sum()) >= MIN_GROUP else MIN_BRIDGE
-        if bridge < min(weakest, least):
-            weakest, cut = float(bridge), side
-    return cut
+    seen = views.seen[rows]
+    shared = _shared_points(seen)
+    tree = minimum_spanning_tree(sparse.csr_matrix(np.where(shared > 0, 1 / (shared + 1), 0)))
+    order, parent = breadth_first_order(tree, 0, directed=False)
+    if len(order) < len(rows):  # not even connected
+        return np.isin(np.arange(len(rows)), order)
+    below = np.eye(len(rows), dtype=bool)  # (R, R) the subtree of each image
+    for child in order[:0:-1]:
+        below[parent[child]] |= below[child]
+    cuts = below[order[1:]]  # (R - 1, R) one for each edge of the tree
+    inside, total = sparse.csr_matrix(cuts.astype(float)) @ seen, np.asarray(seen.sum(0)).ravel()
+    one = np.asarray(inside.todense())  # (R - 1, N)
+    bridge = ((one > 0) & (one < total) & (total > 2)).sum(1)
+    for cut in np.argsort(bridge, kind="stable"):
+        if bridge[cut] < MIN_BRIDGE:
+            return np.asarray(cuts[cut])
+    smaller = np.minimum(cuts.sum(1), (~cuts).sum(1))
+    groups = np.flatnonzero(smaller >= MIN_GROUP)
+    for cut in groups[np.argsort(bridge[groups], kind="stable")[:WEAKEST_CUTS]]:
+        expected, found = _found_again(views, rows, np.asarray(cuts[cut]))
+        if expected >= MIN_EXPECTED and found < MIN_SEEN * expected:
+            return np.asarray(cuts[cut])
+    return None
+
+
+def _found_again(views: _Views, rows: IntArray, side: BoolArray) -> tuple[int, int]:
+    """Count the observations that the images of one side should have of the other side's points.
+
+    Expected is a point that two images of its side see, in an image of the other side that it lies
+    in, from a direction and a distance near those of one of the two.
+
+    Args:
+        side: (R,) of `rows`.
+    Returns:
+        how many are expected, and how many of these were made; of both directions together.
+    """
+    pose, size = views.cam_from_world[rows], np.array(views.size)
+    centre = -np.einsum("nij,ni->nj", pose[:, :, :3], pose[:, :, 3])  # (R, 3)
+    expected = found = 0
+    for own in (side, ~side):
+        seen = views.seen[rows[own]]
+        points = np.flatnonzero(np.asarray(seen.sum(0)).ravel() >= 2)  # (n,)
+        xyz, seen = views.xyz[points], seen[:, points].tocoo()
+        there = views.seen[rows[~own]][:, points].tocsr()
+        border = np.argsort(-np.asarray(there.sum(1)).ravel(), kind="stable")[:BORDER_IMAGES]
+        ray = centre[own][seen.row] - xyz[seen.col]  # (m, 3) from the point to a camera that has it
+        length = np.linalg.norm(ray, axis=1)
+        for image in border:
+            camera = pose[~own][image]
+            at = (xyz @ camera[:, :3].T + camera[:, 3]) @ views.img_from_cam.T  # (n, 3)
+            inside = at[:, 2] > 0
+            xy = at[:, :2] / np.where(inside, at[:, 2], 1)[:, None]
+            inside &= ((xy > 0) & (xy < size)).all(1)
+            here = centre[~own][image] - xyz  # (n, 3)
+            away = np.linalg.norm(here, axis=1)[seen.col]
+            cosine = (ray * here[seen.col]).sum(1) / (length * away)
+            near = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
+            near &= np.abs(np.log(length / away)) < np.log(NEAR_VIEW_SCALE)
+            inside &= np.bincount(seen.col[near], minlength=len(points)) > 0
+            expected += int(inside.sum())
+            found += int(inside[there[image].indices].sum())
+    return expected, found

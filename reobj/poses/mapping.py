@@ -162,6 +162,7 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
 
 
 STRONG_TRI_ANGLE_DEG = 5.0  # triangulation angle that calibrates a focal length (chosen)
+STRONG_TURN_DEG = 45.0  # or turn of the camera on the way: an orbit, however flat (chosen)
 STRONG_SPREAD = 0.1  # and spread of the cameras over the depth that does (chosen)
 FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen: 28-103 deg wide)
 MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
@@ -182,6 +183,7 @@ class _Part:
     model: Any
     registered: float  # share of the keyframes
     tri_angle_deg: float  # median over points of the widest angle between two rays
+    turn_deg: float  # widest angle of a viewing direction from their mean, twice
     parallax_px: float  # what turns of the camera alone cannot explain
     spread: float  # rms distance of the cameras from their mean over the median depth
     focal: float  # over the longer side
@@ -191,7 +193,7 @@ class _Part:
     def calibrates(self) -> bool:
         """True if the geometry is strong enough to trust the focal length that came out."""
         low, high = FOCAL_RANGE
-        wide = self.tri_angle_deg >= STRONG_TRI_ANGLE_DEG
+        wide = self.tri_angle_deg >= STRONG_TRI_ANGLE_DEG or self.turn_deg >= STRONG_TURN_DEG
         return wide and self.spread >= STRONG_SPREAD and low <= self.focal <= high
 
 
@@ -203,9 +205,12 @@ def _measured(model: Any, count: int) -> _Part:
     seen = [model.image(i).num_points3D for i in centre] or [0]
     parallax = _parallax_px(model)
     angle, depth = _angle_and_depth(model, centre)
-    spread = 0.0
+    spread = turn = 0.0
     if centre:
         spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
+        axes = np.array([model.image(i).cam_from_world().matrix()[2, :3] for i in centre])  # (R, 3)
+        off_mean = (axes @ axes.mean(0)).min() / max(np.linalg.norm(axes.mean(0)), 1e-12)
+        turn = 2 * math.degrees(math.acos(np.clip(off_mean, -1, 1)))
     few = len(centre) < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
     checks = (
         (few, f"only {len(centre)} of {count} keyframes connect"),
@@ -220,7 +225,7 @@ def _measured(model: Any, count: int) -> _Part:
          f"the focal length came out as {focal:.2f} x the width"),
     )  # fmt: skip
     problem = next((text for bad, text in checks if bad), "")
-    return _Part(model, len(centre) / count, angle, parallax, spread, focal, problem)
+    return _Part(model, len(centre) / count, angle, turn, parallax, spread, focal, problem)
 
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
@@ -354,7 +359,8 @@ def _run_mapper(database: Path, mapper: str, fixed: bool, count: int, seed: int)
     options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
     # global adjustment more rarely and less exactly than by default (chosen: time; see `_refine`)
     options |= {"ba_global_frames_ratio": 1.4, "ba_global_points_ratio": 1.4}
-    options |= {"ba_global_function_tolerance": 1e-5}
+    options |= {"ba_global_function_tolerance": 1e-5, "ba_global_max_refinements": 2}
+    options |= {"ba_local_max_refinements": 1}
     options |= {"ba_refine_focal_length": not fixed, "ba_refine_extra_params": not fixed}
     options |= RELAXED if mapper == "relaxed" else {}
     done = itertools.count(2)
