@@ -204,6 +204,14 @@ def explained_share(model: Any, pairs: MatchedPairs, rows: IntArray) -> Array:
     return shares
 
 
+def count_explained(model: Any, pairs: MatchedPairs) -> float:
+    """Count the verified matches between the images of a model that the model explains."""
+    inside = np.isin(pairs.image_ids, model.reg_image_ids()).all(1)
+    rows = np.flatnonzero(inside & np.array([len(m) > 0 for m in pairs.inliers], bool))
+    counts = np.array([len(pairs.inliers[row]) for row in rows])
+    return float((explained_share(model, pairs, rows) * counts).sum())
+
+
 def _contradicted_neighbours(
     model: Any, pairs: MatchedPairs, ids: IntArray, order: Sequence[int]
 ) -> IntArray:
