@@ -71,7 +71,7 @@ def fitted(
         fits = fitter(config, poses, names)(views, list(classes.values()))
     objects = describe_objects(tracks, names, fits, views, config)
     video = VideoInfo("walk.mp4", *SIZE, 30.0)
-    world = describe_world(poses, fits, [])
+    world = describe_world(poses, [fits], [])
     return rt.Result(tracks, names, video, objects, world, poses, fits)
 
 

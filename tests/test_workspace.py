@@ -170,13 +170,13 @@ def test_the_published_model_is_a_copy(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / name).write_text(name)
-        space.publish_model(tmp_path / name)
+        space.publish_model([tmp_path / name])
         assert [p.name for p in (space.out / "sparse").iterdir()] == [name]
     shutil.rmtree(tmp_path / "b")
     assert (space.out / "sparse/b").read_text() == "b"
-    space.publish_model(tmp_path / "b")  # a failed reconstruction has none
+    space.publish_model([tmp_path / "b"])  # a failed reconstruction has none
     assert not (space.out / "sparse").exists()
-    space.publish_model(tmp_path / "a")
+    space.publish_model([tmp_path / "a"])
     space.publish_model(None)
     assert sorted(p.name for p in space.out.iterdir()) == ["cache"]
 
@@ -188,7 +188,7 @@ def test_a_model_is_published_whole_or_not_at_all(
     (tmp_path / "model").mkdir()
     for name in ("1", "2"):
         (tmp_path / "model" / name).write_text("first")
-    space.publish_model(tmp_path / "model")
+    space.publish_model([tmp_path / "model"])
 
     def interrupted(source: Path, target: Path) -> None:
         target.mkdir()
@@ -197,9 +197,9 @@ def test_a_model_is_published_whole_or_not_at_all(
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(shutil, "copytree", interrupted)
-        space.publish_model(tmp_path / "model")
+        space.publish_model([tmp_path / "model"])
     assert [(space.out / "sparse" / n).read_text() for n in ("1", "2")] == ["first", "first"]
-    space.publish_model(tmp_path / "model")
+    space.publish_model([tmp_path / "model"])
     assert sorted(p.name for p in space.out.iterdir()) == ["cache", "sparse"]
 
 
