@@ -444,14 +444,17 @@ def test_the_page_holds_the_scene(page: Path) -> None:
     data, poses = data_of(page), poses_of_walk()
     found = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(-1, 3, 4)
     np.testing.assert_allclose(found, invert_rigid(poses.cam_from_world), atol=1e-6)
-    points = np.frombuffer(base64.b64decode(data["points"]), "<f4").reshape(-1, 3)
+    (part,) = data["parts"]
+    points = np.frombuffer(base64.b64decode(part["points"]), "<f4").reshape(-1, 3)
     np.testing.assert_allclose(points, poses.points, atol=1e-6)
-    assert data["objects"][1]["seen"] == [0, 8, 15, 23] and data["up"] == [0, 0, 1]
+    assert data["objects"][1]["seen"] == [0, 8, 15, 23] and part["up"] == [0, 0, 1]
     assert [tuple(o["color"]) for o in data["objects"]] == [
         object_color(i)[::-1] for i in (1, 2, 3, 4)
     ]
-    assert data["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
-    assert data["steps"] == {"frame": list(range(24)), "seconds": pytest.approx(1 / 30)}
+    assert part["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
+    assert data["steps"] == {
+        "frame": list(range(24)), "seconds": pytest.approx(1 / 30), "part": [0] * 24,
+    }  # fmt: skip
     assert "cov" not in data["objects"][0] and data["why_flat"] == ""
 
 
@@ -594,9 +597,9 @@ def test_up_is_guessed_from_level_cameras(tmp_path: Path) -> None:
     result = rt.Result(tracks_of_walk(poses), NAMES, VideoInfo("a", WIDTH, HEIGHT, 25.0))
     result.poses, result.world = poses, rt.World("m", "user", 23, 0, 24)
     write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
-    data = data_of(tmp_path / "a.html")
-    np.testing.assert_allclose(data["up"], [0, 0, 1], atol=0.05)
-    assert data["facts"].endswith("units: m · up is guessed from the cameras")
+    (part,) = data_of(tmp_path / "a.html")["parts"]
+    np.testing.assert_allclose(part["up"], [0, 0, 1], atol=0.05)
+    assert part["facts"].endswith("units: m · up is guessed from the cameras")
 
 
 def test_long_videos_are_thinned(tmp_path: Path) -> None:
