@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from simulated import fitted, tracks_of, walk, with_columns
+from simulated import fitted, into_part, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
@@ -402,6 +402,54 @@ def test_fingers_and_a_phone_screen(browser: Browser, page: Path) -> None:
     assert browser.eval("document.documentElement.scrollWidth") <= 390
     browser.picture(SCREENSHOTS / "phone.png")
     assert complaints(browser) == []
+
+
+def test_parts_are_chosen_and_everything_follows(browser: Browser, parted_folder: Path) -> None:
+    browser.open(parted_folder / "scene.html")
+    rows = "[...document.querySelectorAll('.row b')].map(b => +b.textContent)"
+    shown = "[solid.map(o => o.id), steps.length, posed.length, +$('slider').max, G.cloud.count]"
+    assert browser.eval("[$('part').hidden, $('part').options.length]") == [False, 2]
+    assert browser.eval("document.title") == "frames: 6 objects in 2 parts"
+    assert browser.eval(rows) == [1, 2, 3]
+    assert browser.eval(shown) == [[1, 2, 3], 40, 38, 39, 3]
+    assert browser.eval("$('facts').textContent").startswith("cameras of 38 of 40 frames")
+    before = browser.eval("radius")
+    browser.eval("select(solid[0]); goTo(20)")
+    browser.eval("$('part').value = 1; $('part').onchange()")
+    browser.settle()
+    assert browser.eval(rows) == [4, 5, 6]
+    assert browser.eval(shown) == [[4, 5, 6], 24, 23, 23, 3]
+    assert browser.eval("[state.step, state.selected, $('panel').innerHTML]") == [-1, None, ""]
+    assert browser.eval("$('facts').textContent").startswith("cameras of 23 of 24 frames")
+    assert 4 < browser.eval("radius") / before < 9  # 3 units a metre instead of .5
+    solid = browser.eval("solid[1].center")
+    np.testing.assert_allclose(solid, into_part(1, np.array([[0, 0.1, 0.41]]))[0], atol=0.1)
+    browser.click(*center_of(browser, 5))
+    assert browser.eval("$('panel').querySelector('h2').textContent") == "5 chair"
+    assert "± " in browser.eval("$('panel').querySelector('dl').textContent")
+    picture = "document.querySelectorAll('.crops figure')"
+    browser.eval(f"[...{picture}].forEach(f => {{ f.click(); }})")
+    assert browser.eval("S.steps.part[state.step]") == 1
+    browser.eval("$('slider').value = 23; $('slider').oninput()")
+    assert browser.eval("[state.step, $('clock').textContent]") == [63, "frame 63"]
+    browser.eval("$('play').click()")  # from the end of the part to its first frame
+    moved = "new Promise(f => setInterval(() => state.step !== 63 && f(state.step), 20))"
+    assert 40 <= browser.eval(moved) < 60
+    browser.eval("$('play').click(); goTo(3)")  # of the other part
+    assert browser.eval(f"[+$('part').value, +$('slider').value, {rows}]") == [0, 3, [1, 2, 3]]
+    for phone in (False, True):
+        size = {"width": 390, "height": 780} if phone else {"width": 1280, "height": 800}
+        browser.open(parted_folder / "scene.html", **size, phone=phone)
+        browser.eval("enter(1); goTo(50)")
+        browser.settle()
+        assert browser.eval("document.documentElement.scrollWidth <= innerWidth")
+        browser.picture(SCREENSHOTS / f"parts-{'phone' if phone else 'desktop'}.png")
+    assert complaints(browser) == []
+
+
+def test_one_part_has_no_selector(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    assert browser.eval("[$('part').hidden, $('part').offsetWidth]") == [True, 0]
 
 
 def test_identities_only_still_open(browser: Browser, tmp_path: Path) -> None:

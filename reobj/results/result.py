@@ -433,7 +433,9 @@ class Result:
                 f"{text:<26} {sigma:>6}  {o.status}{part}{reason}"
             )
         counts = sorted(Counter(o.class_name for o in self.objects).items())
-        lines.append("distinct objects: " + (", ".join(f"{n} {c}" for c, n in counts) or "none"))
+        each = " (each part counted by itself)" if len(self.world.parts) > 1 else ""
+        names = ", ".join(f"{n} {c}" for c, n in counts) or "none"
+        lines.append(f"distinct objects: {names}{each}")
         lines += self._camera_lines()
         lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in self.seconds.items()))
         if self.out is not None:
