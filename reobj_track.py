@@ -1091,7 +1091,7 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
     result.embedding_row = detected[result.embedding_row]
     result.seconds["objects"] = time.monotonic() - started
-    result.warnings += [*(poses.messages if poses is not None else ()), *parts_message(result)]
+    result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
     for warning in result.warnings:
         log.warning(warning)
     started = time.monotonic()
@@ -1211,7 +1211,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     known, count = poses.known.sum(), len(poses.frame)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
-    for message in poses.messages:
+    for message in (*poses.messages, *parts_message(poses)):
         log.warning(message)
     return 0
 

@@ -168,11 +168,11 @@ def join_fits(
     return quadrics.ObjectFits(**columns)
 
 
-def parts_message(result: Result) -> list[str]:
+def parts_message(poses: Poses) -> list[str]:
     """Say what several parts mean for the user, and what helps; [] if there is one only."""
-    parts = result.world.parts
-    if len(parts) < 2:
+    if poses.part_count == 1:
         return []
+    parts = describe_world(poses, [None] * poses.part_count, []).parts
     where = shortened([f"part {k}: {part.span_text}" for k, part in enumerate(parts)])
     return [
         f"the cameras come in {len(parts)} parts that do not connect ({where}): each has its own "

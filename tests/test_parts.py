@@ -28,7 +28,8 @@ from simulated import (
 
 import reobj.parts
 import reobj_track as rt
-from reobj.cameras import invert_rigid
+from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
+from reobj.files import part_path
 from reobj.parts import parts_message
 from reobj.results.overlay import Overlay
 from reobj.results.result import validate_objects
@@ -120,7 +121,7 @@ def test_one_part_is_the_result_itself() -> None:
     poses = two_parts().of_part(0)
     result = finished(unlinked(poses, tracks_in_two_parts(two_parts())[: 3 * BREAK]))
     assert result.of_part(0) is result and result.parts() == [result]
-    assert parts_message(result) == []
+    assert parts_message(poses) == []
     assert {o.part for o in result.objects} == {0} and len(result.world.parts) == 1
 
 
@@ -208,8 +209,29 @@ def test_up_is_a_direction_of_the_largest_part() -> None:
     assert [p.up_source == "given" for p in parts] == [True, False]
 
 
-def test_the_message_says_what_it_means_and_what_helps(parted: rt.Result) -> None:
-    (text,) = parts_message(parted)
+def test_boxes_that_no_fit_can_use_do_not_choose_the_part() -> None:
+    tracks = tracks_in_two_parts(two_parts())
+    weak = (tracks.detection_index == 0) & (tracks.frame < BREAK)
+    given = unlinked(tracks=with_columns(tracks, score=np.where(weak, 0.1, 0.9)))
+    given.identities_given = True
+    assert [(o.part, o.status) for o in finished(given).objects] == [
+        (1, "ok"),
+        (0, "ok"),
+        (0, "ok"),
+    ]
+
+
+def test_up_of_the_poses_is_that_of_the_largest_part() -> None:
+    up = into_part(0, np.array([[0, 0, 1.0], [0, 0, 0]]))
+    poses = dataclasses.replace(two_parts(), up_in_world=(up[0] - up[1]) / PARTS[0][0])
+    parts = finished(unlinked(poses)).world.parts
+    assert [p.up_source == "given" for p in parts] == [True, False]
+    true = into_part(1, np.array([[0, 0, 1.0], [0, 0, 0]]))
+    np.testing.assert_allclose(parts[1].up_in_world, (true[0] - true[1]) / PARTS[1][0], atol=0.03)
+
+
+def test_the_message_says_what_it_means_and_what_helps() -> None:
+    (text,) = parts_message(two_parts())
     for words in ("2 parts", "part 0: frames 0-39", "part 1: frames 40-63", "own frame and scale",
                   "two objects", "overlaps more", "--poses", "--to cvat"):  # fmt: skip
         assert words in text
@@ -300,6 +322,58 @@ def test_files_of_parts_of_an_earlier_run_go(parted: rt.Result, tmp_path: Path) 
     one.save(tmp_path)
     left = {path.name for path in tmp_path.iterdir()} - {"cache"}
     assert left == {"tracks.txt", "objects.json", "poses.txt", "objects.ply", "poses_partial.txt"}
+
+
+def test_run_writes_what_a_broken_reconstruction_gives(
+    parted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the pose stage on: models, files, cache; a later run in one piece leaves no part."""
+    found, calls = two_parts(), list[int]()
+
+    def estimate(video: Any, config: rt.PosesConfig, work_dir: Path, **_: Any) -> rt.Poses:
+        calls.append(config.seed)
+        poses = found if config.seed == 0 else dataclasses.replace(found, part=0 * found.part)
+        for k in range(poses.part_count):
+            names = [f"{f:03d}.jpg" for f in poses.of_part(k).frame]
+            write_colmap(part_path(work_dir / "sparse", k), poses.of_part(k), names)
+        return poses
+
+    monkeypatch.setattr("reobj.poses.stage.estimate_poses", estimate)
+    tracks = tracks_in_two_parts(found)
+    ltwh = np.column_stack([tracks.xyxy[:, :2], tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]])
+    rows = np.column_stack([tracks.frame + 1, 0 * tracks.frame - 1, ltwh, tracks.score,
+                            np.full(len(tracks), CHAIR + 1)])  # fmt: skip
+    np.savetxt(tmp_path / "det.txt", rows, delimiter=",", fmt="%.6g")
+    args = ["run", str(parted_folder.parent / "frames"), "-o", str(tmp_path / "out"),
+            "--detections", str(tmp_path / "det.txt"), "--set", "output.overlay=0"]  # fmt: skip
+    names = ("poses_part1.txt", "objects_part1.ply", "sparse_part1")
+    for _ in range(2):  # the second time from the cache
+        assert rt.main(args) == 0
+        result = rt.Result.load(tmp_path / "out")
+        assert {o.part for o in result.objects if o.located} == {0, 1}
+        assert all((tmp_path / "out" / name).exists() for name in names)
+        for k, registered in enumerate((38, 23)):
+            model = read_sparse_model(part_path(tmp_path / "out/sparse", k))
+            assert len(model.names) == registered and len(model.points) == 3
+    assert calls == [0]
+    assert rt.main([*args, "--set", "poses.seed=1"]) == 0
+    assert not any((tmp_path / "out" / name).exists() for name in names)
+    assert (tmp_path / "out/sparse").is_dir() and calls == [0, 1]
+
+
+def test_poses_command_writes_a_file_for_each_part(
+    parted_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = (two_parts(), None)
+    monkeypatch.setattr(rt, "reconstruct_cached", lambda *a, **k: given)
+    frames = str(parted_folder.parent / "frames")
+    assert rt.main(["poses", frames, "-o", str(tmp_path)]) == 0
+    lengths = [len(np.loadtxt(tmp_path / name)) for name in ("poses.txt", "poses_part1.txt")]
+    assert lengths == [38, 23]
+    assert "the cameras come in 2 parts" in capsys.readouterr().err
 
 
 def test_the_summary_has_a_line_for_each_part(parted: rt.Result) -> None:

@@ -424,9 +424,10 @@ def test_parts_are_chosen_and_everything_follows(browser: Browser, parted_folder
     assert 4 < browser.eval("radius") / before < 9  # 3 units a metre instead of .5
     solid = browser.eval("solid[1].center")
     np.testing.assert_allclose(solid, into_part(1, np.array([[0, 0.1, 0.41]]))[0], atol=0.1)
+    browser.eval("S.parts[1].scale.rel_sigma = .77")
     browser.click(*center_of(browser, 5))
     assert browser.eval("$('panel').querySelector('h2').textContent") == "5 chair"
-    assert "± " in browser.eval("$('panel').querySelector('dl').textContent")
+    assert "from priors, ± 77 %" in browser.eval("$('panel').querySelector('dl').textContent")
     picture = "document.querySelectorAll('.crops figure')"
     browser.eval(f"[...{picture}].forEach(f => {{ f.click(); }})")
     assert browser.eval("S.steps.part[state.step]") == 1
@@ -595,6 +596,16 @@ def test_views_from_other_sides_are_shown() -> None:
     tracks.xyxy[own] = [0, 0, 50, 50]  # equally good
     late = [(tracks.frame[diverse_rows(tracks, found, p, 4)] > 20).sum() for p in (still, None)]
     assert late[0] >= 2 and late[1] == 1  # by time alone: the last one
+
+
+def test_views_are_those_of_the_cameras_of_the_part(parted: rt.Result) -> None:
+    wanted = set(Pictures(parted, VIDEO).wanted.tolist())
+    for o in parted.objects:
+        chosen = [
+            diverse_rows(parted.tracks, o, poses, 8).tolist()
+            for poses in (parted.poses.of_part(o.part), parted.poses.of_part(1 - o.part))
+        ]
+        assert chosen[0] != chosen[1] and wanted >= set(chosen[0])
 
 
 def test_boxes_are_drawn_in_small_frames(tmp_path: Path) -> None:
