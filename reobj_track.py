@@ -58,7 +58,7 @@ from scipy.optimize import linear_sum_assignment
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera, Poses, scaled_camera, viewing_rays, write_tum
+from reobj.cameras import Camera, Poses, scaled_camera, viewing_rays
 from reobj.files import Progress, atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
@@ -69,7 +69,6 @@ from reobj.identity.embedding import (
     as_embeddings,
 )
 from reobj.identity.gaps import fill_gaps
-from reobj.identity.linking import link
 from reobj.identity.reid import (
     EllipsoidMap,
     Gallery,
@@ -78,8 +77,9 @@ from reobj.identity.reid import (
     part_cosines,
 )
 from reobj.identity.sampling import SamplingLayout
-from reobj.objects import ObjectsConfig, describe_objects, describe_world, fitter
+from reobj.objects import ObjectsConfig
 from reobj.options import add_flags, config_from_args, list_options
+from reobj.parts import link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
@@ -90,7 +90,15 @@ from reobj.poses.stage import (
 )
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, export
-from reobj.results.result import Object, Result, VideoInfo, World, validate_objects
+from reobj.results.result import (
+    Object,
+    Part,
+    Result,
+    VideoInfo,
+    World,
+    validate_objects,
+    write_trajectories,
+)
 from reobj.results.scene import write_pictures
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import (
@@ -119,18 +127,16 @@ from reobj.types import (
     box_iou,
     cxcywh_from_xyxy,
     log,
-    object_classes,
     option,
     unit_rows,
     widen,
     xyxy_from_cxcywh,
 )
-from reobj.views import gather_views
 
 __all__ = [
     "COCO_NAMES", "Camera", "Config", "CropEmbedder", "DetectConfig", "DetectionSource",
     "Detections", "EmbedConfig", "Embedder", "Embeddings", "Frame", "InputConfig", "LinkEvent",
-    "Object", "ObjectsConfig", "OnnxDetector", "OutputConfig", "Poses", "PosesConfig",
+    "Object", "ObjectsConfig", "OnnxDetector", "OutputConfig", "Part", "Poses", "PosesConfig",
     "ReobjError", "Result", "SamplingLayout", "Tracker", "TrackerConfig", "Tracks", "Video",
     "World", "__version__", "estimate_poses", "evaluate", "export", "list_models", "main",
     "model_path", "open_detections", "read_detections", "read_poses", "read_tracks", "refit",
@@ -1078,33 +1084,14 @@ def _given_tracks(
 
 def _finish(result: Result, video: Video, workspace: Workspace, config: Config) -> Result:
     """Link tracklets, fit one solid an object, and write all files of the output folder."""
-    started, own, tracks = time.monotonic(), config.objects, result.tracks
-    poses, class_names = result.poses, result.class_names
-    located = poses is not None and poses.known.sum() >= own.min_views
-    fit = fitter(own, poses, class_names) if located and poses is not None else None
-    events: list[LinkEvent] = []
-    if not result.identities_given and own.link:
-        tracks, events = link(
-            tracks, class_names, result.embeddings, result.embedding_row,
-            poses if located else None, fit, moving=own.moving_classes,
-            min_score=own.min_score, min_views=own.min_views,
-        )  # fmt: skip
-    elif not result.identities_given:
-        tracks = tracks.with_identities(tracks.track_id)
-    views = None
-    if len(tracks) and poses is not None and fit is not None:
-        classes = object_classes(tracks)
-        group = np.searchsorted(list(classes), tracks.track_id)
-        views = gather_views(tracks, poses, group, len(classes), own.min_score)
-        result.fits = fit(views, list(classes.values()))
-    result.objects = describe_objects(tracks, class_names, result.fits, views, own)
+    started, poses = time.monotonic(), result.poses
+    link_and_fit(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
-    result.tracks, result.out = fill_gaps(tracks, video.size, gap), workspace.out
+    result.tracks, result.out = fill_gaps(result.tracks, video.size, gap), workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
     result.embedding_row = detected[result.embedding_row]
-    result.world = describe_world(poses, result.fits, events)
     result.seconds["objects"] = time.monotonic() - started
-    result.warnings += poses.messages if poses is not None else ()
+    result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
     for warning in result.warnings:
         log.warning(warning)
     started = time.monotonic()
@@ -1219,12 +1206,12 @@ def _cmd_poses(args: argparse.Namespace) -> int:
         poses, model = reconstruct_cached(video, config.poses, workspace)
     workspace.publish_model(model)
     if poses.known.any():
-        write_tum(workspace.out / "poses.txt", poses)
+        write_trajectories(workspace.out, poses)
         write_supplied_model(poses, video, workspace.out)
     known, count = poses.known.sum(), len(poses.frame)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
-    for message in poses.messages:
+    for message in (*poses.messages, *parts_message(poses)):
         log.warning(message)
     return 0
 

@@ -42,7 +42,7 @@ CONFIGS = (
     "InputConfig DetectConfig EmbedConfig TrackerConfig PosesConfig ObjectsConfig OutputConfig"
 )
 GROUPS: dict[str, str] = {
-    "The whole chain": "run refit Result Object World LinkEvent evaluate export",
+    "The whole chain": "run refit Result Object World Part LinkEvent evaluate export",
     "The tracker": "track Tracker Tracks Detections Embeddings Frame Video",
     "Detectors and files": "OnnxDetector DetectionSource open_detections read_detections "
     "read_tracks write_detections_npz list_models model_path COCO_NAMES",

@@ -179,6 +179,11 @@ class Poses:
         """Number of parts, at least 1."""
         return int(self.part.max(initial=0)) + 1
 
+    def part_of(self, frame: IntArray) -> IntArray:
+        """Return the part (n,) of frames (n,); one that was not read to the next that was."""
+        row = np.searchsorted(self.frame, frame).clip(max=len(self.frame) - 1)
+        return np.asarray(self.part[row], np.int64)
+
     def of_part(self, part: int) -> Poses:
         """Return one part alone: its frames, poses and points in its world, and no messages."""
         rows = np.flatnonzero(self.part == part)
@@ -189,6 +194,7 @@ class Poses:
         return dataclasses.replace(
             self,
             **{k: getattr(self, k)[rows] for k in ("frame", "time_s", "cam_from_world", "status")},
+            up_in_world=None if part else self.up_in_world,  # of another world
             points=self.points[kept],
             colors=self.colors[kept],
             visibility=np.column_stack([row_of[seen[:, 0]], np.searchsorted(kept, seen[:, 1])]),
@@ -222,7 +228,7 @@ def save_poses(path: Path, poses: Poses) -> None:
 def load_poses(path: Path) -> Poses:
     """Read what `save_poses` wrote."""
     data, facts = load_npz(path)
-    arrays = {k: data[k] for k in _POSE_ARRAYS}
+    arrays = {k: data[k] for k in _POSE_ARRAYS if k in data}  # older files lack the last
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
     return Poses(

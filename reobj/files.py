@@ -37,6 +37,20 @@ def atomic(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+def part_path(path: Path, part: int) -> Path:
+    """Name the file or folder of one part of the cameras' path: that of part 0 is `path` itself.
+
+    >>> part_path(Path("poses.txt"), 2).name
+    'poses_part2.txt'
+    """
+    return path.with_name(f"{path.stem}_part{part}{path.suffix}") if part else path
+
+
+def part_paths(path: Path) -> list[Path]:
+    """List what is there of `part_path` for all parts but part 0."""
+    return sorted(path.parent.glob(f"{path.stem}_part[0-9]*{path.suffix}"))
+
+
 def read_text(path: Path) -> str:
     """Read a UTF-8 file, with or without a byte order mark."""
     try:

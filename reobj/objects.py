@@ -17,7 +17,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
 from reobj.files import rounded
-from reobj.results.result import Object, World, significant
+from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
 from reobj.views import Views
 
@@ -189,11 +189,37 @@ def _with_solid(
 
 
 def describe_world(
-    poses: Poses | None, fits: quadrics.ObjectFits | None, events: Sequence[LinkEvent]
+    poses: Poses | None,
+    fits: Sequence[quadrics.ObjectFits | None],
+    events: Sequence[LinkEvent],
 ) -> World:
-    """Describe the world of the poses: units, gravity, scale, frames, joins and splits."""
+    """Describe the world of the poses: units, gravity, scale, frames, joins and splits.
+
+    Args:
+        fits: of each part, None where nothing was fitted.
+    """
     if poses is None:
         return World(links=tuple(events))
+    parts = tuple(_describe_part(poses, k, fit) for k, fit in enumerate(fits))
+    first = parts[0]
+    return World(
+        "m" if poses.metric else "arbitrary",
+        poses.source,
+        first.registered_frames,
+        first.interpolated_frames,
+        len(poses.frame),
+        first.up_in_world,
+        first.up_source,
+        first.scale,
+        tuple(events),
+        parts,
+    )
+
+
+def _describe_part(poses: Poses, part: int, fits: quadrics.ObjectFits | None) -> Part:
+    """Describe one part of the poses from its frames and its fits."""
+    row, poses = np.flatnonzero(poses.part == part), poses.of_part(part)
+    runs = np.split(poses.frame, np.flatnonzero(np.diff(row) > 1) + 1)
     scale, up = None, poses.up_in_world
     up_source = "none" if up is None else "poses"
     if fits is not None:
@@ -201,14 +227,12 @@ def describe_world(
         scale = quadrics.Scale(value, sigma, fits.scale.source)
         if fits.up.any():
             up, up_source = fits.up, fits.up_source
-    return World(
-        "m" if poses.metric else "arbitrary",
-        poses.source,
+    return Part(
+        [[int(run[0]), int(run[-1])] for run in runs if len(run)],
+        len(poses.frame),
         int(poses.known.sum()),
         int((poses.status == "interpolated").sum()),
-        len(poses.frame),
         None if up is None else significant(up),
         up_source,
         scale,
-        tuple(events),
     )

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
-from simulated import fitted, tracks_of, walk
+from simulated import SIZE, finished, fitted, tracks_of, unlinked, walk
 
 import reobj_track as rt
+from reobj.results.workspace import Workspace
 
 ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
 CAMERA = "492.756788421,492.756788421,320,240"  # of examples/room/camera.txt
@@ -30,3 +33,24 @@ def chairs() -> rt.Result:
     """Three simulated chairs, fitted; not saved. Copy it before you change it."""
     poses = walk()
     return fitted(tracks_of(poses), poses)
+
+
+@pytest.fixture(scope="session")
+def parted() -> rt.Result:
+    """The chairs again, of cameras in two parts; not saved. Copy it before you change it."""
+    return finished(unlinked())
+
+
+@pytest.fixture(scope="session")
+def parted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output folder of the two parts with all its files, as `objects` writes them."""
+    top = tmp_path_factory.mktemp("parts")
+    (top / "frames").mkdir()
+    for i in range(64):
+        image = np.full((SIZE[1], SIZE[0], 3), (60, 60 + 2 * i, 60), np.uint8)
+        cv2.imwrite(str(top / f"frames/{i:03d}.jpg"), image)
+    workspace, given = Workspace(top / "out"), unlinked()
+    workspace.bind(rt.Video(top / "frames"))
+    workspace.save_last(given, given.poses)
+    assert rt.main(["objects", str(workspace.out)]) == 0
+    return workspace.out

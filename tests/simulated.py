@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
 from reobj.objects import describe_objects, describe_world, fitter
+from reobj.parts import link_and_fit
 from reobj.results.result import VideoInfo
 from reobj.types import object_classes
 from reobj.views import gather_views
@@ -71,7 +74,7 @@ def fitted(
         fits = fitter(config, poses, names)(views, list(classes.values()))
     objects = describe_objects(tracks, names, fits, views, config)
     video = VideoInfo("walk.mp4", *SIZE, 30.0)
-    world = describe_world(poses, fits, [])
+    world = describe_world(poses, [fits], [])
     return rt.Result(tracks, names, video, objects, world, poses, fits)
 
 
@@ -80,3 +83,60 @@ def with_columns(tracks: rt.Tracks, **columns: object) -> rt.Tracks:
     n = len(tracks)
     arrays = {k: np.full(n, v) if np.isscalar(v) else v for k, v in columns.items()}
     return dataclasses.replace(tracks, **arrays)  # type: ignore[arg-type]
+
+
+BREAK = 40  # first frame of the second part in `two_parts`
+PARTS = (  # scale, rotation vector, shift: x_in_part = scale * R @ x_in_true + shift
+    (0.5, (0.2, 0.1, -0.3), (1.0, 2.0, -1.0)),
+    (3.0, (-1.0, 0.7, 0.4), (-5.0, 0.5, 4.0)),
+)
+
+
+def into_part(part: int, points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of the true world in that of a part."""
+    scale, turn, shift = PARTS[part]
+    return scale * points @ Rotation.from_rotvec(turn).as_matrix().T + shift
+
+
+def two_parts(frames: int = 64) -> rt.Poses:
+    """A walk around the chairs that breaks at frame 40: two worlds; 38 to 40 have no pose.
+
+    Every chair's centre is a sparse point that all frames of its part observe.
+    """
+    true = walk(frames, 200.0)
+    part = (np.arange(frames) >= BREAK).astype(np.int64)
+    cams = true.cam_from_world.copy()
+    for k, (scale, turn, shift) in enumerate(PARTS):
+        rows = part == k  # X_cam = R_c X + t_c; times the scale, with X = R' (X_part - shift) / s
+        rotation = cams[rows, :, :3] @ Rotation.from_rotvec(turn).as_matrix().T
+        cams[rows, :, 3] = scale * cams[rows, :, 3] - rotation @ np.array(shift)
+        cams[rows, :, :3] = rotation
+    cams[BREAK - 2 : BREAK + 1] = np.nan
+    status = np.where(np.isfinite(cams[:, 0, 0]), "pnp", "none")
+    centers = chair_solids().center_in_world
+    row, point = np.divmod(np.arange(frames * 3), 3)
+    return dataclasses.replace(
+        true, cam_from_world=cams, status=status, source="pycolmap", metric=False,
+        up_in_world=None, points=np.concatenate([into_part(k, centers) for k in (0, 1)]),
+        colors=np.repeat(np.array([[0], [9]], np.uint8), 3, 0) * np.ones(3, np.uint8),
+        visibility=np.column_stack([row, point + 3 * part[row]]), part=part,
+    )  # fmt: skip
+
+
+def tracks_in_two_parts(poses: rt.Poses) -> rt.Tracks:
+    """Boxes of the chairs in `two_parts`: the tracker follows all three over the break."""
+    true = dataclasses.replace(walk(len(poses.frame), 200.0), frame=poses.frame)
+    return tracks_of(true, 0.5)
+
+
+def unlinked(poses: rt.Poses | None = None, tracks: rt.Tracks | None = None) -> rt.Result:
+    """What the tracker and the reconstruction hand over: by default in two parts."""
+    poses = two_parts() if poses is None else poses
+    tracks = tracks_in_two_parts(poses) if tracks is None else tracks
+    return rt.Result(tracks, rt.COCO_NAMES, VideoInfo("walk.mp4", *SIZE, 30.0), poses=poses)
+
+
+def finished(result: rt.Result, **options: Any) -> rt.Result:
+    """The same result, linked and fitted."""
+    link_and_fit(result, rt.ObjectsConfig(**options))
+    return result

@@ -26,14 +26,13 @@ from reobj.results.evaluation import (
     drop_ignored,
     identity_map,
     labelled,
-    read_true_solids,
     return_ranks,
-    score_objects,
     score_report,
     score_tracks,
     visits,
 )
 from reobj.results.result import VideoInfo
+from reobj.results.solids import read_true_solids, score_objects
 from reobj.results.workspace import Workspace
 from reobj.types import Embeddings
 

@@ -286,7 +286,7 @@ def test_world_of_a_fit() -> None:
     poses = dataclasses.replace(poses, metric=False, status=status)
     fits, _ = a_fit(scale=quadrics.Scale(2.123456789, 0.123456789, "priors"))
     event = rt.LinkEvent("join", (1, 2), 0.5, 1.0, True)
-    world = describe_world(poses, fits, [event])
+    world = describe_world(poses, [fits], [event])
     assert (world.units, world.source) == ("arbitrary", "user")
     assert (world.registered_frames, world.interpolated_frames, world.frames) == (5, 1, 6)
     assert world.scale == (2.123457, 0.1235, "priors") and world.links == (event,)
@@ -303,8 +303,8 @@ def test_up_is_the_fits_or_the_poses(
 ) -> None:
     poses = dataclasses.replace(walk(3), up_in_world=np.array([1.0, 0, 0]) if poses_know else None)
     changes = {} if fit_knows else {"up": np.zeros(3), "up_source": "none"}
-    world = describe_world(poses, a_fit(**changes)[0], [])
+    world = describe_world(poses, [a_fit(**changes)[0]], [])
     assert (None if world.up_in_world is None else world.up_in_world.tolist()) == up
     assert world.up_source == source
-    flat = describe_world(poses, None, [])
+    flat = describe_world(poses, [None], [])
     assert flat.scale is None and flat.up_source == ("poses" if poses_know else "none")

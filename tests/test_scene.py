@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from simulated import fitted, tracks_of, walk, with_columns
+from simulated import fitted, into_part, tracks_of, walk, with_columns
 
 import quadrics
 import reobj_track as rt
@@ -404,6 +404,55 @@ def test_fingers_and_a_phone_screen(browser: Browser, page: Path) -> None:
     assert complaints(browser) == []
 
 
+def test_parts_are_chosen_and_everything_follows(browser: Browser, parted_folder: Path) -> None:
+    browser.open(parted_folder / "scene.html")
+    rows = "[...document.querySelectorAll('.row b')].map(b => +b.textContent)"
+    shown = "[solid.map(o => o.id), steps.length, posed.length, +$('slider').max, G.cloud.count]"
+    assert browser.eval("[$('part').hidden, $('part').options.length]") == [False, 2]
+    assert browser.eval("document.title") == "frames: 6 objects in 2 parts"
+    assert browser.eval(rows) == [1, 2, 3]
+    assert browser.eval(shown) == [[1, 2, 3], 40, 38, 39, 3]
+    assert browser.eval("$('facts').textContent").startswith("cameras of 38 of 40 frames")
+    before = browser.eval("radius")
+    browser.eval("select(solid[0]); goTo(20)")
+    browser.eval("$('part').value = 1; $('part').onchange()")
+    browser.settle()
+    assert browser.eval(rows) == [4, 5, 6]
+    assert browser.eval(shown) == [[4, 5, 6], 24, 23, 23, 3]
+    assert browser.eval("[state.step, state.selected, $('panel').innerHTML]") == [-1, None, ""]
+    assert browser.eval("$('facts').textContent").startswith("cameras of 23 of 24 frames")
+    assert 4 < browser.eval("radius") / before < 9  # 3 units a metre instead of .5
+    solid = browser.eval("solid[1].center")
+    np.testing.assert_allclose(solid, into_part(1, np.array([[0, 0.1, 0.41]]))[0], atol=0.1)
+    browser.eval("S.parts[1].scale.rel_sigma = .77")
+    browser.click(*center_of(browser, 5))
+    assert browser.eval("$('panel').querySelector('h2').textContent") == "5 chair"
+    assert "from priors, ± 77 %" in browser.eval("$('panel').querySelector('dl').textContent")
+    picture = "document.querySelectorAll('.crops figure')"
+    browser.eval(f"[...{picture}].forEach(f => {{ f.click(); }})")
+    assert browser.eval("S.steps.part[state.step]") == 1
+    browser.eval("$('slider').value = 23; $('slider').oninput()")
+    assert browser.eval("[state.step, $('clock').textContent]") == [63, "frame 63"]
+    browser.eval("$('play').click()")  # from the end of the part to its first frame
+    moved = "new Promise(f => setInterval(() => state.step !== 63 && f(state.step), 20))"
+    assert 40 <= browser.eval(moved) < 60
+    browser.eval("$('play').click(); goTo(3)")  # of the other part
+    assert browser.eval(f"[+$('part').value, +$('slider').value, {rows}]") == [0, 3, [1, 2, 3]]
+    for phone in (False, True):
+        size = {"width": 390, "height": 780} if phone else {"width": 1280, "height": 800}
+        browser.open(parted_folder / "scene.html", **size, phone=phone)
+        browser.eval("enter(1); goTo(50)")
+        browser.settle()
+        assert browser.eval("document.documentElement.scrollWidth <= innerWidth")
+        browser.picture(SCREENSHOTS / f"parts-{'phone' if phone else 'desktop'}.png")
+    assert complaints(browser) == []
+
+
+def test_one_part_has_no_selector(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    assert browser.eval("[$('part').hidden, $('part').offsetWidth]") == [True, 0]
+
+
 def test_identities_only_still_open(browser: Browser, tmp_path: Path) -> None:
     """No cameras: pictures and a timeline, and the reason."""
     browser.open(write_page(tmp_path / "flat", in_3d=False))
@@ -444,14 +493,17 @@ def test_the_page_holds_the_scene(page: Path) -> None:
     data, poses = data_of(page), poses_of_walk()
     found = np.frombuffer(base64.b64decode(data["poses"]), "<f4").reshape(-1, 3, 4)
     np.testing.assert_allclose(found, invert_rigid(poses.cam_from_world), atol=1e-6)
-    points = np.frombuffer(base64.b64decode(data["points"]), "<f4").reshape(-1, 3)
+    (part,) = data["parts"]
+    points = np.frombuffer(base64.b64decode(part["points"]), "<f4").reshape(-1, 3)
     np.testing.assert_allclose(points, poses.points, atol=1e-6)
-    assert data["objects"][1]["seen"] == [0, 8, 15, 23] and data["up"] == [0, 0, 1]
+    assert data["objects"][1]["seen"] == [0, 8, 15, 23] and part["up"] == [0, 0, 1]
     assert [tuple(o["color"]) for o in data["objects"]] == [
         object_color(i)[::-1] for i in (1, 2, 3, 4)
     ]
-    assert data["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
-    assert data["steps"] == {"frame": list(range(24)), "seconds": pytest.approx(1 / 30)}
+    assert part["facts"] == "cameras of 23 of 24 frames · scale from poses, ± 0 %"
+    assert data["steps"] == {
+        "frame": list(range(24)), "seconds": pytest.approx(1 / 30), "part": [0] * 24,
+    }  # fmt: skip
     assert "cov" not in data["objects"][0] and data["why_flat"] == ""
 
 
@@ -546,6 +598,16 @@ def test_views_from_other_sides_are_shown() -> None:
     assert late[0] >= 2 and late[1] == 1  # by time alone: the last one
 
 
+def test_views_are_those_of_the_cameras_of_the_part(parted: rt.Result) -> None:
+    wanted = set(Pictures(parted, VIDEO).wanted.tolist())
+    for o in parted.objects:
+        chosen = [
+            diverse_rows(parted.tracks, o, poses, 8).tolist()
+            for poses in (parted.poses.of_part(o.part), parted.poses.of_part(1 - o.part))
+        ]
+        assert chosen[0] != chosen[1] and wanted >= set(chosen[0])
+
+
 def test_boxes_are_drawn_in_small_frames(tmp_path: Path) -> None:
     """A frame of 960 px is shown with 320, and its boxes too."""
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((720, 960, 3), np.uint8))
@@ -594,9 +656,9 @@ def test_up_is_guessed_from_level_cameras(tmp_path: Path) -> None:
     result = rt.Result(tracks_of_walk(poses), NAMES, VideoInfo("a", WIDTH, HEIGHT, 25.0))
     result.poses, result.world = poses, rt.World("m", "user", 23, 0, 24)
     write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
-    data = data_of(tmp_path / "a.html")
-    np.testing.assert_allclose(data["up"], [0, 0, 1], atol=0.05)
-    assert data["facts"].endswith("units: m · up is guessed from the cameras")
+    (part,) = data_of(tmp_path / "a.html")["parts"]
+    np.testing.assert_allclose(part["up"], [0, 0, 1], atol=0.05)
+    assert part["facts"].endswith("units: m · up is guessed from the cameras")
 
 
 def test_long_videos_are_thinned(tmp_path: Path) -> None:

@@ -170,15 +170,39 @@ def test_the_published_model_is_a_copy(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / name).write_text(name)
-        space.publish_model(tmp_path / name)
+        space.publish_model([tmp_path / name])
         assert [p.name for p in (space.out / "sparse").iterdir()] == [name]
     shutil.rmtree(tmp_path / "b")
     assert (space.out / "sparse/b").read_text() == "b"
-    space.publish_model(tmp_path / "b")  # a failed reconstruction has none
+    space.publish_model([tmp_path / "b"])  # a failed reconstruction has none
     assert not (space.out / "sparse").exists()
-    space.publish_model(tmp_path / "a")
+    space.publish_model([tmp_path / "a"])
     space.publish_model(None)
     assert sorted(p.name for p in space.out.iterdir()) == ["cache"]
+
+
+def test_every_part_has_its_model(tmp_path: Path) -> None:
+    """Of fewer parts than before, the models of the others go; what is no part's stays."""
+    space, models = Workspace(tmp_path / "out"), [tmp_path / name for name in "abc"]
+    for model in models:
+        model.mkdir()
+        (model / model.name).write_text(model.name)
+    (space.out / "sparse_participants").mkdir()
+
+    def published() -> dict[str, list[str]]:
+        found = {p.name: sorted(f.name for f in p.iterdir()) for p in space.out.iterdir()}
+        return {name: files for name, files in found.items() if name.startswith("sparse")}
+
+    space.publish_model(models)
+    kept: dict[str, list[str]] = {"sparse_participants": []}
+    assert published() == kept | {"sparse": ["a"], "sparse_part1": ["b"], "sparse_part2": ["c"]}
+    space.publish_model(models[1:])
+    assert published() == kept | {"sparse": ["b"], "sparse_part1": ["c"]}
+    shutil.rmtree(models[1])
+    space.publish_model(models[:2])
+    assert published() == kept | {"sparse": ["a"]}
+    space.publish_model(None)
+    assert published() == kept
 
 
 def test_a_model_is_published_whole_or_not_at_all(
@@ -188,7 +212,7 @@ def test_a_model_is_published_whole_or_not_at_all(
     (tmp_path / "model").mkdir()
     for name in ("1", "2"):
         (tmp_path / "model" / name).write_text("first")
-    space.publish_model(tmp_path / "model")
+    space.publish_model([tmp_path / "model"])
 
     def interrupted(source: Path, target: Path) -> None:
         target.mkdir()
@@ -197,9 +221,9 @@ def test_a_model_is_published_whole_or_not_at_all(
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(shutil, "copytree", interrupted)
-        space.publish_model(tmp_path / "model")
+        space.publish_model([tmp_path / "model"])
     assert [(space.out / "sparse" / n).read_text() for n in ("1", "2")] == ["first", "first"]
-    space.publish_model(tmp_path / "model")
+    space.publish_model([tmp_path / "model"])
     assert sorted(p.name for p in space.out.iterdir()) == ["cache", "sparse"]
 
 

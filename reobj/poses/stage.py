@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from reobj.cameras import Poses, load_poses, save_poses, write_colmap
+from reobj.files import part_path
 from reobj.poses.checks import check_poses
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.readers import read_poses
@@ -38,13 +39,14 @@ def check_directions(poses: Poses, tracks: Tracks) -> None:
 
 def reconstruct_cached(
     video: Video, config: PosesConfig, workspace: Workspace, moving: Tracks | None = None
-) -> tuple[Poses, Path]:
+) -> tuple[Poses, list[Path]]:
     """Reconstruct the cameras of a video, or take them from the output folder's cache.
 
     Args:
         moving: tracks of things that move; nothing on them is matched.
     Returns:
-        poses, and the folder of their COLMAP model (missing if the reconstruction failed).
+        poses, and the folder of the COLMAP model of each part (missing if the reconstruction
+        failed).
     """
     boxes = np.empty((0, 5))
     if moving is not None and len(moving):
@@ -54,19 +56,23 @@ def reconstruct_cached(
     path = workspace.path("poses", content, video.config, config, digest)
     model = path.with_suffix(".sparse")
     if path.exists():
-        return load_poses(path), model
+        poses = load_poses(path)
+        return poses, [part_path(model, k) for k in range(poses.part_count)]
     work = workspace.cache / "sfm"
     boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
     poses = estimate_poses(video, config, work, boxes_to_mask=boxes_of)
     if poses.known.any():
-        shutil.rmtree(model, ignore_errors=True)
-        (work / "sparse").replace(model)
+        for k in range(poses.part_count):
+            shutil.rmtree(part_path(model, k), ignore_errors=True)
+            part_path(work / "sparse", k).replace(part_path(model, k))
         save_poses(path, poses)
-    return poses, model
+    return poses, [part_path(model, k) for k in range(poses.part_count)]
 
 
 def write_supplied_model(poses: Poses, video: Video, out: Path) -> None:
     """Write sparse/ of supplied poses; a reconstruction has its own, with more in it."""
     if poses.source == "user" and poses.known.any():
-        names = [video.name(int(f)) or f"{f:06d}" for f in poses.frame]
-        write_colmap(out / "sparse", poses, names)
+        for k in range(poses.part_count):
+            part = poses.of_part(k)
+            names = [video.name(int(f)) or f"{f:06d}" for f in part.frame]
+            write_colmap(part_path(out / "sparse", k), part, names)

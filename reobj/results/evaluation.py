@@ -1,4 +1,4 @@
-"""Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k of returns, O3D of solids.
+"""Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k of returns; in 3D: solids.py.
 
 Start at `evaluate`; `score_tracks` scores any two sets of `LabelledBoxes`. Writes nothing.
 """
@@ -16,11 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-import quadrics
 from reobj import __version__
-from reobj.cameras import Poses, import_pycolmap, invert_rigid
 from reobj.files import load_json
 from reobj.results.result import Result
+from reobj.results.solids import score_objects
 from reobj.results.workspace import LAST_TRACKS, Workspace
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import InputConfig
@@ -352,127 +351,6 @@ def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | 
     return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
 
 
-MIN_HALF_AXIS = 0.005  # world units of the truth, metres: a sheet is taken as 1 cm thick (chosen)
-
-
-def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
-    """Read ids and ellipsoids of a gt_objects.json: `half_axes`, or extents `size` with axes `R`.
-
-    Where an object has a `visible_part`, that is the truth: no camera saw the rest.
-    """
-    try:
-        entries = load_json(path)["objects"]
-        seen = [e | e.get("visible_part", {}) for e in entries]
-        half = [np.array(e["size"]) / 2 if "R" in e else np.array(e["half_axes"]) for e in seen]
-        axes = [np.array(e["R"] if "R" in e else e["world_from_obj"])[:3, :3] for e in seen]
-        center = np.array([e["center"] for e in seen], np.float64).reshape(-1, 3)
-        half_axes = np.maximum(np.array(half, np.float64).reshape(-1, 3), MIN_HALF_AXIS)
-        rotation = np.array(axes, np.float64).reshape(-1, 3, 3)
-        return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, rotation)
-    except (IndexError, KeyError, TypeError, AttributeError) as error:
-        expected = "objects with id, center, size and R, or half_axes and world_from_obj"
-        raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
-
-
-def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, Array, Array]:
-    """Align our world with the truth's by a similarity of the camera centres.
-
-    Poses that the user supplied are in the truth's world already.
-
-    Args:
-        truth_poses: TUM, or a 4x4 world_from_cam a line; None is enough for supplied poses.
-    Returns:
-        scale, rotation (3, 3) and shift (3,): x_in_truth = scale * rotation @ x_in_ours + shift.
-    """
-    poses = result.poses
-    if poses is None:
-        raise ReobjError(f"{result.out}: no cameras here, so nothing to compare in 3D; see `run`")
-    if poses.source == "user":
-        return 1.0, np.eye(3), np.zeros(3)
-    if truth_poses is None:
-        raise ReobjError("reconstructed cameras have a world of their own: give --gt-poses")
-    centers = _true_centers(truth_poses, poses)  # (F, 3)
-    use = poses.known & np.isfinite(centers).all(1)
-    ours = invert_rigid(poses.cam_from_world[use])[:, :, 3]  # (f, 3)
-    true_from_ours = None
-    if use.sum() >= 3:  # Umeyama, PAMI 1991
-        true_from_ours = import_pycolmap().estimate_sim3d(ours, centers[use])
-    if true_from_ours is None:
-        raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
-    turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
-    return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
-
-
-SAME_TIME_S = 0.02  # of a frame and its true pose; chosen: half a frame at 25 Hz
-
-
-def _true_centers(path: Path, poses: Poses) -> Array:
-    """Read camera centres (F, 3) of the poses' frames, NaN where unknown.
-
-    TUM rows belong to the frame of their time; of 4x4 world_from_cam, row n belongs to frame n.
-    """
-    try:
-        table = np.loadtxt(path, ndmin=2)
-    except ValueError as error:
-        raise ReobjError(f"{path}: {error}; expected TUM rows or 16 numbers a line") from error
-    if table.shape[1] == 16:
-        frame = poses.frame.clip(0, len(table) - 1)
-        return np.where((frame == poses.frame)[:, None], table[frame][:, 3:12:4], np.nan)
-    if table.shape[1] != 8:
-        found = f"{table.shape[1]} columns"
-        raise ReobjError(f"{path}: {found}; expected TUM rows of 8 numbers, or 16 numbers a line")
-    nearest = np.abs(table[:, :1] - poses.time_s[None]).argmin(0)  # (F,)
-    far = np.abs(table[nearest, 0] - poses.time_s) > SAME_TIME_S
-    return np.where(far[:, None], np.nan, table[nearest, 1:4])
-
-
-def score_objects(
-    result: Result, solids: Path, truth_poses: Path | None, pairs: dict[int, int | None]
-) -> dict[str, Any]:
-    """Score the ellipsoids against the true ones: O3D (volume IoU), centre and size errors.
-
-    Args:
-        solids: gt_objects.json. truth_poses: as in `align_with_truth`.
-        pairs: found identity of every true one, or None (`identity_map`): an object counts as found
-            only if the identities say so.
-    Returns:
-        counts and errors by name, centre errors in units of the truth; `o3d_all` counts 0 for every
-        true object without ellipsoid; `scale_error`: of our metres per unit, relative.
-    """
-    ids, truth = read_true_solids(solids)
-    scale, turn, shift = align_with_truth(result, truth_poses)
-    located, ours = result.located, result.ellipsoids()
-    row_of = {o.id: row for row, o in enumerate(located)}
-    rows = [i for i, t in enumerate(ids) if pairs.get(t) in row_of]  # of the truth
-    if not rows:
-        return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
-    own = np.array([row_of[pairs[ids[i]] or 0] for i in rows])  # of ours
-    center = ours.center_in_world[own] @ (scale * turn).T + shift  # (n, 3)
-    axes = turn @ ours.world_from_obj[own]
-    found = quadrics.Ellipsoids(center, scale * ours.half_axes[own], axes)
-    goal = truth[np.array(rows)]
-    o3d = quadrics.volume_overlap(found, goal)  # (n,)
-    error = np.linalg.norm(center - goal.center_in_world, axis=1)  # (n,) units of the truth
-    size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3  # (n,) mean side
-    claimed = result.world.scale.value if result.world.scale is not None else None
-    each = [
-        {"id": ids[i], "object": located[j].id, "class": located[j].class_name, "o3d": a,
-         "center_error": b}
-        for i, j, a, b in zip(rows, own.tolist(), o3d.tolist(), error.tolist(), strict=True)
-    ]  # fmt: skip
-    return {
-        "true": len(pairs),
-        "found": len(rows),
-        "o3d_found": float(o3d.mean()),
-        "o3d_median": float(np.median(o3d)),
-        "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
-        "center_error_median": float(np.median(error)),
-        "size_error_median": float(np.expm1(np.median(size))),
-        "scale_error": None if not claimed else abs(claimed / scale - 1),
-        "objects": each,
-    }
-
-
 _COLUMNS = "HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split()
 _COUNTS = ("IDSW", "Frag", "ids_per_object")  # the others are shares
 
@@ -497,8 +375,8 @@ def score_report(scores: dict[str, Any]) -> str:
     else:
         lines.append("Rank-k: no embeddings here (an output folder of `run` or `track` keeps them)")
     if "objects" in scores:
-        facts = {k: v for k, v in scores["objects"].items() if k != "objects" and v is not None}
-        lines.append("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in facts.items()))
+        numbers = {k: v for k, v in scores["objects"].items() if isinstance(v, int | float)}
+        lines.append("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in numbers.items()))
     return "\n".join(lines)
 
 

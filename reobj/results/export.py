@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reobj import __version__
-from reobj.cameras import invert_rigid, quat_wxyz_from_matrix
-from reobj.files import atomic
+from reobj.cameras import Poses, invert_rigid, quat_wxyz_from_matrix
+from reobj.files import atomic, spans
 from reobj.results.result import Result
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import CVAT_BOX
@@ -44,6 +44,22 @@ def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
     path = Path(path) if path else Path(out) / name
     write(Result.load(out), path)
     return path
+
+
+def _largest_part(result: Result, path: Path) -> Result:
+    """Return the objects and cameras that fit into one world; warns of those that do not."""
+    if len(parts := result.world.parts) > 1:
+        held = f"part 0 of {len(parts)} ({parts[0].span_text})"
+        log.warning("%s holds %s: the others have a frame and scale of their own", path, held)
+    return result.of_part(0)
+
+
+def _say_parts(result: Result, path: Path) -> None:
+    """Say which objects are of which part: an object that two parts show is two of them."""
+    if len(result.world.parts) > 1:
+        ids = [spans(o.id for o in part.objects) or "none" for part in result.parts()]
+        of = [f"{part.span_text}: {i}" for part, i in zip(result.world.parts, ids, strict=True)]
+        log.warning("%s: no object is joined over the parts; objects of %s", path, "; ".join(of))
 
 
 def _frames_read(result: Result) -> tuple[list[int], list[str]]:
@@ -80,13 +96,18 @@ def export_coco_vid(result: Result, path: Path) -> None:
          "video_id": 1, "frame_id": f}
         for f in frames
     ]  # fmt: skip
+    _say_parts(result, path)
+    part_of: dict[int, dict[str, int]] = {}
+    if len(result.world.parts) > 1:
+        part_of = {o.id: {"part": o.part} for o in result.objects}
     corners = tracks.xyxy.round(2)
     boxes = np.hstack([corners[:, :2], corners[:, 2:] - corners[:, :2]]).round(2).tolist()
     annotations = [
         {"id": i + 1, "image_id": image_id[int(tracks.frame[i])], "video_id": 1,
          "category_id": int(tracks.class_id[i]) + 1, "instance_id": int(tracks.track_id[i]),
          "track_id": int(tracks.track_id[i]), "bbox": box, "area": round(box[2] * box[3], 2),
-         "iscrowd": 0, "score": float(tracks.score[i])}
+         "iscrowd": 0, "score": float(tracks.score[i]),
+         **part_of.get(int(tracks.track_id[i]), {})}
         for i, box in enumerate(boxes)
     ]  # fmt: skip
     data = {
@@ -110,6 +131,7 @@ def export_cvat(result: Result, path: Path) -> None:
     """
     tracks, video = result.tracks, result.video
     frames, _ = _frames_read(result)
+    _say_parts(result, path)
     root = ET.Element("annotations")
     ET.SubElement(root, "version").text = "1.1"
     task = ET.SubElement(ET.SubElement(root, "meta"), "task")
@@ -169,6 +191,7 @@ def export_glb(result: Result, path: Path) -> None:
         import trimesh
     except ImportError as error:
         raise ReobjError("trimesh is not installed: pip install 'reobj-track[viewer]'") from error
+    result = _largest_part(result, path)
     scale, turn = _upright(result, path, [0.0, 1, 0])
     world, poses = np.eye(4), result.poses
     world[:3, :3] = scale * turn
@@ -206,7 +229,8 @@ def export_rrd(result: Result, path: Path) -> None:
         import rerun as rr
     except ImportError as error:
         raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
-    scale, turn = _upright(result, path, [0.0, 0, 1])
+    largest = _largest_part(result, path)
+    scale, turn = _upright(largest, path, [0.0, 0, 1])
     names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
     rec = rr.RecordingStream("reobj_track", recording_id=Path(result.video.path).name)
     rec.set_log_time_enabled(False)  # when the export was made is of no interest
@@ -216,9 +240,9 @@ def export_rrd(result: Result, path: Path) -> None:
         rec.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Horizontal(*views)))
         rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
-        ellipsoids = result.ellipsoids()
+        ellipsoids = largest.ellipsoids()
         xyzw = np.roll(quat_wxyz_from_matrix(ellipsoids.world_from_obj), -1, 1)  # (O, 4)
-        for i, o in enumerate(result.located):
+        for i, o in enumerate(largest.located):
             solid = rr.Ellipsoids3D(
                 half_sizes=scale * ellipsoids.half_axes[i : i + 1], labels=[names[o.id]],
                 centers=scale * ellipsoids.center_in_world[i : i + 1],
@@ -226,16 +250,18 @@ def export_rrd(result: Result, path: Path) -> None:
                 colors=[object_color(o.id)[::-1]],
             )  # fmt: skip
             rec.log(["world", "objects", o.class_name, str(o.id)], solid, static=True)
-        if result.poses is not None:
-            cloud = rr.Points3D(scale * result.poses.points, colors=result.poses.colors)
+        if (poses := largest.poses) is not None:
+            cloud = rr.Points3D(scale * poses.points, colors=poses.colors)
             rec.log("world/points", cloud, static=True)
-        _rrd_frames(rr, rec, result, names, scale)
+        _rrd_frames(rr, rec, result, poses, names, scale)
         rec.disconnect()  # writes what is left
 
 
-def _rrd_frames(rr: Any, rec: Any, result: Result, names: dict[int, str], scale: float) -> None:
-    """Log each frame's camera, if it has one, and boxes."""
-    poses, tracks, (frames, _) = result.poses, result.tracks, _frames_read(result)
+def _rrd_frames(
+    rr: Any, rec: Any, result: Result, poses: Poses | None, names: dict[int, str], scale: float
+) -> None:
+    """Log each frame's camera, if `poses` have one, and boxes."""
+    tracks, (frames, _) = result.tracks, _frames_read(result)
     pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
     fps = result.video.fps or IMAGE_FPS
     for frame in frames:

@@ -136,7 +136,6 @@ class Overlay:
         # codecs want even sides
         self.size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
         self.scale, self.tracks = self.size[0] / width, result.tracks
-        self.ids = [o.id for o in result.located]
         self.sure = {o.id for o in result.located if o.status == "ok"}
         self.labels = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         self.outlines = _project_all(result, self.scale)
@@ -150,10 +149,10 @@ class Overlay:
         small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
         image = np.asarray(small, np.uint8)
         if frame.index in self.outlines:
-            dual_c, visible = self.outlines[frame.index]
+            ids, dual_c, visible = self.outlines[frame.index]
             seen = set(rows.track_id.tolist())
-            drawn = visible & np.array([i in seen or i in self.sure for i in self.ids], bool)
-            draw_ellipses(image, dual_c, drawn, self.ids, seen)
+            drawn = visible & np.array([i in seen or i in self.sure for i in ids], bool)
+            draw_ellipses(image, dual_c, drawn, ids, seen)
         draw_tracks(image, rows, self.labels, self.scale)
         self.writer.write(image)
 
@@ -162,17 +161,22 @@ class Overlay:
         self.writer.close(complete)
 
 
-def _project_all(result: Result, scale: float) -> dict[int, tuple[Array, BoolArray]]:
-    """Project the ellipsoids of the located objects into every frame with a pose.
+def _project_all(result: Result, scale: float) -> dict[int, tuple[list[int], Array, BoolArray]]:
+    """Project the ellipsoids of the located objects into the frames with a pose of their part.
 
     Returns:
-        by frame number: dual conics (O, 3, 3) in scaled pixels, and visible (O,).
+        by frame number: identities (O), dual conics (O, 3, 3) in scaled pixels, and visible (O,).
     """
-    poses = result.poses
-    if poses is None or not result.located or not poses.known.any():
-        return {}
+    outlines: dict[int, tuple[list[int], Array, BoolArray]] = {}
     scaled = np.diag([scale, scale, 1.0])
-    img_from_world = scaled @ poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
-    dual_c, visible = quadrics.project(result.ellipsoids().dual_quadrics(), img_from_world)
-    frames = poses.frame[poses.known].tolist()
-    return dict(zip(frames, zip(dual_c, visible, strict=True), strict=True))
+    for part in result.parts():
+        ids, poses = [o.id for o in part.located], part.poses
+        if poses is None or not ids or not poses.known.any():
+            continue
+        img_from_world = scaled @ poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
+        projected = quadrics.project(part.ellipsoids().dual_quadrics(), img_from_world)
+        for frame, dual_c, visible in zip(
+            poses.frame[poses.known].tolist(), *projected, strict=True
+        ):
+            outlines[frame] = (ids, dual_c, visible)
+    return outlines

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 import quadrics
@@ -29,10 +28,14 @@ from reobj.files import (
     load_json,
     load_npz,
     numbers,
+    part_path,
+    part_paths,
     rounded,
     save_npz,
+    shortened,
     without_password,
 )
+from reobj.results.ply import write_ply
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
 from reobj.types import (
@@ -43,7 +46,6 @@ from reobj.types import (
     LinkEvent,
     ReobjError,
     Tracks,
-    object_color,
 )
 
 FORMAT = "reobj-objects"
@@ -82,6 +84,7 @@ class Object:
         frames_seen: frames that show it. parallax_deg: widest angle between two viewing rays.
         reprojection_iou_median: overlap of the projected solid with the boxes.
         tracklet_ids: its unbroken tracks; visits: first and last frame of each, by time.
+        part: of the cameras' path, whose world and units its lengths are in (`Poses.part`).
     """
 
     id: int
@@ -104,6 +107,7 @@ class Object:
     reprojection_iou_median: float | None = None
     tracklet_ids: list[int] = field(default_factory=list)
     visits: list[list[int]] = field(default_factory=list)
+    part: int = 0
 
     @property
     def located(self) -> bool:
@@ -118,6 +122,7 @@ class Object:
     @staticmethod
     def from_json(entry: dict[str, Any]) -> Object:
         """Read an entry of objects.json; unknown keys are ignored."""
+        entry = {"part": 0, **entry}  # older files have no parts
         values = {f.name: entry[_JSON_KEYS.get(f.name, f.name)] for f in dataclasses.fields(Object)}
         for name in ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov"):
             values[name] = None if values[name] is None else np.array(values[name], np.float64)
@@ -125,15 +130,42 @@ class Object:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """Frames, gravity and scale of a rigid part of the cameras' path, which is a world of its own.
+
+    Attributes:
+        spans: first and last frame of each unbroken run of its frames; frames: their number.
+        registered_frames, interpolated_frames: of them with a pose, and between two.
+        up_in_world, up_source, scale: as in `World`.
+    """
+
+    spans: list[list[int]]
+    frames: int
+    registered_frames: int
+    interpolated_frames: int = 0
+    up_in_world: Array | None = None
+    up_source: str = "none"
+    scale: quadrics.Scale | None = None
+
+    @property
+    def span_text(self) -> str:
+        """Frames of the part, for messages: "frames 0-99, 130"."""
+        return "frames " + shortened([str(a) if a == b else f"{a}-{b}" for a, b in self.spans])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class World:
     """Units, gravity and scale of the world that the objects stand in, and how they were linked.
 
+    Where the cameras come in several parts, this is the world of the largest one.
+
     Attributes:
         units: "m", "arbitrary", or None without cameras. source: of the poses.
-        registered_frames, interpolated_frames, frames: with a pose, between two, in all.
+        registered_frames, interpolated_frames: with a pose, between two; frames: in all parts.
         up_in_world: (3,) unit vector against gravity; up_source: where it comes from.
         scale: metres per unit, its relative sigma and source; None without a fit.
         links: joins and splits of tracklets with their evidence.
+        parts: of the cameras' path, the largest first; () without cameras.
     """
 
     units: str | None = None
@@ -145,16 +177,11 @@ class World:
     up_source: str = "none"
     scale: quadrics.Scale | None = None
     links: tuple[LinkEvent, ...] = ()
+    parts: tuple[Part, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the `world` of objects.json."""
-        values = {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
-        if self.scale is not None:
-            values["scale"] = {
-                "metres_per_unit": self.scale.value,
-                "rel_sigma": self.scale.rel_sigma,
-                "source": self.scale.source,
-            }
+        values = _world_json(self) | {"parts": [_world_json(part) for part in self.parts]}
         links = [dataclasses.asdict(event) for event in self.links]
         for link in links:
             link["place_iou"] = rounded(link["place_iou"], EVIDENCE_DIGITS)
@@ -164,14 +191,33 @@ class World:
     @staticmethod
     def from_json(entry: dict[str, Any]) -> World:
         """Read the `world` of objects.json."""
-        values = {f.name: entry[f.name] for f in dataclasses.fields(World) if f.name in entry}
-        if (up := values.get("up_in_world")) is not None:
-            values["up_in_world"] = np.array(up, np.float64)
-        if (scale := values.get("scale")) is not None:
-            facts = (scale["metres_per_unit"], scale["rel_sigma"], scale["source"])
-            values["scale"] = quadrics.Scale(*facts)
+        values = _world_values(World, entry)
         values["links"] = tuple(LinkEvent.from_json(link) for link in values.get("links", ()))
+        values["parts"] = tuple(Part(**_world_values(Part, e)) for e in values.get("parts", ()))
         return World(**values)
+
+
+def _world_json(world: World | Part) -> dict[str, Any]:
+    """Convert a world's fields for JSON, but for its links and parts."""
+    values = {f.name: _plain(getattr(world, f.name)) for f in dataclasses.fields(world)}
+    if world.scale is not None:
+        values["scale"] = {
+            "metres_per_unit": world.scale.value,
+            "rel_sigma": world.scale.rel_sigma,
+            "source": world.scale.source,
+        }
+    return values
+
+
+def _world_values(kind: type[World | Part], entry: dict[str, Any]) -> dict[str, Any]:
+    """Read what `_world_json` wrote; what an older file lacks is left out."""
+    values = {f.name: entry[f.name] for f in dataclasses.fields(kind) if f.name in entry}
+    if (up := values.get("up_in_world")) is not None:
+        values["up_in_world"] = np.array(up, np.float64)
+    if (scale := values.get("scale")) is not None:
+        facts = (scale["metres_per_unit"], scale["rel_sigma"], scale["source"])
+        values["scale"] = quadrics.Scale(*facts)
+    return values
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,8 +271,30 @@ class Result:
         """Objects that have a solid, by id."""
         return [o for o in self.objects if o.located]
 
+    def of_part(self, part: int) -> Result:
+        """Return the objects, cameras and world of one part alone, without the fits.
+
+        The tracks stay those of the whole video. With one part only: this result itself.
+        """
+        if self.poses is None or self.poses.part_count == 1:
+            return self
+        facts, names = self.world.parts[part], {f.name for f in dataclasses.fields(Part)}
+        own = {name: getattr(facts, name) for name in names - {"spans"}}
+        return dataclasses.replace(
+            self,
+            objects=[o for o in self.objects if o.part == part],
+            world=dataclasses.replace(self.world, **own, parts=(facts,)),
+            poses=self.poses.of_part(part),
+            fits=None,
+        )
+
+    def parts(self) -> list[Result]:
+        """Return `of_part` of all parts, the largest first: this result alone if it has one."""
+        count = 1 if self.poses is None else self.poses.part_count
+        return [self.of_part(part) for part in range(count)]
+
     def ellipsoids(self) -> quadrics.Ellipsoids:
-        """Return the ellipsoids of the `located` objects, in their order, in world."""
+        """Return the ellipsoids of the `located` objects, in their order: each in its own part."""
         found = self.located
         if self.fits is not None:  # with all digits
             return self.fits.ellipsoids[np.array([o.located for o in self.objects], bool)]
@@ -243,20 +311,23 @@ class Result:
     def save(self, out: str | Path) -> None:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
 
+        Of several parts each has its own poses and objects: poses_part1.txt, objects_part1.ply, ...
         Each file appears only when it is complete. Those of an earlier run are removed,
         pictures too: `write_pictures` makes new ones from the video.
         """
         self.out = out = Path(out)
-        for name in (*STALE, *([LAST_POSES] if self.poses is None else ())):
-            (out / name).unlink(missing_ok=True)
+        remove_stale(out)
+        if self.poses is None:
+            (out / LAST_POSES).unlink(missing_ok=True)
         write_mot(out / "tracks.txt", self.tracks)
         self._write_objects(out / "objects.json")
         if self.poses is not None:
             save_poses(out / LAST_POSES, self.poses)
-            if self.poses.known.any():
-                write_tum(out / "poses.txt", self.poses)
+            write_trajectories(out, self.poses)
         if self.fits is not None or self.located:
-            write_ply(out / "objects.ply", self.ellipsoids(), [o.id for o in self.located])
+            for k, part in enumerate(self.parts()):
+                ids = [o.id for o in part.located]
+                write_ply(part_path(out / "objects.ply", k), part.ellipsoids(), ids)
 
     @staticmethod
     def load(out: str | Path) -> Result:
@@ -353,25 +424,46 @@ class Result:
         for o in self.objects:
             size = o.size if o.size_m is None else o.size_m
             text = "-" if size is None else " x ".join(f"{s:.2f}" for s in size)
+            text += " units" if scaled and size is not None and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             reason = f" ({o.reason})" if o.reason else ""
+            part = f", part {o.part}" if len(self.world.parts) > 1 else ""
             lines.append(
                 f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
-                f"{text:<26} {sigma:>6}  {o.status}{reason}"
+                f"{text:<26} {sigma:>6}  {o.status}{part}{reason}"
             )
         counts = sorted(Counter(o.class_name for o in self.objects).items())
-        lines.append("distinct objects: " + (", ".join(f"{n} {c}" for c, n in counts) or "none"))
-        if self.poses is not None:
-            known, count = self.world.registered_frames, self.world.frames
-            lines.append(f"cameras: {known} of {count} frames ({self.poses.source})")
-        if scale := self.world.scale:
-            sigma = f"{100 * (scale.rel_sigma or 0):.0f} %"
-            lines.append(f"scale: {scale.value} m per unit, sigma {sigma} (from {scale.source})")
+        each = " (each part counted by itself)" if len(self.world.parts) > 1 else ""
+        names = ", ".join(f"{n} {c}" for c, n in counts) or "none"
+        lines.append(f"distinct objects: {names}{each}")
+        lines += self._camera_lines()
         lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in self.seconds.items()))
         if self.out is not None:
             files = [self.out / n for n in ("scene.html", "overlay.mp4", "objects.json")]
             lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
         return "\n".join(lines)
+
+    def _camera_lines(self) -> list[str]:
+        """Say how many frames have a camera and what the scale is; of several parts, of each."""
+        world = self.world
+        if self.poses is None:
+            return []
+        if len(world.parts) < 2:
+            scale = [f"scale: {_scale_text(world.scale)}"] if world.scale else []
+            known, count = world.registered_frames, world.frames
+            return [f"cameras: {known} of {count} frames ({self.poses.source})", *scale]
+        known = sum(part.registered_frames for part in world.parts)
+        lines = [
+            f"cameras: {known} of {world.frames} frames ({self.poses.source}) in "
+            f"{len(world.parts)} parts, each in a frame and scale of its own"
+        ]
+        for k, part in enumerate(world.parts):
+            count = sum(o.part == k for o in self.objects)
+            scale = [f"scale {_scale_text(part.scale)}"] if part.scale else []
+            cameras = f"{part.registered_frames} of {part.frames} frames"
+            facts = [part.span_text, cameras, f"{count} object{'s' * (count != 1)}", *scale]
+            lines.append(f"part {k}: " + "; ".join(facts))
+        return lines
 
     def _write_objects(self, path: Path) -> None:
         versions = {}
@@ -395,6 +487,11 @@ class Result:
             part.write_text(json.dumps(data, indent=1) + "\n")
 
 
+def _scale_text(scale: quadrics.Scale) -> str:
+    sigma = f"{100 * (scale.rel_sigma or 0):.0f} %"
+    return f"{scale.value} m per unit, sigma {sigma} (from {scale.source})"
+
+
 def significant(values: Array) -> Array:
     """Round an array to six significant digits, as its text in objects.json has them."""
     return np.array(numbers(values), np.float64).reshape(np.shape(values))
@@ -415,6 +512,21 @@ def written_by(out: Path) -> str:
         return "is damaged: run the video again"
     by = f"written by reobj_track {wrote or 'before 0.2'}, this is {__version__}"
     return f"{by}: run the video again"
+
+
+def remove_stale(out: Path) -> None:
+    """Remove what an earlier run wrote and another one may not: of further parts too."""
+    for path in (out / name for name in STALE):
+        for file in (path, *part_paths(path)):
+            file.unlink(missing_ok=True)
+
+
+def write_trajectories(out: Path, poses: Poses) -> None:
+    """Write poses.txt, and poses_part1.txt, ... of further parts: a TUM file is one world."""
+    for old in part_paths(out / "poses.txt"):
+        old.unlink()
+    for k in range(poses.part_count if poses.known.any() else 0):
+        write_tum(part_path(out / "poses.txt", k), poses.of_part(k))
 
 
 def load_last_poses(out: Path) -> Poses | None:
@@ -445,44 +557,3 @@ def write_mot(path: Path, tracks: Tracks) -> None:
     rows = np.column_stack([tracks.frame + 1, tracks.track_id, ltwh, tracks.score])  # (N, 7)
     with atomic(path) as part:
         np.savetxt(part, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
-
-
-PLY_DETAIL = 2  # subdivisions of an octahedron: 512 triangles an ellipsoid
-
-
-def write_ply(path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int]) -> None:
-    """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world."""
-    sphere, faces = _sphere_mesh(PLY_DETAIL)  # (P, 3), (T, 3)
-    half = ellipsoids.half_axes[:, None] * sphere  # (O, P, 3)
-    points = half @ np.swapaxes(ellipsoids.world_from_obj, 1, 2)
-    points += ellipsoids.center_in_world[:, None]
-    colors = np.array([object_color(i)[::-1] for i in object_id], np.uint8).reshape(-1, 3)  # RGB
-    vertex = np.zeros(points.shape[:2], [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertex["xyz"], vertex["rgb"] = points, colors[:, None]
-    face = np.zeros((len(points), len(faces)), [("n", "u1"), ("i", "<i4", 3)])
-    face["n"], face["i"] = 3, faces + (np.arange(len(points)) * len(sphere))[:, None, None]
-    names = [f"property float {n}\n" for n in "xyz"]
-    names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
-    header = (
-        "ply\nformat binary_little_endian 1.0\ncomment reobj_track ellipsoids\n"
-        f"element vertex {vertex.size}\n{''.join(names)}"
-        f"element face {face.size}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    with atomic(path) as part:
-        part.write_bytes(header.encode() + vertex.tobytes() + face.tobytes())
-
-
-def _sphere_mesh(detail: int) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Triangulate the unit sphere: points (P, 3), triangles (T, 3) of a divided octahedron."""
-    points = np.concatenate([np.eye(3), -np.eye(3)])
-    faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
-                      [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])  # fmt: skip
-    for _ in range(detail + 1):
-        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2)
-        edges, edge_of = np.unique(edges, axis=0, return_inverse=True)
-        middle = points[edges].sum(1)  # (E, 3)
-        (a, b, c), (ab, bc, ca) = faces.T, len(points) + edge_of.reshape(-1, 3).T
-        points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
-        faces = np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])  # (4, 3, T)
-        faces = faces.transpose(2, 0, 1).reshape(-1, 3)
-    return points, faces

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid
+from reobj.cameras import Poses, invert_rigid, place_of
 from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.results.overlay import Overlay, draw_tracks
 from reobj.results.result import Object, Result, World, significant
@@ -48,8 +48,9 @@ class Pictures:
         count = SCENE_MAX_CROPS // max(len(result.objects), 1)
         count = min(max(count, 1), SCENE_CROPS)
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
+        poses = [part.poses for part in result.parts()]
         chosen = {
-            o.id: diverse_rows(result.tracks, o, result.poses, count)
+            o.id: diverse_rows(result.tracks, o, poses[o.part], count)
             for o in ranked[:SCENE_MAX_CROPS]
         }
         self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
@@ -86,15 +87,18 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
 
     The best box comes first (large, of good score), then whatever is farthest from the chosen ones
     in time and, where there are cameras, in viewing direction.
+
+    Args:
+        poses: of the object's part.
     """
     rows = np.flatnonzero(tracks.track_id == found.id)
     frame, box = tracks.frame[rows], tracks.xyxy[rows]
     quality = tracks.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
     place = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
     if poses is not None and found.center is not None:
-        world_from_cam = invert_rigid(poses.cam_from_world)  # (F, 3, 4)
-        at = np.searchsorted(poses.frame, frame).clip(max=len(poses.frame) - 1)
-        ray = world_from_cam[at, :, 3] - found.center
+        at, known = place_of(poses, frame)
+        eye = invert_rigid(poses.cam_from_world[at])[:, :, 3]  # (N, 3)
+        ray = np.where(known[:, None], eye - found.center, np.nan)
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         place = np.hstack([place, np.nan_to_num(ray)])  # (N, 4)
         quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # no pose: last
@@ -125,21 +129,22 @@ def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) ->
     frames = scene_frames(result)
     steps = frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]  # (S,)
     seconds = video.config.every / (video.fps or IMAGE_FPS) * len(frames) / max(1, len(steps))
-    world = result.world.to_json()
+    poses = result.poses
+    of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
+    thin = math.ceil(0 if poses is None else len(poses.points) / SCENE_POINTS) or 1
     data = {
         "title": Path(str(video.source)).name,
-        "facts": _scene_facts(result.world),
         "warnings": result.warnings,
-        "world": {k: v for k, v in world.items() if k != "links"},
         "links": [
             link | {key: rounded(link[key], 2) for key in ("place_iou", "appearance_log_odds")}
-            for link in world["links"]
+            for link in result.world.to_json()["links"]
         ],
         "objects": [_scene_object(o, result.tracks, steps, pictures) for o in result.objects],
         "thumbs": pictures.frames,
         "why_flat": _why_flat(result),
-        "steps": {"frame": steps.tolist(), "seconds": seconds},
+        "steps": {"frame": steps.tolist(), "seconds": seconds, "part": of_part.tolist()},
         **_scene_cameras(result, steps),
+        "parts": [_scene_part(k, part, thin) for k, part in enumerate(result.parts())],
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = Path(__file__).with_name("scene.html").read_text().split("@DATA@")
@@ -151,22 +156,31 @@ SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .4 MB o
 
 
 def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
-    """Collect the cameras of the steps, the sparse points and the upward direction."""
-    poses, up = result.poses, result.world.up_in_world
+    """Collect the intrinsics and the cameras of the steps, each in the world of its part."""
+    poses = result.poses
     if poses is None or not poses.known.any():
-        return {"camera": None, "poses": "", "points": "", "colors": "", "up": [0, 0, 1]}
-    thin = slice(None, None, math.ceil(len(poses.points) / SCENE_POINTS) or 1)
-    K = poses.camera.K
+        return {"camera": None, "poses": ""}
+    size, K = {"width": poses.camera.width, "height": poses.camera.height}, poses.camera.K
+    shown = invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)])
+    return {"camera": size | {"fx": K[0, 0], "fy": K[1, 1]}, "poses": base64_text(shown, "<f4")}
+
+
+def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
+    """Collect every `thin`-th point, scale and upward direction of one part, and its name."""
+    poses, up = part.poses, part.world.up_in_world
+    count, spans = len(part.objects), ", ".join(p.span_text for p in part.world.parts)
+    facts = {
+        "name": f"part {number}: {spans}; {count} object{'s' * (count != 1)}",
+        "facts": _scene_facts(part.world),
+        "scale": part.world.to_json()["scale"],
+    }
+    if poses is None or not poses.known.any():
+        return facts | {"points": "", "colors": "", "up": [0, 0, 1]}
     if up is None:
-        up = quadrics.camera_up(K @ poses.cam_from_world[poses.known])[0]
-    size = {"width": poses.camera.width, "height": poses.camera.height}
-    return {
-        "camera": size | {"fx": K[0, 0], "fy": K[1, 1]},
-        "poses": base64_text(
-            invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)]), "<f4"
-        ),
-        "points": base64_text(poses.points[thin], "<f4"),
-        "colors": base64_text(poses.colors[thin], "u1"),
+        up = quadrics.camera_up(poses.camera.K @ poses.cam_from_world[poses.known])[0]
+    return facts | {
+        "points": base64_text(poses.points[::thin], "<f4"),
+        "colors": base64_text(poses.colors[::thin], "u1"),
         "up": significant(up).tolist(),
     }
 

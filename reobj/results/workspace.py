@@ -9,13 +9,14 @@ import dataclasses
 import hashlib
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
-from reobj.files import atomic, load_json
-from reobj.results.result import LAST_POSES, STALE, Result, load_last_poses, written_by
+from reobj.files import atomic, load_json, part_path, part_paths
+from reobj.results.result import LAST_POSES, Result, load_last_poses, remove_stale, written_by
 from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.types import ReobjError
 
@@ -81,7 +82,8 @@ class Workspace:
                         f"{self.out}: holds the results of {old.get('source', 'another video')}, "
                         f"not of {video.source}; choose another -o, or say --overwrite"
                     )
-                for name in (*STALE, "tracks.txt", "objects.json", LAST_TRACKS, LAST_POSES):
+                remove_stale(self.out)
+                for name in ("tracks.txt", "objects.json", LAST_TRACKS, LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
             part.write_text(json.dumps(fingerprint))
@@ -127,12 +129,19 @@ class Workspace:
         tracked.poses = load_last_poses(self.out)
         return tracked
 
-    def publish_model(self, model: Path | None) -> None:
-        """Make OUT/sparse a copy of a COLMAP model; None: remove that of an earlier run."""
-        path, part = self.out / "sparse", self.out / ".part-sparse"
-        shutil.rmtree(part, ignore_errors=True)  # of a run that was killed here
-        if model is not None and model.is_dir():
-            shutil.copytree(model, part)
-        shutil.rmtree(path, ignore_errors=True)
-        if part.is_dir():
-            part.replace(path)
+    def publish_model(self, models: Sequence[Path] | None) -> None:
+        """Make OUT/sparse, OUT/sparse_part1, ... copies of COLMAP models, one of each part.
+
+        Those of an earlier run are removed; a folder that does not exist is left out.
+        """
+        path, copy = self.out / "sparse", self.out / ".part-sparse"
+        for left in (copy, *part_paths(copy)):  # of a run that was killed here
+            shutil.rmtree(left, ignore_errors=True)
+        for k, model in enumerate(models or ()):
+            if model.is_dir():
+                shutil.copytree(model, part_path(copy, k))
+        for old in (path, *part_paths(path)):
+            shutil.rmtree(old, ignore_errors=True)
+        for k in range(len(models or ())):
+            if part_path(copy, k).is_dir():
+                part_path(copy, k).replace(part_path(path, k))

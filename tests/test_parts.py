@@ -1,0 +1,531 @@
+"""Cameras in two parts that do not connect: each is a world of its own, in every file."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import (
+    BREAK,
+    CHAIR,
+    PARTS,
+    SIZE,
+    chair_solids,
+    finished,
+    into_part,
+    tracks_in_two_parts,
+    two_parts,
+    unlinked,
+    walk,
+    with_columns,
+)
+
+import reobj.parts
+import reobj_track as rt
+from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
+from reobj.files import part_path
+from reobj.parts import parts_message
+from reobj.results.overlay import Overlay
+from reobj.results.result import validate_objects
+from reobj.results.solids import score_objects
+from reobj.types import Embeddings
+
+CENTERS = chair_solids().center_in_world
+NAMES = rt.COCO_NAMES
+
+
+# ---- Linked and fitted ----
+
+
+def test_every_part_has_its_own_identities(parted: rt.Result) -> None:
+    """The tracker followed the chairs over the break; nothing is known of where they went."""
+    assert [(o.id, o.part) for o in parted.objects] == [
+        (1, 0), (2, 0), (3, 0), (4, 1), (5, 1), (6, 1),
+    ]  # fmt: skip
+    tracks = parted.tracks
+    assert set(tracks.track_id[tracks.frame < BREAK]) == {1, 2, 3}
+    assert set(tracks.track_id[tracks.frame >= BREAK]) == {4, 5, 6}
+    np.testing.assert_array_equal(tracks.track_id % 3, (tracks.detection_index + 1) % 3)
+    assert [o.visits for o in parted.objects] == [[[0, 39]]] * 3 + [[[40, 63]]] * 3
+    assert len({t for o in parted.objects for t in o.tracklet_ids}) == 6
+
+
+def test_every_part_has_its_own_frame_and_scale(parted: rt.Result) -> None:
+    for part, (scale, *_) in enumerate(PARTS):
+        own = [o for o in parted.objects if o.part == part]
+        centers = np.array([o.center for o in own])
+        np.testing.assert_allclose(centers, into_part(part, CENTERS), atol=0.02 * scale)
+        np.testing.assert_allclose([o.size[2] for o in own], 0.82 * scale, rtol=0.03)
+        np.testing.assert_allclose([o.size_m[2] for o in own], 0.82, rtol=0.2)
+
+
+def test_a_part_comes_out_as_if_it_were_a_video_of_its_own(parted: rt.Result) -> None:
+    for part in (0, 1):
+        poses = parted.poses.of_part(part)
+        tracks = tracks_in_two_parts(parted.poses)
+        alone = finished(unlinked(poses, tracks[np.isin(tracks.frame, poses.frame)]))
+        own = [o for o in parted.objects if o.part == part]
+        assert len(alone.objects) == len(own) == 3
+        for a, b in zip(alone.objects, own, strict=True):
+            a, b = a.to_json(), b.to_json()
+            for key in ("id", "part", "tracks"):
+                del a[key], b[key]
+            assert a == b
+        (facts,) = alone.world.to_json()["parts"]
+        assert facts == parted.world.to_json()["parts"][part]
+
+
+def test_the_world_describes_its_parts(parted: rt.Result) -> None:
+    world = parted.world
+    assert [(p.spans, p.frames, p.registered_frames) for p in world.parts] == [
+        ([[0, 39]], 40, 38), ([[40, 63]], 24, 23),
+    ]  # fmt: skip
+    for part, (scale, turn, _) in zip(world.parts, PARTS, strict=True):
+        assert part.scale.source == "priors"
+        np.testing.assert_allclose(part.scale.value, 1 / scale, rtol=0.2)
+        up = into_part(PARTS.index((scale, turn, _)), np.array([[0, 0, 1.0], [0, 0, 0]]))
+        np.testing.assert_allclose(part.up_in_world, (up[0] - up[1]) / scale, atol=0.03)
+    largest = world.parts[0]  # the fields that there were before there were parts
+    assert world.registered_frames == 38 and world.frames == 64
+    assert world.scale == largest.scale and world.up_source == largest.up_source
+    np.testing.assert_array_equal(world.up_in_world, largest.up_in_world)
+
+
+def test_fits_are_in_the_order_of_the_objects(parted: rt.Result) -> None:
+    fits, poses = parted.fits, parted.poses
+    assert len(fits) == len(fits.reason) == len(fits.cov) == 6
+    np.testing.assert_allclose(
+        fits.ellipsoids.center_in_world, [o.center for o in parted.objects], rtol=1e-5
+    )
+    seen = poses.part[poses.known]  # of the rows of `inlier`
+    assert fits.inlier.shape == (61, 6)
+    assert fits.inlier[seen == 0, :3].mean() > 0.9 < fits.inlier[seen == 1, 3:].mean()
+    assert not fits.inlier[seen == 0, 3:].any() and not fits.inlier[seen == 1, :3].any()
+    assert fits.scale.value == pytest.approx(parted.world.scale.value, abs=1e-6)
+    of_second = parted.of_part(1)
+    assert [o.id for o in of_second.located] == [4, 5, 6]
+    np.testing.assert_allclose(
+        of_second.ellipsoids().half_axes, parted.ellipsoids().half_axes[3:], rtol=1e-5
+    )
+    assert of_second.world.scale == parted.world.parts[1].scale
+    assert len(of_second.poses.frame) == of_second.world.frames == 24
+
+
+def test_one_part_is_the_result_itself() -> None:
+    poses = two_parts().of_part(0)
+    result = finished(unlinked(poses, tracks_in_two_parts(two_parts())[: 3 * BREAK]))
+    assert result.of_part(0) is result and result.parts() == [result]
+    assert parts_message(poses) == []
+    assert {o.part for o in result.objects} == {0} and len(result.world.parts) == 1
+
+
+def test_without_linking_too_identities_end_with_their_part() -> None:
+    result = finished(unlinked(), link=False)
+    assert [(o.id, o.part) for o in result.objects] == [(i + 1, i // 3) for i in range(6)]
+
+
+def test_embeddings_stay_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The linker of each part gets those of its own frames, numbered by its own rows."""
+    given = unlinked()
+    row = np.arange(0, len(given.tracks), 7)  # of the tracks that were embedded
+    frame = given.tracks.frame[row]
+    given.embeddings = Embeddings(frame[:, None] + 0.0, -frame[:, None] - 0.0)
+    given.embedding_row, seen = row, []
+
+    def noted(tracks: rt.Tracks, names: Any, embeddings: Embeddings, rows: Any, *a: Any, **k: Any):
+        np.testing.assert_array_equal(embeddings.foreground[:, 0], tracks.frame[rows])
+        np.testing.assert_array_equal(embeddings.background[:, 0], -tracks.frame[rows])
+        seen.extend(tracks.frame[rows].tolist())
+        return tracks, []
+
+    monkeypatch.setattr(reobj.parts, "link", noted)
+    finished(given)
+    assert seen == frame.tolist()
+
+
+def test_identities_of_the_user_may_span_parts() -> None:
+    """They stay as they are; the solid lies in the part that has most of the boxes."""
+    poses = two_parts()
+    tracks = tracks_in_two_parts(poses)
+    tracks = tracks[(tracks.detection_index < 2) | (tracks.frame >= BREAK - 10)]  # chair 3: late
+    given = unlinked(
+        poses, with_columns(tracks, track_id=np.array([7, 5, 6])[tracks.detection_index])
+    )
+    given.identities_given = True
+    result = finished(given)
+    assert [(o.id, o.part, o.status) for o in result.objects] == [
+        (5, 0, "ok"), (6, 1, "ok"), (7, 0, "ok"),
+    ]  # fmt: skip
+    assert [o.frames_seen for o in result.objects] == [64, 34, 64]
+    assert [o.views for o in result.objects] == [38, 23, 38]
+    places = [into_part(0, CENTERS[1:2])[0], into_part(1, CENTERS[2:])[0], into_part(0, CENTERS)[0]]
+    np.testing.assert_allclose([o.center for o in result.objects], places, atol=0.06)
+    np.testing.assert_allclose(result.ellipsoids().center_in_world, places, atol=0.06)
+    np.testing.assert_array_equal(result.tracks.track_id, given.tracks.track_id)
+
+
+def test_a_part_with_too_few_cameras_rejects_its_own_objects_only() -> None:
+    poses = two_parts()
+    lost = poses.cam_from_world.copy()
+    lost[BREAK + 3 :] = np.nan  # two cameras are left: 41 and 42
+    result = finished(unlinked(dataclasses.replace(poses, cam_from_world=lost)))
+    assert [o.status for o in result.objects] == ["ok"] * 3 + ["rejected"] * 3
+    assert result.objects[4].reason == "seen in 2 frames with a camera pose; 3 are needed"
+    assert [p.registered_frames for p in result.world.parts] == [38, 2]
+    assert len(result.ellipsoids()) == 3
+
+
+@pytest.mark.parametrize("empty", [0, 1])
+def test_a_part_without_objects(empty: int, tmp_path: Path) -> None:
+    poses = two_parts()
+    tracks = tracks_in_two_parts(poses)
+    result = finished(unlinked(poses, tracks[poses.part_of(tracks.frame) != empty]))
+    assert [(o.id, o.part, o.status) for o in result.objects] == [
+        (i, 1 - empty, "ok") for i in (1, 2, 3)
+    ]
+    assert result.world.parts[empty].scale is None is not result.world.parts[1 - empty].scale
+    assert (result.fits.scale.source == "none") == (empty == 0) == (result.world.scale is None)
+    result.save(tmp_path)
+    assert f"part {empty}: " in rt.Result.load(tmp_path).summary()
+
+
+def test_no_object_at_all(tmp_path: Path) -> None:
+    result = finished(unlinked(tracks=rt.Tracks.empty()))
+    assert result.objects == [] and result.fits is None and len(result.world.parts) == 2
+    result.save(tmp_path)
+    assert len(rt.Result.load(tmp_path).world.parts) == 2
+
+
+def test_up_is_a_direction_of_the_largest_part() -> None:
+    up = into_part(0, np.array([[0, 0, 1.0], [0, 0, 0]]))
+    text = ",".join(map(str, up[0] - up[1]))
+    parts = finished(unlinked(), up=text).world.parts
+    assert [p.up_source == "given" for p in parts] == [True, False]
+
+
+def test_boxes_that_no_fit_can_use_do_not_choose_the_part() -> None:
+    tracks = tracks_in_two_parts(two_parts())
+    weak = (tracks.detection_index == 0) & (tracks.frame < BREAK)
+    given = unlinked(tracks=with_columns(tracks, score=np.where(weak, 0.1, 0.9)))
+    given.identities_given = True
+    assert [(o.part, o.status) for o in finished(given).objects] == [
+        (1, "ok"),
+        (0, "ok"),
+        (0, "ok"),
+    ]
+
+
+def test_up_of_the_poses_is_that_of_the_largest_part() -> None:
+    up = into_part(0, np.array([[0, 0, 1.0], [0, 0, 0]]))
+    poses = dataclasses.replace(two_parts(), up_in_world=(up[0] - up[1]) / PARTS[0][0])
+    parts = finished(unlinked(poses)).world.parts
+    assert [p.up_source == "given" for p in parts] == [True, False]
+    true = into_part(1, np.array([[0, 0, 1.0], [0, 0, 0]]))
+    np.testing.assert_allclose(parts[1].up_in_world, (true[0] - true[1]) / PARTS[1][0], atol=0.03)
+
+
+def test_the_message_says_what_it_means_and_what_helps() -> None:
+    (text,) = parts_message(two_parts())
+    for words in ("2 parts", "part 0: frames 0-39", "part 1: frames 40-63", "own frame and scale",
+                  "two objects", "overlaps more", "--poses", "--to cvat"):  # fmt: skip
+        assert words in text
+
+
+def test_identities_joined_by_hand_are_kept(parted_folder: Path, tmp_path: Path) -> None:
+    """Object 4 is object 1 behind the break: merged in tracks.txt, given back."""
+    out = tmp_path / "out"
+    shutil.copytree(parted_folder, out)
+    rows = np.loadtxt(out / "tracks.txt", delimiter=",")
+    rows[rows[:, 1] == 4, 1] = 1
+    np.savetxt(tmp_path / "mot.txt", rows, delimiter=",", fmt="%.6g")
+    assert rt.main(["objects", str(out), "--tracks", str(tmp_path / "mot.txt")]) == 0
+    found = rt.Result.load(out).objects
+    assert [(o.id, o.part, o.frames_seen, o.status) for o in found] == [
+        (1, 0, 64, "ok"), (2, 0, 40, "ok"), (3, 0, 40, "ok"), (5, 1, 24, "ok"), (6, 1, 24, "ok"),
+    ]  # fmt: skip
+    np.testing.assert_allclose(found[0].center, into_part(0, CENTERS[:1])[0], atol=0.02)
+
+
+# ---- Files ----
+
+
+def test_each_part_has_files_of_its_own(parted_folder: Path) -> None:
+    poses = two_parts()
+    for part, name in enumerate(("poses.txt", "poses_part1.txt")):
+        own = poses.of_part(part)
+        table = np.loadtxt(parted_folder / name)
+        np.testing.assert_allclose(table[:, 0], own.time_s[own.known], atol=1e-6)
+        centers = invert_rigid(own.cam_from_world[own.known])[:, :, 3]
+        np.testing.assert_allclose(table[:, 1:4], centers, atol=1e-6)
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
+    for part, name in enumerate(("objects.ply", "objects_part1.ply")):
+        mesh = trimesh.load(parted_folder / name)
+        middle = into_part(part, CENTERS).mean(0)
+        np.testing.assert_allclose(mesh.vertices.mean(0), middle, atol=0.02 * PARTS[part][0])
+
+
+def test_parts_come_back_when_loaded(
+    parted_folder: Path, parted: rt.Result, tmp_path: Path
+) -> None:
+    found = rt.Result.load(parted_folder)
+    assert found.world.to_json() == parted.world.to_json()
+    assert [o.to_json() for o in found.objects] == [o.to_json() for o in parted.objects]
+    assert [w for w in found.warnings if "2 parts" in w]
+    np.testing.assert_array_equal(found.poses.part, parted.poses.part)
+    found.save(tmp_path)
+    for name in ("objects.json", "poses.txt", "poses_part1.txt", "cache/last-poses.npz"):
+        assert (tmp_path / name).read_bytes() == (parted_folder / name).read_bytes(), name
+
+
+def test_objects_json_is_as_its_schema_says(parted_folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
+    assert validate_objects(parted_folder / "objects.json") == []
+    data = json.loads((parted_folder / "objects.json").read_text())
+    assert [o["part"] for o in data["objects"]] == [0, 0, 0, 1, 1, 1]
+    data["objects"][0]["part"] = -1
+    del data["world"]["parts"][1]["spans"]
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    faults = " ".join(validate_objects(tmp_path / "a.json"))
+    assert "objects[0].part" in faults and "world.parts[1]" in faults
+
+
+def test_folders_from_before_there_were_parts_load(chairs: rt.Result, tmp_path: Path) -> None:
+    dataclasses.replace(chairs).save(tmp_path)
+    data = json.loads((tmp_path / "objects.json").read_text())
+    del data["world"]["parts"]
+    for entry in data["objects"]:
+        del entry["part"]
+    (tmp_path / "objects.json").write_text(json.dumps(data))
+    arrays = dict(np.load(tmp_path / "cache/last-poses.npz"))
+    del arrays["part"], arrays["visibility"]
+    np.savez(tmp_path / "cache/last-poses.npz", **arrays)
+    found = rt.Result.load(tmp_path)
+    assert [o.part for o in found.objects] == [0, 0, 0] and found.world.parts == ()
+    assert found.poses.part_count == 1 and found.of_part(0) is found
+    assert "part" not in found.summary() and "scale: 1.0" in found.summary()
+
+
+def test_files_of_parts_of_an_earlier_run_go(parted: rt.Result, tmp_path: Path) -> None:
+    dataclasses.replace(parted).save(tmp_path)
+    names = ("poses_part1.txt", "objects_part1.ply")
+    assert all((tmp_path / name).exists() for name in names)
+    (tmp_path / "poses_part2.txt").write_text("of three parts")
+    (tmp_path / "poses_partial.txt").write_text("mine")
+    poses = two_parts().of_part(0)
+    one = finished(unlinked(poses, tracks_in_two_parts(two_parts())[: 3 * BREAK]))
+    one.save(tmp_path)
+    left = {path.name for path in tmp_path.iterdir()} - {"cache"}
+    assert left == {"tracks.txt", "objects.json", "poses.txt", "objects.ply", "poses_partial.txt"}
+
+
+def test_run_writes_what_a_broken_reconstruction_gives(
+    parted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the pose stage on: models, files, cache; a later run in one piece leaves no part."""
+    found, calls = two_parts(), list[int]()
+
+    def estimate(video: Any, config: rt.PosesConfig, work_dir: Path, **_: Any) -> rt.Poses:
+        calls.append(config.seed)
+        poses = found if config.seed == 0 else dataclasses.replace(found, part=0 * found.part)
+        for k in range(poses.part_count):
+            names = [f"{f:03d}.jpg" for f in poses.of_part(k).frame]
+            write_colmap(part_path(work_dir / "sparse", k), poses.of_part(k), names)
+        return poses
+
+    monkeypatch.setattr("reobj.poses.stage.estimate_poses", estimate)
+    tracks = tracks_in_two_parts(found)
+    ltwh = np.column_stack([tracks.xyxy[:, :2], tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]])
+    rows = np.column_stack([tracks.frame + 1, 0 * tracks.frame - 1, ltwh, tracks.score,
+                            np.full(len(tracks), CHAIR + 1)])  # fmt: skip
+    np.savetxt(tmp_path / "det.txt", rows, delimiter=",", fmt="%.6g")
+    args = ["run", str(parted_folder.parent / "frames"), "-o", str(tmp_path / "out"),
+            "--detections", str(tmp_path / "det.txt"), "--set", "output.overlay=0"]  # fmt: skip
+    names = ("poses_part1.txt", "objects_part1.ply", "sparse_part1")
+    for _ in range(2):  # the second time from the cache
+        assert rt.main(args) == 0
+        result = rt.Result.load(tmp_path / "out")
+        assert {o.part for o in result.objects if o.located} == {0, 1}
+        assert all((tmp_path / "out" / name).exists() for name in names)
+        for k, registered in enumerate((38, 23)):
+            model = read_sparse_model(part_path(tmp_path / "out/sparse", k))
+            assert len(model.names) == registered and len(model.points) == 3
+    assert calls == [0]
+    assert rt.main([*args, "--set", "poses.seed=1"]) == 0
+    assert not any((tmp_path / "out" / name).exists() for name in names)
+    assert (tmp_path / "out/sparse").is_dir() and calls == [0, 1]
+
+
+def test_poses_command_writes_a_file_for_each_part(
+    parted_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = (two_parts(), None)
+    monkeypatch.setattr(rt, "reconstruct_cached", lambda *a, **k: given)
+    frames = str(parted_folder.parent / "frames")
+    assert rt.main(["poses", frames, "-o", str(tmp_path)]) == 0
+    lengths = [len(np.loadtxt(tmp_path / name)) for name in ("poses.txt", "poses_part1.txt")]
+    assert lengths == [38, 23]
+    assert "the cameras come in 2 parts" in capsys.readouterr().err
+
+
+def test_the_summary_has_a_line_for_each_part(parted: rt.Result) -> None:
+    lines = parted.summary().splitlines()
+    assert (
+        "cameras: 61 of 64 frames (pycolmap) in 2 parts, each in a frame and scale of its own"
+        in lines
+    )
+    first, second = (line for line in lines if line.startswith("part "))
+    assert first.startswith("part 0: frames 0-39; 38 of 40 frames; 3 objects; scale ")
+    assert second.startswith("part 1: frames 40-63; 23 of 24 frames; 3 objects; scale ")
+    assert sum("ok, part 1" in line for line in lines) == 3
+    assert not [line for line in lines if line.startswith("scale")]
+
+
+def test_a_part_without_scale_is_not_said_to_be_in_metres(parted: rt.Result) -> None:
+    unscaled = [dataclasses.replace(o, size_m=None) if o.part else o for o in parted.objects]
+    lines = dataclasses.replace(parted, objects=unscaled).summary().splitlines()
+    assert "m  " in lines[0]
+    assert ["units" in line for line in lines[1:7]] == [False] * 3 + [True] * 3
+
+
+# ---- Pictures ----
+
+
+def ellipse_box(dual_c: np.ndarray) -> np.ndarray:
+    """Corners of the box around a conic, xyxy: x = (c02 -+ sqrt(c02^2 - c00 c22)) / c22."""
+    c = dual_c / dual_c[2, 2]
+    half = np.sqrt([c[0, 2] ** 2 - c[0, 0], c[1, 2] ** 2 - c[1, 1]])
+    return np.concatenate([c[:2, 2] - half, c[:2, 2] + half])
+
+
+def test_the_overlay_draws_each_part_in_its_own_frames(parted: rt.Result, tmp_path: Path) -> None:
+    class Facts:
+        config, fps, size = rt.InputConfig(), 30.0, SIZE
+
+    video: Any = Facts()
+    film = Overlay(parted, tmp_path / "a.mp4", video)
+    film.close(False)
+    assert sorted(film.outlines) == [f for f in range(64) if f not in (38, 39, 40)]
+    for frame in (0, 20, 37, 41, 63):
+        ids, dual_c, visible = film.outlines[frame]
+        assert ids == ([1, 2, 3] if frame < BREAK else [4, 5, 6]) and visible.all()
+        boxes = np.array([ellipse_box(c) for c in dual_c])
+        seen = parted.tracks.xyxy[parted.tracks.frame == frame]
+        np.testing.assert_allclose(boxes, seen, atol=0.2 * (seen[:, 3] - seen[:, 1]).max())
+
+
+def test_the_page_holds_every_part(parted_folder: Path) -> None:
+    text = (parted_folder / "scene.html").read_text()
+    data = json.loads(text.split('id="data">')[1].split("</script>")[0])
+    assert data["steps"]["part"] == [0] * 40 + [1] * 24
+    assert [p["name"] for p in data["parts"]] == [
+        "part 0: frames 0-39; 3 objects", "part 1: frames 40-63; 3 objects",
+    ]  # fmt: skip
+    assert [p["facts"].split(" · ")[0] for p in data["parts"]] == [
+        "cameras of 38 of 40 frames", "cameras of 23 of 24 frames",
+    ]  # fmt: skip
+    poses = two_parts()
+    for part, entry in enumerate(data["parts"]):
+        points = np.frombuffer(base64.b64decode(entry["points"]), "<f4")
+        np.testing.assert_allclose(points.reshape(-1, 3), poses.of_part(part).points, atol=1e-5)
+        assert entry["scale"]["metres_per_unit"] == pytest.approx(1 / PARTS[part][0], rel=0.2)
+    assert [o["part"] for o in data["objects"]] == [0, 0, 0, 1, 1, 1]
+    assert all(len(o["crops"]) >= 3 for o in data["objects"])
+
+
+# ---- Exports and scores ----
+
+
+def exported(folder: Path, to: str, path: Path, caplog: pytest.LogCaptureFixture) -> str:
+    caplog.clear()
+    rt.export(folder, to, path)
+    return caplog.text
+
+
+def test_exports_in_3d_hold_the_largest_part(
+    parted_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
+    text = exported(parted_folder, "glb", tmp_path / "a.glb", caplog)
+    assert "holds part 0 of 2 (frames 0-39)" in text
+    scene: Any = trimesh.load(tmp_path / "a.glb")
+    assert set(scene.graph.nodes_geometry) == {"chair 1", "chair 2", "chair 3", "points", "cameras"}
+    assert len(scene.geometry["points"].vertices) == 3
+    pytest.importorskip("rerun", reason="pip install rerun-sdk (extra viewer)")
+    assert "holds part 0 of 2" in exported(parted_folder, "rrd", tmp_path / "a.rrd", caplog)
+    assert (tmp_path / "a.rrd").stat().st_size > 1000
+
+
+def test_exports_in_2d_say_the_part(
+    parted_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = exported(parted_folder, "coco-vid", tmp_path / "a.json", caplog)
+    assert "frames 0-39: 1-3; frames 40-63: 4-6" in text
+    rows = json.loads((tmp_path / "a.json").read_text())["annotations"]
+    assert {(row["track_id"], row["part"]) for row in rows} == {
+        (1, 0), (2, 0), (3, 0), (4, 1), (5, 1), (6, 1),
+    }  # fmt: skip
+    assert "frames 40-63: 4-6" in exported(parted_folder, "cvat", tmp_path / "a.xml", caplog)
+
+
+def truth(tmp_path: Path, frames: int = 64) -> tuple[Path, Path]:
+    """True solids 1 to 3, and true cameras of the first frames."""
+    solids, eyes = chair_solids(), true_eyes()
+    entries = [
+        {"id": i + 1, "center": solids.center_in_world[i].tolist(),
+         "size": (2 * solids.half_axes[i]).tolist(), "R": solids.world_from_obj[i].tolist()}
+        for i in range(3)
+    ]  # fmt: skip
+    (tmp_path / "gt_objects.json").write_text(json.dumps({"objects": entries}))
+    c2w = np.tile(np.eye(4), (frames, 1, 1))
+    c2w[:, :3, 3] = eyes[:frames]
+    np.savetxt(tmp_path / "poses_c2w.txt", c2w.reshape(-1, 16))
+    return tmp_path / "gt_objects.json", tmp_path / "poses_c2w.txt"
+
+
+def true_eyes() -> np.ndarray:
+    return invert_rigid(walk(64, 200.0).cam_from_world)[:, :, 3]
+
+
+def test_each_part_is_scored_after_an_alignment_of_its_own(
+    parted: rt.Result, tmp_path: Path
+) -> None:
+    pairs: dict[int, int | None] = {1: 1, 2: 5, 3: 6}  # one of the first part, two of the second
+    found = score_objects(parted, *truth(tmp_path), pairs)
+    assert (found["true"], found["found"]) == (3, 3)
+    assert found["o3d_all"] > 0.9 and found["center_error_median"] < 0.02
+    errors = found["part_scale_errors"]
+    assert found["scale_error"] == errors[0] and len(errors) == 2 and max(errors) < 0.2
+    scales = [part.scale.value * scale for part, (scale, *_) in zip(
+        parted.world.parts, PARTS, strict=True)]  # fmt: skip
+    np.testing.assert_allclose(errors, np.abs(np.array(scales) - 1), atol=5e-3)
+
+
+def test_a_part_without_true_cameras_is_not_found(
+    parted: rt.Result, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = score_objects(parted, *truth(tmp_path, BREAK), {1: 1, 2: 5, 3: 6})
+    assert found["found"] == 1 and found["part_scale_errors"][1] is None
+    assert "part 1 of the cameras is not scored in 3D" in caplog.text
+    with pytest.raises(rt.ReobjError, match="poses in common"):
+        score_objects(parted, *truth(tmp_path, 2), {1: 1})
+
+
+def test_eval_reports_both_parts(parted_folder: Path, tmp_path: Path) -> None:
+    tracks = tracks_in_two_parts(two_parts())
+    ltwh = np.column_stack([tracks.xyxy[:, :2], tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]])
+    rows = np.column_stack([tracks.frame + 1, tracks.track_id, ltwh, np.ones(len(tracks)),
+                            np.full(len(tracks), CHAIR), np.ones(len(tracks))])  # fmt: skip
+    np.savetxt(tmp_path / "gt.txt", rows, delimiter=",")
+    scores = rt.evaluate(parted_folder, tmp_path / "gt.txt", *truth(tmp_path))
+    assert scores["objects"]["found"] == 3 and scores["objects"]["o3d_all"] > 0.9
+    assert "scale_error" in rt.score_report(scores)
+    assert scores["tracks"]["all"]["ids_per_object"] == 2
