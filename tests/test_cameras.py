@@ -17,7 +17,6 @@ from reobj.cameras import (
     angle_deg,
     invert_rigid,
     load_poses,
-    parse_camera,
     place_of,
     quat_wxyz_from_matrix,
     read_sparse_model,
@@ -74,33 +73,6 @@ def test_a_resized_camera_sees_the_same_rays(model):
     pixels = np.array(camera.to_pycolmap().img_from_cam(rays))
     np.testing.assert_allclose(made.img_from_cam(rays), pixels / 2, atol=1e-9)
     assert camera.resized(SIZE) == camera
-
-
-def test_a_camera_is_parsed():
-    assert parse_camera("", SIZE) is None and parse_camera("  ", SIZE) is None
-    pinhole = parse_camera("500,510,320,240", SIZE)
-    assert pinhole == rt.Camera("PINHOLE", *SIZE, (500, 510, 320, 240))
-    opencv = parse_camera("500,510,320,240,-.1,.02", SIZE)
-    assert opencv == rt.Camera("OPENCV", *SIZE, (500, 510, 320, 240, -0.1, 0.02, 0, 0))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1,2,3",  # too few
-        "1,2,3,4,5,6,7,8,9",  # too many
-        "a,b,c,d",
-        "-5,5,320,240",
-        "500,nan,320,240",
-        "500,500,900,240",  # centre of another size
-        "500,500,320,400",
-        "50,50,320,240",  # focal length of no lens
-        "7000,7000,320,240",
-    ],
-)
-def test_a_wrong_camera_is_refused(text):
-    with pytest.raises(rt.ReobjError, match="--camera"):
-        parse_camera(text, SIZE)
 
 
 def test_a_scaled_camera_is_a_pinhole():
