@@ -142,7 +142,8 @@ def brown_camera(
     params = (fx, fy, cx, cy, *terms[:count])
     if not np.isfinite(params).all() or min(fx, fy) <= 0:
         raise ReobjError("a number is not finite, or a focal length not positive")
-    return Camera(model, *size, params)
+    width, height = _sized(size)
+    return Camera(model, width, height, params)
 
 
 def _focal_and_centre(matrix: Any) -> tuple[float, float, float, float]:

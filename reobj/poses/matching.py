@@ -29,7 +29,7 @@ def rows_by_order(count: int, frame: IntArray, names: Sequence[str]) -> IntArray
     if count == len(frame):
         return np.arange(count)
     if len(names):  # images picked out of those that the rows count
-        row = _rows_by_number([str(i) for i in range(count)], frame, names)
+        row = rows_by_number([str(i) for i in range(count)], frame, names)
         if (row >= 0).all():
             return row
     if frame.max() >= count:
@@ -45,11 +45,11 @@ def rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) ->
         found = np.array([rows.get(key(name), -1) for name in names], np.int64)
         if (found >= 0).any():
             return found
-    by_name, by_frame = _rows_by_number(given, frame, names), _rows_by_number(given, frame, ())
+    by_name, by_frame = rows_by_number(given, frame, names), rows_by_number(given, frame, ())
     return by_name if (by_name >= 0).sum() >= max(1, (by_frame >= 0).sum()) else by_frame
 
 
-def _rows_by_number(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
+def rows_by_number(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
     """Match the last numbers in the names of the poses' images and of the frames.
 
     Frames without names have their frame numbers; what is given then counts from 1 where there is
@@ -68,6 +68,20 @@ def _last_numbers(names: Sequence[str]) -> IntArray:
     """Read the last whole number in each name without suffix, -1 where there is none."""
     digits = [re.findall(r"\d+", Path(name).stem) for name in names]
     return np.array([int(d[-1]) if d else -1 for d in digits], np.int64)
+
+
+EVEN_TIMES = 0.1  # of a step: how far times of numbered frames may be from even ones (chosen)
+
+
+def numbers_of_times(stamps_s: Array) -> IntArray:
+    """Number times (N,), ascending: multiples of their step from 0 on, else one after the other."""
+    steps = np.diff(stamps_s)
+    if len(steps) and stamps_s[0] >= 0:
+        number = stamps_s / np.median(steps)
+        even = np.abs(number - number.round()).max() < EVEN_TIMES
+        if even and number[-1] < 2 * len(number):  # few are missing: they do count from 0
+            return np.asarray(number.round(), np.int64)
+    return np.arange(len(stamps_s))
 
 
 LONE_FRAME_S = 1 / 60  # half a frame interval where there is only one frame (chosen: 30 Hz)

@@ -53,12 +53,7 @@ def read_poses(
         ReobjError: damaged, unknown, not rigid, without intrinsics, or of another video.
     """
     path, size = Path(path), (int(video.size[0]), int(video.size[1]))
-    if not path.exists():
-        raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
-    reader = READERS.get(_pose_format(path) if fmt == "auto" else fmt)
-    if reader is None:
-        raise ReobjError(f"--pose-format {fmt}: unknown; known are auto, {', '.join(READERS)}")
-    given = reader(path, size)
+    given = read_pose_file(path, fmt, size)
     intrinsics = parse_camera(camera, size)
     if intrinsics is None:
         if given.camera is None:
@@ -90,8 +85,22 @@ def read_poses(
     )  # fmt: skip
 
 
+def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
+    """Read a file or folder of poses in one of the formats of READERS, or the one recognised.
+
+    Args:
+        size: (w, h) of the images, for formats that do not state it.
+    """
+    if not path.exists():
+        raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
+    reader = READERS.get(_pose_format(path) if fmt == "auto" else fmt)
+    if reader is None:
+        raise ReobjError(f"--pose-format {fmt}: unknown; known are auto, {', '.join(READERS)}")
+    return reader(path, size)
+
+
 def _rows_of_frames(
-    given: _PoseFile, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
+    given: PoseFile, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
 ) -> tuple[IntArray, str, list[str]]:
     """Find the row of each frame in a file of poses by name, time stamp or order.
 
@@ -121,8 +130,8 @@ def _in_frames(visibility: IntArray, row: IntArray) -> IntArray:
 
 
 @dataclass(frozen=True, slots=True)
-class _PoseFile:
-    """What a reader returns: N poses in the order of the file.
+class PoseFile:
+    """Hold what a reader returns: N poses in the order of the file, by time where they have one.
 
     Attributes:
         cam_from_world: (N, 3, 4), NaN where the file says that there is no pose.
@@ -252,16 +261,16 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
     return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
 
 
-def _read_tum(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read TUM rows: seconds, world_from_cam; metres unless the header is our own and says no."""
     rows, where = _read_table(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
     metric = re.search(f"^#.*{NO_SCALE}", read_text(path), re.MULTILINE) is None
     order = np.unique(rows[:, 0], return_index=True)[1]
-    return _PoseFile(invert_rigid(world_from_cam)[order], stamps_s=rows[order, 0], metric=metric)
+    return PoseFile(invert_rigid(world_from_cam)[order], stamps_s=rows[order, 0], metric=metric)
 
 
-def _read_record3d(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read Record3D's metadata: `poses` qx qy qz qw tx ty tz, world_from_cam, OpenGL axes, y up."""
     data = _json_object(path)
     try:
@@ -275,10 +284,10 @@ def _read_record3d(path: Path, size: tuple[int, int]) -> _PoseFile:
     where = [f"{path}, poses[{i}]" for i in range(len(rows))]
     world_from_gl = _from_quaternions(rows[:, :4], rows[:, 4:], where)
     poses = CV_FROM_GL @ invert_rigid(world_from_gl)
-    return _PoseFile(poses, camera, metric=True, up_in_world=np.array([0, 1.0, 0]))
+    return PoseFile(poses, camera, metric=True, up_in_world=np.array([0, 1.0, 0]))
 
 
-def _read_scannet(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read ScanNet's `pose/<frame>.txt` (z up) or 7-Scenes' `*.pose.txt`: 4x4 world_from_cam.
 
     Metres; inf: no pose. ScanNet's intrinsics have the centre of the first pixel at (0, 0).
@@ -298,7 +307,7 @@ def _read_scannet(path: Path, size: tuple[int, int]) -> _PoseFile:
         camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
     up = np.array([0, 0, 1.0]) if folder.name == "pose" else None
     names = tuple(file.stem for file in files)
-    return _PoseFile(invert_rigid(world_from_cam), camera, names, metric=True, up_in_world=up)
+    return PoseFile(invert_rigid(world_from_cam), camera, names, metric=True, up_in_world=up)
 
 
 def _arkit_files(path: Path) -> list[Path]:
@@ -313,7 +322,7 @@ def _arkit_files(path: Path) -> list[Path]:
 ARKIT_KEYS = {"cameraPoseARFrame", "t_00"}  # 3D Scanner App, Polycam
 
 
-def _read_arkit(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read a raw export of Polycam or of 3D Scanner App: a JSON file for each image.
 
     world_from_cam row by row, `t_00` to `t_23` or `cameraPoseARFrame`; ARKit's axes (those of
@@ -337,10 +346,10 @@ def _read_arkit(path: Path, size: tuple[int, int]) -> _PoseFile:
             raise ReobjError(f"{at}: no camera ({error!r}); expected {what}") from None
     poses = CV_FROM_GL @ invert_rigid(_checked_rigid(np.array(matrices), where))
     names, up = tuple(file.stem for file in files), np.array([0, 1.0, 0])
-    return _PoseFile(poses, _one_camera(cameras, path), names, metric=True, up_in_world=up)
+    return PoseFile(poses, _one_camera(cameras, path), names, metric=True, up_in_world=up)
 
 
-def _read_transforms(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read nerfstudio's or instant-ngp's transforms.json: world_from_cam, OpenGL axes; no scale.
 
     nerfstudio turned the world by `applied_transform` A; this is undone:
@@ -362,7 +371,7 @@ def _read_transforms(path: Path, size: tuple[int, int]) -> _PoseFile:
         what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
         raise ReobjError(f"{path}: {what}") from None
     gl_from_world = invert_rigid(_checked_rigid(matrix, where)) @ applied  # (N, 3, 4)
-    return _PoseFile(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
+    return PoseFile(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
 
 
 MAX_FOCAL_SPREAD = 0.02  # of the images of one camera, a share: autofocus (chosen)
@@ -380,7 +389,7 @@ def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
     return found[len(found) // 2]
 
 
-def _read_colmap(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read a COLMAP model, binary (preferred) or text, with or without rigs; scale unknown."""
     start = path if path.is_dir() else path.parent
     folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
@@ -400,20 +409,22 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> _PoseFile:
         raise ReobjError(f"{found[0]}: the COLMAP model has no registered image")
     camera = _one_camera(model.cameras, found[0])
     seen = np.column_stack([model.obs_image, model.obs_point])
-    return _PoseFile(
+    return PoseFile(
         model.cam_from_world, camera, model.names, points=model.points, colors=model.colors,
         visibility=seen,
     )  # fmt: skip
 
 
-def _read_colmap_text(folder: Path) -> _PoseFile:
+def _read_colmap_text(folder: Path) -> PoseFile:
     """Read a COLMAP text model, also one of poses alone.
 
     Many tools leave out points3D.txt, or the line of observations after each image: pycolmap
     refuses the first, and with the second takes every other image for observations.
     """
     cameras = _colmap_text_cameras(folder / "cameras.txt")
-    rows, names, used, where, row_of = [], [], [], [], {}
+    names, used, where = [], [], []
+    rows: list[list[float]] = []
+    row_of: dict[str, int] = {}
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     observations_next = False
     for at, words in _lines(folder / "images.txt"):
@@ -437,7 +448,7 @@ def _read_colmap_text(folder: Path) -> _PoseFile:
     poses = _from_quaternions(np.roll(quaternion_wxyz, -1, 1), translation, where)
     xyz, colors, seen = _colmap_text_points(folder / "points3D.txt", row_of)
     camera = _one_camera(used, folder)
-    return _PoseFile(poses, camera, tuple(names), points=xyz, colors=colors, visibility=seen)
+    return PoseFile(poses, camera, tuple(names), points=xyz, colors=colors, visibility=seen)
 
 
 def _colmap_text_cameras(path: Path) -> dict[str, Camera]:
@@ -480,7 +491,7 @@ def _colmap_text_points(
     return table[:, 1:4], colors, np.array(seen, np.int64).reshape(-1, 2)
 
 
-READERS: dict[str, Callable[[Path, tuple[int, int]], _PoseFile]] = {
+READERS: dict[str, Callable[[Path, tuple[int, int]], PoseFile]] = {
     "colmap": _read_colmap,
     "tum": _read_tum,
     "transforms": _read_transforms,

@@ -302,7 +302,12 @@ def _image_files(source: str) -> list[Path]:
     files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     if not files:
         raise ReobjError(f"{source}: no images there (looked for {' '.join(IMAGE_SUFFIXES)})")
-    return sorted(files, key=lambda p: re.sub(r"\d+", lambda n: n[0].zfill(20), p.name))
+    return sorted(files, key=lambda p: by_number(p.name))
+
+
+def by_number(name: str) -> str:
+    """Return a key that sorts names by the numbers in them."""
+    return re.sub(r"\d+", lambda n: n[0].zfill(20), name)
 
 
 def _read_image(path: Path) -> Image | None:
