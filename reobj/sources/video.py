@@ -76,8 +76,10 @@ def times_of_names(names: Sequence[str]) -> Array | None:
     found = []
     for per_s in STAMPS_PER_S:
         step_s = float(np.median(steps)) / per_s if len(steps) else 1 / IMAGE_FPS
-        dated = bool(EPOCH_S[0] < numbers[0] / per_s < EPOCH_S[1])
-        if FRAME_STEPS_S[0] <= step_s <= FRAME_STEPS_S[1] and (dated or len(steps)):
+        first_s = float(numbers[0]) / per_s
+        dated = EPOCH_S[0] < first_s < EPOCH_S[1]
+        clock = dated or (first_s < EPOCH_S[0] and len(steps) > 0)  # or since it was switched on
+        if clock and FRAME_STEPS_S[0] <= step_s <= FRAME_STEPS_S[1]:
             found.append((not dated, abs(math.log(step_s * IMAGE_FPS)), per_s))
     return numbers / min(found)[2] if found else None
 
