@@ -49,7 +49,9 @@ def open_video(
             "--tracks FILE), --poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"
         )
     path, posed, unknown = Path(boxes), poses.mode, (1, 1)
-    size = image_size(path) if path.is_file() else None
+    if not path.is_file():
+        raise ReobjError(f"{path}: no such file of detections")
+    size = image_size(path)
     stated = stated_camera(poses.camera, size)
     size = size or (unknown if stated is None else (stated.width, stated.height))
     given = read_pose_file(Path(posed), poses.fmt, size)
