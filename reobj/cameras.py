@@ -273,7 +273,10 @@ def place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
 
 
 def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
-    """Undistort boxes (N, 4) by the middles of their edges; edges at the image border stay."""
+    """Undistort boxes (N, 4) by the middles of their edges; edges at the image border stay.
+
+    A box is NaN where an edge has no undistorted pixel.
+    """
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
     edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) middles
@@ -282,7 +285,8 @@ def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
     undistorted = camera.undistort(edges)[:, side, axis]  # (N, 4)
     limit = np.array([camera.width, camera.height] * 2)
     at_border = (xyxy <= 1) | (xyxy >= limit - 1)
-    return np.where(at_border, xyxy, undistorted)
+    found = np.where(at_border, xyxy, undistorted)
+    return np.where(np.isfinite(found).all(1, keepdims=True), found, np.nan)
 
 
 def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:

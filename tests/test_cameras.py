@@ -163,6 +163,9 @@ def test_boxes_are_undistorted_by_the_middles_of_their_edges():
     np.testing.assert_allclose(found[0], [ideal[0, 0], ideal[1, 1], ideal[2, 0], ideal[3, 1]])
     np.testing.assert_array_equal(found[1, [0, 2, 3]], [0, 640, 480])  # at the image border
     assert abs(found[0] - boxes[0]).min() > 0.1 and found[1, 1] != 50
+    fisheye = rt.Camera("SIMPLE_FISHEYE", *SIZE, (200.0, 320.0, 240.0))
+    rows = np.array([[2, 200, 90, 300.0], [200, 150, 400, 300]])  # the first reaches beyond 90 deg
+    assert np.isnan(undistort_boxes(rows, fisheye)).all(1).tolist() == [True, False]
     assert undistort_boxes(boxes, PINHOLE) is boxes and not len(undistort_boxes(boxes[:0], camera))
 
 

@@ -312,14 +312,9 @@ def _read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
 
 def _arkit_files(path: Path) -> list[Path]:
     """List the files of cameras, one an image, of a raw export of an app that uses ARKit."""
-    folders = [path / "keyframes" / n for n in ("corrected_cameras", "cameras")] + [path]
-    found = [sorted(folder.glob("*.json"), key=lambda f: f.name) for folder in folders]
-    files = next((files for files in found if files), [])
-    own = [f for f in files if f.name.startswith("frame_")] or files
-    return own if own and ARKIT_KEYS & _json_object(own[0]).keys() else []
-
-
-ARKIT_KEYS = {"cameraPoseARFrame", "t_00"}  # 3D Scanner App, Polycam
+    polycam = [path / "keyframes" / name for name in ("corrected_cameras", "cameras")]
+    found = [sorted(path.glob("frame_*.json")), *(sorted(p.glob("*.json")) for p in polycam)]
+    return next((files for files in found if files), [])
 
 
 def _read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -330,7 +325,7 @@ def _read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     files = _arkit_files(path)
     if not files:
-        raise ReobjError(f"{path}: no JSON files with {' or '.join(sorted(ARKIT_KEYS))}")
+        raise ReobjError(f"{path}: no frame_*.json, nor keyframes/cameras/*.json in it")
     data = [_json_object(file) for file in files]
     where = [str(file) for file in files]
     matrices, cameras = [], []
