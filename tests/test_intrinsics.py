@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from pose_worlds import SIZE
+from pose_worlds import SIZE, some_cameras, supplied
 
+import reobj.poses.stage as stage
 import reobj_track as rt
 from reobj.poses.intrinsics import camera_line, parse_camera, stated_camera
+from reobj.results.workspace import Workspace
 
 ROOM = Path(rt.__file__).parent / "examples" / "room"
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(rt.__file__).resolve().parent.parent / "shared"))
@@ -181,6 +185,28 @@ def test_a_line_reads_back_with_all_digits():
 
 def test_the_example_rooms_camera_is_read():
     assert parse_camera(str(ROOM / "camera.txt"), SIZE).K[0, 0] == 492.756788421
+
+
+def test_another_content_of_the_file_is_another_reconstruction(tmp_path, monkeypatch):
+    """The cache knows the camera that a file holds, not its name."""
+    path, cameras = tmp_path / "camera.txt", []
+
+    def found(video, config, work, **_):
+        camera = parse_camera(config.camera, video.size)
+        cameras.append(camera)
+        (work / "sparse").mkdir(parents=True)
+        return dataclasses.replace(supplied(some_cameras(2)), camera=camera, source="pycolmap")
+
+    monkeypatch.setattr(stage, "estimate_poses", found)
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((480, 640, 3), np.uint8))
+    video, workspace = rt.Video(tmp_path / "*.png"), Workspace(tmp_path / "out")
+    config = rt.PosesConfig(camera=str(path))
+    for content in ("500,510,320,240", "PINHOLE 640 480 500 510 320 240", "600,610,320,240"):
+        path.write_text(content)
+        poses, _ = stage.reconstruct_cached(video, config, workspace)
+        assert poses.camera == parse_camera(content, SIZE)
+    assert len(cameras) == 2  # the first two are the same camera
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="no real recordings: set REOBJ_SHARED")

@@ -75,7 +75,8 @@ def read_poses(
         count = len(given.cam_from_world)
         raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({what})")
     if not known.all():
-        lost = spans(frame[~known].tolist())
+        step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
+        lost = spans(frame[~known].tolist(), step)
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
     status = np.where(known, "supplied", "none")
     return Poses(
