@@ -17,6 +17,7 @@ from reobj.cameras import invert_rigid, write_colmap, write_tum
 CAMERA = f"{FOCAL},{FOCAL},320,240"
 K = [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]]
 NAMES = [f"{i:04d}.jpg" for i in range(FRAMES)]
+EVERY_SECOND = rt.InputConfig(every=2)
 
 
 GL = np.diag([1.0, -1, -1, 1])
@@ -219,6 +220,17 @@ def test_numbers_of_names_that_do_not_meet_are_not_forced(tmp_path):
     names = [f"IMG_{i:04d}.jpg" for i in range(1, FRAMES + 1)]
     poses = read(path, blank(FRAMES, names), camera=CAMERA)
     np.testing.assert_allclose(poses.cam_from_world, cams, atol=1e-9)
+
+
+@pytest.mark.parametrize("write", [as_seven_scenes, as_record3d])
+def test_every_second_image_counted_from_1_keeps_its_place(tmp_path, write):
+    """With --every 2 all their numbers have a pose, the wrong one."""
+    for i in range(1, FRAMES + 1):
+        cv2.imwrite(str(tmp_path / f"IMG_{i:04d}.png"), np.zeros((480, 640, 3), np.uint8))
+    (tmp_path / "poses").mkdir()
+    path, video = write(tmp_path / "poses", some_cameras()), rt.Video(tmp_path, EVERY_SECOND)
+    poses = rt.read_poses(path, video, camera=CAMERA)
+    np.testing.assert_allclose(poses.cam_from_world, some_cameras()[::2], atol=1e-9)
 
 
 @pytest.mark.parametrize("write", [as_colmap_text, as_colmap_binary, as_nerfstudio])

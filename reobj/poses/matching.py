@@ -16,11 +16,16 @@ from reobj.cameras import invert_rigid
 from reobj.types import Array, BoolArray, IntArray, ReobjError
 
 
-def rows_by_order(count: int, frame: IntArray, names: Sequence[str]) -> IntArray:
+def rows_by_order(
+    count: int, frame: IntArray, names: Sequence[str], images: Sequence[str]
+) -> IntArray:
     """Match `count` poses without names or times to frames (F,): one each, or by number.
 
-    Numbers are those in the names of the frames, where they all have a row, else the frames' own.
+    Numbers are those in the names of the frames, where they are images that were picked out of
+    `count`, else the frames' own.
 
+    Args:
+        names: (F,) of the frames read, or (). images: of all frames of the source, or ().
     Returns:
         row (F,) of each frame.
     Raises:
@@ -28,7 +33,7 @@ def rows_by_order(count: int, frame: IntArray, names: Sequence[str]) -> IntArray
     """
     if count == len(frame):
         return np.arange(count)
-    if len(names):  # images picked out of those that the rows count
+    if len(names) and len(images) != count:
         row = rows_by_number([str(i) for i in range(count)], frame, names)
         if (row >= 0).all():
             return row
@@ -38,15 +43,28 @@ def rows_by_order(count: int, frame: IntArray, names: Sequence[str]) -> IntArray
     return frame.copy()
 
 
-def rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
-    """Match by path, else file name, else stem, else the last number in the names."""
+def rows_by_name(
+    given: Sequence[str], frame: IntArray, names: Sequence[str], images: Sequence[str]
+) -> IntArray:
+    """Match by path, else file name, else stem, else the last number in the names.
+
+    Where there is a pose for every image, but under other numbers, the frames' own numbers count.
+
+    Args:
+        given: (N,) of the poses. names: (F,) of the frames read, or (). images: of all frames of
+            the source, or ().
+    Returns:
+        row (F,) of each frame, -1: none.
+    """
     for key in (str, lambda n: Path(n).name, lambda n: Path(n).stem):
         rows = {key(name): r for r, name in enumerate(given)}
         found = np.array([rows.get(key(name), -1) for name in names], np.int64)
         if (found >= 0).any():
             return found
     by_name, by_frame = rows_by_number(given, frame, names), rows_by_number(given, frame, ())
-    return by_name if (by_name >= 0).sum() >= max(1, (by_frame >= 0).sum()) else by_frame
+    other = len(images) == len(given) and set(_last_numbers(images)) != set(_last_numbers(given))
+    more = (by_name >= 0).sum() >= max(1, (by_frame >= 0).sum())
+    return by_name if more and not other else by_frame
 
 
 def rows_by_number(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:

@@ -64,7 +64,7 @@ def read_poses(
         raise ReobjError("the video has no frame that can be read: poses belong to nothing")
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
     names = [video.names[n] for n in frame if video.names]
-    row, what, messages = _rows_of_frames(given, path, frame, time_s, names)
+    row, what, messages = _rows_of_frames(given, path, frame, time_s, names, video.names)
     poses = np.full((len(frame), 3, 4), np.nan)
     poses[row >= 0] = given.cam_from_world[row[row >= 0]]
     if given.stamps_s is not None and len(given.stamps_s) > 1:
@@ -101,8 +101,9 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
 
 
 def _rows_of_frames(
-    given: PoseFile, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
-) -> tuple[IntArray, str, list[str]]:
+    given: PoseFile, path: Path, frame: IntArray, time_s: Array, names: Sequence[str],
+    images: Sequence[str],
+) -> tuple[IntArray, str, list[str]]:  # fmt: skip
     """Find the row of each frame in a file of poses by name, time stamp or order.
 
     Returns:
@@ -110,14 +111,15 @@ def _rows_of_frames(
     """
     if given.names:
         what = f"images {given.names[0]!r} ..., frames {names[0] if len(names) else frame[0]!r} ..."
-        return rows_by_name(given.names, frame, names), what, []
+        return rows_by_name(given.names, frame, names, images), what, []
     if given.stamps_s is not None:
         what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, "
         what += f"frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
         row, messages = rows_by_time(given.stamps_s, frame, time_s)
         return row, what, messages
     try:
-        return rows_by_order(len(given.cam_from_world), frame, names), "in order", []
+        row = rows_by_order(len(given.cam_from_world), frame, names, images)
+        return row, "in order", []
     except ReobjError as error:
         raise ReobjError(f"{path}: {error}") from None
 
