@@ -538,6 +538,15 @@ def test_a_rotation_between_two_stamps_is_interpolated(tmp_path):
     np.testing.assert_allclose(poses.cam_from_world[2], cams[2], atol=1e-9)  # the last one: nearest
 
 
+def test_poses_at_the_times_of_the_frames_are_taken_as_they_are(tmp_path):
+    """Times rounded to a millisecond are the same times: nothing is interpolated."""
+    path = as_tum(tmp_path, some_cameras())
+    exact = read(path, camera=CAMERA).cam_from_world
+    for i in range(FRAMES):
+        edit(path, i + 1, word(0, f"{i / 30:.3f}"))
+    np.testing.assert_array_equal(read(path, camera=CAMERA).cam_from_world, exact)
+
+
 def test_time_stamps_of_another_clock_are_refused_when_counts_differ(tmp_path):
     path = as_tum(tmp_path, some_cameras(4))
     for i in range(4):

@@ -104,6 +104,7 @@ def numbers_of_times(stamps_s: Array) -> IntArray:
 
 LONE_FRAME_S = 1 / 60  # half a frame interval where there is only one frame (chosen: 30 Hz)
 STAMP_TOLERANCE_S = 0.02  # between a frame and its pose (default of TUM's associate.py)
+SAME_TIME_S = 5e-4  # times in files and containers are rounded to a ms
 STAMP_STEP_S = 0.1  # between poses, up to which one between them is interpolated (chosen: 10 Hz)
 
 
@@ -137,15 +138,13 @@ def interpolated(cam_from_world: Array, stamps_s: Array, time_s: Array) -> tuple
     Rotations by slerp, centres along a line.
 
     Returns:
-        cam_from_world (n, 3, 4), and at which times (F,): where two such poses are.
+        cam_from_world (n, 3, 4), and at which times (F,): where two such poses are, neither of
+        them at that very time.
     """
     after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)
     a, b = after - 1, after
-    use = (
-        (stamps_s[a] <= time_s)
-        & (time_s < stamps_s[b])
-        & (stamps_s[b] - stamps_s[a] <= STAMP_STEP_S)
-    )
+    use = (time_s - stamps_s[a] > SAME_TIME_S) & (stamps_s[b] - time_s > SAME_TIME_S)
+    use &= stamps_s[b] - stamps_s[a] <= STAMP_STEP_S
     use &= np.isfinite(cam_from_world[a] + cam_from_world[b]).all((1, 2))
     a, b = a[use], b[use]
     share = ((time_s[use] - stamps_s[a]) / (stamps_s[b] - stamps_s[a]))[:, None]  # (n, 1)
