@@ -81,6 +81,7 @@ from reobj.objects import ObjectsConfig
 from reobj.options import add_flags, config_from_args, list_options
 from reobj.parts import link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
+from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
     check_directions,
@@ -943,7 +944,7 @@ def track(
 
 
 def run(
-    source: str | Path | int,
+    source: str | Path | int | None,
     out: str | Path,
     config: Config | None = None,
     *,
@@ -955,8 +956,8 @@ def run(
     """Run the chain on a video: detect, track, poses, objects; write the output folder's files.
 
     Args:
-        source: video file, folder of images, glob, camera index or URL of a stream. Ctrl-C ends a
-            live one: its files are written.
+        source: video file, folder of images, glob, camera index or URL of a stream (Ctrl-C ends a
+            live one: its files are written); None: no images, only detections and poses.
         out: output folder; results of earlier stages found there are used again.
         detections: file with recorded detections, or a callable image -> detections; default:
             config.detect.model.
@@ -970,7 +971,7 @@ def run(
     config = config or Config()
     if config.threads:
         cv2.setNumThreads(config.threads)
-    video = Video(source, config.input)
+    video = open_video(source, config.input, config.poses, tracks or detections)
     workspace = Workspace(out, overwrite)
     workspace.bind(video, overwrite)
     seconds: dict[str, float] = {}
@@ -999,9 +1000,8 @@ def refit(
 ) -> Result:
     """Link and fit again from what an output folder holds; tracks: identities from this file."""
     workspace = Workspace.open(out)
-    result, (source, read_as) = workspace.load_last(), workspace.source
-    config = dataclasses.replace(config or Config(), input=read_as)
-    video = Video(source, config.input)
+    result, video = workspace.load_last(), workspace.video()
+    config = dataclasses.replace(config or Config(), input=video.config)
     if tracks:
         poses = result.poses
         result = _given_tracks(tracks, video, config.detect, result)
@@ -1181,7 +1181,8 @@ def _add_run(sub: Any, name: str, text: str) -> None:
     add = _command(
         sub, name, text, _cmd_poses if name == "poses" else _cmd_run, *sections
     ).add_argument
-    add("video", help="video file, folder of images, glob in quotes, camera index, stream URL")
+    text = "video file, folder of images, glob in quotes, camera index, stream URL (`run`: or none)"
+    add("video", nargs="?" if name == "run" else None, help=text)
     add("-o", "--out", required=True, help="output folder")
     add("--overwrite", action="store_true", help="write into a folder that holds something else")
     if name != "poses":

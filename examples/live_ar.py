@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("video", nargs="?", type=Path, default=ROOM / "room.mp4")
     parser.add_argument("--poses", type=Path, default=ROOM / "poses.txt")
-    parser.add_argument("--camera", default="492.7568,492.7568,320,240", help="fx,fy,cx,cy in px")
+    parser.add_argument("--camera", default="492.7568,492.7568,320,240", help="as run has it")
     parser.add_argument("--detections", type=Path, default=ROOM / "detections.npz")
     parser.add_argument("--detector", help="ONNX detector in place of recorded detections")
     parser.add_argument(

@@ -38,12 +38,31 @@ def import_pycolmap() -> Any:
     return pycolmap
 
 
+def camera_parameters(model: str) -> list[str]:
+    """List the parameters of one of COLMAP's camera models in their order: fx, fy, cx, cy, ...
+
+    Raises:
+        ReobjError: the installed pycolmap does not know it, or it has no focal length.
+    """
+    pycolmap = import_pycolmap()
+    known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    if model not in known:
+        raise ReobjError(f"no camera model {model}; pycolmap has {', '.join(known)}")
+    made = pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2)
+    if not made.focal_length_idxs():
+        raise ReobjError(f"a {model} camera has no focal length; cut perspective images out of it")
+    return [name.strip() for name in made.params_info.split(",")]
+
+
+INVERSE_PX = 0.01  # between a pixel and its undistorted ray distorted again (chosen: no error)
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Intrinsics as COLMAP has them.
 
     Attributes:
-        model: COLMAP's name of the camera model: PINHOLE, OPENCV, SIMPLE_RADIAL, ...
+        model: COLMAP's name of the camera model: PINHOLE, OPENCV, ...; any that pycolmap has.
         width, height: of the images, pixels.
         params: in the model's order: focal length(s), principal point, distortion.
     """
@@ -56,23 +75,40 @@ class Camera:
     @property
     def K(self) -> Array:
         """Calibration matrix (3, 3) without the distortion."""
-        one_focal = self.model.startswith("SIMPLE_") or self.model in ("RADIAL", "RADIAL_FISHEYE")
-        fx, fy, cx, cy = (self.params[0], *self.params[:3]) if one_focal else self.params[:4]
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        if self.model == "PINHOLE":  # needs no pycolmap
+            fx, fy, cx, cy = self.params
+            return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        return np.asarray(self.to_pycolmap().calibration_matrix(), np.float64)
 
     def undistort(self, xy: Array) -> Array:
-        """Map pixels (..., 2) to those of a pinhole camera with the same K; NaN stays NaN."""
+        """Map pixels (..., 2) to those of a pinhole camera with the same K.
+
+        NaN stays NaN; so become pixels that a pinhole cannot have (90 deg off the axis or more),
+        and those outside of what the distortion was fitted to, which it does not map back.
+        """
         camera = self.to_pycolmap()
         flat = np.asarray(xy, np.float64).reshape(-1, 2)
         ideal = np.full_like(flat, np.nan)
-        good = np.isfinite(flat).all(1)
-        if good.any():
-            rays = np.asarray(camera.cam_from_img(flat[good]), np.float64)
-            ideal[good] = rays @ self.K[:2, :2].T + self.K[:2, 2]
+        rows = np.flatnonzero(np.isfinite(flat).all(1))
+        if len(rows):
+            ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
+            ray, rows = ray[ray[:, 2] > 0], rows[ray[:, 2] > 0]
+            back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
+            good = np.linalg.norm(back - flat[rows], axis=1) < INVERSE_PX
+            ray, rows = ray[good], rows[good]
+            ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
 
     def to_pycolmap(self) -> Any:
-        """Return the same camera as `pycolmap.Camera` with id 1."""
+        """Return the same camera as `pycolmap.Camera` with id 1.
+
+        Raises:
+            ReobjError: no model of the installed pycolmap, or other parameters than it has.
+        """
+        names = camera_parameters(self.model)
+        if len(self.params) != len(names):
+            what = f"{len(self.params)} parameters of a {self.model} camera"
+            raise ReobjError(f"{what}; expected {', '.join(names)}")
         intrinsics = dataclasses.asdict(self) | {"params": list(self.params)}
         return import_pycolmap().Camera(camera_id=1, **intrinsics)
 
@@ -83,31 +119,6 @@ class Camera:
         made = self.to_pycolmap()
         made.rescale(*size)
         return Camera(self.model, *size, tuple(made.params.tolist()))
-
-
-def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
-    """Parse `fx,fy,cx,cy[,k1,k2,p1,p2]`, pixels of frames of size (w, h).
-
-    Returns:
-        a PINHOLE camera, an OPENCV camera if there is distortion; None of an empty text.
-    Raises:
-        ReobjError: other text, or numbers that do not belong to frames of that size.
-
-    >>> parse_camera("500,500,320,240", (640, 480)).model
-    'PINHOLE'
-    """
-    if not text.strip():
-        return None
-    with contextlib.suppress(ValueError):
-        numbers = [float(part) for part in text.split(",")]
-        if 4 <= len(numbers) <= 8 and np.isfinite(numbers).all() and min(numbers[:2]) > 0:
-            numbers += [0.0] * (8 - len(numbers) if len(numbers) > 4 else 0)
-            camera = Camera("OPENCV" if len(numbers) == 8 else "PINHOLE", *size, tuple(numbers))
-            return checked_camera(camera, f"--camera {text}")
-    raise ReobjError(
-        f"--camera {text!r}: expected fx,fy,cx,cy[,k1,k2,p1,p2], pixels of frames "
-        f"of {size[0]}x{size[1]}"
-    )
 
 
 MAX_OFF_CENTRE = 0.2  # of the principal point from the middle, over the size (chosen: wide)
@@ -268,7 +279,10 @@ def place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
 
 
 def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
-    """Undistort boxes (N, 4) by the middles of their edges; edges at the image border stay."""
+    """Undistort boxes (N, 4) by the middles of their edges; edges at the image border stay.
+
+    A box is NaN where an edge has no undistorted pixel.
+    """
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
     edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) middles
@@ -277,7 +291,8 @@ def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
     undistorted = camera.undistort(edges)[:, side, axis]  # (N, 4)
     limit = np.array([camera.width, camera.height] * 2)
     at_border = (xyxy <= 1) | (xyxy >= limit - 1)
-    return np.where(at_border, xyxy, undistorted)
+    found = np.where(at_border, xyxy, undistorted)
+    return np.where(np.isfinite(found).all(1, keepdims=True), found, np.nan)
 
 
 def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:

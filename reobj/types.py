@@ -44,7 +44,10 @@ def option(default: Any, text: str, flag: str = "") -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One video frame: source number (0-based), time in seconds, BGR image (H, W, 3) uint8."""
+    """One video frame: source number (0-based), time in seconds, BGR image (H, W, 3) uint8.
+
+    (The image is None in an `ImagelessVideo`.)
+    """
 
     index: int
     time_s: float

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from pose_worlds import PINHOLE, SIZE, some_cameras, supplied
@@ -15,9 +16,9 @@ from scipy.spatial.transform import Rotation
 import reobj_track as rt
 from reobj.cameras import (
     angle_deg,
+    camera_parameters,
     invert_rigid,
     load_poses,
-    parse_camera,
     place_of,
     quat_wxyz_from_matrix,
     read_sparse_model,
@@ -37,6 +38,17 @@ DISTORTED = {
     "RADIAL": (500.0, 325.0, 245.0, -0.1, 0.02),
     "OPENCV": (500.0, 480.0, 330.0, 250.0, -0.1, 0.02, 0.001, -0.002),
     "OPENCV_FISHEYE": (400.0, 390.0, 330.0, 250.0, 0.01, 0.002, 0.0, 0.0),
+    "FULL_OPENCV": (500.0, 480.0, 330.0, 250.0, -0.1, 0.02, 1e-3, -2e-3, 0.01, 0.02, 0.01, 1e-3),
+    "FOV": (400.0, 390.0, 330.0, 250.0, 0.9),
+    "SIMPLE_RADIAL_FISHEYE": (400.0, 330.0, 250.0, 0.01),
+    "RADIAL_FISHEYE": (400.0, 330.0, 250.0, 0.01, 0.002),
+    "THIN_PRISM_FISHEYE": (400.0, 390.0, 330.0, 250.0, *[0.002] * 8),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (400.0, 390.0, 330.0, 250.0, *[0.001] * 12),
+    "SIMPLE_DIVISION": (500.0, 330.0, 250.0, -0.1),
+    "DIVISION": (500.0, 480.0, 330.0, 250.0, -0.1),
+    "SIMPLE_FISHEYE": (400.0, 330.0, 250.0),
+    "FISHEYE": (400.0, 390.0, 330.0, 250.0),
+    "EUCM": (400.0, 390.0, 330.0, 250.0, 0.5, 1.1),
 }
 
 
@@ -63,6 +75,66 @@ def test_undistorted_pixels_are_those_of_a_pinhole_with_the_same_k(model):
     assert np.isnan(ideal[1, 3]).all()
 
 
+def test_every_model_of_pycolmap_with_a_focal_length_is_tested():
+    pycolmap = pytest.importorskip("pycolmap")
+    known = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
+    assert known <= set(DISTORTED)
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_the_parameters_that_k_holds_are_those_of_their_names(model):
+    """The model's own names say which numbers are focal lengths and centre."""
+    names = camera_parameters(model)
+    value = dict(zip(names, DISTORTED[model], strict=True))
+    fx, fy = (value["f"],) * 2 if "f" in value else (value["fx"], value["fy"])
+    K = rt.Camera(model, *SIZE, DISTORTED[model]).K
+    np.testing.assert_allclose(K, [[fx, 0, value["cx"]], [0, fy, value["cy"]], [0, 0, 1]])
+
+
+# OpenCV's five coefficients of TUM RGB-D's cameras: fx, fy, cx, cy, k1, k2, p1, p2, k3
+TUM_CAMERAS = {
+    "fr1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "fr2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+}
+
+
+@pytest.mark.parametrize("name", TUM_CAMERAS)
+def test_k3_is_undistorted_as_opencv_does(name):
+    numbers = TUM_CAMERAS[name]
+    camera = rt.Camera("FULL_OPENCV", *SIZE, (*numbers, 0.0, 0.0, 0.0))
+    grid = np.stack(np.meshgrid(np.linspace(0, 640, 9), np.linspace(0, 480, 7)), -1)  # (7, 9, 2)
+    K, criteria = camera.K, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+    theirs = cv2.undistortPoints(
+        grid.reshape(-1, 1, 2), K, np.array(numbers[4:]), P=K, criteria=criteria
+    )
+    np.testing.assert_allclose(camera.undistort(grid), theirs.reshape(grid.shape), atol=1e-5)
+    without = rt.Camera("OPENCV", *SIZE, numbers[:8]).undistort(grid)
+    assert np.nanmax(np.abs(without - camera.undistort(grid))) > 3  # k3 matters at the corners
+
+
+def test_pixels_that_no_pinhole_can_have_are_nan():
+    """Of a fisheye of 180 degrees and more, and outside of what a polynomial can undo."""
+    fisheye = rt.Camera("SIMPLE_FISHEYE", *SIZE, (200.0, 320.0, 240.0))
+    found = fisheye.undistort(np.array([[320.0, 240], [0, 240], [0, 0], [320, 0]]))
+    assert np.isfinite(found).all(1).tolist() == [True, False, False, True]  # 92, 115, 69 deg
+    assert found[3, 1] == pytest.approx(240 - 200 * np.tan(1.2))
+    barrel = rt.Camera("SIMPLE_RADIAL", *SIZE, (400.0, 320.0, 240.0, -0.5))
+    assert np.isnan(barrel.undistort(np.array([[0.0, 0]]))).all()
+
+
+@pytest.mark.parametrize(
+    "model, params, message",
+    [
+        ("MAGIC", (500.0, 320.0, 240.0), "no camera model MAGIC; pycolmap has SIMPLE_PINHOLE"),
+        ("OPENCV", (500.0, 500.0, 320.0), "3 parameters of a OPENCV camera; expected fx, fy, cx"),
+        ("EQUIRECTANGULAR", (640.0, 320.0), "EQUIRECTANGULAR camera has no focal length"),
+    ],
+)
+def test_what_is_no_camera_is_refused_by_name(model, params, message):
+    with pytest.raises(rt.ReobjError, match=message):
+        _ = rt.Camera(model, *SIZE, params).K
+
+
 @pytest.mark.parametrize("model", DISTORTED)
 def test_a_resized_camera_sees_the_same_rays(model):
     pycolmap = pytest.importorskip("pycolmap")
@@ -74,33 +146,6 @@ def test_a_resized_camera_sees_the_same_rays(model):
     pixels = np.array(camera.to_pycolmap().img_from_cam(rays))
     np.testing.assert_allclose(made.img_from_cam(rays), pixels / 2, atol=1e-9)
     assert camera.resized(SIZE) == camera
-
-
-def test_a_camera_is_parsed():
-    assert parse_camera("", SIZE) is None and parse_camera("  ", SIZE) is None
-    pinhole = parse_camera("500,510,320,240", SIZE)
-    assert pinhole == rt.Camera("PINHOLE", *SIZE, (500, 510, 320, 240))
-    opencv = parse_camera("500,510,320,240,-.1,.02", SIZE)
-    assert opencv == rt.Camera("OPENCV", *SIZE, (500, 510, 320, 240, -0.1, 0.02, 0, 0))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1,2,3",  # too few
-        "1,2,3,4,5,6,7,8,9",  # too many
-        "a,b,c,d",
-        "-5,5,320,240",
-        "500,nan,320,240",
-        "500,500,900,240",  # centre of another size
-        "500,500,320,400",
-        "50,50,320,240",  # focal length of no lens
-        "7000,7000,320,240",
-    ],
-)
-def test_a_wrong_camera_is_refused(text):
-    with pytest.raises(rt.ReobjError, match="--camera"):
-        parse_camera(text, SIZE)
 
 
 def test_a_scaled_camera_is_a_pinhole():
@@ -118,6 +163,9 @@ def test_boxes_are_undistorted_by_the_middles_of_their_edges():
     np.testing.assert_allclose(found[0], [ideal[0, 0], ideal[1, 1], ideal[2, 0], ideal[3, 1]])
     np.testing.assert_array_equal(found[1, [0, 2, 3]], [0, 640, 480])  # at the image border
     assert abs(found[0] - boxes[0]).min() > 0.1 and found[1, 1] != 50
+    fisheye = rt.Camera("SIMPLE_FISHEYE", *SIZE, (200.0, 320.0, 240.0))
+    rows = np.array([[2, 200, 90, 300.0], [200, 150, 400, 300]])  # the first reaches beyond 90 deg
+    assert np.isnan(undistort_boxes(rows, fisheye)).all(1).tolist() == [True, False]
     assert undistort_boxes(boxes, PINHOLE) is boxes and not len(undistort_boxes(boxes[:0], camera))
 
 

@@ -113,11 +113,12 @@ def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("max_gap, filled", [(2, True), (1, False)])
 def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max_gap, filled):
+    monkeypatch.setattr("reobj.poses.estimate.MAX_GAP", max_gap)
     video, _, _, poses = reconstructed
     cams, status = poses.cam_from_world.copy(), poses.status.copy()
     cams[11:13], status[11:13] = np.nan, "none"
     monkeypatch.setattr("reobj.poses.estimate.locate_between", lambda *a: (cams, status))
-    found = rt.estimate_poses(video, config(max_gap=max_gap), tmp_path)
+    found = rt.estimate_poses(video, config(), tmp_path)
     assert found.known.all() == filled and (found.status[11] == "interpolated") == filled
     assert bool(found.messages) != filled
     if not filled:

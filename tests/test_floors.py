@@ -21,16 +21,18 @@ FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
     2: "reobj.files reobj.options reobj.identity.gaps reobj.identity.sampling reobj.sources.masks",
-    3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded",
-    4: "reobj.views reobj.sources.detection_files reobj.identity.camera_motion "
-    "reobj.identity.embedding reobj.identity.reid reobj.poses.keyframes reobj.poses.mapping "
-    "reobj.poses.readers reobj.poses.checks reobj.results.ply",
+    3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded "
+    "reobj.poses.child",
+    4: "reobj.views reobj.sources.imageless reobj.sources.detection_files "
+    "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
+    "reobj.poses.keyframes reobj.poses.features reobj.poses.consistency reobj.poses.intrinsics "
+    "reobj.poses.matching reobj.poses.checks reobj.results.ply",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
-    "reobj.poses.localize reobj.results.result",
+    "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.results.result",
     6: "reobj.sources.detectors reobj.poses.estimate reobj.objects reobj.results.workspace "
     "reobj.results.overlay reobj.results.solids",
-    7: "reobj.parts reobj.poses.stage reobj.results.evaluation reobj.results.export "
-    "reobj.results.scene",
+    7: "reobj.parts reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
+    "reobj.results.export reobj.results.scene",
     8: "reobj_track",
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}

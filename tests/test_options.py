@@ -668,10 +668,18 @@ def reconstructed(lab: Lab, value: Any) -> rt.Poses:
     return poses
 
 
-@shows("poses.max_gap")
+@shows("poses.metric")
 def _(lab: Lab) -> None:
-    for value, count in ((2, 0), (3, 6)):
-        assert (reconstructed(lab, value).status == "interpolated").sum() == count
+    """Of a model without scale; a reconstruction cannot be declared metric."""
+    video = rt.Video(images(lab.path / "images", 4))
+    cams = rt.Poses(CAMERA, np.arange(4), np.arange(4) / 30, arc(4), np.full(4, "pnp"), "pycolmap")
+    write_colmap(lab.path / "model", cams, video.names)
+    for value in (False, True):
+        config = lab.config(value, poses__mode=str(lab.path / "model"))
+        found = stage.supplied_poses(video, config.poses)
+        assert found is not None and found.known.all() and found.metric is value
+    with pytest.raises(rt.ReobjError, match="--metric"):
+        stage.supplied_poses(video, lab.config(True).poses)
 
 
 @shows("poses.seed")

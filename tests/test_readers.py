@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import cv2
 import numpy as np
 import pytest
-from pose_worlds import FOCAL, FRAMES, SIZE, blank, some_cameras, supplied
+from pose_worlds import FOCAL, FRAMES, PINHOLE, SIZE, FakeVideo, blank, some_cameras, supplied
 from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
@@ -16,6 +17,7 @@ from reobj.cameras import invert_rigid, write_colmap, write_tum
 CAMERA = f"{FOCAL},{FOCAL},320,240"
 K = [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]]
 NAMES = [f"{i:04d}.jpg" for i in range(FRAMES)]
+EVERY_SECOND = rt.InputConfig(every=2)
 
 
 GL = np.diag([1.0, -1, -1, 1])
@@ -49,6 +51,30 @@ def as_scannet(folder, cams):
     )
     for i, w in enumerate(full(invert_rigid(cams))):
         text(folder / "pose" / f"{i}.txt", w)
+    return folder
+
+
+def as_seven_scenes(folder, cams):
+    for i, w in enumerate(full(invert_rigid(cams))):
+        text(folder / f"frame-{i:06d}.pose.txt", w)
+    return folder
+
+
+def as_polycam(folder, cams):
+    (folder / "keyframes" / "corrected_cameras").mkdir(parents=True)
+    for i, w in enumerate(full(invert_rigid(cams)) @ GL):
+        numbers = {f"t_{r}{c}": w[r, c] for r in range(3) for c in range(4)}
+        own = {"fx": FOCAL, "fy": FOCAL, "cx": 320, "cy": 240, "width": 640, "height": 480}
+        path = folder / "keyframes" / "corrected_cameras" / f"{i:04d}.json"
+        text(path, json.dumps(numbers | own | {"blur_score": 80.0}))
+    return folder
+
+
+def as_3d_scanner_app(folder, cams):
+    text(folder / "info.json", json.dumps({"device": "a phone"}))
+    for i, w in enumerate(full(invert_rigid(cams)) @ GL):
+        data = {"cameraPoseARFrame": w.ravel().tolist(), "intrinsics": np.ravel(K).tolist()}
+        text(folder / f"frame_{i:05d}.json", json.dumps(data | {"time": i / 30}))
     return folder
 
 
@@ -120,10 +146,11 @@ def as_colmap_binary(folder, cams):
     return folder
 
 
-def model(folder, cams):
+def model(folder, cams, camera=PINHOLE):
     """Write our own COLMAP text model, with two points that no image observes."""
     points = np.arange(6.0).reshape(2, 3)
     extra = {"points": points, "colors": np.array([[9, 8, 7], [250, 0, 1]], np.uint8)}
+    extra["camera"] = camera
     write_colmap(folder, dataclasses.replace(supplied(cams), **extra), NAMES[: len(cams)])
     return folder
 
@@ -143,7 +170,103 @@ FORMATS = [
     (as_instant_ngp, False, None), (as_nerfstudio, False, None), (as_colmap_text, False, None),
     (as_colmap_poses_only, False, None), (as_colmap_without_points, False, None),
     (as_colmap_with_observations, False, None), (as_colmap_binary, False, None),
+    (as_seven_scenes, True, None), (as_polycam, True, (0, 1, 0)),
+    (as_3d_scanner_app, True, (0, 1, 0)),
 ]  # fmt: skip
+
+
+WITHOUT_CAMERA = (as_tum, as_seven_scenes)
+
+
+@pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
+def test_any_format_can_be_declared_metric(tmp_path, write, metric, up):
+    path, camera = write(tmp_path, some_cameras()), CAMERA if write in WITHOUT_CAMERA else ""
+    assert read(path, camera=camera, metric=True).metric
+    assert read(path, camera=camera).metric == metric
+
+
+@pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
+@pytest.mark.parametrize("named", [True, False])
+def test_poses_of_some_frames_say_which_have_none(tmp_path, write, metric, up, named):
+    """Six poses for eight frames: all formats but the one that has neither names nor times."""
+    path, cams = write(tmp_path, some_cameras()), some_cameras()
+    names = [f"{i:04d}.jpg" for i in range(FRAMES + 2)] if named else ()
+    video, camera = blank(FRAMES + 2, names), CAMERA if write in WITHOUT_CAMERA else ""
+    if write is as_record3d:
+        with pytest.raises(rt.ReobjError, match="6 rows, frame numbers up to 7"):
+            read(path, video)
+        return
+    poses = read(path, video, camera=camera)
+    assert poses.known.tolist() == [True] * 6 + [False] * 2
+    np.testing.assert_allclose(poses.cam_from_world[:6], cams, atol=1e-9)
+    assert "6 of 8 frames, none for 6-7" in poses.messages[0]
+
+
+@pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
+def test_some_images_of_those_with_poses_find_theirs(tmp_path, write, metric, up):
+    """Every second image, under its own name, as 7-Scenes' and Record3D's users thin them."""
+    path, cams = write(tmp_path, some_cameras()), some_cameras()
+    name = {as_seven_scenes: "frame-{:06d}.color.png", as_3d_scanner_app: "frame_{:05d}.jpg"}
+    names = [name.get(write, "{:04d}.jpg").format(i) for i in (0, 2, 4)]
+    if write is as_tum:
+        return  # by time
+    poses = read(path, blank(3, names), camera=CAMERA if write in WITHOUT_CAMERA else "")
+    np.testing.assert_allclose(poses.cam_from_world, cams[::2], atol=1e-9)
+
+
+def test_numbers_of_names_that_do_not_meet_are_not_forced(tmp_path):
+    """Images counted from 1, poses from 0: both in order, as the frames' own numbers say."""
+    path, cams = as_seven_scenes(tmp_path, some_cameras()), some_cameras()
+    names = [f"IMG_{i:04d}.jpg" for i in range(1, FRAMES + 1)]
+    poses = read(path, blank(FRAMES, names), camera=CAMERA)
+    np.testing.assert_allclose(poses.cam_from_world, cams, atol=1e-9)
+
+
+@pytest.mark.parametrize("write", [as_seven_scenes, as_record3d])
+def test_every_second_image_counted_from_1_keeps_its_place(tmp_path, write):
+    """With --every 2 all their numbers have a pose, the wrong one."""
+    for i in range(1, FRAMES + 1):
+        cv2.imwrite(str(tmp_path / f"IMG_{i:04d}.png"), np.zeros((480, 640, 3), np.uint8))
+    (tmp_path / "poses").mkdir()
+    path, video = write(tmp_path / "poses", some_cameras()), rt.Video(tmp_path, EVERY_SECOND)
+    poses = rt.read_poses(path, video, camera=CAMERA)
+    np.testing.assert_allclose(poses.cam_from_world, some_cameras()[::2], atol=1e-9)
+
+
+@pytest.mark.parametrize("write", [as_colmap_text, as_colmap_binary, as_nerfstudio])
+def test_distorted_cameras_of_files_come_along(tmp_path, write):
+    """FULL_OPENCV of a COLMAP model, k3 of a transforms.json."""
+    terms = (-0.1, 0.02, 0.001, 0.002, 0.3, 0.0, 0.0, 0.0)
+    camera = rt.Camera("FULL_OPENCV", *SIZE, (FOCAL, FOCAL, 320.0, 240.0, *terms))
+    if write is as_nerfstudio:
+        path = write(tmp_path, some_cameras())
+        named = zip(("k1", "k2", "p1", "p2", "k3"), terms[:5], strict=True)
+        edit_json(tmp_path / NGP, lambda data: data.update(dict(named)))
+    else:
+        path = model(tmp_path, some_cameras(), camera)
+        if write is as_colmap_binary:
+            pycolmap = pytest.importorskip("pycolmap")
+            pycolmap.Reconstruction(str(path)).write_binary(str(path))
+    assert read(path).camera == camera
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_who_observed_the_points_of_a_model_comes_along(tmp_path, binary):
+    """By rows of the frames, of which the first has no pose."""
+    pycolmap = pytest.importorskip("pycolmap")
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 20
+    truth = pycolmap.synthesize_dataset(options)
+    (truth.write_binary if binary else truth.write_text)(str(tmp_path))
+    size = (truth.camera(1).width, truth.camera(1).height)
+    names = ["0.png", *sorted(image.name for image in truth.images.values())]
+    video = FakeVideo([np.zeros((size[1], size[0], 3), np.uint8)] * 5, names)
+    poses = read(tmp_path, video)
+    assert poses.known.tolist() == [False] + [True] * 4 and len(poses.points) == 20
+    ids = sorted(truth.points3D)
+    seen = {(names.index(truth.image(e.image_id).name), row)
+            for row, i in enumerate(ids) for e in truth.point3D(i).track.elements}  # fmt: skip
+    assert set(map(tuple, poses.visibility.tolist())) == seen and len(poses.visibility) > 40
 
 
 def read(path, video=None, **options):
@@ -153,7 +276,7 @@ def read(path, video=None, **options):
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
 def test_every_format_reads_back_the_same(tmp_path, write, metric, up):
     cams = some_cameras()
-    poses = read(write(tmp_path, cams), camera=CAMERA if write is as_tum else "")
+    poses = read(write(tmp_path, cams), camera=CAMERA if write in WITHOUT_CAMERA else "")
     np.testing.assert_allclose(poses.cam_from_world, cams, atol=1e-9)
     np.testing.assert_allclose(poses.camera.K, K, atol=1e-9)
     assert poses.known.all() and poses.metric == metric and set(poses.status) == {"supplied"}
@@ -361,6 +484,67 @@ def test_time_stamps_are_matched_within_half_a_frame(tmp_path, stamps, known):
         edit(path, i + 1, word(0, repr(stamp)))
     poses = read(path, blank(FRAMES), camera=CAMERA)
     assert np.flatnonzero(poses.known).tolist() == known
+
+
+@pytest.mark.parametrize(
+    "step, stamps, offset, known",
+    [
+        (1 / 30, np.arange(0, 0.3, 0.01), 0.004, [0, 1, 2, 3, 4, 5]),  # motion capture, 100 Hz
+        (1.0, np.arange(0, 6, 0.01), 0.0, [0, 1, 2, 3, 4, 5]),  # images of every second
+        (1.0, np.arange(0, 6, 1.0), 0.03, []),  # half a frame is far more than TUM's 20 ms
+        (1.0, np.arange(0, 4, 0.01), 0.067, [1, 2, 3, 4]),  # begins 67 ms after the first image
+    ],
+)
+def test_images_with_times_in_their_names_meet_poses_of_a_higher_rate(
+    tmp_path, step, stamps, offset, known
+):
+    """TUM: 1305031102.175304.png; the pose is that of its time, between two of the file."""
+    start = 1305031102.175304
+    times = start + step * np.arange(FRAMES)
+    for time in times:
+        cv2.imwrite(str(tmp_path / f"{time:.6f}.png"), np.zeros((48, 64, 3), np.uint8))
+    cams = some_cameras(len(stamps))
+    path = as_tum(tmp_path, cams)
+    rows = np.loadtxt(path)
+    rows[:, 0] = start + stamps + offset
+    np.savetxt(path, rows, "%.6f " + " %.9f" * 7)
+    video = rt.Video(tmp_path)
+    np.testing.assert_allclose(video.times_s, times, atol=1e-6)
+    camera = "50,50,32,24"
+    if not known:
+        with pytest.raises(rt.ReobjError, match="none of its 6 poses"):
+            rt.read_poses(path, video, camera=camera)
+        return
+    poses = rt.read_poses(path, video, camera=camera)
+    assert np.flatnonzero(poses.known).tolist() == known and poses.metric
+    centre = invert_rigid(cams)[:, :, 3]
+    wanted = [np.interp(times[known] - start - offset, stamps, axis) for axis in centre.T]
+    found = invert_rigid(poses.cam_from_world[known])[:, :, 3]
+    np.testing.assert_allclose(found, np.transpose(wanted), atol=1e-5)  # times have 6 digits
+    write_tum(tmp_path / "out.txt", poses)  # carries the times, so that evo can compare
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "out.txt", ndmin=2)[:, 0], times[known],
+                               atol=1e-6)  # fmt: skip
+
+
+def test_a_rotation_between_two_stamps_is_interpolated(tmp_path):
+    turn = Rotation.from_rotvec([[0, 0, 0], [0, 0.2, 0], [0, 0.4, 0]]).as_matrix()
+    cams = np.concatenate([turn, np.zeros((3, 3, 1))], 2)
+    path = as_tum(tmp_path, cams)
+    for i in range(3):
+        edit(path, i + 1, word(0, str((i - 0.25) / 30)))
+    poses = read(path, blank(3), camera=CAMERA)
+    found = Rotation.from_matrix(poses.cam_from_world[:2, :, :3]).as_rotvec()
+    np.testing.assert_allclose(found[:, 1], [0.05, 0.25], atol=1e-9)
+    np.testing.assert_allclose(poses.cam_from_world[2], cams[2], atol=1e-9)  # the last one: nearest
+
+
+def test_poses_at_the_times_of_the_frames_are_taken_as_they_are(tmp_path):
+    """Times rounded to a millisecond are the same times: nothing is interpolated."""
+    path = as_tum(tmp_path, some_cameras())
+    exact = read(path, camera=CAMERA).cam_from_world
+    for i in range(FRAMES):
+        edit(path, i + 1, word(0, f"{i / 30:.3f}"))
+    np.testing.assert_array_equal(read(path, camera=CAMERA).cam_from_world, exact)
 
 
 def test_time_stamps_of_another_clock_are_refused_when_counts_differ(tmp_path):

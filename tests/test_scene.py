@@ -678,6 +678,8 @@ def test_long_videos_are_thinned(tmp_path: Path) -> None:
 class Source:
     """A video that counts how often its frames are read, and can be interrupted."""
 
+    has_images = True
+
     def __init__(self, video: Any, live: bool = False) -> None:
         self.config, self.size, self.scale, self.fps = (
             getattr(video, name) for name in ("config", "size", "scale", "fps")

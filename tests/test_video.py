@@ -23,6 +23,7 @@ import pytest
 
 import reobj_track as rt
 from reobj.sources import video as video_room
+from reobj.sources.video import times_of_names
 from reobj.types import Image
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -607,3 +608,52 @@ def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path
         assert "secret" not in written and str(server.server_port) in written
         assert not list(out.rglob(".part*"))
         (out / "tracks.txt").unlink()
+
+
+# ---- Times in the names of images ----------------------------------------------------------------
+
+START = 1305031102.175304
+
+
+@pytest.mark.parametrize(
+    "names, times_s",
+    [
+        ([f"{START + i / 30:.6f}.png" for i in range(9)], START + np.arange(9) / 30),  # TUM
+        ([f"rgb_{START + i:.3f}.png" for i in range(3)], START + np.arange(3)),
+        ([f"{1305031102175 + 33 * i}.jpg" for i in range(3)],
+         1305031102.175 + 0.033 * np.arange(3)),
+        ([f"{1305031102175304 + 33333 * i}.jpg" for i in range(3)],
+         START + 0.033333 * np.arange(3)),
+        ([f"{1305031102175304000 + 33333000 * i}.jpg" for i in range(3)],
+         START + 0.033333 * np.arange(3)),  # EuRoC, ROS
+        ([f"video_{87551170813262 + 33333333 * i}.jpg" for i in range(3)],
+         87551.170813262 + 0.033333333 * np.arange(3)),  # since the device was switched on
+        ([f"{1500000000000000 + 33333333 * i}.jpg" for i in range(3)],
+         1500000 + 0.033333333 * np.arange(3)),  # ns, switched on 17 days ago
+        ([f"{i / 30:.6f}.png" for i in range(4)], np.arange(4) / 30),
+        ([f"{1305031102 + 5 * i}.jpg" for i in range(3)], 1305031102 + 5.0 * np.arange(3)),
+        (["1305031102.175304.png"], [START]),
+        ([f"{i:06d}.png" for i in range(9)], None),  # counters
+        ([f"{i:010d}.png" for i in range(9)], None),  # KITTI
+        ([f"frame-{i:06d}.color.png" for i in range(9)], None),  # 7-Scenes
+        ([f"v1.{i:04d}.png" for i in range(9)], None),  # of a renderer
+        ([f"PXL_20230524_{142233123 + 90000 * i}.jpg" for i in range(9)], None),  # hhmmssmmm
+        ([f"IMG_20230524{142233 + i}.jpg" for i in range(3)], None),  # YYYYMMDDhhmmss
+        (["b.png", "a.png"], None),
+        ([], None),
+    ],
+)  # fmt: skip
+def test_times_are_read_from_names_that_are_time_stamps(names, times_s):
+    found = times_of_names(names)
+    assert (found is None) == (times_s is None)
+    if times_s is not None:
+        np.testing.assert_allclose(found, times_s, atol=1e-6)
+
+
+def test_frames_have_the_times_of_their_names(tmp_path):
+    for i in range(5):
+        cv2.imwrite(str(tmp_path / f"{START + i / 10:.6f}.png"), np.zeros((48, 64, 3), np.uint8))
+    video = rt.Video(tmp_path, rt.InputConfig(start=1, every=2))
+    found = [(frame.index, frame.time_s) for frame in video]
+    np.testing.assert_allclose(found, [(1, START + 0.1), (3, START + 0.3)], atol=1e-6)
+    assert video.fps == pytest.approx(10)

@@ -16,19 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from reobj.cameras import (
-    Camera,
-    Poses,
-    SparseModel,
-    import_pycolmap,
-    parse_camera,
-    read_sparse_model,
-)
+from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_sparse_model
 from reobj.files import Progress, spans
+from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import MAX_FLOW, MIN_FLOW, ResizedFrame, ResizedVideo, pick_keyframes
 from reobj.poses.localize import fill_gaps, locate_between
 from reobj.poses.mapping import FOCAL_GUESS, reconstruct
 from reobj.types import Array, BoolArray, IntArray, ReobjError, option
+
+MAX_GAP = 15  # most lost frames in a row that are interpolated (chosen: half a second at 30 Hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,19 +38,18 @@ class PosesConfig:
     )
     fmt: str = option(
         "auto",
-        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d",
+        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit",
         "--pose-format",
     )
     camera: str = option(
         "",
-        "intrinsics: fx,fy,cx,cy[,k1,k2,p1,p2] in native pixels (COLMAP: centre + .5)",
+        "intrinsics, native pixels (COLMAP: centre + .5): fx,fy,cx,cy[,k1,k2,p1,p2[,k3]], "
+        "MODEL WIDTH HEIGHT PARAMS, or a file (cameras.txt, K.txt, intrinsics.json)",
         "--camera",
     )
+    metric: bool = option(False, "supplied poses are in metres, whatever their format", "--metric")
     size_px: int = option(640, "longer side to which frames are shrunk for the reconstruction, px")
     max_keyframes: int = option(400, "most keyframes; a longer way takes wider steps")
-    max_gap: int = option(
-        15, "most lost frames in a row that are interpolated (and marked `interpolated`)"
-    )
     seed: int = option(0, "random seed of the reconstruction")
 
 
@@ -148,7 +143,7 @@ def _locate_all(
     seen, first = [], 0
     for number, (model, rows) in enumerate(zip(models, part_rows, strict=True)):
         cameras, found = locate_between(model, rows, video, config.seed, line)
-        cameras, found = fill_gaps(frame, cameras, found, config.max_gap)
+        cameras, found = fill_gaps(frame, cameras, found, MAX_GAP)
         mine = (found != "none") & (part < 0)
         mine |= np.isin(np.arange(len(frame)), rows)  # its own keyframes
         cam_from_world[mine], status[mine], part[mine] = cameras[mine], found[mine], number

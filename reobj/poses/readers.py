@@ -1,4 +1,4 @@
-"""Poses made elsewhere: COLMAP, TUM, transforms.json (nerfstudio, instant-ngp), ScanNet, Record3D.
+"""Poses made elsewhere: COLMAP, TUM, transforms.json, ScanNet, 7-Scenes, Record3D, ARKit.
 
 Each format has a reader that turns its conventions into cam_from_world, OpenCV axes, COLMAP pixels;
 `read_poses` then finds the frame of each pose. Whether the conventions were those that the file
@@ -7,7 +7,6 @@ claims is judged later, by `checks`.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -23,69 +22,124 @@ from reobj.cameras import (
     NO_SCALE,
     Camera,
     Poses,
-    checked_camera,
     invert_rigid,
-    parse_camera,
     read_sparse_model,
 )
 from reobj.files import load_json, read_text, spans
+from reobj.poses.intrinsics import (
+    CAMERA_FORMS,
+    camera_from_json,
+    colmap_camera,
+    fitted_camera,
+    parse_camera,
+)
+from reobj.poses.matching import interpolated, rows_by_name, rows_by_order, rows_by_time
 from reobj.types import Array, IntArray, ReobjError
 
 
-def read_poses(path: str | Path, video: Any, fmt: str = "auto", camera: str = "") -> Poses:
+def read_poses(
+    path: str | Path, video: Any, fmt: str = "auto", camera: str = "", metric: bool = False
+) -> Poses:
     """Read the poses of a video's frames from a file or folder of another tool.
 
     Args:
         path: file or folder. video: the frames they belong to.
-        fmt: auto (recognised), colmap, tum, transforms, scannet or record3d.
-        camera: intrinsics fx,fy,cx,cy[,k1,k2,p1,p2] in place of the file's.
+        fmt: auto (recognised), colmap, tum, transforms, scannet, record3d or arkit.
+        camera: intrinsics in place of the file's, as `--camera` takes them.
+        metric: the poses are in metres, also where the format does not say so.
     Returns:
         poses of the frames that the file knows, NaN for the others (counted in `messages`).
     Raises:
         ReobjError: damaged, unknown, not rigid, without intrinsics, or of another video.
     """
     path, size = Path(path), (int(video.size[0]), int(video.size[1]))
-    if not path.exists():
-        raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
-    reader = READERS.get(_pose_format(path) if fmt == "auto" else fmt)
-    if reader is None:
-        raise ReobjError(f"--pose-format {fmt}: unknown; known are auto, {', '.join(READERS)}")
-    given = reader(path, size)
-    intrinsics = parse_camera(camera, size) or given.camera
+    given = read_pose_file(path, fmt, size)
+    intrinsics = parse_camera(camera, size)
     if intrinsics is None:
-        raise ReobjError(f"{path}: no intrinsics; add --camera fx,fy,cx,cy[,k1,k2,p1,p2], pixels")
-    own = (intrinsics.width, intrinsics.height)
-    if abs(own[0] * size[1] - own[1] * size[0]) > max(*own, *size):  # more than rounding
-        raise ReobjError(
-            f"{path}: the poses are of {own[0]}x{own[1]} images, the frames are "
-            f"{size[0]}x{size[1]}; expected the same shape (rotated or cropped video?)"
-        )
-    intrinsics = checked_camera(intrinsics.resized(size), str(path))
+        if given.camera is None:
+            raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
+        intrinsics = fitted_camera(given.camera, size, str(path))
     numbers = [(frame.index, frame.time_s) for frame in video]
     if not numbers:
         raise ReobjError("the video has no frame that can be read: poses belong to nothing")
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
     names = [video.names[n] for n in frame if video.names]
-    row, messages = _rows_of_frames(given, path, frame, time_s, names)
+    row, what, messages = _rows_of_frames(given, path, frame, time_s, names, video.names)
     poses = np.full((len(frame), 3, 4), np.nan)
     poses[row >= 0] = given.cam_from_world[row[row >= 0]]
+    if given.stamps_s is not None and len(given.stamps_s) > 1:
+        exact, use = interpolated(given.cam_from_world, given.stamps_s, time_s)
+        poses[use & (row >= 0)] = exact[row[use] >= 0]
     known = np.isfinite(poses).all((1, 2))
+    if not known.any():
+        count = len(given.cam_from_world)
+        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({what})")
     if not known.all():
-        lost = spans(frame[~known].tolist())
+        step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
+        lost = spans(frame[~known].tolist(), step)
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
     status = np.where(known, "supplied", "none")
-    extra = (given.metric, given.up_in_world, given.points, given.colors)
-    found = (intrinsics, frame, time_s, poses, status, "user", *extra)
-    return Poses(*found, messages=tuple(messages))
+    return Poses(
+        intrinsics, frame, time_s, poses, status, "user",
+        metric=given.metric or metric, up_in_world=given.up_in_world, points=given.points,
+        colors=given.colors, visibility=_in_frames(given.visibility, row), messages=tuple(messages),
+    )  # fmt: skip
+
+
+def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
+    """Read a file or folder of poses in one of the formats of READERS, or the one recognised.
+
+    Args:
+        size: (w, h) of the images, for formats that do not state it.
+    """
+    if not path.exists():
+        raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
+    reader = READERS.get(_pose_format(path) if fmt == "auto" else fmt)
+    if reader is None:
+        raise ReobjError(f"--pose-format {fmt}: unknown; known are auto, {', '.join(READERS)}")
+    return reader(path, size)
+
+
+def _rows_of_frames(
+    given: PoseFile, path: Path, frame: IntArray, time_s: Array, names: Sequence[str],
+    images: Sequence[str],
+) -> tuple[IntArray, str, list[str]]:  # fmt: skip
+    """Find the row of each frame in a file of poses by name, time stamp or order.
+
+    Returns:
+        row (F,), -1 where it has none; what was compared; messages.
+    """
+    if given.names:
+        what = f"images {given.names[0]!r} ..., frames {names[0] if len(names) else frame[0]!r} ..."
+        return rows_by_name(given.names, frame, names, images), what, []
+    if given.stamps_s is not None:
+        what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, "
+        what += f"frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
+        row, messages = rows_by_time(given.stamps_s, frame, time_s)
+        return row, what, messages
+    try:
+        row = rows_by_order(len(given.cam_from_world), frame, names, images)
+        return row, "in order", []
+    except ReobjError as error:
+        raise ReobjError(f"{path}: {error}") from None
+
+
+def _in_frames(visibility: IntArray, row: IntArray) -> IntArray:
+    """Replace rows of poses (M, 2) by those of the frames that have them; others fall out."""
+    frame_of = np.full(int(max(row.max(initial=-1), visibility[:, 0].max(initial=-1))) + 1, -1)
+    frame_of[row[row >= 0]] = np.flatnonzero(row >= 0)
+    at = frame_of[visibility[:, 0]]
+    return np.column_stack([at, visibility[:, 1]])[at >= 0]
 
 
 @dataclass(frozen=True, slots=True)
-class _PoseFile:
-    """What a reader returns: N poses in the order of the file.
+class PoseFile:
+    """Hold what a reader returns: N poses in the order of the file, by time where they have one.
 
     Attributes:
         cam_from_world: (N, 3, 4), NaN where the file says that there is no pose.
         names, stamps_s: of the images, or their times: how their frames are found.
+        visibility: (M, 2) row of the pose that observed a point, and row of the point.
     """
 
     cam_from_world: Array
@@ -96,6 +150,7 @@ class _PoseFile:
     up_in_world: Array | None = None
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
 
 def _pose_format(path: Path) -> str:
@@ -103,7 +158,9 @@ def _pose_format(path: Path) -> str:
     if path.is_dir():
         if (path / "transforms.json").exists():
             return "transforms"
-        return "scannet" if (path / "pose").is_dir() or any(path.glob("*.pose.txt")) else "colmap"
+        if (path / "pose").is_dir() or any(path.glob("*.pose.txt")):
+            return "scannet"
+        return "arkit" if _arkit_files(path) else "colmap"
     if path.name.startswith("images."):
         return "colmap"
     if path.suffix == ".json" or path.name == "metadata":
@@ -207,15 +264,16 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
     return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
 
 
-def _read_tum(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read TUM rows: seconds, world_from_cam; metres unless the header is our own and says no."""
     rows, where = _read_table(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
     metric = re.search(f"^#.*{NO_SCALE}", read_text(path), re.MULTILINE) is None
-    return _PoseFile(invert_rigid(world_from_cam), stamps_s=rows[:, 0], metric=metric)
+    order = np.unique(rows[:, 0], return_index=True)[1]
+    return PoseFile(invert_rigid(world_from_cam)[order], stamps_s=rows[order, 0], metric=metric)
 
 
-def _read_record3d(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read Record3D's metadata: `poses` qx qy qz qw tx ty tz, world_from_cam, OpenGL axes, y up."""
     data = _json_object(path)
     try:
@@ -229,10 +287,10 @@ def _read_record3d(path: Path, size: tuple[int, int]) -> _PoseFile:
     where = [f"{path}, poses[{i}]" for i in range(len(rows))]
     world_from_gl = _from_quaternions(rows[:, :4], rows[:, 4:], where)
     poses = CV_FROM_GL @ invert_rigid(world_from_gl)
-    return _PoseFile(poses, camera, metric=True, up_in_world=np.array([0, 1.0, 0]))
+    return PoseFile(poses, camera, metric=True, up_in_world=np.array([0, 1.0, 0]))
 
 
-def _read_scannet(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read ScanNet's `pose/<frame>.txt` (z up) or 7-Scenes' `*.pose.txt`: 4x4 world_from_cam.
 
     Metres; inf: no pose. ScanNet's intrinsics have the centre of the first pixel at (0, 0).
@@ -252,10 +310,44 @@ def _read_scannet(path: Path, size: tuple[int, int]) -> _PoseFile:
         camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
     up = np.array([0, 0, 1.0]) if folder.name == "pose" else None
     names = tuple(file.stem for file in files)
-    return _PoseFile(invert_rigid(world_from_cam), camera, names, metric=True, up_in_world=up)
+    return PoseFile(invert_rigid(world_from_cam), camera, names, metric=True, up_in_world=up)
 
 
-def _read_transforms(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _arkit_files(path: Path) -> list[Path]:
+    """List the files of cameras, one an image, of a raw export of an app that uses ARKit."""
+    polycam = [path / "keyframes" / name for name in ("corrected_cameras", "cameras")]
+    found = [sorted(path.glob("frame_*.json")), *(sorted(p.glob("*.json")) for p in polycam)]
+    return next((files for files in found if files), [])
+
+
+def _read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
+    """Read a raw export of Polycam or of 3D Scanner App: a JSON file for each image.
+
+    world_from_cam row by row, `t_00` to `t_23` or `cameraPoseARFrame`; ARKit's axes (those of
+    OpenGL), metres, y up.
+    """
+    files = _arkit_files(path)
+    if not files:
+        raise ReobjError(f"{path}: no frame_*.json, nor keyframes/cameras/*.json in it")
+    data = [_json_object(file) for file in files]
+    where = [str(file) for file in files]
+    matrices, cameras = [], []
+    for at, d in zip(where, data, strict=True):
+        try:
+            rows = d.get("cameraPoseARFrame") or [
+                d[f"t_{i}{j}"] for i in range(3) for j in range(4)
+            ]
+            matrices.append(np.array([*rows, 0, 0, 0, 1][:16], np.float64).reshape(4, 4))
+            cameras.append(camera_from_json(d, size))
+        except (KeyError, TypeError, ValueError) as error:
+            what = "4x4 cameraPoseARFrame or t_00 to t_23, and intrinsics"
+            raise ReobjError(f"{at}: no camera ({error!r}); expected {what}") from None
+    poses = CV_FROM_GL @ invert_rigid(_checked_rigid(np.array(matrices), where))
+    names, up = tuple(file.stem for file in files), np.array([0, 1.0, 0])
+    return PoseFile(poses, _one_camera(cameras, path), names, metric=True, up_in_world=up)
+
+
+def _read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read nerfstudio's or instant-ngp's transforms.json: world_from_cam, OpenGL axes; no scale.
 
     nerfstudio turned the world by `applied_transform` A; this is undone:
@@ -270,32 +362,14 @@ def _read_transforms(path: Path, size: tuple[int, int]) -> _PoseFile:
     try:
         matrix = np.array([f["transform_matrix"] for f in frames], np.float64).reshape(-1, 4, 4)
         names = tuple(str(f["file_path"]) for f in frames)
-        cameras = [_transforms_camera({**data, **f}, size) for f in frames]
+        cameras = [camera_from_json({**data, **f}, size) for f in frames]
         applied = np.eye(4)
         applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
     except (KeyError, TypeError, ValueError, IndexError) as error:
         what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
         raise ReobjError(f"{path}: {what}") from None
     gl_from_world = invert_rigid(_checked_rigid(matrix, where)) @ applied  # (N, 3, 4)
-    return _PoseFile(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
-
-
-def _transforms_camera(data: dict[str, Any], size: tuple[int, int]) -> Camera | None:
-    """Make the camera of a frame of transforms.json; None without a focal length."""
-    width, height = int(data.get("w", size[0])), int(data.get("h", size[1]))
-    focal = data.get("fl_x")
-    if focal is None and "camera_angle_x" in data:
-        focal = 0.5 * width / math.tan(0.5 * float(data["camera_angle_x"]))
-    if focal is None:
-        return None
-    fisheye = data.get("is_fisheye") or "FISHEYE" in str(data.get("camera_model", "")).upper()
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-    centre = (data.get("cx", width / 2), data.get("cy", height / 2))
-    terms = (focal, data.get("fl_y", focal), *centre, *(data.get(key, 0) for key in keys))
-    params = tuple(float(value) for value in terms)
-    if not fisheye and not any(params[4:]):
-        return Camera("PINHOLE", width, height, params[:4])
-    return Camera("OPENCV_FISHEYE" if fisheye else "OPENCV", width, height, params)
+    return PoseFile(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
 
 
 MAX_FOCAL_SPREAD = 0.02  # of the images of one camera, a share: autofocus (chosen)
@@ -313,7 +387,7 @@ def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
     return found[len(found) // 2]
 
 
-def _read_colmap(path: Path, size: tuple[int, int]) -> _PoseFile:
+def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read a COLMAP model, binary (preferred) or text, with or without rigs; scale unknown."""
     start = path if path.is_dir() else path.parent
     folders = [start / part for part in ("", "sparse/0", "sparse", "0", "colmap/sparse/0")]
@@ -332,19 +406,23 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> _PoseFile:
     if not model.names:
         raise ReobjError(f"{found[0]}: the COLMAP model has no registered image")
     camera = _one_camera(model.cameras, found[0])
-    return _PoseFile(
-        model.cam_from_world, camera, model.names, points=model.points, colors=model.colors
-    )
+    seen = np.column_stack([model.obs_image, model.obs_point])
+    return PoseFile(
+        model.cam_from_world, camera, model.names, points=model.points, colors=model.colors,
+        visibility=seen,
+    )  # fmt: skip
 
 
-def _read_colmap_text(folder: Path) -> _PoseFile:
+def _read_colmap_text(folder: Path) -> PoseFile:
     """Read a COLMAP text model, also one of poses alone.
 
     Many tools leave out points3D.txt, or the line of observations after each image: pycolmap
     refuses the first, and with the second takes every other image for observations.
     """
     cameras = _colmap_text_cameras(folder / "cameras.txt")
-    rows, names, used, where = [], [], [], []
+    names, used, where = [], [], []
+    rows: list[list[float]] = []
+    row_of: dict[str, int] = {}
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     observations_next = False
     for at, words in _lines(folder / "images.txt"):
@@ -356,6 +434,7 @@ def _read_colmap_text(folder: Path) -> _PoseFile:
             raise ReobjError(f"{at}: expected {expected}")
         if words[8] not in cameras:
             raise ReobjError(f"{at}: no camera {words[8]} in cameras.txt")
+        row_of[words[0]] = len(rows)
         rows.append(_numbers(words[1:8], at, expected))
         names.append(" ".join(words[9:]))
         used.append(cameras[words[8]])
@@ -365,9 +444,9 @@ def _read_colmap_text(folder: Path) -> _PoseFile:
         raise ReobjError(f"{folder / 'images.txt'}: no images in it")
     quaternion_wxyz, translation = np.split(np.array(rows), [4], axis=1)  # (N, 4), (N, 3)
     poses = _from_quaternions(np.roll(quaternion_wxyz, -1, 1), translation, where)
-    xyz, colors = _colmap_text_points(folder / "points3D.txt")
+    xyz, colors, seen = _colmap_text_points(folder / "points3D.txt", row_of)
     camera = _one_camera(used, folder)
-    return _PoseFile(poses, camera, tuple(names), points=xyz, colors=colors)
+    return PoseFile(poses, camera, tuple(names), points=xyz, colors=colors, visibility=seen)
 
 
 def _colmap_text_cameras(path: Path) -> dict[str, Camera]:
@@ -375,101 +454,46 @@ def _colmap_text_cameras(path: Path) -> dict[str, Camera]:
     cameras = {}
     for at, words in _lines(path):
         try:
-            _, _, width, height, *params = words
-            camera = Camera(words[1], int(width), int(height), tuple(map(float, params)))
-            valid = np.isfinite(camera.params).all() and camera.to_pycolmap().verify_params()
-        except (ValueError, TypeError, IndexError, RuntimeError):
-            valid = not words  # a blank line
-        if not valid:
+            if words:
+                cameras[words[0]] = colmap_camera(words[1:])
+        except (ValueError, TypeError) as error:
+            reason = f" ({error})" if isinstance(error, ReobjError) else ""
             expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], with COLMAP's models"
-            raise ReobjError(f"{at}: expected {expected}")
-        if words:
-            cameras[words[0]] = camera
+            raise ReobjError(f"{at}: expected {expected}{reason}") from None
     return cameras
 
 
-def _colmap_text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """Read the points (P, 3) and colours (P, 3) of a points3D.txt by ascending id, if it exists."""
-    rows, expected = [], "POINT3D_ID X Y Z R G B ERROR TRACK[]"
+def _colmap_text_points(
+    path: Path, row_of: dict[str, int]
+) -> tuple[Array, npt.NDArray[np.uint8], IntArray]:
+    """Read a points3D.txt, if it exists, by ascending id.
+
+    Args:
+        row_of: row of each image id.
+    Returns:
+        points (P, 3), their colours (P, 3), and (M, 2) rows of images and of points they observed.
+    """
+    rows: list[list[float]] = []
+    tracks, expected = [], "POINT3D_ID X Y Z R G B ERROR TRACK[]"
     for at, words in _lines(path) if path.exists() else ():
         if words and len(words) < 8:
             raise ReobjError(f"{at}: expected {expected}")
         if words:
             rows.append(_numbers(words[:7], at, expected))
-    table = np.array(sorted(rows)).reshape(-1, 7)
-    return table[:, 1:4], table[:, 4:].clip(0, 255).astype(np.uint8)
+            tracks.append([row_of[i] for i in words[8::2] if i in row_of])
+    table = np.array(rows).reshape(-1, 7)
+    order = np.argsort(table[:, 0], kind="stable")
+    seen = [(image, point) for point, at in enumerate(order) for image in tracks[at]]
+    table = table[order]
+    colors = table[:, 4:].clip(0, 255).astype(np.uint8)
+    return table[:, 1:4], colors, np.array(seen, np.int64).reshape(-1, 2)
 
 
-def _rows_of_frames(
-    given: _PoseFile, path: Path, frame: IntArray, time_s: Array, names: Sequence[str]
-) -> tuple[IntArray, list[str]]:
-    """Find the row of each frame in a file of poses by name, time stamp or order.
-
-    Returns:
-        row (F,), -1 where it has none; messages.
-    """
-    count = len(given.cam_from_world)
-    messages: list[str] = []
-    if given.names:
-        row = _rows_by_name(given.names, frame, names)
-        what = f"images {given.names[0]!r} ..., frames {names[0] if len(names) else frame[0]!r} ..."
-    elif given.stamps_s is not None:
-        row, messages = _rows_by_time(given.stamps_s, frame, time_s)
-        what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, "
-        what += f"frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
-    else:
-        row = np.arange(count) if count == len(frame) else frame.copy()
-        what = f"{count} rows, frame numbers up to {frame.max()}; expected one row a frame"
-        row[row >= count] = -1
-        if frame.max() >= count != len(frame):
-            raise ReobjError(f"{path}: {what}")
-    if (row < 0).all():
-        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({what})")
-    return row, messages
-
-
-def _rows_by_name(given: Sequence[str], frame: IntArray, names: Sequence[str]) -> IntArray:
-    """Match by path, else file name, else stem, else the last number in the name.
-
-    Numbers are frame numbers; they count from 1 where there is a 1, no 0, and one too many.
-    """
-    for key in (str, lambda n: Path(n).name, lambda n: Path(n).stem):
-        rows = {key(name): r for r, name in enumerate(given)}
-        found = np.array([rows.get(key(name), -1) for name in names], np.int64)
-        if (found >= 0).any():
-            return found
-    digits = [re.findall(r"\d+", Path(name).stem) for name in given]
-    numbers = np.array([int(d[-1]) if d else -1 for d in digits])  # (N,)
-    from_one = 0 not in numbers and 1 in numbers and numbers.max() > frame.max()
-    row_of = dict(zip((numbers - from_one).tolist(), range(len(given)), strict=True))
-    return np.array([row_of.get(n, -1) for n in frame.tolist()], np.int64)
-
-
-LONE_FRAME_S = 1 / 60  # half a frame interval where there is only one frame (chosen: 30 Hz)
-
-
-def _rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
-    """Match the nearest stamp within half a frame interval.
-
-    Stamps of another clock (no overlap in time) are matched in order if there is one for each
-    frame.
-
-    Returns:
-        row (F,) of each frame, -1: none; messages.
-    """
-    if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
-        message = "time stamps are of another clock than the frames: matched in order"
-        return np.arange(len(frame)), [message]
-    steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
-    half = 0.5 * float(np.median(steps)) if len(steps) else LONE_FRAME_S
-    nearest = np.abs(stamps_s[None] - time_s[:, None]).argmin(1)  # (F,)
-    return np.where(np.abs(stamps_s[nearest] - time_s) <= half * (1 + 1e-6), nearest, -1), []
-
-
-READERS: dict[str, Callable[[Path, tuple[int, int]], _PoseFile]] = {
+READERS: dict[str, Callable[[Path, tuple[int, int]], PoseFile]] = {
     "colmap": _read_colmap,
     "tum": _read_tum,
     "transforms": _read_transforms,
     "scannet": _read_scannet,
     "record3d": _read_record3d,
+    "arkit": _read_arkit,
 }

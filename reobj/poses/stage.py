@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import shutil
 from pathlib import Path
@@ -12,6 +13,7 @@ from reobj.cameras import Poses, load_poses, save_poses, write_colmap
 from reobj.files import part_path
 from reobj.poses.checks import check_poses
 from reobj.poses.estimate import PosesConfig, estimate_poses
+from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.readers import read_poses
 from reobj.results.workspace import Workspace
 from reobj.sources.video import Video, source_fingerprint
@@ -21,8 +23,10 @@ from reobj.types import ReobjError, Tracks, rows_by
 def supplied_poses(video: Video, config: PosesConfig) -> Poses | None:
     """Read poses given by the user; None if they are to be reconstructed."""
     if config.mode in ("auto", "none"):
+        if config.metric:
+            raise ReobjError("--metric is said of supplied poses; a reconstruction has no scale")
         return None
-    return read_poses(config.mode, video, config.fmt, config.camera)
+    return read_poses(config.mode, video, config.fmt, config.camera, config.metric)
 
 
 def check_directions(poses: Poses, tracks: Tracks) -> None:
@@ -52,6 +56,8 @@ def reconstruct_cached(
     if moving is not None and len(moving):
         boxes = np.column_stack([moving.frame, moving.xyxy])
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
+    if camera := parse_camera(config.camera, video.size):  # the content of a file, not its name
+        config = dataclasses.replace(config, camera=camera_line(camera))
     content = source_fingerprint(video.source)
     path = workspace.path("poses", content, video.config, config, digest)
     model = path.with_suffix(".sparse")

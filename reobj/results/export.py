@@ -22,7 +22,7 @@ from reobj.files import atomic, spans
 from reobj.results.result import Result
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import CVAT_BOX
-from reobj.sources.video import IMAGE_FPS, Video
+from reobj.sources.video import IMAGE_FPS
 from reobj.types import Array, ReobjError, Tracks, log, object_classes, object_color
 
 
@@ -71,7 +71,7 @@ def _frames_read(result: Result) -> tuple[list[int], list[str]]:
     video = None
     if result.out is not None and (result.out / "cache" / "source.json").is_file():
         with contextlib.suppress(ReobjError):  # moved or deleted since: most exports need none
-            video = Video(*Workspace.open(result.out).source)
+            video = Workspace.open(result.out).video()
     names = video.names if video is not None else []
     read = np.empty(0, np.int64)
     if result.poses is not None:

@@ -230,12 +230,13 @@ def write_pictures(
 ) -> None:
     """Write overlay.mp4 and scene.html in one pass over the video.
 
-    Each file appears only when it is complete. A live source cannot be read again: no overlay then,
-    and a page without pictures.
+    Each file appears only when it is complete. A live source cannot be read again, and frames may
+    have no images: no overlay then, and a page without pictures.
     """
-    film = Overlay(result, out / "overlay.mp4", video) if overlay and not video.is_live else None
+    visible = video.has_images and not video.is_live
+    film = Overlay(result, out / "overlay.mp4", video) if overlay and visible else None
     pictures = Pictures(result, video) if scene else None
-    sinks = [sink for sink in (film, pictures) if sink is not None and not video.is_live]
+    sinks = [sink for sink in (film, pictures) if sink is not None and visible]
     progress, complete = Progress("pictures", video.expected), False
     try:
         for frame in video if sinks else ():

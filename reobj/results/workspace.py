@@ -17,6 +17,7 @@ from reobj import __version__
 from reobj.cameras import Poses, save_poses
 from reobj.files import atomic, load_json, part_path, part_paths
 from reobj.results.result import LAST_POSES, Result, load_last_poses, remove_stale, written_by
+from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.types import ReobjError
 
@@ -72,6 +73,7 @@ class Workspace:
             "source": str(source.absolute()) if source.exists() else str(video.source),
             "content": source_fingerprint(video.source),
             "input": dataclasses.asdict(video.config),
+            "frames": video.facts() if isinstance(video, ImagelessVideo) else None,
         }
         if path.exists():
             old = load_json(path)
@@ -97,6 +99,12 @@ class Workspace:
             return str(facts["source"]), InputConfig(**facts["input"])
         except (KeyError, TypeError) as error:
             raise ReobjError(f"{path}: {written_by(self.out)} ({error!r})") from error
+
+    def video(self) -> Video:
+        """Open the video that the folder is bound to, read as it was."""
+        source, config = self.source
+        frames = load_json(self.out / SOURCE).get("frames")
+        return ImagelessVideo(source, config=config, **frames) if frames else Video(source, config)
 
     def path(self, stage: str, *key: Any) -> Path:
         """Return the file for a stage's result under a key: its inputs and options.

@@ -23,7 +23,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from reobj.files import load_json, read_text, shortened
+from reobj.files import load_json, load_npz, read_text, shortened
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, read_npz
 from reobj.sources.video import Video
@@ -129,7 +129,18 @@ def read_mot_rows(path: Path) -> Array:
 
 
 MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
-NUMBERS = ("frame", "id", "x1", "y1", "x2", "y2", "w", "h", "score")  # columns that hold numbers
+NUMBERS = (
+    "frame",
+    "time",
+    "id",
+    "x1",
+    "y1",
+    "x2",
+    "y2",
+    "w",
+    "h",
+    "score",
+)  # columns that hold numbers
 
 
 def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
@@ -146,6 +157,8 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
     count = len(lines)
     class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
     messages = [f"{len(new)} class names not in the list: {shortened(new)}"] if new else []
+    if "frame" not in column:
+        column["frame"] = _frames_at(column["time"], video, path)
     frame = column["frame"].astype(np.int64) - is_mot
     if frame.min(initial=0) == -1 and is_mot:
         frame += 1
@@ -181,8 +194,53 @@ def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray
     return tuple(columns[:width]), stripped, np.array([line for line, _ in rows], np.int64), is_mot
 
 
+def _frames_at(time_s: Array, video: Video, path: Path) -> Array:
+    """Find the frames at times (N,) in s, -1 where none is within half a frame interval."""
+    if video.times_s is None:
+        raise ReobjError(f"{path}, line 1: no column frame; time stamps are of use only where the "
+                         "names of the images are time stamps too")  # fmt: skip
+    half = 0.5 * float(np.median(np.diff(video.times_s))) if len(video.times_s) > 1 else 0.0
+    after = np.searchsorted(video.times_s, time_s).clip(max=len(video.times_s) - 1)  # (N,)
+    pair = np.stack([(after - 1).clip(0), after], 1)  # (N, 2)
+    offset = np.abs(video.times_s[pair] - time_s[:, None])
+    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
+    return np.where(offset.min(1) <= half, nearest, -1).astype(np.float64)
+
+
+def recorded_times(path: Path) -> Array | None:
+    """Return the distinct times, ascending, of a CSV with a column of them and none of frames."""
+    if path.suffix.lower() in (".npz", ".json", ".xml", ".zip"):
+        return None
+    columns, cells, lines, _ = _table_cells(path)
+    if "frame" in columns or "time" not in columns:
+        return None
+    at = columns.index("time")
+    return np.unique(_column([row[at] for row in cells], lines, path))
+
+
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Return the (w, h) of the images that a file of detections was made for, if it says so."""
+    data: Any = {}
+    if path.suffix.lower() == ".npz":
+        data = load_npz(path)[0].get("image_size", ())
+    elif path.suffix.lower() == ".json":
+        images = (_dataset(path, load_json(path)) or {}).get("images") or [{}]
+        first = images[0]
+        data = [first[key] for key in ("width", "height") if key in first]
+    return (int(data[0]), int(data[1])) if len(data) == 2 else None
+
+
+def image_names(path: Path) -> list[str]:
+    """List the images of a COCO dataset, in the file or beside it; [] of any other file."""
+    if path.suffix.lower() != ".json":
+        return []
+    images = (_dataset(path, load_json(path)) or {}).get("images", ())
+    return [Path(image["file_name"]).name for image in images if "file_name" in image]
+
+
 CSV_ALIASES = {"x": "x1", "y": "y1", "width": "w", "height": "h", "confidence": "score",
-               "conf": "score", "class_id": "class", "class_name": "class"}  # fmt: skip
+               "conf": "score", "class_id": "class", "class_name": "class",
+               "coco80_class": "class", "timestamp": "time", "time_s": "time"}  # fmt: skip
 
 
 def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
@@ -191,7 +249,8 @@ def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
     plain = [name.strip() for name in header.lstrip("# ").split(",")]
     columns = tuple(CSV_ALIASES.get(name, name) for name in plain)
     ends = ("w", "h") if "w" in columns else ("x2", "y2")
-    missing = [role for role in ("frame", "x1", "y1", *ends) if role not in columns]
+    when = "time" if "time" in columns else "frame"
+    missing = [role for role in (when, "x1", "y1", *ends) if role not in columns]
     if missing:
         raise ReobjError(f"{path}, line 1: no column {', '.join(missing)} in the header {header}: "
                          "expected one such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
@@ -284,11 +343,7 @@ def _coco_dataset(
     Returns:
         Frame by image id (empty: the id is the frame), class name by category id, and messages.
     """
-    data = own if isinstance(own, dict) else None
-    for other in sorted(path.parent.glob("*.json")) if data is None else ():
-        with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
-            found = json.loads(other.read_text()) if other != path else None
-            data = found if isinstance(found, dict) and found.get("images") else data
+    data = _dataset(path, own)
     ids = list(range(len(names))) or [i for i in range(1, 91) if i not in COCO_GAPS]
     name_of = dict(zip(ids, names or COCO_NAMES, strict=True))
     if data is None:
@@ -301,6 +356,16 @@ def _coco_dataset(
         for i, image in enumerate(data["images"])
     }
     return frame_of, name_of, []
+
+
+def _dataset(path: Path, own: Any) -> dict[str, Any] | None:
+    """Return the COCO dataset that a file holds (its content is `own`) or that lies beside it."""
+    data = own if isinstance(own, dict) else None
+    for other in sorted(path.parent.glob("*.json")) if data is None else ():
+        with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
+            found = json.loads(other.read_text()) if other != path else None
+            data = found if isinstance(found, dict) and found.get("images") else data
+    return data
 
 
 def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:

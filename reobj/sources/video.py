@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from reobj.files import shortened, without_password
-from reobj.types import Frame, Image, ReobjError, option
+from reobj.types import Array, Frame, Image, ReobjError, option
 
 IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
 
@@ -50,6 +50,40 @@ LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: one to work on next 
 LIVE_TIMEOUT_S = 2.0  # chosen: no frame for so long, and a live source has ended
 
 
+# Image names that are time stamps (TUM: 1305031102.175304.png)
+STAMPS_PER_S = (1.0, 1e3, 1e6, 1e9)  # s, ms, us, ns
+EPOCH_S = (946684800.0, 4102444800.0)  # 2000 to 2100, in s since 1970
+FRAME_STEPS_S = (1 / 240, 10.0)  # between two images: the fastest phones; photos one by one
+LEAST_STAMP = 1e9  # whole numbers below are counters (chosen: s since 1970 have ten digits)
+
+
+def times_of_names(names: Sequence[str]) -> Array | None:
+    """Read the times of images (F,) in s from names that are time stamps; None if they are none.
+
+    The last number of every name counts if it has a decimal point, or at least ten digits. Its
+    unit, s, ms, us or ns, is the one in which the images have a plausible rate, a plausible date
+    since 1970 first.
+    """
+    words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
+    if not words or not all(words):
+        return None
+    numbers = np.array([float(word) for (word,) in words])
+    if not (all("." in word for (word,) in words) or numbers.min() >= LEAST_STAMP):
+        return None
+    steps = np.diff(numbers)
+    if (steps <= 0).any():
+        return None
+    found = []
+    for per_s in STAMPS_PER_S:
+        step_s = float(np.median(steps)) / per_s if len(steps) else 1 / IMAGE_FPS
+        first_s = float(numbers[0]) / per_s
+        dated = EPOCH_S[0] < first_s < EPOCH_S[1]
+        clock = dated or (first_s < EPOCH_S[0] and len(steps) > 0)  # or since it was switched on
+        if clock and FRAME_STEPS_S[0] <= step_s <= FRAME_STEPS_S[1]:
+            found.append((not dated, abs(math.log(step_s * IMAGE_FPS)), per_s))
+    return numbers / min(found)[2] if found else None
+
+
 class Video:
     """Iterate over the frames of a video file, image folder, glob, camera index or stream URL.
 
@@ -62,6 +96,8 @@ class Video:
     Attributes:
         source: what was given, without a URL's password.
         files, names: paths and file names of images by frame number, [] for videos.
+        times_s: (F,) of images whose names are time stamps, else None: they come at 30 Hz.
+        has_images: False where frames have none (`ImagelessVideo`).
         is_live: a camera or stream, which cannot be read twice.
         read, dropped: wanted frames of a live source so far, and those of them never yielded.
         size: (w, h) of the source in px, after rotation by its metadata.
@@ -70,6 +106,8 @@ class Video:
         skipped: numbers of the frames, in the last iteration, that could not be read or had
             another size. messages: warnings for the user, each once.
     """
+
+    has_images = True
 
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
         self._address, self.config = str(source), config or InputConfig()
@@ -83,6 +121,7 @@ class Video:
         self._is_url = bool(STREAM_URL.match(self._address))
         self.files = [] if self._is_url else _image_files(self.source)
         self.names = [path.name for path in self.files]
+        self.times_s = times_of_names(self.names)
         self.is_live = self._is_url or (self.source.isdigit() and not Path(self.source).exists())
         self.size, self.fps, self.frame_count = self._probe()
         if 0 < self.frame_count <= self.config.start:
@@ -109,7 +148,8 @@ class Video:
         if self.files:
             stop = min(self.config.stop or self.frame_count, self.frame_count)
             numbers = range(self.config.start, stop, self.config.every)
-            decoded = ((i, i / IMAGE_FPS, _read_image(self.files[i])) for i in numbers)
+            times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
+            decoded = ((i, float(times_s[i]), _read_image(self.files[i])) for i in numbers)
         for index, time_s, image in decoded:
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 self.skipped.append(index)
@@ -234,6 +274,8 @@ class Video:
         """
         images: Iterator[Image | None] = map(_read_image, self.files)
         fps, count = IMAGE_FPS, len(self.files)
+        if self.times_s is not None and count > 1:
+            fps = float((count - 1) / np.ptp(self.times_s))
         if not self.files:
             capture = self._open()
             images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
@@ -262,7 +304,12 @@ def _image_files(source: str) -> list[Path]:
     files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     if not files:
         raise ReobjError(f"{source}: no images there (looked for {' '.join(IMAGE_SUFFIXES)})")
-    return sorted(files, key=lambda p: re.sub(r"\d+", lambda n: n[0].zfill(20), p.name))
+    return sorted(files, key=lambda p: by_number(p.name))
+
+
+def by_number(name: str) -> str:
+    """Return a key that sorts names by the numbers in them."""
+    return re.sub(r"\d+", lambda n: n[0].zfill(20), name)
 
 
 def _read_image(path: Path) -> Image | None:

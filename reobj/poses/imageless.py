@@ -1,0 +1,105 @@
+"""Frames without images: numbered as poses and detections of a video speak of them.
+
+Start at `open_video`. What such frames are is said in `sources.imageless`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reobj.poses.estimate import PosesConfig
+from reobj.poses.intrinsics import stated_camera
+from reobj.poses.matching import numbers_of_times, rows_by_number
+from reobj.poses.readers import PoseFile, read_pose_file
+from reobj.sources.detection_files import (
+    DetectConfig,
+    image_names,
+    image_size,
+    read_detections,
+    read_tracks,
+    recorded_times,
+)
+from reobj.sources.imageless import ImagelessVideo
+from reobj.sources.video import InputConfig, Video, by_number
+from reobj.types import ReobjError
+
+
+def open_video(
+    source: str | Path | int | None,
+    config: InputConfig,
+    poses: PosesConfig,
+    boxes: Any = None,
+) -> Video:
+    """Open a video, or without one the frames that detections and poses speak of.
+
+    Args:
+        source: as `Video` takes it; None: there is none.
+        poses, boxes: file of poses, and of detections or identities; of use without a video.
+    Raises:
+        ReobjError: no video, and no file of detections, poses or size of the images either.
+    """
+    if source is not None:
+        return Video(source, config)
+    if not isinstance(boxes, str | Path) or not boxes or poses.mode in ("auto", "none"):
+        raise ReobjError(
+            "no video: name one, or give `run` what needs no images: --detections FILE (or "
+            "--tracks FILE), --poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"
+        )
+    path, posed, unknown = Path(boxes), poses.mode, (1, 1)
+    if not path.is_file():
+        raise ReobjError(f"{path}: no such file of detections")
+    size = image_size(path)
+    stated = stated_camera(poses.camera, size)
+    size = size or (unknown if stated is None else (stated.width, stated.height))
+    given = read_pose_file(Path(posed), poses.fmt, size)
+    if size == unknown and given.camera is not None:
+        size = (given.camera.width, given.camera.height)
+    if size == unknown:
+        raise ReobjError(f"{posed}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS")
+    video = _frames_of(given, path, size, posed, config)
+    video.messages.append(
+        f"no images: {video.frame_count} frames of {size[0]}x{size[1]} as {posed} and {path} "
+        "have them; tracked by motion and cameras alone, no appearance, no pictures"
+    )
+    return video
+
+
+def _frames_of(
+    given: PoseFile, boxes: Path, size: tuple[int, int], source: str, config: InputConfig
+) -> ImagelessVideo:
+    """Number the frames of poses and detections as a folder of their images would be.
+
+    Times in a CSV of detections are those of the frames. Else images of a COCO dataset or of the
+    poses, sorted by the numbers in their names, are numbered; if the detections have more frames
+    than that, the numbers in the names count. Poses without names: even times from 0 on are
+    numbers, anything else is one row a frame.
+    """
+    if (times_s := recorded_times(boxes)) is not None:
+        return ImagelessVideo(source, size, config, times_s=times_s)
+    first = ImagelessVideo(source, size, config)
+    images = {Path(name).name for name in image_names(boxes) or given.names}
+    names = sorted(images, key=by_number)
+    if boxes.suffix.lower() not in (".xml", ".zip"):
+        found = read_detections(boxes, first, DetectConfig(min_score=0.0)).frame
+    else:
+        found = read_tracks(boxes, first)[0].frame
+    count = int(found.max(initial=-1)) + 1
+    if names and count > len(names):
+        row = rows_by_number(names, np.arange(count), ())
+        names = [names[r] if r >= 0 else "" for r in row]
+    if names:
+        return ImagelessVideo(source, size, config, names=names)
+    rows, stamps_s = len(given.cam_from_world), given.stamps_s
+    if stamps_s is not None:
+        number = numbers_of_times(stamps_s)
+        times_s = np.interp(np.arange(number[-1] + 1), number, stamps_s)
+        rows = len(times_s)
+        if count <= rows:
+            return ImagelessVideo(source, size, config, times_s=times_s)
+    if count > rows:
+        what = f"{boxes}: frame {count - 1}, but {source} has {rows} poses without names"
+        raise ReobjError(f"{what}; expected a pose for each frame, or a CSV with a `timestamp`")
+    return ImagelessVideo(source, size, config, count=rows)

@@ -1,0 +1,246 @@
+"""Intrinsics from outside: what --camera says, COLMAP's camera lines, JSON files of many tools.
+
+Start at `parse_camera`. What a camera does is the business of `cameras`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reobj.cameras import Camera, camera_parameters, checked_camera
+from reobj.files import load_json, read_text
+from reobj.types import ReobjError
+
+NUMBERS = "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]"  # OpenCV's order
+CAMERA_FORMS = f"{NUMBERS}; MODEL WIDTH HEIGHT PARAMS as COLMAP has it; or a file"
+
+
+def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
+    """Parse what --camera says: numbers, a camera as COLMAP writes it, or a file.
+
+    Args:
+        text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]`, pixels; `[ID] MODEL WIDTH HEIGHT PARAMS`;
+            or a file that holds one of these (a cameras.txt of one camera), a matrix K of 3x3 or
+            4x4, or JSON (`camera_from_json`).
+        size: (w, h) of the frames, and of a camera that does not state its own.
+    Returns:
+        the camera of the frames: one of another size but the same shape is resized; None of an
+        empty text.
+    Raises:
+        ReobjError: anything else, or a camera that does not belong to such frames.
+
+    >>> parse_camera("500,500,320,240", (640, 480)).model
+    'PINHOLE'
+    """
+    camera = stated_camera(text, size)
+    return None if camera is None else fitted_camera(camera, size, f"--camera {text}")
+
+
+def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
+    """Parse as `parse_camera` does, without a look at the frames: the camera at its own size.
+
+    Args:
+        size: of a camera that does not state its own; None: refuse it.
+    """
+    if not text.strip():
+        return None
+    is_file = os.path.isfile(text)  # of any text, however long
+    try:
+        content = read_text(Path(text)) if is_file else text
+        if is_file and content.lstrip()[:1] in ("{", "["):
+            camera = camera_from_json(load_json(Path(text)), size)
+        else:
+            camera = _camera_from_text(content, size)
+        if camera is None:
+            raise ReobjError(f"no focal length; expected {CAMERA_FORMS}")
+    except ReobjError as error:
+        raise ReobjError(f"--camera {text}: {error}") from None
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError):
+        what = "not understood" if is_file else "no such file, and no camera"
+        raise ReobjError(f"--camera {text}: {what}; expected {CAMERA_FORMS}") from None
+    return camera
+
+
+def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
+    """Return the camera of images resized to (w, h) `size`; refuse one of another shape."""
+    width, height = camera.width, camera.height
+    try:
+        camera_parameters(camera.model)  # a panorama has no K
+    except ReobjError as error:
+        raise ReobjError(f"{where}: {error}") from None
+    if abs(width * size[1] - height * size[0]) > max(width, height, *size):  # more than rounding
+        raise ReobjError(
+            f"{where}: a camera of {width}x{height} images, but the frames are {size[0]}x{size[1]};"
+            " expected the same shape (rotated or cropped video?)"
+        )
+    return checked_camera(camera.resized(size), where)
+
+
+def camera_line(camera: Camera) -> str:
+    """Write a camera as COLMAP does: MODEL WIDTH HEIGHT PARAMS, with all digits."""
+    return " ".join(map(str, (camera.model, camera.width, camera.height, *camera.params)))
+
+
+def _camera_from_text(text: str, size: tuple[int, int] | None) -> Camera:
+    """Read numbers, a matrix K, or a line of COLMAP's cameras.txt; `#` begins a comment."""
+    lines = [line.partition("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    rows = [words for words in lines if words]
+    if any(word.isupper() and not _is_number(word) for words in rows for word in words[:2]):
+        if len(rows) > 1:
+            raise ReobjError(f"{len(rows)} cameras; expected one")
+        return colmap_camera(rows[0][rows[0][0].isdigit() :])
+    table = np.array([[float(word) for word in words] for words in rows])
+    if table.shape in ((3, 3), (4, 4)):
+        return brown_camera(size, *_focal_and_centre(table))
+    numbers = table.ravel().tolist()
+    if len(rows) != 1 or len(numbers) not in (*range(4, 10), 12):
+        raise ReobjError(f"{len(numbers)} numbers; expected {CAMERA_FORMS}")
+    return brown_camera(size, *numbers)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def colmap_camera(words: Sequence[str]) -> Camera:
+    """Make a camera of the words MODEL WIDTH HEIGHT PARAMS of a line of COLMAP's cameras.txt.
+
+    Raises:
+        ReobjError: no model of the installed pycolmap, or other parameters than it has.
+        ValueError: a word is no number.
+    """
+    model, width, height, *params = words
+    camera = Camera(model, int(width), int(height), tuple(map(float, params)))
+    if not np.isfinite(camera.params).all() or min(camera.width, camera.height) < 1:
+        raise ReobjError(f"{' '.join(words)!r}: a number is not finite, or the size not positive")
+    camera.to_pycolmap()  # refuses what is no camera
+    return camera
+
+
+def brown_camera(
+    size: tuple[int, int] | None, fx: float, fy: float, cx: float, cy: float, *distortion: float
+) -> Camera:
+    """Make a camera of OpenCV's numbers, in the simplest of COLMAP's models that holds them.
+
+    Args:
+        size: (w, h) px. distortion: k1, k2, p1, p2, k3, k4, k5, k6, from the end on left out where
+            they are 0: Brown's, and from k4 on OpenCV's rational one.
+    """
+    terms = [*distortion, *[0.0] * (8 - len(distortion))]
+    model, count = ("OPENCV", 4) if any(terms) else ("PINHOLE", 0)
+    model, count = ("FULL_OPENCV", 8) if any(terms[4:]) else (model, count)
+    params = (fx, fy, cx, cy, *terms[:count])
+    if not np.isfinite(params).all() or min(fx, fy) <= 0:
+        raise ReobjError("a number is not finite, or a focal length not positive")
+    width, height = _sized(size)
+    return Camera(model, width, height, params)
+
+
+def _focal_and_centre(matrix: Any) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy of K: 3x3 or 4x4, nested or flat, row by row or column by column."""
+    flat = np.array(matrix, np.float64).ravel()
+    K = flat.reshape(4, 4)[:3, :3] if flat.size == 16 else flat.reshape(3, 3)
+    K = K.T if K[2, :2].any() else K  # Open3D, Record3D
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+
+
+# Keys in the wild: COLMAP, nerfstudio and instant-ngp, OpenCV and ROS, Open3D, Record3D, RealSense
+SIZES = (("w", "h"), ("width", "height"), ("image_width", "image_height"))
+FOCALS = (("fx", "fy"), ("fl_x", "fl_y"), ("f", "f"), ("focal", "focal"))
+CENTRES = (("cx", "cy"), ("ppx", "ppy"))
+MATRICES = ("camera_matrix", "K", "intrinsic_matrix", "intrinsics", "intrinsic")
+DISTORTIONS = ("distortion_coefficients", "dist_coeffs", "distortion", "dist", "coeffs", "D")
+BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FISHEYE = ("k1", "k2", "k3", "k4")
+BROWN_MODELS = (
+    "", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
+    "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL",
+)  # fmt: skip
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4")
+
+
+def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
+    """Make a camera of the keys that tools write into JSON files.
+
+    Args:
+        data: focal length `fx`, `fy` (`fl_x`, or `camera_angle_x` in radians) and centre `cx`,
+            `cy`, or a matrix `K`, `camera_matrix`, `intrinsic_matrix`; distortion by name (`k1`,
+            ...) or as a list in OpenCV's order; `w`, `h` or `width`, `height`; `model` or
+            `camera_model`, with COLMAP's `params` or the names of its parameters. All this may
+            stand in an object `camera` or `intrinsics`.
+        size: (w, h) where the data have none.
+    Returns:
+        the camera at the size of the data; None without a focal length.
+    """
+    data = data | next((data[k] for k in ("camera", "intrinsics") if _is_object(data.get(k))), {})
+    size = next(((int(data[w]), int(data[h])) for w, h in SIZES if w in data), size)
+    model = str(data.get("model", data.get("camera_model", ""))).upper()
+    if size and model and "params" in data:
+        return colmap_camera([model, *map(str, (*size, *data["params"]))])
+    pinhole = _pinhole_of_json(data, size)
+    if pinhole is None:
+        return None
+    if data.get("is_fisheye") or model in FISHEYE_MODELS:
+        width, height = _sized(size)
+        return Camera("OPENCV_FISHEYE", width, height, (*pinhole, *_terms(data, FISHEYE)))
+    if model in BROWN_MODELS:
+        return brown_camera(size, *pinhole, *_terms(data, BROWN))
+    return _camera_of_names(model, data, pinhole, _sized(size))
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+def _pinhole_of_json(
+    data: dict[str, Any], size: tuple[int, int] | None
+) -> tuple[float, float, float, float] | None:
+    """Return fx, fy, cx, cy of an object's own keys or its matrix; None without focal length."""
+    for key in MATRICES:
+        matrix = data[key].get("data") if _is_object(data.get(key)) else data.get(key)
+        if matrix is not None:
+            return _focal_and_centre(matrix)
+    middle = (0.5 * size[0], 0.5 * size[1]) if size else (math.nan, math.nan)
+    cx, cy = next(((data[x], data[y]) for x, y in CENTRES if x in data), middle)
+    fx, fy = next(((data[x], data.get(y, data[x])) for x, y in FOCALS if x in data), (None, None))
+    if fx is None and size and "camera_angle_x" in data:
+        fx = fy = 0.5 * size[0] / math.tan(0.5 * float(data["camera_angle_x"]))
+    return None if fx is None or fy is None else (float(fx), float(fy), float(cx), float(cy))
+
+
+def _terms(data: dict[str, Any], names: Sequence[str]) -> list[float]:
+    """Return the distortion, in the order of its names, 0 where it is not given."""
+    given: Any = next((data[key] for key in DISTORTIONS if key in data), [])
+    values = np.ravel(given["data"] if _is_object(given) else given).tolist()
+    if len(values) > len(names) and any(values[len(names) :]):
+        raise ReobjError(f"{len(values)} distortion coefficients; expected {','.join(names)}")
+    listed = dict(zip(names, values, strict=False)) or {"k1": data.get("k", 0.0)}
+    return [float(data.get(name, listed.get(name, 0.0))) for name in names]
+
+
+def _camera_of_names(
+    model: str, data: dict[str, Any], pinhole: Sequence[float], size: tuple[int, int]
+) -> Camera:
+    """Make a camera of any other of COLMAP's models, its parameters found by their names."""
+    known = data | dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True)) | {"f": pinhole[0]}
+    names = camera_parameters(model)
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise ReobjError(f"no {', '.join(missing)} of a {model} camera")
+    return Camera(model, *size, tuple(float(known[name]) for name in names))
+
+
+def _sized(size: tuple[int, int] | None) -> tuple[int, int]:
+    if size is None:
+        raise ReobjError("no image size; expected MODEL WIDTH HEIGHT PARAMS, or JSON with w and h")
+    return size

@@ -1,0 +1,72 @@
+"""Frames without images: what stands for a video where only detections and poses are at hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from reobj.sources.video import IMAGE_FPS, InputConfig, Video, times_of_names
+from reobj.types import Frame, ReobjError
+
+NO_IMAGE: Any = None
+
+
+class ImagelessVideo(Video):
+    """Iterate over frames that have a number, a time and perhaps a name, but no image.
+
+    What needs a picture is not possible: detectors, appearance, a reconstruction of the cameras,
+    the overlay, pictures on the page. Tracking by motion and known cameras, ellipsoids and all
+    files are.
+
+    Args:
+        source: the file or folder of poses that names the frames.
+        size: (w, h) of the images that the detections were made on, px.
+        times_s: (F,) of the frames by number. None: by their names, or else 30 Hz.
+        names: (F,) of the images by number, "" where unknown, or [].
+        count: F, where there are neither times nor names.
+    """
+
+    has_images = False
+
+    def __init__(
+        self,
+        source: str | Path,
+        size: Sequence[int],
+        config: InputConfig | None = None,
+        *,
+        times_s: npt.ArrayLike | None = None,
+        names: Sequence[str] = (),
+        count: int = 0,
+    ) -> None:
+        self.source, self.config = str(source), config or InputConfig()
+        if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
+            raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
+        self.size = self.working_size = (int(size[0]), int(size[1]))
+        self.scale = 1.0
+        self.names, self.files = list(names), []
+        given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
+        self.times_s = given
+        self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
+        self.fps = IMAGE_FPS
+        if given is not None and len(given) > 1:
+            self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
+        self.is_live, self.read, self.dropped = False, 0, 0
+        self.skipped, self.messages = [], []
+
+    def facts(self) -> dict[str, Any]:
+        """Return the arguments that make the same frames again, as JSON takes them."""
+        times_s = None if self.times_s is None else self.times_s.tolist()
+        return {"size": self.size, "times_s": times_s, "names": self.names,
+                "count": self.frame_count}  # fmt: skip
+
+    def __iter__(self) -> Iterator[Frame]:
+        stop = min(self.config.stop or self.frame_count, self.frame_count)
+        times_s = self.times_s
+        for index in range(self.config.start, stop, self.config.every):
+            time_s = index / IMAGE_FPS if times_s is None else float(times_s[index])
+            yield Frame(index, time_s, NO_IMAGE)

@@ -1,0 +1,287 @@
+"""Runs from detections and poses alone: frames without images, and what is not possible."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quadrics
+import reobj_track as rt
+from reobj.cameras import invert_rigid, write_colmap
+from reobj.poses.imageless import open_video
+
+SHARED = Path(os.environ.get("REOBJ_SHARED", Path(rt.__file__).resolve().parent.parent / "shared"))
+SIZE, FRAMES = (320, 240), 24
+CAMERA = rt.Camera("PINHOLE", *SIZE, (300.0, 300.0, 160.0, 120.0))
+LINE = "PINHOLE 320 240 300 300 160 120"
+CENTRES = np.array([[-0.5, 0, 0.41], [0.6, 0.3, 0.41]])
+SOLIDS = quadrics.Ellipsoids(
+    CENTRES, np.tile([0.28, 0.3, 0.41], (2, 1)), np.eye(3)[None].repeat(2, 0)
+)
+OPTIONS = rt.Config(embed=rt.EmbedConfig(model="none"))
+
+
+def arc(count: int = FRAMES) -> np.ndarray:
+    """cam_from_world (F, 3, 4) on an arc of 90 degrees around the origin, z up, 3.5 m off."""
+    angle = np.radians(np.linspace(-45, 45, count))
+    eye = np.stack([3.5 * np.sin(angle), -3.5 * np.cos(angle), np.full(count, 1.6)], 1)
+    forward = [0, 0, 0.4] - eye
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    turn = np.stack([right, np.cross(forward, right), forward], 1)  # (F, 3, 3)
+    return np.concatenate([turn, -turn @ eye[:, :, None]], 2)
+
+
+def boxes() -> list[tuple[int, int, list[float]]]:
+    """Frame, object and xyxy of the boxes of both chairs in every frame."""
+    found = quadrics.solid_boxes(SOLIDS, "box", CAMERA.K @ arc())  # (F, 2, 4)
+    return [(f, k, found[f, k].tolist()) for f, k in np.ndindex(FRAMES, 2)]
+
+
+def as_csv(folder: Path, when: str = "frame", of: object = None) -> Path:
+    """CSV of the boxes; `of`: what the first column holds for each frame."""
+    rows = [f"{of[f] if of else f},{','.join(map(str, box))},.9,chair" for f, _, box in boxes()]
+    path = folder / "det.csv"
+    path.write_text(f"{when},x1,y1,x2,y2,score,class\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def as_npz(folder: Path) -> Path:
+    frames = [
+        (f, rt.Detections.from_array([[*box, 0.9, 56] for g, _, box in boxes() if g == f]))
+        for f in range(FRAMES)
+    ]
+    rt.write_detections_npz(folder / "det.npz", frames, rt.COCO_NAMES, SIZE)
+    return folder / "det.npz"
+
+
+def as_coco(folder: Path, names: list[str]) -> Path:
+    """COCO results with the dataset beside them, whose images come in another order."""
+    order = np.random.default_rng(0).permutation(FRAMES).tolist()
+    images = [
+        {"id": 100 + f, "file_name": f"images/{names[f]}", "width": 320, "height": 240}
+        for f in order
+    ]
+    data = {"images": images, "categories": [{"id": 1, "name": "chair"}]}
+    (folder / "dataset.json").write_text(json.dumps(data))
+    rows = [
+        {"image_id": 100 + f, "category_id": 1, "score": 0.9,
+         "bbox": [x, y, x2 - x, y2 - y]} for f, _, (x, y, x2, y2) in boxes()
+    ]  # fmt: skip
+    (folder / "det.json").write_text(json.dumps(rows))
+    return folder / "det.json"
+
+
+def as_tum(folder: Path, times: object = None) -> Path:
+    world_from_cam = invert_rigid(arc())
+    quaternion = Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat()
+    times = np.arange(FRAMES) / 30 if times is None else times
+    np.savetxt(folder / "groundtruth.txt", np.c_[times, world_from_cam[:, :, 3], quaternion],
+               "%.9f")  # fmt: skip
+    return folder / "groundtruth.txt"
+
+
+def as_colmap(folder: Path, names: list[str]) -> Path:
+    count = len(names)
+    poses = rt.Poses(CAMERA, np.arange(count), np.arange(count) / 30, arc(), np.full(count, "pnp"),
+                     "pycolmap")  # fmt: skip
+    write_colmap(folder / "model", poses, names)
+    return folder / "model"
+
+
+def run(folder: Path, detections: Path, poses: Path, camera: str = "", **known: object):
+    section = rt.PosesConfig(mode=str(poses), camera=camera, **known)
+    config = rt.Config(embed=OPTIONS.embed, poses=section)
+    return rt.run(None, folder / "out", config, detections=detections)
+
+
+def assert_both_chairs(result: rt.Result) -> None:
+    assert [o.class_name for o in result.objects] == ["chair", "chair"]
+    found = np.array([o.center for o in result.objects])
+    found = found[np.argsort(found[:, 0])]
+    np.testing.assert_allclose(found, CENTRES, atol=0.02)
+    assert [o.frames_seen for o in result.objects] == [FRAMES, FRAMES]
+
+
+def assert_chairs_in_place(result: rt.Result) -> None:
+    """Without images and poses the camera's turn is unknown, and tracks may break."""
+    found = np.array([o.center for o in result.located])
+    distance = np.linalg.norm(found[:, None] - CENTRES, axis=2).min(0)
+    assert distance.max() < 0.02
+
+
+def test_all_files_are_written_but_those_with_pictures(tmp_path: Path) -> None:
+    result = run(tmp_path, as_csv(tmp_path), as_tum(tmp_path), LINE)
+    assert_both_chairs(result)
+    assert result.world.scale.source == "poses" and result.world.units == "m"
+    assert "no images: 24 frames of 320x240" in result.warnings[0]
+    out = tmp_path / "out"
+    names = {path.name for path in out.iterdir()}
+    assert {
+        "tracks.txt",
+        "objects.json",
+        "objects.ply",
+        "poses.txt",
+        "sparse",
+        "scene.html",
+    } <= names
+    assert "overlay.mp4" not in names
+    assert len((out / "tracks.txt").read_text().splitlines()) == 2 * FRAMES
+    page = (out / "scene.html").read_text()
+    assert '"thumbs":[]' in page and '"crops":[]' in page and "data:image" not in page.split("@")[0]
+    np.testing.assert_allclose(np.loadtxt(out / "poses.txt")[:, 0], np.arange(FRAMES) / 30)
+
+
+def test_an_output_folder_without_images_is_fitted_and_exported_again(tmp_path: Path) -> None:
+    run(tmp_path, as_csv(tmp_path), as_colmap(tmp_path, [f"{i}.jpg" for i in range(FRAMES)]))
+    out = tmp_path / "out"
+    assert_both_chairs(rt.refit(out))
+    rt.export(out, "coco-vid")
+    images = json.loads((out / "coco_vid.json").read_text())["images"]
+    assert [image["file_name"] for image in images] == [f"{i}.jpg" for i in range(FRAMES)]
+    assert (out / "sparse" / "images.txt").read_text().count(".jpg") == FRAMES
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"{i:05d}.jpg" for i in range(FRAMES)],
+        [f"{i}.png" for i in range(FRAMES)],  # 2.png comes before 10.png
+        [f"{3 + i + i // 5:05d}.jpg" for i in range(FRAMES)],  # numbers with gaps
+        [f"{1305031102 + i / 30:.6f}.png" for i in range(FRAMES)],
+    ],
+)
+def test_names_of_the_poses_number_the_frames_as_their_folder_would(
+    tmp_path: Path, names: list[str]
+) -> None:
+    assert_both_chairs(run(tmp_path, as_csv(tmp_path), as_colmap(tmp_path, names)))
+    stamps = np.loadtxt(tmp_path / "out" / "poses.txt")[:, 0]
+    start = 1305031102 if names[0][:2] == "13" else 0
+    np.testing.assert_allclose(stamps, start + np.arange(FRAMES) / 30, atol=1e-5)
+
+
+def test_names_of_a_coco_dataset_number_the_frames(tmp_path: Path) -> None:
+    names = [f"frame_{7 * i:04d}.jpg" for i in range(FRAMES)]
+    path = as_coco(tmp_path, names)
+    assert_both_chairs(run(tmp_path, path, as_colmap(tmp_path, names)))
+
+
+def test_poses_of_some_images_keep_the_numbers_in_their_names(tmp_path: Path) -> None:
+    model = as_colmap(tmp_path, [f"{i:04d}.jpg" for i in range(FRAMES)])
+    images = (model / "images.txt").read_text().splitlines()
+    kept = [line for line in images if line and int(line[-8:-4]) not in (3, 4, 9)]
+    (model / "images.txt").write_text("\n\n".join(kept) + "\n\n")
+    result = run(tmp_path, as_csv(tmp_path), model)
+    assert_chairs_in_place(result)
+    assert result.poses.frame[~result.poses.known].tolist() == [3, 4, 9]
+    assert any("none for 3-4, 9" in warning for warning in result.warnings)
+
+
+def test_a_column_of_times_meets_poses_of_a_higher_rate(tmp_path: Path) -> None:
+    """As TUM's recordings have it: detections at 30 Hz, motion capture at another rate."""
+    times = [f"{1341847980.722988 + i / 30:.6f}" for i in range(FRAMES)]
+    path = as_csv(tmp_path, "timestamp", times)
+    mocap = as_tum(tmp_path, np.array(times, float))
+    rows = np.loadtxt(mocap)
+    between = (rows[1:] + rows[:-1]) / 2  # near enough
+    between[:, 4:] /= np.linalg.norm(between[:, 4:], axis=1, keepdims=True)
+    np.savetxt(mocap, np.concatenate([rows, between])[np.argsort(np.r_[rows[:, 0], between[:, 0]])],
+               "%.9f")  # fmt: skip
+    result = run(tmp_path, path, mocap, LINE)
+    assert_both_chairs(result)
+    np.testing.assert_allclose(result.poses.time_s, np.array(times, float), atol=1e-6)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_frames_are_chosen_as_of_a_video(tmp_path: Path, every: int) -> None:
+    config = rt.InputConfig(start=2, stop=20, every=every)
+    section = rt.PosesConfig(mode=str(as_tum(tmp_path)), camera=LINE)
+    video = open_video(None, config, section, as_csv(tmp_path))
+    assert [frame.index for frame in video] == list(range(2, 20, every))
+    assert all(frame.image is None for frame in video) and video.expected == 18 // every
+
+
+def test_our_own_poses_with_a_gap_keep_their_frames(tmp_path: Path) -> None:
+    """Even times from 0 on are frame numbers: rows of lost frames may be missing."""
+    path = as_tum(tmp_path)
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(rows[:5] + rows[8:]) + "\n")
+    result = run(tmp_path, as_csv(tmp_path), path, LINE)
+    assert_chairs_in_place(result)
+    assert result.poses.frame[~result.poses.known].tolist() == [5, 6, 7]
+
+
+def test_the_size_is_that_of_the_detections_where_they_say_it(tmp_path: Path) -> None:
+    assert_both_chairs(run(tmp_path, as_npz(tmp_path), as_tum(tmp_path), "300,300,160,120"))
+
+
+@pytest.mark.parametrize(
+    "detections, poses, camera, message",
+    [
+        (None, "tum", LINE, "no video: name one, or give"),
+        (lambda image: [], "tum", LINE, "no video: name one, or give"),
+        ("csv", "auto", LINE, "no video: name one, or give"),
+        ("csv", "none", LINE, "no video: name one, or give"),
+        ("csv", "tum", "300,300,160,120", "no image size"),
+        ("csv", "tum", "", "groundtruth.txt: no image size"),
+        ("no.csv", "tum", LINE, "no.csv: no such file of detections"),
+        ("csv", "no.txt", LINE, "no.txt: no such file"),
+        ("late", "tum", LINE, "frame 99, but .*groundtruth.txt has 24 poses"),
+    ],
+)
+def test_what_is_not_possible_is_said_in_one_line(
+    tmp_path: Path, detections: object, poses: str, camera: str, message: str
+) -> None:
+    if detections in ("csv", "late"):
+        path = as_csv(tmp_path)
+        if detections == "late":
+            path.write_text(path.read_text() + "99,10,10,90,90,.9,chair\n")
+        detections = path
+    mode = str(as_tum(tmp_path)) if poses == "tum" else poses
+    config = rt.Config(poses=rt.PosesConfig(mode=mode, camera=camera))
+    with pytest.raises(rt.ReobjError, match=message) as refused:
+        rt.run(None, tmp_path / "out", config, detections=detections)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_command_line_needs_no_video_for_run_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["-o", str(tmp_path / "out"), "--detections", str(as_csv(tmp_path)),
+             "--poses", str(as_tum(tmp_path)), "--camera", LINE]  # fmt: skip
+    assert rt.main(["run", *words]) == 0
+    assert "distinct objects: 2 chair" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        rt.main(["track", *words[:4]])
+
+
+def test_tracks_need_no_images_either(tmp_path: Path) -> None:
+    path = tmp_path / "tracks.csv"
+    rows = [f"{f},{k + 1},{','.join(map(str, box))},chair" for f, k, box in boxes()]
+    path.write_text("frame,id,x1,y1,x2,y2,class\n" + "\n".join(rows) + "\n")
+    config = rt.Config(poses=rt.PosesConfig(mode=str(as_tum(tmp_path)), camera=LINE))
+    assert_both_chairs(rt.run(None, tmp_path / "out", config, tracks=path))
+
+
+# ---- Real recordings -----------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="no real recordings: set REOBJ_SHARED")
+def test_tums_office_has_boxes_and_motion_capture_only(tmp_path: Path) -> None:
+    """100 frames of fr3/office, whose images are not at hand."""
+    data = SHARED / "data" / "tum_fr3_office"
+    config = rt.Config(
+        input=rt.InputConfig(start=300, stop=400),
+        poses=rt.PosesConfig(mode=str(data / "groundtruth.txt"),
+                             camera=str(data / "intrinsics.json")),
+    )  # fmt: skip
+    result = rt.run(None, tmp_path / "out", config, detections=data / "detections_yolo.csv")
+    assert result.poses.known.sum() == 100 and result.poses.metric
+    assert result.poses.time_s[0] == pytest.approx(1341847990.8, abs=0.5)
+    assert sum(o.located for o in result.objects) >= 10

@@ -1,0 +1,230 @@
+"""What --camera takes: numbers, COLMAP's lines, matrices, JSON files of many tools."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pose_worlds import SIZE, some_cameras, supplied
+
+import reobj.poses.stage as stage
+import reobj_track as rt
+from reobj.poses.intrinsics import camera_line, parse_camera, stated_camera
+from reobj.results.workspace import Workspace
+
+ROOM = Path(rt.__file__).parent / "examples" / "room"
+SHARED = Path(os.environ.get("REOBJ_SHARED", Path(rt.__file__).resolve().parent.parent / "shared"))
+DATA = SHARED / "data"
+PINHOLE = rt.Camera("PINHOLE", *SIZE, (500, 510, 320, 240))
+OPENCV = rt.Camera("OPENCV", *SIZE, (500, 510, 320, 240, -0.1, 0.02, 0.001, 0.002))
+FR2 = (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172)  # TUM RGB-D
+K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+
+
+def test_numbers_are_parsed():
+    assert parse_camera("", SIZE) is None and parse_camera("  ", SIZE) is None
+    assert parse_camera("500,510,320,240", SIZE) == PINHOLE
+    assert parse_camera("500 510 320 240", SIZE) == PINHOLE
+    assert parse_camera("500,510,320,240,0,0,0,0", SIZE) == PINHOLE
+    opencv = parse_camera("500,510,320,240,-.1,.02", SIZE)
+    assert opencv == rt.Camera("OPENCV", *SIZE, (500, 510, 320, 240, -0.1, 0.02, 0, 0))
+    assert parse_camera("500,510,320,240,-.1,.02,.001,.002", SIZE) == OPENCV
+    fr2 = parse_camera(",".join(map(str, FR2)), SIZE)
+    assert fr2 == rt.Camera("FULL_OPENCV", *SIZE, (*FR2, 0, 0, 0))
+    rational = (500, 510, 320, 240, -0.1, 0.02, 1e-3, 2e-3, 0.01, 0.02, 0.03, 0.04)
+    found = parse_camera(",".join(map(str, rational)), SIZE)
+    assert found == rt.Camera("FULL_OPENCV", *SIZE, rational)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("1,2,3", "3 numbers; expected fx,fy,cx,cy"),
+        ("500,500,320,240,1,2,3,4,5,6", "10 numbers"),
+        ("500,500,320,240,0,0,0,0,0,0,0", "11 numbers"),
+        ("500,500,320,240" + ",0" * 9, "13 numbers"),
+        ("a,b,c,d", "no such file, and no camera"),
+        ("camera.json", "no such file, and no camera"),
+        ("-5,5,320,240", "not positive"),
+        ("500,nan,320,240", "not finite"),
+        ("500,500,900,240", "do not fit"),  # centre of another size
+        ("500,500,320,400", "do not fit"),
+        ("50,50,320,240", "do not fit"),  # focal length of no lens
+        ("7000,7000,320,240", "do not fit"),
+        ("MAGIC 640 480 500 320 240", "no camera model MAGIC"),
+        ("OPENCV 640 480 500 500 320 240", "4 parameters of a OPENCV camera; expected fx, fy"),
+        ("PINHOLE 640 480 500 500 320 x", "no such file, and no camera"),
+        ("PINHOLE 640 480 500 500 320 nan", "not finite"),
+        ("EQUIRECTANGULAR 640 480 640 480", "has no focal length"),
+        ("PINHOLE 480 640 500 500 240 320", "480x640 images, but the frames are 640x480"),
+    ],
+)
+def test_a_wrong_camera_is_refused_in_one_line(text, message):
+    with pytest.raises(rt.ReobjError, match=message) as refused:
+        parse_camera(text, SIZE)
+    assert str(refused.value).startswith(f"--camera {text}: ") and "\n" not in str(refused.value)
+
+
+FILES = {
+    "cameras.txt": "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    "1 PINHOLE 640 480 500 510 320 240  # of a phone\n",
+    "camera.txt": "PINHOLE 640 480 500 510 320 240",
+    "K.txt": "5.00e+02 0 3.2e+02\n0 5.1e+02 2.4e+02\n0 0 1\n",
+    "intrinsic_color.txt": "500 0 320 0\n0 510 240 0\n0 0 1 0\n0 0 0 1\n",
+    "numbers.txt": "# fx fy cx cy\n500, 510, 320, 240\n",
+}
+JSON = {
+    "ours": {"model": "PINHOLE", "w": 640, "h": 480, "fx": 500, "fy": 510, "cx": 320, "cy": 240},
+    "no size": {"fx": 500, "fy": 510, "cx": 320, "cy": 240},
+    "no centre": {"fx": 500.0, "fy": 510.0, "width": 640, "height": 480},
+    "params": {"model": "PINHOLE", "width": 640, "height": 480, "params": [500, 510, 320, 240]},
+    "nerfstudio": {"camera_model": "OPENCV", "fl_x": 500, "fl_y": 510, "cx": 320, "cy": 240,
+                   "w": 640.0, "h": 480.0, "k1": 0, "k2": 0, "k3": 0, "k4": 0, "p1": 0, "p2": 0},
+    "K nested": {"K": K, "image_width": 640, "image_height": 480},
+    "K flat": {"K": np.ravel(K).tolist()},
+    "Record3D": {"K": np.ravel(np.transpose(K)).tolist(), "w": 640, "h": 480, "poses": []},
+    "Open3D": {"width": 640, "height": 480, "intrinsic_matrix": np.ravel(np.transpose(K)).tolist()},
+    "ROS": {"camera_matrix": {"rows": 3, "cols": 3, "data": np.ravel(K).tolist()},
+            "distortion_model": "plumb_bob", "distortion_coefficients": {"data": [0] * 5}},
+    "nested": {"camera": {"fx": 500, "fy": 510, "cx": 320, "cy": 240, "width": 640, "height": 480}},
+    "list": {"intrinsics": np.ravel(K).tolist()},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_text_files_are_read(tmp_path, name):
+    (tmp_path / name).write_text(FILES[name])
+    assert parse_camera(str(tmp_path / name), SIZE) == PINHOLE
+
+
+@pytest.mark.parametrize("name", JSON)
+def test_json_files_are_read(tmp_path, name):
+    path = tmp_path / "intrinsics.json"
+    path.write_text(json.dumps(JSON[name]))
+    assert parse_camera(str(path), SIZE) == PINHOLE
+
+
+FX = {"fx": 500, "fy": 510, "cx": 320, "cy": 240, "w": 640, "h": 480}
+TERMS = (-0.1, 0.02, 0.001, 0.002)
+NAMED = dict(zip(("k1", "k2", "p1", "p2"), TERMS, strict=True))
+
+
+@pytest.mark.parametrize(
+    "more, model, distortion",
+    [
+        (NAMED, "OPENCV", TERMS),
+        ({**NAMED, "k3": 0.3}, "FULL_OPENCV", (*TERMS, 0.3, 0, 0, 0)),
+        ({"dist_coeffs": [*TERMS, 0.3]}, "FULL_OPENCV", (*TERMS, 0.3, 0, 0, 0)),
+        ({"distortion": [[*TERMS, 0.0]]}, "OPENCV", TERMS),
+        ({"is_fisheye": True, "k1": 0.1, "k4": 0.4}, "OPENCV_FISHEYE", (0.1, 0, 0, 0.4)),
+        ({"camera_model": "OPENCV_FISHEYE", "D": [0.1, 0.2, 0.3, 0.4]}, "OPENCV_FISHEYE",
+         (0.1, 0.2, 0.3, 0.4)),
+        ({"model": "SIMPLE_RADIAL", "k": -0.2}, "OPENCV", (-0.2, 0, 0, 0)),
+        ({"model": "FOV", "omega": 0.9}, "FOV", (0.9,)),
+        ({"model": "EUCM", "alpha": 0.5, "beta": 1.1}, "EUCM", (0.5, 1.1)),
+    ],
+)  # fmt: skip
+def test_distortion_in_json_is_read(tmp_path, more, model, distortion):
+    path = tmp_path / "intrinsics.json"
+    path.write_text(json.dumps(FX | more))
+    assert parse_camera(str(path), SIZE) == rt.Camera(
+        model, *SIZE, (500, 510, 320, 240, *distortion)
+    )
+
+
+def test_a_camera_of_another_size_is_resized_and_of_another_shape_refused(tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_text("7 OPENCV 1280 960 1000 1020 640 480 -0.1 0.02 0.001 0.002\n")
+    assert parse_camera(str(path), SIZE) == OPENCV
+    with pytest.raises(rt.ReobjError, match="1280x960 images, but the frames are 480x640"):
+        parse_camera(str(path), (480, 640))
+
+
+@pytest.mark.parametrize(
+    "name, content, message",
+    [
+        ("a.json", "{", "line 1: not valid JSON"),
+        ("a.json", "[1, 2]", "not understood"),
+        ("a.json", "{}", "no focal length"),
+        ("a.json", '{"w": 640, "h": 480}', "no focal length"),
+        ("a.json", '{"fx": 500, "cx": 320}', "not understood"),
+        ("a.json", '{"fx": "x"}', "not understood"),
+        ("a.json", '{"K": [1, 2]}', "not understood"),
+        ("a.json", '{"fx": 500, "model": "FOV"}', "no omega of a FOV camera"),
+        ("a.json", '{"fx": 500, "model": "MAGIC"}', "no camera model MAGIC"),
+        ("cameras.txt", "1 PINHOLE 640 480 500 510 320 240\n" * 2, "2 cameras; expected one"),
+        ("K.txt", "1 2\n3 4\n", "expected fx,fy"),
+        ("K.txt", "1 2 3\n3 4\n", "not understood"),
+        ("empty.txt", "", "0 numbers"),
+        ("picture.txt", bytes(range(256)), "cannot be read as text"),
+    ],
+)
+def test_a_wrong_file_is_refused_in_one_line(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(rt.ReobjError, match=message) as refused:
+        parse_camera(str(path), SIZE)
+    assert str(refused.value).startswith(f"--camera {path}: ") and "\n" not in str(refused.value)
+
+
+def test_a_camera_says_its_own_size_where_nothing_else_does():
+    assert stated_camera("PINHOLE 640 480 500 510 320 240", None) == PINHOLE
+    with pytest.raises(rt.ReobjError, match="no image size"):
+        stated_camera("500,510,320,240", None)
+
+
+def test_a_line_reads_back_with_all_digits():
+    camera = rt.Camera("OPENCV", *SIZE, (500.123456789012, 510, 320, 240, 1e-17, 0, 0, 0.1 + 0.2))
+    assert parse_camera(camera_line(camera), SIZE) == camera
+
+
+def test_the_example_rooms_camera_is_read():
+    assert parse_camera(str(ROOM / "camera.txt"), SIZE).K[0, 0] == 492.756788421
+
+
+def test_another_content_of_the_file_is_another_reconstruction(tmp_path, monkeypatch):
+    """The cache knows the camera that a file holds, not its name."""
+    path, cameras = tmp_path / "camera.txt", []
+
+    def found(video, config, work, **_):
+        camera = parse_camera(config.camera, video.size)
+        cameras.append(camera)
+        (work / "sparse").mkdir(parents=True)
+        return dataclasses.replace(supplied(some_cameras(2)), camera=camera, source="pycolmap")
+
+    monkeypatch.setattr(stage, "estimate_poses", found)
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((480, 640, 3), np.uint8))
+    video, workspace = rt.Video(tmp_path / "*.png"), Workspace(tmp_path / "out")
+    config = rt.PosesConfig(camera=str(path))
+    for content in ("500,510,320,240", "PINHOLE 640 480 500 510 320 240", "600,610,320,240"):
+        path.write_text(content)
+        poses, _ = stage.reconstruct_cached(video, config, workspace)
+        assert poses.camera == parse_camera(content, SIZE)
+    assert len(cameras) == 2  # the first two are the same camera
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="no real recordings: set REOBJ_SHARED")
+@pytest.mark.parametrize(
+    "name, size, model, focal",
+    [
+        ("hololens_kitchen/intrinsics.json", (540, 360), "PINHOLE", 495.56775700934577),
+        ("hololens_kitchen/K.txt", (540, 360), "PINHOLE", 495.5677570093457689),
+        ("redkitchen_7scenes/intrinsics.json", (640, 480), "PINHOLE", 530.0),
+        ("studio_room/intrinsics.json", (1920, 1080), "OPENCV", 903.3096914819945),
+        ("studio_room/transforms.json", (1920, 1080), "OPENCV", 903.3096914819945),
+        ("studio_room/colmap_text/cameras.txt", (1920, 1080), "OPENCV", 903.3096914819945),
+        ("tum_fr3_office/intrinsics.json", (640, 480), "PINHOLE", 535.4),
+    ],
+)
+def test_the_cameras_of_real_recordings_are_read(name, size, model, focal):
+    camera = parse_camera(str(DATA / name), size)
+    assert camera.model == model and camera.K[0, 0] == pytest.approx(focal)
+    if "K.txt" not in name:  # the others state their size
+        half = parse_camera(str(DATA / name), (size[0] // 2, size[1] // 2))
+        assert half.K[0, 0] == pytest.approx(focal / 2)
