@@ -70,13 +70,15 @@ from reobj.identity.embedding import (
 )
 from reobj.identity.gaps import fill_gaps
 from reobj.identity.linking import link
-from reobj.identity.reid import (
+from reobj.identity.places import (
     EllipsoidMap,
-    Gallery,
-    SimilarityCalibration,
-    match_probability,
-    part_cosines,
+    VisiblePoints,
+    overlap_within_reach,
+    project_ends,
+    project_spans,
+    spans_of_boxes,
 )
+from reobj.identity.reid import Gallery, SimilarityCalibration, match_probability, part_cosines
 from reobj.identity.sampling import SamplingLayout
 from reobj.objects import ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.options import add_flags, config_from_args, list_options
@@ -292,6 +294,9 @@ class TrackState:
     embedded: IntArray  # (T,) frame of the last embedding, -1: never
     votes: Array  # (T, C) score sums of the classes
     embedding: Floats  # (T, E) running mean of the embeddings
+    ends: Array  # (T, 2, 3) in world, of the span of the viewing ray where the thing is, or NaN
+    size: Array  # (T, 2) width and height in the middle of it, in the unit of the world
+    reach: Array  # (T, 2) px that it may be seen beside its predicted place
 
     def select(self, keep: npt.NDArray[Any]) -> TrackState:
         """Return the chosen tracks."""
@@ -312,13 +317,14 @@ class TrackState:
         zero = np.zeros(len(box), np.int64)
         none, nothing = np.zeros((len(box), 1)), np.zeros((len(box), 0), np.float32)
         return TrackState(
-            mean, cov, tracklet, zero - 1, zero, zero, zero + frame, zero - 1, none, nothing
-        )
+            mean, cov, tracklet, zero - 1, zero, zero, zero + frame, zero - 1, none, nothing,
+            np.full((len(box), 2, 3), np.nan), np.full((len(box), 2), np.nan), 0 * box[:, :2],
+        )  # fmt: skip
 
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 3  # of the files of Tracker.save
+STATE_VERSION = 4  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -381,13 +387,14 @@ class Tracker:
         self.gallery = Gallery()
         self.reid_calibration = SimilarityCalibration()  # of views some time apart
         self.match_calibration = SimilarityCalibration()  # of a track and a detection
-        self.places = EllipsoidMap()
+        self.part = 0  # of the cameras' path, in whose world the latest frame lies
+        self.maps = [EllipsoidMap()]  # places of the identities in the world of each part
         self.last_seen = none  # (I,) frame of each identity's last detection
         self.identity_class = none  # (I,)
         self._next_tracklet = 1
         self._camera_motion = CameraMotion()
-        self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
-        self._last_pose: Array | None = None
+        self._last_pose: Array | None = None  # of the frame before the latest
+        self._pose: Array | None = None  # (3, 4) cam_from_world of the latest frame
         self._view: Array | None = None  # (3, 4) img_from_world of the latest frame
         self._image_size = (0, 0)
         self._latest: Tracks | None = None
@@ -401,6 +408,8 @@ class Tracker:
         embeddings: Embeddings | npt.ArrayLike | None = None,
         cam_from_world: Array | None = None,
         camera: Camera | None = None,
+        points: Array | None = None,
+        part: int = 0,
     ) -> Tracks:
         """Track the detections of the next frame.
 
@@ -411,6 +420,8 @@ class Tracker:
             embeddings: of all detections: an (D, E) array or `Embeddings`.
             cam_from_world: (3, 4) pose of this frame, with `camera`: objects are known by their
                 place in 3D.
+            points: (N, 3) in world, seen in this frame: how far away a new track is.
+            part: of the cameras' path; each has a world of its own, and places in it.
         Returns:
             The detections that belong to a confirmed track; decided once.
         """
@@ -419,10 +430,13 @@ class Tracker:
         given = as_embeddings(embeddings, len(detections))
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, frame, detections, weight)
+        self._enter(part)
         self._predict(frame, cam_from_world, camera)
         track_of = self._associate(detections, lazy)  # (D,) row of the track's state, or -1
         self._update_states(detections, track_of)
         track_of = self._spawn(detections, track_of)
+        if points is not None and self._pose is not None and camera is not None:
+            self._locate(detections, track_of, points, camera.K)
         self._embed(detections, track_of, lazy)
         track_of = self._confirm(track_of)
         self._lazy, self._latest = lazy, self._report(detections, track_of)
@@ -444,24 +458,39 @@ class Tracker:
             return np.empty(0, np.int64), np.empty((0, 0), np.float32)
         return np.flatnonzero(lazy.done), lazy.rows[lazy.done]
 
+    @property
+    def places(self) -> EllipsoidMap:
+        """Places of the identities in the world of the latest frame."""
+        return self.maps[self.part]
+
+    def _enter(self, part: int) -> None:
+        """Go on in the world of another part of the path, in which no track has a place yet."""
+        if part != self.part:
+            self.part, self._last_pose, self.state.ends[:] = part, None, np.nan
+            self.maps += [EllipsoidMap() for _ in range(part + 1 - len(self.maps))]
+
     def _predict(
         self, frame: Image | None, cam_from_world: Array | None, camera: Camera | None
     ) -> None:
         """Predict all tracks, then move them by the camera's own motion.
 
         That is what the image shows, or without an image the known rotation; with a pose, tracks
-        whose object has a place in 3D go where that is seen.
+        whose place in 3D is known go where that is seen.
         """
         state = self.state
         state.mean, state.cov = kalman_predict(state.mean, state.cov, self.config)
         state.mean[:, 2:, 0] = state.mean[:, 2:, 0].clip(1.0)  # a size stays positive
+        state.reach[:] = 0
         self._view, before, pose = None, state.mean[..., 0].copy(), None
         if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
             pose = np.asarray(cam_from_world, np.float64)
+        self._pose = pose
         if frame is not None and self.config.camera_motion:
             motion = self._camera_motion(frame)
             state.mean, state.cov = warp_states(state.mean, state.cov, motion)
             state.mean[:, :2, 0] += self._camera_motion.parallax(before[:, :2])
+            if pose is None:
+                self._last_pose = None  # the tracks are no longer where it saw them
         elif pose is not None and camera is not None and self._last_pose is not None:
             rotation = pose[:, :3] @ self._last_pose[:, :3].T
             turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for what is far
@@ -472,37 +501,80 @@ class Tracker:
         state.missed += in_view | (state.missed == 0)
 
     def _follow_places(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
-        """Move tracks of known place as their ellipsoid's image does.
+        """Move tracks of known place as the image of their ellipsoid or of their span does.
 
         Args:
             predicted: (T, 4) boxes cx, cy, w, h predicted for a camera at rest.
         Returns:
             (T,) True where a detection is to be expected.
         """
-        state = self.state
+        state, K = self.state, camera.K
         self._image_size = size = (camera.width, camera.height)
-        self._view = view = camera.K @ cam_from_world  # (3, 4)
-        self._last_pose = cam_from_world
-        now, before = self.places.project(view, size, PLACE_IN_VIEW), self._place_boxes
-        self._place_boxes = now
+        self._view = view = K @ cam_from_world  # (3, 4)
+        last, self._last_pose = self._last_pose, cam_from_world
         known = _rows_of(self.places.known, state.identity, False)
-        now, before = (_rows_of(boxes, state.identity, np.nan) for boxes in (now, before))
-        in_view = ~known | np.isfinite(now[:, 0])
-        followed = known & (state.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
-        shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
-        moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)  # (T, 4)
-        state.mean[followed, :, 0] = moved[followed]
-        lost = known & (state.missed > 0)
-        where = np.where(in_view[:, None], now, [-1e6, -1e6, 1, 1])  # out of view: matches nothing
+        inside = np.isfinite(self.places.project(view, size, PLACE_IN_VIEW)[:, 0])  # (I,)
+        in_view = ~known | _rows_of(inside, state.identity, False)
+        now, reach = self._seen_places(cam_from_world, K, known)
+        located = known | np.isfinite(state.ends[:, 0, 0])
+        followed = np.zeros(len(known), bool)
+        if last is not None:
+            before, reach_before = self._seen_places(last, K, known)
+            followed = (state.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
+            shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
+            moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
+            state.mean[followed, :, 0] = moved[followed]  # (T, 4)
+            state.reach[followed] = np.abs(reach - reach_before)[followed]
+        lost = located & (state.missed > 0)
+        shown = (in_view & np.isfinite(now[:, 0]))[:, None]
+        where = np.where(shown, now, [-1e6, -1e6, 1, 1])  # out of view: matches nothing
         again = TrackState.spawn(where[lost], state.tracklet[lost], 0, self.config)
         state.mean[lost], state.cov[lost] = again.mean, again.cov
+        state.reach[lost] = np.abs(reach[lost])
+        state.cov[:, :2, 0] += state.reach**2
         return np.asarray(in_view, bool)
 
+    def _seen_places(
+        self, cam_from_world: Array, K: Array, known: BoolArray
+    ) -> tuple[Array, Array]:
+        """Project the places of tracks: those of their identities where known (T,), else spans.
+
+        Returns:
+            (T, 4) boxes cx, cy, w, h, NaN where unknown or out of view; (T, 2) px, one sigma of
+            their centre in the direction that is known least.
+        """
+        state, view = self.state, K @ cam_from_world
+        boxes = self.places.project(view, self._image_size, 0.0)
+        boxes = _rows_of(boxes, state.identity, np.nan)
+        ends = _rows_of(self.places.ends, state.identity, np.nan)
+        spans = project_spans(state.ends, state.size, K, cam_from_world)
+        boxes = np.where(known[:, None], boxes, spans)
+        reach = project_ends(np.where(known[:, None, None], ends, state.ends), view)
+        return boxes, np.nan_to_num(reach)
+
+    def _locate(self, detections: Detections, track_of: IntArray, points: Array, K: Array) -> None:
+        """Note where the tracks seen now are, by the points in their boxes.
+
+        Identities with an ellipsoid do without.
+        """
+        state = self.state
+        rows = np.flatnonzero(track_of >= 0)
+        rows = rows[~_rows_of(self.places.known, state.identity[track_of[rows]], False)]
+        if len(rows) and self._pose is not None:
+            ends, size = spans_of_boxes(detections.xyxy[rows], points, self._pose, K)
+            t = track_of[rows]
+            state.ends[t], state.size[t] = ends, size
+
     def _add_views(self, confirmed: Tracks, view: Array) -> None:
-        """Keep the boxes of this frame as views of their objects, and fit places now and then."""
-        self.places.add(self.frame_number, confirmed.track_id - 1, confirmed.xyxy, view)
-        if self.frame_number % PLACE_REFIT == 0 and self.places.refit(self._image_size):
-            self._place_boxes = self.places.project(view, self._image_size, PLACE_IN_VIEW)
+        """Keep the boxes of this frame as views of their objects, and fit places now and then.
+
+        At once where at least half of them are due, which is where the camera takes wide steps.
+        """
+        identity = confirmed.track_id - 1
+        self.places.add(self.frame_number, identity, confirmed.xyxy, view)
+        due = self.places.due
+        if self.frame_number % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
+            self.places.refit(self._image_size)
 
     def _associate(self, detections: Detections, lazy: LazyEmbeddings) -> IntArray:
         """Match detections to tracks: high scores by motion, then the rest by overlap.
@@ -515,8 +587,8 @@ class Tracker:
         """
         config = self.config
         same_class = _same_class(self.state.votes, detections.class_id)  # (T, D), as all below
-        cost, feasible, iou = self._motion_cost(detections.xyxy, same_class, lazy.available)
-        evidence = IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS
+        cost, feasible, iou, share = self._motion_cost(detections.xyxy, same_class, lazy.available)
+        evidence = share * (IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS)
         priority = self._priority_cost()[:, None]
         first = feasible & (detections.score >= config.high_score)
         weak = (cost + priority > WEAK_MATCH_COST) & (self.state.embedded >= 0)[:, None]
@@ -535,24 +607,27 @@ class Tracker:
 
     def _motion_cost(
         self, xyxy: Array, same_class: BoolArray, has_appearance: bool
-    ) -> tuple[Array, BoolArray, Array]:
+    ) -> tuple[Array, BoolArray, Array, Array]:
         """Compare tracks and detections by motion.
 
         Returns:
             cost in [0, 1] from overlap and gated distance, which pairs pass the gate, and IoU,
-            (T, D) each.
+            (T, D) each; share (T, 1) of what an overlap says where the place is uncertain.
         """
         state, box = self.state, cxcywh_from_xyxy(xyxy)
         iou = box_iou(xyxy_from_cxcywh(state.mean[..., 0]), xyxy)
+        share = np.ones((len(iou), 1))
+        if state.reach.any():
+            iou, share = overlap_within_reach(state.mean[..., 0], state.reach, box)
         distance = squared_mahalanobis(state.mean, state.cov, box[:, :2]) / GATE_CHI2
         feasible = (distance < 1) | (iou > GATE_IOU)
         if not has_appearance:
             growth = np.log(state.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
             feasible &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(-1)
             feasible &= iou >= MOTION_ONLY_IOU
-        cost = (1 - DISTANCE_WEIGHT) * (1 - iou) + DISTANCE_WEIGHT * distance.clip(0, 1)
+        cost = (1 - DISTANCE_WEIGHT) * (1 - iou * share) + DISTANCE_WEIGHT * distance.clip(0, 1)
         cost = cost + CLASS_COST * ~same_class
-        return cost, feasible & (same_class | (iou > LOW_IOU)), iou
+        return cost, feasible & (same_class | (iou * share > LOW_IOU)), iou, share
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
@@ -704,8 +779,8 @@ class Tracker:
         gallery.add(identity, embedding, self._viewing_rays(t))
 
     def _viewing_rays(self, t: IntArray) -> Array:
-        """Return unit vectors (n, 3) in world in which tracks are seen, NaN without a pose."""
-        if self._view is None:
+        """Return unit vectors (n, 3) in which tracks are seen in the world of part 0, else NaN."""
+        if self._view is None or self.part:
             return np.full((len(t), 3), np.nan)
         return viewing_rays(xyxy_from_cxcywh(self.state.mean[t, :, 0]), self._view)
 
@@ -758,14 +833,14 @@ class Tracker:
         identity = np.flatnonzero(self.last_seen < state.first[ready].max(initial=0))  # (I,)
         if not len(identity) or not self.config.remember:
             return result
-        iou = self._place_iou(ready, identity)  # (n, I)
-        at_known_place = iou > LOW_IOU
+        iou, share = self._place_iou(ready, identity)  # (n, I), (I,)
+        at_known_place = iou * share > LOW_IOU
         rays = self._viewing_rays(ready)
         logit = self.reid_calibration.logit(
             *self.gallery.parts(state.embedding[ready], identity, rays)
         )
         logit[at_known_place & np.isinf(logit)] = 0  # no appearance: the place decides
-        logit += np.where(at_known_place, IOU_ODDS * iou - NO_OVERLAP_ODDS, 0)
+        logit += np.where(at_known_place, share * (IOU_ODDS * iou - NO_OVERLAP_ODDS), 0)
         logit -= JUMP_ODDS * self._far_from_own_track(ready, identity)
         possible = self.last_seen[identity] < state.first[ready][:, None]
         possible &= self.identity_class[identity] == state.votes[ready].argmax(1)[:, None]
@@ -778,21 +853,29 @@ class Tracker:
         result[claimed[column]] = identity[column]
         return result
 
-    def _place_iou(self, ready: IntArray, identity: IntArray) -> Array:
-        """Return IoU (n, I) of tracks with the projected places of identities, NaN: unknown."""
-        iou = np.full((len(ready), len(identity)), np.nan)
+    def _place_iou(self, ready: IntArray, identity: IntArray) -> tuple[Array, Array]:
+        """Compare tracks with the projected places of identities, within two sigma of these.
+
+        Returns:
+            IoU (n, I), NaN: unknown; share (I,) of what an overlap says, see
+            `overlap_within_reach`.
+        """
+        iou, share = np.full((len(ready), len(identity)), np.nan), np.ones((len(identity), 1))
         if self._view is not None and len(identity):
             projected = self.places.project(self._view, self._image_size, 0.0)
             places = _rows_of(projected, identity, np.nan)  # (I, 4)
-            box = xyxy_from_cxcywh(self.state.mean[ready, :, 0])
-            iou = np.nan_to_num(box_iou(box, xyxy_from_cxcywh(places)))
-            iou[:, ~_rows_of(self.places.known, identity, False)] = np.nan
-        return iou
+            ends = _rows_of(self.places.ends, identity, np.nan)
+            reach = 2 * np.abs(np.nan_to_num(project_ends(ends, self._view)))
+            box = self.state.mean[ready, :, 0]
+            found, share = overlap_within_reach(places, reach, box)  # (I, n), (I,)
+            known = _rows_of(self.places.known, identity, False)
+            iou[:, known] = np.nan_to_num(found.T[:, known])
+        return iou, np.nan_to_num(share[:, 0])
 
     def _far_from_own_track(self, ready: IntArray, identity: IntArray) -> BoolArray:
         """Mark (n, I) where the identity's own track still coasts, far from the newcomer.
 
-        Only without poses: with them the places in 3D tell.
+        Only of identities without a place in 3D: that tells more.
         """
         state = self.state
         row = np.full(len(self.last_seen), -1)
@@ -801,7 +884,8 @@ class Tracker:
         row = row[identity]  # (I,)
         center = state.mean[ready, :2, 0]
         far = squared_mahalanobis(state.mean[row], state.cov[row], center) > JUMP_GATE * GATE_CHI2
-        return np.asarray(far.T & (row >= 0) & (self._view is None), bool)
+        placed = _rows_of(self.places.known, identity, False) & (self._view is not None)
+        return np.asarray(far.T & (row >= 0) & ~placed, bool)
 
     def _report(self, detections: Detections, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""
@@ -838,6 +922,7 @@ class Tracker:
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
             tracker = cls(TrackerConfig(**facts["config"]), embedder)
+            tracker.maps = [EllipsoidMap() for name in arrays if name.endswith(".dual_q")]
             for key, (owner, name) in tracker._saved().items():
                 old = getattr(owner, name)
                 if old is not None or key in arrays:
@@ -851,12 +936,12 @@ class Tracker:
 
     def _saved(self) -> dict[str, tuple[Any, str]]:
         """List all that changes from frame to frame: owner and attribute, by its name in files."""
-        own = "frame_number last_seen identity_class _next_tracklet _last_pose _place_boxes"
+        own = "frame_number last_seen identity_class _next_tracklet _last_pose part"
         parts: dict[str, tuple[Any, Sequence[str]]] = {
             "tracker": (self, own.split()),
             "state": (self.state, [f.name for f in dataclasses.fields(TrackState)]),
             "gallery": (self.gallery, Gallery.ARRAYS),
-            "places": (self.places, EllipsoidMap.ARRAYS),
+            **{f"places{k or ''}": (m, EllipsoidMap.ARRAYS) for k, m in enumerate(self.maps)},
             "reid_calibration": (self.reid_calibration, SimilarityCalibration.ARRAYS),
             "match_calibration": (self.match_calibration, SimilarityCalibration.ARRAYS),
             "camera_motion": (self._camera_motion, CameraMotion.ARRAYS),
@@ -923,13 +1008,17 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    pose_of, camera = {}, None
+    row_of: dict[int, int] = {}
     if poses is not None:
-        pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
-        camera = scaled_camera(poses.camera, video.scale)
+        row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
+        camera, visible = scaled_camera(poses.camera, video.scale), VisiblePoints(poses)
     for frame in video:
-        pose = pose_of.get(frame.index)
-        tracks = tracker.update(source(frame), frame.image, cam_from_world=pose, camera=camera)
+        known: dict[str, Any] = {}
+        if poses is not None and frame.index in row_of:
+            row = row_of[frame.index]
+            known = {"cam_from_world": poses.cam_from_world[row], "camera": camera,
+                     "points": visible(row), "part": int(poses.part[row])}  # fmt: skip
+        tracks = tracker.update(source(frame), frame.image, **known)
         yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Poses, angle_deg, place_of, undistort_boxes, viewing_rays
-from reobj.identity.reid import SimilarityCalibration, paired_cosine, quick_fit
+from reobj.identity.places import quick_fit
+from reobj.identity.reid import SimilarityCalibration, paired_cosine
 from reobj.types import (
     Array,
     BoolArray,

@@ -74,8 +74,8 @@ def read_poses(path: str | Path, video: Any, fmt: str = "auto", camera: str = ""
         lost = spans(frame[~known].tolist())
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
     status = np.where(known, "supplied", "none")
-    extra = (given.metric, given.up_in_world, given.points, given.colors, tuple(messages))
-    return Poses(intrinsics, frame, time_s, poses, status, "user", *extra)
+    extra = (given.metric, given.up_in_world, given.points, given.colors)
+    return Poses(intrinsics, frame, time_s, poses, status, "user", *extra, messages=tuple(messages))
 
 
 @dataclass(frozen=True, slots=True)
