@@ -21,18 +21,20 @@ from reobj.types import Array, BoolArray, IntArray, cxcywh_from_xyxy
 # ---- Ellipsoids of identities ------------------------------------------------------------------
 
 
+MIN_PARALLAX_DEG = 2.0  # between the views of a fit (chosen)
+
+
 def quick_fit(
-    boxes: Array, img_from_world: Array, image_size: tuple[int, int]
+    boxes: Array, img_from_world: Array, image_size: tuple[int, int], usual_size: float
 ) -> quadrics.ObjectFits:
     """Fit ellipsoids of any size to boxes (V, G, 4) in a few steps (`quadrics.fit_objects`).
 
-    The unit of the world is arbitrary: for the fit, whose prior is in metres, the objects have the
-    size of usual things in the median.
-
     Args:
         img_from_world: (V, 3, 4) K @ cam_from_world.
+        usual_size: of the scene's things in the unit of the world (`usual_size`): the world may
+            have any unit, but the prior of the fit is in metres.
     """
-    ratio = _usual_over_own_size(boxes, img_from_world)
+    ratio = float(np.exp(np.log(quadrics.UNKNOWN_SIZE_M).mean())) / usual_size
     cameras = img_from_world.copy()
     cameras[..., 3] *= ratio
     config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
@@ -48,37 +50,40 @@ def quick_fit(
     return dataclasses.replace(fits, ellipsoids=own, size=fits.size / ratio, cov=cov)
 
 
-def _usual_over_own_size(boxes: Array, img_from_world: Array) -> float:
-    """Return the size of usual things over the median size of these, triangulated roughly."""
+def rough_sizes(boxes: Array, img_from_world: Array) -> Array:
+    """Estimate the sizes of things by triangulating the centres of their boxes (V, G, 4).
+
+    Returns:
+        (V, G) that each view gives, in the unit of the world; NaN without parallax.
+    """
     views, groups = boxes.shape[:2]
     cameras = np.broadcast_to(img_from_world[:, None], (views, groups, 3, 4)).reshape(-1, 3, 4)
     rays = viewing_rays(boxes.reshape(-1, 4), cameras).reshape(views, groups, 3)
     seen = np.isfinite(rays[..., 0])  # (V, G)
+    turned = np.linalg.norm(np.fmax.reduce(rays) - np.fmin.reduce(rays), axis=1)  # (G,) rad
     rays = np.where(seen[..., None], rays, 0)
     inverse = np.linalg.inv(img_from_world[:, :, :3])  # (V, 3, 3)
     centres = -np.einsum("vij,vj->vi", inverse, img_from_world[:, :, 3])  # (V, 3)
-    # sum_v (I - d d') (X - c) = 0; where the rays are parallel, X stays near the cameras
+    # sum_v (I - d d') (X - c) = 0
     across = seen[..., None, None] * np.eye(3) - rays[..., :, None] * rays[..., None, :]
-    total = across.sum(0) + 1e-9 * np.eye(3)  # (G, 3, 3)
-    target = np.einsum("vgij,vj->gi", across, centres) + 1e-9 * centres.mean(0)
-    point = np.linalg.solve(total, target[..., None])[..., 0]  # (G, 3)
+    target = np.einsum("vgij,vj->gi", across, centres)[..., None]  # (G, 3, 1)
+    point = (np.linalg.pinv(across.sum(0), hermitian=True) @ target)[..., 0]  # (G, 3)
     depth = ((point - centres[:, None]) * rays).sum(-1)  # (V, G)
     side = np.sqrt((boxes[..., 2:] - boxes[..., :2]).clip(0).prod(-1))  # (V, G) px
     focal = np.sqrt(np.abs(np.linalg.det(img_from_world[:, :, :3])))  # (V,) px
-    size = np.where(seen & (depth > 0), side * depth / focal[:, None], np.nan)
-    spread = np.where(seen[..., None], rays, np.nan)
-    turned = np.linalg.norm(np.fmax.reduce(spread) - np.fmin.reduce(spread), axis=1)  # (G,) rad
-    wide = turned >= np.radians(MAP_MIN_PARALLAX_DEG)
-    for chosen in (size[:, wide], size):
-        if np.isfinite(chosen).any() and (median := float(np.nanmedian(chosen))) > 0:
-            return float(np.exp(np.log(quadrics.UNKNOWN_SIZE_M).mean())) / median
-    return 1.0
+    use = seen & (depth > 0) & (turned >= np.radians(MIN_PARALLAX_DEG))
+    return np.where(use, side * depth / focal[:, None], np.nan)
+
+
+def usual_size(sizes: Array) -> float:
+    """Return the median of sizes of any shape, of which some are unknown (NaN); 1 if all are."""
+    known = sizes[np.isfinite(sizes) & (sizes > 0)]
+    return float(np.median(known)) if len(known) else 1.0
 
 
 MAP_VIEWS = 16  # views kept of every identity (chosen)
 MAP_FIRST_STEP_DEG = 1.0  # between the viewing rays of two views; doubled whenever they are full
 MAP_MIN_VIEWS = 3  # of a fit: fewer boxes leave an ellipsoid undetermined (9 unknowns, 4 a box)
-MAP_MIN_PARALLAX_DEG = 2.0  # between the views of a fit (chosen)
 # longest half axis over the middle one: objects that were half seen give needles, reaching behind
 # the camera (95 % of priors.json are below 5.8; IDF1 of redkitchen with poses 79.1 -> 88.4)
 MAP_MAX_ELONGATION = 6.0
@@ -96,11 +101,13 @@ class EllipsoidMap:
         frame: (I, V) frame of each view, negative: free. boxes: (I, V, 4) x1, y1, x2, y2.
         img_from_world: (I, V, 3, 4). rays: (I, V, 3) viewing rays, NaN: free.
         step_deg: (I,) between the rays of two views. fresh: (I,) views since the last fit.
-        dual_q: (I, 4, 4) ellipsoids, NaN unknown. ends: (I, 2, 3) one sigma to either side of the
-            centre, in the direction that is known least.
+        size: (I, V) rough, NaN unknown. dual_q: (I, 4, 4) ellipsoids, NaN unknown.
+        ends: (I, 2, 3) one sigma to either side of the centre, in the direction known least.
     """
 
-    ARRAYS = ("frame", "boxes", "img_from_world", "rays", "step_deg", "fresh", "dual_q", "ends")
+    ARRAYS = (
+        "frame", "boxes", "img_from_world", "rays", "step_deg", "fresh", "size", "dual_q", "ends"
+    )  # fmt: skip
 
     def __init__(self) -> None:
         self.frame = np.zeros((0, MAP_VIEWS), np.int64)
@@ -109,6 +116,7 @@ class EllipsoidMap:
         self.rays = np.zeros((0, MAP_VIEWS, 3))
         self.step_deg = np.zeros(0)
         self.fresh = np.zeros(0, np.int64)
+        self.size = np.zeros((0, MAP_VIEWS))
         self.dual_q = np.zeros((0, 4, 4))
         self.ends = np.zeros((0, 2, 3))
 
@@ -155,8 +163,9 @@ class EllipsoidMap:
         boxes = np.full((len(frames), len(due), 4), np.nan)  # (F, O, 4)
         boxes[row, at] = self.boxes[due][at, slot]
         cameras = self.img_from_world[due][at, slot][first]  # (F, 3, 4)
-        fits = quick_fit(boxes, cameras, image_size)
-        good = (fits.status != "rejected") & (fits.parallax_deg >= MAP_MIN_PARALLAX_DEG)  # (O,)
+        self.size[due[at], slot] = rough_sizes(boxes, cameras)[row, at]
+        fits = quick_fit(boxes, cameras, image_size, usual_size(self.size))
+        good = (fits.status != "rejected") & (fits.parallax_deg >= MIN_PARALLAX_DEG)  # (O,)
         axes = np.sort(fits.ellipsoids.half_axes, 1)  # (O, 3)
         good &= axes[:, 2] <= MAP_MAX_ELONGATION * axes[:, 1]
         self.dual_q[due] = np.where(good[:, None, None], fits.ellipsoids.dual_quadrics(), np.nan)
@@ -191,7 +200,7 @@ class EllipsoidMap:
         if extra > 0:
             extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
             fills = {"frame": NO_FRAME, "dual_q": np.nan, "rays": np.nan, "ends": np.nan}
-            fills["step_deg"] = MAP_FIRST_STEP_DEG
+            fills |= {"size": np.nan, "step_deg": MAP_FIRST_STEP_DEG}
             for name in self.ARRAYS:
                 old = getattr(self, name)
                 new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
