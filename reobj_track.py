@@ -39,7 +39,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import hashlib
 import json
 import logging
 import math
@@ -59,7 +58,7 @@ from scipy.optimize import linear_sum_assignment
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera, Poses, scaled_camera, viewing_rays, write_tum
-from reobj.files import Progress, atomic, load_npz, save_npz
+from reobj.files import atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
 from reobj.identity.embedding import (
@@ -86,6 +85,7 @@ from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
     check_directions,
+    poses_key,
     reconstruct_cached,
     supplied_poses,
     write_supplied_model,
@@ -94,6 +94,7 @@ from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, export
 from reobj.results.result import Object, Result, VideoInfo, World, validate_objects
 from reobj.results.scene import write_pictures
+from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import (
     DetectConfig,
@@ -102,7 +103,7 @@ from reobj.sources.detection_files import (
 )
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.recorded import write_detections_npz
-from reobj.sources.video import InputConfig, Video, source_fingerprint
+from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
 from reobj.types import (
     COCO_NAMES,
@@ -123,6 +124,7 @@ from reobj.types import (
     log,
     object_classes,
     option,
+    rows_by,
     unit_rows,
     widen,
     xyxy_from_cxcywh,
@@ -1061,16 +1063,25 @@ def run(
     poses = supplied_poses(video, config.poses) if in_3d else None
     if tracks:
         result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
+        boxes, names = result.tracks, result.class_names
     else:
-        result = _track_video(video, workspace, config, detections, poses, seconds)
+        found = open_detections(video, config.detect, detections, config.threads, config.offline)
+        found, boxes = keep_detections(found, video, workspace), Tracks.empty()
+        if in_3d and not video.is_live:
+            started = time.monotonic()
+            found, boxes = detect_all(found, video, workspace)
+            seconds["detect"] = time.monotonic() - started
+        names = found.class_names
     model = None
     if poses is not None:
-        check_directions(poses, result.tracks)
+        check_directions(poses, boxes if tracks else _tracklets(boxes))
     elif in_3d and not video.is_live:
-        moving = np.isin(np.array([*result.class_names, ""]), config.objects.moving_classes)
-        rows, started = result.tracks[moving[result.tracks.class_id]], time.monotonic()
+        moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
+        rows, started = boxes[moving & (boxes.score >= config.tracker.high_score)], time.monotonic()
         poses, model = reconstruct_cached(video, config.poses, workspace, rows)
         seconds["poses"] = time.monotonic() - started
+    if not tracks:
+        result = _track_video(video, workspace, config, found, poses, seconds)
     workspace.save_last(result, poses)
     workspace.publish_model(model)
     result.poses, result.seconds = poses, seconds
@@ -1097,61 +1108,34 @@ def _track_video(
     video: Video,
     workspace: Workspace,
     config: Config,
-    detections: Any,
+    source: DetectionSource,
     poses: Poses | None,
     seconds: dict[str, float],
 ) -> Result:
-    """Detect and track all frames, or take both from the cache; a live source is never cached."""
-    source = open_detections(video, config.detect, detections, config.threads, config.offline)
-    supplied = "" if poses is None else hashlib.sha256(poses.cam_from_world.tobytes()).hexdigest()
-    key = (source_fingerprint(video.source), config.input, source.key)
-    path = workspace.path("tracks", *key, config.embed, config.tracker, supplied)
-    cached = bool(source.key) and not video.is_live
-    if cached and path.exists():
+    """Track all frames, or take the tracks from the cache; a live source is never cached."""
+    poses = poses if poses is not None and poses.known.any() else None
+    key = (*detections_key(source, video), config.embed, config.tracker, poses_key(poses))
+    path = workspace.path("tracks", *key)
+    if source.key and not video.is_live and path.exists():
         return Result.load_tracked(path)
-    started = time.monotonic()
-    if cached:
-        source = source.cached(
-            workspace.path("detections", *key).with_suffix(""), video.working_size
-        )
-    embed = config.embed
+    started, embed = time.monotonic(), config.embed
     embedder = make_embedder(embed.model, embed.head, config.threads, config.offline)
     tracker = Tracker(config.tracker, embedder)
-    frames: list[int] = []
-    steps: list[Tracks] = []
-    embedded: list[tuple[IntArray, Floats]] = []
-    progress = Progress("track", video.expected)
-    try:
-        for frame, _ in track(video, source, tracker, poses=poses):
-            frames.append(frame.index)
-            steps.append(tracker.latest)
-            embedded.append(tracker.latest_embeddings())
-            progress.step()
-    except KeyboardInterrupt:  # the way to end a live source
-        if not video.is_live:
-            raise
-    finally:
-        progress.close()
-        source.flush()
-    if not frames:
-        why = "--start/--stop/--every leave none, or the file is damaged"
-        raise ReobjError(f"{video.source}: no frame could be read ({why})")
-    tracks = Tracks.concatenate(frames, steps, video.scale)
-    result = Result(tracks, source.class_names, VideoInfo.of(video))
-    result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
-    result.warnings += [*source.messages, *video.messages]
-    if video.is_live:
-        result.warnings += [
-            f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
-            "a live source cannot be read twice: identities only; record it for 3D",
-        ]
-    if not len(result.tracks):
-        result.warnings.append(
-            "no object was tracked: no detections, or all below tracker.new_score"
-        )
+    steps = track(video, source, tracker, poses=poses)
+    result = collect_tracks(steps, tracker, video, source)
     seconds["track"] = time.monotonic() - started
     result.save_tracked(path)
     return result
+
+
+def _tracklets(boxes: Tracks) -> Tracks:
+    """Track detections by motion alone, to check cameras that nothing may rest on yet."""
+    tracker, steps = Tracker(), []
+    rows = rows_by(boxes.frame)
+    for own in rows:
+        tracker.update(Detections(boxes.xyxy[own], boxes.score[own], boxes.class_id[own]))
+        steps.append(tracker.latest)
+    return Tracks.concatenate([int(boxes.frame[own[0]]) for own in rows], steps)
 
 
 def _given_tracks(

@@ -23,13 +23,15 @@ FLOORS = {
     2: "reobj.files reobj.options reobj.identity.gaps reobj.identity.sampling reobj.sources.masks",
     3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded",
     4: "reobj.views reobj.sources.detection_files reobj.identity.camera_motion "
-    "reobj.identity.embedding reobj.identity.reid reobj.poses.keyframes reobj.poses.mapping "
+    "reobj.identity.embedding reobj.identity.reid reobj.identity.places "
+    "reobj.poses.keyframes reobj.poses.mapping "
     "reobj.poses.readers reobj.poses.checks",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.poses.localize reobj.results.result",
     6: "reobj.sources.detectors reobj.poses.estimate reobj.objects reobj.results.workspace "
     "reobj.results.overlay",
-    7: "reobj.poses.stage reobj.results.evaluation reobj.results.export reobj.results.scene",
+    7: "reobj.poses.stage reobj.results.evaluation reobj.results.stages reobj.results.export "
+    "reobj.results.scene",
     8: "reobj_track",
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
