@@ -13,17 +13,18 @@
 
 How it works (start reading at `run()`, then `track()`, then `Tracker.update()`):
   1. detect    boxes, scores, classes and masks of every frame: an ONNX model, a file, or a callable
-  2. predict   constant-velocity Kalman filter, moved along with the camera's own motion
-  3. associate gate by motion, then one cost from overlap and appearance; high scores first
-  4. embed     one feature map a frame, pooled under each object (foreground) and around it
-  5. recognise objects that come back, from a gallery that never expires
-  6. poses     keyframes -> pycolmap -> PnP for the frames between; or poses supplied by the user
+  2. poses     keyframes -> pycolmap -> PnP for the frames between; or poses supplied by the user
+  3. predict   constant-velocity Kalman filter, moved along with the camera: by the place in 3D of
+               each object where the frame has a pose, else by the motion of the image
+  4. associate gate by motion, then one cost from overlap and appearance; high scores first
+  5. embed     one feature map a frame, pooled under each object (foreground) and around it
+  6. recognise objects that come back, by place, and from a gallery that never expires
   7. link      tracklets that explain the same place in 3D become one object, or are split again
   8. fit       one solid and its ellipsoid per object from its boxes and a size prior (quadrics.py)
 
 This file is the tool: Kalman filter, association, re-identification, the loop, the command line.
 What it uses lies in the package `reobj`: sources/ (video, detections, weights), identity/
-(embeddings, gallery, linking), poses/ (cameras), objects.py (the fit), results/ (files, pages).
+(embeddings, gallery, places, linking), poses/ (cameras), objects.py (the fit), results/ (files, pages).
 
 Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
 [0, 1] and has its centre at (0.5, 0.5) as in COLMAP; `b_from_a` maps coordinates in a to b;
@@ -53,7 +54,6 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 import quadrics
 from reobj import __version__
@@ -61,23 +61,23 @@ from reobj.cameras import Camera, Poses, scaled_camera, viewing_rays, write_tum
 from reobj.files import atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
-from reobj.identity.embedding import (
-    EmbedConfig,
-    Embedder,
-    LazyEmbeddings,
-    as_embeddings,
-)
+from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
 from reobj.identity.gaps import fill_gaps
 from reobj.identity.linking import link
 from reobj.identity.places import (
     EllipsoidMap,
     VisiblePoints,
     overlap_within_reach,
-    project_ends,
-    project_spans,
+    rows_of,
     spans_of_boxes,
-)
-from reobj.identity.reid import Gallery, SimilarityCalibration, match_probability, part_cosines
+)  # fmt: skip
+from reobj.identity.reid import (
+    Gallery,
+    SimilarityCalibration,
+    assign,
+    match_probability,
+    part_cosines,
+)  # fmt: skip
 from reobj.identity.sampling import SamplingLayout
 from reobj.objects import ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.options import add_flags, config_from_args, list_options
@@ -96,11 +96,7 @@ from reobj.results.result import Object, Result, VideoInfo, World, validate_obje
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import (
-    DetectConfig,
-    read_detections,
-    read_tracks,
-)
+from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
@@ -514,14 +510,15 @@ class Tracker:
         self._image_size = size = (camera.width, camera.height)
         self._view = view = K @ cam_from_world  # (3, 4)
         last, self._last_pose = self._last_pose, cam_from_world
-        known = _rows_of(self.places.known, state.identity, False)
+        known = rows_of(self.places.known, state.identity, False)
         inside = np.isfinite(self.places.project(view, size, PLACE_IN_VIEW)[:, 0])  # (I,)
-        in_view = ~known | _rows_of(inside, state.identity, False)
-        now, reach = self._seen_places(cam_from_world, K, known)
+        in_view = ~known | rows_of(inside, state.identity, False)
+        tracked = (state.identity, state.ends, state.size, K, size)
+        now, reach = self.places.tracks_seen(cam_from_world, *tracked)
         located = known | np.isfinite(state.ends[:, 0, 0])
         followed = np.zeros(len(known), bool)
         if last is not None:
-            before, reach_before = self._seen_places(last, K, known)
+            before, reach_before = self.places.tracks_seen(last, *tracked)
             followed = (state.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
             shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
             moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
@@ -536,24 +533,6 @@ class Tracker:
         state.cov[:, :2, 0] += state.reach**2
         return np.asarray(in_view, bool)
 
-    def _seen_places(
-        self, cam_from_world: Array, K: Array, known: BoolArray
-    ) -> tuple[Array, Array]:
-        """Project the places of tracks: those of their identities where known (T,), else spans.
-
-        Returns:
-            (T, 4) boxes cx, cy, w, h, NaN where unknown or out of view; (T, 2) px, one sigma of
-            their centre in the direction that is known least.
-        """
-        state, view = self.state, K @ cam_from_world
-        boxes = self.places.project(view, self._image_size, 0.0)
-        boxes = _rows_of(boxes, state.identity, np.nan)
-        ends = _rows_of(self.places.ends, state.identity, np.nan)
-        spans = project_spans(state.ends, state.size, K, cam_from_world)
-        boxes = np.where(known[:, None], boxes, spans)
-        reach = project_ends(np.where(known[:, None, None], ends, state.ends), view)
-        return boxes, np.nan_to_num(reach)
-
     def _locate(self, detections: Detections, track_of: IntArray, points: Array, K: Array) -> None:
         """Note where the tracks seen now are, by the points in their boxes.
 
@@ -561,7 +540,7 @@ class Tracker:
         """
         state = self.state
         rows = np.flatnonzero(track_of >= 0)
-        rows = rows[~_rows_of(self.places.known, state.identity[track_of[rows]], False)]
+        rows = rows[~rows_of(self.places.known, state.identity[track_of[rows]], False)]
         if len(rows) and self._pose is not None:
             ends, size = spans_of_boxes(detections.xyxy[rows], points, self._pose, K)
             t = track_of[rows]
@@ -671,7 +650,7 @@ class Tracker:
         while True:
             track_of[:] = -1
             good = feasible & ~refused & (cost < MAX_COST)
-            _assign(cost + priority, good, track_of)
+            assign(cost + priority, good, track_of)
             matched = np.flatnonzero(track_of >= 0)
             matched = matched[must_agree[track_of[matched], matched] & ~compared[matched]]
             ask = (rivals & must_agree)[track_of[matched]].any(0)  # (D,) and their rivals
@@ -769,7 +748,7 @@ class Tracker:
         if len(rows):
             own = state.embedding[track_of[rows]]
             parts = part_cosines(own, lazy.get(rows), lazy.foreground_width)  # (n, n) each
-            _calibrate(self.match_calibration, parts, detections.class_id[rows])
+            self.match_calibration.add_frame(*parts, detections.class_id[rows])
 
     def _add_to_gallery(self, embedding: Floats, t: IntArray, class_id: IntArray) -> None:
         """Add embeddings (n, E) of tracks t to the gallery, and calibrate with its first views."""
@@ -777,7 +756,7 @@ class Tracker:
         if len(gallery.count):
             first = gallery.rows[identity, 0] * (gallery.count[identity, None] > 1)
             parts = part_cosines(embedding, first, gallery.foreground_width)
-            _calibrate(self.reid_calibration, parts, class_id)
+            self.reid_calibration.add_frame(*parts, class_id)
         gallery.add(identity, embedding, self._viewing_rays(t))
 
     def _viewing_rays(self, t: IntArray) -> Array:
@@ -835,7 +814,8 @@ class Tracker:
         identity = np.flatnonzero(self.last_seen < state.first[ready].max(initial=0))  # (I,)
         if not len(identity) or not self.config.remember:
             return result
-        iou, share = self._place_iou(ready, identity)  # (n, I), (I,)
+        box = state.mean[ready, :, 0]
+        iou, share = self.places.overlap(box, identity, self._view, self._image_size)
         at_known_place = iou * share > LOW_IOU
         rays = self._viewing_rays(ready)
         logit = self.reid_calibration.logit(
@@ -850,29 +830,10 @@ class Tracker:
         probability = match_probability(logit)
         claimed = np.full(len(identity), -1, np.int64)
         good = probability >= self.config.return_probability
-        _assign(1 - probability, good | (at_known_place & (logit > 0)), claimed)
+        assign(1 - probability, good | (at_known_place & (logit > 0)), claimed)
         column = np.flatnonzero(claimed >= 0)
         result[claimed[column]] = identity[column]
         return result
-
-    def _place_iou(self, ready: IntArray, identity: IntArray) -> tuple[Array, Array]:
-        """Compare tracks with the projected places of identities, within two sigma of these.
-
-        Returns:
-            IoU (n, I), NaN: unknown; share (I,) of what an overlap says, see
-            `overlap_within_reach`.
-        """
-        iou, share = np.full((len(ready), len(identity)), np.nan), np.ones((len(identity), 1))
-        if self._view is not None and len(identity):
-            projected = self.places.project(self._view, self._image_size, 0.0)
-            places = _rows_of(projected, identity, np.nan)  # (I, 4)
-            ends = _rows_of(self.places.ends, identity, np.nan)
-            reach = 2 * np.abs(np.nan_to_num(project_ends(ends, self._view)))
-            box = self.state.mean[ready, :, 0]
-            found, share = overlap_within_reach(places, reach, box)  # (I, n), (I,)
-            known = _rows_of(self.places.known, identity, False)
-            iou[:, known] = np.nan_to_num(found.T[:, known])
-        return iou, np.nan_to_num(share[:, 0])
 
     def _far_from_own_track(self, ready: IntArray, identity: IntArray) -> BoolArray:
         """Mark (n, I) where the identity's own track still coasts, far from the newcomer.
@@ -886,7 +847,7 @@ class Tracker:
         row = row[identity]  # (I,)
         center = state.mean[ready, :2, 0]
         far = squared_mahalanobis(state.mean[row], state.cov[row], center) > JUMP_GATE * GATE_CHI2
-        placed = _rows_of(self.places.known, identity, False) & (self._view is not None)
+        placed = rows_of(self.places.known, identity, False) & (self._view is not None)
         return np.asarray(far.T & (row >= 0) & ~placed, bool)
 
     def _report(self, detections: Detections, track_of: IntArray) -> Tracks:
@@ -951,35 +912,10 @@ class Tracker:
         return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
 
 
-def _calibrate(
-    calibration: SimilarityCalibration, parts: tuple[Array, Array], class_id: IntArray
-) -> None:
-    """Show a calibration all pairs of one class in a frame, (n, n): the diagonal is one object."""
-    fore, back = parts
-    own = np.eye(len(class_id), dtype=bool)
-    other = (class_id[:, None] == class_id) & ~own
-    calibration.add(fore[own], back[own], True)
-    calibration.add(fore[other], back[other], False)
-
-
-def _rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
-    """Take rows of a table of identities (I, ...), `missing` where there is none: (T, ...)."""
-    table = np.concatenate([rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)])
-    return np.asarray(table[np.where(identity < len(rows), identity, -1)])
-
-
 def _same_class(votes: Array, class_id: IntArray) -> BoolArray:
     """Mark pairs (T, D) whose detection has the class that the track was mostly seen as."""
     own = votes.argmax(1) if votes.size else np.zeros(len(votes), np.int64)
     return np.asarray(own[:, None] == class_id[None], bool)
-
-
-def _assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
-    """Match as many rows to columns as possible, then at least cost; fills row_of_column (C,)."""
-    if possible.any():
-        rows, columns = linear_sum_assignment(np.where(possible, cost, 1e3))
-        good = possible[rows, columns]
-        row_of_column[columns[good]] = rows[good]
 
 
 # ---- The loop ----------------------------------------------------------------------------------

@@ -111,12 +111,11 @@ def test_without_parallax_there_is_no_place(walked: float, known: bool) -> None:
     assert bool(mapped([ball(0)], views).known[0]) is known
 
 
-def test_views_that_contradict_each_other_give_no_place() -> None:
-    """Boxes that jump to and fro, as of a track that slips between two things."""
-    places = EllipsoidMap()
+def test_boxes_at_random_give_no_place() -> None:
+    places, rng = EllipsoidMap(), np.random.default_rng(3)
     for i, view in enumerate(WALK):
-        jump = outline(ball(0), view) + 150 * (i % 2) * np.array([1, -1, 1, -1])
-        places.add(5 * i, one(), jump[None], view)
+        corner, side = rng.uniform(0, 400, 2), rng.uniform(10, 80, 2)
+        places.add(5 * i, one(), np.concatenate([corner, corner + side])[None], view)
         places.refit(SIZE)
     assert not places.known[0]
 
@@ -206,7 +205,7 @@ def test_the_points_in_a_box_tell_how_far_away_its_thing_is() -> None:
     boxes = np.array([[352.5, 210, 412.5, 270], [150, 220, 190, 260.0]])
     ends, size = spans_of_boxes(boxes, np.concatenate([on_ball, wall]), EYE, CAMERA.K)
     assert 3.7 < ends[0, 0, 2] < 4.0 < ends[0, 1, 2] < 4.6 and 5 < ends[1].mean(0)[2] < 7
-    np.testing.assert_allclose(size[0], 60 / 500 * 4, rtol=0.03)
+    np.testing.assert_allclose(size[0], 60 / 500 * 4, rtol=0.06)
     there = project_spans(ends, size, CAMERA.K, EYE)
     np.testing.assert_allclose(xyxy_from_cxcywh(there), boxes, atol=1e-6)
     assert np.abs(project_ends(ends, CAMERA.K @ EYE)).max() < 1e-6  # on the rays of this view

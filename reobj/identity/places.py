@@ -11,8 +11,10 @@ Axes: I identities, V views, G groups of boxes, D detections, T tracks, N points
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Poses, viewing_rays
@@ -195,6 +197,45 @@ class EllipsoidMap:
         seen = before_camera[0] & (area > share * whole)
         return np.where(seen[:, None], cxcywh_from_xyxy(cut), np.nan)
 
+    def tracks_seen(
+        self, cam_from_world: Array, identity: IntArray, ends: Array, size: Array, K: Array,
+        image_size: tuple[int, int],
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Project the places of tracks: of their identities (T,) where known, else their spans.
+
+        Args:
+            ends, size: (T, 2, 3), (T, 2) of the spans (`spans_of_boxes`).
+        Returns:
+            (T, 4) boxes cx, cy, w, h, NaN where unknown or out of view; (T, 2) px, one sigma of
+            their centre in the direction that is known least.
+        """
+        view, known = K @ cam_from_world, rows_of(self.known, identity, False)
+        boxes = rows_of(self.project(view, image_size, 0.0), identity, np.nan)
+        spans = project_spans(ends, size, K, cam_from_world)
+        own = rows_of(self.ends, identity, np.nan)
+        reach = project_ends(np.where(known[:, None, None], own, ends), view)
+        return np.where(known[:, None], boxes, spans), np.nan_to_num(reach)
+
+    def overlap(
+        self, box: Array, identity: IntArray, view: Array | None, image_size: tuple[int, int]
+    ) -> tuple[Array, Array]:
+        """Compare boxes (n, 4) cx, cy, w, h with places of identities (I,), within two sigma.
+
+        Args:
+            view: (3, 4) img_from_world; None: nothing is known.
+        Returns:
+            IoU (n, I), NaN: unknown; share (I,) of what an overlap says (`overlap_within_reach`).
+        """
+        iou, share = np.full((len(box), len(identity)), np.nan), np.ones(len(identity))
+        if view is not None and len(identity):
+            places = rows_of(self.project(view, image_size, 0.0), identity, np.nan)  # (I, 4)
+            reach = 2 * np.abs(project_ends(rows_of(self.ends, identity, np.nan), view))
+            found, share = overlap_within_reach(places, np.nan_to_num(reach), box)  # (I, n)
+            known = rows_of(self.known, identity, False)
+            iou[:, known] = np.nan_to_num(found.T[:, known])
+            share = np.nan_to_num(share[:, 0])
+        return iou, share
+
     def _grow(self, identities: int) -> None:
         extra = identities - len(self.frame)
         if extra > 0:
@@ -205,6 +246,12 @@ class EllipsoidMap:
                 old = getattr(self, name)
                 new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
                 setattr(self, name, np.concatenate([old, new]))
+
+
+def rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
+    """Take rows of a table of identities (I, ...), `missing` where there is none: (T, ...)."""
+    table = np.concatenate([rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)])
+    return np.asarray(table[np.where(identity < len(rows), identity, -1)])
 
 
 # ---- Spans of tracks ---------------------------------------------------------------------------
@@ -233,7 +280,8 @@ class VisiblePoints:
         near = [i for i in near if 0 <= i < len(self.rows)]
         near = [i for i in near if self.part[self.rows[i]] == self.part[row]]
         seen = [self.observed[self.starts[i] : self.stops[i]] for i in near]
-        return self.points[np.unique(np.concatenate([np.empty(0, np.int64), *seen]))]
+        rows = np.unique(np.concatenate([np.empty(0, np.int64), *seen]))
+        return np.asarray(self.points[rows], np.float64)
 
 
 def spans_of_boxes(

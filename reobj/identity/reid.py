@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
 
 from reobj.cameras import angle_deg
-from reobj.types import Array, Floats, IntArray, unit_rows
+from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
 
 # ---- Gallery -----------------------------------------------------------------------------------
 
@@ -193,6 +194,13 @@ class SimilarityCalibration:
         value = np.where(known, value, 0.0)
         self.moments[int(same)] += [known.sum(1), value.sum(1), (value * value).sum(1)]
 
+    def add_frame(self, foreground: Array, background: Array, class_id: IntArray) -> None:
+        """Add all pairs of one class in a frame, cosines (n, n): the diagonal is one object."""
+        own = np.eye(len(class_id), dtype=bool)
+        other = (class_id[:, None] == class_id) & ~own
+        self.add(foreground[own], background[own], True)
+        self.add(foreground[other], background[other], False)
+
     def logit(
         self,
         foreground: npt.ArrayLike,
@@ -257,3 +265,11 @@ def _best_other(odds: Array) -> Array:
     """Return (N, M) the largest of the other entries of the row, 0 if there are none."""
     top = np.sort(np.pad(odds, ((0, 0), (2, 0))), 1)[:, -2:]  # (N, 2) second, best
     return np.where(odds == top[:, 1:], top[:, :1], top[:, 1:])
+
+
+def assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
+    """Match as many rows to columns as possible, then at least cost; fills row_of_column (C,)."""
+    if possible.any():
+        rows, columns = linear_sum_assignment(np.where(possible, cost, 1e3))
+        good = possible[rows, columns]
+        row_of_column[columns[good]] = rows[good]
