@@ -24,7 +24,7 @@ How it works (start reading at `run()`, then `track()`, then `Tracker.update()`)
 
 This file is the tool: Kalman filter, association, re-identification, the loop, the command line.
 What it uses lies in the package `reobj`: sources/ (video, detections, weights), identity/
-(embeddings, gallery, places, linking), poses/ (cameras), objects.py (the fit), results/ (files, pages).
+(embeddings, gallery, linking), poses/ (cameras), objects.py (the fit), results/ (files, pages).
 
 Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
 [0, 1] and has its centre at (0.5, 0.5) as in COLMAP; `b_from_a` maps coordinates in a to b;
@@ -57,7 +57,7 @@ import numpy.typing as npt
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera, Poses, scaled_camera, viewing_rays, write_tum
+from reobj.cameras import Camera, Poses, viewing_rays, write_tum
 from reobj.files import atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
@@ -65,8 +65,8 @@ from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_e
 from reobj.identity.gaps import fill_gaps
 from reobj.identity.linking import link
 from reobj.identity.places import (
+    CamerasOfFrames,
     EllipsoidMap,
-    VisiblePoints,
     overlap_within_reach,
     rows_of,
     spans_of_boxes,
@@ -434,7 +434,7 @@ class Tracker:
         self._update_states(detections, track_of)
         track_of = self._spawn(detections, track_of)
         if points is not None and self._pose is not None and camera is not None:
-            self._locate(detections, track_of, points, camera.K)
+            self._locate(detections, track_of, points, self._pose, camera.K)
         self._embed(detections, track_of, lazy)
         track_of = self._confirm(track_of)
         self._lazy, self._latest = lazy, self._report(detections, track_of)
@@ -533,7 +533,9 @@ class Tracker:
         state.cov[:, :2, 0] += state.reach**2
         return np.asarray(in_view, bool)
 
-    def _locate(self, detections: Detections, track_of: IntArray, points: Array, K: Array) -> None:
+    def _locate(
+        self, detections: Detections, track_of: IntArray, points: Array, pose: Array, K: Array
+    ) -> None:
         """Note where the tracks seen now are, by the points in their boxes.
 
         Identities with an ellipsoid do without.
@@ -541,10 +543,8 @@ class Tracker:
         state = self.state
         rows = np.flatnonzero(track_of >= 0)
         rows = rows[~rows_of(self.places.known, state.identity[track_of[rows]], False)]
-        if len(rows) and self._pose is not None:
-            ends, size = spans_of_boxes(detections.xyxy[rows], points, self._pose, K)
-            t = track_of[rows]
-            state.ends[t], state.size[t] = ends, size
+        spans = spans_of_boxes(detections.xyxy[rows], points, pose, K)
+        state.ends[track_of[rows]], state.size[track_of[rows]] = spans
 
     def _add_views(self, confirmed: Tracks, view: Array) -> None:
         """Keep the boxes of this frame as views of their objects, and fit places now and then.
@@ -946,17 +946,9 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    row_of: dict[int, int] = {}
-    if poses is not None:
-        row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
-        camera, visible = scaled_camera(poses.camera, video.scale), VisiblePoints(poses)
+    told = CamerasOfFrames(poses, video.scale)
     for frame in video:
-        known: dict[str, Any] = {}
-        if poses is not None and frame.index in row_of:
-            row = row_of[frame.index]
-            known = {"cam_from_world": poses.cam_from_world[row], "camera": camera,
-                     "points": visible(row), "part": int(poses.part[row])}  # fmt: skip
-        tracks = tracker.update(source(frame), frame.image, **known)
+        tracks = tracker.update(source(frame), frame.image, **told(frame.index))
         yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 

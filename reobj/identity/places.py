@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.cameras import Poses, viewing_rays
+from reobj.cameras import Poses, scaled_camera, viewing_rays
 from reobj.types import Array, BoolArray, IntArray, cxcywh_from_xyxy
 
 # ---- Ellipsoids of identities ------------------------------------------------------------------
@@ -282,6 +282,32 @@ class VisiblePoints:
         seen = [self.observed[self.starts[i] : self.stops[i]] for i in near]
         rows = np.unique(np.concatenate([np.empty(0, np.int64), *seen]))
         return np.asarray(self.points[rows], np.float64)
+
+
+class CamerasOfFrames:
+    """Answer what a tracker is told of the camera of a frame: keyword arguments of its `update`.
+
+    Args:
+        poses: of the video; None: nothing is known. scale: px of the frames per native px.
+    """
+
+    def __init__(self, poses: Poses | None, scale: float) -> None:
+        self.poses, self.row_of = poses, {}
+        if poses is not None:
+            self.row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
+            self.camera, self.visible = scaled_camera(poses.camera, scale), VisiblePoints(poses)
+
+    def __call__(self, frame: int) -> dict[str, Any]:
+        """Return pose, camera, points and part of a frame, by its number in the source."""
+        if self.poses is None or frame not in self.row_of:
+            return {}
+        row = self.row_of[frame]
+        return {
+            "cam_from_world": self.poses.cam_from_world[row],
+            "camera": self.camera,
+            "points": self.visible(row),
+            "part": int(self.poses.part[row]),
+        }
 
 
 def spans_of_boxes(
