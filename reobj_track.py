@@ -434,7 +434,7 @@ class Tracker:
         self._update_states(detections, track_of)
         track_of = self._spawn(detections, track_of)
         if points is not None and self._pose is not None and camera is not None:
-            self._locate(detections, track_of, points, self._pose, camera.K)
+            self._note_spans(detections, track_of, points, self._pose, camera.K)
         self._embed(detections, track_of, lazy)
         track_of = self._confirm(track_of)
         self._lazy, self._latest = lazy, self._report(detections, track_of)
@@ -533,7 +533,7 @@ class Tracker:
         state.cov[:, :2, 0] += state.reach**2
         return np.asarray(in_view, bool)
 
-    def _locate(
+    def _note_spans(
         self, detections: Detections, track_of: IntArray, points: Array, pose: Array, K: Array
     ) -> None:
         """Note where the tracks seen now are, by the points in their boxes.

@@ -276,10 +276,10 @@ class VisiblePoints:
     def __call__(self, row: int) -> Array:
         """Return the points (N, 3) in world that a row of the poses sees."""
         at = int(np.searchsorted(self.rows, row))
-        near = [at] if at < len(self.rows) and self.rows[at] == row else [at - 1, at]
-        near = [i for i in near if 0 <= i < len(self.rows)]
-        near = [i for i in near if self.part[self.rows[i]] == self.part[row]]
-        seen = [self.observed[self.starts[i] : self.stops[i]] for i in near]
+        beside = [at] if at < len(self.rows) and self.rows[at] == row else [at - 1, at]
+        beside = [i for i in beside if 0 <= i < len(self.rows)]
+        beside = [i for i in beside if self.part[self.rows[i]] == self.part[row]]
+        seen = [self.observed[self.starts[i] : self.stops[i]] for i in beside]
         rows = np.unique(np.concatenate([np.empty(0, np.int64), *seen]))
         return np.asarray(self.points[rows], np.float64)
 
