@@ -13,11 +13,12 @@
 
 How it works (start reading at `run()`, then `track()`, then `Tracker.update()`):
   1. detect    boxes, scores, classes and masks of every frame: an ONNX model, a file, or a callable
-  2. predict   constant-velocity Kalman filter, moved along with the camera's own motion
-  3. associate gate by motion, then one cost from overlap and appearance; high scores first
-  4. embed     one feature map a frame, pooled under each object (foreground) and around it
-  5. recognise objects that come back, from a gallery that never expires
-  6. poses     keyframes -> pycolmap -> PnP for the frames between; or poses supplied by the user
+  2. poses     keyframes -> pycolmap -> PnP for the frames between; or poses supplied by the user
+  3. predict   constant-velocity Kalman filter, moved along with the camera: by the place in 3D of
+               each object where the frame has a pose, else by the motion of the image
+  4. associate gate by motion, then one cost from overlap and appearance; high scores first
+  5. embed     one feature map a frame, pooled under each object (foreground) and around it
+  6. recognise objects that come back, by place, and from a gallery that never expires
   7. link      tracklets that explain the same place in 3D become one object, or are split again
   8. fit       one solid and its ellipsoid per object from its boxes and a size prior (quadrics.py)
 
@@ -39,7 +40,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import hashlib
 import json
 import logging
 import math
@@ -54,28 +54,29 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera, Poses, scaled_camera, viewing_rays
-from reobj.files import Progress, atomic, load_npz, save_npz
+from reobj.cameras import Camera, Poses, viewing_rays
+from reobj.files import atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
-from reobj.identity.embedding import (
-    EmbedConfig,
-    Embedder,
-    LazyEmbeddings,
-    as_embeddings,
-)
+from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
 from reobj.identity.gaps import fill_gaps
-from reobj.identity.reid import (
+from reobj.identity.places import (
+    CamerasOfFrames,
     EllipsoidMap,
+    overlap_within_reach,
+    rows_of,
+    spans_of_boxes,
+)  # fmt: skip
+from reobj.identity.reid import (
     Gallery,
     SimilarityCalibration,
+    assign,
     match_probability,
     part_cosines,
-)
+)  # fmt: skip
 from reobj.identity.sampling import SamplingLayout
 from reobj.objects import ObjectsConfig
 from reobj.options import add_flags, config_from_args, list_options
@@ -85,6 +86,7 @@ from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
     check_directions,
+    poses_key,
     reconstruct_cached,
     supplied_poses,
     write_supplied_model,
@@ -101,15 +103,12 @@ from reobj.results.result import (
     write_trajectories,
 )
 from reobj.results.scene import write_pictures
+from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import (
-    DetectConfig,
-    read_detections,
-    read_tracks,
-)
+from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.recorded import write_detections_npz
-from reobj.sources.video import InputConfig, Video, source_fingerprint
+from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
 from reobj.types import (
     COCO_NAMES,
@@ -129,6 +128,7 @@ from reobj.types import (
     cxcywh_from_xyxy,
     log,
     option,
+    rows_by,
     unit_rows,
     widen,
     xyxy_from_cxcywh,
@@ -299,6 +299,9 @@ class TrackState:
     embedded: IntArray  # (T,) frame of the last embedding, -1: never
     votes: Array  # (T, C) score sums of the classes
     embedding: Floats  # (T, E) running mean of the embeddings
+    ends: Array  # (T, 2, 3) in world, of the span of the viewing ray where the thing is, or NaN
+    size: Array  # (T, 2) width and height in the middle of it, in the unit of the world
+    reach: Array  # (T, 2) px that it may be seen beside its predicted place
 
     def select(self, keep: npt.NDArray[Any]) -> TrackState:
         """Return the chosen tracks."""
@@ -319,13 +322,14 @@ class TrackState:
         zero = np.zeros(len(box), np.int64)
         none, nothing = np.zeros((len(box), 1)), np.zeros((len(box), 0), np.float32)
         return TrackState(
-            mean, cov, tracklet, zero - 1, zero, zero, zero + frame, zero - 1, none, nothing
-        )
+            mean, cov, tracklet, zero - 1, zero, zero, zero + frame, zero - 1, none, nothing,
+            np.full((len(box), 2, 3), np.nan), np.full((len(box), 2), np.nan), 0 * box[:, :2],
+        )  # fmt: skip
 
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 3  # of the files of Tracker.save
+STATE_VERSION = 4  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -388,13 +392,14 @@ class Tracker:
         self.gallery = Gallery()
         self.reid_calibration = SimilarityCalibration()  # of views some time apart
         self.match_calibration = SimilarityCalibration()  # of a track and a detection
-        self.places = EllipsoidMap()
+        self.part = 0  # of the cameras' path, in whose world the latest frame lies
+        self.maps = [EllipsoidMap()]  # places of the identities in the world of each part
         self.last_seen = none  # (I,) frame of each identity's last detection
         self.identity_class = none  # (I,)
         self._next_tracklet = 1
         self._camera_motion = CameraMotion()
-        self._place_boxes = np.empty((0, 4))  # (I, 4) of the places in the latest frame
-        self._last_pose: Array | None = None
+        self._last_pose: Array | None = None  # of the frame before the latest
+        self._pose: Array | None = None  # (3, 4) cam_from_world of the latest frame
         self._view: Array | None = None  # (3, 4) img_from_world of the latest frame
         self._image_size = (0, 0)
         self._latest: Tracks | None = None
@@ -408,6 +413,8 @@ class Tracker:
         embeddings: Embeddings | npt.ArrayLike | None = None,
         cam_from_world: Array | None = None,
         camera: Camera | None = None,
+        points: Array | None = None,
+        part: int = 0,
     ) -> Tracks:
         """Track the detections of the next frame.
 
@@ -418,6 +425,8 @@ class Tracker:
             embeddings: of all detections: an (D, E) array or `Embeddings`.
             cam_from_world: (3, 4) pose of this frame, with `camera`: objects are known by their
                 place in 3D.
+            points: (N, 3) in world, seen in this frame: how far away a new track is.
+            part: of the cameras' path; each has a world of its own, and places in it.
         Returns:
             The detections that belong to a confirmed track; decided once.
         """
@@ -426,10 +435,13 @@ class Tracker:
         given = as_embeddings(embeddings, len(detections))
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, frame, detections, weight)
+        self._enter(part)
         self._predict(frame, cam_from_world, camera)
         track_of = self._associate(detections, lazy)  # (D,) row of the track's state, or -1
         self._update_states(detections, track_of)
         track_of = self._spawn(detections, track_of)
+        if points is not None and self._pose is not None and camera is not None:
+            self._note_spans(detections, track_of, points, self._pose, camera.K)
         self._embed(detections, track_of, lazy)
         track_of = self._confirm(track_of)
         self._lazy, self._latest = lazy, self._report(detections, track_of)
@@ -451,24 +463,39 @@ class Tracker:
             return np.empty(0, np.int64), np.empty((0, 0), np.float32)
         return np.flatnonzero(lazy.done), lazy.rows[lazy.done]
 
+    @property
+    def places(self) -> EllipsoidMap:
+        """Places of the identities in the world of the latest frame."""
+        return self.maps[self.part]
+
+    def _enter(self, part: int) -> None:
+        """Go on in the world of another part of the path, in which no track has a place yet."""
+        if part != self.part:
+            self.part, self._last_pose, self.state.ends[:] = part, None, np.nan
+            self.maps += [EllipsoidMap() for _ in range(part + 1 - len(self.maps))]
+
     def _predict(
         self, frame: Image | None, cam_from_world: Array | None, camera: Camera | None
     ) -> None:
         """Predict all tracks, then move them by the camera's own motion.
 
         That is what the image shows, or without an image the known rotation; with a pose, tracks
-        whose object has a place in 3D go where that is seen.
+        whose place in 3D is known go where that is seen.
         """
         state = self.state
         state.mean, state.cov = kalman_predict(state.mean, state.cov, self.config)
         state.mean[:, 2:, 0] = state.mean[:, 2:, 0].clip(1.0)  # a size stays positive
+        state.reach[:] = 0
         self._view, before, pose = None, state.mean[..., 0].copy(), None
         if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
             pose = np.asarray(cam_from_world, np.float64)
+        self._pose = pose
         if frame is not None and self.config.camera_motion:
             motion = self._camera_motion(frame)
             state.mean, state.cov = warp_states(state.mean, state.cov, motion)
             state.mean[:, :2, 0] += self._camera_motion.parallax(before[:, :2])
+            if pose is None:
+                self._last_pose = None  # the tracks are no longer where it saw them
         elif pose is not None and camera is not None and self._last_pose is not None:
             rotation = pose[:, :3] @ self._last_pose[:, :3].T
             turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for what is far
@@ -479,37 +506,63 @@ class Tracker:
         state.missed += in_view | (state.missed == 0)
 
     def _follow_places(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
-        """Move tracks of known place as their ellipsoid's image does.
+        """Move tracks of known place as the image of their ellipsoid or of their span does.
 
         Args:
             predicted: (T, 4) boxes cx, cy, w, h predicted for a camera at rest.
         Returns:
             (T,) True where a detection is to be expected.
         """
-        state = self.state
+        state, K = self.state, camera.K
         self._image_size = size = (camera.width, camera.height)
-        self._view = view = camera.K @ cam_from_world  # (3, 4)
-        self._last_pose = cam_from_world
-        now, before = self.places.project(view, size, PLACE_IN_VIEW), self._place_boxes
-        self._place_boxes = now
-        known = _rows_of(self.places.known, state.identity, False)
-        now, before = (_rows_of(boxes, state.identity, np.nan) for boxes in (now, before))
-        in_view = ~known | np.isfinite(now[:, 0])
-        followed = known & (state.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
-        shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
-        moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)  # (T, 4)
-        state.mean[followed, :, 0] = moved[followed]
-        lost = known & (state.missed > 0)
-        where = np.where(in_view[:, None], now, [-1e6, -1e6, 1, 1])  # out of view: matches nothing
+        self._view = view = K @ cam_from_world  # (3, 4)
+        last, self._last_pose = self._last_pose, cam_from_world
+        known = rows_of(self.places.known, state.identity, False)
+        inside = np.isfinite(self.places.project(view, size, PLACE_IN_VIEW)[:, 0])  # (I,)
+        in_view = ~known | rows_of(inside, state.identity, False)
+        tracked = (state.identity, state.ends, state.size, K, size)
+        now, reach = self.places.tracks_seen(cam_from_world, *tracked)
+        located = known | np.isfinite(state.ends[:, 0, 0])
+        followed = np.zeros(len(known), bool)
+        if last is not None:
+            before, reach_before = self.places.tracks_seen(last, *tracked)
+            followed = (state.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
+            shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
+            moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
+            state.mean[followed, :, 0] = moved[followed]  # (T, 4)
+            state.reach[followed] = np.abs(reach - reach_before)[followed]
+        lost = located & (state.missed > 0)
+        shown = (in_view & np.isfinite(now[:, 0]))[:, None]
+        where = np.where(shown, now, [-1e6, -1e6, 1, 1])  # out of view: matches nothing
         again = TrackState.spawn(where[lost], state.tracklet[lost], 0, self.config)
         state.mean[lost], state.cov[lost] = again.mean, again.cov
+        state.reach[lost] = np.abs(reach[lost])
+        state.cov[:, :2, 0] += state.reach**2
         return np.asarray(in_view, bool)
 
+    def _note_spans(
+        self, detections: Detections, track_of: IntArray, points: Array, pose: Array, K: Array
+    ) -> None:
+        """Note where the tracks seen now are, by the points in their boxes.
+
+        Identities with an ellipsoid do without.
+        """
+        state = self.state
+        rows = np.flatnonzero(track_of >= 0)
+        rows = rows[~rows_of(self.places.known, state.identity[track_of[rows]], False)]
+        spans = spans_of_boxes(detections.xyxy[rows], points, pose, K)
+        state.ends[track_of[rows]], state.size[track_of[rows]] = spans
+
     def _add_views(self, confirmed: Tracks, view: Array) -> None:
-        """Keep the boxes of this frame as views of their objects, and fit places now and then."""
-        self.places.add(self.frame_number, confirmed.track_id - 1, confirmed.xyxy, view)
-        if self.frame_number % PLACE_REFIT == 0 and self.places.refit(self._image_size):
-            self._place_boxes = self.places.project(view, self._image_size, PLACE_IN_VIEW)
+        """Keep the boxes of this frame as views of their objects, and fit places now and then.
+
+        At once where at least half of them are due, which is where the camera takes wide steps.
+        """
+        identity = confirmed.track_id - 1
+        self.places.add(self.frame_number, identity, confirmed.xyxy, view)
+        due = self.places.due
+        if self.frame_number % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
+            self.places.refit(self._image_size)
 
     def _associate(self, detections: Detections, lazy: LazyEmbeddings) -> IntArray:
         """Match detections to tracks: high scores by motion, then the rest by overlap.
@@ -522,8 +575,8 @@ class Tracker:
         """
         config = self.config
         same_class = _same_class(self.state.votes, detections.class_id)  # (T, D), as all below
-        cost, feasible, iou = self._motion_cost(detections.xyxy, same_class, lazy.available)
-        evidence = IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS
+        cost, feasible, iou, share = self._motion_cost(detections.xyxy, same_class, lazy.available)
+        evidence = share * (IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS)
         priority = self._priority_cost()[:, None]
         first = feasible & (detections.score >= config.high_score)
         weak = (cost + priority > WEAK_MATCH_COST) & (self.state.embedded >= 0)[:, None]
@@ -542,24 +595,27 @@ class Tracker:
 
     def _motion_cost(
         self, xyxy: Array, same_class: BoolArray, has_appearance: bool
-    ) -> tuple[Array, BoolArray, Array]:
+    ) -> tuple[Array, BoolArray, Array, Array]:
         """Compare tracks and detections by motion.
 
         Returns:
             cost in [0, 1] from overlap and gated distance, which pairs pass the gate, and IoU,
-            (T, D) each.
+            (T, D) each; share (T, 1) of what an overlap says where the place is uncertain.
         """
         state, box = self.state, cxcywh_from_xyxy(xyxy)
         iou = box_iou(xyxy_from_cxcywh(state.mean[..., 0]), xyxy)
+        share = np.ones((len(iou), 1))
+        if state.reach.any():
+            iou, share = overlap_within_reach(state.mean[..., 0], state.reach, box)
         distance = squared_mahalanobis(state.mean, state.cov, box[:, :2]) / GATE_CHI2
         feasible = (distance < 1) | (iou > GATE_IOU)
         if not has_appearance:
             growth = np.log(state.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
             feasible &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(-1)
             feasible &= iou >= MOTION_ONLY_IOU
-        cost = (1 - DISTANCE_WEIGHT) * (1 - iou) + DISTANCE_WEIGHT * distance.clip(0, 1)
+        cost = (1 - DISTANCE_WEIGHT) * (1 - iou * share) + DISTANCE_WEIGHT * distance.clip(0, 1)
         cost = cost + CLASS_COST * ~same_class
-        return cost, feasible & (same_class | (iou > LOW_IOU)), iou
+        return cost, feasible & (same_class | (iou * share > LOW_IOU)), iou, share
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
@@ -601,7 +657,7 @@ class Tracker:
         while True:
             track_of[:] = -1
             good = feasible & ~refused & (cost < MAX_COST)
-            _assign(cost + priority, good, track_of)
+            assign(cost + priority, good, track_of)
             matched = np.flatnonzero(track_of >= 0)
             matched = matched[must_agree[track_of[matched], matched] & ~compared[matched]]
             ask = (rivals & must_agree)[track_of[matched]].any(0)  # (D,) and their rivals
@@ -699,7 +755,7 @@ class Tracker:
         if len(rows):
             own = state.embedding[track_of[rows]]
             parts = part_cosines(own, lazy.get(rows), lazy.foreground_width)  # (n, n) each
-            _calibrate(self.match_calibration, parts, detections.class_id[rows])
+            self.match_calibration.add_frame(*parts, detections.class_id[rows])
 
     def _add_to_gallery(self, embedding: Floats, t: IntArray, class_id: IntArray) -> None:
         """Add embeddings (n, E) of tracks t to the gallery, and calibrate with its first views."""
@@ -707,12 +763,12 @@ class Tracker:
         if len(gallery.count):
             first = gallery.rows[identity, 0] * (gallery.count[identity, None] > 1)
             parts = part_cosines(embedding, first, gallery.foreground_width)
-            _calibrate(self.reid_calibration, parts, class_id)
+            self.reid_calibration.add_frame(*parts, class_id)
         gallery.add(identity, embedding, self._viewing_rays(t))
 
     def _viewing_rays(self, t: IntArray) -> Array:
-        """Return unit vectors (n, 3) in world in which tracks are seen, NaN without a pose."""
-        if self._view is None:
+        """Return unit vectors (n, 3) in which tracks are seen in the world of part 0, else NaN."""
+        if self._view is None or self.part:
             return np.full((len(t), 3), np.nan)
         return viewing_rays(xyxy_from_cxcywh(self.state.mean[t, :, 0]), self._view)
 
@@ -765,14 +821,15 @@ class Tracker:
         identity = np.flatnonzero(self.last_seen < state.first[ready].max(initial=0))  # (I,)
         if not len(identity) or not self.config.remember:
             return result
-        iou = self._place_iou(ready, identity)  # (n, I)
-        at_known_place = iou > LOW_IOU
+        box = state.mean[ready, :, 0]
+        iou, share = self.places.overlap(box, identity, self._view, self._image_size)
+        at_known_place = iou * share > LOW_IOU
         rays = self._viewing_rays(ready)
         logit = self.reid_calibration.logit(
             *self.gallery.parts(state.embedding[ready], identity, rays)
         )
         logit[at_known_place & np.isinf(logit)] = 0  # no appearance: the place decides
-        logit += np.where(at_known_place, IOU_ODDS * iou - NO_OVERLAP_ODDS, 0)
+        logit += np.where(at_known_place, share * (IOU_ODDS * iou - NO_OVERLAP_ODDS), 0)
         logit -= JUMP_ODDS * self._far_from_own_track(ready, identity)
         possible = self.last_seen[identity] < state.first[ready][:, None]
         possible &= self.identity_class[identity] == state.votes[ready].argmax(1)[:, None]
@@ -780,26 +837,15 @@ class Tracker:
         probability = match_probability(logit)
         claimed = np.full(len(identity), -1, np.int64)
         good = probability >= self.config.return_probability
-        _assign(1 - probability, good | (at_known_place & (logit > 0)), claimed)
+        assign(1 - probability, good | (at_known_place & (logit > 0)), claimed)
         column = np.flatnonzero(claimed >= 0)
         result[claimed[column]] = identity[column]
         return result
 
-    def _place_iou(self, ready: IntArray, identity: IntArray) -> Array:
-        """Return IoU (n, I) of tracks with the projected places of identities, NaN: unknown."""
-        iou = np.full((len(ready), len(identity)), np.nan)
-        if self._view is not None and len(identity):
-            projected = self.places.project(self._view, self._image_size, 0.0)
-            places = _rows_of(projected, identity, np.nan)  # (I, 4)
-            box = xyxy_from_cxcywh(self.state.mean[ready, :, 0])
-            iou = np.nan_to_num(box_iou(box, xyxy_from_cxcywh(places)))
-            iou[:, ~_rows_of(self.places.known, identity, False)] = np.nan
-        return iou
-
     def _far_from_own_track(self, ready: IntArray, identity: IntArray) -> BoolArray:
         """Mark (n, I) where the identity's own track still coasts, far from the newcomer.
 
-        Only without poses: with them the places in 3D tell.
+        Only of identities without a place in 3D: that tells more.
         """
         state = self.state
         row = np.full(len(self.last_seen), -1)
@@ -808,7 +854,8 @@ class Tracker:
         row = row[identity]  # (I,)
         center = state.mean[ready, :2, 0]
         far = squared_mahalanobis(state.mean[row], state.cov[row], center) > JUMP_GATE * GATE_CHI2
-        return np.asarray(far.T & (row >= 0) & (self._view is None), bool)
+        placed = rows_of(self.places.known, identity, False) & (self._view is not None)
+        return np.asarray(far.T & (row >= 0) & ~placed, bool)
 
     def _report(self, detections: Detections, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""
@@ -845,6 +892,7 @@ class Tracker:
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
             tracker = cls(TrackerConfig(**facts["config"]), embedder)
+            tracker.maps = [EllipsoidMap() for name in arrays if name.endswith(".dual_q")]
             for key, (owner, name) in tracker._saved().items():
                 old = getattr(owner, name)
                 if old is not None or key in arrays:
@@ -858,12 +906,12 @@ class Tracker:
 
     def _saved(self) -> dict[str, tuple[Any, str]]:
         """List all that changes from frame to frame: owner and attribute, by its name in files."""
-        own = "frame_number last_seen identity_class _next_tracklet _last_pose _place_boxes"
+        own = "frame_number last_seen identity_class _next_tracklet _last_pose part"
         parts: dict[str, tuple[Any, Sequence[str]]] = {
             "tracker": (self, own.split()),
             "state": (self.state, [f.name for f in dataclasses.fields(TrackState)]),
             "gallery": (self.gallery, Gallery.ARRAYS),
-            "places": (self.places, EllipsoidMap.ARRAYS),
+            **{f"places{k or ''}": (m, EllipsoidMap.ARRAYS) for k, m in enumerate(self.maps)},
             "reid_calibration": (self.reid_calibration, SimilarityCalibration.ARRAYS),
             "match_calibration": (self.match_calibration, SimilarityCalibration.ARRAYS),
             "camera_motion": (self._camera_motion, CameraMotion.ARRAYS),
@@ -871,35 +919,10 @@ class Tracker:
         return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
 
 
-def _calibrate(
-    calibration: SimilarityCalibration, parts: tuple[Array, Array], class_id: IntArray
-) -> None:
-    """Show a calibration all pairs of one class in a frame, (n, n): the diagonal is one object."""
-    fore, back = parts
-    own = np.eye(len(class_id), dtype=bool)
-    other = (class_id[:, None] == class_id) & ~own
-    calibration.add(fore[own], back[own], True)
-    calibration.add(fore[other], back[other], False)
-
-
-def _rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
-    """Take rows of a table of identities (I, ...), `missing` where there is none: (T, ...)."""
-    table = np.concatenate([rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)])
-    return np.asarray(table[np.where(identity < len(rows), identity, -1)])
-
-
 def _same_class(votes: Array, class_id: IntArray) -> BoolArray:
     """Mark pairs (T, D) whose detection has the class that the track was mostly seen as."""
     own = votes.argmax(1) if votes.size else np.zeros(len(votes), np.int64)
     return np.asarray(own[:, None] == class_id[None], bool)
-
-
-def _assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
-    """Match as many rows to columns as possible, then at least cost; fills row_of_column (C,)."""
-    if possible.any():
-        rows, columns = linear_sum_assignment(np.where(possible, cost, 1e3))
-        good = possible[rows, columns]
-        row_of_column[columns[good]] = rows[good]
 
 
 # ---- The loop ----------------------------------------------------------------------------------
@@ -930,13 +953,9 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    pose_of, camera = {}, None
-    if poses is not None:
-        pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
-        camera = scaled_camera(poses.camera, video.scale)
+    told = CamerasOfFrames(poses, video.scale)
     for frame in video:
-        pose = pose_of.get(frame.index)
-        tracks = tracker.update(source(frame), frame.image, cam_from_world=pose, camera=camera)
+        tracks = tracker.update(source(frame), frame.image, **told(frame.index))
         yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 
@@ -979,16 +998,25 @@ def run(
     poses = supplied_poses(video, config.poses) if in_3d else None
     if tracks:
         result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
+        boxes, names = result.tracks, result.class_names
     else:
-        result = _track_video(video, workspace, config, detections, poses, seconds)
+        found = open_detections(video, config.detect, detections, config.threads, config.offline)
+        found, boxes = keep_detections(found, video, workspace), Tracks.empty()
+        if in_3d and not video.is_live:
+            started = time.monotonic()
+            found, boxes = detect_all(found, video, workspace)
+            seconds["detect"] = time.monotonic() - started
+        names = found.class_names
     model = None
     if poses is not None:
-        check_directions(poses, result.tracks)
+        check_directions(poses, boxes if tracks else _tracklets(boxes))
     elif in_3d and not video.is_live:
-        moving = np.isin(np.array([*result.class_names, ""]), config.objects.moving_classes)
-        rows, started = result.tracks[moving[result.tracks.class_id]], time.monotonic()
+        moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
+        rows, started = boxes[moving & (boxes.score >= config.tracker.high_score)], time.monotonic()
         poses, model = reconstruct_cached(video, config.poses, workspace, rows)
         seconds["poses"] = time.monotonic() - started
+    if not tracks:
+        result = _track_video(video, workspace, config, found, poses, seconds)
     workspace.save_last(result, poses)
     workspace.publish_model(model)
     result.poses, result.seconds = poses, seconds
@@ -1014,61 +1042,34 @@ def _track_video(
     video: Video,
     workspace: Workspace,
     config: Config,
-    detections: Any,
+    source: DetectionSource,
     poses: Poses | None,
     seconds: dict[str, float],
 ) -> Result:
-    """Detect and track all frames, or take both from the cache; a live source is never cached."""
-    source = open_detections(video, config.detect, detections, config.threads, config.offline)
-    supplied = "" if poses is None else hashlib.sha256(poses.cam_from_world.tobytes()).hexdigest()
-    key = (source_fingerprint(video.source), config.input, source.key)
-    path = workspace.path("tracks", *key, config.embed, config.tracker, supplied)
-    cached = bool(source.key) and not video.is_live
-    if cached and path.exists():
+    """Track all frames, or take the tracks from the cache; a live source is never cached."""
+    poses = poses if poses is not None and poses.known.any() else None
+    key = (*detections_key(source, video), config.embed, config.tracker, poses_key(poses))
+    path = workspace.path("tracks", *key)
+    if source.key and not video.is_live and path.exists():
         return Result.load_tracked(path)
-    started = time.monotonic()
-    if cached:
-        source = source.cached(
-            workspace.path("detections", *key).with_suffix(""), video.working_size
-        )
-    embed = config.embed
+    started, embed = time.monotonic(), config.embed
     embedder = make_embedder(embed.model, embed.head, config.threads, config.offline)
     tracker = Tracker(config.tracker, embedder)
-    frames: list[int] = []
-    steps: list[Tracks] = []
-    embedded: list[tuple[IntArray, Floats]] = []
-    progress = Progress("track", video.expected)
-    try:
-        for frame, _ in track(video, source, tracker, poses=poses):
-            frames.append(frame.index)
-            steps.append(tracker.latest)
-            embedded.append(tracker.latest_embeddings())
-            progress.step()
-    except KeyboardInterrupt:  # the way to end a live source
-        if not video.is_live:
-            raise
-    finally:
-        progress.close()
-        source.flush()
-    if not frames:
-        why = "--start/--stop/--every leave none, or the file is damaged"
-        raise ReobjError(f"{video.source}: no frame could be read ({why})")
-    tracks = Tracks.concatenate(frames, steps, video.scale)
-    result = Result(tracks, source.class_names, VideoInfo.of(video))
-    result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
-    result.warnings += [*source.messages, *video.messages]
-    if video.is_live:
-        result.warnings += [
-            f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
-            "a live source cannot be read twice: identities only; record it for 3D",
-        ]
-    if not len(result.tracks):
-        result.warnings.append(
-            "no object was tracked: no detections, or all below tracker.new_score"
-        )
+    steps = track(video, source, tracker, poses=poses)
+    result = collect_tracks(steps, tracker, video, source)
     seconds["track"] = time.monotonic() - started
     result.save_tracked(path)
     return result
+
+
+def _tracklets(boxes: Tracks) -> Tracks:
+    """Track detections by motion alone, to check cameras that nothing may rest on yet."""
+    tracker, steps = Tracker(), []
+    rows = rows_by(boxes.frame)
+    for own in rows:
+        tracker.update(Detections(boxes.xyxy[own], boxes.score[own], boxes.class_id[own]))
+        steps.append(tracker.latest)
+    return Tracks.concatenate([int(boxes.frame[own[0]]) for own in rows], steps)
 
 
 def _given_tracks(

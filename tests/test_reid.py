@@ -1,14 +1,11 @@
-"""Gallery, calibrated similarity and places: against formulas and rooms written down here."""
+"""Gallery and calibrated similarity: against formulas and rooms written down here."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-import quadrics
-import reobj_track as rt
 from reobj.identity.reid import (
-    EllipsoidMap,
     Gallery,
     SimilarityCalibration,
     match_probability,
@@ -261,126 +258,3 @@ def test_match_probability_equals_brute_force() -> None:
 def test_match_probability_of_single_pairs(logit, expected) -> None:
     found = match_probability(np.array(logit), 1.0)
     np.testing.assert_allclose(found, np.reshape(expected, found.shape), atol=1e-4)
-
-
-# ---- Places in 3D ----
-
-CAMERA = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
-SIZE = (640, 480)
-
-
-def view_at(x: float, turn_deg: float = 0.0) -> np.ndarray:
-    """img_from_world (3, 4) of a camera at (x, 0, 0), turned to the right."""
-    a = np.radians(turn_deg)
-    turn = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
-    return CAMERA.K @ np.c_[turn, turn @ [-x, 0, 0]]
-
-
-def ball(
-    x: float, half_axes: tuple[float, ...] = (0.2, 0.2, 0.2), z: float = 4.0
-) -> quadrics.Ellipsoids:
-    return quadrics.Ellipsoids(np.array([[x, 0.1, z]]), np.array([half_axes]), np.eye(3)[None])
-
-
-def outline(thing: quadrics.Ellipsoids, view: np.ndarray) -> np.ndarray:
-    """Box (4,) of the image of points sampled on the surface."""
-    rng = np.random.default_rng(0)
-    sphere = unit(rng, 20000, 3)
-    points = thing.center_in_world[0] + sphere * thing.half_axes[0]
-    seen = np.c_[points, np.ones(len(points))] @ view.T
-    xy = seen[:, :2] / seen[:, 2:]
-    return np.concatenate([xy.min(0), xy.max(0)])
-
-
-def mapped(
-    things: list[quadrics.Ellipsoids], views: list[np.ndarray], step: int = 5
-) -> EllipsoidMap:
-    places, identity = EllipsoidMap(), np.arange(len(things))
-    for i, view in enumerate(views):
-        places.add(step * i, identity, np.stack([outline(t, view) for t in things]), view)
-    places.refit(SIZE)
-    return places
-
-
-WALK = [view_at(x) for x in np.linspace(-1.1, 1.1, 12)]
-
-
-def test_places_are_found_and_projected() -> None:
-    """In a view that was not used the boxes are those of the things themselves."""
-    things = [ball(-0.5), ball(0.6, (0.3, 0.2, 0.25))]
-    places = mapped(things, WALK)
-    assert places.known[:3].tolist() == [True, True, False]
-    found = places.project(view_at(0.3, 8), SIZE, 0.5)
-    for box, thing in zip(found[:2], things, strict=True):
-        x1, y1, x2, y2 = outline(thing, view_at(0.3, 8))
-        np.testing.assert_allclose(box, [(x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1], atol=3)
-    assert np.isnan(found[2:]).all()
-
-
-def test_places_out_of_view_are_not_projected() -> None:
-    """Half out to the left: its part in the image, if as much as asked for; behind: nothing."""
-    places = mapped([ball(0)], WALK)
-    x1, y1, x2, y2 = outline(ball(0), view_at(0, 33.5))
-    assert x1 < -10 and x2 > 20
-    inside = x2 / (x2 - x1)
-    found = places.project(view_at(0, 33.5), SIZE, inside - 0.1)[0]
-    np.testing.assert_allclose(found, [x2 / 2, (y1 + y2) / 2, x2, y2 - y1], atol=4)
-    assert np.isnan(places.project(view_at(0, 33.5), SIZE, inside + 0.1)[0]).all()
-    for turn in (90, 180):
-        assert np.isnan(places.project(view_at(0, turn), SIZE, 0.0)[0]).all()
-
-
-@pytest.mark.parametrize(("length", "known"), [(0.2, True), (2.0, False)])
-def test_a_needle_is_no_place(length: float, known: bool) -> None:
-    """Half-seen things give ellipsoids that reach beyond the camera: they tell nothing."""
-    assert bool(mapped([ball(0, (length, 0.1, 0.1))], WALK).known[0]) is known
-
-
-@pytest.mark.parametrize(("walked", "known"), [(0.0, False), (0.05, False), (0.4, True)])
-def test_without_parallax_there_is_no_place(walked: float, known: bool) -> None:
-    """A ball at 4 m and a camera that turns, and walks 0, 0.7 or 5.7 degrees of parallax."""
-    xs = np.linspace(-walked / 2, walked / 2, 12)
-    views = [view_at(x, turn) for x, turn in zip(xs, np.linspace(-10, 10, 12), strict=True)]
-    assert bool(mapped([ball(0)], views).known[0]) is known
-
-
-def test_a_place_is_forgotten_when_its_views_contradict_each_other() -> None:
-    places = mapped([ball(0)], WALK)
-    assert places.known[0]
-    wrong = np.array([[0.0, 0, 20, 20], [600, 400, 640, 480]])
-    for i in range(60):
-        places.add(100 + 20 * i, one(), wrong[[i % 2]], view_at(0.01 * i))
-        places.refit(SIZE)
-    assert not places.known[0]
-
-
-def test_a_fit_waits_for_new_views() -> None:
-    """Three views at least, and more than a quarter of them new."""
-    places = EllipsoidMap()
-    told = []
-    for i, view in enumerate(WALK):
-        places.add(5 * i, one(), outline(ball(0), view)[None], view)
-        told.append(places.refit(SIZE))
-    assert np.flatnonzero(told).tolist() == [2, 4, 6, 9]  # with 3, 5, 7 and 10 views
-    assert not EllipsoidMap().refit(SIZE)
-
-
-def test_views_are_few_and_spread_over_the_whole_life() -> None:
-    places = EllipsoidMap()
-    for frame in range(1000):
-        places.add(frame, one(), np.full((1, 4), float(frame)), np.full((3, 4), float(frame)))
-    held = places.frame[0] >= 0
-    frames = np.sort(places.frame[0][held])
-    assert 8 <= len(frames) <= 16
-    assert frames[0] < 100 and frames[-1] > 850 and np.diff(frames).max() < 200
-    np.testing.assert_array_equal(places.boxes[0, held, 0], places.frame[0, held])
-    np.testing.assert_array_equal(places.img_from_world[0, held, 0, 0], places.frame[0, held])
-
-
-def test_the_first_views_are_five_frames_apart() -> None:
-    places = EllipsoidMap()
-    for frame in range(23):
-        places.add(frame, np.array([0, 1][: 1 + (frame > 7)]), np.ones((2, 4))[: 1 + (frame > 7)],
-                   np.eye(3, 4))  # fmt: skip
-    assert sorted(f for f in places.frame[0].tolist() if f >= 0) == [0, 5, 10, 15, 20]
-    assert sorted(f for f in places.frame[1].tolist() if f >= 0) == [8, 13, 18]

@@ -292,6 +292,91 @@ def test_a_changed_option_recomputes_only_what_depends_on_it(
     assert cli(*args, "--set", "detect.min_score=0.3") == 0 and counting.calls == 2 * FRAMES
 
 
+def panning(frames: int = FRAMES) -> rt.Poses:
+    """Cameras of the clip, known but for frame 5."""
+    step = np.arange(frames)
+    poses = np.tile(np.eye(3, 4), (frames, 1, 1))
+    poses[:, 0, 3] = -0.1 * step
+    poses[5] = np.nan
+    camera = rt.Camera("PINHOLE", 320, 240, (300.0, 300.0, 160.0, 120.0))
+    return rt.Poses(camera, step, step / 30, poses, np.full(frames, "pnp"), "pycolmap")
+
+
+class Stages:
+    """Stands in for the reconstruction and watches the tracker; any stage can be interrupted."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, counting: type[CountingDetector]) -> None:
+        self.log: list[str] = []
+        self.told: list[object] = []
+        self.masked: list[int] = []
+        self.stop_at = ""
+        update = rt.Tracker.update
+
+        def estimate(video: rt.Video, config: object, work: Path, boxes_to_mask=None) -> rt.Poses:
+            self.step("poses", counting.calls)
+            self.masked = [len(boxes_to_mask(i)) if boxes_to_mask else 0 for i in range(FRAMES)]
+            (work / "sparse").mkdir(parents=True)
+            return panning()
+
+        def watched(tracker: rt.Tracker, *args: object, **told: object) -> rt.Tracks:
+            if "cam_from_world" in told:
+                self.step("track", counting.calls)
+                self.told.append(told["cam_from_world"])
+            return update(tracker, *args, **told)
+
+        monkeypatch.setattr("reobj.poses.stage.estimate_poses", estimate)
+        monkeypatch.setattr(rt.Tracker, "update", watched)
+
+    def step(self, stage: str, detected: int) -> None:
+        if stage == self.stop_at:
+            self.stop_at = ""
+            raise KeyboardInterrupt
+        if [f"{stage} {detected}"] != self.log[-1:]:
+            self.log.append(f"{stage} {detected}")
+
+
+@pytest.mark.parametrize("stop_at", ["", "detect", "poses", "track"])
+def test_first_all_detections_then_cameras_then_tracks_with_them(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: str,
+    counting: type[CountingDetector],
+) -> None:  # fmt: skip
+    """Every stage once, with what the one before found; also where it was interrupted before."""
+    stages = Stages(monkeypatch, counting)
+    counting.stop_at, stages.stop_at = 7 if stop_at == "detect" else -1, stop_at
+    args = ("run", clip, "-o", tmp_path / "out", "--detector", tmp_path / "fake.onnx", *QUICK)
+    if stop_at:
+        assert cli(*args) == 130
+        assert len(list((tmp_path / "out/cache").glob("tracks-*.npz"))) == 0
+    assert cli(*args) == 0
+    assert counting.calls == FRAMES
+    assert stages.log == [f"poses {FRAMES}", f"track {FRAMES}"]
+    told = np.array(stages.told[-FRAMES:])
+    np.testing.assert_array_equal(told, panning().cam_from_world)
+    assert cli(*args) == 0  # all from the cache
+    assert counting.calls == FRAMES and len(stages.told) == FRAMES
+    assert cli(*args, "--poses", "none") == 0  # other tracks, the same detections
+    assert counting.calls == FRAMES and len(list((tmp_path / "out/cache").glob("tracks-*"))) == 2
+
+
+def test_a_function_detects_once_too_and_sure_people_are_masked(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, counting: type[CountingDetector]
+) -> None:
+    """Nothing is known of what it depends on, so nothing of it is kept for another run."""
+    stages, calls = Stages(monkeypatch, counting), []
+
+    def people(image: np.ndarray) -> list[list[float]]:
+        calls.append(1)
+        return [[100, 60, 140, 110, 0.9, 0], [10, 60, 50, 110, 0.2, 0], [200, 9, 240, 90, 0.9, 56]]
+
+    output = rt.OutputConfig(overlay=False, scene=False)
+    config = rt.Config(output=output, embed=rt.EmbedConfig(model="none"))
+    rt.run(clip, tmp_path / "out", config, detections=people)
+    assert len(calls) == FRAMES and len(stages.told) == FRAMES
+    assert stages.masked == [1] * FRAMES
+    left = [p.name for p in (tmp_path / "out/cache").iterdir()]
+    assert not [name for name in left if name.startswith(("detections", "boxes"))]
+
+
 def test_a_killed_run_leaves_nothing_broken(clip: Path, detections: Path, tmp_path: Path) -> None:
     """SIGKILL in the middle of the tracking, and while the pictures are made: the next run gives
     what an undisturbed one does.

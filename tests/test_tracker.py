@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
+from reobj.types import box_iou
 
 CHAIR, CUP = 56, 41
 ROOM = Path(__file__).parent.parent / "examples" / "room"
@@ -629,6 +630,65 @@ def test_a_frame_without_pose_changes_no_place() -> None:
     for _ in range(20):
         tracker.update(rt.Detections.empty(), cam_from_world=np.full((3, 4), np.nan), camera=CAMERA)
     np.testing.assert_array_equal(tracker.places.dual_q, places)
+
+
+def points_on_balls(scale: float) -> np.ndarray:
+    """Sparse points: 40 on each of the balls, 60 on a wall behind them."""
+    rng = np.random.default_rng(2)
+    balls = BALLS.center_in_world[:, None] + 0.2 * unit(rng, 120, 3).reshape(3, 40, 3)
+    wall = np.c_[rng.uniform(-3, 3, (60, 2)), np.full(60, 7.0)]
+    return scale * np.concatenate([balls.reshape(-1, 3), wall])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.02, 37.0])
+def test_twins_keep_their_identities_over_steps_wider_than_their_boxes(scale: float) -> None:
+    """Two balls that look the same, 125 px apart and 50 wide; the camera steps aside by 100 px, so
+    each is seen next beside where the other was. Known cameras of any unit, and a few points.
+    """
+    tracker, points = rt.Tracker(), points_on_balls(scale)
+    seen, alone, last = [], rt.Tracker(), None
+    for x in [-1.6, -0.8, 0.0, 0.8, 1.6, 0.8, 0.0, -0.8, -1.6, -0.8, 0.0, 0.8]:
+        pose = pose_at(x)
+        found, which = balls_seen(pose)
+        two = which < 2
+        found, which = found[two], which[two]
+        if last is not None:
+            own = box_iou(found.xyxy, last)
+            assert np.diag(own).max() == 0  # of each ball with itself
+        last = found.xyxy
+        view = np.ones((2, 8))
+        scaled = np.c_[pose[:, :3], scale * pose[:, 3]]
+        tracks = tracker.update(
+            found, embeddings=view, cam_from_world=scaled, camera=CAMERA, points=points
+        )
+        seen.append(dict(zip(which[tracks.detection_index], tracks.track_id, strict=True)))
+        alone.update(found, embeddings=view)
+    assert seen == [{0: 1, 1: 2}] * len(seen)
+    assert len(alone.last_seen) != 2 or len(alone.latest) < 2 or alone.state.tracklet.max() > 2
+
+
+def test_a_new_part_of_the_path_knows_no_place_of_another() -> None:
+    """Half a second without a new picture, then the cameras go on in a world of their own: turned,
+    moved and smaller. The tracks go on; back in the first world its places are known again.
+    """
+    tracker = rt.Tracker()
+    walk(tracker, PAST)
+    first = tracker.places
+    assert first.known.sum() == 2
+    turn = Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()
+    for x in np.linspace(0.5, 0.1, 21):
+        pose = pose_at(x)
+        other = np.c_[pose[:, :3] @ turn, 0.3 * (pose[:, 3] + pose[:, :3] @ [3.0, -2, 5])]
+        found, _ = balls_seen(pose)
+        tracks = tracker.update(found, cam_from_world=other, camera=CAMERA, part=1)
+        assert tracks.track_id.tolist() == [1, 2] and tracks.tracklet_id.tolist() == [1, 2]
+    assert tracker.places is not first and tracker.places.known.sum() == 2
+    assert not np.allclose(tracker.places.ends[:2], first.ends[:2], atol=0.1)
+    before = first.frame.copy()
+    found, _ = balls_seen(pose_at(0.1))
+    tracks = tracker.update(found, cam_from_world=pose_at(0.1), camera=CAMERA)
+    assert tracks.track_id.tolist() == [1, 2] and tracker.places is first
+    assert (first.frame != before).sum() <= 2  # nothing of the other part came into it
 
 
 # ---- Rules of the association ----

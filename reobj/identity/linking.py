@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Poses, angle_deg, place_of, undistort_boxes, viewing_rays
-from reobj.identity.reid import SimilarityCalibration, paired_cosine, quick_fit
+from reobj.identity.places import quick_fit, rough_sizes, usual_size
+from reobj.identity.reid import SimilarityCalibration, paired_cosine
 from reobj.types import (
     Array,
     BoolArray,
@@ -111,6 +112,9 @@ class Linker:
         self.fragment = _cut_at_gaps(tracks, CUT_GAP)  # (N,)
         self._describe_fragments(class_names, moving)
         if poses is not None:
+            count = len(self.tracklets)
+            views = gather_views(tracks, poses, self.fragment, count, min_score)
+            self.usual_size = usual_size(rough_sizes(views.boxes, views.img_from_world))
             self._cut()
             self._describe_fragments(class_names, moving)
         self.co_occur, self.distinct = self._co_occurrence()
@@ -284,7 +288,8 @@ class Linker:
         size = [len(rows) for rows in groups]
         rows, label = np.concatenate(groups), np.repeat(np.arange(len(groups)), size)
         views = gather_views(self.tracks[rows], self.poses, label, len(size), self.min_score)
-        ellipsoids = quick_fit(views.boxes, views.img_from_world, views.image_size).ellipsoids
+        seen = (views.boxes, views.img_from_world, views.image_size)
+        ellipsoids = quick_fit(*seen, self.usual_size).ellipsoids
         solids = quadrics.solid_boxes(ellipsoids, "ellipsoid", views.img_from_world)
         solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
         at = np.searchsorted(self.located, self.tracks.frame[rows])

@@ -1,10 +1,10 @@
-"""Re-identification: what identities looked like, what a similarity means, where identities are.
+"""Re-identification: what identities looked like, and what a similarity means.
 
 `Gallery` keeps a few views of every identity, `SimilarityCalibration` turns cosines into log odds,
-`match_probability` sets these against rivals, and `EllipsoidMap` keeps places in 3D. Which
-detection takes which identity is decided by the tracker and the linker.
+and `match_probability` sets these against rivals. Where identities are is of
+`reobj.identity.places`; which detection takes which identity the tracker and the linker decide.
 
-Axes: I identities, K views of an identity in the gallery, V in the map, E width of an embedding.
+Axes: I identities, K views of an identity in the gallery, E width of an embedding.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
 
-import quadrics
 from reobj.cameras import angle_deg
-from reobj.types import Array, BoolArray, Floats, IntArray, cxcywh_from_xyxy, unit_rows
+from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
 
 # ---- Gallery -----------------------------------------------------------------------------------
 
@@ -194,6 +194,13 @@ class SimilarityCalibration:
         value = np.where(known, value, 0.0)
         self.moments[int(same)] += [known.sum(1), value.sum(1), (value * value).sum(1)]
 
+    def add_frame(self, foreground: Array, background: Array, class_id: IntArray) -> None:
+        """Add all pairs of one class in a frame, cosines (n, n): the diagonal is one object."""
+        own = np.eye(len(class_id), dtype=bool)
+        other = (class_id[:, None] == class_id) & ~own
+        self.add(foreground[own], background[own], True)
+        self.add(foreground[other], background[other], False)
+
     def logit(
         self,
         foreground: npt.ArrayLike,
@@ -260,117 +267,9 @@ def _best_other(odds: Array) -> Array:
     return np.where(odds == top[:, 1:], top[:, :1], top[:, 1:])
 
 
-# ---- Places in 3D ------------------------------------------------------------------------------
-
-
-def quick_fit(boxes: Array, img_from_world: Array, image_size: tuple[int, int]) -> Any:
-    """Fit ellipsoids of any size to boxes (V, G, 4) in a few steps (`quadrics.fit_objects`)."""
-    config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
-    return quadrics.fit_objects(
-        boxes, img_from_world, image_size, support="ellipsoid", config=config
-    )
-
-
-MAP_VIEWS = 16  # views kept of every identity (chosen)
-MAP_FIRST_STEP = 5  # frames between them; doubled whenever they are full (chosen)
-MAP_MIN_VIEWS = 3  # of a fit: fewer boxes leave an ellipsoid undetermined (9 unknowns, 4 a box)
-MAP_MIN_PARALLAX_DEG = 2.0  # between the views of a fit (chosen)
-# longest half axis over the middle one: objects that were half seen give needles, reaching behind
-# the camera (95 % of priors.json are below 5.8; IDF1 of redkitchen with poses 79.1 -> 88.4)
-MAP_MAX_ELONGATION = 6.0
-NO_FRAME = -1000  # of a free view: long before the first frame
-
-
-class EllipsoidMap:
-    """The place in 3D of every identity, for a tracker that is given the camera's poses.
-
-    Of every identity a few views are kept, evenly over its life, and an ellipsoid is fitted to
-    them now and then. Memory grows with the number of identities, not with time.
-
-    Attributes:
-        frame: (I, V) frame of each view, negative: free. boxes: (I, V, 4) x1, y1, x2, y2.
-        img_from_world: (I, V, 3, 4). step: (I,) frames between views.
-        fresh: (I,) views since the last fit. dual_q: (I, 4, 4) ellipsoids, NaN unknown.
-    """
-
-    ARRAYS = ("frame", "boxes", "img_from_world", "step", "fresh", "dual_q")
-
-    def __init__(self) -> None:
-        self.frame = np.zeros((0, MAP_VIEWS), np.int64)
-        self.boxes = np.zeros((0, MAP_VIEWS, 4))
-        self.img_from_world = np.zeros((0, MAP_VIEWS, 3, 4))
-        self.step = np.zeros(0, np.int64)
-        self.fresh = np.zeros(0, np.int64)
-        self.dual_q = np.zeros((0, 4, 4))
-
-    def add(self, frame: int, identity: IntArray, xyxy: Array, img_from_world: Array) -> None:
-        """Add a view (N, 4) of each of N different identities, where one is due in this frame.
-
-        When an identity's views are full, every other one goes and the step between them doubles.
-        """
-        self._grow(int(identity.max(initial=-1)) + 1)
-        due = frame - self.frame[identity].max(1) >= self.step[identity]
-        for i, box in zip(identity[due], xyxy[due], strict=True):
-            if (self.frame[i] >= 0).all():
-                self.frame[i, self.frame[i].argsort()[1::2]] = NO_FRAME
-                self.step[i] *= 2
-            slot = self.frame[i].argmin()
-            self.frame[i, slot], self.boxes[i, slot] = frame, box
-            self.img_from_world[i, slot] = img_from_world
-            self.fresh[i] += 1
-
-    def refit(self, image_size: tuple[int, int]) -> bool:
-        """Fit the ellipsoids of all identities with enough fresh views (above a quarter of theirs).
-
-        A fit that is rejected, has no parallax or is a needle makes the place unknown.
-
-        Returns:
-            Whether any was due.
-        """
-        seen = self.frame >= 0  # (I, V)
-        due = np.flatnonzero((seen.sum(1) >= MAP_MIN_VIEWS) & (self.fresh > seen.sum(1) // 4))
-        if not len(due):
-            return False
-        at, slot = np.nonzero(seen[due])
-        frames, first, row = np.unique(
-            self.frame[due][at, slot], return_index=True, return_inverse=True
-        )
-        boxes = np.full((len(frames), len(due), 4), np.nan)  # (F, O, 4)
-        boxes[row, at] = self.boxes[due][at, slot]
-        cameras = self.img_from_world[due][at, slot][first]  # (F, 3, 4)
-        fits = quick_fit(boxes, cameras, image_size)
-        good = (fits.status != "rejected") & (fits.parallax_deg >= MAP_MIN_PARALLAX_DEG)  # (O,)
-        axes = np.sort(fits.ellipsoids.half_axes, 1)  # (O, 3)
-        good &= axes[:, 2] <= MAP_MAX_ELONGATION * axes[:, 1]
-        self.dual_q[due] = np.where(good[:, None, None], fits.ellipsoids.dual_quadrics(), np.nan)
-        self.fresh[due] = 0
-        return True
-
-    @property
-    def known(self) -> BoolArray:
-        """(I,) whether the place of the identity is known."""
-        return np.asarray(np.isfinite(self.dual_q[:, 0, 0]), bool)
-
-    def project(self, img_from_world: Array, image_size: tuple[int, int], share: float) -> Array:
-        """Project the ellipsoids into an image.
-
-        Returns:
-            (I, 4) boxes cx, cy, w, h of their parts in the image; NaN where the place is unknown,
-            or where no more than `share` of the box lies in the image.
-        """
-        dual_c, before_camera = quadrics.project(self.dual_q, img_from_world[None])
-        boxes = quadrics.boxes_from_dual_conics(dual_c[0])  # (I, 4)
-        cut = quadrics.clip_boxes(boxes, image_size)
-        area, whole = ((b[:, 2:] - b[:, :2]).prod(1) for b in (cut, boxes))
-        seen = before_camera[0] & (area > share * whole)
-        return np.where(seen[:, None], cxcywh_from_xyxy(cut), np.nan)
-
-    def _grow(self, identities: int) -> None:
-        extra = identities - len(self.frame)
-        if extra > 0:
-            extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
-            fills = {"frame": NO_FRAME, "dual_q": np.nan, "step": MAP_FIRST_STEP}
-            for name in self.ARRAYS:
-                old = getattr(self, name)
-                new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)
-                setattr(self, name, np.concatenate([old, new]))
+def assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
+    """Match as many rows to columns as possible, then at least cost; fills row_of_column (C,)."""
+    if possible.any():
+        rows, columns = linear_sum_assignment(np.where(possible, cost, 1e3))
+        good = possible[rows, columns]
+        row_of_column[columns[good]] = rows[good]

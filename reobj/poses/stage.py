@@ -75,6 +75,16 @@ def reconstruct_cached(
     return poses, [part_path(model, k) for k in range(poses.part_count)]
 
 
+def poses_key(poses: Poses | None) -> str:
+    """Return what changes with everything that a tracker takes from the poses; "": none."""
+    if poses is None:
+        return ""
+    digest = hashlib.sha256(repr(poses.camera).encode())
+    for values in (poses.frame, poses.cam_from_world, poses.part, poses.points, poses.visibility):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
 def write_supplied_model(poses: Poses, video: Video, out: Path) -> None:
     """Write sparse/ of supplied poses; a reconstruction has its own, with more in it."""
     if poses.source == "user" and poses.known.any():

@@ -250,6 +250,7 @@ class DetectionSource:
             then nothing that follows from them may be cached either.
         messages: for the user.
         slow: worth keeping on disk. cache: where they are kept.
+        recorded: those of a file, all known beforehand.
     """
 
     detect: Callable[[Frame], Detections]
@@ -258,6 +259,7 @@ class DetectionSource:
     messages: Sequence[str] = ()
     slow: bool = False
     cache: DetectionCache | None = None
+    recorded: RecordedDetections | None = None
 
     def __call__(self, frame: Frame) -> Detections:
         """Return the detections of a frame, from the cache if they are there."""
@@ -330,8 +332,9 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         return detector
     if isinstance(detector, RecordedDetections):
         return DetectionSource(
-            lambda frame: detector.at(frame.index), detector.class_names, "", detector.messages
-        )
+            lambda frame: detector.at(frame.index), detector.class_names, "", detector.messages,
+            recorded=detector,
+        )  # fmt: skip
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip

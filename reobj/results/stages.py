@@ -1,0 +1,121 @@
+"""The first stages of a run in its output folder: all detections, then the tracks of the video."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reobj.files import Progress, load_npz, save_npz
+from reobj.results.result import Result, VideoInfo
+from reobj.results.workspace import Workspace
+from reobj.sources.detectors import DetectionCache, DetectionSource
+from reobj.sources.video import Video, source_fingerprint
+from reobj.types import Array, Floats, Frame, IntArray, ReobjError, Tracks
+
+
+def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
+    """Return what the detections of a video depend on."""
+    return (source_fingerprint(video.source), video.config, source.key)
+
+
+def keep_detections(source: DetectionSource, video: Video, workspace: Workspace) -> DetectionSource:
+    """Return a source that keeps what is slow to detect in the output folder, for later runs."""
+    if video.is_live:
+        return source
+    folder = workspace.path("detections", *detections_key(source, video)).with_suffix("")
+    return source.cached(folder, video.working_size)
+
+
+def detect_all(
+    source: DetectionSource, video: Video, workspace: Workspace
+) -> tuple[DetectionSource, Tracks]:
+    """Find the objects of all frames of a video, before anything is known of its cameras.
+
+    Returns:
+        the source, which answers from what was found: nothing is detected twice, whatever the
+        detector; and all detections as rows without identities, in native pixels.
+    """
+    if source.recorded is not None:
+        own = source.recorded
+        return source, _rows(own.frame, own.xyxy, own.score, own.class_id)
+    path = workspace.path("boxes", *detections_key(source, video))
+    if source.key and path.exists():
+        found, _ = load_npz(path)
+        return source, _rows(*(found[n] for n in ("frame", "xyxy", "score", "class_id")))
+    if source.cache is None:  # it cannot be known again: for this run only
+        folder = workspace.cache / "detections-once"
+        shutil.rmtree(folder, ignore_errors=True)
+        source = dataclasses.replace(source, cache=DetectionCache(folder, video.working_size))
+    frames: list[int] = []
+    steps = []
+    progress = Progress("detect", video.expected)
+    try:
+        for frame in video:
+            found_now = source(frame)
+            frames += [frame.index] * len(found_now)
+            steps.append((found_now.xyxy / video.scale, found_now.score, found_now.class_id))
+            progress.step()
+    finally:
+        progress.close()
+        source.flush()
+    columns = [np.concatenate(column) for column in zip(*steps, strict=True)] if steps else []
+    rows = _rows(np.array(frames, np.int64), *columns) if steps else Tracks.empty()
+    if source.key:
+        save_npz(path, {n: getattr(rows, n) for n in ("frame", "xyxy", "score", "class_id")})
+    return source, rows
+
+
+def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tracks:
+    """Make rows of detections, of no identity."""
+    none = np.zeros(len(frame), np.int64)
+    return Tracks(frame, none, none, xyxy, score, class_id, none - 1)
+
+
+def collect_tracks(
+    steps: Iterator[tuple[Frame, Tracks]], tracker: Any, video: Video, source: DetectionSource
+) -> Result:
+    """Collect what a tracker decides in a video, with its embeddings and what the user should know.
+
+    Args:
+        steps: the running `track(video, source, tracker)`.
+    """
+    frames: list[int] = []
+    found: list[Tracks] = []
+    embedded: list[tuple[IntArray, Floats]] = []
+    progress = Progress("track", video.expected)
+    try:
+        for frame, _ in steps:
+            frames.append(frame.index)
+            found.append(tracker.latest)
+            embedded.append(tracker.latest_embeddings())
+            progress.step()
+    except KeyboardInterrupt:  # the way to end a live source
+        if not video.is_live:
+            raise
+    finally:
+        progress.close()
+        source.flush()
+        if source.cache is not None and not source.key:
+            shutil.rmtree(Path(source.cache.folder), ignore_errors=True)
+    if not frames:
+        why = "--start/--stop/--every leave none, or the file is damaged"
+        raise ReobjError(f"{video.source}: no frame could be read ({why})")
+    tracks = Tracks.concatenate(frames, found, video.scale)
+    result = Result(tracks, source.class_names, VideoInfo.of(video))
+    result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
+    result.warnings += [*source.messages, *video.messages]
+    if video.is_live:
+        result.warnings += [
+            f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
+            "a live source cannot be read twice: identities only; record it for 3D",
+        ]
+    if not len(result.tracks):
+        result.warnings.append(
+            "no object was tracked: no detections, or all below tracker.new_score"
+        )
+    return result
