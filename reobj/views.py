@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reobj.cameras import Poses, undistort_boxes
-from reobj.types import Array, BoolArray, IntArray, Tracks
+from reobj.types import Array, IntArray, Tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +61,7 @@ class VisiblePoints:
 
     def __init__(self, poses: Poses) -> None:
         self.poses = poses
-        order = np.lexsort(poses.visibility.T[::-1])
-        observer, self._point = poses.visibility[order].T  # (M,) rows of frames, rows of points
+        observer, self._point = np.unique(poses.visibility, axis=0).T  # (M,) rows each
         self._start = np.searchsorted(observer, np.arange(len(poses.frame) + 1))
         self._observers = np.flatnonzero(np.diff(self._start))  # frames that observed something
         self._img_from_world = poses.camera.K @ poses.cam_from_world  # (F, 3, 4)
@@ -79,8 +78,7 @@ class VisiblePoints:
             return own
         of_part = self._observers[self.poses.part[self._observers] == self.poses.part[row]]
         after = np.searchsorted(of_part, row)
-        near = of_part[max(after - 1, 0) : after + 1]
-        found = [self.observed(other) for other in near]
+        found = [self.observed(other) for other in of_part[max(after - 1, 0) : after + 1]]
         points = np.unique(np.concatenate([np.empty(0, np.int64), *found]))
         size = (self.poses.camera.width, self.poses.camera.height)
         image = np.array([[0.0, 0.0, *size]])
@@ -117,6 +115,6 @@ def points_in_boxes(
     depth = projected[:, 2]
     xy = projected[:, :2] / np.where(depth > 0, depth, np.nan)[:, None]  # (N, 2)
     boxes = xyxy[:, None]  # (D, 1, 4)
-    inside: BoolArray = ((xy >= boxes[..., :2]) & (xy <= boxes[..., 2:])).all(2)  # (D, N)
+    inside = ((xy >= boxes[..., :2]) & (xy <= boxes[..., 2:])).all(2)  # (D, N)
     box, point = np.nonzero(inside)
     return box, point, depth[point]

@@ -74,8 +74,23 @@ def read_poses(path: str | Path, video: Any, fmt: str = "auto", camera: str = ""
         lost = spans(frame[~known].tolist())
         messages.append(f"{path}: poses for {known.sum()} of {len(frame)} frames, none for {lost}")
     status = np.where(known, "supplied", "none")
-    extra = (given.metric, given.up_in_world, given.points, given.colors, tuple(messages))
-    return Poses(intrinsics, frame, time_s, poses, status, "user", *extra)
+    row_of = np.full(len(given.cam_from_world), -1)
+    row_of[row[row >= 0]] = np.flatnonzero(row >= 0)
+    seen = given.visibility[row_of[given.visibility[:, 0]] >= 0]
+    return Poses(
+        intrinsics,
+        frame,
+        time_s,
+        poses,
+        status,
+        "user",
+        given.metric,
+        given.up_in_world,
+        given.points,
+        given.colors,
+        np.column_stack([row_of[seen[:, 0]], seen[:, 1]]),
+        messages=tuple(messages),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +100,7 @@ class _PoseFile:
     Attributes:
         cam_from_world: (N, 3, 4), NaN where the file says that there is no pose.
         names, stamps_s: of the images, or their times: how their frames are found.
+        visibility: (M, 2) which poses observed which points: rows.
     """
 
     cam_from_world: Array
@@ -95,6 +111,7 @@ class _PoseFile:
     up_in_world: Array | None = None
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
 
 def _pose_format(path: Path) -> str:
@@ -332,7 +349,12 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> _PoseFile:
         raise ReobjError(f"{found[0]}: the COLMAP model has no registered image")
     camera = _one_camera(model.cameras, found[0])
     return _PoseFile(
-        model.cam_from_world, camera, model.names, points=model.points, colors=model.colors
+        model.cam_from_world,
+        camera,
+        model.names,
+        points=model.points,
+        colors=model.colors,
+        visibility=np.column_stack([model.obs_image, model.obs_point]),
     )
 
 
@@ -343,7 +365,7 @@ def _read_colmap_text(folder: Path) -> _PoseFile:
     refuses the first, and with the second takes every other image for observations.
     """
     cameras = _colmap_text_cameras(folder / "cameras.txt")
-    rows, names, used, where = [], [], [], []
+    rows, names, used, where, row_of = [], [], [], [], {}
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     observations_next = False
     for at, words in _lines(folder / "images.txt"):
@@ -355,6 +377,7 @@ def _read_colmap_text(folder: Path) -> _PoseFile:
             raise ReobjError(f"{at}: expected {expected}")
         if words[8] not in cameras:
             raise ReobjError(f"{at}: no camera {words[8]} in cameras.txt")
+        row_of[words[0]] = len(rows)
         rows.append(_numbers(words[1:8], at, expected))
         names.append(" ".join(words[9:]))
         used.append(cameras[words[8]])
@@ -364,9 +387,8 @@ def _read_colmap_text(folder: Path) -> _PoseFile:
         raise ReobjError(f"{folder / 'images.txt'}: no images in it")
     quaternion_wxyz, translation = np.split(np.array(rows), [4], axis=1)  # (N, 4), (N, 3)
     poses = _from_quaternions(np.roll(quaternion_wxyz, -1, 1), translation, where)
-    xyz, colors = _colmap_text_points(folder / "points3D.txt")
-    camera = _one_camera(used, folder)
-    return _PoseFile(poses, camera, tuple(names), points=xyz, colors=colors)
+    points = _colmap_text_points(folder / "points3D.txt", row_of)
+    return _PoseFile(poses, _one_camera(used, folder), tuple(names), None, False, None, *points)
 
 
 def _colmap_text_cameras(path: Path) -> dict[str, Camera]:
@@ -387,16 +409,33 @@ def _colmap_text_cameras(path: Path) -> dict[str, Camera]:
     return cameras
 
 
-def _colmap_text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """Read the points (P, 3) and colours (P, 3) of a points3D.txt by ascending id, if it exists."""
-    rows, expected = [], "POINT3D_ID X Y Z R G B ERROR TRACK[]"
+def _colmap_text_points(
+    path: Path, row_of: dict[str, int]
+) -> tuple[Array, npt.NDArray[np.uint8], IntArray]:
+    """Read the points of a points3D.txt by ascending id, if it exists.
+
+    Args:
+        row_of: row of each image id; a track may name images that are left out.
+    Returns:
+        points (N, 3), colours (N, 3), and which images observed which points (M, 2): rows.
+    """
+    rows: list[list[float]] = []
+    tracks, expected = {}, "POINT3D_ID X Y Z R G B ERROR TRACK[]"
     for at, words in _lines(path) if path.exists() else ():
         if words and len(words) < 8:
             raise ReobjError(f"{at}: expected {expected}")
         if words:
             rows.append(_numbers(words[:7], at, expected))
+            tracks[rows[-1][0]] = words[8::2]  # IMAGE_ID POINT2D_IDX ...
     table = np.array(sorted(rows)).reshape(-1, 7)
-    return table[:, 1:4], table[:, 4:].clip(0, 255).astype(np.uint8)
+    seen = [
+        (row_of[image], point)
+        for point, number in enumerate(table[:, 0].tolist())
+        for image in tracks[number]
+        if image in row_of
+    ]
+    visibility = np.array(seen, np.int64).reshape(-1, 2)
+    return table[:, 1:4], table[:, 4:].clip(0, 255).astype(np.uint8), visibility
 
 
 def _rows_of_frames(
