@@ -365,7 +365,8 @@ def _read_colmap_text(folder: Path) -> _PoseFile:
     refuses the first, and with the second takes every other image for observations.
     """
     cameras = _colmap_text_cameras(folder / "cameras.txt")
-    rows, names, used, where = [], [], [], []
+    rows: list[list[float]] = []
+    names, used, where = [], [], []
     row_of: dict[str, int] = {}
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     observations_next = False
