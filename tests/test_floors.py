@@ -26,7 +26,7 @@ FLOORS = {
     "reobj.identity.embedding reobj.identity.reid reobj.poses.keyframes reobj.poses.mapping "
     "reobj.poses.readers reobj.poses.checks reobj.poses.child",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
-    "reobj.poses.localize reobj.poses.points reobj.results.result",
+    "reobj.poses.localize reobj.poses.points reobj.poses.depth reobj.results.result",
     6: "reobj.sources.detectors reobj.poses.estimate reobj.objects reobj.results.workspace "
     "reobj.results.overlay",
     7: "reobj.poses.stage reobj.results.evaluation reobj.results.export reobj.results.scene",

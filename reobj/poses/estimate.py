@@ -43,8 +43,12 @@ class PosesConfig:
         "intrinsics: fx,fy,cx,cy[,k1,k2,p1,p2] in native pixels (COLMAP: centre + .5)",
         "--camera",
     )
+    depth: str = option(
+        "",
+        "folder of depth maps, 16-bit PNG in mm, or FOLDER:UNITS per metre: points, metric scale",
+        "--depth",
+    )
     size_px: int = option(640, "longer side to which frames are shrunk for the reconstruction, px")
-    max_keyframes: int = option(150, "most keyframes; a longer way takes wider steps")
     max_gap: int = option(
         15, "most lost frames in a row that are interpolated (and marked `interpolated`)"
     )
@@ -77,7 +81,7 @@ def estimate_poses(
     size = (int(video.size[0]), int(video.size[1]))
     camera, resized = parse_camera(config.camera, size), ResizedVideo(video, config.size_px)
     line = progress("keyframes", video.expected)
-    keys = _enough_keyframes(resized, config.max_keyframes, line)
+    keys = _enough_keyframes(resized, MAX_KEYFRAMES, line)
     images, names = [key.bgr for key in keys], [_frame_name(video, key.frame) for key in keys]
     boxes = [
         np.empty((0, 4)) if boxes_to_mask is None else np.reshape(boxes_to_mask(k.frame), (-1, 4))
@@ -115,6 +119,7 @@ def estimate_poses(
     return dataclasses.replace(poses, messages=tuple(messages))
 
 
+MAX_KEYFRAMES = 150  # a longer way takes wider steps (chosen: time)
 MIN_KEYFRAMES = 40  # below, the spacing is halved as long as there is motion (chosen)
 
 

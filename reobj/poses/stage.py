@@ -2,26 +2,64 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import shutil
 from pathlib import Path
 
 import numpy as np
 
-from reobj.cameras import Poses, load_poses, save_poses, write_colmap
+from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
 from reobj.poses.checks import check_poses
+from reobj.poses.depth import add_depth
 from reobj.poses.estimate import PosesConfig, estimate_poses
+from reobj.poses.points import triangulate
 from reobj.poses.readers import read_poses
 from reobj.results.workspace import Workspace
 from reobj.sources.video import Video, source_fingerprint
 from reobj.types import ReobjError, Tracks, rows_by
 
 
-def supplied_poses(video: Video, config: PosesConfig) -> Poses | None:
-    """Read poses given by the user; None if they are to be reconstructed."""
+def supplied_poses(
+    video: Video, config: PosesConfig, workspace: Workspace | None = None
+) -> Poses | None:
+    """Read poses given by the user; None if they are to be reconstructed.
+
+    Args:
+        workspace: the poses get points, from depth maps or triangulated, and these are kept there.
+    """
     if config.mode in ("auto", "none"):
         return None
-    return read_poses(config.mode, video, config.fmt, config.camera)
+    poses = read_poses(config.mode, video, config.fmt, config.camera)
+    return poses if workspace is None else with_points(poses, video, config, workspace)
+
+
+def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: Workspace) -> Poses:
+    """Add points from depth maps, else, if there are none, triangulate them; or from the cache."""
+    if not poses.known.any() or (len(poses.visibility) and not config.depth):
+        return poses
+    path = _points_path(poses, video, config, workspace)
+    if path.exists():
+        return load_poses(path)
+    if not len(poses.visibility) and not (config.depth and poses.metric):
+        size_px, seed = config.size_px, config.seed
+        poses = triangulate(
+            poses, video, size_px=size_px, seed=seed, work_dir=workspace.cache / "sfm"
+        )
+    if config.depth:
+        poses = add_depth(poses, config.depth, video)
+    if len(poses.points):
+        save_poses(path, poses)
+    return poses
+
+
+def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Workspace) -> Path:
+    """Return the cached file of poses with their points."""
+    maps = source_fingerprint(config.depth.partition(":")[0]) if config.depth else ""
+    arrays = (poses.cam_from_world, poses.points, poses.visibility, poses.part)
+    digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+    content = (source_fingerprint(video.source), video.config, poses.camera, poses.messages)
+    return workspace.path("points", *content, config, maps, digest)
 
 
 def check_directions(poses: Poses, tracks: Tracks) -> None:
@@ -51,10 +89,11 @@ def reconstruct_cached(
         boxes = np.column_stack([moving.frame, moving.xyxy])
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
     content = source_fingerprint(video.source)
-    path = workspace.path("poses", content, video.config, config, digest)
+    own = dataclasses.replace(config, depth="")
+    path = workspace.path("poses", content, video.config, own, digest)
     model = path.with_suffix(".sparse")
     if path.exists():
-        return load_poses(path), model
+        return _with_depth(load_poses(path), model, video, config, workspace)
     work = workspace.cache / "sfm"
     boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
     poses = estimate_poses(video, config, work, boxes_to_mask=boxes_of)
@@ -62,7 +101,27 @@ def reconstruct_cached(
         shutil.rmtree(model, ignore_errors=True)
         (work / "sparse").replace(model)
         save_poses(path, poses)
-    return poses, model
+    return _with_depth(poses, model, video, config, workspace)
+
+
+def _with_depth(
+    poses: Poses, model: Path, video: Video, config: PosesConfig, workspace: Workspace
+) -> tuple[Poses, Path]:
+    """Scale a reconstruction by depth maps, with its COLMAP model, and add their points."""
+    if not config.depth or not poses.known.any():
+        return poses, model
+    found = with_points(poses, video, config, workspace)
+    if not found.metric:
+        return found, model
+    scaled = _points_path(poses, video, config, workspace).with_suffix(".sparse")
+    pc = import_pycolmap()
+    whole = pc.Reconstruction(str(model))
+    of_largest = poses.known & (poses.part == 0)
+    length = [np.linalg.norm(p.cam_from_world[of_largest, :, 3]) for p in (found, poses)]
+    whole.transform(pc.Sim3d(length[0] / length[1], pc.Rotation3d(), np.zeros(3)))
+    scaled.mkdir(exist_ok=True)
+    whole.write(str(scaled))
+    return found, scaled
 
 
 def write_supplied_model(poses: Poses, video: Video, out: Path) -> None:
