@@ -17,6 +17,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
 from reobj.files import rounded
+from reobj.poses.floor import floor_of
 from reobj.results.result import Object, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
 from reobj.views import Views
@@ -191,7 +192,7 @@ def _with_solid(
 def describe_world(
     poses: Poses | None, fits: quadrics.ObjectFits | None, events: Sequence[LinkEvent]
 ) -> World:
-    """Describe the world of the poses: units, gravity, scale, frames, joins and splits."""
+    """Describe the world of the poses: units, gravity, scale, floor, frames, joins and splits."""
     if poses is None:
         return World(links=tuple(events))
     scale, up = None, poses.up_in_world
@@ -201,6 +202,8 @@ def describe_world(
         scale = quadrics.Scale(value, sigma, fits.scale.source)
         if fits.up.any():
             up, up_source = fits.up, fits.up_source
+    known = None if scale is None or scale.source == "none" else scale.value
+    floor, reason = floor_of(poses, up, 1.0 if poses.metric else known)
     return World(
         "m" if poses.metric else "arbitrary",
         poses.source,
@@ -211,4 +214,6 @@ def describe_world(
         up_source,
         scale,
         tuple(events),
+        floor=floor,
+        floor_reason=reason,
     )

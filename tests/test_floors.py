@@ -24,7 +24,7 @@ FLOORS = {
     3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded",
     4: "reobj.views reobj.sources.detection_files reobj.identity.camera_motion "
     "reobj.identity.embedding reobj.identity.reid reobj.poses.keyframes reobj.poses.mapping "
-    "reobj.poses.readers reobj.poses.checks reobj.poses.child",
+    "reobj.poses.readers reobj.poses.checks reobj.poses.child reobj.poses.floor",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.poses.localize reobj.poses.points reobj.poses.depth reobj.results.result",
     6: "reobj.sources.detectors reobj.poses.estimate reobj.objects reobj.results.workspace "

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reobj.cameras import Poses, invert_rigid
+from reobj.files import numbers
 from reobj.types import Array, BoolArray, IntArray
 
 
@@ -83,7 +84,7 @@ def find_floor(
     local = local[local[:, 2] < np.median(centres @ up)]
     if len(local) < MIN_POINTS:
         return None, f"{len(local)} points lie lower than the cameras, {MIN_POINTS} are needed"
-    middle = np.median(centres @ axes[:2].T, axis=0)  # (2,) across
+    middle = centres.mean(0) @ axes[:2].T  # (2,) across
     local[:, :2] -= middle
     start = _best_level(local, noise)
     if start is None:
@@ -92,24 +93,26 @@ def find_floor(
     off = _half_samples(local, noise) - plane  # (H, 3)
     cov = off.T @ off / max(len(off), 1)  # (3, 3)
     normal = np.array([-plane[1], -plane[2], 1.0]) @ axes
-    length = float(np.linalg.norm(normal))
+    normal /= np.linalg.norm(normal)
     foot = np.array([*middle, plane[0]]) @ axes
-    tilt = float(np.sqrt(np.linalg.eigvalsh(cov[1:, 1:])[-1].clip(0)))
-    floor = Floor(
-        normal=normal / length,
-        offset=float(normal @ foot) / length,
-        middle=foot,
-        sigma=math.hypot(math.sqrt(cov[0, 0]), SYSTEMATIC * distance),
-        tilt_sigma_deg=math.hypot(math.degrees(tilt), SYSTEMATIC_DEG),
-        inliers=int(on_it.sum()),
-    )
+    tilt_deg = math.degrees(np.sqrt(np.linalg.eigvalsh(cov[1:, 1:])[-1].clip(0)))
+    sigma = math.hypot(math.sqrt(cov[0, 0]), SYSTEMATIC * distance)
+    values = (float(normal @ foot), sigma, math.hypot(tilt_deg, SYSTEMATIC_DEG))
+    offset, sigma, tilt_sigma_deg = numbers(np.array(values))  # as objects.json has them
+    directions = (np.array(numbers(normal)), offset, np.array(numbers(foot)))
+    floor = Floor(*directions, sigma, tilt_sigma_deg, int(on_it.sum()))
     height_m = float(np.median(centres @ floor.normal - floor.offset)) * metres_per_unit
+    off = local[:, 2] - np.column_stack([np.ones(len(local)), local[:, :2]]) @ plane
+    on, above = ((low * noise < off) & (off < high * noise) for low, high in ((-1, 1), ABOVE))
+    if on.sum() < MIN_EDGE * above.sum() * 2 / (ABOVE[1] - ABOVE[0]):
+        return None, "no level has clearly more points on it than above it"
     reason = _fault(floor, local, on_it, noise, height_m, metres_per_unit)
     return (None, reason) if reason else (floor, "")
 
 
 MIN_INLIERS, MIN_SHARE = 30, 0.015  # of the points, after thinning (chosen)
 MIN_SPREAD = 0.3  # rms spread across of the points on it over that of all (chosen)
+MIN_EDGE = 1.5  # density of points on it over that shortly above (chosen)
 MAX_SIGMA = 3.0  # of the height, in `noise` (chosen: 11 cm at 3 m)
 CAMERA_HEIGHT_M = (0.3, 2.5)  # of a camera in a hand above a floor (chosen: wide)
 STANDING_M = 1.1  # a camera so high is above a floor, not above a table (chosen) ...

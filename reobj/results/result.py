@@ -33,6 +33,7 @@ from reobj.files import (
     save_npz,
     without_password,
 )
+from reobj.poses.floor import Floor
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
 from reobj.types import (
@@ -134,6 +135,7 @@ class World:
         up_in_world: (3,) unit vector against gravity; up_source: where it comes from.
         scale: metres per unit, its relative sigma and source; None without a fit.
         links: joins and splits of tracklets with their evidence.
+        floor: the plane of the floor; None where none can be told, and floor_reason says why.
     """
 
     units: str | None = None
@@ -145,10 +147,14 @@ class World:
     up_source: str = "none"
     scale: quadrics.Scale | None = None
     links: tuple[LinkEvent, ...] = ()
+    floor: Floor | None = None
+    floor_reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the `world` of objects.json."""
         values = {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        if self.floor is not None:
+            values["floor"] = {k: _plain(v) for k, v in dataclasses.asdict(self.floor).items()}
         if self.scale is not None:
             values["scale"] = {
                 "metres_per_unit": self.scale.value,
@@ -170,6 +176,9 @@ class World:
         if (scale := values.get("scale")) is not None:
             facts = (scale["metres_per_unit"], scale["rel_sigma"], scale["source"])
             values["scale"] = quadrics.Scale(*facts)
+        if (floor := values.get("floor")) is not None:
+            vectors = {name: np.array(floor[name], np.float64) for name in ("normal", "middle")}
+            values["floor"] = Floor(**floor | vectors)
         values["links"] = tuple(LinkEvent.from_json(link) for link in values.get("links", ()))
         return World(**values)
 
