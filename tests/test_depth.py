@@ -12,8 +12,10 @@ import pytest
 from pose_worlds import FakeVideo, motion, supplied
 
 import reobj_track as rt
-from reobj.cameras import invert_rigid
+from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
+from reobj.poses import stage
 from reobj.poses.depth import add_depth, depth_scale, find_depth_maps
+from reobj.results.workspace import Workspace
 
 SIZE = (320, 240)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (250.0, 250.0, 160.0, 120.0))
@@ -353,6 +355,71 @@ def test_bad_input_gives_one_line(tmp_path, walk, make, text, expected):
 def test_units_are_those_behind_the_colon(tmp_path, walk):
     folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, units=5000)
     assert on_walls(add(metric(walk), f"{folder}:5000").points).max() < 0.01
+
+
+# ---- In a run ------------------------------------------------------------------------------------
+
+
+def image_folder(folder):
+    folder.mkdir()
+    for i in range(FRAMES):
+        cv2.imwrite(str(folder / f"{i:04d}.png"), np.full((*SIZE[::-1], 3), 20 * i, np.uint8))
+    return rt.Video(folder)
+
+
+def test_a_reconstruction_and_its_model_become_metric_once(tmp_path, walk, monkeypatch):
+    """The second time all comes from the cache; the model without depth maps stays as it was."""
+    pycolmap = pytest.importorskip("pycolmap")
+    video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    found, asked = with_points(walk, 0.5), []
+
+    def estimate(video, config, work, boxes_to_mask=None):
+        asked.append(config)
+        write_colmap(work / "text", found, NUMBERS)
+        (work / "sparse").mkdir()
+        pycolmap.Reconstruction(str(work / "text")).write(str(work / "sparse"))
+        return found
+
+    monkeypatch.setattr(stage, "estimate_poses", estimate)
+    config = rt.PosesConfig(depth=str(folder))
+    for _ in range(2):
+        poses, model = stage.reconstruct_cached(video, config, workspace)
+        assert poses.metric and len(poses.points) > 3000 and len(asked) == 1
+        cams = read_sparse_model(model).cam_from_world
+        np.testing.assert_allclose(cams, poses.cam_from_world, atol=1e-6)
+        assert len(read_sparse_model(model).points) == len(found.points)
+        monkeypatch.setattr(stage, "add_depth", None)
+    plain, model = stage.reconstruct_cached(video, rt.PosesConfig(), workspace)
+    assert not plain.metric and len(asked) == 1
+    cams = read_sparse_model(model).cam_from_world
+    np.testing.assert_allclose(cams, found.cam_from_world, atol=1e-6)
+
+
+def test_supplied_poses_are_triangulated_once_where_they_bring_no_points(
+    tmp_path, walk, monkeypatch
+):
+    video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    asked = []
+
+    def triangulate(poses, video, *, size_px, seed, work_dir):
+        asked.append((size_px, seed))
+        return with_points(poses, 1.0)
+
+    monkeypatch.setattr(stage, "triangulate", triangulate)
+    options = {"size_px": 300, "seed": 7}
+    for _ in range(2):
+        poses = stage.with_points(walk, video, rt.PosesConfig(**options), workspace)
+        assert len(poses.points) == 360 and asked == [(300, 7)]
+    assert stage.with_points(poses, video, rt.PosesConfig(), workspace) is poses
+    with_depth = rt.PosesConfig(depth=str(folder), **options)
+    found = stage.with_points(metric(walk), video, with_depth, workspace)  # maps alone
+    assert len(found.points) > 3000 and len(asked) == 1
+    found = stage.with_points(walk, video, with_depth, workspace)  # the scale needs points
+    assert found.metric and len(asked) == 2
+    unknown = dataclasses.replace(walk, cam_from_world=np.full_like(walk.cam_from_world, np.nan))
+    assert stage.with_points(unknown, video, rt.PosesConfig(), workspace) is unknown
 
 
 # ---- A recording ---------------------------------------------------------------------------------

@@ -58,8 +58,9 @@ def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Wor
     maps = source_fingerprint(config.depth.partition(":")[0]) if config.depth else ""
     arrays = (poses.cam_from_world, poses.points, poses.visibility, poses.part)
     digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
-    content = (source_fingerprint(video.source), video.config, poses.camera, poses.messages)
-    return workspace.path("points", *content, config, maps, digest)
+    facts = (poses.camera, poses.metric, poses.messages)
+    content = source_fingerprint(video.source)
+    return workspace.path("points", content, video.config, *facts, config, maps, digest)
 
 
 def check_directions(poses: Poses, tracks: Tracks) -> None:
