@@ -237,7 +237,10 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
 MAX_MAPS = 60  # maps that are read, evenly spread (chosen: time)
 MIN_MAPS = 3  # with a ratio, to tell a scale from (chosen)
 MIN_RATIOS = 10  # points of a map that give its ratio (chosen)
-SENSOR_SIGMA = 0.01  # relative, of a depth camera's own scale (Khoshelham and Elberink 2012: ~1 %)
+# Relative sigma that the scatter does not show: of the depth camera itself (Khoshelham and Elberink
+# 2012: ~1 %), of its place and the colour camera's focal length (chosen: redkitchen, 1 to 3 %).
+SENSOR_SIGMA = 0.02
+RUNS = 8  # of the path, whose scatter tells the sigma (chosen)
 MAX_SCALE_SPREAD = 0.2  # relative, between maps: then depth and cameras contradict (chosen)
 
 
@@ -266,8 +269,10 @@ def depth_scale(poses: Poses, maps: DepthMaps) -> tuple[Array, Array, int] | str
             )
         used += len(logs)
         scales.append(float(np.exp(np.median(logs))))
-        # 1.25: of a median instead of a mean
-        sigmas.append(float(np.hypot(1.25 * spread / np.sqrt(len(logs)), SENSOR_SIGMA)))
+        # neighbouring maps err alike: runs of them count as one measurement each
+        runs = np.array([np.median(run) for run in np.array_split(logs, min(RUNS, len(logs)))])
+        sigma = float(runs.std(ddof=1)) / np.sqrt(len(runs))
+        sigmas.append(float(np.hypot(sigma, SENSOR_SIGMA)))
     return np.array(scales), np.array(sigmas), used
 
 
