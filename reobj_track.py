@@ -995,7 +995,7 @@ def run(
     workspace.bind(video, overwrite)
     seconds: dict[str, float] = {}
     in_3d = in_3d and config.poses.mode != "none"
-    poses = supplied_poses(video, config.poses) if in_3d else None
+    poses = supplied_poses(video, config.poses, workspace) if in_3d else None
     if tracks:
         result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
         boxes, names = result.tracks, result.class_names
@@ -1203,7 +1203,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     video = Video(args.video, config.input)
     workspace = Workspace(args.out, args.overwrite)
     workspace.bind(video, args.overwrite)
-    poses, model = supplied_poses(video, config.poses), None
+    poses, model = supplied_poses(video, config.poses, workspace), None
     if poses is None:
         poses, model = reconstruct_cached(video, config.poses, workspace)
     workspace.publish_model(model)

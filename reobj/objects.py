@@ -17,6 +17,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
 from reobj.files import rounded
+from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
 from reobj.views import Views
@@ -193,7 +194,7 @@ def describe_world(
     fits: Sequence[quadrics.ObjectFits | None],
     events: Sequence[LinkEvent],
 ) -> World:
-    """Describe the world of the poses: units, gravity, scale, frames, joins and splits.
+    """Describe the world of the poses: units, gravity, scale, floor, frames, joins and splits.
 
     Args:
         fits: of each part, None where nothing was fitted.
@@ -201,7 +202,10 @@ def describe_world(
     if poses is None:
         return World(links=tuple(events))
     parts = tuple(_describe_part(poses, k, fit) for k, fit in enumerate(fits))
-    first = parts[0]
+    first, scale = parts[0], parts[0].scale
+    known = None if scale is None or scale.source == "none" else scale.value
+    metres = 1.0 if poses.metric else known
+    floor, reason = floor_of(poses.of_part(0), first.up_in_world, metres)
     return World(
         "m" if poses.metric else "arbitrary",
         poses.source,
@@ -213,6 +217,8 @@ def describe_world(
         first.scale,
         tuple(events),
         parts,
+        floor,
+        reason,
     )
 
 

@@ -1,4 +1,4 @@
-"""Boxes of groups of tracks in the frames that have a pose: the input of the fit.
+"""What frames with a pose see: boxes of groups of tracks (the input of the fit), sparse points.
 
 Which rows make a group is decided by linking (tracklets) or by the identities (objects).
 """
@@ -49,3 +49,72 @@ def gather_views(
     img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (V, 3, 4)
     size = (poses.camera.width, poses.camera.height)
     return Views(poses.frame[poses.known], boxes, score, img_from_world, size)
+
+
+class VisiblePoints:
+    """Index of the sparse points that each frame sees.
+
+    A frame that observed none itself (between two keyframes, or without depth map) is taken to see
+    what the nearest frames of its part before and after it observed, as far as that lies in its
+    image. What hides in between is not known: such a point may lie behind something near.
+    """
+
+    def __init__(self, poses: Poses) -> None:
+        self.poses = poses
+        observer, self._point = np.unique(poses.visibility, axis=0).T  # (M,) rows each
+        self._start = np.searchsorted(observer, np.arange(len(poses.frame) + 1))
+        self._observers = np.flatnonzero(np.diff(self._start))  # frames that observed something
+        self._img_from_world = poses.camera.K @ poses.cam_from_world  # (F, 3, 4)
+
+    def observed(self, row: int) -> IntArray:
+        """Return the points that the frame in this row of the poses observed itself."""
+        return np.asarray(self._point[self._start[row] : self._start[row + 1]], np.int64)
+
+    def in_frame(self, row: int) -> IntArray:
+        """Return the rows of the points seen by the frame in this row of the poses, ascending."""
+        if not self.poses.known[row]:
+            return np.empty(0, np.int64)
+        if len(own := self.observed(row)):
+            return own
+        of_part = self._observers[self.poses.part[self._observers] == self.poses.part[row]]
+        after = np.searchsorted(of_part, row)
+        found = [self.observed(other) for other in of_part[max(after - 1, 0) : after + 1]]
+        points = np.unique(np.concatenate([np.empty(0, np.int64), *found]))
+        size = (self.poses.camera.width, self.poses.camera.height)
+        image = np.array([[0.0, 0.0, *size]])
+        _, inside, _ = points_in_boxes(self.poses.points[points], self._img_from_world[row], image)
+        return points[inside]
+
+    def in_boxes(self, row: int, xyxy: Array) -> tuple[IntArray, IntArray, Array]:
+        """Find the points that a frame sees inside boxes.
+
+        Args:
+            row: of the frame in the poses. xyxy: (D, 4) boxes in native pixels.
+        Returns:
+            one entry for each of K pairs of a box and a point in it, by box: rows of the boxes
+            (K,) and of the points (K,), depth (K,) of the point in the frame's camera.
+        """
+        points, boxes = self.in_frame(row), undistort_boxes(xyxy, self.poses.camera)
+        inside = points_in_boxes(self.poses.points[points], self._img_from_world[row], boxes)
+        return inside[0], points[inside[1]], inside[2]
+
+
+def points_in_boxes(
+    points: Array, img_from_world: Array, xyxy: Array
+) -> tuple[IntArray, IntArray, Array]:
+    """Find the points in front of a camera that project into boxes.
+
+    Args:
+        points: (N, 3) in world. img_from_world: (3, 4) K @ cam_from_world of a pinhole camera.
+        xyxy: (D, 4) undistorted boxes in its pixels; NaN: none.
+    Returns:
+        one entry for each of K pairs of a box and a point in it, by box: rows of the boxes (K,)
+        and of the points (K,), depth (K,) of the point along the optical axis, in world units.
+    """
+    projected = points @ img_from_world[:, :3].T + img_from_world[:, 3]  # (N, 3)
+    depth = projected[:, 2]
+    xy = projected[:, :2] / np.where(depth > 0, depth, np.nan)[:, None]  # (N, 2)
+    boxes = xyxy[:, None]  # (D, 1, 4)
+    inside = ((xy >= boxes[..., :2]) & (xy <= boxes[..., 2:])).all(2)  # (D, N)
+    box, point = np.nonzero(inside)
+    return box, point, depth[point]

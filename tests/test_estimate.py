@@ -26,8 +26,11 @@ def config(**changes):
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     images, truth = textured_room(30, 0.08, size=(320, 240))
-    folder, few = tmp_path_factory.mktemp("walk"), config(max_keyframes=12)
-    return FakeVideo(images), truth, folder, rt.estimate_poses(FakeVideo(images), few, folder)
+    folder = tmp_path_factory.mktemp("walk")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 12)
+        poses = rt.estimate_poses(FakeVideo(images), config(), folder)
+    return FakeVideo(images), truth, folder, poses
 
 
 def test_a_walk_gets_a_pose_for_every_frame(walk):
@@ -76,7 +79,8 @@ def test_options_arrive_at_the_reconstruction(walk, tmp_path, monkeypatch):
     assert (seen["camera"], seen["focal_guesses"], seen["seed"]) == (None, [0.8], 0)
     assert len(seen["images"]) > 8 and all(boxes.shape == (0, 4) for boxes in seen["boxes"])
     mask = lambda frame: np.full((2, 4), float(frame))  # noqa: E731
-    changed = seen_job(monkeypatch, video, tmp_path, size_px=160, max_keyframes=8, seed=3,
+    monkeypatch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 8)
+    changed = seen_job(monkeypatch, video, tmp_path, size_px=160, seed=3,
                        camera="288,288,160,120", boxes=mask)  # fmt: skip
     assert changed["images"][0].shape == (120, 160, 3) and len(changed["images"]) <= 8
     assert changed["camera"].params[0] == 288 and changed["seed"] == 3

@@ -26,9 +26,11 @@ FLOORS = {
     4: "reobj.views reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
     "reobj.identity.places reobj.poses.keyframes reobj.poses.features "
-    "reobj.poses.consistency reobj.poses.intrinsics reobj.poses.matching reobj.poses.checks reobj.results.ply",
+    "reobj.poses.consistency reobj.poses.intrinsics reobj.poses.matching "
+    "reobj.poses.checks reobj.poses.floor reobj.results.ply",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
-    "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.results.result",
+    "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
+    "reobj.poses.depth reobj.results.result",
     6: "reobj.sources.detectors reobj.poses.estimate reobj.objects reobj.results.workspace "
     "reobj.results.overlay reobj.results.solids",
     7: "reobj.parts reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "

@@ -27,6 +27,7 @@ import reobj.sources.detectors as detectors
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
 from reobj.options import every_option, list_options, with_option
+from reobj.results.workspace import Workspace
 from reobj.sources.weights import own_models
 
 CHAIR = 56
@@ -636,12 +637,32 @@ def _(lab: Lab) -> None:
     assert sizes == [(120, 160)] * 2
 
 
-@shows("poses.max_keyframes")
+@shows("poses.depth")
 def _(lab: Lab) -> None:
-    most = lab.caught(estimate, "pick_keyframes", "max_keyframes")
-    video = rt.Video(images(lab.path / "images", 2))
-    rt.estimate_poses(video, lab.config(7).poses, lab.path / "work")
-    assert set(most) == {7}
+    """Maps of supplied and of reconstructed poses; nothing is triangulated then."""
+    given: list[str] = []
+
+    def noted(poses: rt.Poses, depth: str, video: Any) -> rt.Poses:
+        given.append(depth)
+        return poses
+
+    lab.patch.setattr(stage, "add_depth", noted)
+    lab.patch.setattr(stage, "triangulate", lambda poses, *_, **__: poses)
+    video, workspace = rt.Video(images(lab.path / "images", 4)), Workspace(lab.path / "out")
+    path = tum_file(lab.path / "cams.txt", arc(4))
+    options = {"poses__mode": path, "poses__camera": CAMERA_TEXT}
+    for depth in ("", "maps:5000"):
+        stage.supplied_poses(video, lab.config(depth, **options).poses, workspace)
+        known = rt.Poses(CAMERA, np.arange(4), np.arange(4) / 30, arc(4), np.full(4, "pnp"), "x")
+        lab.patch.setattr(stage, "estimate_poses", lambda *_, p=known, **__: write_model(p, lab))
+        stage.reconstruct_cached(video, lab.config(depth).poses, workspace)
+    assert given == ["maps:5000"] * 2
+
+
+def write_model(poses: rt.Poses, lab: Lab) -> rt.Poses:
+    """Stand for a reconstruction, with its COLMAP model."""
+    write_colmap(lab.path / "out" / "cache" / "sfm" / "sparse", poses, [str(i) for i in range(4)])
+    return poses
 
 
 def reconstructed(lab: Lab, value: Any) -> rt.Poses:

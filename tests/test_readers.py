@@ -313,6 +313,33 @@ def test_colmap_points_come_along_in_the_order_of_their_numbers(tmp_path, write)
     np.testing.assert_array_equal(poses.colors, [[9, 8, 7], [250, 0, 1]])
 
 
+@pytest.mark.parametrize("binary", [False, True])
+def test_colmap_observations_come_along_as_rows_of_frames_and_points(tmp_path, binary):
+    """Ids count from 1 here; images 1 and 6 of the model are no frames of the video."""
+    folder = model(tmp_path / "text", some_cameras())
+    observed = {1: [1, 2], 2: [2], 3: [1], 4: [], 5: [1, 2], 6: [1]}  # points of each image
+    rows = [
+        f"{row}\n" + " ".join(f"{9 * k + 1}.5 2.5 {point}" for k, point in enumerate(points))
+        for row, points in zip(image_rows(folder), observed.values(), strict=True)
+    ]
+    text(folder / "images.txt", "\n".join(rows) + "\n")
+    lines = (folder / "points3D.txt").read_text().splitlines()
+    tracks = [
+        [f"{image} {points.index(p)}" for image, points in observed.items() if p in points]
+        for p in (1, 2)
+    ]
+    pairs = zip(lines, tracks, strict=True)
+    text(folder / "points3D.txt", "".join(f"{row} {' '.join(seen)}\n" for row, seen in pairs))
+    if binary:
+        found = pytest.importorskip("pycolmap").Reconstruction(str(folder))
+        folder = tmp_path / "binary"
+        folder.mkdir()
+        found.write_binary(str(folder))
+    poses = read(folder, blank(4, NAMES[1:5]))
+    assert sorted(map(tuple, poses.visibility.tolist())) == [(0, 1), (1, 0), (3, 0), (3, 1)]
+    assert len(poses.points) == 2
+
+
 def test_own_files_read_back(tmp_path):
     cams = some_cameras()
     cams[2] = np.nan

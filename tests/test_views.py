@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -10,7 +11,7 @@ import pytest
 from simulated import CAMERA, SIZE, tracks_of, walk, with_columns
 
 import reobj_track as rt
-from reobj.views import gather_views
+from reobj.views import VisiblePoints, gather_views, points_in_boxes
 
 
 def one_box_each(frames: list[int], box: tuple[float, ...] = (10, 20, 60, 90)) -> rt.Tracks:
@@ -92,3 +93,82 @@ def test_cameras_of_views_project_like_the_poses() -> None:
     x, y, z = views.img_from_world[4] @ [*point, 1]
     expected = np.ravel(camera.img_from_cam(pose * point))
     np.testing.assert_allclose([x / z, y / z], expected, atol=1e-9)
+
+
+def test_points_in_boxes_are_those_that_project_into_them() -> None:
+    """Against a loop; points behind the camera lie in no box, although they project into one."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-6, 6, (800, 3))
+    pose = walk(3).cam_from_world[1]
+    corner = rng.uniform(0, 400, (7, 2))
+    xyxy = np.column_stack([corner, corner + rng.uniform(50, 250, (7, 2))])
+    xyxy[3] = np.nan
+    found = points_in_boxes(points, CAMERA.K @ pose, xyxy)
+    expected = []
+    for b, (x1, y1, x2, y2) in enumerate(xyxy):
+        for p, point in enumerate(points):
+            in_cam = pose[:, :3] @ point + pose[:, 3]
+            x, y, z = CAMERA.K @ in_cam
+            if z > 0 and x1 <= x / z <= x2 and y1 <= y / z <= y2:
+                expected.append((b, p, in_cam[2]))
+    assert len(expected) > 50 and (points @ pose[2, :3] + pose[2, 3] < 0).any()
+    np.testing.assert_allclose(np.column_stack(found), expected)
+
+
+def test_no_points_or_no_boxes_make_no_pairs() -> None:
+    pose = CAMERA.K @ walk(3).cam_from_world[1]
+    box, point, depth = points_in_boxes(np.empty((0, 3)), pose, np.array([[0.0, 0, 9, 9]]))
+    assert box.shape == point.shape == depth.shape == (0,)
+    box, point, depth = points_in_boxes(np.zeros((4, 3)), pose, np.empty((0, 4)))
+    assert box.shape == point.shape == depth.shape == (0,)
+
+
+def sparse_walk(count: int = 7, **options: Any) -> rt.Poses:
+    """A walk with points at the origin, of which frames 0 and 4 observed one each, 4 another."""
+    points = np.array([[0.0, 0, 0.5], [0.1, 0, 0.5], [1.0, 0, 1.2], [50.0, 50, 50]])
+    visibility = np.array([[4, 2], [0, 0], [4, 0], [4, 3]])
+    colors = np.zeros((4, 3), np.uint8)
+    poses = walk(count, **options)
+    return dataclasses.replace(poses, points=points, colors=colors, visibility=visibility)
+
+
+def test_frames_see_what_they_or_their_neighbours_observed() -> None:
+    poses = sparse_walk()
+    visible = VisiblePoints(poses)
+    assert visible.observed(4).tolist() == [0, 2, 3] and visible.observed(1).tolist() == []
+    assert visible.in_frame(0).tolist() == [0]  # its own observation alone
+    assert visible.in_frame(2).tolist() == [0, 2]  # both neighbours'; point 3 is out of its image
+    assert visible.in_frame(6).tolist() == [0, 2]  # nothing after it
+    assert not any(1 in visible.in_frame(row) for row in range(7))  # observed by no frame
+
+
+def test_frames_without_a_pose_or_of_another_part_see_nothing() -> None:
+    poses = dataclasses.replace(sparse_walk(), part=np.array([0, 0, 0, 1, 1, 2, 2]))
+    poses.cam_from_world[1] = np.nan
+    visible = VisiblePoints(poses)
+    assert [visible.in_frame(row).tolist() for row in range(7)] == [
+        [0], [], [0], [0, 2], [0, 2, 3], [], [],
+    ]  # fmt: skip
+
+
+def test_boxes_of_a_frame_get_their_points_with_depth() -> None:
+    """Boxes are undistorted: with this lens the point at a corner leaves the box otherwise."""
+    camera = rt.Camera("SIMPLE_RADIAL", *SIZE, (520.0, 320.0, 240.0, 0.3))
+    poses = sparse_walk(camera=camera)
+    model = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=640, height=480, params=list(camera.params)
+    )
+    in_cam = poses.points[:3] @ poses.cam_from_world[4, :, :3].T + poses.cam_from_world[4, :, 3]
+    x, y = np.asarray(model.img_from_cam(in_cam))[2]  # where the lens puts point 2
+    boxes = np.array([[x - 2, y - 2, x + 2, y + 2], [0.0, 0, 1, 1], [0.0, 0, 640, 480]])
+    box, point, depth = VisiblePoints(poses).in_boxes(4, boxes)
+    assert list(zip(box.tolist(), point.tolist(), strict=True)) == [(0, 2), (2, 0), (2, 2)]
+    np.testing.assert_allclose(depth, in_cam[[2, 0, 2], 2])
+
+
+def test_poses_without_points_show_none() -> None:
+    visible = VisiblePoints(walk(3))
+    assert visible.in_frame(1).tolist() == []
+    assert [len(column) for column in visible.in_boxes(1, np.array([[0.0, 0, 640, 480]]))] == [
+        0
+    ] * 3

@@ -37,12 +37,6 @@ class MatchedPairs:
     keypoints: dict[int, Array]
     fundamental: Array
 
-    def among(self, ids: Sequence[int]) -> MatchedPairs:
-        """Return the pairs of some images alone."""
-        rows = np.flatnonzero(np.isin(self.image_ids, list(ids)).all(1))
-        chosen = [self.inliers[row] for row in rows]
-        return MatchedPairs(self.image_ids[rows], chosen, self.keypoints, self.fundamental[rows])
-
 
 def read_pairs(database: Path) -> MatchedPairs:
     """Read keypoints and verified matches."""

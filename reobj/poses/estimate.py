@@ -48,8 +48,12 @@ class PosesConfig:
         "--camera",
     )
     metric: bool = option(False, "supplied poses are in metres, whatever their format", "--metric")
+    depth: str = option(
+        "",
+        "folder of depth maps, 16-bit PNG in mm, or FOLDER:UNITS per metre: points, metric scale",
+        "--depth",
+    )
     size_px: int = option(640, "longer side to which frames are shrunk for the reconstruction, px")
-    max_keyframes: int = option(400, "most keyframes; a longer way takes wider steps")
     seed: int = option(0, "random seed of the reconstruction")
 
 
@@ -79,7 +83,7 @@ def estimate_poses(
     size = (int(video.size[0]), int(video.size[1]))
     camera, resized = parse_camera(config.camera, size), ResizedVideo(video, config.size_px)
     line = progress("keyframes", video.expected)
-    keys = _enough_keyframes(resized, config.max_keyframes, line)
+    keys = _enough_keyframes(resized, MAX_KEYFRAMES, line)
     focal = _exif_focal(video) or FOCAL_GUESS
 
     def mapped(keys: list[ResizedFrame]) -> tuple[list[SparseModel], list[str]]:
@@ -165,6 +169,7 @@ def _locate_all(
     )
 
 
+MAX_KEYFRAMES = 400  # a longer way takes wider steps (chosen: 150 tore a walk of 373 photos)
 MIN_KEYFRAMES = 40  # below, the spacing is halved as long as there is motion (chosen)
 
 

@@ -96,42 +96,48 @@ MAX_RATIO = 0.8  # of the angles to the best and the second best (Lowe, IJCV 200
 MAX_ANGLE = 0.7  # between matching descriptors, radians (COLMAP)
 
 
-def match_features(database: Path, ids: Sequence[int], seed: int) -> None:
-    """Match and verify all pairs of a few keyframes, else sequential pairs and retrieved ones.
-
-    Pairs that are matched already are skipped.
+def choose_pairs(database: Path, ids: Sequence[int], seed: int) -> list[tuple[int, int]]:
+    """Choose all pairs of a few keyframes, else sequential pairs and retrieved ones.
 
     Args:
         ids: of the keyframes, in the order of time.
     """
-    pc, listed, count = import_pycolmap(), database.parent / "pairs.txt", len(ids)
+    if (count := len(ids)) <= MAX_EXHAUSTIVE:
+        return list(itertools.combinations(ids, 2))
+    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
+        found = [np.asarray(db.read_descriptors(number).data) for number in ids]
+    pairs = {(i, i + offset) for offset in OFFSETS for i in range(count - offset)}
+    pairs |= set(_pairs_from_retrieval(found, seed))
+    return [(ids[i], ids[j]) for i, j in sorted(pairs)]
+
+
+def match_pairs(database: Path, pairs: Sequence[tuple[int, int]], seed: int) -> None:
+    """Match pairs of images and verify them by two-view geometry; those that are done are skipped.
+
+    Args:
+        pairs: ids of images in the database.
+    """
+    pc, listed = import_pycolmap(), database.parent / "pairs.txt"
     verification = pc.TwoViewGeometryOptions()
     ransac = verification.ransac
     ransac.random_seed = seed  # else two runs differ
     # fewer than COLMAP's 100 to 10,000, times 3: the same inliers in half the time (measured)
     ransac.min_num_trials, ransac.max_num_trials, ransac.dyn_num_trials_multiplier = 30, 2000, 1.0
     with contextlib.closing(pc.Database.open(str(database))) as db:
-        found = [np.asarray(db.read_descriptors(number).data) for number in ids]
-        known = {
-            (i, j) for i, j in itertools.combinations(ids, 2) if db.exists_two_view_geometry(i, j)
-        }
-    pairs = set(itertools.combinations(range(count), 2))
-    if count > MAX_EXHAUSTIVE:
-        pairs = {(i, i + offset) for offset in OFFSETS for i in range(count - offset)}
-        pairs |= set(_pairs_from_retrieval(found, seed))
-    todo = sorted((i, j) for i, j in pairs if (ids[i], ids[j]) not in known)
-    lengths = (np.linalg.norm(d.astype(np.float32), axis=1, keepdims=True) for d in found)
-    unit = [d / np.maximum(n, 1e-9) for d, n in zip(found, lengths, strict=True)]
+        todo = [pair for pair in pairs if not db.exists_two_view_geometry(*pair)]
+        unit = {}
+        for number in sorted({number for pair in todo for number in pair}):
+            rows = np.asarray(db.read_descriptors(number).data).astype(np.float32)
+            unit[number] = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
     with ThreadPoolExecutor(2) as pool:
         for start in range(0, len(todo), MATCH_CHUNK):
             chunk = todo[start : start + MATCH_CHUNK]
             matches = list(pool.map(lambda pair: _matches(unit[pair[0]], unit[pair[1]]), chunk))
             with contextlib.closing(pc.Database.open(str(database))) as db:
-                for (i, j), match in zip(chunk, matches, strict=True):
-                    if not db.exists_matches(ids[i], ids[j]):
-                        db.write_matches(ids[i], ids[j], match)
-            lines = (f"{ids[i]:06d} {ids[j]:06d}\n" for i, j in chunk)
-            listed.write_text("".join(lines))
+                for pair, match in zip(chunk, matches, strict=True):
+                    if not db.exists_matches(*pair):
+                        db.write_matches(*pair, match)
+            listed.write_text("".join(f"{i:06d} {j:06d}\n" for i, j in chunk))
             pc.verify_matches(str(database), str(listed), verification)
             send_progress("match", start + len(chunk), len(todo))
 

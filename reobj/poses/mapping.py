@@ -34,7 +34,7 @@ from reobj.poses.consistency import (
     focal_from_pairs,
     read_pairs,
 )
-from reobj.poses.features import extract_features, match_features
+from reobj.poses.features import choose_pairs, extract_features, match_pairs
 from reobj.types import Array, Image
 
 HOW_TO_FILM = (
@@ -138,9 +138,8 @@ def _reconstruct_job(folder: Path) -> None:
     database, size = folder / "database.db", (images.shape[2], images.shape[1])
     camera = _start_camera(job, size)
     extract_features(database, images, job["ids"], job["boxes"], camera)
-    match_features(database, job["ids"], job["seed"])
+    match_pairs(database, choose_pairs(database, job["ids"], job["seed"]), job["seed"])
     pairs = read_pairs(database)
-    pairs = pairs.among(job["ids"])
     focal = None if job["camera"] is not None else focal_from_pairs(pairs, size)
     search = _Search(database, job["ids"], pairs, job["seed"])
     parts, messages = search.run(job["camera"] is not None, focal, job["guess"])

@@ -9,24 +9,66 @@ from pathlib import Path
 
 import numpy as np
 
-from reobj.cameras import Poses, load_poses, save_poses, write_colmap
+from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
 from reobj.files import part_path
 from reobj.poses.checks import check_poses
+from reobj.poses.depth import add_depth
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
+from reobj.poses.points import triangulate
 from reobj.poses.readers import read_poses
 from reobj.results.workspace import Workspace
 from reobj.sources.video import Video, source_fingerprint
 from reobj.types import ReobjError, Tracks, rows_by
 
 
-def supplied_poses(video: Video, config: PosesConfig) -> Poses | None:
-    """Read poses given by the user; None if they are to be reconstructed."""
+def supplied_poses(
+    video: Video, config: PosesConfig, workspace: Workspace | None = None
+) -> Poses | None:
+    """Read poses given by the user; None if they are to be reconstructed.
+
+    Args:
+        workspace: the poses get points, from depth maps or triangulated, and these are kept there.
+    """
     if config.mode in ("auto", "none"):
         if config.metric:
             raise ReobjError("--metric is said of supplied poses; a reconstruction has no scale")
         return None
-    return read_poses(config.mode, video, config.fmt, config.camera, config.metric)
+    poses = read_poses(config.mode, video, config.fmt, config.camera, config.metric)
+    return poses if workspace is None else with_points(poses, video, config, workspace)
+
+
+def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: Workspace) -> Poses:
+    """Add points from depth maps, else, if there are none, triangulate them; or from the cache."""
+    if (
+        not video.has_images
+        or not poses.known.any()
+        or (len(poses.visibility) and not config.depth)
+    ):
+        return poses
+    path = _points_path(poses, video, config, workspace)
+    if path.exists():
+        return load_poses(path)
+    if not len(poses.visibility) and not (config.depth and poses.metric):
+        size_px, seed = config.size_px, config.seed
+        poses = triangulate(
+            poses, video, size_px=size_px, seed=seed, work_dir=workspace.cache / "sfm"
+        )
+    if config.depth:
+        poses = add_depth(poses, config.depth, video)
+    if len(poses.points):
+        save_poses(path, poses)
+    return poses
+
+
+def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Workspace) -> Path:
+    """Return the cached file of poses with their points."""
+    maps = source_fingerprint(config.depth.partition(":")[0]) if config.depth else ""
+    arrays = (poses.cam_from_world, poses.points, poses.visibility, poses.part)
+    digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+    facts = (poses.camera, poses.metric, poses.messages)
+    content = source_fingerprint(video.source)
+    return workspace.path("points", content, video.config, *facts, config, maps, digest)
 
 
 def check_directions(poses: Poses, tracks: Tracks) -> None:
@@ -59,11 +101,13 @@ def reconstruct_cached(
     if camera := parse_camera(config.camera, video.size):  # the content of a file, not its name
         config = dataclasses.replace(config, camera=camera_line(camera))
     content = source_fingerprint(video.source)
-    path = workspace.path("poses", content, video.config, config, digest)
+    own = dataclasses.replace(config, depth="")
+    path = workspace.path("poses", content, video.config, own, digest)
     model = path.with_suffix(".sparse")
     if path.exists():
         poses = load_poses(path)
-        return poses, [part_path(model, k) for k in range(poses.part_count)]
+        models = [part_path(model, k) for k in range(poses.part_count)]
+        return _with_depth(poses, models, video, config, workspace)
     work = workspace.cache / "sfm"
     boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
     poses = estimate_poses(video, config, work, boxes_to_mask=boxes_of)
@@ -72,7 +116,8 @@ def reconstruct_cached(
             shutil.rmtree(part_path(model, k), ignore_errors=True)
             part_path(work / "sparse", k).replace(part_path(model, k))
         save_poses(path, poses)
-    return poses, [part_path(model, k) for k in range(poses.part_count)]
+    models = [part_path(model, k) for k in range(poses.part_count)]
+    return _with_depth(poses, models, video, config, workspace)
 
 
 def poses_key(poses: Poses | None) -> str:
@@ -83,6 +128,26 @@ def poses_key(poses: Poses | None) -> str:
     for values in (poses.frame, poses.cam_from_world, poses.part, poses.points, poses.visibility):
         digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
+
+
+def _with_depth(
+    poses: Poses, models: list[Path], video: Video, config: PosesConfig, workspace: Workspace
+) -> tuple[Poses, list[Path]]:
+    """Scale a reconstruction by depth maps, with its COLMAP models, and add their points."""
+    if not config.depth or not poses.known.any():
+        return poses, models
+    found = with_points(poses, video, config, workspace)
+    if not found.metric:
+        return found, models
+    pc, scaled = import_pycolmap(), _points_path(poses, video, config, workspace)
+    for k, model in enumerate(models):
+        of_part = poses.known & (poses.part == k)
+        length = [np.linalg.norm(p.cam_from_world[of_part, :, 3]) for p in (found, poses)]
+        whole = pc.Reconstruction(str(model))
+        whole.transform(pc.Sim3d(length[0] / length[1], pc.Rotation3d(), np.zeros(3)))
+        part_path(scaled.with_suffix(".sparse"), k).mkdir(exist_ok=True)
+        whole.write(str(part_path(scaled.with_suffix(".sparse"), k)))
+    return found, [part_path(scaled.with_suffix(".sparse"), k) for k in range(len(models))]
 
 
 def write_supplied_model(poses: Poses, video: Video, out: Path) -> None:

@@ -35,6 +35,7 @@ from reobj.files import (
     shortened,
     without_password,
 )
+from reobj.poses.floor import Floor
 from reobj.results.ply import write_ply
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
@@ -166,6 +167,7 @@ class World:
         scale: metres per unit, its relative sigma and source; None without a fit.
         links: joins and splits of tracklets with their evidence.
         parts: of the cameras' path, the largest first; () without cameras.
+        floor: the plane of the floor; None where none can be told, and floor_reason says why.
     """
 
     units: str | None = None
@@ -178,10 +180,14 @@ class World:
     scale: quadrics.Scale | None = None
     links: tuple[LinkEvent, ...] = ()
     parts: tuple[Part, ...] = ()
+    floor: Floor | None = None
+    floor_reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the `world` of objects.json."""
         values = _world_json(self) | {"parts": [_world_json(part) for part in self.parts]}
+        if self.floor is not None:
+            values["floor"] = {k: _plain(v) for k, v in dataclasses.asdict(self.floor).items()}
         links = [dataclasses.asdict(event) for event in self.links]
         for link in links:
             link["place_iou"] = rounded(link["place_iou"], EVIDENCE_DIGITS)
@@ -192,6 +198,9 @@ class World:
     def from_json(entry: dict[str, Any]) -> World:
         """Read the `world` of objects.json."""
         values = _world_values(World, entry)
+        if (floor := values.get("floor")) is not None:
+            vectors = {name: np.array(floor[name], np.float64) for name in ("normal", "middle")}
+            values["floor"] = Floor(**floor | vectors)
         values["links"] = tuple(LinkEvent.from_json(link) for link in values.get("links", ()))
         values["parts"] = tuple(Part(**_world_values(Part, e)) for e in values.get("parts", ()))
         return World(**values)

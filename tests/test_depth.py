@@ -1,0 +1,445 @@
+"""Depth maps: which frame each belongs to, their camera, points, visibility and metric scale."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pose_worlds import FakeVideo, motion, supplied
+
+import reobj_track as rt
+from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
+from reobj.poses import stage
+from reobj.poses.depth import add_depth, depth_scale, find_depth_maps
+from reobj.results.workspace import Workspace
+
+SIZE = (320, 240)
+CAMERA = rt.Camera("PINHOLE", *SIZE, (250.0, 250.0, 160.0, 120.0))
+FRAMES = 12
+
+
+def depth_of_box(cam_from_world, camera=CAMERA, half=5.0):
+    """Depth (h, w) in m inside a room |x|, |y|, |z - 1| < half, seen from within."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([x, y], -1).reshape(-1, 2)
+    if camera.model != "PINHOLE":
+        pixels = camera.undistort(pixels)
+    in_cam = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T
+    world_from_cam = invert_rigid(cam_from_world)
+    ray, centre = in_cam @ world_from_cam[:, :3].T, world_from_cam[:, 3] - [0, 0, 1]
+    with np.errstate(divide="ignore"):
+        t = ((half * np.sign(ray) - centre) / ray).min(1)  # in units of depth: z of the ray is 1
+    return t.reshape(camera.height, camera.width)
+
+
+def on_walls(points, half=5.0):
+    return np.abs(np.abs(points - [0, 0, 1]).max(1) - half)
+
+
+def write_maps(folder, cams, names, units=1000.0, camera=CAMERA, depth_from_color=None):
+    folder.mkdir(parents=True, exist_ok=True)
+    for pose, name in zip(cams, names, strict=True):
+        seen = pose
+        if depth_from_color is not None:
+            turn, shift = depth_from_color[:, :3], depth_from_color[:, 3]
+            seen = np.column_stack([turn @ pose[:, :3], turn @ pose[:, 3] + shift])
+        depth = depth_of_box(seen, camera) * units
+        depth[:20, :30] = 0
+        depth[-20:, :30] = 65535
+        cv2.imwrite(str(folder / name), depth.round().astype(np.uint16))
+    return folder
+
+
+@pytest.fixture
+def walk():
+    cams = motion("walk", FRAMES)
+    return supplied(cams, CAMERA)
+
+
+def metric(poses):
+    return dataclasses.replace(poses, metric=True)
+
+
+def video_of(names):
+    images = [np.full((*SIZE[::-1], 3), 20 * i, np.uint8) for i in range(FRAMES)]
+    return FakeVideo(images, names)
+
+
+class NamedVideo(FakeVideo):
+    def name(self, index):
+        return self.names[index] if self.names else ""
+
+
+def add(poses, text, names=()):
+    images = [np.full((*SIZE[::-1], 3), 20 * i, np.uint8) for i in range(FRAMES)]
+    return add_depth(poses, str(text), NamedVideo(images, names))
+
+
+NUMBERS = [f"{i:04d}.png" for i in range(FRAMES)]
+
+
+# ---- Points --------------------------------------------------------------------------------------
+
+
+def test_points_lie_on_the_walls_with_colour_and_the_frames_that_see_them(tmp_path, walk):
+    walk.cam_from_world[3] = np.nan
+    good = np.delete(np.arange(FRAMES), 3)
+    folder = write_maps(tmp_path / "d", walk.cam_from_world[good], [NUMBERS[i] for i in good])
+    poses = add(metric(walk), folder)
+    assert 3000 < len(poses.points) <= 20000 and poses.messages == ()
+    assert on_walls(poses.points).max() < 0.01
+    row, point = poses.visibility.T
+    assert set(row.tolist()) == set(good.tolist()) and set(point.tolist()) == set(
+        range(len(poses.points))
+    )
+    pose = poses.cam_from_world[row]
+    in_cam = np.einsum("mij,mj->mi", pose[:, :, :3], poses.points[point]) + pose[:, :, 3]
+    xy = (in_cam @ CAMERA.K.T)[:, :2] / in_cam[:, 2:]
+    assert (in_cam[:, 2] > 0).all() and (xy > 0).all() and (xy < SIZE).all()
+    assert set(np.unique(poses.colors).tolist()) <= {20 * int(i) for i in good}
+    assert len(set(np.unique(poses.colors).tolist())) > 5
+    voxel = np.floor((poses.points - poses.points.min(0)) / 0.02).astype(int)
+    assert len(np.unique(voxel, axis=0)) > 0.7 * len(voxel)  # thinned
+
+
+def test_points_seen_by_a_frame_are_those_that_it_really_sees(tmp_path, walk):
+    """Something stands before the wall in two maps; points behind it are not seen from there."""
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    for name in NUMBERS[4:6]:
+        depth = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+        depth[100:140, 140:180] = 1500
+        cv2.imwrite(str(folder / name), depth)
+    poses = add(metric(walk), folder)
+    far = on_walls(poses.points) > 0.05
+    for row in (4, 5):
+        seen = poses.visibility[poses.visibility[:, 0] == row, 1]
+        pose = poses.cam_from_world[row]
+        in_cam = poses.points[seen] @ pose[:, :3].T + pose[:, 3]
+        x, y = ((in_cam @ CAMERA.K.T)[:, :2] / in_cam[:, 2:]).T
+        hidden = (x > 142) & (x < 178) & (y > 102) & (y < 138) & ~far[seen]
+        assert not hidden.any()
+    other = poses.visibility[poses.visibility[:, 0] == 8, 1]
+    assert not far[other].any()  # the rest looks through it: it was dropped, or seen by 4 and 5
+
+
+def test_existing_points_stay_and_keep_their_rows(tmp_path, walk):
+    own = np.array([[9.0, 9, 9], [8, 8, 8]])
+    given = dataclasses.replace(
+        metric(walk), points=own, colors=np.array([[1, 2, 3]] * 2, np.uint8),
+        visibility=np.array([[0, 1], [1, 0]]),
+    )  # fmt: skip
+    poses = add(given, write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS))
+    np.testing.assert_array_equal(poses.points[:2], own)
+    np.testing.assert_array_equal(poses.visibility[:2], [[0, 1], [1, 0]])
+    assert poses.visibility[2:, 1].min() == 2 and len(poses.colors) == len(poses.points)
+
+
+def test_maps_of_another_camera_are_placed_by_its_file(tmp_path, walk):
+    """Other intrinsics, size and place than the colour camera's."""
+    camera = rt.Camera("PINHOLE", 200, 160, (190.0, 180.0, 104.0, 77.0))
+    color_from_depth = np.column_stack([np.eye(3), [0.3, -0.1, 0.05]])
+    folder = tmp_path / "d"
+    write_maps(folder, walk.cam_from_world, NUMBERS, 1000, camera, invert_rigid(color_from_depth))
+    own = dict(zip(("fx", "fy", "cx", "cy"), camera.params, strict=True))
+    facts = own | {"T_color_from_depth": [0.3, -0.1, 0.05]}
+    (folder / "intrinsics.json").write_text(json.dumps(facts))
+    assert on_walls(add(metric(walk), folder).points).max() < 0.02
+    (folder / "intrinsics.json").write_text(json.dumps(own))  # the way between them left out
+    assert np.median(on_walls(add(metric(walk), folder).points)) > 0.02
+    (folder / "intrinsics.json").unlink()
+    with pytest.raises(rt.ReobjError, match="put the depth camera's intrinsics there"):
+        add(metric(walk), folder)
+    beside = {"fx": 1, "depth": own, "T_color_from_depth": [0.3, -0.1, 0.05]}
+    (tmp_path / "intrinsics.json").write_text(json.dumps(beside))
+    assert on_walls(add(metric(walk), folder).points).max() < 0.02
+
+
+def test_scannets_intrinsics_have_another_pixel_centre(tmp_path, walk):
+    K = np.eye(4)
+    K[:2, :3] = [[240, 0, 99.5], [0, 240, 79.5]]
+    folder = write_maps(tmp_path / "depth", walk.cam_from_world[:1], ["0.png"])
+    (tmp_path / "intrinsic").mkdir()
+    np.savetxt(tmp_path / "intrinsic" / "intrinsic_depth.txt", K)
+    maps = find_depth_maps(str(folder), walk, ())
+    assert maps.camera.params == (240, 240, 100, 80)
+
+
+def test_the_lens_of_the_colour_camera_is_taken_out_of_registered_maps(tmp_path):
+    camera = rt.Camera("SIMPLE_RADIAL", *SIZE, (250.0, 160.0, 120.0, 0.25))
+    poses = metric(supplied(motion("walk", FRAMES), camera))
+    folder = write_maps(tmp_path / "d", poses.cam_from_world, NUMBERS, camera=camera)
+    off = on_walls(add(poses, folder).points)
+    assert np.percentile(off, 99) < 0.06
+    plain = dataclasses.replace(poses, camera=CAMERA)
+    assert np.percentile(on_walls(add(plain, folder).points), 99) > 0.06
+
+
+def test_large_maps_are_thinned_in_the_right_place(tmp_path, walk):
+    """Every 3rd pixel of 960: half a pixel off would show."""
+    camera = CAMERA.resized((960, 720))
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, camera=camera)
+    maps = find_depth_maps(str(folder), walk, ())
+    depth, K = maps.read(5)
+    assert depth.shape == (240, 320)
+    y, x = np.mgrid[30:200:10, 40:300:10].reshape(2, -1)
+    in_cam = np.column_stack([x + 0.5, y + 0.5, np.ones(len(x))]) @ np.linalg.inv(K).T
+    world_from_cam = invert_rigid(walk.cam_from_world[5])
+    points = (in_cam * depth[y, x][:, None]) @ world_from_cam[:, :3].T + world_from_cam[:, 3]
+    assert on_walls(points).max() < 0.002
+
+
+# ---- Scale ---------------------------------------------------------------------------------------
+
+
+def with_points(poses, unit_m, noise=0.0, seed=0):
+    """The same world without scale, with sparse points of the walls seen by every second frame."""
+    rng = np.random.default_rng(seed)
+    points, seen = [], []
+    for row in range(0, FRAMES, 2):
+        depth = depth_of_box(poses.cam_from_world[row])
+        x, y = rng.integers(0, SIZE[0], 60), rng.integers(0, SIZE[1], 60)
+        z = depth[y, x] * np.exp(noise * rng.normal(size=60))
+        in_cam = np.column_stack([x + 0.5, y + 0.5, np.ones(60)]) @ np.linalg.inv(CAMERA.K).T
+        world_from_cam = invert_rigid(poses.cam_from_world[row])
+        seen += [(row, len(points) * 60 + i) for i in range(60)]
+        points.append((in_cam * z[:, None]) @ world_from_cam[:, :3].T + world_from_cam[:, 3])
+    cams = poses.cam_from_world.copy()
+    cams[:, :, 3] /= unit_m
+    xyz = np.concatenate(points) / unit_m
+    return dataclasses.replace(
+        poses, cam_from_world=cams, points=xyz, colors=np.zeros(xyz.shape, np.uint8),
+        visibility=np.array(seen), source="pycolmap",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("unit_m", "noise"), [(0.07, 0.0), (23.0, 0.05)])
+def test_a_reconstruction_becomes_metric(tmp_path, walk, unit_m, noise):
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    poses = add(with_points(walk, unit_m, noise), folder)
+    assert poses.metric and "metric by 12 depth maps" in poses.messages[0]
+    scale = poses.cam_from_world[:, :, 3] / walk.cam_from_world[:, :, 3]
+    np.testing.assert_allclose(scale, 1, rtol=0.02)
+    np.testing.assert_allclose(poses.cam_from_world[:, :, :3], walk.cam_from_world[:, :, :3])
+    assert np.median(on_walls(poses.points)) < 0.1 and len(poses.points) > 1000
+
+
+def test_the_scale_has_a_sigma_that_holds(tmp_path, walk):
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    maps = find_depth_maps(str(folder), walk, ())
+    errors = []
+    for seed in range(10):
+        scale, sigma, used = depth_scale(with_points(walk, 0.5, 0.1, seed), maps)
+        errors.append(np.log(scale[0] / 0.5) / sigma[0])
+        assert used == FRAMES and 0.02 <= sigma[0] < 0.06
+    assert (np.abs(errors) < 2).all()
+
+
+def test_every_part_has_its_own_scale(tmp_path, walk):
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    one, other = with_points(walk, 0.5), with_points(walk, 4.0)
+    part = (np.arange(FRAMES) >= 6).astype(int)
+    second = part[:, None, None] == 1
+    seen_by_second = np.isin(
+        np.arange(len(one.points)), one.visibility[one.visibility[:, 0] >= 6, 1]
+    )
+    given = dataclasses.replace(
+        one, part=part, cam_from_world=np.where(second, other.cam_from_world, one.cam_from_world),
+        points=np.where(seen_by_second[:, None], other.points, one.points),
+    )  # fmt: skip
+    poses = add(given, folder)
+    assert poses.metric
+    np.testing.assert_allclose(poses.cam_from_world, walk.cam_from_world, rtol=0.02, atol=1e-9)
+    assert np.percentile(on_walls(poses.points), 90) < 0.1
+    for name in NUMBERS[5:]:
+        (folder / name).unlink()
+    lacking = add(given, folder)
+    assert not lacking.metric and "scale of part 1 stays unknown" in lacking.messages[0]
+    np.testing.assert_array_equal(lacking.cam_from_world, given.cam_from_world)
+
+
+def test_maps_that_contradict_each_other_give_no_scale(tmp_path, walk):
+    folder = write_maps(tmp_path / "d", walk.cam_from_world[::2], NUMBERS[::2])
+    write_maps(folder, walk.cam_from_world[1::2], NUMBERS[1::2], units=3000)
+    poses = add(with_points(walk, 0.5), folder)
+    assert not poses.metric and "varies by" in poses.messages[0]
+
+
+@pytest.mark.parametrize("mistake", ["units", "poses"])
+def test_maps_that_contradict_metric_poses_give_no_points(tmp_path, walk, mistake):
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    text = f"{folder}:300" if mistake == "units" else folder
+    if mistake == "poses":
+        walk = dataclasses.replace(walk, cam_from_world=invert_rigid(walk.cam_from_world))
+    poses = add(metric(walk), text)
+    assert len(poses.points) == 0 and "no points from depth" in poses.messages[0]
+
+
+# ---- Which map belongs to which frame ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("maps", "names", "expected"),
+    [
+        (["a.png", "c.png"], ["c.jpg", "b.jpg", "a.jpg"], [0, 2]),  # by name
+        (["frame-02.depth.png"], ["frame-01.color.png", "frame-02.color.png"], [1]),  # 7-Scenes
+        (["0002_depth.png"], ["0001_rgb.png", "0002_rgb.png"], [1]),
+        (["1305031102.160407.png"], ["1305031102.175304.png", "1305031102.211214.png"], [0]),  # TUM
+        (["d7.png", "d8.png"], ["img008.jpg", "img009.jpg"], [0]),  # by the last number
+        (["7.png", "3.png"], [], [3, 7]),  # of a video: frame numbers
+    ],
+)
+def test_maps_find_their_frames(tmp_path, maps, names, expected):
+    count = len(names) or 9
+    poses = supplied(motion("walk", count), CAMERA)
+    write_maps(tmp_path / "d", poses.cam_from_world[: len(maps)], maps)
+    found = find_depth_maps(str(tmp_path / "d"), poses, names)
+    assert sorted(found.files) == expected
+
+
+def empty(folder):
+    folder.mkdir()
+
+
+def strange(folder):
+    folder.mkdir()
+    (folder / "x.png").write_bytes(b"no image")
+
+
+def color_image(folder):
+    folder.mkdir()
+    cv2.imwrite(str(folder / "0001.png"), np.zeros((240, 320, 3), np.uint8))
+
+
+def other_names(folder):
+    write_maps(folder, motion("walk", 1), ["99.png"])
+
+
+def other_sizes(folder):
+    write_maps(folder, motion("walk", 2), NUMBERS[:2])
+    cv2.imwrite(str(folder / NUMBERS[1]), np.ones((24, 32), np.uint16))
+
+
+def other_json(folder):
+    write_maps(folder, motion("walk", 1), NUMBERS[:1])
+    (folder / "intrinsics.json").write_text('{"fx": 3}')
+
+
+def other_matrix(folder):
+    write_maps(folder, motion("walk", 1), NUMBERS[:1])
+    (folder / "intrinsic_depth.txt").write_text("1 2 3")
+
+
+@pytest.mark.parametrize(
+    ("make", "text", "expected"),
+    [
+        (None, "d", "no such folder"), (empty, "d:much", "no such folder"),
+        (empty, "d:0", "no such folder"), (empty, "d", "no .png in it"),
+        (strange, "d", "no depth map"), (color_image, "d", "no depth map"),
+        (other_names, "d", "none of its 1 depth maps"), (other_sizes, "d", "32x24 pixels"),
+        (other_json, "d", "expected fx, fy"), (other_matrix, "d", "3x3 or 4x4"),
+    ],
+)  # fmt: skip
+def test_bad_input_gives_one_line(tmp_path, walk, make, text, expected):
+    if make is not None:
+        make(tmp_path / "d")
+    if make is strange:
+        (tmp_path / "d" / "x.png").rename(tmp_path / "d" / "0001.png")
+    with pytest.raises(rt.ReobjError, match=expected):
+        add(metric(walk), f"{tmp_path}/{text}")
+
+
+def test_units_are_those_behind_the_colon(tmp_path, walk):
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS, units=5000)
+    assert on_walls(add(metric(walk), f"{folder}:5000").points).max() < 0.01
+
+
+# ---- In a run ------------------------------------------------------------------------------------
+
+
+def image_folder(folder):
+    folder.mkdir()
+    for i in range(FRAMES):
+        cv2.imwrite(str(folder / f"{i:04d}.png"), np.full((*SIZE[::-1], 3), 20 * i, np.uint8))
+    return rt.Video(folder)
+
+
+def test_a_reconstruction_and_its_model_become_metric_once(tmp_path, walk, monkeypatch):
+    """The second time all comes from the cache; the model without depth maps stays as it was."""
+    pycolmap = pytest.importorskip("pycolmap")
+    video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    found, asked = with_points(walk, 0.5), []
+
+    def estimate(video, config, work, boxes_to_mask=None):
+        asked.append(config)
+        write_colmap(work / "text", found, NUMBERS)
+        (work / "sparse").mkdir()
+        pycolmap.Reconstruction(str(work / "text")).write(str(work / "sparse"))
+        return found
+
+    monkeypatch.setattr(stage, "estimate_poses", estimate)
+    config = rt.PosesConfig(depth=str(folder))
+    for _ in range(2):
+        poses, model = stage.reconstruct_cached(video, config, workspace)
+        assert poses.metric and len(poses.points) > 3000 and len(asked) == 1
+        cams = read_sparse_model(model).cam_from_world
+        np.testing.assert_allclose(cams, poses.cam_from_world, atol=1e-6)
+        assert len(read_sparse_model(model).points) == len(found.points)
+        monkeypatch.setattr(stage, "add_depth", None)
+    plain, model = stage.reconstruct_cached(video, rt.PosesConfig(), workspace)
+    assert not plain.metric and len(asked) == 1
+    cams = read_sparse_model(model).cam_from_world
+    np.testing.assert_allclose(cams, found.cam_from_world, atol=1e-6)
+
+
+def test_supplied_poses_are_triangulated_once_where_they_bring_no_points(
+    tmp_path, walk, monkeypatch
+):
+    video, workspace = image_folder(tmp_path / "images"), Workspace(tmp_path / "out")
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    asked = []
+
+    def triangulate(poses, video, *, size_px, seed, work_dir):
+        asked.append((size_px, seed))
+        return with_points(poses, 1.0)
+
+    monkeypatch.setattr(stage, "triangulate", triangulate)
+    options = {"size_px": 300, "seed": 7}
+    for _ in range(2):
+        poses = stage.with_points(walk, video, rt.PosesConfig(**options), workspace)
+        assert len(poses.points) == 360 and asked == [(300, 7)]
+    assert stage.with_points(poses, video, rt.PosesConfig(), workspace) is poses
+    with_depth = rt.PosesConfig(depth=str(folder), **options)
+    found = stage.with_points(metric(walk), video, with_depth, workspace)  # maps alone
+    assert len(found.points) > 3000 and len(asked) == 1
+    found = stage.with_points(walk, video, with_depth, workspace)  # the scale needs points
+    assert found.metric and len(asked) == 2
+    unknown = dataclasses.replace(walk, cam_from_world=np.full_like(walk.cam_from_world, np.nan))
+    assert stage.with_points(unknown, video, rt.PosesConfig(), workspace) is unknown
+
+
+# ---- A recording ---------------------------------------------------------------------------------
+
+REDKITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "redkitchen_7scenes"
+
+
+@pytest.mark.skipif(not REDKITCHEN.exists(), reason="needs ../shared/data")
+def test_redkitchens_maps_agree_with_its_poses():
+    """Their floor lies where it was measured in the fused cloud: up.X = -1.525 (+- 3 cm)."""
+    video = rt.Video(REDKITCHEN / "images", rt.InputConfig(every=10))
+    world_from_cam = np.loadtxt(REDKITCHEN / "poses_c2w.txt").reshape(-1, 4, 4)[::10, :3]
+    camera = rt.Camera("PINHOLE", 640, 480, (530.0, 530.0, 322.0, 238.0))
+    given = dataclasses.replace(
+        metric(supplied(invert_rigid(world_from_cam), camera)),
+        frame=np.array([frame.index for frame in video]),
+    )
+    poses = add_depth(given, str(REDKITCHEN / "depth"), video)
+    assert 10000 < len(poses.points) <= 20000 and poses.messages == ()
+    assert len(poses.visibility) > 5 * len(poses.points)
+    height = poses.points @ [0.0070, -0.8930, -0.4500]
+    on_floor = np.abs(height + 1.525) < 0.05
+    assert on_floor.sum() > 300 and (height < -1.7).mean() < 0.02

@@ -1,0 +1,199 @@
+"""The floor of synthetic rooms: where it is, how sure that is, and where there is none."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pose_worlds import motion, supplied
+from scipy.spatial.transform import Rotation
+from simulated import walk
+
+import reobj_track as rt
+from reobj.objects import describe_world
+from reobj.poses.floor import find_floor, floor_of
+
+UP = np.array([0, 0, 1.0])
+
+
+def room(seed=0, on_floor=400, noise=0.01, wrong=0.01, table=True, half=3.0):
+    """Points (N, 3) of a room of 6 x 6 m, floor at z = 0: walls, a table, chairs, stray points."""
+    rng = np.random.default_rng(seed)
+    floor = np.column_stack([rng.uniform(-half, half, (on_floor, 2)), np.zeros(on_floor)])
+    side = rng.integers(0, 4, 1200)
+    along, up = rng.uniform(-half, half, 1200), rng.uniform(0, 2.4, 1200)
+    wall = np.where((side % 2 == 0)[:, None], np.column_stack([along, half + 0 * along]),
+                    np.column_stack([half + 0 * along, along]))  # fmt: skip
+    wall = np.column_stack([wall * np.where(side < 2, 1, -1)[:, None], up])
+    top = np.column_stack([rng.uniform([-0.8, -0.5], [0.8, 0.5], (900, 2)), np.full(900, 0.74)])
+    things = rng.uniform([-2, -2, 0], [2, 2, 1], (300, 3))
+    stray = rng.uniform([-half, -half, -2], [half, half, 0], (int(wrong * 2000), 3))
+    parts = [floor, wall, things, stray] + [top] * table
+    points = np.concatenate([part for part in parts if len(part)])
+    return points + rng.normal(0, noise, points.shape)
+
+
+def cameras(height=1.5, radius=2.0, count=30):
+    angle = np.linspace(0, 2 * np.pi, count)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle + height])
+
+
+def tilted(deg, axis=0):
+    return Rotation.from_rotvec(np.radians(deg) * np.eye(3)[axis]).apply(UP)
+
+
+@pytest.mark.parametrize(("noise", "on_floor"), [(0.003, 400), (0.02, 400), (0.02, 120)])
+@pytest.mark.parametrize("tilt_deg", [0, 3])
+def test_the_floor_is_found_within_its_sigma(noise, on_floor, tilt_deg):
+    """Not the table's top, which has more points; gravity is a few degrees off."""
+    errors = []
+    for seed in range(4):
+        points = room(seed, on_floor, noise)
+        floor, reason = find_floor(points, tilted(tilt_deg, seed % 2), cameras(), 1.0)
+        assert floor is not None and reason == ""
+        height = floor.middle[2]  # the true floor is z = 0
+        tilt = np.degrees(np.arccos(floor.normal @ UP))
+        errors += [height / floor.sigma, tilt / floor.tilt_sigma_deg]
+        assert abs(height) < 0.03 and tilt < 1.5 and floor.inliers > 0.5 * on_floor
+        assert floor.normal @ floor.middle == pytest.approx(floor.offset, abs=1e-5)
+        assert 0.001 < floor.sigma < 0.05
+        np.testing.assert_allclose(floor.middle[:2], 0, atol=0.2)
+    assert np.mean(np.abs(errors) < 2) >= 0.85
+
+
+def test_more_noise_makes_it_less_sure():
+    quiet, loud = (find_floor(room(0, 150, n), UP, cameras(), 1.0)[0] for n in (0.003, 0.03))
+    assert quiet is not None and loud is not None and quiet.sigma < loud.sigma
+
+
+def test_any_unit_and_any_axes_will_do():
+    turn = Rotation.from_euler("zyx", [30, 100, -20], degrees=True)
+    points, centres = room(), cameras()
+    plain, _ = find_floor(points, UP, centres, 1.0)
+    moved, _ = find_floor(
+        20 * turn.apply(points) + 7, turn.apply(UP), 20 * turn.apply(centres) + 7, 0.05
+    )
+    assert plain is not None and moved is not None
+    np.testing.assert_allclose(moved.normal, turn.apply(plain.normal), atol=2e-3)
+    np.testing.assert_allclose(moved.middle, 20 * turn.apply(plain.middle) + 7, atol=0.1)
+    assert moved.sigma == pytest.approx(20 * plain.sigma, rel=0.3)
+
+
+def test_texture_does_not_outvote_area():
+    """A carpet with thousands of points lies 2 cm above the rest of the floor."""
+    rng = np.random.default_rng(1)
+    carpet = np.column_stack([rng.uniform(-0.6, 0.6, (6000, 2)), rng.normal(0.02, 0.004, 6000)])
+    floor, _ = find_floor(np.concatenate([room(0, 600), carpet]), UP, cameras(), 1.0)
+    assert floor is not None and abs(floor.middle[2]) < 0.01
+
+
+def table_top(size=0.7):
+    """A table's top with things on it, and nothing else."""
+    rng = np.random.default_rng(0)
+    top = np.column_stack([rng.uniform(-size, size, (900, 2)), rng.normal(0, 0.002, 900)])
+    return np.concatenate([top, rng.uniform([-0.3, -0.3, 0], [0.3, 0.3, 0.3], (400, 3))])
+
+
+ORBIT, HIGHER = cameras(0.5, 0.8), np.array([0, 0, 9.0])
+TABLE = np.array([0, 0, 0.74])
+
+
+@pytest.mark.parametrize(
+    ("points", "centres", "metres", "reason"),
+    [
+        (table_top(), ORBIT, 1.0, "may be a table's top"),
+        (table_top() * 4, ORBIT * 4, 0.25, "may be a table's top"),  # not metric
+        (table_top(), ORBIT, None, "scale is unknown"),
+        (room(on_floor=0, table=False, wrong=0), cameras(), 1.0, "no level|points lie|no clear"),
+        (room(), cameras(9.0), 1.0, "m below the cameras"),
+        (room(), cameras(), 0.1, "m below the cameras"),  # a doll's house
+        (room()[:50], cameras(), 1.0, "50 points, 100 are needed"),
+        (room() + HIGHER, cameras(), 1.0, "0 points lie lower than the cameras"),
+        (room(), np.empty((0, 3)), 1.0, "are needed"),
+        (np.random.default_rng(0).normal(0, 2, (3000, 3)), cameras(), 1.0, "level"),
+    ],
+)
+def test_no_floor_is_told_where_there_is_none(points, centres, metres, reason):
+    floor, why = find_floor(points, UP, centres, metres)
+    assert floor is None
+    assert any(part in why for part in reason.split("|")), why
+
+
+def test_a_table_is_not_the_floor_where_the_floor_is_seen_below():
+    """The cameras are near the table; a strip of floor beside it is enough."""
+    rng = np.random.default_rng(0)
+    strip = np.column_stack([rng.uniform([-2, 0.8], [2, 2], (250, 2)), rng.normal(0, 0.005, 250)])
+    points = np.concatenate([table_top() + TABLE, strip])
+    floor, why = find_floor(points, UP, ORBIT + TABLE, 1.0)
+    assert floor is not None, why
+    assert abs(floor.normal @ [0, 1.4, 0] - floor.offset) < 0.02
+
+
+# ---- Of poses, and in a result -------------------------------------------------------------------
+
+
+def poses_in_room(**changes):
+    cams = motion("orbit", 30)
+    points = room()
+    seen = np.column_stack(
+        [np.tile(np.arange(3), len(points)), np.repeat(np.arange(len(points)), 3)]
+    )
+    poses = dataclasses.replace(
+        supplied(cams), points=points, colors=np.zeros(points.shape, np.uint8), visibility=seen,
+        metric=True, up_in_world=UP,
+    )  # fmt: skip
+    return dataclasses.replace(poses, **changes)
+
+
+def test_points_that_only_two_frames_observed_do_not_count():
+    poses = poses_in_room()
+    count = len(poses.points)
+    ghost = poses.points[:500] - TABLE  # a second level below
+    seen = np.column_stack([np.tile([0, 1], 500), np.repeat(np.arange(500) + count, 2)])
+    poses = dataclasses.replace(
+        poses, points=np.concatenate([poses.points, ghost]),
+        colors=np.zeros((count + 500, 3), np.uint8),
+        visibility=np.concatenate([poses.visibility, seen]),
+    )  # fmt: skip
+    floor, _ = floor_of(poses, UP, 1.0)
+    assert floor is not None and abs(floor.middle[2]) < 0.03
+
+
+def test_the_floor_is_that_of_the_largest_part():
+    part = np.repeat([0, 1], 15)
+    poses = poses_in_room(part=part)
+    count = len(poses.points)
+    other = poses.points + 5 * HIGHER
+    seen = poses.visibility + np.array([20, count])
+    both = dataclasses.replace(
+        poses, points=np.concatenate([poses.points, other]),
+        colors=np.zeros((2 * count, 3), np.uint8),
+        visibility=np.concatenate([poses.visibility, seen]),
+    )  # fmt: skip
+    floor, _ = floor_of(both, UP, 1.0)
+    assert floor is not None and abs(floor.middle[2]) < 0.03
+
+
+def test_without_gravity_there_is_no_floor():
+    assert floor_of(poses_in_room(), None, 1.0) == (None, "gravity is unknown")
+
+
+def test_the_world_of_a_result_has_it_and_reads_it_back():
+    world = describe_world(poses_in_room(), None, [])
+    back = rt.World.from_json(world.to_json())
+    assert world.floor is not None and back.floor is not None and back.floor_reason == ""
+    for name in ("offset", "sigma", "tilt_sigma_deg", "inliers"):
+        assert getattr(back.floor, name) == getattr(world.floor, name)
+    np.testing.assert_array_equal(back.floor.normal, world.floor.normal)
+    np.testing.assert_array_equal(back.floor.middle, world.floor.middle)
+    assert back.to_json() == world.to_json()
+    entry = world.to_json()
+    del entry["floor"], entry["floor_reason"]  # an older file
+    assert rt.World.from_json(entry).floor is None
+
+
+def test_the_world_of_a_result_says_why_there_is_none():
+    world = describe_world(poses_in_room(metric=False), None, [])
+    assert world.floor is None and "scale is unknown" in world.floor_reason
+    assert "0 points" in describe_world(walk(4), None, []).floor_reason
