@@ -629,6 +629,8 @@ def fit_lfd(boxes_xyxy: Array, img_from_world: Array) -> tuple[Array, BoolArray]
     seen = index >= 0
     enough = seen.sum(1) >= 3  # (O,)
     dual_q = np.full((n_obj, 4, 4), np.nan)
+    if not enough.any():
+        return dual_q, np.zeros(n_obj, bool)
     index, seen = index[enough], seen[enough]
     boxes = boxes_xyxy[index, np.flatnonzero(enough)[:, None]]  # (O, V, 4)
     boxes = np.where(seen[..., None], boxes, [0, 0, 1, 1.0])
@@ -1626,8 +1628,8 @@ def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: boo
         square = (capped * fit.good / data.edges.share[fit.obj]).sum((1, 2))
     level = square / dof
     mine = level <= _least(level, fit.obj)  # of the supports tried, the one that fits
-    # the median of chi2 / dof is (1 - 2 / (9 dof))^3 (Wilson and Hilferty 1931)
-    middle = _weighted_median((level / (1.0 - 2.0 / (9.0 * dof)) ** 3)[mine], dof[mine])
+    level /= (1.0 - 2.0 / (9.0 * dof)) ** 3  # the median of chi2 / dof: Wilson and Hilferty 1931
+    middle = _weighted_median(level[mine], np.minimum(dof[mine], OBJECT_NOISE_DOF))
     total = dof[mine].sum()
     pooled = (NOISE_PRIOR_DOF + middle * total) / (NOISE_PRIOR_DOF + total)
     own = (OBJECT_NOISE_DOF * pooled + square) / (OBJECT_NOISE_DOF + dof)
@@ -1861,10 +1863,9 @@ def _scale_from_priors(fit: _Fit, data: _Data, spec: _Spec) -> tuple[float, floa
     are hidden in part (they look small and vote too high) cannot move far.
     """
     obj = fit.obj
-    cov = _safe_inverse(fit.hessian + ROTATION_CAP)[:, 3:6, 3:6]
     prior = _problems(spec, obj, fit.code, fit.axis)
     known = np.linalg.inv(prior.size_info)  # (B, 3, 3)
-    inverse = np.linalg.inv(known + cov)
+    inverse = np.linalg.inv(known + _safe_inverse(fit.hessian + ROTATION_CAP)[:, 3:6, 3:6])
     info = inverse.sum((1, 2))
     weight = inverse.sum(2) / info[:, None]  # (B, 3) of the axes
     vote = (weight * (prior.size_mean - fit.state.log_half)).sum(1)
@@ -1890,13 +1891,13 @@ def _pool_categories(middle: Array, variance: Array) -> tuple[float, float]:
     Ref: random effects, DerSimonian and Laird 1986; contaminated normal, Tukey 1960.
     """
     grid = np.linspace(middle.min() - 2.0, middle.max() + 2.0, 1001)  # (G,)
-    extra = np.linspace(0.0, 3.0, 13)[:, None]  # (T, 1) sigma of the half-normal
-    own = variance + (SCENE_LOG * extra) ** 2  # (T, C)
+    extra = np.linspace(0.0, 3.0, 13)  # (T,) sigma of the half-normal
+    own = variance + (SCENE_LOG * extra[:, None]) ** 2  # (T, C)
     likely = np.zeros((len(grid), *own.shape))  # (G, T, C)
     for share, shift, sigma in VOTES:
         square = (middle - shift - grid[:, None, None]) ** 2 / (own + sigma**2)
         likely += share * np.exp(-0.5 * square) / np.sqrt(own + sigma**2)
-    log_post = np.log(likely + 1e-300).sum(2) - 0.5 * extra[:, 0] ** 2  # (G, T)
+    log_post = np.log(likely + 1e-300).sum(2) - 0.5 * extra**2  # (G, T)
     post = np.exp(log_post - log_post.max()).sum(1)
     mean = np.average(grid, weights=post)
     return float(mean), float(np.sqrt(np.average((grid - mean) ** 2, weights=post)))
