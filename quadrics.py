@@ -1890,8 +1890,8 @@ def _pool_categories(middle: Array, variance: Array) -> tuple[float, float]:
     out (kinds unknown to the priors); VOTES says what else can be wrong with it.
     Ref: random effects, DerSimonian and Laird 1986; contaminated normal, Tukey 1960.
     """
-    grid = np.linspace(middle.min() - 2.0, middle.max() + 2.0, 1001)  # (G,)
-    extra = np.linspace(0.0, 3.0, 13)  # (T,) sigma of the half-normal
+    grid = np.linspace(middle.min() - 2.0, middle.max() + 2.0, 501)  # (G,)
+    extra = np.linspace(0.0, 3.0, 7)  # (T,) sigma of the half-normal
     own = variance + (SCENE_LOG * extra[:, None]) ** 2  # (T, C)
     likely = np.zeros((len(grid), *own.shape))  # (G, T, C)
     for share, shift, sigma in VOTES:

@@ -704,7 +704,7 @@ def test_one_bad_stretch_of_cameras_does_not_spoil_the_rest(way: str) -> None:
     seen = np.isfinite(boxes[..., 0])
     share = seen[bad].sum(0) / seen.sum(0)  # (O,) of its views that are lost
     apart, both = share == 0, (share > 0) & (share < 0.4)
-    assert apart.sum() > 20 and both.sum() > 3 and (share > 0.6).sum() > 10
+    assert apart.sum() > 20 and both.sum() > 3 and (share > 0.6).sum() > 8
     assert (good.status != "rejected").all() and (spoilt.status[apart | both] != "rejected").all()
     assert (spoilt.status == good.status)[apart].mean() > 0.95
     same = q.volume_overlap(good.ellipsoids, spoilt.ellipsoids)
