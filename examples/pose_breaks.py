@@ -411,6 +411,8 @@ RECORDINGS = {
 }
 WALKS = ("room", "redkitchen", "studio_room", "office_loop", "hololens", "bonsai", "walk", "orbit",
          "tour", "table")  # fmt: skip
+GOOD = ("room", "redkitchen", "studio_room", "office_loop", "bonsai", "livingroom13", "tum_fr3",
+        "apple", "teddybear", "walk", "orbit", "table", "tour")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -731,7 +733,7 @@ def issue_case(
 def planned(args: argparse.Namespace, shelf: Shelf) -> list[str]:
     """Name the cases to run, good recordings first."""
     here = [name for name in RECORDINGS if shelf.has(name)]
-    whole = [f"good-{name}" for name in here]
+    whole = [f"good-{name}" for name in GOOD if name in here]
     needs = {"room_mirrored": "room", "bonsai_every_3rd": "bonsai", "hololens": "hololens"}
     whole += [f"issue-{name}" for name in ISSUES if shelf.has(needs[name])]
     kinds = list(KINDS)
