@@ -585,8 +585,16 @@ def corridor(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
 
 
 def turn(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
-    """Walk, turn on the spot, walk on."""
-    return stretch(shelf, ("turn", "turn_b"), rng, 30)
+    """Walk, turn on the spot in wider or smaller steps, walk on."""
+    name = str(rng.choice(["turn", "turn_b"]))
+    clip, every = shelf.clip(name), int(rng.integers(1, 5))
+    count = len(clip.images)
+    first, last = (round(share * count) for share in rr.TURNS_FROM_TO)
+    before, after = rng.integers(8, first + 1), rng.integers(8, count - last + 1)
+    rows = np.r_[first - before : first, first:last:every, last : last + after]
+    if rng.random() < 0.25:
+        rows = rows[::-1]
+    return clip.rows(rows), f"{name} {rows[0]}..{rows[-1]}, every {every} of the turn"
 
 
 def zoomed_stretch(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
@@ -626,6 +634,9 @@ KINDS: dict[str, Callable[[Shelf, Sequence[str], Rng], Broken]] = {
     "thin": thin,
 }
 KNOWN_CAMERA = 0.25  # share of the cases with given intrinsics (chosen)
+DENSE_EVERY = 5  # of the cases of a kind one takes nearly all pictures as keyframes: more than 30
+# are not matched each with each, as in a long recording
+DENSE_KEYFRAMES = 80  # allowed; half of that many are wanted
 
 
 # ---- Running ------------------------------------------------------------------------------------
@@ -702,6 +713,8 @@ def prepare(
         focal = clip.focal * width
         config = replace(config, camera=f"{focal:.3f},{focal:.3f},{width / 2},{height / 2}")
         what += ", camera given"
+    if number % DENSE_EVERY == DENSE_EVERY - 1:
+        config, what = replace(config, max_keyframes=DENSE_KEYFRAMES), f"{what}, many keyframes"
     return rt.Video(folder / "images"), clip.truth, clip.world, config, what, clip.focal
 
 

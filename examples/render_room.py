@@ -2331,6 +2331,9 @@ def tour_keys(room: Room, seed: int) -> list[tuple[float, tuple[float, float], A
     return [(i / (len(stops) - 1), spot, aim) for i, (spot, aim) in enumerate(stops)]
 
 
+TURNS_FROM_TO = (0.3, 0.7)  # of the frames of the path "turn"
+
+
 def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array]:
     """Where the walk passes: time (K,) in 0..1, camera x, y (K, 2), what it looks at (K, 3)."""
     w, d, _ = room.size_m
@@ -2362,9 +2365,9 @@ def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array
     elif kind == "tour":
         keys = tour_keys(room, seed)
     elif kind == "turn":
-        stop = (1.0, -0.2)
-        keys = [(0.00, (0.05, 0.85), dining), (0.15, (0.85, 0.45), dining), (0.30, stop, dining)]
-        keys += [(0.50, stop, couch), (0.70, stop, desk)]
+        stop, (first, last) = (1.0, -0.2), TURNS_FROM_TO
+        keys = [(0.00, (0.05, 0.85), dining), (0.15, (0.85, 0.45), dining), (first, stop, dining)]
+        keys += [((first + last) / 2, stop, couch), (last, stop, desk)]
         keys += [(0.85, (0.5, -0.9), desk), (1.00, (-0.4, -1.1), desk)]
     elif kind == "corridor":
         keys = [
