@@ -205,8 +205,11 @@ def test_table_counts_and_names_what_failed() -> None:
     text = pb.table([line, line | {"case": "turn-002", "outcome": "refused"}])
     assert "| turn | 2 | 0 | 0 | 1 | 0 | 1 | 0 |" in text and "1 of 2" in text
     assert "- turn-001" in text and "- turn-002" not in text
-    lost = {"case": "good-room", "kind": "good", "outcome": "partly", "look": "", "cpu_s": 1.0}
-    assert pb.failed(lost) and not pb.failed(lost | {"outcome": "whole"})
+    good = {"case": "good-room", "kind": "good", "outcome": "whole", "look": "", "cpu_s": 1.0}
+    good |= {"parts": 1, "right": pb.RECORDINGS["room"].today}
+    assert not pb.failed(good)
+    changes = {"right": 100}, {"parts": 2}, {"outcome": "said"}, {"outcome": "passed"}
+    assert all(pb.failed(good | change) for change in changes)
 
 
 def test_results_of_a_call_that_was_killed_are_read(tmp_path: Path) -> None:
