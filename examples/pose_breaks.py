@@ -75,12 +75,13 @@ SHORT = rt.PosesConfig(size_px=320, max_keyframes=24)  # for 24-40 pictures: 5 t
 
 # ---- Verdict ------------------------------------------------------------------------------------
 
-MAX_CENTRE = 0.1  # error of a centre over the extent of its part's true path. Good recordings stay
-# below .06 (docs/poses.md, redkitchen against a Kinect), wrong joins start at .3 (issue 15)
-MAX_SCALE_JUMP = (
-    1.35  # of the local scale within a part: a jump by half bends a straight path by no
-)
-# more than .05 of its extent (chosen; Kinect poses of redkitchen: 1.1)
+# Error of a centre over the extent of its part's true path. Good recordings stay below .06
+# (docs/poses.md: redkitchen against a Kinect), a wrong loop of the corridor is at .6.
+MAX_CENTRE = 0.1
+LEAST_EXTENT = 0.05  # of that path over all of its world's: a part that hardly moved (chosen)
+# Local scale within a part over that of most of it. Half as much again bends a straight path by no
+# more than .05 of its extent, which MAX_CENTRE lets pass (chosen).
+MAX_SCALE_JUMP = 1.35
 MAX_TURN_DEG = 10.0  # error of an orientation; good recordings stay below 3 in the median
 STRAY_SHARE = 0.05  # of a part's frames, at least one: so many are strays, counted and not a break
 WHOLE_SHARE = 0.9  # of the frames in one part: whole
@@ -115,31 +116,41 @@ def world_from_cam(cam_from_world: Array) -> tuple[Array, Array]:
     return -(turn @ cam_from_world[:, :, 3:])[:, :, 0], turn
 
 
-def misfit(found: Array, truth: Array, scaled: Array, shift: Array) -> tuple[Array, Array]:
-    """Errors (n,) of centres, over the extent of the true path, and of orientations, degrees."""
+def extent_of(cam_from_world: Array) -> float:
+    """Diagonal of the box around the centres of cameras (n, 3, 4)."""
+    return float(np.linalg.norm(np.ptp(world_from_cam(cam_from_world)[0], axis=0)))
+
+
+def misfit(
+    found: Array, truth: Array, to_truth: tuple[Array, Array], extent: float
+) -> tuple[Array, Array]:
+    """Errors (n,) of centres, over an extent, and of orientations, degrees."""
     (a, turn_a), (b, turn_b) = world_from_cam(found), world_from_cam(truth)
-    extent = max(float(np.linalg.norm(np.ptp(b, axis=0))), 1e-9)
+    scaled, shift = to_truth
     error = np.linalg.norm(a @ scaled.T + shift - b, axis=1) / extent
     rotation = scaled / np.cbrt(np.linalg.det(scaled))
     cosine = (np.einsum("ij,fjk,fik->f", rotation, turn_a, turn_b) - 1) / 2
     return error, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def fit_part(found: Array, truth: Array, seed: int = 0) -> tuple[Array, Array]:
+def fit_part(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Array, Array]:
     """Measure the cameras (n, 3, 4) of one part under the similarity on which most agree.
 
     Hypotheses are fitted to all, to halves, quarters and eighths of the path and to random samples.
 
+    Args:
+        least_extent: the smallest size of a path that errors are related to.
     Returns:
         as `misfit`.
     """
-    rng, rows = np.random.default_rng(seed), np.arange(len(found))
+    rng, rows = np.random.default_rng(0), np.arange(len(found))
+    extent = max(extent_of(truth), least_extent)
     subsets = [s for k in (1, 2, 4, 8) for s in np.array_split(rows, k) if len(s) >= 2] or [rows]
     subsets += [rng.choice(rows, min(5, len(rows)), replace=False) for _ in range(30)]
-    best, most = misfit(found, truth, *align(found, truth)), -1.0
+    best, most = misfit(found, truth, align(found, truth), extent), -1.0
     for subset in subsets:
         for _ in range(4):  # to those who agree
-            error, turn = misfit(found, truth, *align(found[subset], truth[subset]))
+            error, turn = misfit(found, truth, align(found[subset], truth[subset]), extent)
             good = fits(error, turn)
             score = good.sum() - error[good].mean() if good.any() else 0.0
             if score > most:
@@ -225,7 +236,9 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray) -> Verdict:
         own = world[frame] == at[0][at[1].argmax()]
         error, turn = np.full(len(rows), np.inf), np.full(len(rows), 180.0)
         pair, scale = (poses.cam_from_world[rows[own]], truth[frame[own]]), np.ones(len(rows))
-        error[own], turn[own] = fit_part(*pair)
+        of_world = np.isfinite(truth).all((1, 2)) & (world == at[0][at[1].argmax()])
+        least = max(LEAST_EXTENT * extent_of(truth[of_world]), 1e-9)
+        error[own], turn[own] = fit_part(*pair, least)
         good = fits(error, turn)
         scale[good] = local_scale(*(side[good[own]] for side in pair))
         good &= np.abs(np.log(scale)) <= np.log(MAX_SCALE_JUMP)
@@ -236,7 +249,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray) -> Verdict:
         elif not good.all():
             wrong += frame[~good].tolist()
             bad_errors.append(errors[-1][:, ~good])
-            looks.append(describe(int(part), frame, own, good, errors[-1], scale))
+            looks.append(describe(int(part), frame, own, good, errors[-1], pair))
     known = np.isfinite(truth).all((1, 2)).sum()
     if not errors:
         return Verdict("refused", 0.0, 0, 0, 0, (), 0.0, 0.0, "; ".join(poses.messages)[:200])
@@ -252,17 +265,25 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray) -> Verdict:
 
 
 def describe(
-    part: int, frame: IntArray, own: BoolArray, good: BoolArray, errors: Array, scale: Array
+    part: int,
+    frame: IntArray,
+    own: BoolArray,
+    good: BoolArray,
+    errors: Array,
+    pair: Sequence[Array],
 ) -> str:
-    """Say which frames of a part are wrong, and how."""
+    """Say which frames of a part are wrong, and how; `pair`: found and true poses of its world."""
     other = f", {(~own).sum()} of them of another world" if not own.all() else ""
     off, turn = np.median(errors[:, ~good], axis=1)
     far = f"{100 * off:.0f} % of the path" if np.isfinite(off) else "no place at all in it"
-    return (
-        f"part {part} of {len(frame)} frames: {(~good).sum()} wrong ({spans(frame[~good])})"
-        f"{other}; in the median off by {far} and {turn:.0f} deg, local scale "
-        f"{np.median(scale[~good]):.2f}"
-    )
+    text = f"part {part} of {len(frame)} frames: {(~good).sum()} wrong ({spans(frame[~good])})"
+    text += f"{other}; in the median off by {far} and {turn:.0f} deg"
+    ratio = [
+        np.divide(*(np.sqrt(world_from_cam(side[rows])[0].var(0).sum()) for side in pair))
+        for rows in (good[own], ~good[own])
+        if rows.sum() >= 2
+    ]
+    return text + (f", scale {ratio[1] / ratio[0]:.2f} of the rest" if len(ratio) == 2 else "")
 
 
 def spans(numbers: Iterable[int]) -> str:
