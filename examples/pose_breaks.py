@@ -405,33 +405,34 @@ class Recording:
 SMALL = rr.RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, light_rays=2)
 
 
-def rendered(seed: int, path: str, frames: int, plan: str = "home") -> Recording:
+def rendered(seed: int, path: str, frames: int, plan: str = "home", today: int = 0) -> Recording:
     """Describe a clip of examples/render_room.py, small; a turn is one on the spot exactly."""
     shake_m = 0.0 if path == "turn" else SMALL.shake_m
-    return Recording(
-        room=replace(SMALL, seed=seed, path=path, frames=frames, plan=plan, shake_m=shake_m)
-    )
+    room = replace(SMALL, seed=seed, path=path, frames=frames, plan=plan, shake_m=shake_m)
+    return Recording(room=room, today=today)
 
 
 RECORDINGS = {
     "room": Recording("room/room.mp4", 2, "room/poses.txt", 0.77, today=240),
-    "redkitchen": Recording("redkitchen_7scenes/images", 4, "poses_c2w.txt", 0.828, good_every=4),
-    "studio_room": Recording("studio_room/images", 1, "poses_c2w.txt", 0.4705),
-    "office_loop": Recording("office_loop/images", 2),
+    "redkitchen": Recording(
+        "redkitchen_7scenes/images", 4, "poses_c2w.txt", 0.828, good_every=4, today=125
+    ),
+    "studio_room": Recording("studio_room/images", 1, "poses_c2w.txt", 0.4705, today=35),
+    "office_loop": Recording("office_loop/images", 2, today=237),
     "hololens": Recording("hololens_kitchen/images", 1, "poses_c2w.txt", 0.9177),
     "bonsai": Recording("bonsai_mip360/images"),
-    "livingroom13": Recording("livingroom13/images"),
-    "tum_fr3": Recording("tum_fr3_office/images17", 1, "poses17_c2w.txt", 0.8365),
-    "apple": Recording("orbit_clips/apple.mp4"),
-    "teddybear": Recording("orbit_clips/teddybear.mp4"),
-    "walk": rendered(11, "walk", 72),
+    "livingroom13": Recording("livingroom13/images", today=13),
+    "tum_fr3": Recording("tum_fr3_office/images17", 1, "poses17_c2w.txt", 0.8365, today=17),
+    "apple": Recording("orbit_clips/apple.mp4", today=50),
+    "teddybear": Recording("orbit_clips/teddybear.mp4", today=9),
+    "walk": rendered(11, "walk", 72, today=72),
     "turn": rendered(11, "turn", 60),
     "corridor": rendered(11, "corridor", 66, "corridor"),
     "table": rendered(11, "table", 48),
-    "orbit": rendered(12, "orbit", 48),
+    "orbit": rendered(12, "orbit", 48, today=48),
     "turn_b": rendered(12, "turn", 60),
     "corridor_b": rendered(12, "corridor", 60, "corridor"),
-    "tour": rendered(21, "tour", 96, "varied"),
+    "tour": rendered(21, "tour", 96, "varied", today=96),
 }
 WALKS = ("room", "redkitchen", "studio_room", "office_loop", "hololens", "bonsai", "walk", "orbit",
          "tour", "table")  # fmt: skip
