@@ -68,6 +68,21 @@ COCO_NAMES = tuple(
 
 # ---- Configuration ------------------------------------------------------------------------------
 
+PATHS = {
+    "revisit": "leaves its first view and comes back",
+    "walk": "round the room without coming back",
+    "orbit": "a quarter round the dining table",
+    "tour": "twice past every table and couch, another way for every seed",
+    "table": "photos STEP_M apart, taken standing still, once round a table, weaving up and down",
+    "turn": "a walk that stops for 40 % of the frames, where the camera only turns",
+    "corridor": "straight on along x, looking to one side",
+}
+PLANS = {
+    "home": "the plan of examples/room",
+    "varied": "another room for every seed",
+    "corridor": "CORRIDOR_ROOMS rooms of the home plan in a row that look the same",
+}
+
 
 @dataclass(frozen=True, slots=True)
 class RoomConfig:
@@ -89,8 +104,8 @@ class RoomConfig:
     plants: int = 2
     couch: bool = True
     extras: bool = True  # laptop, keyboard, mouse, vase, clock, teddy bear, ball, suitcase, bowl
-    path: str = "revisit"  # revisit (leave, come back) | walk (around) | orbit (one table) | tour
-    plan: str = "home"  # home (the plan of examples/room) | varied (another room for every seed)
+    path: str = "revisit"  # one of PATHS
+    plan: str = "home"  # one of PLANS
     eye_m: float = 1.5  # camera height
     shake_deg: float = 0.5  # amplitude of the hand's rotation
     shake_m: float = 0.012  # amplitude of the hand's translation
@@ -1786,8 +1801,10 @@ def make_room(config: RoomConfig) -> Room:
 
     Raises: ValueError for an unknown plan.
     """
-    if config.plan not in ("home", "varied"):
-        raise ValueError(f"plan {config.plan!r} is unknown: use home or varied")
+    if config.plan not in PLANS:
+        raise ValueError(f"plan {config.plan!r} is unknown: use {', '.join(PLANS)}")
+    if config.plan == "corridor":
+        return rooms_in_a_row(make_room(replace(config, plan="home")), CORRIDOR_ROOMS)
     varied = config.plan == "varied"
     rng = np.random.default_rng([config.seed, 1])
     sides = rng.uniform((5.0, 4.4, 2.4), (8.6, 7.2, 3.1)) if varied else config.room_m
@@ -1834,6 +1851,38 @@ def home_plan(config: RoomConfig, rng: Rng, size: tuple[float, float, float]) ->
         + lounge_places(rng, size)
         + shelf_places(size)
     )
+
+
+CORRIDOR_ROOMS = 3  # chosen: two wrong places for every view
+JOIN_M = 0.2  # what is so close to a wall that is left out goes with it: pictures, curtains
+
+
+def rooms_in_a_row(room: Room, count: int) -> Room:
+    """Repeat a room along x, without the walls between: every part looks the same, light too."""
+    w, d, h = room.size_m
+    x = room.surfaces.corners_in_world[..., 0]  # (S, 8)
+    west, east = ((np.abs(x - side * w / 2) < JOIN_M).all(1) for side in (-1, 1))  # (S,)
+    surfaces, objects, outlines = [], [], []
+    for copy in range(count):
+        keep = ~((east & (copy < count - 1)) | (west & (copy > 0)))
+        shift, first = np.array([(copy - (count - 1) / 2) * w, 0.0, 0.0]), copy * len(room.objects)
+        part = {name: getattr(room.surfaces, name)[keep] for name in Surfaces.__slots__}
+        part["world_from_patch"] = part["world_from_patch"] + np.pad(
+            shift[:, None], ((0, 0), (3, 0))
+        )
+        part["corners_in_world"] = part["corners_in_world"] + shift
+        part["owner"] = np.where(part["owner"] < 0, -1, part["owner"] + first)
+        surfaces.append(part)
+        objects += [
+            replace(o, index=o.index + first, center_in_world=o.center_in_world + shift)
+            for o in room.objects
+        ]
+        outlines += [outline + shift for outline in room.outline_in_world]
+    joined = {name: np.concatenate([s[name] for s in surfaces]) for name in Surfaces.__slots__}
+    return Room(
+        (count * w, d, h), tuple(objects), Surfaces(**joined), room.atlas, room.light,
+        tuple(outlines),
+    )  # fmt: skip
 
 
 def object_windows(
@@ -2282,6 +2331,9 @@ def tour_keys(room: Room, seed: int) -> list[tuple[float, tuple[float, float], A
     return [(i / (len(stops) - 1), spot, aim) for i, (spot, aim) in enumerate(stops)]
 
 
+TURNS_FROM_TO = (0.3, 0.7)  # of the frames of the path "turn"
+
+
 def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array]:
     """Where the walk passes: time (K,) in 0..1, camera x, y (K, 2), what it looks at (K, 3)."""
     w, d, _ = room.size_m
@@ -2312,8 +2364,17 @@ def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array
         keys = [(i / 7, spot, dining) for i, spot in enumerate(spots)]
     elif kind == "tour":
         keys = tour_keys(room, seed)
+    elif kind == "turn":
+        stop, (first, last) = (1.0, -0.2), TURNS_FROM_TO
+        keys = [(0.00, (0.05, 0.85), dining), (0.15, (0.85, 0.45), dining), (first, stop, dining)]
+        keys += [((first + last) / 2, stop, couch), (last, stop, desk)]
+        keys += [(0.85, (0.5, -0.9), desk), (1.00, (-0.4, -1.1), desk)]
+    elif kind == "corridor":
+        keys = [
+            (t, (x, -0.3), (x + 1.2, d / 2, 1.0)) for t, x in ((0, 1 - w / 2), (1, w / 2 - 1.8))
+        ]
     elif kind != "revisit":
-        raise ValueError(f"path {kind!r} is unknown: use revisit, walk, orbit or tour")
+        raise ValueError(f"path {kind!r} is unknown: use {', '.join(PATHS)}")
     times, spots_xy, targets = zip(*keys, strict=True)
     return np.array(times), np.array(spots_xy), np.array(targets)
 
@@ -2337,8 +2398,52 @@ def hand_shake(rng: Rng, seconds: Array) -> Array:
     return wave
 
 
+STEP_M = 0.28  # between two photos of the path "table" (issue 15: a held-back orbit's steps)
+EYE_RANGE_M = (0.95, 1.85)  # their heights: kneeling to standing
+WALL_MARGIN_M = 0.35  # of the path "table"
+
+
+def table_path(room: Room, config: RoomConfig) -> Array:
+    """Photos once round the table with most space about it, weaving up and down, looking at it.
+
+    Returns:
+        cam_from_world (F, 3, 4), STEP_M apart along the way; few photos go straight round.
+    Raises: ValueError for a room without a table.
+    """
+    limit = np.array(room.size_m[:2]) / 2
+    tables = [o.center_in_world for o in room.objects if o.class_name == "dining table"]
+    if not tables:
+        raise ValueError("path 'table' needs a room with a dining table")
+    space, at = max(((limit - np.abs(t[:2])).min(), -i) for i, t in enumerate(tables))
+    target, radius = tables[-at], space - WALL_MARGIN_M
+    low, high = EYE_RANGE_M
+
+    def way(waves: float) -> tuple[Array, Array]:
+        """Fine points (N, 3) of the way with so many waves, and the length (N,) up to each."""
+        turn = np.linspace(0, 2 * np.pi, 20000)
+        up = 0.5 * (high + low + (high - low) * np.sin(waves * turn))
+        xy = target[:2] + radius * np.column_stack([np.cos(turn), np.sin(turn)])
+        points = np.column_stack([xy, up])
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        return points, np.concatenate([[0.0], np.cumsum(steps)])
+
+    fewest, most = 0.0, float(config.frames)
+    for _ in range(40):  # the length grows with the waves
+        middle = (fewest + most) / 2
+        longer = way(middle)[1][-1] > STEP_M * (config.frames - 1)
+        fewest, most = (fewest, middle) if longer else (middle, most)
+    points, length = way(fewest)
+    places = np.linspace(0, length[-1], config.frames)
+    centers = np.column_stack([np.interp(places, length, column) for column in points.T])  # (F, 3)
+    aim = target + np.random.default_rng([config.seed, 2]).normal(0, 0.05, centers.shape) - centers
+    pitch = np.arctan2(aim[:, 2], np.hypot(aim[:, 0], aim[:, 1]))
+    return look_along(centers, np.arctan2(aim[:, 1], aim[:, 0]), pitch, np.zeros(config.frames))
+
+
 def camera_path(room: Room, config: RoomConfig) -> Array:
-    """Walk through the room by hand: cam_from_world (F, 3, 4), always translating, seeded."""
+    """Walk through the room by hand: cam_from_world (F, 3, 4), seeded."""
+    if config.path == "table":
+        return table_path(room, config)
     rng = np.random.default_rng([config.seed, 2])
     times, spots, targets = path_keys(room, config.path, config.seed)
     aim = targets - np.column_stack([spots, np.full(len(spots), config.eye_m)])  # (K, 3)
@@ -2447,7 +2552,8 @@ def render_clip(room: Room, config: RoomConfig, cameras: Array | None = None) ->
         clean, instance, depth = render(
             room, K, pose, size, config.supersample, exposure_at(index, config)
         )
-        after = poses[index + 1] if index + 1 < len(poses) else poses[index]
+        moves = index + 1 < len(poses) and config.path != "table"  # photos: nothing is blurred
+        after = poses[index + 1] if moves else pose
         rotation = after[:, :3] @ pose[:, :3].T
         next_from_cam = np.concatenate(
             [rotation, (after[:, 3] - rotation @ pose[:, 3])[:, None]], 1
@@ -2863,11 +2969,16 @@ def build_parser() -> argparse.ArgumentParser:
     add("--fps", type=float, default=base.fps)
     add(
         "--path",
-        choices=("revisit", "walk", "orbit", "tour"),
+        choices=PATHS,
         default=base.path,
-        help="how the camera moves",
+        help="how the camera moves: " + "; ".join(f"{k}: {v}" for k, v in PATHS.items()),
     )
-    add("--plan", choices=("home", "varied"), default=base.plan, help="varied: a room of its own")
+    add(
+        "--plan",
+        choices=PLANS,
+        default=base.plan,
+        help="; ".join(f"{k}: {v}" for k, v in PLANS.items()),
+    )
     add("--chairs", type=int, default=base.chairs, help="identical chairs, up to 6")
     add("--monitors", type=int, default=base.monitors)
     add("--noise", type=float, default=base.noise, help="sensor noise in grey levels")

@@ -143,8 +143,69 @@ def test_path_stays_in_the_room(room, kind: str) -> None:
     assert np.all(np.abs(centers[:, :2]) < np.array(room.size_m[:2]) / 2 - 0.3)
 
 
+def viewing(room, **changes) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (F, 3) and viewing directions (F, 3) of a path."""
+    poses = rr.camera_path(room, rr.replace(SMALL, **changes))
+    return -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3]
+
+
+def test_table_is_photographed_once_round_in_steps_of_28_cm(room) -> None:
+    centers, forward = viewing(room, path="table", frames=150)
+    tables = [o for o in room.objects if o.class_name == "dining table"]
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert np.median(steps) == pytest.approx(0.28, abs=0.01) and steps.max() < 0.285
+    assert np.all(np.abs(centers[:, :2]) < np.array(room.size_m[:2]) / 2 - 0.3)
+    away = centers[:, None] - [t.center_in_world for t in tables]  # (F, T, 3)
+    target = np.linalg.norm(away[..., :2], axis=2).std(0).argmin()  # the one that it goes round
+    turn = np.unwrap(np.arctan2(away[:, target, 1], away[:, target, 0]))
+    assert np.degrees(turn[-1] - turn[0]) == pytest.approx(360) and np.all(np.diff(turn) > 0)
+    to_table = -away[:, target] / np.linalg.norm(away[:, target], axis=1, keepdims=True)
+    assert np.degrees(np.arccos((forward * to_table).sum(1))).max() < 15
+    few, _ = viewing(room, path="table", frames=13)  # fewer than 28 cm steps would need
+    assert np.ptp(few[:, 2]) < 0.01 and np.ptp(np.linalg.norm(np.diff(few, axis=0), axis=1)) < 1e-3
+
+
+def test_photos_are_not_blurred_by_their_steps(room) -> None:
+    config = rr.replace(SMALL, path="table", frames=40, noise=0.0)
+    still, moving = (
+        next(rr.render_clip(room, rr.replace(config, shutter=shutter))).image
+        for shutter in (0.0, 0.9)
+    )
+    np.testing.assert_array_equal(still, moving)
+
+
+def test_turn_stays_on_the_spot_and_turns_far(room) -> None:
+    centers, forward = viewing(room, path="turn", frames=100, shake_m=0.0)
+    still = slice(40, 60)
+    assert np.ptp(centers[still], axis=0).max() < 1e-6
+    assert np.linalg.norm(np.diff(centers[:25], axis=0), axis=1).min() > 1e-3
+    assert np.degrees(np.arccos(forward[40] @ forward[60])) > 60
+
+
+def test_rooms_of_the_corridor_look_the_same_from_the_same_place(room) -> None:
+    row, (w, d, h) = rr.rooms_in_a_row(room, 3), room.size_m
+    assert row.size_m == (3 * w, d, h) and len(row.objects) == 3 * len(room.objects)
+    assert [o.index for o in row.objects] == list(range(len(row.objects)))
+    centers, _ = viewing(row, path="corridor", frames=60)
+    assert np.all(np.diff(centers[:, 0]) > 0) and np.ptp(centers[:, 0]) > 2.3 * w
+    K, views = rr.camera_matrix(SMALL), []
+    for x in (-w, 0.0, w):  # looking at one side of each room
+        angles = np.array([[1.2], [-0.3], [0.0]])
+        pose = rr.look_along(np.array([[x - 1, -0.3, 1.5]]), *angles)[0]
+        views.append(rr.render(row, K, pose, (320, 240), 1))
+    for image, instance, depth in views[1:]:
+        assert (np.abs(image.astype(int) - views[0][0]).max(2) > 8).mean() < 0.02
+        np.testing.assert_allclose(depth, views[0][2], atol=0.05)
+        both = (instance >= 0) & (views[0][1] >= 0)
+        step = (instance - views[0][1])[both] / len(room.objects)
+        assert both.any() and set(step.tolist()) <= {1.0, 2.0}
+    ahead = rr.look_along(np.array([[-1.5 * w + 1, 0.0, 2.2]]), *np.zeros((3, 1)))[0]
+    depth = rr.render(row, K, ahead, (320, 240), 1)[2]
+    assert np.quantile(depth, 0.95) > 1.5 * w  # no wall between
+
+
 def test_unknown_path_is_refused(room) -> None:
-    with pytest.raises(ValueError, match="use revisit"):
+    with pytest.raises(ValueError, match="use revisit, walk"):
         rr.camera_path(room, rr.RoomConfig(path="fly"))
 
 

@@ -1,0 +1,921 @@
+#!/usr/bin/env python3
+"""Break good recordings, reconstruct their cameras, and count what passes as good.
+
+    python examples/pose_breaks.py -o OUT [--data FOLDER] [--cases 216] [--jobs 2] [--only KIND...]
+    python examples/pose_breaks.py -o OUT mirrored_half-009      # these cases; pictures are kept
+
+Writes OUT/results.jsonl, a line for every case; a second call goes on from there. What is cut from
+the recordings, and the poses of whole recordings that have no truth, are made once and kept
+(--cache, default OUT/cache). Calls public names only. Exit code 1 if a wrong reconstruction passed
+as good, or a good recording was refused or torn.
+
+Kinds of breaks, in short stretches (24-40 pictures):
+    mirrored_half    from a cut on all pictures are mirrored left to right: two worlds that no
+                     rigid motion joins
+    mirrored_middle  a stretch in the middle is mirrored
+    left_out         pictures are left out where the view turns most
+    permuted         pictures are shuffled: in blocks, or all; blocks in another order
+    two_rooms        two recordings one after the other, or by turns (at one focal length)
+    corridor         rendered rooms in a row that look the same: what is seen again is elsewhere
+    turn             rendered: the camera only turns for a stretch
+    zoomed           a stretch is zoomed: another focal length
+    thin             a stretch is blurred or dark: the sides of it share few points
+and beside them
+    issue            the two breaks that issue 15 names, whole and at the defaults
+    good             recordings as they are, at the defaults: what registers today must go on to
+
+Verdict. Every frame has a true pose and a world that it shows. A part of the result is right if all
+its frames show one world and ONE similarity brings their cameras (centres and orientations) to the
+truth, with the same scale all along; the similarity is the one on which most frames agree. A
+result is
+    whole     right, in one part with (nearly) every frame
+    partly    right, in several parts or with frames that have no pose
+    refused   without poses
+    said      wrong, but messages name all wrong frames by number
+    passed    wrong otherwise: some part holds frames that do not belong to it, without a word
+So a shuffled set that comes out right is no failure, and neither is a break that is found. A part
+whose true cameras stay in place is judged by its orientations alone. Interpolated frames, which are
+marked, are not judged.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import render_room as rr
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import reobj_track as rt
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+Images = npt.NDArray[np.uint8]
+Rng = np.random.Generator
+
+ROOT = Path(__file__).resolve().parent.parent
+CLIP_PX = 480  # longer side of the pictures that are kept (chosen)
+SHORT = rt.PosesConfig(size_px=320, max_keyframes=24)  # for 24-40 pictures: 5 to 9 s of one core
+
+# ---- Verdict ------------------------------------------------------------------------------------
+
+# Error of a centre over the extent of its part's true path. Good recordings stay below .06
+# (docs/poses.md: redkitchen against a Kinect), a wrong loop of the corridor is at .6.
+MAX_CENTRE = 0.1
+LEAST_EXTENT = 0.05  # of that path over all of its world's: a part that hardly moved (chosen)
+# Local scale within a part over that of most of it. Half as much again bends a straight path by no
+# more than .05 of its extent, which MAX_CENTRE lets pass (chosen).
+MAX_SCALE_JUMP = 1.35
+MAX_TURN_DEG = 10.0  # error of an orientation; good recordings stay below 3 in the median
+STRAY_SHARE = 0.05  # of a part's frames, at least one: so many are strays, counted and not a break
+WHOLE_SHARE = 0.9  # of the frames in one part: whole
+
+
+def align(found: Array, truth: Array) -> tuple[Array, Array]:
+    """Bring cameras to the truth by one similarity.
+
+    Centres and orientations have the same say, so that a straight path has no free roll.
+
+    Args:
+        found, truth: cam_from_world (n, 3, 4), n >= 1; a similarity of all of them is fitted.
+    Returns:
+        rotation (3, 3) times scale, and shift (3,).
+    Ref: Umeyama, PAMI 1991, with the mean of the relative orientations added to the covariance.
+    """
+    (a, turn_a), (b, turn_b) = world_from_cam(found), world_from_cam(truth)
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    size = np.sqrt((a0**2).sum(1).mean() * (b0**2).sum(1).mean())
+    relative = np.einsum("fij,fkj->ik", turn_b, turn_a) / len(a)  # b_from_a
+    covariance = relative + (b0.T @ a0 / (len(a) * size) if size > 1e-12 else 0)
+    u, _, vt = np.linalg.svd(covariance)
+    rotation = u * [1, 1, np.sign(np.linalg.det(u @ vt))] @ vt
+    scale = (b0 * (a0 @ rotation.T)).sum() / max((a0**2).sum(), 1e-24)
+    scaled = max(float(scale), 1e-12) * rotation
+    return scaled, b.mean(0) - scaled @ a.mean(0)
+
+
+def world_from_cam(cam_from_world: Array) -> tuple[Array, Array]:
+    """Centres (n, 3) and orientations (n, 3, 3)."""
+    turn = np.swapaxes(cam_from_world[:, :, :3], 1, 2)
+    return -(turn @ cam_from_world[:, :, 3:])[:, :, 0], turn
+
+
+def extent_of(cam_from_world: Array) -> float:
+    """Diagonal of the box around the centres of cameras (n, 3, 4)."""
+    return float(np.linalg.norm(np.ptp(world_from_cam(cam_from_world)[0], axis=0)))
+
+
+def misfit(
+    found: Array, truth: Array, to_truth: tuple[Array, Array], extent: float
+) -> tuple[Array, Array]:
+    """Errors (n,) of centres, over an extent, and of orientations, degrees."""
+    (a, turn_a), (b, turn_b) = world_from_cam(found), world_from_cam(truth)
+    scaled, shift = to_truth
+    error = np.linalg.norm(a @ scaled.T + shift - b, axis=1) / extent
+    rotation = scaled / np.cbrt(np.linalg.det(scaled))
+    cosine = (np.einsum("ij,fjk,fik->f", rotation, turn_a, turn_b) - 1) / 2
+    return error, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def fit_part(found: Array, truth: Array, least_extent: float = 1e-9) -> tuple[Array, Array]:
+    """Measure the cameras (n, 3, 4) of one part under the similarity on which most agree.
+
+    Hypotheses are fitted to all, to halves, quarters and eighths of the path and to random samples.
+
+    Args:
+        least_extent: the smallest size of a path that errors are related to.
+    Returns:
+        as `misfit`.
+    """
+    rng, rows = np.random.default_rng(0), np.arange(len(found))
+    extent = max(extent_of(truth), least_extent)
+    subsets = [s for k in (1, 2, 4, 8) for s in np.array_split(rows, k) if len(s) >= 2] or [rows]
+    subsets += [rng.choice(rows, min(5, len(rows)), replace=False) for _ in range(30)]
+    best, most = misfit(found, truth, align(found, truth), extent), -1.0
+    for subset in subsets:
+        for _ in range(4):  # to those who agree
+            error, turn = misfit(found, truth, align(found[subset], truth[subset]), extent)
+            good = fits(error, turn)
+            score = good.sum() - error[good].mean() if good.any() else 0.0
+            if score > most:
+                best, most = (error, turn), float(score)
+            if good.sum() < 2:
+                break
+            subset = rows[good]
+    return best
+
+
+WINDOW_SHARE = 6  # of a part's frames on each side in which its local scale is taken (chosen)
+LEAST_SPREAD = 0.1  # of the true centres in it over that of all; less tells nothing (chosen)
+
+
+def local_scale(found: Array, truth: Array) -> Array:
+    """Measure by how much the path around each frame is larger or smaller than most of it is.
+
+    Args:
+        found, truth: cam_from_world (n, 3, 4) of a part, in order.
+    Returns:
+        (n,) true over found spread of the centres in a window, over the value on which most frames
+        agree; 1 where the camera hardly moved.
+    """
+    a, b = world_from_cam(found)[0], world_from_cam(truth)[0]
+    half = max(3, len(a) // WINDOW_SHARE)
+    windows = [slice(max(0, i - half), i + half + 1) for i in range(len(a))]
+    spread = np.array([[np.sqrt(x[w].var(0).sum()) for x in (a, b)] for w in windows])  # (n, 2)
+    moves = spread[:, 1] > max(LEAST_SPREAD * np.sqrt(b.var(0).sum()), 1e-9)
+    ratio = np.log(np.maximum(spread[:, 1], 1e-12) / np.maximum(spread[:, 0], 1e-12))
+    if not moves.any():
+        return np.ones(len(a))
+    agree = np.abs(ratio[moves][:, None] - ratio[moves]) < np.log(MAX_SCALE_JUMP) / 2  # (m, m)
+    most = np.median(ratio[moves][agree[agree.sum(1).argmax()]])
+    return np.exp(np.where(moves, ratio - most, 0.0))
+
+
+def fits(error: Array, turn_deg: Array) -> BoolArray:
+    """(n,) True where a camera is where the truth has it."""
+    return np.asarray((error <= MAX_CENTRE) & (turn_deg <= MAX_TURN_DEG), bool)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a result is worth against the truth.
+
+    Attributes:
+        outcome: whole, partly, refused, said or passed (head of this file).
+        posed: share of the frames that have a pose. right: frames whose pose is right. parts:
+        number of parts with poses.
+        strays: frames off their part that are too few to be a break. wrong: frame numbers of those
+        that do not belong to their part. centre, turn_deg: their median errors (of all frames, if
+        none is wrong), centres over the extent of the part. look: what to look at.
+    """
+
+    outcome: str
+    posed: float
+    right: int
+    parts: int
+    strays: int
+    wrong: tuple[int, ...]
+    centre: float
+    turn_deg: float
+    look: str
+
+
+def judge(poses: rt.Poses, truth: Array, world: IntArray) -> Verdict:
+    """Compare poses with the truth by frame number.
+
+    Args:
+        truth: cam_from_world (N, 3, 4) of frame 0 .. N - 1, NaN where it is unknown. world: (N,)
+            which world each frame shows; true poses of different worlds have nothing in common.
+    """
+    posed = poses.known & (poses.status != "interpolated")
+    wrong, strays, looks, right = list[int](), 0, list[str](), [0]
+    errors, bad_errors = list[Array](), list[Array]()
+    for part in np.unique(poses.part[posed]):
+        rows = np.flatnonzero(posed & (poses.part == part))
+        rows = rows[np.isfinite(truth[poses.frame[rows]]).all((1, 2))]
+        if not len(rows):
+            continue
+        frame = poses.frame[rows]
+        at = np.unique(world[frame], return_counts=True)
+        own = world[frame] == at[0][at[1].argmax()]
+        error, turn = np.full(len(rows), np.inf), np.full(len(rows), 180.0)
+        pair, scale = (poses.cam_from_world[rows[own]], truth[frame[own]]), np.ones(len(rows))
+        of_world = np.isfinite(truth).all((1, 2)) & (world == at[0][at[1].argmax()])
+        least = max(LEAST_EXTENT * extent_of(truth[of_world]), 1e-9)
+        error[own], turn[own] = fit_part(*pair, least)
+        good = fits(error, turn)
+        scale[good] = local_scale(*(side[good[own]] for side in pair))
+        good &= np.abs(np.log(scale)) <= np.log(MAX_SCALE_JUMP)
+        errors.append(np.stack([error, turn]))
+        right.append(int(good.sum()))
+        if 0 < (~good).sum() <= max(1, round(STRAY_SHARE * len(rows))):
+            strays += int((~good).sum())
+        elif not good.all():
+            wrong += frame[~good].tolist()
+            bad_errors.append(errors[-1][:, ~good])
+            looks.append(describe(int(part), frame, own, good, errors[-1], pair))
+    known = np.isfinite(truth).all((1, 2)).sum()
+    if not errors:
+        return Verdict("refused", 0.0, 0, 0, 0, (), 0.0, 0.0, "; ".join(poses.messages)[:200])
+    middle = np.median(np.concatenate(bad_errors or errors, 1), axis=1)
+    outcome = "whole" if max(right) >= WHOLE_SHARE * known else "partly"
+    if wrong:
+        outcome = "said" if set(wrong) <= named_frames(poses.messages) else "passed"
+        looks += [f"messages: {poses.messages}"]
+    return Verdict(
+        outcome, float(poses.known.mean()), sum(right), len(errors), strays, tuple(wrong),
+        round(float(min(middle[0], 999)), 4), round(float(middle[1]), 2), "; ".join(looks),
+    )  # fmt: skip
+
+
+def describe(
+    part: int,
+    frame: IntArray,
+    own: BoolArray,
+    good: BoolArray,
+    errors: Array,
+    pair: Sequence[Array],
+) -> str:
+    """Say which frames of a part are wrong, and how; `pair`: found and true poses of its world."""
+    other = f", {(~own).sum()} of them of another world" if not own.all() else ""
+    off, turn = np.median(errors[:, ~good], axis=1)
+    far = f"{100 * off:.0f} % of the path" if np.isfinite(off) else "no place at all in it"
+    text = f"part {part} of {len(frame)} frames: {(~good).sum()} wrong ({spans(frame[~good])})"
+    text += f"{other}; in the median off by {far} and {turn:.0f} deg"
+    ratio = [
+        np.divide(*(np.sqrt(world_from_cam(side[rows])[0].var(0).sum()) for side in pair))
+        for rows in (good[own], ~good[own])
+        if rows.sum() >= 2
+    ]
+    return text + (f", scale {ratio[1] / ratio[0]:.2f} of the rest" if len(ratio) == 2 else "")
+
+
+def spans(numbers: Iterable[int]) -> str:
+    """Write ascending numbers as spans: 3-5, 9."""
+    found: list[list[int]] = []
+    for n in numbers:
+        if found and n == found[-1][1] + 1:
+            found[-1][1] = n
+        else:
+            found.append([n, n])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in found)
+
+
+NUMBERS = re.compile(r"frames?\s+((?:\d+(?:\s*(?:-|to)\s*\d+)?(?:,\s*|\s+and\s+)?)+)", re.I)
+
+
+def named_frames(messages: Sequence[str]) -> set[int]:
+    """Frame numbers that messages name: `frames 78-113, 120`, `frame 51`.
+
+    >>> sorted(named_frames(["frames 3-5, 9: off", "of 12 frames 2 are lost"]))
+    [3, 4, 5, 9]
+    """
+    found: set[int] = set()
+    for text in (t for m in messages for t in NUMBERS.findall(re.sub(r"\d+ of \d+ frames", "", m))):
+        for first, last in re.findall(r"(\d+)(?:\s*(?:-|to)\s*(\d+))?", text):
+            found |= set(range(int(first), int(last or first) + 1))
+    return found
+
+
+# ---- Clips --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """Pictures and the truth about their cameras.
+
+    Attributes:
+        images: (N, h, w, 3) BGR. truth: cam_from_world (N, 3, 4), NaN where unknown. world: (N,)
+        which world each shows. focal: over the width.
+    """
+
+    images: Images
+    truth: Array
+    world: IntArray
+    focal: float
+
+    def rows(self, rows: Any) -> Clip:
+        """Return these pictures in this order."""
+        return Clip(np.asarray(self.images[rows]), self.truth[rows], self.world[rows], self.focal)
+
+
+FLIP = np.diag([-1.0, 1.0, 1.0])
+
+
+def mirrored(clip: Clip, rows: IntArray) -> Clip:
+    """Mirror some pictures left to right: they show the mirrored world, seen from there.
+
+    x_cam = R X + t becomes F x_cam = (F R F) (F X) + F t with F the flip of x.
+    """
+    images, truth, world = clip.images.copy(), clip.truth.copy(), clip.world.copy()
+    images[rows] = images[rows][:, :, ::-1]
+    truth[rows] = FLIP @ truth[rows]
+    truth[rows, :, :3] = truth[rows, :, :3] @ FLIP
+    world[rows] = -1 - world[rows]
+    return replace(clip, images=images, truth=truth, world=world)
+
+
+def zoomed(image: Any, factor: float, size: tuple[int, int]) -> Any:
+    """Cut the middle out of a picture and enlarge it to (w, h), its shape kept."""
+    height, width = image.shape[:2]
+    cut = min(width / size[0], height / size[1]) / factor
+    to_cut = np.array([[1 / cut, 0, 0], [0, 1 / cut, 0]])
+    to_cut[:, 2] = np.array(size) / 2 - np.array([width, height]) / cut / 2 + 0.5 * (1 / cut - 1)
+    flags = cv2.INTER_AREA if cut > 1 else cv2.INTER_LINEAR
+    return cv2.warpAffine(image, to_cut, size, flags=flags)
+
+
+def with_focal(clip: Clip, focal: float, size: tuple[int, int]) -> Clip:
+    """Cut and resize the pictures so that their focal length is `focal` over the width or more."""
+    height, width = clip.images.shape[1:3]
+    used = min(width, height * size[0] / size[1]) / width  # of the width, by the shape alone
+    factor = max(focal * used / clip.focal, 1.0)
+    images = np.stack([zoomed(image, factor, size) for image in clip.images])
+    return replace(clip, images=images, focal=clip.focal / used * factor)
+
+
+def write_pictures(clip: Clip, folder: Path) -> None:
+    """Write the pictures as an image folder, numbered."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for i, image in enumerate(clip.images):
+        cv2.imwrite(str(folder / f"{i:04d}.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+# ---- Recordings ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A recording, or a clip to be rendered, and what the tool makes of it today.
+
+    Attributes:
+        source: file or folder below --data or examples/. every: of its pictures, for the clip.
+        truth: file of true poses, "" without: the poses of the whole recording, found once at the
+        defaults, take its place. focal: true one over the width (0: the one found).
+        room: RoomConfig of a rendered one. today: frames with a right pose, in one part, at the
+        defaults with `good_every`, at commit a196537; interpolated ones do not count. 0: broken.
+    """
+
+    source: str = ""
+    every: int = 1
+    truth: str = ""
+    focal: float = 0.0
+    room: rr.RoomConfig | None = None
+    good_every: int = 1
+    today: int = 0
+
+
+SMALL = rr.RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, light_rays=2)
+
+
+def rendered(seed: int, path: str, frames: int, plan: str = "home", today: int = 0) -> Recording:
+    """Describe a clip of examples/render_room.py, small; a turn is one on the spot exactly."""
+    shake_m = 0.0 if path == "turn" else SMALL.shake_m
+    room = replace(SMALL, seed=seed, path=path, frames=frames, plan=plan, shake_m=shake_m)
+    return Recording(room=room, today=today)
+
+
+RECORDINGS = {
+    "room": Recording("room/room.mp4", 2, "room/poses.txt", 0.77, today=240),
+    "redkitchen": Recording(
+        "redkitchen_7scenes/images", 4, "poses_c2w.txt", 0.828, good_every=4, today=125
+    ),
+    "studio_room": Recording("studio_room/images", 1, "poses_c2w.txt", 0.4705, today=35),
+    "office_loop": Recording("office_loop/images", 2, today=237),
+    "hololens": Recording("hololens_kitchen/images", 1, "poses_c2w.txt", 0.9177),
+    "bonsai": Recording("bonsai_mip360/images"),
+    "livingroom13": Recording("livingroom13/images", today=13),
+    "tum_fr3": Recording("tum_fr3_office/images17", 1, "poses17_c2w.txt", 0.8365, today=17),
+    "apple": Recording("orbit_clips/apple.mp4", today=50),
+    "teddybear": Recording("orbit_clips/teddybear.mp4", today=9),
+    "walk": rendered(11, "walk", 72, today=72),
+    "turn": rendered(11, "turn", 60),
+    "corridor": rendered(11, "corridor", 66, "corridor"),
+    "table": rendered(11, "table", 48),
+    "orbit": rendered(12, "orbit", 48, today=48),
+    "turn_b": rendered(12, "turn", 60),
+    "corridor_b": rendered(12, "corridor", 60, "corridor"),
+    "tour": rendered(21, "tour", 96, "varied", today=96),
+}
+WALKS = ("room", "redkitchen", "studio_room", "office_loop", "hololens", "bonsai", "walk", "orbit",
+         "tour", "table")  # fmt: skip
+GOOD = ("room", "redkitchen", "studio_room", "office_loop", "bonsai", "livingroom13", "tum_fr3",
+        "apple", "teddybear", "walk", "orbit", "table", "tour")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Shelf:
+    """Where recordings come from, and the clips made of them."""
+
+    data: Path
+    cache: Path
+
+    def path(self, name: str) -> Path:
+        """Where a recording lies; a rendered one is not on disk."""
+        source = RECORDINGS[name].source
+        inside = ROOT / "examples" / source
+        return inside if source.startswith("room/") else self.data / source
+
+    def has(self, name: str) -> bool:
+        """Return True if the recording is on this machine, or can be rendered."""
+        return RECORDINGS[name].room is not None or self.path(name).exists()
+
+    def clip(self, name: str) -> Clip:
+        """Return the clip of a recording; made at the first call."""
+        folder = self.cache / name
+        if not (folder / "truth.npz").exists():
+            made = self._render(name) if RECORDINGS[name].room else self._read(name)
+            folder.mkdir(parents=True, exist_ok=True)
+            np.save(folder / "images.npy", made.images)
+            np.savez(folder / "part.npz", truth=made.truth, world=made.world, focal=made.focal)
+            (folder / "part.npz").replace(folder / "truth.npz")
+        facts = np.load(folder / "truth.npz")
+        images = np.load(folder / "images.npy", mmap_mode="r")
+        return Clip(images, facts["truth"], facts["world"], float(facts["focal"]))
+
+    def _render(self, name: str) -> Clip:
+        config = RECORDINGS[name].room or SMALL
+        frames = list(rr.render_clip(rr.make_room(config), config))
+        truth = np.stack([f.cam_from_world for f in frames])
+        focal = float(rr.camera_matrix(config)[0, 0]) / config.width
+        images = np.stack([f.image for f in frames])
+        return Clip(images, truth, np.zeros(len(frames), np.int64), focal)
+
+    def _read(self, name: str) -> Clip:
+        recording = RECORDINGS[name]
+        video = rt.Video(self.path(name), rt.InputConfig(every=recording.every, max_size=CLIP_PX))
+        frames = list(video)
+        truth, focal = self.truth(name)
+        images = np.stack([f.image for f in frames])
+        truth = truth[[f.index for f in frames]]
+        return Clip(images, truth, np.zeros(len(frames), np.int64), recording.focal or focal)
+
+    def truth(self, name: str) -> tuple[Array, float]:
+        """Return cam_from_world (N, 3, 4) by frame of the source, and the focal length."""
+        recording, path = RECORDINGS[name], self.path(name)
+        if recording.room is not None:
+            return self.clip(name).truth, self.clip(name).focal
+        if recording.truth.startswith("room/"):
+            width, height, focal = 640, 480, recording.focal * 640
+            camera = f"{focal},{focal},{width / 2},{height / 2}"
+            tum = ROOT / "examples" / recording.truth
+            supplied = rt.read_poses(tum, rt.Video(path), camera=camera)
+            return supplied.cam_from_world, recording.focal
+        if recording.truth:
+            world_from = np.loadtxt(path.parent / recording.truth).reshape(-1, 4, 4)
+            return np.asarray(np.linalg.inv(world_from)[:, :3], np.float64), recording.focal
+        saved = self.cache / f"{name}_reference.npz"
+        if not saved.exists():
+            self._reconstruct_whole(path, saved)
+        return np.load(saved)["truth"], float(np.load(saved)["focal"])
+
+    def _reconstruct_whole(self, path: Path, saved: Path) -> None:
+        """Write the poses of a whole recording at the defaults, and its focal length.
+
+        Raises: ReobjError if they cannot serve as the truth: frames are missing.
+        """
+        self.cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=self.cache) as work:
+            poses = rt.estimate_poses(rt.Video(path), rt.PosesConfig(), Path(work))
+            kept = poses.known & (poses.part == 0) & (poses.status != "interpolated")
+            if kept.mean() < WHOLE_SHARE:
+                raise rt.ReobjError(
+                    f"{path}: {kept.sum()} of {len(kept)} frames got a pose: no reference for the "
+                    f"bench. Give one that an earlier version made (--cache). {poses.messages}"
+                )
+            cams = np.full((int(poses.frame.max()) + 1, 3, 4), np.nan)
+            cams[poses.frame[kept]] = poses.cam_from_world[kept]
+            np.savez(
+                Path(work) / "truth.npz",
+                truth=cams,
+                focal=poses.camera.K[0, 0] / poses.camera.width,
+            )
+            (Path(work) / "truth.npz").replace(saved)
+
+
+# ---- Breaks: (shelf, names of recordings there, rng) -> clip, what was done ---------------------
+
+Broken = tuple[Clip, str]
+
+
+def stretch(shelf: Shelf, names: Sequence[str], rng: Rng, least: int = 24) -> Broken:
+    """Cut 24 to 40 pictures, or all if there are fewer, out of one of the recordings."""
+    name = str(rng.choice(list(names)))
+    clip = shelf.clip(name)
+    count = min(int(rng.integers(least, 41)), len(clip.images))
+    stride = int(rng.integers(1, min(2, max(1, len(clip.images) // count)) + 1))
+    start = int(rng.integers(0, len(clip.images) - stride * (count - 1)))
+    rows = start + stride * np.arange(count)
+    if rng.random() < 0.25:
+        rows = rows[::-1]
+    return clip.rows(rows), f"{name} {rows[0]}..{rows[-1]} by {stride}"
+
+
+def mirrored_half(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Mirror all pictures after a cut."""
+    clip, what = stretch(shelf, names, rng)
+    cut = round(len(clip.images) * rng.uniform(0.35, 0.65))
+    return mirrored(clip, np.arange(cut, len(clip.images))), f"{what}, mirrored from {cut} on"
+
+
+def mirrored_middle(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Mirror the pictures of a stretch in the middle."""
+    clip, what = stretch(shelf, names, rng)
+    rows = middle(len(clip.images), rng, 0.25, 0.5)
+    return mirrored(clip, rows), f"{what}, {rows[0]}-{rows[-1]} mirrored"
+
+
+def middle(count: int, rng: Rng, least: float, most: float) -> IntArray:
+    """Rows of a stretch that leaves a quarter of the pictures on each side, where it can."""
+    length = round(count * rng.uniform(least, most))
+    first = int(rng.integers(count // 4, max(count // 4, count - length - count // 4) + 1))
+    return np.arange(first, first + length)
+
+
+def left_out(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Leave out the stretch, of a share of the clip, over which the view turns most."""
+    clip, what = stretch(shelf, [n for n in names if n != "table"], rng, 36)
+    count, gap = len(clip.images), round(len(clip.images) * rng.uniform(0.3, 0.55))
+    starts = np.arange(count // 5, max(count // 5 + 1, count - gap - count // 5))
+    axis = clip.truth[:, 2, :3]  # viewing directions
+    cosine = np.nan_to_num((axis[starts - 1] * axis[starts + gap]).sum(1), nan=1.0)
+    first = int(rng.choice(starts[np.argsort(cosine)][:3]))
+    rows = np.r_[0:first, first + gap : count]
+    return clip.rows(rows), f"{what}, {first}-{first + gap - 1} left out"
+
+
+def permuted(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Shuffle: all pictures, those of blocks, or blocks of them."""
+    clip, what = stretch(shelf, names, rng)
+    way = str(rng.choice(["all", "in blocks", "blocks"]))
+    size = len(clip.images) if way == "all" else int(rng.integers(4, 9))
+    blocks = np.split(np.arange(len(clip.images)), np.arange(size, len(clip.images), size))
+    if way == "blocks":
+        blocks = [blocks[i] for i in rng.permutation(len(blocks))]
+    else:
+        blocks = [rng.permutation(block) for block in blocks]
+    return clip.rows(np.concatenate(blocks)), f"{what}, shuffled: {way} of {size}"
+
+
+def two_rooms(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Put two recordings into one file, one after the other or by turns."""
+    first, second = (str(n) for n in rng.choice(list(names), 2, replace=False))
+    pair = [stretch(shelf, [name], rng) for name in (first, second)]
+    clips = [clip.rows(np.arange(min(len(clip.images), 24))) for clip, _ in pair]
+    height, width = clips[0].images.shape[1:3]
+    size = (width, height)
+    for _ in range(2):  # the second time to what the first has reached by cutting
+        focal = max(clip.focal for clip in clips)
+        clips = [with_focal(clip, focal, size) for clip in clips]
+    turns = int(rng.choice([1, 1, 2, 3]))
+    pieces = [np.array_split(np.arange(len(clip.images)), turns) for clip in clips]
+    worlds = [replace(clip, world=clip.world + i) for i, clip in enumerate(clips)]
+    parts = [worlds[i].rows(pieces[i][k]) for k in range(turns) for i in (0, 1)]
+    joined = Clip(
+        np.concatenate([p.images for p in parts]),
+        np.concatenate([p.truth for p in parts]),
+        np.concatenate([p.world for p in parts]),
+        clips[0].focal,
+    )
+    return joined, f"{pair[0][1]} and {pair[1][1]} in {2 * turns} pieces"
+
+
+def corridor(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Walk past rooms that look the same."""
+    return stretch(shelf, ("corridor", "corridor_b"), rng, 36)
+
+
+def turn(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Walk, turn on the spot in wider or smaller steps, walk on."""
+    name = str(rng.choice(["turn", "turn_b"]))
+    clip, every = shelf.clip(name), int(rng.integers(1, 5))
+    count = len(clip.images)
+    first, last = (round(share * count) for share in rr.TURNS_FROM_TO)
+    before, after = rng.integers(8, first + 1), rng.integers(8, count - last + 1)
+    rows = np.r_[first - before : first, first:last:every, last : last + after]
+    if rng.random() < 0.25:
+        rows = rows[::-1]
+    return clip.rows(rows), f"{name} {rows[0]}..{rows[-1]}, every {every} of the turn"
+
+
+def zoomed_stretch(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Zoom a stretch in the middle or the rest."""
+    clip, what = stretch(shelf, names, rng)
+    count = len(clip.images)
+    rows = middle(count, rng, 0.3, 0.5) if rng.random() < 0.5 else np.arange(count // 2, count)
+    images, factor = clip.images.copy(), float(rng.uniform(1.25, 1.5))
+    size = (images.shape[2], images.shape[1])
+    images[rows] = [zoomed(images[i], factor, size) for i in rows]
+    return replace(clip, images=images), f"{what}, {rows[0]}-{rows[-1]} zoomed by {factor:.2f}"
+
+
+def thin(shelf: Shelf, names: Sequence[str], rng: Rng) -> Broken:
+    """Blur or darken a stretch in the middle, by far too much or nearly."""
+    clip, what = stretch(shelf, names, rng, 30)
+    rows, images = middle(len(clip.images), rng, 0.2, 0.4), clip.images.copy()
+    if rng.random() < 0.5:
+        sigma = float(rng.uniform(2, 6)) * images.shape[2] / 400
+        images[rows] = [cv2.GaussianBlur(images[i], (0, 0), sigma) for i in rows]
+        return replace(clip, images=images), f"{what}, {rows[0]}-{rows[-1]} blurred by {sigma:.1f}"
+    light = float(rng.uniform(0.02, 0.1))
+    dark = images[rows] * light + rng.normal(0, 1.5, images[rows].shape)
+    images[rows] = dark.clip(0, 255).round().astype(np.uint8)
+    return replace(clip, images=images), f"{what}, {rows[0]}-{rows[-1]} at {light:.2f} of the light"
+
+
+KINDS: dict[str, Callable[[Shelf, Sequence[str], Rng], Broken]] = {
+    "mirrored_half": mirrored_half,
+    "mirrored_middle": mirrored_middle,
+    "left_out": left_out,
+    "permuted": permuted,
+    "two_rooms": two_rooms,
+    "corridor": corridor,
+    "turn": turn,
+    "zoomed": zoomed_stretch,
+    "thin": thin,
+}
+KNOWN_CAMERA = 0.25  # share of the cases with given intrinsics (chosen)
+DENSE_EVERY = 5  # of the cases of a kind one takes nearly all pictures as keyframes: more than 30
+# are not matched each with each, as in a long recording
+DENSE_KEYFRAMES = 80  # allowed; half of that many are wanted
+
+
+# ---- Running ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One case and all that its process needs."""
+
+    name: str
+    shelf: Shelf
+    names: tuple[str, ...]
+    seed: int
+    work: Path
+    keep: bool
+
+
+def run_case(job: Job) -> dict[str, Any]:
+    """Make a case, reconstruct it, judge it; return its line of the results."""
+    cv2.setNumThreads(1)
+    kind, _, tail = job.name.partition("-")
+    started, cpu = time.monotonic(), cpu_s()
+    folder = job.work / job.name
+    shutil.rmtree(folder, ignore_errors=True)
+    line: dict[str, Any] = {"case": job.name, "kind": kind}
+    try:
+        video, truth, world, config, what, focal = prepare(job, kind, tail, folder)
+        started, cpu = time.monotonic(), cpu_s()
+        (folder / "sfm").mkdir(parents=True)
+        poses = rt.estimate_poses(video, config, folder / "sfm")
+        found = judge(poses, truth, world)
+        ratio = poses.camera.K[0, 0] / poses.camera.width / focal
+        line |= {"what": what, "frames": len(poses.frame), "known": int(poses.known.sum())}
+        line |= {"focal_ratio": round(float(ratio), 4), "messages": list(poses.messages)}
+        line |= dataclasses.asdict(found)
+    except Exception as error:  # a bench goes on: the summary counts it
+        line |= {"outcome": "crashed", "look": f"{type(error).__name__}: {error}"}
+    line |= {"wall_s": round(time.monotonic() - started, 1), "cpu_s": round(cpu_s() - cpu, 1)}
+    if not job.keep:
+        shutil.rmtree(folder, ignore_errors=True)
+    return line
+
+
+def cpu_s() -> float:
+    """Seconds of processors used by this process and its children that ended."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
+
+
+def prepare(
+    job: Job, kind: str, tail: str, folder: Path
+) -> tuple[rt.Video, Array, IntArray, rt.PosesConfig, str, float]:
+    """Return video, truth, worlds, options, what was done, and focal length of a case."""
+    if kind == "good":
+        recording = RECORDINGS[tail]
+        if recording.room is None:
+            video = rt.Video(job.shelf.path(tail), rt.InputConfig(every=recording.good_every))
+            truth, focal = job.shelf.truth(tail)
+            kept = np.arange(len(truth)) % recording.good_every == 0
+            truth = np.where(kept[:, None, None], truth, np.nan)
+        else:
+            clip = job.shelf.clip(tail)
+            write_pictures(clip, folder / "images")
+            video, truth, focal = rt.Video(folder / "images"), clip.truth, clip.focal
+        return video, truth, np.zeros(len(truth), np.int64), rt.PosesConfig(), "as it is", focal
+    if kind == "issue":
+        return issue_case(job.shelf, tail, folder)
+    number = int(tail)
+    rng = np.random.default_rng([job.seed, list(KINDS).index(kind), number])
+    clip, what = KINDS[kind](job.shelf, job.names, rng)
+    write_pictures(clip, folder / "images")
+    config, (height, width) = SHORT, clip.images.shape[1:3]
+    if rng.random() < KNOWN_CAMERA:
+        focal = clip.focal * width
+        config = replace(config, camera=f"{focal:.3f},{focal:.3f},{width / 2},{height / 2}")
+        what += ", camera given"
+    if number % DENSE_EVERY == DENSE_EVERY - 1:
+        config, what = replace(config, max_keyframes=DENSE_KEYFRAMES), f"{what}, many keyframes"
+    return rt.Video(folder / "images"), clip.truth, clip.world, config, what, clip.focal
+
+
+ISSUES = ("room_mirrored", "bonsai_every_3rd", "hololens")
+
+
+def issue_case(
+    shelf: Shelf, name: str, folder: Path
+) -> tuple[rt.Video, Array, IntArray, rt.PosesConfig, str, float]:
+    """Make a case that issue 15 names, at the defaults."""
+    if name == "room_mirrored":
+        video = rt.Video(shelf.path("room"))
+        truth, focal = shelf.truth("room")
+        images = np.stack([frame.image for frame in video])
+        clip = Clip(images, truth, np.zeros(len(truth), np.int64), focal)
+        clip = mirrored(clip, np.arange(len(truth) // 2, len(truth)))
+        write_pictures(clip, folder / "images")
+        what = "the second half of 240 frames mirrored"
+        return rt.Video(folder / "images"), clip.truth, clip.world, rt.PosesConfig(), what, focal
+    source, every = ("bonsai", 3) if name == "bonsai_every_3rd" else ("hololens", 1)
+    truth, focal = shelf.truth(source)
+    kept = np.arange(len(truth)) % every == 0
+    truth = np.where(kept[:, None, None], truth, np.nan)
+    video = rt.Video(shelf.path(source), rt.InputConfig(every=every))
+    world = np.zeros(len(truth), np.int64)
+    return video, truth, world, rt.PosesConfig(), f"every {every}", focal
+
+
+def planned(args: argparse.Namespace, shelf: Shelf) -> list[str]:
+    """Name the cases to run, good recordings first."""
+    here = [name for name in RECORDINGS if shelf.has(name)]
+    whole = [f"good-{name}" for name in GOOD if name in here]
+    needs = {"room_mirrored": "room", "bonsai_every_3rd": "bonsai", "hololens": "hololens"}
+    whole += [f"issue-{name}" for name in ISSUES if shelf.has(needs[name])]
+    kinds = list(KINDS)
+    short = [f"{kinds[i % len(kinds)]}-{i // len(kinds):03d}" for i in range(args.cases)]
+    names = short if args.quick else whole + short
+    return args.names or [n for n in names if not args.only or n.partition("-")[0] in args.only]
+
+
+QUICK_CASES = 12
+QUICK_WALKS = ("room", "walk")  # needs nothing but this repository
+PARTS_OF_OUTCOME = ("whole", "partly", "refused", "said", "passed", "crashed")
+
+
+def main() -> int:
+    """Run the bench and print its table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", help="only these cases, e.g. turn-003; files are kept")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--cache", type=Path, help="clips and references (default OUT/cache)")
+    parser.add_argument("--cases", type=int, default=216, help="broken ones (default 216)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--only", nargs="*", default=[], choices=[*KINDS, "issue", "good"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK_CASES} cases, own data only")
+    args = parser.parse_args()
+    args.cases = QUICK_CASES if args.quick else args.cases
+    shelf = Shelf(args.data, args.cache or args.out / "cache")
+    args.out.mkdir(parents=True, exist_ok=True)
+    walks = tuple(n for n in (QUICK_WALKS if args.quick else WALKS) if shelf.has(n))
+    results = args.out / "results.jsonl"
+    done = read_results(results)
+    names = planned(args, shelf)
+    todo = [n for n in names if n not in done or args.names]
+    jobs = [Job(n, shelf, walks, args.seed, args.out / "work", bool(args.names)) for n in todo]
+    if jobs:
+        make_clips(shelf, walks, names, args.jobs)
+    started = time.monotonic()
+    with multiprocessing.get_context("spawn").Pool(args.jobs) as pool, open(results, "a") as file:
+        for count, line in enumerate(pool.imap_unordered(run_case, jobs), 1):
+            file.write(json.dumps(line) + "\n")
+            file.flush()
+            done[line["case"]] = line
+            left = (time.monotonic() - started) / count * (len(jobs) - count) / 60
+            print(f"{count}/{len(jobs)} {line['case']}: {line['outcome']} {line['cpu_s']} s, "
+                  f"{left:.0f} min left", file=sys.stderr, flush=True)  # fmt: skip
+    chosen = [done[name] for name in names if name in done]
+    print(table(chosen))
+    return int(any(failed(line) for line in chosen))
+
+
+def make_clips(shelf: Shelf, walks: Sequence[str], names: Sequence[str], jobs: int) -> None:
+    """Render and read what the cases need, before they do at the same time."""
+    kinds = {name.partition("-")[0] for name in names}
+    needed = {n for n in walks if kinds & (set(KINDS) - {"corridor", "turn"})}
+    needed |= {n for n in RECORDINGS if f"good-{n}" in names}
+    needed |= {n for n in ("corridor", "corridor_b") if "corridor" in kinds}
+    needed |= {n for n in ("turn", "turn_b") if "turn" in kinds}
+    missing = sorted(n for n in needed if not (shelf.cache / n / "truth.npz").exists())
+    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        for name in pool.imap_unordered(MakeClip(shelf), missing):
+            print(f"clip {name}", file=sys.stderr, flush=True)
+
+
+@dataclass(frozen=True, slots=True)
+class MakeClip:
+    """Make a clip in another process."""
+
+    shelf: Shelf
+
+    def __call__(self, name: str) -> str:
+        cv2.setNumThreads(1)
+        self.shelf.clip(name)
+        return name
+
+
+def read_results(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the lines of earlier calls by case; the last one of a case counts."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    found = [json.loads(line) for line in lines if line.endswith("}")]
+    return {line["case"]: line for line in found}
+
+
+def failed(line: dict[str, Any]) -> bool:
+    """Return True for what must not be: wrong and passed, or a good recording lost."""
+    if line["outcome"] in ("passed", "crashed"):
+        return True
+    today = RECORDINGS[line["case"].partition("-")[2]].today if line["kind"] == "good" else 0
+    if not today:
+        return False
+    torn = line["outcome"] == "said" or line["parts"] != 1
+    return bool(torn or line["right"] < WHOLE_SHARE * today)
+
+
+def table(lines: Sequence[dict[str, Any]]) -> str:
+    """Format the summary: a row a kind, good recordings, failing cases."""
+    text = ["| kind | cases | " + " | ".join(PARTS_OF_OUTCOME) + " | stray frames | s a case |"]
+    text += ["|---" * (len(PARTS_OF_OUTCOME) + 4) + "|"]
+    broken = [line for line in lines if line["kind"] != "good"]
+    for kind in [*dict.fromkeys(line["kind"] for line in broken), "all"]:
+        rows = [line for line in broken if kind in (line["kind"], "all")]
+        counts = [sum(row["outcome"] == o for row in rows) for o in PARTS_OF_OUTCOME]
+        strays = sum(row.get("strays", 0) for row in rows)
+        seconds = np.mean([row["cpu_s"] for row in rows]) if rows else 0.0
+        numbers = " | ".join(map(str, [len(rows), *counts, strays]))
+        text.append(f"| {kind} | {numbers} | {seconds:.1f} |")
+    good = [line for line in lines if line["kind"] == "good"]
+    if good:
+        text += [
+            "",
+            "| recording | with pose | right | right at a196537 | parts | outcome | centre, % | "
+            "turn, deg | focal / true |",
+        ]
+        text += ["|---" * 9 + "|"]
+    for g in good:
+        text.append(
+            f"| {g['case'][5:]} | {g.get('known')} of {g.get('frames')} | {g.get('right')} | "
+            f"{RECORDINGS[g['case'][5:]].today} | {g.get('parts')} | "
+            f"{g['outcome']} | {100 * g.get('centre', 0):.2f} | {g.get('turn_deg', 0):.2f} | "
+            f"{g.get('focal_ratio')} |"
+        )
+    lost = sum(failed(g) for g in good)
+    passed = sum(line["outcome"] == "passed" for line in broken)
+    text += ["", f"passed as good though wrong: {passed} of {len(broken)}; good recordings refused "
+             f"or torn: {lost} of {len(good)}"]  # fmt: skip
+    for line in (line for line in lines if failed(line)):
+        text.append(f"- {line['case']}: {line.get('what', '')}: {line['outcome']}: {line['look']}")
+    return "\n".join(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
