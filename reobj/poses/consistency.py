@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from reobj.cameras import import_pycolmap
 from reobj.types import Array, BoolArray, IntArray
@@ -92,8 +92,8 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
 
 
 EXPLAINED_PX = 4.0  # largest distance from the epipolar line (COLMAP's filter_max_reproj_error)
-MIN_MATCHES = 30  # verified matches of neighbours that can contradict (COLMAP registers from 30)
-MIN_EXPLAINED = 0.5  # share of them that the model must explain (measured: right .64-1, wrong 0-.4)
+MIN_MATCHES = 30  # verified matches of neighbours that say something (COLMAP registers from 30 on)
+MIN_TIED = 0.1  # share of them that are one point of the model (measured: right .38-.98, wrong 0)
 MIN_BRIDGE = 30  # points that tie two groups of images (COLMAP registers one image from 30 on)
 MIN_GROUP = 3  # images; fewer that hang on few points are left to be located by PnP
 WEAKEST_CUTS = 3  # whose missing points are counted (chosen: time)
@@ -117,13 +117,10 @@ def consistent_groups(model: Any, pairs: MatchedPairs, order: Sequence[int]) -> 
         are in none.
     """
     views = _read_views(model)
-    contradicted = _contradicted_neighbours(model, pairs, views.ids, order)
-    todo, groups = [np.arange(len(views.ids))], []
+    todo, groups = _runs_of_tied_neighbours(model, pairs, views.ids, order), []
     while todo:
         rows = todo.pop()
-        side = _contradiction_cut(views, rows, contradicted)
-        if side is None:
-            side = _weak_cut(views, rows)
+        side = _weak_cut(views, rows)
         if side is None:
             groups.append(views.ids[rows])
             continue
@@ -206,40 +203,34 @@ def count_explained(model: Any, pairs: MatchedPairs) -> float:
     return float((explained_share(model, pairs, rows) * counts).sum())
 
 
-def _contradicted_neighbours(
+def _runs_of_tied_neighbours(
     model: Any, pairs: MatchedPairs, ids: IntArray, order: Sequence[int]
-) -> IntArray:
-    """Find pairs (n, 2) of rows of `ids` that follow each other in time and contradict the model.
+) -> list[IntArray]:
+    """Split rows of `ids` where the model does not hold the matches of neighbours in time together.
 
-    Pictures that follow each other show one place; other pairs may look alike by chance.
-    """
-    place, row = {image: k for k, image in enumerate(order)}, {int(i): r for r, i in enumerate(ids)}
-    near = [
-        k
-        for k, (a, b) in enumerate(pairs.image_ids.tolist())
-        if a in row and b in row and abs(place[a] - place[b]) == 1
-        and len(pairs.inliers[k]) >= MIN_MATCHES
-    ]  # fmt: skip
-    share = explained_share(model, pairs, np.array(near, np.int64))
-    wrong = pairs.image_ids[np.array(near, np.int64)[share < MIN_EXPLAINED]]
-    return np.array([[row[a], row[b]] for a, b in wrong.tolist()], np.int64).reshape(-1, 2)
-
-
-def _contradiction_cut(views: _Views, rows: IntArray, contradicted: IntArray) -> BoolArray | None:
-    """Separate the first two contradicting images among `rows` where the fewest points are shared.
+    Pictures that follow each other show one place (others may look alike by chance): a good share
+    of their verified matches must be one point of the model, two observations each. They are not
+    where the camera was put at a twin of its place, or at another scale. An image that is tied to
+    neither of its neighbours is left out, so that it does not split the rest.
 
     Returns:
-        (R,) True on one side, None if no pair of rows contradicts.
+        rows (n,) of each run, ascending.
     """
-    where = {int(r): k for k, r in enumerate(rows)}
-    for a, b in contradicted.tolist():
-        if a in where and b in where:
-            capacity = sparse.csr_matrix(_shared_points(views.seen[rows]).astype(np.int32))
-            left = capacity - maximum_flow(capacity, where[a], where[b]).flow
-            left.eliminate_zeros()
-            reached = breadth_first_order(left, where[a], return_predecessors=False)
-            return np.isin(np.arange(len(rows)), reached)
-    return None
+    point_of = {
+        i: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(i).points2D])
+        for i in ids.tolist()
+    }
+    place, row = {image: k for k, image in enumerate(order)}, {int(i): r for r, i in enumerate(ids)}
+    untied = np.zeros(len(ids) + 1, bool)  # of each row and the one before it
+    for (a, b), matches in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
+        if a in row and b in row and abs(place[a] - place[b]) == 1 and len(matches) >= MIN_MATCHES:
+            one, other = point_of[a][matches[:, 0]], point_of[b][matches[:, 1]]
+            tied = np.mean((one == other) & (one >= 0))
+            untied[max(row[a], row[b])] = tied < MIN_TIED
+    loose = untied[:-1] & untied[1:]
+    starts = np.flatnonzero(untied[:-1] & ~loose & ~np.append(False, loose[:-1]))
+    runs = np.split(np.arange(len(ids)), starts)
+    return [kept for run in runs if len(kept := run[~loose[run]])]
 
 
 def _shared_points(seen: Any) -> Array:
