@@ -13,6 +13,7 @@ import pytest
 from pose_worlds import FakeVideo, ate_percent, blank, textured_room
 
 import reobj_track as rt
+from reobj.poses.mapping import Mapped
 
 pytest.importorskip("pycolmap")
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -61,9 +62,9 @@ def seen_job(monkeypatch, video, folder, **changes):
     """What `estimate_poses` hands to the reconstruction."""
     seen = {}
 
-    def record(images, names, boxes, size, **options):
-        seen.update(images=images, names=names, boxes=boxes, size=size, **options)
-        return ["stopped here"]
+    def record(images, ids, names, boxes, size, **options):
+        seen.update(images=images, ids=ids, names=names, boxes=boxes, size=size, **options)
+        return Mapped([], ["stopped here"])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", record)
     boxes = changes.pop("boxes", None)
@@ -76,7 +77,7 @@ def test_options_arrive_at_the_reconstruction(walk, tmp_path, monkeypatch):
     video = walk[0]
     seen = seen_job(monkeypatch, video, tmp_path)
     assert seen["images"][0].shape == (240, 320, 3) and seen["size"] == (320, 240)
-    assert (seen["camera"], seen["focal_guesses"], seen["seed"]) == (None, [0.8], 0)
+    assert (seen["camera"], seen["focal_guess"], seen["seed"]) == (None, 0.8, 0)
     assert len(seen["images"]) > 8 and all(boxes.shape == (0, 4) for boxes in seen["boxes"])
     mask = lambda frame: np.full((2, 4), float(frame))  # noqa: E731
     monkeypatch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 8)
@@ -84,9 +85,9 @@ def test_options_arrive_at_the_reconstruction(walk, tmp_path, monkeypatch):
                        camera="288,288,160,120", boxes=mask)  # fmt: skip
     assert changed["images"][0].shape == (120, 160, 3) and len(changed["images"]) <= 8
     assert changed["camera"].params[0] == 288 and changed["seed"] == 3
-    assert changed["focal_guesses"] == []
     numbers = [int(name.removesuffix(".jpg").split("_")[1]) for name in changed["names"]]
     assert [boxes[0, 0] for boxes in changed["boxes"]] == numbers
+    assert changed["ids"] == [number + 1 for number in numbers]
 
 
 @pytest.fixture
@@ -96,7 +97,7 @@ def reconstructed(walk, monkeypatch):
     def copy(*args, work_dir, **options):
         shutil.copytree(walk[2] / "sparse", work_dir / "sparse")
         (work_dir / "mapping").mkdir()
-        return []
+        return Mapped([work_dir / "sparse"], [])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", copy)
     return walk
@@ -171,16 +172,16 @@ def photo_with_exif(path, image, focal_35mm):
 
 
 @pytest.mark.parametrize("focal_35mm", [48, 0])
-def test_the_exif_focal_length_is_tried_before_the_usual_guess(tmp_path, monkeypatch, focal_35mm):
+def test_the_exif_focal_length_is_the_guess_before_the_usual_one(tmp_path, monkeypatch, focal_35mm):
     """COLMAP: 48 mm of a film whose diagonal is 43.27 mm."""
     images = textured_room(3, 0.5)[0]
     (tmp_path / "photos").mkdir()
     for i, image in enumerate(images):
         photo_with_exif(tmp_path / "photos" / f"{i}.jpg", image, focal_35mm)
     video = rt.Video(tmp_path / "photos")
-    guesses = seen_job(monkeypatch, video, tmp_path / "work")["focal_guesses"]
+    guess = seen_job(monkeypatch, video, tmp_path / "work")["focal_guess"]
     exif = 48 / np.hypot(36, 24) * np.hypot(480, 360) / 480
-    assert guesses == ([pytest.approx(exif, rel=1e-3), 0.8] if focal_35mm else [0.8])
+    assert guess == (pytest.approx(exif, rel=1e-3) if focal_35mm else 0.8)
 
 
 # ---- Recordings ----------------------------------------------------------------------------------

@@ -214,14 +214,14 @@ def _contradicted_neighbours(
     Pictures that follow each other show one place; other pairs may look alike by chance.
     """
     place, row = {image: k for k, image in enumerate(order)}, {int(i): r for r, i in enumerate(ids)}
-    near = [
+    neighbours = [
         k
         for k, (a, b) in enumerate(pairs.image_ids.tolist())
         if a in row and b in row and abs(place[a] - place[b]) == 1
         and len(pairs.inliers[k]) >= MIN_MATCHES
     ]  # fmt: skip
-    share = explained_share(model, pairs, np.array(near, np.int64))
-    wrong = pairs.image_ids[np.array(near, np.int64)[share < MIN_EXPLAINED]]
+    share = explained_share(model, pairs, np.array(neighbours, np.int64))
+    wrong = pairs.image_ids[np.array(neighbours, np.int64)[share < MIN_EXPLAINED]]
     return np.array([[row[a], row[b]] for a, b in wrong.tolist()], np.int64).reshape(-1, 2)
 
 
@@ -315,9 +315,9 @@ def _found_again(views: _Views, rows: IntArray, side: BoolArray) -> tuple[int, i
             here = centre[~own][image] - xyz  # (n, 3)
             away = np.linalg.norm(here, axis=1)[seen.col]
             cosine = (ray * here[seen.col]).sum(1) / (length * away)
-            near = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
-            near &= np.abs(np.log(length / away)) < np.log(NEAR_VIEW_SCALE)
-            inside &= np.bincount(seen.col[near], minlength=len(points)) > 0
+            alike = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
+            alike &= np.abs(np.log(length / away)) < np.log(NEAR_VIEW_SCALE)
+            inside &= np.bincount(seen.col[alike], minlength=len(points)) > 0
             expected += int(inside.sum())
             found += int(inside[there[image].indices].sum())
     return expected, found
