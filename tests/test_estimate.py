@@ -13,9 +13,10 @@ import pytest
 from pose_worlds import FakeVideo, ate_percent, blank, textured_room
 
 import reobj_track as rt
+from reobj.poses.estimate import rows_around_breaks
 from reobj.poses.mapping import Mapped
 
-pytest.importorskip("pycolmap")
+pycolmap = pytest.importorskip("pycolmap")
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROOM = Path(__file__).resolve().parents[1] / "examples" / "room"
 
@@ -156,6 +157,78 @@ def test_empty_video_and_live_camera_are_refused(tmp_path):
     video.is_live = True
     with pytest.raises(rt.ReobjError, match="live"):
         rt.estimate_poses(video, config(), tmp_path)
+
+
+# ---- Breaks --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "parts, rows",
+    [
+        ([[0, 10, 20, 30, 40, 50]], []),  # nothing broke
+        ([[0, 10, 20], [30, 40, 50]], [*range(11, 40)]),  # the step between, and one on each side
+        ([[0, 10, 20, 40, 50]], [*range(11, 50)]),  # a keyframe in no part
+        ([[10, 20, 30, 40, 50]], [*range(1, 20)]),  # the first
+        ([[0, 10, 20, 30, 40]], [*range(31, 50)]),  # the last
+    ],
+)
+def test_more_keyframes_around_breaks(parts, rows, monkeypatch):
+    keys, parts = [0, 10, 20, 30, 40, 50], [np.array(part) for part in parts]
+    monkeypatch.setattr("reobj.poses.estimate.MAX_EXTRA", 9)
+    assert rows_around_breaks(keys, parts) == [row for row in rows if row % 10]
+    monkeypatch.setattr("reobj.poses.estimate.MAX_EXTRA", 1)
+    assert rows_around_breaks(keys, parts) == [row for row in rows if row % 10 == 5]
+
+
+def test_neighbouring_rows_leave_no_room_for_keyframes():
+    parts = [np.array([0, 1, 2]), np.array([3, 4])]
+    assert rows_around_breaks([0, 1, 2, 3, 4], parts) == []
+    assert rows_around_breaks([0, 1, 2, 5, 6], [np.array([0, 1, 2]), np.array([5, 6])]) == [3, 4]
+
+
+def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, monkeypatch):
+    """Once, with those of before among them; ids tell the frames."""
+    calls = []
+
+    def broken(images, ids, names, *args, work_dir, **options):
+        calls.append(list(ids))
+        source = pycolmap.Reconstruction(str(walk[2] / "sparse"))
+        models = []
+        keys = sorted(source.reg_image_ids())
+        for number, own in enumerate((keys[:6], keys[6:])):
+            made = pycolmap.Reconstruction(source)
+            for image_id in set(keys) - set(own):
+                made.deregister_frame(made.image(image_id).frame_id)
+            models.append(work_dir / (f"sparse_part{number}" if number else "sparse"))
+            shutil.rmtree(models[-1], ignore_errors=True)
+            models[-1].mkdir()
+            made.write(str(models[-1]))
+        return Mapped(models, [])
+
+    monkeypatch.setattr("reobj.poses.estimate.reconstruct", broken)
+    monkeypatch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 12)
+    poses = rt.estimate_poses(walk[0], config(), tmp_path)
+    assert len(calls) == 2 and set(calls[0]) < set(calls[1])
+    keys = [row + 1 for row in np.flatnonzero(walk[3].status == "keyframe")]
+    assert calls[0] == keys and calls[1] == sorted(calls[1])
+    assert poses.part_count == 2 and poses.known.all()
+    assert (np.diff(poses.part) >= 0).all() or set(poses.part) == {0, 1}
+    assert poses.visibility[:, 1].max() < len(poses.points)
+    seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of part 0 come first
+    assert poses.visibility[seen == 0, 1].max() < poses.visibility[seen == 1, 1].min()
+    assert "broke into 2 parts (part 1: frames 0-" in poses.messages[0]
+
+
+def test_a_mirrored_half_is_a_part_of_its_own(tmp_path):
+    """A mirror image shows the same textures but no place of the same world."""
+    images, truth = textured_room(24, 0.2, -1.5, size=(320, 240))
+    images[12:] = [np.ascontiguousarray(image[:, ::-1]) for image in images[12:]]
+    poses = rt.estimate_poses(FakeVideo(images), config(), tmp_path)
+    assert poses.part_count == 2 and "broke into 2 parts" in poses.messages[0]
+    first = poses.part[:12]
+    assert (first == first[0]).all() and (poses.part[12:] == 1 - first[0]).all()
+    own = np.arange(24) < 12
+    assert ate_percent(poses.cam_from_world[own], truth[own]) < 2
 
 
 # ---- EXIF ----------------------------------------------------------------------------------------
