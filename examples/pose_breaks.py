@@ -71,7 +71,7 @@ Rng = np.random.Generator
 
 ROOT = Path(__file__).resolve().parent.parent
 CLIP_PX = 480  # longer side of the pictures that are kept (chosen)
-SHORT = rt.PosesConfig(size_px=320, max_keyframes=24)  # for 24-40 pictures: 5 to 9 s of one core
+SHORT = rt.PosesConfig(size_px=320)  # for 24-40 pictures, of which all are keyframes
 
 # ---- Verdict ------------------------------------------------------------------------------------
 
@@ -672,9 +672,6 @@ KINDS: dict[str, Callable[[Shelf, Sequence[str], Rng], Broken]] = {
     "thin": thin,
 }
 KNOWN_CAMERA = 0.25  # share of the cases with given intrinsics (chosen)
-DENSE_EVERY = 5  # of the cases of a kind one takes nearly all pictures as keyframes: more than 30
-# are not matched each with each, as in a long recording
-DENSE_KEYFRAMES = 80  # allowed; half of that many are wanted
 
 
 # ---- Running ------------------------------------------------------------------------------------
@@ -751,8 +748,6 @@ def prepare(
         focal = clip.focal * width
         config = replace(config, camera=f"{focal:.3f},{focal:.3f},{width / 2},{height / 2}")
         what += ", camera given"
-    if number % DENSE_EVERY == DENSE_EVERY - 1:
-        config, what = replace(config, max_keyframes=DENSE_KEYFRAMES), f"{what}, many keyframes"
     return rt.Video(folder / "images"), clip.truth, clip.world, config, what, clip.focal
 
 

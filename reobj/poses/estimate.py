@@ -229,21 +229,25 @@ def _exif_focal(video: Any) -> float:
     return 0.0
 
 
+MAX_BREAKS = 5  # named in a message (chosen)
+
+
 def _breaks(poses: Poses) -> list[str]:
-    """Say where the reconstruction broke, what was done and what helps; [] if it is one part."""
-    if poses.part_count < 2:
+    """Say between which frames the reconstruction broke and what was done; [] if it did not.
+
+    What several parts mean for the objects is said where these are made (`reobj.parts`).
+    """
+    rows = np.flatnonzero(poses.known)
+    at = np.flatnonzero(np.diff(poses.part[rows]))
+    if not len(at):
         return []
-    located = np.flatnonzero(poses.known)
-    step = int(np.median(np.diff(poses.frame)))
-    parts = [
-        spans(poses.frame[located[poses.part[located] == k]].tolist(), step)
-        for k in range(poses.part_count)
-    ]
-    listed = "; ".join(f"part {k + 1}: frames {text}" for k, text in enumerate(parts))
+    ends = zip(poses.frame[rows[at]].tolist(), poses.frame[rows[at + 1]].tolist(), strict=True)
+    where = [f"{a} and {b}" for a, b in ends]
+    more = f" and {len(where) - MAX_BREAKS} more" if len(where) > MAX_BREAKS else ""
     return [
-        f"the reconstruction broke into {len(parts)} parts ({listed}): between them too few points "
-        "were seen from both sides, also with more keyframes there. Each part has a frame and a "
-        "scale of its own; more overlap, slower turns, --camera, or --poses help"
+        f"the reconstruction broke between frames {', '.join(where[:MAX_BREAKS])}{more}: what both "
+        "sides see does not fit together, also with more keyframes there; more overlap, slower "
+        "turns, or --camera help"
     ]
 
 

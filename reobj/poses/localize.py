@@ -8,7 +8,9 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
@@ -34,7 +36,9 @@ def locate_between(
     count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
     cam_from_world[key_rows], status[key_rows] = model.cam_from_world, "keyframe"
-    for before, after, run in _segments(key_rows, video.grays()):
+
+    def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
+        before, after, run = segment
         images = [gray for _, gray in run]
         ahead = _follow_model_points(model, before, images)
         back = _follow_model_points(model, after, images[::-1])[::-1]
@@ -44,7 +48,15 @@ def locate_between(
                 found = absolute_pose(xy, points, camera, gray.shape[1], seed)
                 if found is not None:
                     cam_from_world[row], status[row] = found, "pnp"
-        line.step(len(run) - 1)
+        return len(run) - 1
+
+    segments, threads = _segments(key_rows, video.grays()), cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    with ThreadPoolExecutor(2) as pool:  # segments share nothing; OpenCV's own threads gain less
+        while batch := list(itertools.islice(segments, 2)):
+            for done in pool.map(locate, batch):
+                line.step(done)
+    cv2.setNumThreads(threads)
     line.close()
     jump = _detours(cam_from_world) & (status == "pnp")
     cam_from_world[jump], status[jump] = np.nan, "none"

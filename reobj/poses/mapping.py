@@ -370,12 +370,15 @@ def _run_mapper(database: Path, mapper: str, fixed: bool, count: int, seed: int)
         options["mapper"] = {"bundle_adjustment": kept}
         return list(pc.global_mapping(*paths, options=options).values())
     options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
-    # global adjustment more rarely and less exactly than by default (chosen: time; see `_refine`)
+    # adjustment more rarely and less exactly than by default (chosen: time; see `_refine`)
+    options["mapper"] = {"ba_local_num_images": 4}
     options |= {"ba_global_frames_ratio": 1.4, "ba_global_points_ratio": 1.4}
     options |= {"ba_global_function_tolerance": 1e-5, "ba_global_max_refinements": 2}
     options |= {"ba_local_max_refinements": 1}
     options |= {"ba_refine_focal_length": not fixed, "ba_refine_extra_params": not fixed}
-    options |= RELAXED if mapper == "relaxed" else {}
+    if mapper == "relaxed":
+        options["mapper"] |= RELAXED["mapper"]
+        options["triangulation"] = RELAXED["triangulation"]
     done = itertools.count(2)
     tick = {"next_image_callback": lambda: send_progress("mapping", min(next(done), count), count)}
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
