@@ -282,7 +282,7 @@ def test_two_rooms_come_as_two_parts(tmp_path):
     first, second = models
     assert set(second.names) == {f"{i:03d}.jpg" for i in range(10)}
     assert ate_percent(first.cam_from_world, truth_of(first, np.r_[truth[:10], truth])) < 1.0
-    assert first.cameras == second.cameras
+    assert len({*first.cameras, *second.cameras}) == 1
 
 
 # ---- Experiment of examples/pose_accuracy.py -----------------------------------------------------
