@@ -217,10 +217,10 @@ def test_track_hands_poses_to_the_tracker() -> None:
             return rt.Tracks.empty()
 
     list(rt.track(video, lambda image: [], Noting(), poses=poses))
-    assert [k["cam_from_world"] is None for k in given] == [False, True, False]
+    assert [k.get("cam_from_world") is None for k in given] == [False, True, False]
     np.testing.assert_array_equal([given[0]["cam_from_world"], given[2]["cam_from_world"]], cams)
     small = rt.Camera("PINHOLE", 320, 240, (250.0, 250.0, 160.0, 120.0))
-    assert [k["camera"] for k in given] == [small] * 3
+    assert [given[0]["camera"], given[2]["camera"]] == [small] * 2
 
 
 # ---- Types ----

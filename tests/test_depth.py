@@ -386,13 +386,13 @@ def test_a_reconstruction_and_its_model_become_metric_once(tmp_path, walk, monke
     for _ in range(2):
         poses, model = stage.reconstruct_cached(video, config, workspace)
         assert poses.metric and len(poses.points) > 3000 and len(asked) == 1
-        cams = read_sparse_model(model).cam_from_world
+        cams = read_sparse_model(model[0]).cam_from_world
         np.testing.assert_allclose(cams, poses.cam_from_world, atol=1e-6)
-        assert len(read_sparse_model(model).points) == len(found.points)
+        assert len(read_sparse_model(model[0]).points) == len(found.points)
         monkeypatch.setattr(stage, "add_depth", None)
     plain, model = stage.reconstruct_cached(video, rt.PosesConfig(), workspace)
     assert not plain.metric and len(asked) == 1
-    cams = read_sparse_model(model).cam_from_world
+    cams = read_sparse_model(model[0]).cam_from_world
     np.testing.assert_allclose(cams, found.cam_from_world, atol=1e-6)
 
 

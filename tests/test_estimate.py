@@ -13,8 +13,10 @@ import pytest
 from pose_worlds import FakeVideo, ate_percent, blank, textured_room
 
 import reobj_track as rt
+from reobj.poses.estimate import rows_around_breaks
+from reobj.poses.mapping import Mapped
 
-pytest.importorskip("pycolmap")
+pycolmap = pytest.importorskip("pycolmap")
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROOM = Path(__file__).resolve().parents[1] / "examples" / "room"
 
@@ -29,6 +31,7 @@ def walk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("walk")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 12)
+        patch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)
         poses = rt.estimate_poses(FakeVideo(images), config(), folder)
     return FakeVideo(images), truth, folder, poses
 
@@ -61,9 +64,9 @@ def seen_job(monkeypatch, video, folder, **changes):
     """What `estimate_poses` hands to the reconstruction."""
     seen = {}
 
-    def record(images, names, boxes, size, **options):
-        seen.update(images=images, names=names, boxes=boxes, size=size, **options)
-        return ["stopped here"]
+    def record(images, ids, names, boxes, size, **options):
+        seen.update(images=images, ids=ids, names=names, boxes=boxes, size=size, **options)
+        return Mapped([], ["stopped here"])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", record)
     boxes = changes.pop("boxes", None)
@@ -76,17 +79,19 @@ def test_options_arrive_at_the_reconstruction(walk, tmp_path, monkeypatch):
     video = walk[0]
     seen = seen_job(monkeypatch, video, tmp_path)
     assert seen["images"][0].shape == (240, 320, 3) and seen["size"] == (320, 240)
-    assert (seen["camera"], seen["focal_guesses"], seen["seed"]) == (None, [0.8], 0)
-    assert len(seen["images"]) > 8 and all(boxes.shape == (0, 4) for boxes in seen["boxes"])
+    assert (seen["camera"], seen["focal_guess"], seen["seed"]) == (None, 0.8, 0)
+    assert len(seen["images"]) == 30  # of up to 40 pictures all are taken
+    assert all(boxes.shape == (0, 4) for boxes in seen["boxes"])
     mask = lambda frame: np.full((2, 4), float(frame))  # noqa: E731
     monkeypatch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 8)
+    monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 8)
     changed = seen_job(monkeypatch, video, tmp_path, size_px=160, seed=3,
                        camera="288,288,160,120", boxes=mask)  # fmt: skip
     assert changed["images"][0].shape == (120, 160, 3) and len(changed["images"]) <= 8
     assert changed["camera"].params[0] == 288 and changed["seed"] == 3
-    assert changed["focal_guesses"] == []
     numbers = [int(name.removesuffix(".jpg").split("_")[1]) for name in changed["names"]]
     assert [boxes[0, 0] for boxes in changed["boxes"]] == numbers
+    assert changed["ids"] == [number + 1 for number in numbers]
 
 
 @pytest.fixture
@@ -96,7 +101,7 @@ def reconstructed(walk, monkeypatch):
     def copy(*args, work_dir, **options):
         shutil.copytree(walk[2] / "sparse", work_dir / "sparse")
         (work_dir / "mapping").mkdir()
-        return []
+        return Mapped([work_dir / "sparse"], [])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", copy)
     return walk
@@ -136,8 +141,8 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
     "images, message",
     [
         (textured_room(1, 0)[0], "only 1 different view"),
-        ([np.zeros((240, 320, 3), np.uint8)] * 30, "only 2 different views"),  # black
-        (textured_room(1, 0)[0] * 30, "only 2 different views"),  # still
+        ([np.zeros((240, 320, 3), np.uint8)] * 45, "only 2 different views"),  # black
+        (textured_room(1, 0)[0] * 45, "only 2 different views"),  # still
     ],
 )
 def test_failures_are_no_crash_and_say_what_helps(tmp_path, images, message):
@@ -157,6 +162,79 @@ def test_empty_video_and_live_camera_are_refused(tmp_path):
         rt.estimate_poses(video, config(), tmp_path)
 
 
+# ---- Breaks --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "parts, rows",
+    [
+        ([[0, 10, 20, 30, 40, 50]], []),  # nothing broke
+        ([[0, 10, 20], [30, 40, 50]], [*range(11, 40)]),  # the step between, and one on each side
+        ([[0, 10, 20, 40, 50]], [*range(11, 50)]),  # a keyframe in no part
+        ([[10, 20, 30, 40, 50]], [*range(1, 20)]),  # the first
+        ([[0, 10, 20, 30, 40]], [*range(31, 50)]),  # the last
+    ],
+)
+def test_more_keyframes_around_breaks(parts, rows, monkeypatch):
+    keys, parts = [0, 10, 20, 30, 40, 50], [np.array(part) for part in parts]
+    monkeypatch.setattr("reobj.poses.estimate.MAX_EXTRA", 9)
+    assert rows_around_breaks(keys, parts) == [row for row in rows if row % 10]
+    monkeypatch.setattr("reobj.poses.estimate.MAX_EXTRA", 1)
+    assert rows_around_breaks(keys, parts) == [row for row in rows if row % 10 == 5]
+
+
+def test_neighbouring_rows_leave_no_room_for_keyframes():
+    parts = [np.array([0, 1, 2]), np.array([3, 4])]
+    assert rows_around_breaks([0, 1, 2, 3, 4], parts) == []
+    assert rows_around_breaks([0, 1, 2, 5, 6], [np.array([0, 1, 2]), np.array([5, 6])]) == [3, 4]
+
+
+def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, monkeypatch):
+    """Once, with those of before among them; ids tell the frames."""
+    calls = []
+
+    def broken(images, ids, names, *args, work_dir, **options):
+        calls.append(list(ids))
+        source = pycolmap.Reconstruction(str(walk[2] / "sparse"))
+        models = []
+        keys = sorted(source.reg_image_ids())
+        for number, own in enumerate((keys[:6], keys[6:])):
+            made = pycolmap.Reconstruction(source)
+            for image_id in set(keys) - set(own):
+                made.deregister_frame(made.image(image_id).frame_id)
+            models.append(work_dir / (f"sparse_part{number}" if number else "sparse"))
+            shutil.rmtree(models[-1], ignore_errors=True)
+            models[-1].mkdir()
+            made.write(str(models[-1]))
+        return Mapped(models, [])
+
+    monkeypatch.setattr("reobj.poses.estimate.reconstruct", broken)
+    monkeypatch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 12)
+    monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)
+    poses = rt.estimate_poses(walk[0], config(), tmp_path)
+    assert len(calls) == 2 and set(calls[0]) < set(calls[1])
+    keys = [row + 1 for row in np.flatnonzero(walk[3].status == "keyframe")]
+    assert calls[0] == keys and calls[1] == sorted(calls[1])
+    assert poses.part_count == 2 and poses.known.all()
+    assert (np.diff(poses.part) >= 0).all() or set(poses.part) == {0, 1}
+    assert poses.visibility[:, 1].max() < len(poses.points)
+    seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of part 0 come first
+    assert poses.visibility[seen == 0, 1].max() < poses.visibility[seen == 1, 1].min()
+    assert "broke between frames 27 and 28" in poses.messages[0]
+
+
+def test_a_mirrored_half_is_a_part_of_its_own(tmp_path):
+    """A mirror image shows the same textures but no place of the same world."""
+    images, truth = textured_room(24, 0.2, -1.5, size=(320, 240))
+    images[12:] = [np.ascontiguousarray(image[:, ::-1]) for image in images[12:]]
+    poses = rt.estimate_poses(FakeVideo(images), config(), tmp_path)
+    assert poses.part_count == 2 and "broke between frames 11 and 12" in poses.messages[0]
+    first = poses.part[:12]
+    assert (first == first[0]).all() and (poses.part[12:] == 1 - first[0]).all()
+    own = np.arange(24) < 12
+    assert ate_percent(poses.cam_from_world[own], truth[own]) < 2
+
+
 # ---- EXIF ----------------------------------------------------------------------------------------
 
 
@@ -171,16 +249,16 @@ def photo_with_exif(path, image, focal_35mm):
 
 
 @pytest.mark.parametrize("focal_35mm", [48, 0])
-def test_the_exif_focal_length_is_tried_before_the_usual_guess(tmp_path, monkeypatch, focal_35mm):
+def test_the_exif_focal_length_is_the_guess_before_the_usual_one(tmp_path, monkeypatch, focal_35mm):
     """COLMAP: 48 mm of a film whose diagonal is 43.27 mm."""
     images = textured_room(3, 0.5)[0]
     (tmp_path / "photos").mkdir()
     for i, image in enumerate(images):
         photo_with_exif(tmp_path / "photos" / f"{i}.jpg", image, focal_35mm)
     video = rt.Video(tmp_path / "photos")
-    guesses = seen_job(monkeypatch, video, tmp_path / "work")["focal_guesses"]
+    guess = seen_job(monkeypatch, video, tmp_path / "work")["focal_guess"]
     exif = 48 / np.hypot(36, 24) * np.hypot(480, 360) / 480
-    assert guesses == ([pytest.approx(exif, rel=1e-3), 0.8] if focal_35mm else [0.8])
+    assert guess == (pytest.approx(exif, rel=1e-3) if focal_35mm else 0.8)
 
 
 # ---- Recordings ----------------------------------------------------------------------------------

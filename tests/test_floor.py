@@ -180,7 +180,7 @@ def test_without_gravity_there_is_no_floor():
 
 
 def test_the_world_of_a_result_has_it_and_reads_it_back():
-    world = describe_world(poses_in_room(), None, [])
+    world = describe_world(poses_in_room(), [None], [])
     back = rt.World.from_json(world.to_json())
     assert world.floor is not None and back.floor is not None and back.floor_reason == ""
     for name in ("offset", "sigma", "tilt_sigma_deg", "inliers"):
@@ -194,6 +194,6 @@ def test_the_world_of_a_result_has_it_and_reads_it_back():
 
 
 def test_the_world_of_a_result_says_why_there_is_none():
-    world = describe_world(poses_in_room(metric=False), None, [])
+    world = describe_world(poses_in_room(metric=False), [None], [])
     assert world.floor is None and "scale is unknown" in world.floor_reason
-    assert "0 points" in describe_world(walk(4), None, []).floor_reason
+    assert "0 points" in describe_world(walk(4), [None], []).floor_reason

@@ -16,26 +16,36 @@ from pose_worlds import DotWorld, ate_percent, textured_room
 import reobj_track as rt
 from reobj.cameras import read_sparse_model
 from reobj.files import Progress
-from reobj.poses.mapping import reconstruct
+from reobj.poses.mapping import FOCAL_GUESS, reconstruct
 
 pycolmap = pytest.importorskip("pycolmap")
 
 
-def run(folder, images, boxes=None, size=None, camera=None, guesses=(0.8,), seed=0, progress=None):
-    """Reconstruct; messages, and the model or None."""
-    messages = reconstruct(
+def parts_of(folder, images, boxes=None, size=None, camera=None, guess=FOCAL_GUESS, **changes):
+    """Reconstruct; messages, and the models of all parts."""
+    ids = changes.pop("ids", range(1, len(images) + 1))
+    options = {"seed": 0, "progress": Progress} | changes
+    mapped = reconstruct(
         images,
-        [f"{i:03d}.jpg" for i in range(len(images))],
+        ids,
+        [f"{i - 1:03d}.jpg" for i in ids],
         [np.empty((0, 4))] * len(images) if boxes is None else boxes,
         size or images[0].shape[1::-1],
         camera=camera,
-        focal_guesses=[] if camera else list(guesses),
-        seed=seed,
+        focal_guess=guess,
         work_dir=folder,
-        progress=progress or Progress,
+        **options,
     )
-    sparse = folder / "sparse"
-    return messages, read_sparse_model(sparse) if sparse.exists() else None
+    names = ["sparse", *(f"sparse_part{k}" for k in range(1, len(mapped.models)))]
+    assert mapped.models == [folder / name for name in names[: len(mapped.models)]]
+    assert sorted(folder.glob("sparse*")) == sorted(mapped.models)
+    return mapped.messages, [read_sparse_model(model) for model in mapped.models]
+
+
+def run(*args, **options):
+    """Reconstruct; messages, and the largest model or None."""
+    messages, models = parts_of(*args, **options)
+    return messages, models[0] if models else None
 
 
 def truth_of(model, poses):
@@ -80,7 +90,7 @@ def test_the_same_seed_gives_the_same_bytes(walk, tmp_path):
 def test_calibration_starts_from_the_focal_guess_and_leaves_it(walk, tmp_path):
     """Other bits, the same focal length."""
     images, _, _, _, model = walk
-    messages, other = run(tmp_path, images, guesses=[1.1])
+    messages, other = run(tmp_path, images, guess=1.1)
     assert messages == [] and (other.cam_from_world != model.cam_from_world).any()
     assert other.cameras[0].K[0, 0] == pytest.approx(model.cameras[0].K[0, 0], rel=0.01)
 
@@ -96,7 +106,7 @@ def arc(count, half_rad):
 
 def test_with_little_parallax_the_guess_is_kept_and_said(tmp_path):
     world = DotWorld(count=1200)
-    messages, model = run(tmp_path, [world.image(c) for c in arc(8, 0.15)], guesses=[1.0])
+    messages, model = run(tmp_path, [world.image(c) for c in arc(8, 0.15)], guess=1.0)
     assert "little parallax" in messages[0] and "taken as 1 x" in messages[0]
     assert len(messages) == 1 and model.cameras[0].K[0, 0] == 480
 
@@ -200,8 +210,8 @@ def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
     code = (
         "import numpy as np; from pathlib import Path; from reobj.files import Progress;"
         "from reobj.poses import mapping; images = list(np.load('images.npy'));"
-        "print(mapping.__file__, mapping.reconstruct(images, list('abcdefgh'),"
-        "[np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guesses=[0.8], seed=0,"
+        "print(mapping.__file__, mapping.reconstruct(images, list(range(1, 9)), list('abcdefgh'),"
+        "[np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guess=0.8, seed=0,"
         "work_dir=Path('out'), progress=Progress))"
     )
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
@@ -209,7 +219,8 @@ def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
     result = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
     )
-    assert str(tmp_path / "site") in result.stdout and result.stdout.strip().endswith("[]")
+    out = result.stdout.strip()
+    assert str(tmp_path / "site") in out and out.endswith("messages=[])")
     assert (tmp_path / "out" / "sparse" / "images.bin").exists()
 
 
@@ -226,7 +237,7 @@ def test_a_killed_run_goes_on_where_it_stopped(walk, tmp_path):
     """The second run takes features and matches from the first and ends with the same bytes."""
     images, _, folder, *_ = walk
     started: list[str] = []
-    again = ["features", "match", "mapping", "match", "mapping", "features"]
+    again = ["features", "match", "mapping", "mapping", "features"]
 
     def note(stage, total):
         started.append(stage)
@@ -238,11 +249,40 @@ def test_a_killed_run_goes_on_where_it_stopped(walk, tmp_path):
         run(tmp_path, images, progress=note)
     assert started == ["features", "match", "mapping"]
     run(tmp_path, images, progress=note)
-    assert started[3:] == ["match", "mapping"]
+    assert started[3:] == ["mapping"]
     sparse = [f / "sparse" / "points3D.bin" for f in (tmp_path, folder)]
     assert sparse[0].read_bytes() == sparse[1].read_bytes()
     with pytest.raises(KeyboardInterrupt):  # other input: from the start
         run(tmp_path, images, seed=1, progress=note)
+
+
+def test_with_more_keyframes_only_what_is_new_is_done(walk, tmp_path):
+    """Every second view first, then all: 4 more images, 28 pairs less the 6 that are known."""
+    totals: list[tuple[str, int]] = []
+
+    def note(stage, total):
+        totals.append((stage, total))
+        return Progress(stage, total)
+
+    run(tmp_path, walk[0][::2], ids=range(1, 9, 2), progress=note)
+    messages, model = run(tmp_path, walk[0], progress=note)
+    found = [entry for entry in totals if entry[0] != "mapping"]
+    assert found == [("features", 4), ("match", 6), ("features", 4), ("match", 22)]
+    assert messages == [] and ate_percent(model.cam_from_world, truth_of(model, walk[1])) < 1.0
+    run(tmp_path, walk[0][::-1], progress=note)  # other images under the same ids
+    assert totals[-3:-1] == [("features", 8), ("match", 28)]
+
+
+def test_two_rooms_come_as_two_parts(tmp_path):
+    """The larger part is the first; one camera, the better one, took both."""
+    one, truth = textured_room(12, 0.45, -3, size=(320, 240))
+    other, _ = textured_room(10, 0.45, -3, seed=5, size=(320, 240))
+    messages, models = parts_of(tmp_path, other + one)
+    assert messages == [] and [len(model.names) for model in models] == [12, 10]
+    first, second = models
+    assert set(second.names) == {f"{i:03d}.jpg" for i in range(10)}
+    assert ate_percent(first.cam_from_world, truth_of(first, np.r_[truth[:10], truth])) < 1.0
+    assert len({*first.cameras, *second.cameras}) == 1
 
 
 # ---- Experiment of examples/pose_accuracy.py -----------------------------------------------------

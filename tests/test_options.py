@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj.poses.estimate as estimate
+import reobj.poses.mapping as mapping
 import reobj.poses.stage as stage
 import reobj.sources.detectors as detectors
 import reobj_track as rt
@@ -671,14 +672,14 @@ def reconstructed(lab: Lab, value: Any) -> rt.Poses:
     video = rt.Video(folder if folder.exists() else images(folder, 9))
     keys = np.array([0, 4, 8])
 
-    def made(*args: Any, **known: Any) -> list[str]:
+    def made(*args: Any, **known: Any) -> mapping.Mapped:
         bound = signature.bind(*args, **known).arguments
         seeds.append(bound["seed"])
         found = rt.Poses(CAMERA, keys, keys / 30, arc(9)[keys], np.full(3, "keyframe"), "user")
         work = Path(bound["work_dir"])
         (work / "mapping").mkdir(parents=True, exist_ok=True)
         write_colmap(work / "sparse", found, [video.names[k] for k in keys])
-        return []
+        return mapping.Mapped([work / "sparse"], [])
 
     signature, seeds = inspect.signature(estimate.reconstruct), []
     lab.patch.setattr(estimate, "reconstruct", made)

@@ -82,7 +82,7 @@ def test_poses_that_do_not_explain_the_images_give_a_message(corner, tmp_path, m
     turned = dataclasses.replace(given, cam_from_world=wrong)
     poses = run(video, turned, tmp_path)
     assert len(poses.points) == 0 and len(poses.messages) == 1
-    assert "matched features of 9 images meet in points" in poses.messages[0]
+    assert "matched features of 9 images meet in 3D" in poses.messages[0]
     np.testing.assert_array_equal(poses.cam_from_world, turned.cam_from_world)
 
 

@@ -54,10 +54,8 @@ def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> Non
             a, b = getattr(ours, f.name), getattr(theirs, f.name)
             assert type(a) is type(b), f.name
             np.testing.assert_array_equal(a, b, f.name)
-    for f in dataclasses.fields(rt.World)[:-1]:
-        np.testing.assert_array_equal(
-            getattr(before.world, f.name), getattr(after.world, f.name), f.name
-        )
+    for name in {f.name for f in dataclasses.fields(rt.World)} - {"parts"}:
+        np.testing.assert_array_equal(getattr(before.world, name), getattr(after.world, name), name)
     assert after.world.to_json()["parts"] == before.world.to_json()["parts"]
     assert after.world.links == links and isinstance(after.world.scale, quadrics.Scale)
     assert after.video == before.video and after.warnings == ["take care"]

@@ -1,0 +1,219 @@
+"""What a reconstruction is checked against: its focal length, its ties, its neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from reobj.poses.consistency import (
+    MIN_BRIDGE,
+    MIN_FOCAL_PAIRS,
+    MatchedPairs,
+    consistent_groups,
+    count_explained,
+    explained_share,
+    focal_from_pairs,
+)
+
+pycolmap = pytest.importorskip("pycolmap")
+
+SIZE = (640, 480)
+CAMERA = pycolmap.Camera(
+    camera_id=1, model="SIMPLE_PINHOLE", width=640, height=480, params=[500.0, 320.0, 240.0]
+)
+
+
+def cross(t):
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+def poses_of(count, rng):
+    """cam_from_world (count, 3, 4) of a walk to the right past a wall, with a shake of the hand."""
+    turn = Rotation.from_rotvec(rng.normal(0, 0.03, (count, 3))).as_matrix()
+    centre = np.column_stack([0.25 * np.arange(count), rng.normal(0, 0.05, (count, 2))])
+    return np.concatenate([turn, -turn @ centre[:, :, None]], 2)
+
+
+# ---- The focal length ----------------------------------------------------------------------------
+
+
+def fundamental(focal, count, seed=0):
+    """Fundamental matrices (count, 3, 3) of general pairs at a focal length over the width."""
+    rng = np.random.default_rng(seed)
+    K = np.array([[focal * 640, 0, 320], [0, focal * 640, 240], [0, 0, 1]])
+    turn = Rotation.from_rotvec(rng.normal(0, 0.2, (count, 3))).as_matrix()
+    E = np.array([cross(t) for t in rng.normal(size=(count, 3))]) @ turn
+    F = np.linalg.inv(K).T @ E @ np.linalg.inv(K)
+    return F / np.linalg.norm(F, axis=(1, 2), keepdims=True)
+
+
+def pairs_of(F, matches=50):
+    ids = np.column_stack([np.arange(len(F)), np.arange(len(F)) + 1]) + 1
+    return MatchedPairs(ids, [np.zeros((matches, 2), np.int64)] * len(F), {}, F)
+
+
+@pytest.mark.parametrize("focal", [0.5, 0.8, 1.4])
+def test_the_focal_length_is_that_of_the_fundamental_matrices(focal):
+    assert focal_from_pairs(pairs_of(fundamental(focal, 40)), SIZE) == pytest.approx(
+        focal, rel=0.01
+    )
+
+
+def test_nearly_half_of_the_pairs_may_be_wrong():
+    wrong = np.random.default_rng(3).normal(size=(18, 3, 3)) / [[320, 320, 1]]  # any matrices
+    wrong = wrong / np.array([320, 320, 1])[:, None]
+    F = np.concatenate([fundamental(0.8, 22), wrong])
+    assert focal_from_pairs(pairs_of(F), SIZE) == pytest.approx(0.8, rel=0.02)
+
+
+def test_few_pairs_or_few_matches_tell_no_focal_length():
+    F = fundamental(0.8, MIN_FOCAL_PAIRS)
+    assert focal_from_pairs(pairs_of(F), SIZE) is not None
+    assert focal_from_pairs(pairs_of(F[1:]), SIZE) is None
+    assert focal_from_pairs(pairs_of(F, matches=29), SIZE) is None
+    planar = np.where(np.arange(len(F))[:, None, None] == 0, np.nan, F)
+    assert focal_from_pairs(pairs_of(planar), SIZE) is None
+    assert focal_from_pairs(pairs_of(F[:0]), SIZE) is None
+
+
+def test_a_focal_length_out_of_the_range_is_not_told():
+    assert focal_from_pairs(pairs_of(fundamental(3.5, 40)), SIZE) is None
+
+
+# ---- Groups that hold together -------------------------------------------------------------------
+
+
+class Scene:
+    """Images of points of a wall, and the model and the matches that were made of them.
+
+    Attributes:
+        seen: (R, N) whether an image observes a point. poses: (R, 3, 4), those of the model.
+    """
+
+    def __init__(self, count=12, points=900, seed=0):
+        rng = np.random.default_rng(seed)
+        self.truth = self.poses = poses_of(count, rng)
+        low, high = [-3, -2, 3.5], [3 + 0.25 * count, 2, 5]
+        self.xyz = rng.uniform(low, high, (points, 3))
+        self.xy = np.array([self.project(pose)[0] for pose in self.truth])  # (R, N, 2)
+        self.seen = np.array([self.project(pose)[1] for pose in self.truth])  # (R, N)
+
+    def project(self, pose):
+        at = (self.xyz @ pose[:, :3].T + pose[:, 3]) @ CAMERA.calibration_matrix().T
+        xy = at[:, :2] / at[:, 2:]
+        return xy, (at[:, 2] > 0) & ((xy > 0) & (xy < SIZE)).all(1)
+
+    def untie(self, first, ties):
+        """Points that images on both sides of `first` see are two points, but for some."""
+        both = np.flatnonzero(self.seen[:first].any(0) & self.seen[first:].any(0))
+        cut = both[ties:]
+        before = self.seen[:, cut] & (np.arange(len(self.seen)) < first)[:, None]
+        after = self.seen[:, cut] & ~before
+        self.seen[:, cut] = before
+        self.seen, self.xy = np.hstack([self.seen, after]), np.hstack([self.xy, self.xy[:, cut]])
+        self.xyz = np.vstack([self.xyz, self.xyz[cut]])
+
+    def model(self):
+        made = pycolmap.Reconstruction()
+        made.add_camera_with_trivial_rig(CAMERA)
+        tracks = [[] for _ in self.xyz]
+        for i, (pose, seen) in enumerate(zip(self.poses, self.seen, strict=True)):
+            rows = np.flatnonzero(seen)
+            image = pycolmap.Image(
+                name=f"{i}.jpg", keypoints=self.xy[i, rows], camera_id=1, image_id=i + 1
+            )
+            made.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+            for k, row in enumerate(rows):
+                tracks[row].append((i + 1, k))
+        for xyz, found in zip(self.xyz, tracks, strict=True):
+            if len(found) >= 2:
+                elements = [pycolmap.TrackElement(*element) for element in found]
+                made.add_point3D(xyz, pycolmap.Track(elements))
+        return made
+
+    def pairs(self):
+        """Matches of neighbours and of the next but one, all right."""
+        ids, inliers = [], []
+        count = len(self.seen)
+        for a, b in [(a, a + step) for step in (1, 2) for a in range(count - step)]:
+            both = np.flatnonzero(self.seen[a] & self.seen[b])
+            ids.append((a + 1, b + 1))
+            inliers.append(np.column_stack([both, both]))
+        keypoints = {i + 1: self.xy[i] for i in range(count)}
+        return MatchedPairs(np.array(ids), inliers, keypoints, np.full((len(ids), 3, 3), np.nan))
+
+    def groups(self):
+        order = range(1, len(self.seen) + 1)
+        return [ids.tolist() for ids in consistent_groups(self.model(), self.pairs(), order)]
+
+
+def numbers(*ends):
+    return [list(range(a, b)) for a, b in ends]
+
+
+def test_a_good_model_stays_whole():
+    assert Scene().groups() == numbers((1, 13))
+
+
+@pytest.mark.parametrize("ties", [MIN_BRIDGE - 1, 0])
+def test_groups_tied_by_too_few_points_are_taken_apart(ties):
+    scene = Scene()
+    scene.untie(7, ties)
+    assert scene.groups() == numbers((1, 8), (8, 13))
+
+
+@pytest.mark.parametrize("ties, found", [(60, [(1, 8), (8, 13)]), (3000, [(1, 13)])])
+def test_points_that_near_views_do_not_find_again_part_two_groups(ties, found):
+    """Enough points tie them, but of those that both sides should see few or many are found."""
+    scene = Scene(points=10_000)
+    scene.untie(7, ties)
+    assert scene.groups() == numbers(*found)
+
+
+def test_fewer_than_three_images_that_hang_loose_are_in_no_group():
+    scene = Scene()
+    scene.untie(10, MIN_BRIDGE - 1)
+    assert scene.groups() == numbers((1, 11))
+
+
+@pytest.fixture
+def bent():
+    """The second half of a model, tied by 60 points, with its points turned about the seam."""
+    scene = Scene()
+    scene.untie(6, 60)
+    turn = Rotation.from_rotvec([0, 0, 0.4]).as_matrix()
+    pivot = np.array([1.4, 0, 4])
+    own = ~scene.seen[:6].any(0)
+    scene.xyz[own] = (scene.xyz[own] - pivot) @ turn.T + pivot
+    rotation = scene.truth[6:, :, :3] @ turn.T
+    shift = scene.truth[6:, :, 3] + (scene.truth[6:, :, :3] - rotation) @ pivot
+    scene.poses = np.concatenate([scene.truth[:6], np.dstack([rotation, shift])])
+    return scene
+
+
+def test_neighbours_that_contradict_the_model_are_parted(bent):
+    pairs = bent.pairs()
+    share = explained_share(bent.model(), pairs, np.arange(len(pairs.inliers)))
+    across = (pairs.image_ids <= 6).sum(1) == 1
+    assert (share[across] < 0.5).all() and (share[~across] == 1).all()
+    assert bent.groups() == numbers((1, 7), (7, 13))
+
+
+def test_only_pairs_that_follow_each_other_contradict(bent):
+    """The same, but another picture was between them in time."""
+    order = [1, 2, 3, 4, 5, 6, 99, 7, 8, 9, 10, 11, 12]
+    found = consistent_groups(bent.model(), bent.pairs(), order)
+    assert [len(ids) for ids in found] == [12]
+
+
+def test_explained_matches_are_counted():
+    scene = Scene()
+    pairs = scene.pairs()
+    total = sum(map(len, pairs.inliers))
+    assert count_explained(scene.model(), pairs) == total
+    wrong = pairs.inliers[0].copy()
+    wrong[: len(wrong) // 2, 1] = np.roll(wrong[: len(wrong) // 2, 1], 1)  # half to others
+    pairs.inliers[0] = wrong
+    assert 0.4 < explained_share(scene.model(), pairs, np.array([0]))[0] < 0.7
+    assert count_explained(scene.model(), pairs) < total
