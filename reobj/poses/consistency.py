@@ -208,10 +208,10 @@ def _runs_of_tied_neighbours(
 ) -> list[IntArray]:
     """Split rows of `ids` where the model does not hold the matches of neighbours in time together.
 
-    Pictures that follow each other show one place (others may look alike by chance): a good share
-    of their verified matches must be one point of the model, two observations each. They are not
-    where the camera was put at a twin of its place, or at another scale. An image that is tied to
-    neither of its neighbours is left out, so that it does not split the rest.
+    Images of the model that follow each other show one place (others may be alike by chance): a
+    good share of their verified matches must be one point of the model, two observations each. They
+    are not where the camera was put at a twin of its place, or at another scale. An image that is
+    tied to neither of its neighbours is left out, so that it does not split the rest.
 
     Returns:
         rows (n,) of each run, ascending.
@@ -220,10 +220,11 @@ def _runs_of_tied_neighbours(
         i: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(i).points2D])
         for i in ids.tolist()
     }
-    place, row = {image: k for k, image in enumerate(order)}, {int(i): r for r, i in enumerate(ids)}
+    time = {image: k for k, image in enumerate(order)}
+    row = {int(i): r for r, i in enumerate(sorted(ids.tolist(), key=time.__getitem__))}
     untied = np.zeros(len(ids) + 1, bool)  # of each row and the one before it
     for (a, b), matches in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
-        if a in row and b in row and abs(place[a] - place[b]) == 1 and len(matches) >= MIN_MATCHES:
+        if a in row and b in row and abs(row[a] - row[b]) == 1 and len(matches) >= MIN_MATCHES:
             one, other = point_of[a][matches[:, 0]], point_of[b][matches[:, 1]]
             tied = np.mean((one == other) & (one >= 0))
             untied[max(row[a], row[b])] = tied < MIN_TIED
@@ -306,9 +307,9 @@ def _found_again(views: _Views, rows: IntArray, side: BoolArray) -> tuple[int, i
             here = centre[~own][image] - xyz  # (n, 3)
             away = np.linalg.norm(here, axis=1)[seen.col]
             cosine = (ray * here[seen.col]).sum(1) / (length * away)
-            near = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
-            near &= np.abs(np.log(length / away)) < np.log(NEAR_VIEW_SCALE)
-            inside &= np.bincount(seen.col[near], minlength=len(points)) > 0
+            alike = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
+            alike &= np.abs(np.log(length / away)) < np.log(NEAR_VIEW_SCALE)
+            inside &= np.bincount(seen.col[alike], minlength=len(points)) > 0
             expected += int(inside.sum())
             found += int(inside[there[image].indices].sum())
     return expected, found
