@@ -164,3 +164,15 @@ def sideways(count, step=0.02):
 def turn_deg(a, b):
     """Angles between the orientations of poses (N, 3, 4)."""
     return np.degrees(Rotation.from_matrix(a[:, :, :3] @ b[:, :, :3].swapaxes(1, 2)).magnitude())
+
+
+def arc(count: int) -> np.ndarray:
+    """cam_from_world (F, 3, 4) on an arc of 90 degrees around the origin, z up, 3.5 m off."""
+    angle = np.radians(np.linspace(-45, 45, count))
+    eye = np.stack([3.5 * np.sin(angle), -3.5 * np.cos(angle), np.full(count, 1.6)], 1)
+    forward = [0, 0, 0.4] - eye
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    turn = np.stack([right, np.cross(forward, right), forward], 1)  # (F, 3, 3)
+    return np.concatenate([turn, -turn @ eye[:, :, None]], 2)

@@ -152,8 +152,7 @@ class Scene:
         return MatchedPairs(np.array(ids), inliers, keypoints, np.full((len(ids), 3, 3), np.nan))
 
     def groups(self, across=False):
-        order = range(1, len(self.seen) + 1)
-        found = consistent_groups(self.model(), self.pairs(across), order)
+        found = consistent_groups(self.model(), self.pairs(across))
         return [ids.tolist() for ids in found]
 
 
@@ -200,7 +199,7 @@ def test_an_image_tied_to_neither_neighbour_splits_nothing():
     for k, pair in enumerate(pairs.image_ids.tolist()):
         if 5 in pair and abs(pair[0] - pair[1]) == 1:  # matches that the model does not have
             pairs.inliers[k] = np.column_stack([pairs.inliers[k][:, 0], pairs.inliers[k][::-1, 1]])
-    found = consistent_groups(model, pairs, range(1, 13))
+    found = consistent_groups(model, pairs)
     assert [ids.tolist() for ids in found] == [[1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]]
 
 

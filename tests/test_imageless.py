@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pose_worlds import arc
 from scipy.spatial.transform import Rotation
 
 import quadrics
@@ -26,21 +27,9 @@ SOLIDS = quadrics.Ellipsoids(
 OPTIONS = rt.Config(embed=rt.EmbedConfig(model="none"))
 
 
-def arc(count: int = FRAMES) -> np.ndarray:
-    """cam_from_world (F, 3, 4) on an arc of 90 degrees around the origin, z up, 3.5 m off."""
-    angle = np.radians(np.linspace(-45, 45, count))
-    eye = np.stack([3.5 * np.sin(angle), -3.5 * np.cos(angle), np.full(count, 1.6)], 1)
-    forward = [0, 0, 0.4] - eye
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    turn = np.stack([right, np.cross(forward, right), forward], 1)  # (F, 3, 3)
-    return np.concatenate([turn, -turn @ eye[:, :, None]], 2)
-
-
 def boxes() -> list[tuple[int, int, list[float]]]:
     """Frame, object and xyxy of the boxes of both chairs in every frame."""
-    found = quadrics.solid_boxes(SOLIDS, "box", CAMERA.K @ arc())  # (F, 2, 4)
+    found = quadrics.solid_boxes(SOLIDS, "box", CAMERA.K @ arc(FRAMES))  # (F, 2, 4)
     return [(f, k, found[f, k].tolist()) for f, k in np.ndindex(FRAMES, 2)]
 
 
@@ -79,7 +68,7 @@ def as_coco(folder: Path, names: list[str]) -> Path:
 
 
 def as_tum(folder: Path, times: object = None) -> Path:
-    world_from_cam = invert_rigid(arc())
+    world_from_cam = invert_rigid(arc(FRAMES))
     quaternion = Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat()
     times = np.arange(FRAMES) / 30 if times is None else times
     np.savetxt(folder / "groundtruth.txt", np.c_[times, world_from_cam[:, :, 3], quaternion],
@@ -89,8 +78,8 @@ def as_tum(folder: Path, times: object = None) -> Path:
 
 def as_colmap(folder: Path, names: list[str]) -> Path:
     count = len(names)
-    poses = rt.Poses(CAMERA, np.arange(count), np.arange(count) / 30, arc(), np.full(count, "pnp"),
-                     "pycolmap")  # fmt: skip
+    at, status = np.arange(count), np.full(count, "pnp")
+    poses = rt.Poses(CAMERA, at, at / 30, arc(FRAMES), status, "pycolmap")
     write_colmap(folder / "model", poses, names)
     return folder / "model"
 

@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from pose_worlds import arc
 from scipy.spatial.transform import Rotation
 
 import quadrics
@@ -568,18 +569,6 @@ def tum_file(path: Path, poses: np.ndarray) -> str:
     centre = -np.einsum("fij,fj->fi", turn.as_matrix(), poses[:, :, 3])
     np.savetxt(path, np.c_[np.arange(len(poses)) / 30, centre, turn.as_quat()])
     return str(path)
-
-
-def arc(count: int) -> np.ndarray:
-    """cam_from_world (F, 3, 4) on an arc of 90 degrees around the origin, z up, 3.5 m off."""
-    angle = np.radians(np.linspace(-45, 45, count))
-    eye = np.stack([3.5 * np.sin(angle), -3.5 * np.cos(angle), np.full(count, 1.6)], 1)
-    forward = [0, 0, 0.4] - eye
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    turn = np.stack([right, np.cross(forward, right), forward], 1)  # (F, 3, 3)
-    return np.concatenate([turn, -turn @ eye[:, :, None]], 2)
 
 
 @shows("poses.mode")

@@ -9,7 +9,6 @@ truth and no threshold of one recording.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,19 +104,18 @@ MIN_SEEN = 0.03  # share of such points that must be found again (measured: righ
 MIN_EXPECTED = 100
 
 
-def consistent_groups(model: Any, pairs: MatchedPairs, order: Sequence[int]) -> list[IntArray]:
+def consistent_groups(model: Any, pairs: MatchedPairs) -> list[IntArray]:
     """Split the images of a model into groups that hold together.
 
     Args:
-        model: a `pycolmap.Reconstruction` with one camera.
+        model: a `pycolmap.Reconstruction` with one camera; ids ascend in time.
         pairs: verified matches of its database.
-        order: ids of all keyframes in the order of time.
     Returns:
         ids of the images of each group, the largest group first; images that hang on by too little
         are in none.
     """
     views = _read_views(model)
-    todo, groups = _runs_of_tied_neighbours(model, pairs, views.ids, order), []
+    todo, groups = _runs_of_tied_neighbours(model, pairs, views.ids), []
     while todo:
         rows = todo.pop()
         side = _weak_cut(views, rows)
@@ -203,9 +201,7 @@ def count_explained(model: Any, pairs: MatchedPairs) -> float:
     return float((explained_share(model, pairs, rows) * counts).sum())
 
 
-def _runs_of_tied_neighbours(
-    model: Any, pairs: MatchedPairs, ids: IntArray, order: Sequence[int]
-) -> list[IntArray]:
+def _runs_of_tied_neighbours(model: Any, pairs: MatchedPairs, ids: IntArray) -> list[IntArray]:
     """Split rows of `ids` where the model does not hold the matches of neighbours in time together.
 
     Images of the model that follow each other show one place (others may be alike by chance): a
@@ -220,8 +216,7 @@ def _runs_of_tied_neighbours(
         i: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(i).points2D])
         for i in ids.tolist()
     }
-    time = {image: k for k, image in enumerate(order)}
-    row = {int(i): r for r, i in enumerate(sorted(ids.tolist(), key=time.__getitem__))}
+    row = {int(i): r for r, i in enumerate(ids)}
     untied = np.zeros(len(ids) + 1, bool)  # of each row and the one before it
     for (a, b), matches in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
         if a in row and b in row and abs(row[a] - row[b]) == 1 and len(matches) >= MIN_MATCHES:

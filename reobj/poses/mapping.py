@@ -315,7 +315,7 @@ class _Search:
         """Run a mapper and measure the parts of its models that hold together, largest first."""
         count, taken, parts = len(self.ids), set[int](), list[_Part]()
         models = _run_mapper(self.database, mapper, fixed, count, self.seed)
-        groups = [(g, m) for m in models for g in consistent_groups(m, self.pairs, self.ids)]
+        groups = [(g, m) for m in models for g in consistent_groups(m, self.pairs)]
         for group, model in sorted(groups, key=lambda found: -len(found[0])):
             kept = set(group.tolist()) - taken  # models may overlap
             part = _measured(_only(model, kept), count, self.pairs)
