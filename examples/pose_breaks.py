@@ -175,6 +175,8 @@ def local_scale(found: Array, truth: Array) -> Array:
         agree; 1 where the camera hardly moved.
     """
     a, b = world_from_cam(found)[0], world_from_cam(truth)[0]
+    if not len(a):
+        return np.ones(0)
     half = max(3, len(a) // WINDOW_SHARE)
     windows = [slice(max(0, i - half), i + half + 1) for i in range(len(a))]
     spread = np.array([[np.sqrt(x[w].var(0).sum()) for x in (a, b)] for w in windows])  # (n, 2)

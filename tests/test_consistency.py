@@ -203,6 +203,52 @@ def test_an_image_tied_to_neither_neighbour_splits_nothing():
     assert [ids.tolist() for ids in found] == [[1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12]]
 
 
+def keyframes_dropped(scene, model, dropped):
+    """Take images out of a model, as where a mapper could not place them."""
+    for image in dropped:
+        model.deregister_frame(model.image(image).frame_id)
+    return model
+
+
+def test_a_matched_keyframe_that_has_no_place_parts_its_neighbours_unless_they_are_tied():
+    """Images 1-6 and 9-12: what lies between was matched with both and could not be placed."""
+    scene, dropped = Scene(), [7, 8]
+    model, pairs = keyframes_dropped(scene, scene.model(), dropped), scene.pairs()
+    found = [ids.tolist() for ids in consistent_groups(model, pairs)]
+    assert found == numbers((1, 7), (9, 13))  # 6 and 9 were never matched
+    near = keyframes_dropped(scene, scene.model(), [7])
+    found = [ids.tolist() for ids in consistent_groups(near, pairs)]
+    assert found == [[*range(1, 7), *range(8, 13)]]  # 6 and 8 were, and share points
+
+
+def test_keyframes_that_show_nothing_part_nobody():
+    scene = Scene()
+    model, pairs = keyframes_dropped(scene, scene.model(), [7, 8]), scene.pairs()
+    blurred = np.isin(pairs.image_ids, [7, 8]).any(1)
+    for k in np.flatnonzero(blurred):
+        pairs.inliers[k] = pairs.inliers[k][:29]
+    found = [ids.tolist() for ids in consistent_groups(model, pairs)]
+    assert found == [[*range(1, 7), *range(9, 13)]]
+
+
+@pytest.mark.parametrize("step, found", [(0.25, [(1, 17)]), (0.0, [(1, 9), (9, 17)])])
+def test_where_the_camera_only_turned_no_point_ties_two_groups(step, found):
+    """Images 7-10 see the same new points: with a step between them these have a depth."""
+    scene = Scene(count=16, points=4000)
+    for image in (7, 8, 9):
+        scene.poses[image] = scene.poses[6]
+        scene.poses[image, 0, 3] -= step * (image - 6)
+    first, last = scene.seen.copy(), scene.seen.copy()
+    first[8:], last[:8] = False, False
+    one_side = np.arange(4000) % 2 == 0
+    seen = np.where(one_side, first, last)
+    turning = np.arange(4000) % 4 == 1  # 1000 points that the four share, and nobody else sees
+    seen[:, turning] = False
+    seen[6:10, turning] = True
+    scene.seen = seen
+    assert scene.groups() == numbers(*found)
+
+
 def test_explained_share_falls_where_the_model_turns():
     scene = Scene()
     turn = Rotation.from_rotvec([0, 0, 0.4]).as_matrix()

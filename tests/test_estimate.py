@@ -110,7 +110,7 @@ def reconstructed(walk, monkeypatch):
 def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
     seeds = []
 
-    def note(model, key_rows, video, seed, line):
+    def note(model, key_rows, left_out, video, seed, line):
         seeds.append(seed)
         count = len(video.frames)
         return np.full((count, 3, 4), np.nan), np.full(count, "none")

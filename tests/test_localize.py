@@ -94,12 +94,13 @@ def true_model(cams, key_rows, native=1):
     )
 
 
-def locate(cams, key_rows, images=None, native=1, seed=0):
+def locate(cams, key_rows, images=None, native=1, seed=0, left_out=()):
     images = [WORLD.image(c) for c in cams] if images is None else images
     resized = ResizedVideo(FakeVideo(images), 480)
     list(resized.first_pass(Progress("test")))
     model = true_model(cams, key_rows, native)
-    return locate_between(model, np.array(key_rows), resized, seed, Progress("test"))
+    rows, others = np.array(key_rows), np.array(left_out, int)
+    return locate_between(model, rows, others, resized, seed, Progress("test"))
 
 
 @pytest.mark.parametrize("native", [1, 2])
@@ -111,6 +112,15 @@ def test_frames_between_before_and_behind_keyframes_are_located(native):
     assert status.tolist() == expected
     assert np.median(turn_deg(found, cams)) < 0.02 and turn_deg(found, cams).max() < 0.04
     assert np.linalg.norm(centres(found) - centres(cams), axis=1).max() < 0.004
+
+
+def test_frames_are_not_located_past_a_keyframe_that_mapping_took_out():
+    """Frames 4 and 8 were keyframes, and the model does not hold them."""
+    _, status = locate(sideways(12), [1, 10], left_out=[4, 8])
+    near = ["pnp", "keyframe", "pnp", "pnp", *["none"] * 5, "pnp", "keyframe", "pnp"]
+    assert status.tolist() == near
+    _, status = locate(sideways(6), [2], left_out=[0, 4])
+    assert status.tolist() == ["none", "pnp", "keyframe", "pnp", "none", "none"]
 
 
 def test_frames_without_the_points_are_lost():
@@ -161,6 +171,8 @@ def test_gaps_are_filled_on_a_line_and_never_beyond():
     assert np.isnan(filled[:2]).all() and new.tolist() == expected
     untouched, _ = fill_gaps(np.arange(11), lost, status, 2)
     assert np.isnan(untouched[4:7]).all()
+    refused, _ = fill_gaps(np.arange(11), lost, status, 3, [5])
+    assert np.isnan(refused[4:7]).all()
     sparse, _ = fill_gaps(10 * np.arange(11), lost, status, 3)  # every 10th frame: 39 are missing
     assert np.isnan(sparse[4:7]).all() and np.isnan(lost[4:7]).all()
 

@@ -9,6 +9,8 @@ truth and no threshold of one recording.
 from __future__ import annotations
 
 import contextlib
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from reobj.cameras import import_pycolmap
+from reobj.cameras import import_pycolmap, invert_rigid
 from reobj.types import Array, BoolArray, IntArray
 
 
@@ -35,6 +37,12 @@ class MatchedPairs:
     inliers: list[IntArray]
     keypoints: dict[int, Array]
     fundamental: Array
+
+    def only(self, ids: Sequence[int]) -> MatchedPairs:
+        """Return the pairs of some images."""
+        rows = np.flatnonzero(np.isin(self.image_ids, ids).all(1))
+        inliers, xy = [self.inliers[row] for row in rows], {i: self.keypoints[i] for i in ids}
+        return MatchedPairs(self.image_ids[rows], inliers, xy, self.fundamental[rows])
 
 
 def read_pairs(database: Path) -> MatchedPairs:
@@ -91,9 +99,11 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
 
 
 EXPLAINED_PX = 4.0  # largest distance from the epipolar line (COLMAP's filter_max_reproj_error)
-MIN_MATCHES = 30  # verified matches of neighbours that say something (COLMAP registers from 30 on)
+MIN_MATCHES = 30  # verified matches that say something (COLMAP registers from 30 on)
+MAX_NEIGHBOUR = 4  # keyframes apart, at most, that are looked at (chosen)
 MIN_TIED = 0.1  # share of them that are one point of the model (measured: right .38-.98, wrong 0)
 MIN_BRIDGE = 30  # points that tie two groups of images (COLMAP registers one image from 30 on)
+MIN_RAY_SPREAD = 1 - np.cos(np.radians(1.5))  # of the rays that tell a depth (COLMAP: 1.5 deg)
 MIN_GROUP = 3  # images; fewer that hang on few points are left to be located by PnP
 WEAKEST_CUTS = 3  # whose missing points are counted (chosen: time)
 BORDER_IMAGES = 10  # of each side of a cut, those that share the most points (chosen: time)
@@ -114,11 +124,11 @@ def consistent_groups(model: Any, pairs: MatchedPairs) -> list[IntArray]:
         ids of the images of each group, the largest group first; images that hang on by too little
         are in none.
     """
-    views = _read_views(model)
+    views, matches = _read_views(model), _explained_matches(model, pairs)
     todo, groups = _runs_of_tied_neighbours(model, pairs, views.ids), []
     while todo:
         rows = todo.pop()
-        side = _weak_cut(views, rows)
+        side = _weak_cut(views, rows, matches)
         if side is None:
             groups.append(views.ids[rows])
             continue
@@ -193,40 +203,83 @@ def explained_share(model: Any, pairs: MatchedPairs, rows: IntArray) -> Array:
     return shares
 
 
-def count_explained(model: Any, pairs: MatchedPairs) -> float:
-    """Count the verified matches between the images of a model that the model explains."""
+def _explained_matches(model: Any, pairs: MatchedPairs) -> IntArray:
+    """List pairs of images of a model (P, 3): both ids, how many verified matches it explains."""
     inside = np.isin(pairs.image_ids, model.reg_image_ids()).all(1)
     rows = np.flatnonzero(inside & np.array([len(m) > 0 for m in pairs.inliers], bool))
     counts = np.array([len(pairs.inliers[row]) for row in rows])
-    return float((explained_share(model, pairs, rows) * counts).sum())
+    explained = np.round(explained_share(model, pairs, rows) * counts).astype(np.int64)
+    return np.column_stack([pairs.image_ids[rows], explained])
+
+
+def count_explained(model: Any, pairs: MatchedPairs) -> int:
+    """Count the verified matches between the images of a model that the model explains."""
+    return int(_explained_matches(model, pairs)[:, 2].sum())
 
 
 def _runs_of_tied_neighbours(model: Any, pairs: MatchedPairs, ids: IntArray) -> list[IntArray]:
     """Split rows of `ids` where the model does not hold the matches of neighbours in time together.
 
-    Images of the model that follow each other show one place (others may be alike by chance): a
-    good share of their verified matches must be one point of the model, two observations each. They
-    are not where the camera was put at a twin of its place, or at another scale. An image that is
-    tied to neither of its neighbours is left out, so that it does not split the rest.
+    Images that follow each other show one place (others may be alike by chance), so the model must
+    have their verified matches (`_ties`). It does not where the camera was put at a twin of its
+    place, at another scale, or nowhere. An image that is tied to neither of its neighbours is left
+    out; it splits the rest unless the images before and after it are tied to each other.
 
     Returns:
         rows (n,) of each run, ascending.
     """
+    every = sorted(pairs.keypoints)  # keyframes in the order of time, registered or not
+    tied = _ties(model, pairs, every)
+    links = [tied.get(pair) for pair in itertools.pairwise(every)]
+    around = zip([None, *links], [*links, None], strict=True)
+    inside = set(ids.tolist())
+    kept = [k for k, sides in enumerate(around) if every[k] in inside and sides != (False, False)]
+    starts = [
+        n
+        for n, (a, b) in enumerate(itertools.pairwise(kept), 1)
+        if False in links[a:b] and not (b - a > 1 and tied.get((every[a], every[b])))
+    ]
+    rows = np.searchsorted(ids, [every[k] for k in kept])
+    return [run for run in np.split(rows, starts) if len(run)]
+
+
+def _ties(model: Any, pairs: MatchedPairs, every: list[int]) -> dict[tuple[int, int], bool]:
+    """Tell of each pair of images with enough verified matches whether the model has them.
+
+    A good share must be one point of the model, two observations each; and an essential matrix of
+    their own must not explain many more of them than the model's does.
+
+    Args:
+        every: ids in the order of time; pairs with up to 3 images between them are looked at.
+    """
+    at = {number: k for k, number in enumerate(every)}
     point_of = {
         i: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(i).points2D])
-        for i in ids.tolist()
+        for i in model.reg_image_ids()
     }
-    row = {int(i): r for r, i in enumerate(ids)}
-    untied = np.zeros(len(ids) + 1, bool)  # of each row and the one before it
-    for (a, b), matches in zip(pairs.image_ids.tolist(), pairs.inliers, strict=True):
-        if a in row and b in row and abs(row[a] - row[b]) == 1 and len(matches) >= MIN_MATCHES:
+    ties = {}
+    for row, (a, b) in enumerate(pairs.image_ids.tolist()):
+        matches = pairs.inliers[row]
+        if len(matches) < MIN_MATCHES or at[b] - at[a] > MAX_NEIGHBOUR:
+            continue
+        ties[a, b] = False
+        if a in point_of and b in point_of:
             one, other = point_of[a][matches[:, 0]], point_of[b][matches[:, 1]]
-            tied = np.mean((one == other) & (one >= 0))
-            untied[max(row[a], row[b])] = tied < MIN_TIED
-    loose = untied[:-1] & untied[1:]
-    starts = np.flatnonzero(untied[:-1] & ~loose & ~np.append(False, loose[:-1]))
-    runs = np.split(np.arange(len(ids)), starts)
-    return [kept for run in runs if len(kept := run[~loose[run]])]
+            shared = np.mean((one == other) & (one >= 0))
+            ties[a, b] = bool(shared >= MIN_TIED and not _contradicted(model, pairs, row))
+    return ties
+
+
+def _contradicted(model: Any, pairs: MatchedPairs, row: int) -> bool:
+    """Tell whether two images' own essential matrix explains many more matches than the model."""
+    matches, (a, b) = pairs.inliers[row], pairs.image_ids[row].tolist()
+    explained = float(explained_share(model, pairs, np.array([row]))[0]) * len(matches)
+    if len(matches) - explained < MIN_MATCHES:
+        return False
+    camera, ransac = model.camera(1), {"max_error": EXPLAINED_PX, "random_seed": 0}
+    xy = pairs.keypoints[a][matches[:, 0]], pairs.keypoints[b][matches[:, 1]]
+    own = import_pycolmap().estimate_essential_matrix(*xy, camera, camera, ransac)
+    return bool(own is not None and own["num_inliers"] - explained >= MIN_MATCHES)
 
 
 def _shared_points(seen: Any) -> Array:
@@ -236,13 +289,17 @@ def _shared_points(seen: Any) -> Array:
     return shared
 
 
-def _weak_cut(views: _Views, rows: IntArray) -> BoolArray | None:
+def _weak_cut(views: _Views, rows: IntArray, matches: IntArray) -> BoolArray | None:
     """Find two groups of images that too little ties together.
 
     Candidates are the cuts of the spanning tree of most shared points. A point ties two groups,
-    and their scales, if it is seen in both and twice in one. Too few are few points, or few of
-    those that should be found again: near views of a place that share nothing are two places.
+    and their scales, if one of them sees it from directions that tell its depth, and the other sees
+    it too. Too few are few points, or few of those that should be found again: near views of a
+    place that share nothing are two places. Points without two images that have as many matches are
+    few too: chance matches of a symmetric thing add up over images.
 
+    Args:
+        matches: (P, 3) as `_explained_matches`.
     Returns:
         (R,) True on one side, None if all holds together.
     """
@@ -256,9 +313,10 @@ def _weak_cut(views: _Views, rows: IntArray) -> BoolArray | None:
     for child in order[:0:-1]:
         below[parent[child]] |= below[child]
     cuts = below[order[1:]]  # (R - 1, R) one for each edge of the tree
-    inside, total = sparse.csr_matrix(cuts.astype(float)) @ seen, np.asarray(seen.sum(0)).ravel()
-    one = np.asarray(inside.todense())  # (R - 1, N)
-    bridge = ((one > 0) & (one < total) & (total > 2)).sum(1)
+    inside = matches[np.isin(matches[:, :2], views.ids[rows]).all(1)]
+    one, other = np.searchsorted(views.ids[rows], inside[:, :2]).T
+    across = np.where(cuts[:, one] != cuts[:, other], inside[:, 2], 0)  # (R - 1, P)
+    bridge = np.minimum(_bridges(views, rows, cuts), across.max(1, initial=0))
     for cut in np.argsort(bridge, kind="stable"):
         if bridge[cut] < MIN_BRIDGE:
             return np.asarray(cuts[cut])
@@ -269,6 +327,34 @@ def _weak_cut(views: _Views, rows: IntArray) -> BoolArray | None:
         if expected >= MIN_EXPECTED and found < MIN_SEEN * expected:
             return np.asarray(cuts[cut])
     return None
+
+
+CUTS_AT_ONCE = 50  # whose bridges are counted together (chosen: memory)
+
+
+def _bridges(views: _Views, rows: IntArray, cuts: BoolArray) -> IntArray:
+    """Count the points (C,) that tie the two sides of each cut (C, R) of `rows`.
+
+    The depth of a point is told by n rays whose directions u spread: n - |sum of u|^2 / n, which is
+    1 - cos(angle) for two.
+    """
+    centre = invert_rigid(views.cam_from_world[rows])[:, :, 3]  # (R, 3)
+    seen = views.seen[rows].tocsc()
+    at = seen.tocoo()
+    ray = views.xyz[at.col] - centre[at.row]  # (m, 3)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    rays = [sparse.csc_matrix((u, (at.row, at.col)), seen.shape) for u in ray.T]
+    count = np.zeros(len(cuts), np.int64)
+    for start in range(0, len(cuts), CUTS_AT_ONCE):
+        chunk = cuts[start : start + CUTS_AT_ONCE].astype(float)
+        sides = []
+        for side in (chunk, 1 - chunk):
+            n = np.asarray(side @ seen)  # (c, N)
+            length2 = sum(np.asarray(side @ u) ** 2 for u in rays)
+            sides.append((n > 0, n - length2 / np.maximum(n, 1) >= MIN_RAY_SPREAD))
+        (one, one_deep), (two, two_deep) = sides
+        count[start : start + CUTS_AT_ONCE] = ((one & two_deep) | (two & one_deep)).sum(1)
+    return count
 
 
 def _found_again(views: _Views, rows: IntArray, side: BoolArray) -> tuple[int, int]:

@@ -123,7 +123,8 @@ def estimate_poses(
         nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
         return Poses(camera, frame, time_s, nothing, none, "none", messages=tuple(messages))
     line = progress("pnp", len(frame))
-    poses = _locate_all(models, part_rows, resized, config, line)
+    key_rows = np.array([key.row for key in keys])
+    poses = _locate_all(models, part_rows, key_rows, resized, config, line)
     messages += _breaks(poses)
     messages += _lost_frames(frame, poses.known)
     return dataclasses.replace(poses, messages=tuple(messages))
@@ -132,6 +133,7 @@ def estimate_poses(
 def _locate_all(
     models: list[SparseModel],
     part_rows: list[IntArray],
+    key_rows: IntArray,
     video: ResizedVideo,
     config: PosesConfig,
     line: Progress,
@@ -139,15 +141,16 @@ def _locate_all(
     """Locate all frames in the parts of the reconstruction, each in the first that explains it.
 
     Args:
-        part_rows: row of each image of each model in the video.
+        part_rows: row of each image of each model in the video. key_rows: of all keyframes.
     """
     frame, time_s = np.array(video.frames, np.int64), np.array(video.times_s, np.float64)
     cam_from_world = np.full((len(frame), 3, 4), np.nan)
     status, part = np.full(len(frame), "none", "<U12"), np.full(len(frame), -1)
     seen, first = [], 0
     for number, (model, rows) in enumerate(zip(models, part_rows, strict=True)):
-        cameras, found = locate_between(model, rows, video, config.seed, line)
-        cameras, found = fill_gaps(frame, cameras, found, MAX_GAP)
+        left_out = np.setdiff1d(key_rows, rows)
+        cameras, found = locate_between(model, rows, left_out, video, config.seed, line)
+        cameras, found = fill_gaps(frame, cameras, found, MAX_GAP, left_out)
         mine = (found != "none") & (part < 0)
         mine |= np.isin(np.arange(len(frame)), rows)  # its own keyframes
         cam_from_world[mine], status[mine], part[mine] = cameras[mine], found[mine], number

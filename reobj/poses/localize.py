@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -22,13 +22,21 @@ from reobj.types import Array, BoolArray, Image, IntArray
 
 
 def locate_between(
-    model: SparseModel, key_rows: IntArray, video: ResizedVideo, seed: int, line: Progress
+    model: SparseModel,
+    key_rows: IntArray,
+    left_out: IntArray,
+    video: ResizedVideo,
+    seed: int,
+    line: Progress,
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Locate every frame by PnP from points followed from the keyframes before and after it.
 
+    Points are not followed to or past a keyframe that the model does not hold: what mapping took
+    out, with better matches, PnP must not put back.
+
     Args:
         model: of the keyframes, native pixels. key_rows: (R,) row of each of its images in the
-            video, ascending.
+            video, ascending. left_out: (L,) rows of the other keyframes, ascending.
     Returns:
         cam_from_world: (F, 3, 4), NaN where PnP was refused or the camera jumped. status: (F,) as
         in `Poses`.
@@ -36,6 +44,9 @@ def locate_between(
     count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
     cam_from_world[key_rows], status[key_rows] = model.cam_from_world, "keyframe"
+    keys, rows = np.union1d(key_rows, left_out), np.arange(count)
+    held = np.concatenate([[False], np.isin(keys, key_rows), [False]])  # -1 and K: no keyframe
+    reached = held[np.searchsorted(keys, rows, "right")] | held[np.searchsorted(keys, rows) + 1]
 
     def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
         before, after, run = segment
@@ -43,7 +54,7 @@ def locate_between(
         ahead = _follow_model_points(model, before, images)
         back = _follow_model_points(model, after, images[::-1])[::-1]
         for (row, gray), (seen_a, xy_a), (seen_b, xy_b) in zip(run, ahead, back, strict=True):
-            if status[row] == "none":
+            if reached[row] and status[row] == "none":
                 points, xy = model.points[np.r_[seen_a, seen_b]], np.r_[xy_a, xy_b]
                 found = absolute_pose(xy, points, camera, gray.shape[1], seed)
                 if found is not None:
@@ -164,9 +175,15 @@ def _detours(cam_from_world: Array) -> BoolArray:
 
 
 def fill_gaps(
-    frame: IntArray, cam_from_world: Array, status: npt.NDArray[np.str_], max_gap: int
+    frame: IntArray,
+    cam_from_world: Array,
+    status: npt.NDArray[np.str_],
+    max_gap: int,
+    left_out: Sequence[int] | IntArray = (),
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Interpolate the poses of at most `max_gap` lost frames in a row, never beyond the ends.
+
+    Nor past a row of `left_out`, a keyframe that mapping took out.
 
     The rotation is interpolated by slerp and the camera's centre along a line; the translation of
     cam_from_world on a line would bend the path.
@@ -180,7 +197,8 @@ def fill_gaps(
     filled, status = cam_from_world.copy(), status.copy()
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     for a, b in itertools.pairwise(known):
-        if b - a > 1 and frame[b] - frame[a] - 1 <= max_gap:
+        taken_out = any(a < row < b for row in left_out)
+        if b - a > 1 and frame[b] - frame[a] - 1 <= max_gap and not taken_out:
             share = (frame[a + 1 : b] - frame[a]) / (frame[b] - frame[a])  # (n,)
             ends = invert_rigid(cam_from_world[[a, b]])  # (2, 3, 4) world_from_cam
             between = Slerp([0, 1], Rotation.from_matrix(ends[:, :, :3]))

@@ -35,6 +35,8 @@ from reobj.poses.consistency import (
     read_pairs,
 )
 from reobj.poses.features import choose_pairs, extract_features, match_pairs
+from reobj.poses.uncertainty import relative_centre_sigma
+from reobj.poses.zoom import constant_focal
 from reobj.types import Array, Image
 
 HOW_TO_FILM = (
@@ -141,8 +143,9 @@ def _reconstruct_job(folder: Path) -> None:
     match_pairs(database, choose_pairs(database, job["ids"], job["seed"]), job["seed"])
     pairs = read_pairs(database)
     focal = None if job["camera"] is not None else focal_from_pairs(pairs, size)
-    search = _Search(database, job["ids"], pairs, job["seed"])
-    parts, messages = search.run(job["camera"] is not None, focal, job["guess"])
+    names = dict(zip(job["ids"], job["names"], strict=True))
+    search = _Search(database, names, pairs, job["camera"] is not None, job["seed"])
+    parts, messages = search.run(focal, job["guess"])
     for old in folder.glob("sparse*"):
         shutil.rmtree(old)
     for number, part in enumerate(parts):
@@ -173,9 +176,45 @@ FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen:
 MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
 MIN_POINTS = 100  # refuse a model with fewer (chosen)
 MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
+# Refuse a model with a larger sigma of a camera's centre over the extent of the path, by the
+# adjustment's covariance (measured: right up to .0032, and .002 from 40 keyframes on; wrong from
+# .0037 on, because one of many equal solutions was found)
+MAX_CENTRE_SIGMA = 0.0035
 MIN_TRI_ANGLE_DEG = 1.5  # median; refuse a model with less (chosen; COLMAP's points: 1.5)
 MIN_REGISTERED = 0.5  # share of the keyframes that makes a model worth having ...
 MIN_PART_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
+
+
+@dataclass(frozen=True, slots=True)
+class _Geometry:
+    """How strongly the rays of a model tell its depths and its focal length."""
+
+    tri_angle_deg: float  # median over points of the widest angle between two rays
+    turn_deg: float  # widest angle of a viewing direction from their mean, twice
+    spread: float  # rms distance of the cameras from their mean over the median depth
+    focal: float  # over the longer side
+
+    @property
+    def calibrates(self) -> bool:
+        """True if the geometry is strong enough to trust the focal length that came out."""
+        low, high = FOCAL_RANGE
+        wide = self.tri_angle_deg >= STRONG_TRI_ANGLE_DEG or self.turn_deg >= STRONG_TURN_DEG
+        return wide and self.spread >= STRONG_SPREAD and low <= self.focal <= high
+
+
+def _geometry(model: Any) -> _Geometry:
+    """Measure the geometry of a model."""
+    camera = model.camera(1)
+    centre = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
+    focal = camera.mean_focal_length() / max(camera.width, camera.height)
+    angle, depth = _angle_and_depth(model, centre)
+    if not centre:
+        return _Geometry(angle, 0.0, 0.0, focal)
+    spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
+    axes = np.array([model.image(i).cam_from_world().matrix()[2, :3] for i in centre])  # (R, 3)
+    off_mean = (axes @ axes.mean(0)).min() / max(np.linalg.norm(axes.mean(0)), 1e-12)
+    turn = 2 * math.degrees(math.acos(np.clip(off_mean, -1, 1)))
+    return _Geometry(angle, turn, spread, focal)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,40 +225,23 @@ class _Part:
     """
 
     model: Any
+    geometry: _Geometry
     registered: float  # share of the keyframes
-    tri_angle_deg: float  # median over points of the widest angle between two rays
-    turn_deg: float  # widest angle of a viewing direction from their mean, twice
     parallax_px: float  # what turns of the camera alone cannot explain
-    spread: float  # rms distance of the cameras from their mean over the median depth
-    focal: float  # over the longer side
+    centre_sigma: float  # largest of a camera's centre, over the extent of the path
     explained: float  # verified matches
     problem: str
 
-    @property
-    def calibrates(self) -> bool:
-        """True if the geometry is strong enough to trust the focal length that came out."""
-        low, high = FOCAL_RANGE
-        wide = self.tri_angle_deg >= STRONG_TRI_ANGLE_DEG or self.turn_deg >= STRONG_TURN_DEG
-        return wide and self.spread >= STRONG_SPREAD and low <= self.focal <= high
 
-
-def _measured(model: Any, count: int, pairs: MatchedPairs) -> _Part:
+def _measured(model: Any, count: int, pairs: MatchedPairs, fixed: bool) -> _Part:
     """Measure a model of some of `count` keyframes and name its first problem."""
-    camera = next(iter(model.cameras.values()))
-    centre = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
-    focal = camera.mean_focal_length() / max(camera.width, camera.height)
-    seen = [model.image(i).num_points3D for i in centre] or [0]
-    parallax = _parallax_px(model)
-    angle, depth = _angle_and_depth(model, centre)
-    spread = turn = 0.0
-    if centre:
-        spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
-        axes = np.array([model.image(i).cam_from_world().matrix()[2, :3] for i in centre])  # (R, 3)
-        off_mean = (axes @ axes.mean(0)).min() / max(np.linalg.norm(axes.mean(0)), 1e-12)
-        turn = 2 * math.degrees(math.acos(np.clip(off_mean, -1, 1)))
-    few = len(centre) < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
+    camera, geometry = model.camera(1), _geometry(model)
+    seen = [model.image(i).num_points3D for i in model.reg_image_ids()] or [0]
+    parallax, angle = _parallax_px(model), geometry.tri_angle_deg
+    sigma = relative_centre_sigma(model, not fixed)
+    few = model.num_reg_images() < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
     checks = (
-        (few, f"only {len(centre)} of {count} keyframes connect"),
+        (few, f"only {model.num_reg_images()} of {count} keyframes connect"),
         (model.num_points3D() < MIN_POINTS,
          f"only {model.num_points3D()} points could be triangulated"),
         (np.median(seen) < MIN_POINTS_PER_IMAGE, "the images share too few points"),
@@ -227,81 +249,105 @@ def _measured(model: Any, count: int, pairs: MatchedPairs) -> _Part:
          "a mere turn of the camera explains all images, so there is no depth"),
         (angle < MIN_TRI_ANGLE_DEG,
          f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
+        (sigma > MAX_CENTRE_SIGMA,
+         "there is too little parallax to tell where the camera was"),
         (camera.has_bogus_params(*FOCAL_RANGE, 1.0),
-         f"the focal length came out as {focal:.2f} x the width"),
+         f"the focal length came out as {geometry.focal:.2f} x the width"),
     )  # fmt: skip
     problem = next((text for bad, text in checks if bad), "")
-    measures = (angle, turn, parallax, spread, focal, count_explained(model, pairs))
-    return _Part(model, len(centre) / count, *measures, problem)
+    explained = count_explained(model, pairs)
+    registered = model.num_reg_images() / count
+    return _Part(model, geometry, registered, parallax, sigma, explained, problem)
 
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
+MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
 
-@dataclass(frozen=True, slots=True)
 class _Search:
     """Search for the mapper whose model holds together best.
 
     Attributes:
-        ids: of all keyframes in the order of time. pairs: their verified matches.
+        ids: of the keyframes in the order of time. pairs: their verified matches.
+        names: of the keyframes, for messages. fixed: the intrinsics are known.
     """
 
-    database: Path
-    ids: list[int]
-    pairs: MatchedPairs
-    seed: int
+    def __init__(
+        self, database: Path, names: dict[int, str], pairs: MatchedPairs, fixed: bool, seed: int
+    ) -> None:
+        self.database, self.ids, self.pairs = database, list(names), pairs
+        self.names, self.fixed, self.seed = names, fixed, seed
 
-    def run(self, fixed: bool, focal: float | None, guess: float) -> tuple[list[Any], list[str]]:
-        """Try mappers from strict to permissive until sound parts hold nearly all keyframes.
+    def run(self, focal: float | None, guess: float) -> tuple[list[Any], list[str]]:
+        """Try mappers until sound parts hold nearly all keyframes.
 
-        With the focal length that the matches tell, mapping holds it: freed too early it drifts to
-        a wrong one, and pieces are joined wrongly. The last adjustment frees it. Of several models
-        the one counts that explains most of the verified matches.
+        Images of another focal length are left out as soon as they are found.
 
         Args:
-            fixed: the intrinsics are known. focal: what the matches tell, over the longer side.
-            guess: used where they do not.
+            focal: what the matches tell, over the longer side. guess: used where they do not.
         Returns:
             models of the parts, the largest first ([]: none is sound); messages.
         """
-        start = focal or guess
-        tries = [("strict", False), ("relaxed", False)]
-        if fixed:
-            tries = [("strict", True), ("global", True), ("relaxed", True)]
-        elif focal is not None:
-            tries = [("strict", True), ("global", True), *tries]
+        start, zooms = focal or guess, list[tuple[int, int, float]]()
+        for _ in range(MAX_ROUNDS):
+            best, messages = self._best(start, focal is not None)
+            others, changes = constant_focal([part.model for part in best])
+            if not len(others):
+                break
+            zooms += changes
+            self.ids = [i for i in self.ids if i not in set(others.tolist())]
+            self.pairs = self.pairs.only(self.ids)
+        sound = [part for part in best if not part.problem]
+        if not sound:
+            why = "no two keyframes show the same points from clearly different places"
+            problem = best[0].problem if best else why
+            return [], [f"no camera poses: {problem}; {HOW_TO_FILM}"]
+        messages = [
+            f"the focal length changed between {self.names[a]} and {self.names[b]} (x {ratio:.2f}): "
+            "only the frames of one focal length, the most, have poses; do not zoom"
+            for a, b, ratio in zooms
+        ] + messages
+        return self._one_camera(sound), messages
+
+    def _best(self, start: float, told: bool) -> tuple[list[_Part], list[str]]:
+        """Choose the mapper whose sound parts explain most of the verified matches.
+
+        With the focal length that the matches tell, mapping holds it: freed too early it drifts to
+        a wrong one, and pieces are joined wrongly. The last adjustment frees it.
+
+        Args:
+            start: focal length over the longer side. told: by the matches.
+        """
+        tries = [("incremental", self.fixed)]
+        if self.fixed or told:
+            tries = [("global", True), ("incremental", True)]
         best: list[_Part] = []
         for mapper, held in tries:
-            if not fixed:
+            if not self.fixed:
                 _set_focal(self.database, start, held)
             best = max(best, self._parts(mapper, held), key=_quality)
             if self._ends(best):
                 break
-        if not best:
-            why = "no two keyframes show the same points from clearly different places"
-            return [], [f"no camera poses: {why}; {HOW_TO_FILM}"]
-        messages = []
-        if not fixed and not best[0].problem and not best[0].calibrates:
-            angle = f"{best[0].tri_angle_deg:.1f} deg"
-            weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
+        if self.fixed or not best or best[0].problem or best[0].geometry.calibrates:
+            return best, []
+        if not told:  # what the mapper made of the focal length is worth nothing
             _set_focal(self.database, start, True)
-            best = self._parts("relaxed", True)
-            messages = [
-                f"{weak} and is taken as {start:.3g} x the longer side; sizes and depths are "
-                "rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
-            ]
-        sound = [part for part in best if not part.problem]
-        if not sound:
-            problem = best[0].problem if best else "nothing connects"
-            return [], [f"no camera poses: {problem}; {HOW_TO_FILM}"]
-        calibrate = not fixed and not messages
-        _refine(sound[0].model, calibrate)
-        for part in sound[1:]:  # one camera took them all: that of the largest part
+            best = self._parts("incremental", True)
+        angle = f"{best[0].geometry.tri_angle_deg:.1f} deg" if best else "0 deg"
+        weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
+        return best, [
+            f"{weak} and is taken as {start:.3g} x the longer side; sizes and depths are "
+            "rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
+        ]
+
+    def _one_camera(self, sound: list[_Part]) -> list[Any]:
+        """Adjust smaller parts with the camera of the largest: one camera took them all."""
+        for part in sound[1:]:
             own, camera = part.model.camera(1), sound[0].model.camera(1)
             own.model, own.params = camera.model, camera.params
             _refine(part.model, False)
-        return [part.model for part in sound], messages
+        return [part.model for part in sound]
 
     def _ends(self, parts: list[_Part]) -> bool:
         """True if sound parts hold and explain nearly all, or if the camera only turned."""
@@ -311,17 +357,29 @@ class _Search:
         turned = (p.registered for p in parts if p.problem and p.parallax_px < MIN_PARALLAX_PX)
         return good or max(turned, default=0.0) >= GOOD_REGISTERED
 
-    def _parts(self, mapper: str, fixed: bool) -> list[_Part]:
-        """Run a mapper and measure the parts of its models that hold together, largest first."""
+    def _parts(self, mapper: str, held: bool) -> list[_Part]:
+        """Run a mapper and measure the parts of its models that hold together, largest first.
+
+        What is checked is what comes out: the models are adjusted before.
+        """
         count, taken, parts = len(self.ids), set[int](), list[_Part]()
-        models = _run_mapper(self.database, mapper, fixed, count, self.seed)
-        groups = [(g, m) for m in models for g in consistent_groups(m, self.pairs)]
+        groups = []
+        for model in _run_mapper(self.database, mapper, held, self.ids, self.seed):
+            self._adjust(model)
+            groups += [(group, model) for group in consistent_groups(model, self.pairs)]
         for group, model in sorted(groups, key=lambda found: -len(found[0])):
             kept = set(group.tolist()) - taken  # models may overlap
-            part = _measured(_only(model, kept), count, self.pairs)
+            alone = _only(model, kept)
+            if len(kept) < model.num_reg_images():
+                self._adjust(alone)
+            part = _measured(alone, count, self.pairs, self.fixed)
             parts.append(part)
             taken |= set() if part.problem else kept
         return sorted(parts, key=lambda p: (bool(p.problem), -p.registered))
+
+    def _adjust(self, model: Any) -> None:
+        """Adjust a model once more, with its intrinsics where they are to be calibrated."""
+        _refine(model, not self.fixed and _geometry(model).calibrates)
 
 
 def _quality(parts: list[_Part]) -> tuple[float, int]:
@@ -348,23 +406,24 @@ def _set_focal(database: Path, guess: float, trusted: bool) -> None:
         db.update_camera(camera)
 
 
-RELAXED = {  # COLMAP's options of the second mapper: weak parallax is taken too (chosen)
+WEAK_GEOMETRY = {  # COLMAP's options, so that weak parallax is taken too (chosen)
     "mapper": {"init_min_tri_angle": 4, "init_min_num_inliers": 40, "abs_pose_min_num_inliers": 15,
                "abs_pose_min_inlier_ratio": 0.15, "filter_min_tri_angle": 0.5},
     "triangulation": {"min_angle": 0.5, "ignore_two_view_tracks": False},
 }  # fmt: skip
 
 
-def _run_mapper(database: Path, mapper: str, fixed: bool, count: int, seed: int) -> list[Any]:
-    """Run a mapper ("strict" or "relaxed": incremental; "global"), return all its models.
+def _run_mapper(database: Path, mapper: str, held: bool, ids: list[int], seed: int) -> list[Any]:
+    """Run a mapper ("incremental" or "global") on some images, return all its models.
 
     Args:
-        fixed: the intrinsics in the database are kept.
+        held: the intrinsics in the database are kept.
     """
-    pc, out = import_pycolmap(), database.parent / mapper
+    pc, out, count = import_pycolmap(), database.parent / mapper, len(ids)
     out.mkdir(exist_ok=True)
     paths = (str(database), str(out), str(out))
     options: dict[str, Any] = {"num_threads": 1, "random_seed": seed}  # one: reproducible
+    options["image_names"] = [f"{number:06d}" for number in ids]
     if mapper == "global":  # only with a known focal length: with a wrong one it looks right
         kept = {"refine_focal_length": False, "refine_extra_params": False}
         options["mapper"] = {"bundle_adjustment": kept}
@@ -374,8 +433,8 @@ def _run_mapper(database: Path, mapper: str, fixed: bool, count: int, seed: int)
     options |= {"ba_global_frames_ratio": 1.4, "ba_global_points_ratio": 1.4}
     options |= {"ba_global_function_tolerance": 1e-5, "ba_global_max_refinements": 2}
     options |= {"ba_local_max_refinements": 1}
-    options |= {"ba_refine_focal_length": not fixed, "ba_refine_extra_params": not fixed}
-    options |= RELAXED if mapper == "relaxed" else {}
+    options |= {"ba_refine_focal_length": not held, "ba_refine_extra_params": not held}
+    options |= WEAK_GEOMETRY
     done = itertools.count(2)
     tick = {"next_image_callback": lambda: send_progress("mapping", min(next(done), count), count)}
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
@@ -396,7 +455,7 @@ def _refine(model: Any, calibrate: bool) -> None:
         return
     camera = model.camera(1)
     size = np.array([camera.width, camera.height])
-    focal, _, _, distortion = camera.params
+    focal, distortion = camera.params[0], camera.params[3]
     camera.model = import_pycolmap().CameraModelId.RADIAL
     for free_centre in (True, False):
         camera.params = [focal, *size / 2, distortion, 0]

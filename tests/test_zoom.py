@@ -1,0 +1,59 @@
+"""A camera that zooms: found by each image against its neighbours on one side."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_consistency import CAMERA, Scene
+
+from reobj.poses.zoom import constant_focal
+
+
+def zoomed_scene(zoomed, ratio, seed=0, noise_px=0.3):
+    """A walk whose model is right, but for the pictures of a stretch at another focal length.
+
+    The pixels of those images are what a camera with that focal length sees, each put back by the
+    distance that hides it best: the model of a mapper that knows of one focal length only.
+    """
+    scene = Scene(count=20, seed=seed)
+    centre = np.array([CAMERA.principal_point_x, CAMERA.principal_point_y])
+    scene.poses = scene.truth.copy()
+    for image in zoomed:
+        scene.xy[image] = centre + (scene.xy[image] - centre) * ratio
+        inside = ((scene.xy[image] > 0) & (scene.xy[image] < (640, 480))).all(1)
+        scene.seen[image] &= inside
+        scene.poses[image, 2, 3] -= 4.2 * (1 - 1 / ratio)  # the wall is 3.5 to 5 m away
+    scene.xy = scene.xy + np.random.default_rng(seed).normal(0, noise_px, scene.xy.shape)
+    return scene
+
+
+@pytest.mark.parametrize("ratio", [1.3, 1 / 1.3])
+def test_images_of_another_focal_length_are_found(ratio):
+    others, changes = constant_focal([zoomed_scene(range(7, 13), ratio).model()])
+    assert others.tolist() == list(range(8, 14))
+    assert [(a, b) for a, b, _ in changes] == [(7, 8), (13, 14)]
+    np.testing.assert_allclose([r for _, _, r in changes], [ratio, 1 / ratio], rtol=0.1)
+
+
+def test_the_focal_length_of_most_images_is_kept():
+    others, _ = constant_focal([zoomed_scene(range(6, 20), 1.3).model()])
+    assert others.tolist() == list(range(1, 7))
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.04])
+def test_one_focal_length_is_left_in_peace(ratio):
+    """Also where the lens breathes by a few per cent as it focuses."""
+    others, changes = constant_focal([zoomed_scene(range(7, 13), ratio, noise_px=1.0).model()])
+    assert len(others) == 0 and changes == []
+
+
+def test_models_apart_are_looked_at_each():
+    one, other = zoomed_scene(range(0), 1.0).model(), zoomed_scene(range(7, 13), 1.3).model()
+    assert constant_focal([one])[1] == [] and len(constant_focal([one, other])[1]) == 2
+    assert constant_focal([])[0].tolist() == []
+
+
+def test_too_few_points_tell_nothing():
+    scene = zoomed_scene(range(7, 13), 1.3)
+    scene.seen[:, 30:] = False
+    assert constant_focal([scene.model()])[1] == []
