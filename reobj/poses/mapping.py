@@ -177,9 +177,9 @@ MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 
 MIN_POINTS = 100  # refuse a model with fewer (chosen)
 MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
 # Refuse a model with a larger sigma of a camera's centre over the extent of the path, by the
-# adjustment's covariance (measured: right up to .0032, and .002 from 40 keyframes on; wrong from
-# .0037 on, because one of many equal solutions was found)
-MAX_CENTRE_SIGMA = 0.0035
+# adjustment's covariance: one of many nearly equal solutions was found (measured: right models of 40
+# keyframes and more up to .002, of short stretches .0032; wrong ones from .0026 on)
+MAX_CENTRE_SIGMA = 0.0025
 MIN_TRI_ANGLE_DEG = 1.5  # median; refuse a model with less (chosen; COLMAP's points: 1.5)
 MIN_REGISTERED = 0.5  # share of the keyframes that makes a model worth having ...
 MIN_PART_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
@@ -262,6 +262,8 @@ def _measured(model: Any, count: int, pairs: MatchedPairs, fixed: bool) -> _Part
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
+SURE_CENTRE_SIGMA = 0.001  # as MAX_CENTRE_SIGMA, of an incremental model that needs no other (chosen)
+PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
 MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
 
@@ -313,22 +315,22 @@ class _Search:
     def _best(self, start: float, told: bool) -> tuple[list[_Part], list[str]]:
         """Choose the mapper whose sound parts explain most of the verified matches.
 
-        With the focal length that the matches tell, mapping holds it: freed too early it drifts to
-        a wrong one, and pieces are joined wrongly. The last adjustment frees it.
+        The incremental mapper is fast and right where the parallax is strong; where it is weak, it
+        ends in a wrong one of many nearly equal solutions more often than the global mapper, which
+        needs a focal length and is believed unless it explains clearly less. With the focal length
+        that the matches tell, both hold it: freed too early it drifts to a wrong one, and pieces
+        are joined wrongly. The last adjustment frees it.
 
         Args:
             start: focal length over the longer side. told: by the matches.
         """
-        tries = [("incremental", self.fixed)]
-        if self.fixed or told:
-            tries = [("global", True), ("incremental", True)]
-        best: list[_Part] = []
-        for mapper, held in tries:
-            if not self.fixed:
-                _set_focal(self.database, start, held)
-            best = max(best, self._parts(mapper, held), key=_quality)
-            if self._ends(best):
-                break
+        held = self.fixed or told
+        if not self.fixed:
+            _set_focal(self.database, start, held)
+        best = self._parts("incremental", held)
+        if held and not self._is_sure(best):
+            other = self._parts("global", held)
+            best = max(best, other, key=lambda p: _explained(p) * (1 if p is best else PREFERRED))
         if self.fixed or not best or best[0].problem or best[0].geometry.calibrates:
             return best, []
         if not told:  # what the mapper made of the focal length is worth nothing
@@ -349,13 +351,11 @@ class _Search:
             _refine(part.model, False)
         return [part.model for part in sound]
 
-    def _ends(self, parts: list[_Part]) -> bool:
-        """True if sound parts hold and explain nearly all, or if the camera only turned."""
-        matched = sum(map(len, self.pairs.inliers))
-        registered = sum(part.registered for part in parts if not part.problem)
-        good = registered >= GOOD_REGISTERED and _quality(parts)[0] >= GOOD_EXPLAINED * matched
-        turned = (p.registered for p in parts if p.problem and p.parallax_px < MIN_PARALLAX_PX)
-        return good or max(turned, default=0.0) >= GOOD_REGISTERED
+    def _is_sure(self, parts: list[_Part]) -> bool:
+        """True if parts of strong geometry hold and explain nearly all."""
+        sure = [p for p in parts if not p.problem and p.centre_sigma <= SURE_CENTRE_SIGMA]
+        registered, matched = sum(p.registered for p in sure), sum(map(len, self.pairs.inliers))
+        return registered >= GOOD_REGISTERED and _explained(sure) >= GOOD_EXPLAINED * matched
 
     def _parts(self, mapper: str, held: bool) -> list[_Part]:
         """Run a mapper and measure the parts of its models that hold together, largest first.
@@ -382,9 +382,9 @@ class _Search:
         _refine(model, not self.fixed and _geometry(model).calibrates)
 
 
-def _quality(parts: list[_Part]) -> tuple[float, int]:
-    """Rate what a mapper made: by the matches that its sound parts explain."""
-    return sum(part.explained for part in parts if not part.problem), len(parts)
+def _explained(parts: list[_Part]) -> float:
+    """Count the verified matches that sound parts explain."""
+    return float(sum(part.explained for part in parts if not part.problem))
 
 
 def _only(model: Any, image_ids: set[int]) -> Any:
