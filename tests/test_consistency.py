@@ -223,12 +223,12 @@ def test_a_matched_keyframe_that_has_no_place_parts_its_neighbours_unless_they_a
 
 def test_keyframes_that_show_nothing_part_nobody():
     scene = Scene()
-    model, pairs = keyframes_dropped(scene, scene.model(), [7, 8]), scene.pairs()
-    blurred = np.isin(pairs.image_ids, [7, 8]).any(1)
+    model, pairs = keyframes_dropped(scene, scene.model(), [7]), scene.pairs()
+    blurred = (pairs.image_ids == 7).any(1)
     for k in np.flatnonzero(blurred):
         pairs.inliers[k] = pairs.inliers[k][:29]
     found = [ids.tolist() for ids in consistent_groups(model, pairs)]
-    assert found == [[*range(1, 7), *range(9, 13)]]
+    assert found == [[*range(1, 7), *range(8, 13)]]
 
 
 @pytest.mark.parametrize("step, found", [(0.25, [(1, 17)]), (0.0, [(1, 9), (9, 17)])])
@@ -238,6 +238,7 @@ def test_where_the_camera_only_turned_no_point_ties_two_groups(step, found):
     for image in (7, 8, 9):
         scene.poses[image] = scene.poses[6]
         scene.poses[image, 0, 3] -= step * (image - 6)
+        scene.xy[image], scene.seen[image] = scene.project(scene.poses[image])
     first, last = scene.seen.copy(), scene.seen.copy()
     first[8:], last[:8] = False, False
     one_side = np.arange(4000) % 2 == 0

@@ -105,8 +105,8 @@ def arc(count, half_rad):
 
 
 def test_with_little_parallax_the_guess_is_kept_and_said(tmp_path):
-    world = DotWorld(count=1200)
-    messages, model = run(tmp_path, [world.image(c) for c in arc(8, 0.15)], guess=1.0)
+    world = DotWorld(count=2500)
+    messages, model = run(tmp_path, [world.image(c) for c in arc(12, 0.2)], guess=1.0)
     assert "little parallax" in messages[0] and "taken as 1 x" in messages[0]
     assert len(messages) == 1 and model.cameras[0].K[0, 0] == 480
 
@@ -132,8 +132,8 @@ def test_features_lie_where_the_dots_are(tmp_path):
     """Dots at exactly known places. OpenCV's SIFT is off by a quarter of a pixel (it halves the
     coordinates of an image that it has doubled); COLMAP's half pixel is another matter.
     """
-    world = DotWorld(count=500)
-    cams = arc(6, 0.1)
+    world = DotWorld(count=700)
+    cams = arc(8, 0.1)
     _, model = run(tmp_path, [world.image(c) for c in cams], camera=world.camera)
     off = []
     for image, name in enumerate(model.names):

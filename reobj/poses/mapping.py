@@ -17,14 +17,14 @@ import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reobj.cameras import Camera, import_pycolmap
+from reobj.cameras import Camera, import_pycolmap, invert_rigid
 from reobj.files import Progress, atomic
 from reobj.poses.child import run_child, send_progress
 from reobj.poses.consistency import (
@@ -176,10 +176,15 @@ FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen:
 MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
 MIN_POINTS = 100  # refuse a model with fewer (chosen)
 MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
-# Refuse a model with a larger sigma of a camera's centre over the extent of the path, by the
-# adjustment's covariance: one of many nearly equal solutions was found (measured: right models of 40
-# keyframes and more up to .002, of short stretches .0032; wrong ones from .0026 on)
+# A model whose cameras' centres all have a smaller sigma, over the extent of the path and by the
+# adjustment's covariance, is believed. Above, it may be one of many nearly equal solutions, and
+# another mapper must find the same (measured: right models of 40 keyframes and more .0001 to .002,
+# wrong ones of short stretches from .0015 on). Without another mapper MAX_CENTRE_SIGMA counts.
+SURE_CENTRE_SIGMA = 0.001
 MAX_CENTRE_SIGMA = 0.0025
+# The same: no centre further off, over the extent, no camera turned by more.
+SAME_CENTRE, SAME_TURN_DEG = 0.05, 5.0  # half of what examples/pose_breaks.py calls wrong
+SAME_IMAGES = 0.75  # of the larger model that both must hold (chosen)
 MIN_TRI_ANGLE_DEG = 1.5  # median; refuse a model with less (chosen; COLMAP's points: 1.5)
 MIN_REGISTERED = 0.5  # share of the keyframes that makes a model worth having ...
 MIN_PART_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
@@ -238,7 +243,7 @@ def _measured(model: Any, count: int, pairs: MatchedPairs, fixed: bool) -> _Part
     camera, geometry = model.camera(1), _geometry(model)
     seen = [model.image(i).num_points3D for i in model.reg_image_ids()] or [0]
     parallax, angle = _parallax_px(model), geometry.tri_angle_deg
-    sigma = relative_centre_sigma(model, not fixed)
+    sigma = relative_centre_sigma(model, not fixed and geometry.calibrates)
     few = model.num_reg_images() < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
     checks = (
         (few, f"only {model.num_reg_images()} of {count} keyframes connect"),
@@ -249,8 +254,6 @@ def _measured(model: Any, count: int, pairs: MatchedPairs, fixed: bool) -> _Part
          "a mere turn of the camera explains all images, so there is no depth"),
         (angle < MIN_TRI_ANGLE_DEG,
          f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
-        (sigma > MAX_CENTRE_SIGMA,
-         "there is too little parallax to tell where the camera was"),
         (camera.has_bogus_params(*FOCAL_RANGE, 1.0),
          f"the focal length came out as {geometry.focal:.2f} x the width"),
     )  # fmt: skip
@@ -262,7 +265,6 @@ def _measured(model: Any, count: int, pairs: MatchedPairs, fixed: bool) -> _Part
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
-SURE_CENTRE_SIGMA = 0.001  # as MAX_CENTRE_SIGMA, of an incremental model that needs no other (chosen)
 PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
 MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
@@ -328,14 +330,20 @@ class _Search:
         if not self.fixed:
             _set_focal(self.database, start, held)
         best = self._parts("incremental", held)
-        if held and not self._is_sure(best):
+        if not held:
+            best = _confirmed(best, [], MAX_CENTRE_SIGMA)
+        elif not self._is_sure(best):
             other = self._parts("global", held)
-            best = max(best, other, key=lambda p: _explained(p) * (1 if p is best else PREFERRED))
+            best, other = (
+                _confirmed(one, rival, SURE_CENTRE_SIGMA)
+                for one, rival in ((best, other), (other, best))
+            )
+            best = max(other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1))
         if self.fixed or not best or best[0].problem or best[0].geometry.calibrates:
             return best, []
         if not told:  # what the mapper made of the focal length is worth nothing
             _set_focal(self.database, start, True)
-            best = self._parts("incremental", True)
+            best = _confirmed(self._parts("incremental", True), [], MAX_CENTRE_SIGMA)
         angle = f"{best[0].geometry.tri_angle_deg:.1f} deg" if best else "0 deg"
         weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
         return best, [
@@ -380,6 +388,41 @@ class _Search:
     def _adjust(self, model: Any) -> None:
         """Adjust a model once more, with its intrinsics where they are to be calibrated."""
         _refine(model, not self.fixed and _geometry(model).calibrates)
+
+
+def _confirmed(parts: list[_Part], others: list[_Part], sigma: float) -> list[_Part]:
+    """Find a problem in parts of a larger sigma, unless another mapper came to the same."""
+    found = [
+        replace(part, problem="there is too little parallax to tell where the camera was")
+        if not part.problem
+        and part.centre_sigma > sigma
+        and not any(_same(part.model, other.model) for other in others)
+        else part
+        for part in parts
+    ]
+    return sorted(found, key=lambda p: (bool(p.problem), -p.registered))
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Tell whether two models have their common cameras in the same places.
+
+    One is brought to the other by the mean of the relative orientations, then scale and shift.
+    """
+    ids = sorted({*one.reg_image_ids()} & {*other.reg_image_ids()})
+    if len(ids) < max(3, SAME_IMAGES * max(one.num_reg_images(), other.num_reg_images())):
+        return False
+    a, b = (
+        invert_rigid(np.array([m.image(i).cam_from_world().matrix() for i in ids]))
+        for m in (one, other)
+    )
+    relative = Rotation.from_matrix(b[:, :, :3] @ np.swapaxes(a[:, :, :3], 1, 2))
+    mean = relative.mean()
+    turn = np.degrees((mean.inv() * relative).magnitude())
+    start, end = (c[:, :, 3] - c[:, :, 3].mean(0) for c in (a, b))
+    moved = mean.apply(start)
+    moved *= (moved * end).sum() / max((moved**2).sum(), 1e-12)
+    off = np.linalg.norm(moved - end, axis=1).max() / np.linalg.norm(np.ptp(end, axis=0))
+    return bool(off <= SAME_CENTRE and turn.max() <= SAME_TURN_DEG)
 
 
 def _explained(parts: list[_Part]) -> float:

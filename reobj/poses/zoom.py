@@ -23,6 +23,7 @@ MIN_POINTS = 20  # of such points seen in the image (chosen; two determine a foc
 # 1.5 .15-.30, right models below .03; one side alone up to .12)
 MIN_ZOOM = 0.12
 MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
+TOLD_BY = 2  # images on each side of a gap that are looked at, and must tell together (chosen)
 RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
 
 
@@ -56,16 +57,20 @@ def _beside(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
 
 
 def _changes(model: Any) -> list[tuple[int, int, float]]:
-    """List the changes of the focal length between images that follow each other."""
+    """List the changes of the focal length between images that follow each other.
+
+    On both sides of each gap the next images are seen from the other side; at least two must tell.
+    """
     views, found = _read_rays(model), []
-    for k in range(len(views) - 1):
-        before, after = views[max(0, k + 1 - WINDOW) : k + 1], views[k + 1 : k + 1 + WINDOW]
-        focal = model.camera(1).mean_focal_length()
-        sides = [_log_focal(after[0], before, focal), _log_focal(before[-1], after, focal)]
-        change = np.array([sides[0][0], -sides[1][0]])
-        told = np.isfinite(change)
-        if told.any():
-            log, sigma = change[told].mean(), max(sides[i][1] for i in np.flatnonzero(told))
+    focal = model.camera(1).mean_focal_length()
+    for k in range(1, len(views)):
+        before, after = views[max(0, k - WINDOW) : k], views[k : k + WINDOW]
+        ahead = [_log_focal(image, before, focal) for image in after[:TOLD_BY]]
+        back = [_log_focal(image, after, focal) for image in before[: -1 - TOLD_BY : -1]]
+        told = np.array(ahead + [(-log, sigma) for log, sigma in back])
+        told = told[np.isfinite(told[:, 0])]
+        if len(told) >= TOLD_BY:
+            log, sigma = np.median(told, axis=0)
             if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma):
                 found.append((before[-1].image_id, after[0].image_id, float(np.exp(log))))
     return found
