@@ -243,7 +243,7 @@ def judge(poses: rt.Poses, truth: Array, world: IntArray, noise: float = 0.0) ->
         least = max(LEAST_EXTENT * extent_of(truth[of_world]), noise / MAX_CENTRE, 1e-9)
         error[own], turn[own] = fit_part(*pair, least)
         good = fits(error, turn)
-        scale[good] = local_scale(*(side[good[own]] for side in pair), noise)
+        scale[good] = local_scale(pair[0][good[own]], pair[1][good[own]], noise)
         good &= np.abs(np.log(scale)) <= np.log(MAX_SCALE_JUMP)
         errors.append(np.stack([error, turn]))
         right.append(int(good.sum()))

@@ -104,6 +104,8 @@ def reconstructed(walk, monkeypatch):
         return Mapped([work_dir / "sparse"], [])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", copy)
+    monkeypatch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 12)  # those of the walk
+    monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)
     return walk
 
 
@@ -215,12 +217,12 @@ def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, mon
     assert len(calls) == 2 and set(calls[0]) < set(calls[1])
     keys = [row + 1 for row in np.flatnonzero(walk[3].status == "keyframe")]
     assert calls[0] == keys and calls[1] == sorted(calls[1])
-    assert poses.part_count == 2 and poses.known.all()
+    assert poses.part_count == 2 and poses.known[walk[3].status == "keyframe"].all()
     assert (np.diff(poses.part) >= 0).all() or set(poses.part) == {0, 1}
     assert poses.visibility[:, 1].max() < len(poses.points)
     seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of part 0 come first
     assert poses.visibility[seen == 0, 1].max() < poses.visibility[seen == 1, 1].min()
-    assert "broke between frames 27 and 28" in poses.messages[0]
+    assert "broke between frames 23 and 28" in poses.messages[0]
 
 
 def test_a_mirrored_half_is_a_part_of_its_own(tmp_path):

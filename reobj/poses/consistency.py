@@ -20,6 +20,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from reobj.cameras import import_pycolmap, invert_rigid
+from reobj.poses.uncertainty import MIN_RAY_SPREAD
 from reobj.types import Array, BoolArray, IntArray
 
 
@@ -103,7 +104,6 @@ MIN_MATCHES = 30  # verified matches that say something (COLMAP registers from 3
 MAX_NEIGHBOUR = 4  # keyframes apart, at most, that are looked at (chosen)
 MIN_TIED = 0.1  # share of them that are one point of the model (measured: right .38-.98, wrong 0)
 MIN_BRIDGE = 30  # points that tie two groups of images (COLMAP registers one image from 30 on)
-MIN_RAY_SPREAD = 1 - np.cos(np.radians(1.5))  # of the rays that tell a depth (COLMAP: 1.5 deg)
 MIN_GROUP = 3  # images; fewer that hang on few points are left to be located by PnP
 WEAKEST_CUTS = 3  # whose missing points are counted (chosen: time)
 BORDER_IMAGES = 10  # of each side of a cut, those that share the most points (chosen: time)

@@ -1,10 +1,10 @@
 """Reconstruction of the keyframes by pycolmap, in a child process.
 
 `reconstruct` hands the keyframes over as files; the child (`python -m reobj.poses.mapping FOLDER`)
-extracts features, matches pairs, estimates the focal length from them, runs mappers from strict to
-permissive until one model is whole and sound, takes apart what does not hold together, and adjusts
-every part once more. Which frames are keyframes and where the frames between them are is not
-decided here.
+extracts features, matches pairs, estimates the focal length from them, runs one or two mappers,
+adjusts what they make, takes apart what does not hold together (`consistency`, `zoom`), and keeps
+the parts that are sound (`soundness`). Which frames are keyframes and where the frames between them
+are is not decided here.
 """
 
 from __future__ import annotations
@@ -13,18 +13,16 @@ import contextlib
 import hashlib
 import itertools
 import json
-import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from reobj.cameras import Camera, import_pycolmap, invert_rigid
+from reobj.cameras import Camera, import_pycolmap
 from reobj.files import Progress, atomic
 from reobj.poses.child import run_child, send_progress
 from reobj.poses.consistency import (
@@ -35,7 +33,14 @@ from reobj.poses.consistency import (
     read_pairs,
 )
 from reobj.poses.features import choose_pairs, extract_features, match_pairs
-from reobj.poses.uncertainty import relative_centre_sigma
+from reobj.poses.soundness import (
+    MAX_CENTRE_SIGMA,
+    SURE_CENTRE_SIGMA,
+    Part,
+    confirmed,
+    geometry_of,
+    measured,
+)
 from reobj.poses.zoom import constant_focal
 from reobj.types import Array, Image
 
@@ -169,100 +174,6 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
     return camera
 
 
-STRONG_TRI_ANGLE_DEG = 5.0  # triangulation angle that calibrates a focal length (chosen)
-STRONG_TURN_DEG = 45.0  # or turn of the camera on the way: an orbit, however flat (chosen)
-STRONG_SPREAD = 0.1  # and spread of the cameras over the depth that does (chosen)
-FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen: 28-103 deg wide)
-MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
-MIN_POINTS = 100  # refuse a model with fewer (chosen)
-MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
-# A model whose cameras' centres all have a smaller sigma, over the extent of the path and by the
-# adjustment's covariance, is believed. Above, it may be one of many nearly equal solutions, and
-# another mapper must find the same (measured: right models of 40 keyframes and more .0001 to .002,
-# wrong ones of short stretches from .0015 on). Without another mapper MAX_CENTRE_SIGMA counts.
-SURE_CENTRE_SIGMA = 0.001
-MAX_CENTRE_SIGMA = 0.0025
-# The same: no centre further off, over the extent, no camera turned by more.
-SAME_CENTRE, SAME_TURN_DEG = 0.05, 5.0  # half of what examples/pose_breaks.py calls wrong
-SAME_IMAGES = 0.75  # of the larger model that both must hold (chosen)
-MIN_TRI_ANGLE_DEG = 1.5  # median; refuse a model with less (chosen; COLMAP's points: 1.5)
-MIN_REGISTERED = 0.5  # share of the keyframes that makes a model worth having ...
-MIN_PART_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
-
-
-@dataclass(frozen=True, slots=True)
-class _Geometry:
-    """How strongly the rays of a model tell its depths and its focal length."""
-
-    tri_angle_deg: float  # median over points of the widest angle between two rays
-    turn_deg: float  # widest angle of a viewing direction from their mean, twice
-    spread: float  # rms distance of the cameras from their mean over the median depth
-    focal: float  # over the longer side
-
-    @property
-    def calibrates(self) -> bool:
-        """True if the geometry is strong enough to trust the focal length that came out."""
-        low, high = FOCAL_RANGE
-        wide = self.tri_angle_deg >= STRONG_TRI_ANGLE_DEG or self.turn_deg >= STRONG_TURN_DEG
-        return wide and self.spread >= STRONG_SPREAD and low <= self.focal <= high
-
-
-def _geometry(model: Any) -> _Geometry:
-    """Measure the geometry of a model."""
-    camera = model.camera(1)
-    centre = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
-    focal = camera.mean_focal_length() / max(camera.width, camera.height)
-    angle, depth = _angle_and_depth(model, centre)
-    if not centre:
-        return _Geometry(angle, 0.0, 0.0, focal)
-    spread = float(np.sqrt(np.var(list(centre.values()), axis=0).sum()) / max(depth, 1e-12))
-    axes = np.array([model.image(i).cam_from_world().matrix()[2, :3] for i in centre])  # (R, 3)
-    off_mean = (axes @ axes.mean(0)).min() / max(np.linalg.norm(axes.mean(0)), 1e-12)
-    turn = 2 * math.degrees(math.acos(np.clip(off_mean, -1, 1)))
-    return _Geometry(angle, turn, spread, focal)
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """A model that holds together, and the measures that tell a sound one from a wrong one.
-
-    The reprojection error is none of them: wrong models had the smallest.
-    """
-
-    model: Any
-    geometry: _Geometry
-    registered: float  # share of the keyframes
-    parallax_px: float  # what turns of the camera alone cannot explain
-    centre_sigma: float  # largest of a camera's centre, over the extent of the path
-    explained: float  # verified matches
-    problem: str
-
-
-def _measured(model: Any, count: int, pairs: MatchedPairs, fixed: bool) -> _Part:
-    """Measure a model of some of `count` keyframes and name its first problem."""
-    camera, geometry = model.camera(1), _geometry(model)
-    seen = [model.image(i).num_points3D for i in model.reg_image_ids()] or [0]
-    parallax, angle = _parallax_px(model), geometry.tri_angle_deg
-    sigma = relative_centre_sigma(model, not fixed and geometry.calibrates)
-    few = model.num_reg_images() < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
-    checks = (
-        (few, f"only {model.num_reg_images()} of {count} keyframes connect"),
-        (model.num_points3D() < MIN_POINTS,
-         f"only {model.num_points3D()} points could be triangulated"),
-        (np.median(seen) < MIN_POINTS_PER_IMAGE, "the images share too few points"),
-        (parallax < MIN_PARALLAX_PX,
-         "a mere turn of the camera explains all images, so there is no depth"),
-        (angle < MIN_TRI_ANGLE_DEG,
-         f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
-        (camera.has_bogus_params(*FOCAL_RANGE, 1.0),
-         f"the focal length came out as {geometry.focal:.2f} x the width"),
-    )  # fmt: skip
-    problem = next((text for bad, text in checks if bad), "")
-    explained = count_explained(model, pairs)
-    registered = model.num_reg_images() / count
-    return _Part(model, geometry, registered, parallax, sigma, explained, problem)
-
-
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
 PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
@@ -308,13 +219,13 @@ class _Search:
             problem = best[0].problem if best else why
             return [], [f"no camera poses: {problem}; {HOW_TO_FILM}"]
         messages = [
-            f"the focal length changed between {self.names[a]} and {self.names[b]} (x {ratio:.2f}): "
-            "only the frames of one focal length, the most, have poses; do not zoom"
+            f"the focal length changed between {self.names[a]} and {self.names[b]} "
+            f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
             for a, b, ratio in zooms
         ] + messages
         return self._one_camera(sound), messages
 
-    def _best(self, start: float, told: bool) -> tuple[list[_Part], list[str]]:
+    def _best(self, start: float, told: bool) -> tuple[list[Part], list[str]]:
         """Choose the mapper whose sound parts explain most of the verified matches.
 
         The incremental mapper is fast and right where the parallax is strong; where it is weak, it
@@ -331,11 +242,11 @@ class _Search:
             _set_focal(self.database, start, held)
         best = self._parts("incremental", held)
         if not held:
-            best = _confirmed(best, [], MAX_CENTRE_SIGMA)
+            best = confirmed(best, [], MAX_CENTRE_SIGMA)
         elif not self._is_sure(best):
             other = self._parts("global", held)
             best, other = (
-                _confirmed(one, rival, SURE_CENTRE_SIGMA)
+                confirmed(one, rival, SURE_CENTRE_SIGMA)
                 for one, rival in ((best, other), (other, best))
             )
             best = max(other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1))
@@ -343,7 +254,7 @@ class _Search:
             return best, []
         if not told:  # what the mapper made of the focal length is worth nothing
             _set_focal(self.database, start, True)
-            best = _confirmed(self._parts("incremental", True), [], MAX_CENTRE_SIGMA)
+            best = confirmed(self._parts("incremental", True), [], MAX_CENTRE_SIGMA)
         angle = f"{best[0].geometry.tri_angle_deg:.1f} deg" if best else "0 deg"
         weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
         return best, [
@@ -351,7 +262,7 @@ class _Search:
             "rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
         ]
 
-    def _one_camera(self, sound: list[_Part]) -> list[Any]:
+    def _one_camera(self, sound: list[Part]) -> list[Any]:
         """Adjust smaller parts with the camera of the largest: one camera took them all."""
         for part in sound[1:]:
             own, camera = part.model.camera(1), sound[0].model.camera(1)
@@ -359,18 +270,18 @@ class _Search:
             _refine(part.model, False)
         return [part.model for part in sound]
 
-    def _is_sure(self, parts: list[_Part]) -> bool:
+    def _is_sure(self, parts: list[Part]) -> bool:
         """True if parts of strong geometry hold and explain nearly all."""
         sure = [p for p in parts if not p.problem and p.centre_sigma <= SURE_CENTRE_SIGMA]
         registered, matched = sum(p.registered for p in sure), sum(map(len, self.pairs.inliers))
         return registered >= GOOD_REGISTERED and _explained(sure) >= GOOD_EXPLAINED * matched
 
-    def _parts(self, mapper: str, held: bool) -> list[_Part]:
+    def _parts(self, mapper: str, held: bool) -> list[Part]:
         """Run a mapper and measure the parts of its models that hold together, largest first.
 
         What is checked is what comes out: the models are adjusted before.
         """
-        count, taken, parts = len(self.ids), set[int](), list[_Part]()
+        count, taken, parts = len(self.ids), set[int](), list[Part]()
         groups = []
         for model in _run_mapper(self.database, mapper, held, self.ids, self.seed):
             self._adjust(model)
@@ -380,52 +291,18 @@ class _Search:
             alone = _only(model, kept)
             if len(kept) < model.num_reg_images():
                 self._adjust(alone)
-            part = _measured(alone, count, self.pairs, self.fixed)
+            explained = count_explained(alone, self.pairs)
+            part = measured(alone, count, explained, self.fixed)
             parts.append(part)
             taken |= set() if part.problem else kept
         return sorted(parts, key=lambda p: (bool(p.problem), -p.registered))
 
     def _adjust(self, model: Any) -> None:
         """Adjust a model once more, with its intrinsics where they are to be calibrated."""
-        _refine(model, not self.fixed and _geometry(model).calibrates)
+        _refine(model, not self.fixed and geometry_of(model).calibrates)
 
 
-def _confirmed(parts: list[_Part], others: list[_Part], sigma: float) -> list[_Part]:
-    """Find a problem in parts of a larger sigma, unless another mapper came to the same."""
-    found = [
-        replace(part, problem="there is too little parallax to tell where the camera was")
-        if not part.problem
-        and part.centre_sigma > sigma
-        and not any(_same(part.model, other.model) for other in others)
-        else part
-        for part in parts
-    ]
-    return sorted(found, key=lambda p: (bool(p.problem), -p.registered))
-
-
-def _same(one: Any, other: Any) -> bool:
-    """Tell whether two models have their common cameras in the same places.
-
-    One is brought to the other by the mean of the relative orientations, then scale and shift.
-    """
-    ids = sorted({*one.reg_image_ids()} & {*other.reg_image_ids()})
-    if len(ids) < max(3, SAME_IMAGES * max(one.num_reg_images(), other.num_reg_images())):
-        return False
-    a, b = (
-        invert_rigid(np.array([m.image(i).cam_from_world().matrix() for i in ids]))
-        for m in (one, other)
-    )
-    relative = Rotation.from_matrix(b[:, :, :3] @ np.swapaxes(a[:, :, :3], 1, 2))
-    mean = relative.mean()
-    turn = np.degrees((mean.inv() * relative).magnitude())
-    start, end = (c[:, :, 3] - c[:, :, 3].mean(0) for c in (a, b))
-    moved = mean.apply(start)
-    moved *= (moved * end).sum() / max((moved**2).sum(), 1e-12)
-    off = np.linalg.norm(moved - end, axis=1).max() / np.linalg.norm(np.ptp(end, axis=0))
-    return bool(off <= SAME_CENTRE and turn.max() <= SAME_TURN_DEG)
-
-
-def _explained(parts: list[_Part]) -> float:
+def _explained(parts: list[Part]) -> float:
     """Count the verified matches that sound parts explain."""
     return float(sum(part.explained for part in parts if not part.problem))
 
@@ -526,62 +403,6 @@ def _bundle_adjust(model: Any, calibrate: bool, free_centre: bool) -> None:
         chosen.add_image(i)
     chosen.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pc.create_default_bundle_adjuster(options, chosen, model).solve()
-
-
-ANGLE_SAMPLE = 2000  # points of which the median angle is taken, at least (chosen: time)
-
-
-def _angle_and_depth(model: Any, centre: dict[int, Array]) -> tuple[float, float]:
-    """Measure how well points are triangulated.
-
-    Args:
-        centre: of the camera of each image id.
-    Returns:
-        medians over points of the widest angle between two of its rays, in degrees, and of its
-        distance from the cameras.
-    """
-    ids = sorted(model.point3D_ids())
-    if not ids:
-        return 0.0, 0.0
-    angles, depths = [], []
-    for point_id in ids[:: max(1, len(ids) // ANGLE_SAMPLE)]:
-        point = model.point3D(point_id)
-        rays = point.xyz - np.array([centre[e.image_id] for e in point.track.elements])  # (L, 3)
-        length = np.linalg.norm(rays, axis=1)
-        unit = rays / length[:, None]
-        angles.append(math.degrees(math.acos(float(np.clip((unit @ unit.T).min(), -1, 1)))))
-        depths.append(float(np.median(length)))
-    return float(np.median(angles)), float(np.median(depths))
-
-
-MIN_SHARED = 15  # points of a pair of images whose parallax counts (chosen)
-
-
-def _parallax_px(model: Any) -> float:
-    """Measure the parallax that turns of the camera cannot explain.
-
-    Of each pair of images the rays of the shared points are aligned by a rotation; the median
-    residual is the pair's parallax. Returned is the 95th percentile over pairs, in pixels. A camera
-    that only turned looks sound otherwise: a wrong focal length makes up triangulation angles.
-    """
-    rays: dict[int, dict[int, Array]] = {}
-    for image_id in sorted(model.reg_image_ids()):
-        seen = model.image(image_id).get_observation_points2D()
-        xy = np.array([p.xy for p in seen]).reshape(-1, 2)
-        ideal = np.reshape(model.camera(1).cam_from_img(xy), (-1, 2))
-        unit = np.column_stack([ideal, np.ones(len(seen))])  # (n, 3)
-        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-        rays[image_id] = dict(zip([p.point3D_id for p in seen], unit, strict=True))
-    residuals = []
-    for a, b in itertools.combinations(rays, 2):
-        if (b - a) & (b - a - 1) == 0:  # 1, 2, 4, 8 ... keyframes apart
-            both = sorted(rays[a].keys() & rays[b].keys())
-            if len(both) >= MIN_SHARED:
-                one, other = (np.array([rays[i][p] for p in both]) for i in (a, b))  # (n, 3)
-                turned = Rotation.align_vectors(other, one)[0].apply(one)
-                residuals.append(np.median(np.linalg.norm(turned - other, axis=1)))
-    widest = float(np.percentile(residuals, 95)) if residuals else 0.0
-    return widest * float(model.camera(1).mean_focal_length())
 
 
 def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, Any]) -> None:

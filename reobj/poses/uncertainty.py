@@ -14,6 +14,8 @@ from scipy import sparse
 
 from reobj.types import Array, IntArray
 
+# n - |sum of u|^2 / n of the unit rays u to a point that tell its depth: 1 - cos(angle) for two
+MIN_RAY_SPREAD = 1 - np.cos(np.radians(1.5))  # (COLMAP's min_tri_angle)
 CAUCHY_SIGMAS = 2.0  # residual from where an observation counts less, in sigmas (chosen)
 MIN_NOISE_PX = 0.1  # of an observation, pixels of the resized image (chosen: SIFT's best)
 

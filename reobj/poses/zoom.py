@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reobj.poses.consistency import MIN_RAY_SPREAD
+from reobj.poses.uncertainty import MIN_RAY_SPREAD
 from reobj.types import Array, IntArray
 
 WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends those further off)
@@ -33,8 +33,8 @@ def constant_focal(models: list[Any]) -> tuple[IntArray, list[tuple[int, int, fl
     Args:
         models: `pycolmap.Reconstruction`s; ids of images ascend in time.
     Returns:
-        ids of the images of the other focal lengths; and of each change the ids of the images before
-        and after it and the ratio of their focal lengths.
+        ids of the images of the other focal lengths; and of each change the ids of the images
+        before and after it and the ratio of their focal lengths.
     """
     changes = sorted(change for model in models for change in _changes(model))
     changes = [c for c in changes if not any(_beside(c, other) for other in changes)]
