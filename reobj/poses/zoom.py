@@ -51,9 +51,9 @@ def _beside(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
 
     Images next to a change are bent by it.
     """
-    near = one is not other and (one[0] == other[1] or one[1] == other[0])
+    adjacent = one is not other and (one[0] == other[1] or one[1] == other[0])
     log, rival = np.log(one[2]), np.log(other[2])
-    return bool(near and log * rival > 0 and abs(log) < abs(rival))
+    return bool(adjacent and log * rival > 0 and abs(log) < abs(rival))
 
 
 def _changes(model: Any) -> list[tuple[int, int, float]]:
