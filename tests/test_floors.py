@@ -20,12 +20,14 @@ PATHS = [
 FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
-    2: "reobj.files reobj.options reobj.identity.gaps reobj.identity.sampling reobj.sources.masks",
+    2: "reobj.files reobj.options reobj.identity.gaps reobj.identity.sampling reobj.sources.masks "
+    "reobj.poses.arrays",
     3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded "
     "reobj.poses.child reobj.poses.uncertainty",
     4: "reobj.views reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
     "reobj.identity.places reobj.poses.keyframes reobj.poses.features reobj.poses.soundness "
+    "reobj.poses.adjustment "
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
     "reobj.poses.checks reobj.poses.floor reobj.results.ply",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "

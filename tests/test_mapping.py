@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pose_accuracy
@@ -16,7 +17,10 @@ from pose_worlds import DotWorld, ate_percent, textured_room
 import reobj_track as rt
 from reobj.cameras import read_sparse_model
 from reobj.files import Progress
-from reobj.poses.mapping import FOCAL_GUESS, reconstruct
+from reobj.poses import mapping
+from reobj.poses.consistency import MatchedPairs
+from reobj.poses.mapping import FOCAL_GUESS, mapping_child, reconstruct
+from reobj.poses.soundness import Part
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -25,17 +29,19 @@ def parts_of(folder, images, boxes=None, size=None, camera=None, guess=FOCAL_GUE
     """Reconstruct; messages, and the models of all parts."""
     ids = changes.pop("ids", range(1, len(images) + 1))
     options = {"seed": 0, "progress": Progress} | changes
-    mapped = reconstruct(
-        images,
-        ids,
-        [f"{i - 1:03d}.jpg" for i in ids],
-        [np.empty((0, 4))] * len(images) if boxes is None else boxes,
-        size or images[0].shape[1::-1],
-        camera=camera,
-        focal_guess=guess,
-        work_dir=folder,
-        **options,
-    )
+    with mapping_child(folder) as child:
+        mapped = reconstruct(
+            images,
+            ids,
+            [f"{i - 1:03d}.jpg" for i in ids],
+            [np.empty((0, 4))] * len(images) if boxes is None else boxes,
+            size or images[0].shape[1::-1],
+            camera=camera,
+            focal_guess=guess,
+            child=child,
+            work_dir=folder,
+            **options,
+        )
     names = ["sparse", *(f"sparse_part{k}" for k in range(1, len(mapped.models)))]
     assert mapped.models == [folder / name for name in names[: len(mapped.models)]]
     assert sorted(folder.glob("sparse*")) == sorted(mapped.models)
@@ -104,11 +110,59 @@ def arc(count, half_rad):
     return cams
 
 
-def test_with_little_parallax_the_guess_is_kept_and_said(tmp_path):
-    world = DotWorld(count=2500)
-    messages, model = run(tmp_path, [world.image(c) for c in arc(12, 0.2)], guess=1.0)
-    assert "little parallax" in messages[0] and "taken as 1 x" in messages[0]
-    assert len(messages) == 1 and model.cameras[0].K[0, 0] == 480
+@pytest.fixture
+def search(monkeypatch):
+    """A search among 30 keyframes whose mappers' parts are set by the test: `search.made`."""
+    pairs = MatchedPairs(
+        np.array([[1, 2]]), [np.zeros((1000, 2))], dict.fromkeys(range(1, 31)), np.ones((1, 3, 3))
+    )
+    names = {i: f"{i}.jpg" for i in range(1, 31)}
+    search = mapping._Search(Path("database.db"), names, pairs, False, 0)
+    search.made, search.ran = [], []
+
+    def parts(mapper, held):
+        search.ran.append((mapper, held))
+        return search.made
+
+    monkeypatch.setattr(mapping, "_set_focal", lambda *_: None)
+    monkeypatch.setattr(mapping, "constant_focal", lambda _: (np.empty(0), []))
+    monkeypatch.setattr(search, "_parts", parts)
+    monkeypatch.setattr(search, "_one_camera", lambda sound: [part.model for part in sound])
+    return search
+
+
+def part(first=1, last=30, calibrated=True, sigma=0.0005, problem=""):
+    arrays = SimpleNamespace(ids=np.arange(first, last + 1), focal_over_size=0.8)
+    share = (last - first + 1) / 30
+    return Part("model", arrays, calibrated, 2.4, share, 20.0, sigma, 1000, problem)
+
+
+def test_a_focal_length_that_nothing_tells_is_kept_and_said(search):
+    """No mapper's model determines it: the guess is held, and the user is told."""
+    search.made = [part(calibrated=False)]
+    _, (message,) = search.run(None, 0.8)
+    assert message.startswith("little parallax (rays meet at 2.4 deg)")
+    assert "taken as 0.8 x" in message and "--camera" in message
+    assert search.ran == [("incremental", False), ("incremental", True)]
+
+
+def test_a_part_that_is_refused_is_said_and_why(search):
+    search.made = [part(1, 15), part(16, 27, problem="the camera hardly moved"), part(28, 30)]
+    models, messages = search.run(0.8, 0.8)
+    assert models == ["model"] * 2 and search.ran == [("incremental", True), ("global", True)]
+    assert messages == [
+        "a part of the video (16.jpg to 27.jpg) has no poses: the camera hardly moved"
+    ]
+
+
+def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):
+    found = iter([[1], [2], [3], [4]])
+    changes = [(4, 5, 1.3)]
+    monkeypatch.setattr(mapping, "constant_focal", lambda _: (np.array(next(found)), changes))
+    search.made = [part()]
+    models, (message,) = search.run(0.8, 0.8)
+    assert models == [] and "the focal length keeps changing" in message
+    assert len(search.ran) == mapping.MAX_ROUNDS
 
 
 def test_a_given_camera_is_kept(walk, tmp_path):
@@ -147,17 +201,18 @@ def test_features_lie_where_the_dots_are(tmp_path):
 
 # ---- Refusals ------------------------------------------------------------------------------------
 
-# images, word of the message
+TURNED = "mere turn|from clearly different places"
+# images, words of the message
 REFUSED = {
     "two images": (lambda: textured_room(2, 0.5)[0], "only 2 different views"),
     "noise": (
         lambda: list(np.random.default_rng(0).integers(0, 255, (6, 240, 320, 3), np.uint8)),
         "no two keyframes|keyframes connect",
     ),
-    "turn on the spot": (lambda: textured_room(8, 0, 4, size=(320, 240))[0], "mere turn"),
+    "turn on the spot": (lambda: textured_room(8, 0, 4, size=(320, 240))[0], TURNED),
     "turn with little motion": (
         lambda: textured_room(8, 0.005, 4, size=(320, 240))[0],
-        "mere turn",
+        TURNED,
     ),
 }
 
@@ -210,8 +265,9 @@ def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
     code = (
         "import numpy as np; from pathlib import Path; from reobj.files import Progress;"
         "from reobj.poses import mapping; images = list(np.load('images.npy'));"
+        "child = mapping.mapping_child(Path('out'));"
         "print(mapping.__file__, mapping.reconstruct(images, list(range(1, 9)), list('abcdefgh'),"
-        "[np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guess=0.8, seed=0,"
+        "[np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guess=0.8, seed=0, child=child,"
         "work_dir=Path('out'), progress=Progress))"
     )
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}

@@ -12,7 +12,7 @@ import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import Progress
 from reobj.poses import points as room
-from reobj.poses.child import run_child
+from reobj.poses.child import Child
 from reobj.poses.points import choose_keyframes, choose_pairs, path_steps, triangulate
 
 pytest.importorskip("pycolmap")
@@ -101,10 +101,10 @@ def test_nothing_to_triangulate_is_a_message_and_no_exception(images, tmp_path):
 def test_a_child_that_stops_is_a_message(corner, tmp_path, monkeypatch):
     _, given, video, _, _ = corner
 
-    def stop(module, folder, log_path, progress):
-        return run_child("reobj.poses.nothing", folder, log_path, progress)
+    def stop(module, folder, log_path):
+        return Child("reobj.poses.nothing", folder, log_path)
 
-    monkeypatch.setattr(room, "run_child", stop)
+    monkeypatch.setattr(room, "Child", stop)
     (message,) = run(video, given, tmp_path).messages
     assert "the triangulation stopped (exit code 1), see" in message
     assert "nothing" in (tmp_path / "points.log").read_text()

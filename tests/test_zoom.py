@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_consistency import CAMERA, Scene
 
+from reobj.poses.arrays import read_arrays
 from reobj.poses.zoom import constant_focal
 
 
@@ -27,28 +28,32 @@ def zoomed_scene(zoomed, ratio, seed=0, noise_px=0.3):
     return scene
 
 
+def views_of(*scene, **options):
+    return read_arrays(zoomed_scene(*scene, **options).model())
+
+
 @pytest.mark.parametrize("ratio", [1.3, 1 / 1.3])
 def test_images_of_another_focal_length_are_found(ratio):
-    others, changes = constant_focal([zoomed_scene(range(7, 13), ratio).model()])
+    others, changes = constant_focal([views_of(range(7, 13), ratio)])
     assert others.tolist() == list(range(8, 14))
     assert [(a, b) for a, b, _ in changes] == [(7, 8), (13, 14)]
     np.testing.assert_allclose([r for _, _, r in changes], [ratio, 1 / ratio], rtol=0.1)
 
 
 def test_the_focal_length_of_most_images_is_kept():
-    others, _ = constant_focal([zoomed_scene(range(6, 20), 1.3).model()])
+    others, _ = constant_focal([views_of(range(6, 20), 1.3)])
     assert others.tolist() == list(range(1, 7))
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.04])
 def test_one_focal_length_is_left_in_peace(ratio):
     """Also where the lens breathes by a few per cent as it focuses."""
-    others, changes = constant_focal([zoomed_scene(range(7, 13), ratio, noise_px=1.0).model()])
+    others, changes = constant_focal([views_of(range(7, 13), ratio, noise_px=1.0)])
     assert len(others) == 0 and changes == []
 
 
 def test_models_apart_are_looked_at_each():
-    one, other = zoomed_scene(range(0), 1.0).model(), zoomed_scene(range(7, 13), 1.3).model()
+    one, other = views_of(range(0), 1.0), views_of(range(7, 13), 1.3)
     assert constant_focal([one])[1] == [] and len(constant_focal([one, other])[1]) == 2
     assert constant_focal([])[0].tolist() == []
 
@@ -56,4 +61,4 @@ def test_models_apart_are_looked_at_each():
 def test_too_few_points_tell_nothing():
     scene = zoomed_scene(range(7, 13), 1.3)
     scene.seen[:, 30:] = False
-    assert constant_focal([scene.model()])[1] == []
+    assert constant_focal([read_arrays(scene.model())])[1] == []

@@ -19,8 +19,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from reobj.cameras import import_pycolmap, invert_rigid
-from reobj.poses.uncertainty import MIN_RAY_SPREAD
+from reobj.cameras import import_pycolmap
+from reobj.poses.arrays import MIN_RAY_SPREAD, ModelArrays
 from reobj.types import Array, BoolArray, IntArray
 
 
@@ -114,111 +114,65 @@ MIN_SEEN = 0.03  # share of such points that must be found again (measured: righ
 MIN_EXPECTED = 100
 
 
-def consistent_groups(model: Any, pairs: MatchedPairs) -> list[IntArray]:
+def consistent_groups(arrays: ModelArrays, pairs: MatchedPairs) -> list[IntArray]:
     """Split the images of a model into groups that hold together.
 
     Args:
-        model: a `pycolmap.Reconstruction` with one camera; ids ascend in time.
-        pairs: verified matches of its database.
+        arrays: ids of its images ascend in time. pairs: verified matches of its database.
     Returns:
         ids of the images of each group, the largest group first; images that hang on by too little
         are in none.
     """
-    views, matches = _read_views(model), _explained_matches(model, pairs)
-    todo, groups = _runs_of_tied_neighbours(model, pairs, views.ids), []
+    explained, groups = count_explained(arrays, pairs), []
+    todo = _runs_of_tied_neighbours(arrays, pairs, explained)
     while todo:
         rows = todo.pop()
-        side = _weak_cut(views, rows, matches)
+        side = _weak_cut(arrays, rows, pairs, explained)
         if side is None:
-            groups.append(views.ids[rows])
+            groups.append(arrays.ids[rows])
             continue
         todo += [rows[s] for s in (side, ~side) if s.sum() >= MIN_GROUP]
     return sorted(groups, key=lambda g: (-len(g), int(g[0])))
 
 
-@dataclass(frozen=True, slots=True)
-class _Views:
-    """A model as arrays: R images, N points.
+def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
+    """Count the verified matches (P,) of each pair that lie on the model's epipolar lines.
 
-    Attributes:
-        ids: (R,) of the images, ascending. cam_from_world: (R, 3, 4).
-        img_from_cam: (3, 3), without distortion. size: (w, h).
-        xyz: (N, 3) points. seen: (R, N) sparse, 1 where an image observes a point.
-    """
+    The distance is Sampson's, to first order. A pair with an image that is not in the model has
+    none.
 
-    ids: IntArray
-    cam_from_world: Array
-    img_from_cam: Array
-    size: tuple[int, int]
-    xyz: Array
-    seen: Any
-
-
-def _read_views(model: Any) -> _Views:
-    ids = np.array(sorted(model.reg_image_ids()), np.int64)
-    row = {int(i): r for r, i in enumerate(ids)}
-    points = [model.point3D(i) for i in sorted(model.point3D_ids())]
-    observed = {
-        (row[element.image_id], column)
-        for column, point in enumerate(points)
-        for element in point.track.elements
-    }
-    at = np.array(sorted(observed), np.int64).reshape(-1, 2)
-    camera = model.camera(next(iter(model.cameras)))
-    return _Views(
-        ids,
-        np.array([model.image(int(i)).cam_from_world().matrix() for i in ids]).reshape(-1, 3, 4),
-        np.array(camera.calibration_matrix()),
-        (camera.width, camera.height),
-        np.array([point.xyz for point in points]).reshape(-1, 3),
-        sparse.csr_matrix((np.ones(len(at)), at.T), (len(ids), len(points))),
-    )
-
-
-def explained_share(model: Any, pairs: MatchedPairs, rows: IntArray) -> Array:
-    """Compute the share of the verified matches of pairs that lie on the model's epipolar lines.
-
-    Args:
-        rows: (n,) of `pairs`; both images are in the model.
-    Returns:
-        (n,) shares; the distance is Sampson's, to first order.
     Ref: Hartley and Zisserman 2004, eq. 11.9.
     """
-    camera = model.camera(next(iter(model.cameras)))
-    focal, shares = camera.mean_focal_length(), np.ones(len(rows))
-    for k, pair in enumerate(rows):
-        rays, poses = [], []
-        for side, image_id in enumerate(pairs.image_ids[pair].tolist()):
-            xy = pairs.keypoints[image_id][pairs.inliers[pair][:, side]]
-            ideal = np.reshape(camera.cam_from_img(xy), (-1, 2))
-            rays.append(np.column_stack([ideal, np.ones(len(xy))]))  # (m, 3)
-            poses.append(model.image(image_id).cam_from_world().matrix())
-        rotation = poses[1][:, :3] @ poses[0][:, :3].T
-        x, y, z = poses[1][:, 3] - rotation @ poses[0][:, 3]
-        E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-        line_b, line_a = rays[0] @ E.T, rays[1] @ E  # (m, 3)
+    inside = np.flatnonzero(np.isin(pairs.image_ids, arrays.ids).all(1))  # (p,)
+    ids = arrays.ids.tolist()
+    first = np.cumsum([0, *(len(pairs.keypoints[i]) for i in ids)])  # keypoint of each image
+    xy = np.concatenate([np.empty((0, 2)), *(pairs.keypoints[i] for i in ids)])
+    ideal = np.reshape(arrays.camera.cam_from_img(xy), (-1, 2))
+    a, b = np.searchsorted(arrays.ids, pairs.image_ids[inside]).T  # (p,)
+    rotation, shift = arrays.cam_from_world[:, :, :3], arrays.cam_from_world[:, :, 3]
+    turn = rotation[b] @ np.swapaxes(rotation[a], 1, 2)  # (p, 3, 3)
+    x, y, z = (shift[b] - np.einsum("pij,pj->pi", turn, shift[a])).T
+    none = np.zeros(len(x))
+    cross = np.moveaxis(np.array([[none, -z, y], [z, none, -x], [-y, x, none]]), 2, 0)
+    E = cross @ turn
+    count = np.zeros(len(pairs.inliers), np.int64)
+    for k, row in enumerate(inside.tolist()):
+        match = pairs.inliers[row]
+        one, other = (
+            np.insert(ideal[first[image[k]] + match[:, side]], 2, 1, 1)  # (n, 3)
+            for side, image in enumerate((a, b))
+        )
+        line_b, line_a = one @ E[k].T, other @ E[k]
         slope = (line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)
-        distance = np.abs((rays[1] * line_b).sum(1)) / np.sqrt(slope + 1e-18) * focal
-        shares[k] = np.mean(distance < EXPLAINED_PX)
-    return shares
+        distance = np.abs((other * line_b).sum(1)) / np.sqrt(slope + 1e-18) * arrays.focal
+        count[row] = (distance < EXPLAINED_PX).sum()
+    return count
 
 
-def _explained_matches(model: Any, pairs: MatchedPairs) -> IntArray:
-    """List pairs of images of a model (P, 3): both ids, how many verified matches it explains."""
-    inside = np.isin(pairs.image_ids, model.reg_image_ids()).all(1)
-    rows = np.flatnonzero(inside & np.array([len(m) > 0 for m in pairs.inliers], bool))
-    counts = np.array([len(pairs.inliers[row]) for row in rows])
-    explained = np.round(explained_share(model, pairs, rows) * counts).astype(np.int64)
-    return np.column_stack([pairs.image_ids[rows], explained])
-
-
-def count_explained(model: Any, pairs: MatchedPairs) -> int:
-    """Count the verified matches between the images of a model that the model explains."""
-    return int(_explained_matches(model, pairs)[:, 2].sum())
-
-
-def _runs_of_tied_neighbours(model: Any, pairs: MatchedPairs, ids: IntArray) -> list[IntArray]:
-    """Split rows of `ids` where the model does not hold the matches of neighbours in time together.
+def _runs_of_tied_neighbours(
+    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray
+) -> list[IntArray]:
+    """Split rows of images where the model does not hold the matches of neighbours in time.
 
     Images that follow each other show one place (others may be alike by chance), so the model must
     have their verified matches (`_ties`). It does not where the camera was put at a twin of its
@@ -229,21 +183,23 @@ def _runs_of_tied_neighbours(model: Any, pairs: MatchedPairs, ids: IntArray) -> 
         rows (n,) of each run, ascending.
     """
     every = sorted(pairs.keypoints)  # keyframes in the order of time, registered or not
-    tied = _ties(model, pairs, every)
+    tied = _ties(arrays, pairs, explained, every)
     links = [tied.get(pair) for pair in itertools.pairwise(every)]
     around = zip([None, *links], [*links, None], strict=True)
-    inside = set(ids.tolist())
+    inside = set(arrays.ids.tolist())
     kept = [k for k, sides in enumerate(around) if every[k] in inside and sides != (False, False)]
     starts = [
         n
         for n, (a, b) in enumerate(itertools.pairwise(kept), 1)
         if False in links[a:b] and not (b - a > 1 and tied.get((every[a], every[b])))
     ]
-    rows = np.searchsorted(ids, [every[k] for k in kept])
+    rows = np.searchsorted(arrays.ids, [every[k] for k in kept])
     return [run for run in np.split(rows, starts) if len(run)]
 
 
-def _ties(model: Any, pairs: MatchedPairs, every: list[int]) -> dict[tuple[int, int], bool]:
+def _ties(
+    arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, every: list[int]
+) -> dict[tuple[int, int], bool]:
     """Tell of each pair of images with enough verified matches whether the model has them.
 
     A good share must be one point of the model, two observations each; and an essential matrix of
@@ -253,11 +209,11 @@ def _ties(model: Any, pairs: MatchedPairs, every: list[int]) -> dict[tuple[int, 
         every: ids in the order of time; pairs with up to 3 images between them are looked at.
     """
     at = {number: k for k, number in enumerate(every)}
-    point_of = {
-        i: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(i).points2D])
-        for i in model.reg_image_ids()
-    }
-    ties = {}
+    point_of, ties = {}, {}
+    for row, image_id in enumerate(arrays.ids.tolist()):
+        point_of[image_id] = np.full(len(pairs.keypoints[image_id]), -1)
+        mine = arrays.image == row
+        point_of[image_id][arrays.keypoint[mine]] = arrays.point[mine]
     for row, (a, b) in enumerate(pairs.image_ids.tolist()):
         matches = pairs.inliers[row]
         if len(matches) < MIN_MATCHES or at[b] - at[a] > MAX_NEIGHBOUR:
@@ -266,17 +222,17 @@ def _ties(model: Any, pairs: MatchedPairs, every: list[int]) -> dict[tuple[int, 
         if a in point_of and b in point_of:
             one, other = point_of[a][matches[:, 0]], point_of[b][matches[:, 1]]
             shared = np.mean((one == other) & (one >= 0))
-            ties[a, b] = bool(shared >= MIN_TIED and not _contradicted(model, pairs, row))
+            against = _contradicted(arrays, pairs, row, int(explained[row]))
+            ties[a, b] = bool(shared >= MIN_TIED and not against)
     return ties
 
 
-def _contradicted(model: Any, pairs: MatchedPairs, row: int) -> bool:
+def _contradicted(arrays: ModelArrays, pairs: MatchedPairs, row: int, explained: int) -> bool:
     """Tell whether two images' own essential matrix explains many more matches than the model."""
     matches, (a, b) = pairs.inliers[row], pairs.image_ids[row].tolist()
-    explained = float(explained_share(model, pairs, np.array([row]))[0]) * len(matches)
     if len(matches) - explained < MIN_MATCHES:
         return False
-    camera, ransac = model.camera(1), {"max_error": EXPLAINED_PX, "random_seed": 0}
+    camera, ransac = arrays.camera, {"max_error": EXPLAINED_PX, "random_seed": 0}
     xy = pairs.keypoints[a][matches[:, 0]], pairs.keypoints[b][matches[:, 1]]
     own = import_pycolmap().estimate_essential_matrix(*xy, camera, camera, ransac)
     return bool(own is not None and own["num_inliers"] - explained >= MIN_MATCHES)
@@ -289,7 +245,9 @@ def _shared_points(seen: Any) -> Array:
     return shared
 
 
-def _weak_cut(views: _Views, rows: IntArray, matches: IntArray) -> BoolArray | None:
+def _weak_cut(
+    arrays: ModelArrays, rows: IntArray, pairs: MatchedPairs, explained: IntArray
+) -> BoolArray | None:
     """Find two groups of images that too little ties together.
 
     Candidates are the cuts of the spanning tree of most shared points. A point ties two groups,
@@ -299,11 +257,11 @@ def _weak_cut(views: _Views, rows: IntArray, matches: IntArray) -> BoolArray | N
     few too: chance matches of a symmetric thing add up over images.
 
     Args:
-        matches: (P, 3) as `_explained_matches`.
+        explained: (P,) matches of each pair.
     Returns:
-        (R,) True on one side, None if all holds together.
+        (n,) True on one side of `rows`, None if all holds together.
     """
-    seen = views.seen[rows]
+    seen = arrays.seen()[rows]
     shared = _shared_points(seen)
     tree = minimum_spanning_tree(sparse.csr_matrix(np.where(shared > 0, 1 / (shared + 1), 0)))
     order, parent = breadth_first_order(tree, 0, directed=False)
@@ -313,17 +271,17 @@ def _weak_cut(views: _Views, rows: IntArray, matches: IntArray) -> BoolArray | N
     for child in order[:0:-1]:
         below[parent[child]] |= below[child]
     cuts = below[order[1:]]  # (R - 1, R) one for each edge of the tree
-    inside = matches[np.isin(matches[:, :2], views.ids[rows]).all(1)]
-    one, other = np.searchsorted(views.ids[rows], inside[:, :2]).T
-    across = np.where(cuts[:, one] != cuts[:, other], inside[:, 2], 0)  # (R - 1, P)
-    bridge = np.minimum(_bridges(views, rows, cuts), across.max(1, initial=0))
+    inside = np.flatnonzero(np.isin(pairs.image_ids, arrays.ids[rows]).all(1) & (explained > 0))
+    one, other = np.searchsorted(arrays.ids[rows], pairs.image_ids[inside]).T
+    across = np.where(cuts[:, one] != cuts[:, other], explained[inside], 0)  # (R - 1, p)
+    bridge = np.minimum(_bridges(arrays, rows, cuts), across.max(1, initial=0))
     for cut in np.argsort(bridge, kind="stable"):
         if bridge[cut] < MIN_BRIDGE:
             return np.asarray(cuts[cut])
     smaller = np.minimum(cuts.sum(1), (~cuts).sum(1))
     groups = np.flatnonzero(smaller >= MIN_GROUP)
     for cut in groups[np.argsort(bridge[groups], kind="stable")[:WEAKEST_CUTS]]:
-        expected, found = _found_again(views, rows, np.asarray(cuts[cut]))
+        expected, found = _found_again(arrays, rows, np.asarray(cuts[cut]))
         if expected >= MIN_EXPECTED and found < MIN_SEEN * expected:
             return np.asarray(cuts[cut])
     return None
@@ -332,16 +290,15 @@ def _weak_cut(views: _Views, rows: IntArray, matches: IntArray) -> BoolArray | N
 CUTS_AT_ONCE = 50  # whose bridges are counted together (chosen: memory)
 
 
-def _bridges(views: _Views, rows: IntArray, cuts: BoolArray) -> IntArray:
+def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
     """Count the points (C,) that tie the two sides of each cut (C, R) of `rows`.
 
     The depth of a point is told by n rays whose directions u spread: n - |sum of u|^2 / n, which is
     1 - cos(angle) for two.
     """
-    centre = invert_rigid(views.cam_from_world[rows])[:, :, 3]  # (R, 3)
-    seen = views.seen[rows].tocsc()
+    centre, seen = arrays.centre[rows], arrays.seen()[rows].tocsc()
     at = seen.tocoo()
-    ray = views.xyz[at.col] - centre[at.row]  # (m, 3)
+    ray = arrays.xyz[at.col] - centre[at.row]  # (m, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     rays = [sparse.csc_matrix((u, (at.row, at.col)), seen.shape) for u in ray.T]
     count = np.zeros(len(cuts), np.int64)
@@ -357,7 +314,7 @@ def _bridges(views: _Views, rows: IntArray, cuts: BoolArray) -> IntArray:
     return count
 
 
-def _found_again(views: _Views, rows: IntArray, side: BoolArray) -> tuple[int, int]:
+def _found_again(arrays: ModelArrays, rows: IntArray, side: BoolArray) -> tuple[int, int]:
     """Count the observations that the images of one side should have of the other side's points.
 
     Expected is a point that two images of its side see, in an image of the other side that it lies
@@ -368,20 +325,22 @@ def _found_again(views: _Views, rows: IntArray, side: BoolArray) -> tuple[int, i
     Returns:
         how many are expected, and how many of these were made; of both directions together.
     """
-    pose, size = views.cam_from_world[rows], np.array(views.size)
-    centre = -np.einsum("nij,ni->nj", pose[:, :, :3], pose[:, :, 3])  # (R, 3)
+    pose, centre, camera = arrays.cam_from_world[rows], arrays.centre[rows], arrays.camera
+    every, size = arrays.seen()[rows], (camera.width, camera.height)
+    img_from_cam = np.array(camera.calibration_matrix())
     expected = found = 0
     for own in (side, ~side):
-        seen = views.seen[rows[own]]
+        seen = every[own]
         points = np.flatnonzero(np.asarray(seen.sum(0)).ravel() >= 2)  # (n,)
-        xyz, seen = views.xyz[points], seen[:, points].tocoo()
-        there = views.seen[rows[~own]][:, points].tocsr()
+        xyz, seen = arrays.xyz[points], seen[:, points].tocoo()
+        there = every[~own][:, points].tocsr()
         border = np.argsort(-np.asarray(there.sum(1)).ravel(), kind="stable")[:BORDER_IMAGES]
         ray = centre[own][seen.row] - xyz[seen.col]  # (m, 3) from the point to a camera that has it
         length = np.linalg.norm(ray, axis=1)
         for image in border:
-            camera = pose[~own][image]
-            at = (xyz @ camera[:, :3].T + camera[:, 3]) @ views.img_from_cam.T  # (n, 3)
+            there_from_world = pose[~own][image]
+            at = xyz @ there_from_world[:, :3].T + there_from_world[:, 3]  # (n, 3)
+            at = at @ img_from_cam.T
             inside = at[:, 2] > 0
             xy = at[:, :2] / np.where(inside, at[:, 2], 1)[:, None]
             inside &= ((xy > 0) & (xy < size)).all(1)

@@ -21,7 +21,7 @@ from reobj.files import Progress, spans
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import MAX_FLOW, MIN_FLOW, ResizedFrame, ResizedVideo, pick_keyframes
 from reobj.poses.localize import fill_gaps, locate_between
-from reobj.poses.mapping import FOCAL_GUESS, reconstruct
+from reobj.poses.mapping import FOCAL_GUESS, mapping_child, reconstruct
 from reobj.types import Array, BoolArray, IntArray, ReobjError, option
 
 MAX_GAP = 15  # most lost frames in a row that are interpolated (chosen: half a second at 30 Hz)
@@ -82,39 +82,41 @@ def estimate_poses(
         raise ReobjError("a live camera gives no poses: record a video first, or --poses none")
     size = (int(video.size[0]), int(video.size[1]))
     camera, resized = parse_camera(config.camera, size), ResizedVideo(video, config.size_px)
-    line = progress("keyframes", video.expected)
-    keys = _enough_keyframes(resized, MAX_KEYFRAMES, line)
-    focal = _exif_focal(video) or FOCAL_GUESS
+    with mapping_child(work_dir) as child:
+        line = progress("keyframes", video.expected)
+        keys = _enough_keyframes(resized, MAX_KEYFRAMES, line)
+        focal = _exif_focal(video) or FOCAL_GUESS
 
-    def mapped(keys: list[ResizedFrame]) -> tuple[list[SparseModel], list[str]]:
-        found = reconstruct(
-            [key.bgr for key in keys],
-            [key.row + 1 for key in keys],
-            [_frame_name(video, key.frame) for key in keys],
-            [
-                np.empty((0, 4)) if boxes_to_mask is None
-                else np.reshape(boxes_to_mask(key.frame), (-1, 4))
-                for key in keys
-            ],
-            size,
-            camera=camera,
-            focal_guess=focal,
-            seed=config.seed,
-            work_dir=work_dir,
-            progress=progress,
-        )  # fmt: skip
-        return [read_sparse_model(model) for model in found.models], found.messages
+        def mapped(keys: list[ResizedFrame]) -> tuple[list[SparseModel], list[str]]:
+            found = reconstruct(
+                [key.bgr for key in keys],
+                [key.row + 1 for key in keys],
+                [_frame_name(video, key.frame) for key in keys],
+                [
+                    np.empty((0, 4)) if boxes_to_mask is None
+                    else np.reshape(boxes_to_mask(key.frame), (-1, 4))
+                    for key in keys
+                ],
+                size,
+                camera=camera,
+                focal_guess=focal,
+                seed=config.seed,
+                child=child,
+                work_dir=work_dir,
+                progress=progress,
+            )  # fmt: skip
+            return [read_sparse_model(model) for model in found.models], found.messages
 
-    row_of = {_frame_name(video, number): row for row, number in enumerate(resized.frames)}
-    models, messages = mapped(keys)
-    part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
-    more = rows_around_breaks([key.row for key in keys], part_rows)
-    if models and more:  # the same again with more keyframes where it broke
-        wanted = set(more)
-        extra = [frame for frame in resized if frame.row in wanted]
-        keys = sorted([*keys, *extra], key=lambda key: key.row)
+        row_of = {_frame_name(video, number): row for row, number in enumerate(resized.frames)}
         models, messages = mapped(keys)
         part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
+        more = rows_around_breaks([key.row for key in keys], part_rows)
+        if models and more:  # the same again with more keyframes where it broke
+            wanted = set(more)
+            extra = [frame for frame in resized if frame.row in wanted]
+            keys = sorted([*keys, *extra], key=lambda key: key.row)
+            models, messages = mapped(keys)
+            part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
     shutil.rmtree(work_dir / "mapping", ignore_errors=True)
     frame, time_s = np.array(resized.frames, np.int64), np.array(resized.times_s, np.float64)
     if not models:

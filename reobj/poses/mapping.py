@@ -1,6 +1,6 @@
 """Reconstruction of the keyframes by pycolmap, in a child process.
 
-`reconstruct` hands the keyframes over as files; the child (`python -m reobj.poses.mapping FOLDER`)
+`reconstruct` hands the keyframes over as files; the child (`mapping_child`)
 extracts features, matches pairs, estimates the focal length from them, runs one or two mappers,
 adjusts what they make, takes apart what does not hold together (`consistency`, `zoom`), and keeps
 the parts that are sound (`soundness`). Which frames are keyframes and where the frames between them
@@ -14,9 +14,8 @@ import hashlib
 import itertools
 import json
 import shutil
-import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,8 @@ import numpy as np
 
 from reobj.cameras import Camera, import_pycolmap
 from reobj.files import Progress, atomic
-from reobj.poses.child import run_child, send_progress
+from reobj.poses.adjustment import Adjusted, adjusted
+from reobj.poses.child import Child, send_progress, serve
 from reobj.poses.consistency import (
     MatchedPairs,
     consistent_groups,
@@ -34,15 +34,14 @@ from reobj.poses.consistency import (
 )
 from reobj.poses.features import choose_pairs, extract_features, match_pairs
 from reobj.poses.soundness import (
-    MAX_CENTRE_SIGMA,
+    MIN_PART_IMAGES,
     SURE_CENTRE_SIGMA,
     Part,
     confirmed,
-    geometry_of,
     measured,
 )
 from reobj.poses.zoom import constant_focal
-from reobj.types import Array, Image
+from reobj.types import Array, Image, IntArray
 
 HOW_TO_FILM = (
     "move the camera sideways around the objects (turning on the spot gives no depth), keep things "
@@ -63,6 +62,11 @@ class Mapped:
     messages: list[str]
 
 
+def mapping_child(work_dir: Path) -> Child:
+    """Start the child process that maps below `work_dir`, with its log there."""
+    return Child("reobj.poses.mapping", work_dir / "mapping", work_dir / "pycolmap.log")
+
+
 def reconstruct(
     images: Sequence[Image],
     ids: Sequence[int],
@@ -73,6 +77,7 @@ def reconstruct(
     camera: Camera | None,
     focal_guess: float,
     seed: int,
+    child: Child,
     work_dir: Path,
     progress: Callable[[str, int], Progress],
 ) -> Mapped:
@@ -87,6 +92,7 @@ def reconstruct(
         moving_boxes: (N, 4) xyxy of each image, native pixels: no features there.
         size: (w, h), native. camera: kept as it is; None: calibrated.
         focal_guess: over the longer side, used where the matches do not tell the focal length.
+        child: `mapping_child` of `work_dir`.
     """
     folder = work_dir / "mapping"
     for old in work_dir.glob("sparse*"):
@@ -116,7 +122,7 @@ def reconstruct(
     with atomic(path) as part:
         part.write_text(json.dumps(job))
     (folder / "messages.json").unlink(missing_ok=True)
-    problem = run_child("reobj.poses.mapping", folder, work_dir / "pycolmap.log", progress)
+    problem = child.run(progress)
     if not (folder / "messages.json").exists():
         why = f"no camera poses: the reconstruction {problem}; give --poses"
         return Mapped([], [why])
@@ -204,12 +210,14 @@ class _Search:
         Returns:
             models of the parts, the largest first ([]: none is sound); messages.
         """
-        start, zooms = focal or guess, list[tuple[int, int, float]]()
-        for _ in range(MAX_ROUNDS):
-            best, messages = self._best(start, focal is not None)
-            others, changes = constant_focal([part.model for part in best])
+        zooms = list[tuple[int, int, float]]()
+        for left in range(MAX_ROUNDS)[::-1]:
+            best, messages = self._best(focal or guess, focal is not None)
+            others, changes = constant_focal([part.arrays for part in best])
             if not len(others):
                 break
+            if not left:
+                best = [replace(part, problem="the focal length keeps changing") for part in best]
             zooms += changes
             self.ids = [i for i in self.ids if i not in set(others.tolist())]
             self.pairs = self.pairs.only(self.ids)
@@ -223,6 +231,11 @@ class _Search:
             f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
             for a, b, ratio in zooms
         ] + messages
+        for part in best:
+            ids = part.arrays.ids.tolist()
+            if part.problem and len(ids) >= MIN_PART_IMAGES:
+                ends = f"{self.names[ids[0]]} to {self.names[ids[-1]]}"
+                messages.append(f"a part of the video ({ends}) has no poses: {part.problem}")
         return self._one_camera(sound), messages
 
     def _best(self, start: float, told: bool) -> tuple[list[Part], list[str]]:
@@ -230,32 +243,30 @@ class _Search:
 
         The incremental mapper is fast and right where the parallax is strong; where it is weak, it
         ends in a wrong one of many nearly equal solutions more often than the global mapper, which
-        needs a focal length and is believed unless it explains clearly less. With the focal length
-        that the matches tell, both hold it: freed too early it drifts to a wrong one, and pieces
-        are joined wrongly. The last adjustment frees it.
+        needs a focal length and is believed unless it explains clearly less. The focal length that
+        the matches tell, or else the incremental mapper, is held: freed too early it drifts to a
+        wrong one, and pieces are joined wrongly. The last adjustment frees it.
 
         Args:
             start: focal length over the longer side. told: by the matches.
         """
-        held = self.fixed or told
+        if not (told or self.fixed):
+            _set_focal(self.database, start, False)
+            best = confirmed(self._parts("incremental", False), [])
+            if best and best[0].calibrated:
+                if self._is_sure(best):
+                    return best, []
+                start = best[0].focal
         if not self.fixed:
-            _set_focal(self.database, start, held)
-        best = self._parts("incremental", held)
-        if not held:
-            best = confirmed(best, [], MAX_CENTRE_SIGMA)
-        elif not self._is_sure(best):
-            other = self._parts("global", held)
-            best, other = (
-                confirmed(one, rival, SURE_CENTRE_SIGMA)
-                for one, rival in ((best, other), (other, best))
-            )
-            best = max(other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1))
-        if self.fixed or not best or best[0].problem or best[0].geometry.calibrates:
-            return best, []
-        if not told:  # what the mapper made of the focal length is worth nothing
             _set_focal(self.database, start, True)
-            best = confirmed(self._parts("incremental", True), [], MAX_CENTRE_SIGMA)
-        angle = f"{best[0].geometry.tri_angle_deg:.1f} deg" if best else "0 deg"
+        best = self._parts("incremental", True)
+        if not self._is_sure(best):
+            other = self._parts("global", True)
+            best, other = confirmed(best, other), confirmed(other, best)
+            best = max(other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1))
+        if self.fixed or not best or best[0].problem or best[0].calibrated:
+            return best, []
+        angle = f"{best[0].tri_angle_deg:.1f} deg" if best else "0 deg"
         weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
         return best, [
             f"{weak} and is taken as {start:.3g} x the longer side; sizes and depths are "
@@ -267,7 +278,7 @@ class _Search:
         for part in sound[1:]:
             own, camera = part.model.camera(1), sound[0].model.camera(1)
             own.model, own.params = camera.model, camera.params
-            _refine(part.model, False)
+            adjusted(part.model, False)
         return [part.model for part in sound]
 
     def _is_sure(self, parts: list[Part]) -> bool:
@@ -281,30 +292,32 @@ class _Search:
 
         What is checked is what comes out: the models are adjusted before.
         """
-        count, taken, parts = len(self.ids), set[int](), list[Part]()
-        groups = []
+        taken, parts = set[int](), list[Part]()
+        groups = list[tuple[IntArray, Adjusted]]()
         for model in _run_mapper(self.database, mapper, held, self.ids, self.seed):
-            self._adjust(model)
-            groups += [(group, model) for group in consistent_groups(model, self.pairs)]
-        for group, model in sorted(groups, key=lambda found: -len(found[0])):
-            kept = set(group.tolist()) - taken  # models may overlap
-            alone = _only(model, kept)
-            if len(kept) < model.num_reg_images():
-                self._adjust(alone)
-            explained = count_explained(alone, self.pairs)
-            part = measured(alone, count, explained, self.fixed)
+            whole = adjusted(model, not self.fixed)
+            groups += [(group, whole) for group in consistent_groups(whole.arrays, self.pairs)]
+        for group, whole in sorted(groups, key=lambda found: -len(found[0])):
+            kept, alone = set(group.tolist()) - taken, whole  # models may overlap
+            if len(kept) < len(whole.arrays.ids):
+                alone = adjusted(_only(whole.model, kept), not self.fixed)
+            explained = int(count_explained(alone.arrays, self.pairs).sum())
+            part = measured(
+                alone.model,
+                alone.arrays,
+                alone.centre_sigma,
+                count=len(self.ids),
+                explained=explained,
+                calibrated=alone.calibrated,
+            )
             parts.append(part)
             taken |= set() if part.problem else kept
         return sorted(parts, key=lambda p: (bool(p.problem), -p.registered))
 
-    def _adjust(self, model: Any) -> None:
-        """Adjust a model once more, with its intrinsics where they are to be calibrated."""
-        _refine(model, not self.fixed and geometry_of(model).calibrates)
 
-
-def _explained(parts: list[Part]) -> float:
+def _explained(parts: list[Part]) -> int:
     """Count the verified matches that sound parts explain."""
-    return float(sum(part.explained for part in parts if not part.problem))
+    return sum(part.explained for part in parts if not part.problem)
 
 
 def _only(model: Any, image_ids: set[int]) -> Any:
@@ -329,7 +342,7 @@ def _set_focal(database: Path, guess: float, trusted: bool) -> None:
 WEAK_GEOMETRY = {  # COLMAP's options, so that weak parallax is taken too (chosen)
     "mapper": {"init_min_tri_angle": 4, "init_min_num_inliers": 40, "abs_pose_min_num_inliers": 15,
                "abs_pose_min_inlier_ratio": 0.15, "filter_min_tri_angle": 0.5},
-    "triangulation": {"min_angle": 0.5, "ignore_two_view_tracks": False},
+    "triangulation": {"min_angle": 0.5},
 }  # fmt: skip
 
 
@@ -349,60 +362,15 @@ def _run_mapper(database: Path, mapper: str, held: bool, ids: list[int], seed: i
         options["mapper"] = {"bundle_adjustment": kept}
         return list(pc.global_mapping(*paths, options=options).values())
     options |= {"multiple_models": True, "min_model_size": 3, "extract_colors": False}
-    # global adjustment more rarely and less exactly than by default (chosen: time; see `_refine`)
-    options |= {"ba_global_frames_ratio": 1.4, "ba_global_points_ratio": 1.4}
-    options |= {"ba_global_function_tolerance": 1e-5, "ba_global_max_refinements": 2}
+    # global adjustment more rarely and less exactly than by default (chosen: time; one follows)
+    options |= {"ba_global_frames_ratio": 2.0, "ba_global_points_ratio": 2.0}
+    options |= {"ba_global_function_tolerance": 1e-5, "ba_global_max_refinements": 1}
     options |= {"ba_local_max_refinements": 1}
     options |= {"ba_refine_focal_length": not held, "ba_refine_extra_params": not held}
     options |= WEAK_GEOMETRY
     done = itertools.count(2)
     tick = {"next_image_callback": lambda: send_progress("mapping", min(next(done), count), count)}
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
-
-
-MAX_CENTRE_SHIFT = 0.05  # of the principal point when it is freed, over the size (chosen)
-
-
-def _refine(model: Any, calibrate: bool) -> None:
-    """Adjust cameras and points once more, with a robust loss.
-
-    Args:
-        calibrate: the intrinsics too, with a second distortion term and the principal point, unless
-            that drifts off.
-    """
-    if not calibrate:
-        _bundle_adjust(model, False, False)
-        return
-    camera = model.camera(1)
-    size = np.array([camera.width, camera.height])
-    focal, distortion = camera.params[0], camera.params[3]
-    camera.model = import_pycolmap().CameraModelId.RADIAL
-    for free_centre in (True, False):
-        camera.params = [focal, *size / 2, distortion, 0]
-        _bundle_adjust(model, True, free_centre)
-        shift = np.abs(np.array([camera.principal_point_x, camera.principal_point_y]) - size / 2)
-        if (shift <= MAX_CENTRE_SHIFT * size).all():
-            break
-
-
-SOFT_L1_PX = 0.5  # from where a residual counts less, pixels of the resized image (chosen)
-
-
-def _bundle_adjust(model: Any, calibrate: bool, free_centre: bool) -> None:
-    """Adjust all images and points; the first two cameras fix the gauge."""
-    pc = import_pycolmap()
-    options, chosen = pc.BundleAdjustmentOptions(), pc.BundleAdjustmentConfig()
-    options.print_summary = False
-    options.refine_focal_length = options.refine_extra_params = calibrate
-    options.refine_principal_point = free_centre
-    options.ceres.loss_function_type = pc.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = SOFT_L1_PX
-    options.ceres.solver_options.function_tolerance = 1e-6
-    options.ceres.solver_options.num_threads = 1  # the same result every time
-    for i in model.reg_image_ids():
-        chosen.add_image(i)
-    chosen.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pc.create_default_bundle_adjuster(options, chosen, model).solve()
 
 
 def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, Any]) -> None:
@@ -426,4 +394,5 @@ def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, An
 
 
 if __name__ == "__main__":
-    _reconstruct_job(Path(sys.argv[1]))
+    import_pycolmap()  # before there is something to do
+    serve(_reconstruct_job)

@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ import numpy as np
 
 from reobj.cameras import Camera, Poses, import_pycolmap, invert_rigid, write_colmap
 from reobj.files import Progress, load_npz, save_npz
-from reobj.poses.child import run_child
+from reobj.poses.child import Child, serve
 from reobj.poses.features import extract_features, match_pairs
 from reobj.sources.video import shrunk
 from reobj.types import Array, Image, IntArray
@@ -75,7 +74,8 @@ def triangulate(
         "seed": seed,
     }
     (folder / "job.json").write_text(json.dumps(job))
-    problem = run_child("reobj.poses.points", folder, work_dir / "points.log", progress)
+    with Child("reobj.poses.points", folder, work_dir / "points.log") as child:
+        problem = child.run(progress)
     if problem:
         return _without_points(poses, f"the triangulation {problem}")
     found, facts = load_npz(folder / "points.npz")
@@ -255,4 +255,4 @@ def _count_matched(database: Path) -> int:
 
 
 if __name__ == "__main__":
-    _triangulate_job(Path(sys.argv[1]))
+    serve(_triangulate_job)

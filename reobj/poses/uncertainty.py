@@ -12,93 +12,88 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from reobj.poses.arrays import ModelArrays
 from reobj.types import Array, IntArray
 
-# n - |sum of u|^2 / n of the unit rays u to a point that tell its depth: 1 - cos(angle) for two
-MIN_RAY_SPREAD = 1 - np.cos(np.radians(1.5))  # (COLMAP's min_tri_angle)
 CAUCHY_SIGMAS = 2.0  # residual from where an observation counts less, in sigmas (chosen)
+MIN_DEPTH = 0.01  # median depths; points at a centre would be infinitely sure (chosen)
 MIN_NOISE_PX = 0.1  # of an observation, pixels of the resized image (chosen: SIFT's best)
 
 
-def relative_centre_sigma(model: Any, free_focal: bool) -> float:
-    """Estimate the largest sigma of a camera centre over the extent of the camera's path.
+def relative_sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, float]:
+    """Estimate sigmas of cameras and focal length.
 
     Args:
-        model: a `pycolmap.Reconstruction`, adjusted. free_focal: its focal length was adjusted too.
+        arrays: of an adjusted model. free_camera: its intrinsics were adjusted too.
     Returns:
-        infinite if the observations do not determine the model.
+        the largest of a camera centre over the extent of the camera's path; that of the log of the
+        focal length, 0 if it is not free. Infinite if the observations do not determine the model.
     Ref: Triggs et al., Bundle Adjustment - A Modern Synthesis, 1999, sections 6 and 9.
     """
-    if model.num_reg_images() < 3 or model.num_points3D() == 0:
-        return float("inf")
-    image, point, pose, J, J_point, J_focal = _weighted_jacobians(model)
-    count, points = len(pose), int(point.max()) + 1
-    size = 6 * count + free_focal
-    V = np.zeros((points, 3, 3))
-    np.add.at(V, point, np.swapaxes(J_point, 1, 2) @ J_point)
+    if len(arrays.ids) < 3 or not len(arrays.image):
+        return np.inf, np.inf
+    pose, by_pose, by_point, by_camera = _weighted_jacobians(arrays)
+    by_camera = by_camera.reshape(-1, by_camera.shape[2])[:, : None if free_camera else 0]
+    poses = 6 * len(pose)
+    J = sparse.hstack(
+        [_spread(by_pose, arrays.image, len(pose)), sparse.csr_matrix(by_camera)]
+    ).tocsr()
+    V = np.zeros((len(arrays.xyz), 3, 3))
+    np.add.at(V, arrays.point, np.swapaxes(by_point, 1, 2) @ by_point)
     V += 1e-9 * np.trace(V, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-12 * np.eye(3)
     root = np.linalg.inv(np.linalg.cholesky(V))  # V^-1 = root' root
-    mixed = np.swapaxes(J, 1, 2) @ J_point @ np.swapaxes(root[point], 1, 2)  # (m, 6, 3)
-    rows = np.broadcast_to(6 * image[:, None, None] + np.arange(6)[:, None], mixed.shape)
-    columns = np.broadcast_to(3 * point[:, None, None] + np.arange(3), mixed.shape)
-    entries, at = mixed.ravel(), (rows.ravel(), columns.ravel())
-    W = sparse.csr_matrix((entries, at), (size, 3 * points))
-    normal, own = np.zeros((size, size)), np.zeros((count, 6, 6))
-    np.add.at(own, image, np.swapaxes(J, 1, 2) @ J)
-    for k, block in enumerate(own):
-        normal[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = block
-    if free_focal:
-        of_point, of_pose = np.zeros((points, 3)), np.zeros((count, 6))
-        np.add.at(of_point, point, np.einsum("mai,ma->mi", J_point, J_focal))
-        np.add.at(of_pose, image, np.einsum("mai,ma->mi", J, J_focal))
-        of_point = (root @ of_point[:, :, None]).reshape(1, -1)
-        last = np.full(3 * points, size - 1), np.arange(3 * points)
-        W = W + sparse.csr_matrix((of_point[0], last), W.shape)
-        normal[-1, :-1] = normal[:-1, -1] = of_pose.ravel()
-        normal[-1, -1] = (J_focal**2).sum()
-    normal -= np.asarray((W @ W.T).todense())
-    centre, similarity = _similarity(pose, size)
+    at = np.arange(len(root) + 1)
+    W = J.T @ _spread(by_point, arrays.point, len(root)) @ sparse.bsr_matrix((root, at[:-1], at)).T
+    normal = (J.T @ J - W @ W.T).toarray()
+    centre, similarity = _similarity(pose, len(normal))
     normal += np.median(np.diag(normal)) * similarity @ similarity.T
     values, vectors = np.linalg.eigh(normal)
     if values[0] <= 1e-12 * values[-1]:
-        return float("inf")
-    variance = ((vectors**2 / values).sum(1)[: 6 * count]).reshape(count, 6)[:, :3].sum(1)
+        return np.inf, np.inf
+    variance = (vectors**2 / values).sum(1)
+    of_centre = variance[:poses].reshape(-1, 6)[:, :3].sum(1)
     extent = np.linalg.norm(np.ptp(centre, axis=0))
-    return float(np.sqrt(variance.max()) / max(extent, 1e-12))
+    focal_sigma = float(np.sqrt(variance[poses])) if free_camera else 0.0
+    return float(np.sqrt(of_centre.max()) / max(extent, 1e-12)), focal_sigma
 
 
-def _weighted_jacobians(model: Any) -> tuple[IntArray, IntArray, Array, Array, Array, Array]:
+def _spread(blocks: Array, column: IntArray, count: int) -> Any:
+    """Put blocks (M, 2, k) below each other, each at one of `count` block columns, sparse."""
+    at, shape = np.arange(len(blocks) + 1), (2 * len(blocks), blocks.shape[2] * count)
+    return sparse.bsr_matrix((blocks, column, at), shape)
+
+
+def _weighted_jacobians(arrays: ModelArrays) -> tuple[Array, Array, Array, Array]:
     """Differentiate the observations, in sigmas of their noise.
 
     Returns:
-        image, point: (m,) rows of each observation. pose: (R, 3, 4) cam_from_world; the median
-        depth is the unit of length. Derivatives by centre and turn of the camera (m, 2, 6), by the
-        point (m, 2, 3), by the log of the focal length (m, 2).
+        pose: (R, 3, 4) cam_from_world; the median depth is the unit of length. Derivatives by
+        centre and turn of the camera (M, 2, 6), by the point (M, 2, 3), by the log of the focal
+        length, the principal point and two terms of radial distortion (M, 2, 5).
     """
-    camera, ids = model.camera(1), sorted(model.reg_image_ids())
-    seen = [(k, p) for k, i in enumerate(ids) for p in model.image(i).get_observation_points2D()]
-    image = np.array([k for k, _ in seen])
-    point_ids, point = np.unique([p.point3D_id for _, p in seen], return_inverse=True)
-    xyz = np.array([model.point3D(int(i)).xyz for i in point_ids])
-    pose = np.array([model.image(i).cam_from_world().matrix() for i in ids])
-    focal = camera.mean_focal_length()
-    xy = focal * np.reshape(camera.cam_from_img(np.array([p.xy for _, p in seen])), (-1, 2))
-    in_cam = np.einsum("mij,mj->mi", pose[image][:, :, :3], xyz[point]) + pose[image][:, :, 3]
+    image, focal, pose = arrays.image, arrays.focal, arrays.cam_from_world.copy()
+    xy, in_cam = focal * arrays.ideal, arrays.in_cam()
     unit = np.median(in_cam[:, 2])
     pose[:, :, 3] /= unit
     X, Y, Z = (in_cam / unit).T
+    in_front = Z > MIN_DEPTH
+    Z = np.where(in_front, Z, 1)
     x, y, none = X / Z, Y / Z, np.zeros(len(X))
     residual = xy - focal * np.column_stack([x, y])
     noise = max(1.4826 * float(np.median(np.abs(residual))), MIN_NOISE_PX)
     weight = 1 / (1 + (residual**2).sum(1) / (CAUCHY_SIGMAS * noise) ** 2)
-    scale = np.sqrt(weight) / noise
+    scale = np.where(in_front, np.sqrt(weight) / noise, 0)
     shift = focal * np.array([[1 / Z, none, -x / Z], [none, 1 / Z, -y / Z]])  # (2, 3, m)
     shift = np.moveaxis(shift, 2, 0) * scale[:, None, None]
     turn = focal * np.array([[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x]])
     turn = np.moveaxis(turn, 2, 0) * scale[:, None, None]
     by_point = shift @ pose[image][:, :, :3]
-    by_focal = focal * np.column_stack([x, y]) * scale[:, None]
-    return image, point, pose, np.concatenate([-by_point, turn], 2), by_point, by_focal
+    one, r2 = np.ones(len(x)), x * x + y * y
+    by_camera = focal * np.array(
+        [[x, one, none, x * r2, x * r2 * r2], [y, none, one, y * r2, y * r2 * r2]]
+    )
+    by_camera = np.moveaxis(by_camera, 2, 0) * scale[:, None, None]
+    return pose, np.concatenate([-by_point, turn], 2), by_point, by_camera
 
 
 def _similarity(pose: Array, size: int) -> tuple[Array, Array]:

@@ -8,13 +8,11 @@ pose and its focal length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
+from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from reobj.poses.uncertainty import MIN_RAY_SPREAD
+from reobj.poses.arrays import MIN_RAY_SPREAD, ModelArrays
 from reobj.types import Array, IntArray
 
 WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends those further off)
@@ -27,18 +25,18 @@ TOLD_BY = 2  # images on each side of a gap that are looked at, and must tell to
 RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
 
 
-def constant_focal(models: list[Any]) -> tuple[IntArray, list[tuple[int, int, float]]]:
+def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int, int, float]]]:
     """Choose the images that were taken at one focal length.
 
     Args:
-        models: `pycolmap.Reconstruction`s; ids of images ascend in time.
+        models: ids of images ascend in time.
     Returns:
         ids of the images of the other focal lengths; and of each change the ids of the images
         before and after it and the ratio of their focal lengths.
     """
-    changes = sorted(change for model in models for change in _changes(model))
+    changes = sorted(change for arrays in models for change in _changes(arrays))
     changes = [c for c in changes if not any(_beside(c, other) for other in changes)]
-    ids = np.array(sorted({i for model in models for i in model.reg_image_ids()}), np.int64)
+    ids = np.array(sorted({int(i) for arrays in models for i in arrays.ids}), np.int64)
     log = np.zeros(len(ids))
     for _, after, ratio in changes:
         log[ids >= after] += np.log(ratio)
@@ -56,90 +54,67 @@ def _beside(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
     return bool(adjacent and log * rival > 0 and abs(log) < abs(rival))
 
 
-def _changes(model: Any) -> list[tuple[int, int, float]]:
+def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between images that follow each other.
 
     On both sides of each gap the next images are seen from the other side; at least two must tell.
     """
-    views, found = _read_rays(model), []
-    focal = model.camera(1).mean_focal_length()
-    for k in range(1, len(views)):
-        before, after = views[max(0, k - WINDOW) : k], views[k : k + WINDOW]
-        ahead = [_log_focal(image, before, focal) for image in after[:TOLD_BY]]
-        back = [_log_focal(image, after, focal) for image in before[: -1 - TOLD_BY : -1]]
-        told = np.array(ahead + [(-log, sigma) for log, sigma in back])
-        told = told[np.isfinite(told[:, 0])]
+    count, found = len(arrays.ids), []
+    ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
+    ray = ray[:, 0] / np.linalg.norm(ray[:, 0], axis=1, keepdims=True)  # (M, 3) in world
+    for k in range(1, count):
+        before, after = range(max(0, k - WINDOW), k), range(k, min(k + WINDOW, count))
+        told = []
+        for side, seen, sign in ((before, after[:TOLD_BY], 1), (after, before[-TOLD_BY:], -1)):
+            points = _triangulate(arrays, ray, side)
+            for image in seen:
+                log, sigma = _log_focal(arrays, image, points)
+                told += [(sign * log, sigma)] if np.isfinite(log) else []
         if len(told) >= TOLD_BY:
             log, sigma = np.median(told, axis=0)
             if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma):
-                found.append((before[-1].image_id, after[0].image_id, float(np.exp(log))))
+                ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
+                found.append((*ids, float(np.exp(log))))
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Rays:
-    """An image's rays to points: point_ids (n,) ascending, ideal (n, 2) at depth 1."""
+def _triangulate(arrays: ModelArrays, ray: Array, side: range) -> Array:
+    """Triangulate points from some images that follow each other: the nearest to all their rays.
 
-    image_id: int
-    cam_from_world: Array
-    point_ids: IntArray
-    ideal: Array
+    Args:
+        ray: (M, 3) unit vector of each observation, in world.
+    Returns:
+        (N, 3) points, NaN where the rays do not tell the depth.
+    """
+    first, last = np.searchsorted(arrays.image, (side.start, side.stop))
+    point, image, u = (a[first:last] for a in (arrays.point, arrays.image, ray))
+    at, row = np.unique(point, return_inverse=True)
+    across = (np.eye(3) - u[:, :, None] * u[:, None]).reshape(-1, 9)  # (m, 9)
+    start = (across.reshape(-1, 3, 3) @ arrays.centre[image][:, :, None])[:, :, 0]
+    one = np.ones((len(u), 1))
+    entries = (np.ones(len(row)), (row, np.arange(len(row))))
+    sums = sparse.csr_matrix(entries, (len(at), len(row))) @ np.hstack([across, start, u, one])
+    n = sums[:, 15]
+    told = n - (sums[:, 12:15] ** 2).sum(1) / np.maximum(n, 1) >= MIN_RAY_SPREAD
+    xyz = np.full((len(arrays.xyz), 3), np.nan)
+    A, b = sums[told, :9].reshape(-1, 3, 3), sums[told, 9:12, None]
+    xyz[at[told]] = np.linalg.solve(A, b)[:, :, 0]
+    return xyz
 
 
-def _read_rays(model: Any) -> list[_Rays]:
-    """Read the images of a model in the order of time."""
-    rays = []
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.image(image_id)
-        seen = image.get_observation_points2D()
-        point_ids, rows = np.unique(
-            np.array([p.point3D_id for p in seen], np.int64), return_index=True
-        )
-        xy = np.array([p.xy for p in seen], np.float64).reshape(-1, 2)[rows]
-        ideal = np.reshape(model.camera(1).cam_from_img(xy), (-1, 2))
-        rays.append(_Rays(image_id, image.cam_from_world().matrix(), point_ids, ideal))
-    return rays
-
-
-def _log_focal(image: _Rays, side: list[_Rays], focal: float) -> tuple[float, float]:
-    """Estimate an image's focal length from points that its neighbours on one side triangulate.
+def _log_focal(arrays: ModelArrays, image: int, points: Array) -> tuple[float, float]:
+    """Estimate an image's focal length from points (N, 3), NaN where there are none.
 
     Returns:
-        log of it over `focal`, and its sigma; NaN with too few points.
+        log of it over that of the model, and its sigma; NaN with too few points.
     """
-    point_ids, points = _triangulate(side, image.point_ids)
-    rows = np.searchsorted(image.point_ids, point_ids)
-    in_cam = points @ image.cam_from_world[:, :3].T + image.cam_from_world[:, 3]
-    front = in_cam[:, 2] > 0
+    first, last = np.searchsorted(arrays.image, (image, image + 1))
+    pose, ideal = arrays.cam_from_world[image], arrays.ideal[first:last]
+    in_cam = points[arrays.point[first:last]] @ pose[:, :3].T + pose[:, 3]
+    front = in_cam[:, 2] > 0  # no NaN
     if front.sum() < MIN_POINTS:
         return np.nan, np.nan
-    return _resect(in_cam[front], image.ideal[rows[front]] * focal, focal)
-
-
-def _triangulate(side: list[_Rays], wanted: IntArray) -> tuple[IntArray, Array]:
-    """Triangulate the wanted points from some images: ids (n,) ascending, xyz (n, 3).
-
-    The point nearest to all its rays in space; points whose depth the rays do not tell are left
-    out.
-    """
-    ids, direction, origin = [], [], []
-    for rays in side:
-        mine = np.isin(rays.point_ids, wanted)
-        rotation, shift = rays.cam_from_world[:, :3], rays.cam_from_world[:, 3]
-        ids.append(rays.point_ids[mine])
-        direction.append(np.insert(rays.ideal[mine], 2, 1, 1) @ rotation)
-        origin.append(np.broadcast_to(-shift @ rotation, direction[-1].shape))
-    unit, start = np.concatenate(direction), np.concatenate(origin)  # (m, 3)
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    point_ids, at = np.unique(np.concatenate(ids), return_inverse=True)
-    n = np.bincount(at, minlength=len(point_ids))
-    across = np.eye(3) - unit[:, :, None] * unit[:, None]  # (m, 3, 3)
-    A, b, total = (np.zeros((len(n), *shape)) for shape in ((3, 3), (3,), (3,)))
-    np.add.at(A, at, across)
-    np.add.at(b, at, (across @ start[:, :, None])[:, :, 0])
-    np.add.at(total, at, unit)
-    told = n - (total**2).sum(1) / np.maximum(n, 1) >= MIN_RAY_SPREAD
-    return point_ids[told], np.linalg.solve(A[told], b[told][:, :, None])[:, :, 0]
+    return _resect(in_cam[front], ideal[front] * arrays.focal, arrays.focal)
 
 
 def _resect(in_cam: Array, xy: Array, focal: float) -> tuple[float, float]:
