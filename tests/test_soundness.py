@@ -129,11 +129,18 @@ def moved(step_m=0.0, turn_deg=0.0, count=12):
 )
 def test_weak_geometry_needs_the_same_from_another_mapper(other, sure):
     weak = part(Scene().model(), 0.002)
-    (found,) = confirmed([weak], [part(moved(**other), 0.002)])
+    (found,) = confirmed([weak], [part(moved(**other), 0.002)], True)
     assert (not found.problem) == sure and ("parallax" in found.problem) != sure
+
+
+def test_two_mappers_prove_less_where_nothing_told_the_focal_length():
+    other = part(moved(), 0.002)
+    for sigma, told, sure in ((0.005, True, True), (0.005, False, False), (0.003, False, True)):
+        (found,) = confirmed([part(Scene().model(), sigma)], [other], told)
+        assert (not found.problem) == sure
 
 
 def test_strong_geometry_needs_nobody_and_a_problem_stays():
     strong, bad = part(Scene().model(), 0.0005), part(Scene().model(), 0.0005, "too few points")
-    first, second = confirmed([bad, strong], [])
+    first, second = confirmed([bad, strong], [], True)
     assert first is strong and second is bad

@@ -80,26 +80,31 @@ KLT_WINDOW_PX = 15  # side of the Lucas-Kanade window (chosen; OpenCV's default:
 KLT_ERROR_PX = 1.0  # largest forward-backward error (Kalal et al., ICPR 2010; chosen)
 
 
-def follow_points(old: Image, new: Image, xy: Array) -> tuple[Array, BoolArray]:
-    """Follow points into the next image by Lucas-Kanade, there and back.
+def follow_points(
+    old: Image, new: Image, xy: Array, and_back: bool = True
+) -> tuple[Array, BoolArray]:
+    """Follow points into the next image by Lucas-Kanade.
 
     Args:
         old, new: (h, w) gray. xy: (N, 2) in `old`, OpenCV pixels (centre of the first: 0, 0).
+        and_back: keep only points that come back to where they started.
     Returns:
-        xy: (N, 2) in `new`. kept: (N,) True for points that come back to where they started.
+        xy: (N, 2) in `new`. kept: (N,) True for points that were followed.
     """
     if not len(xy):
         return xy, np.zeros(0, bool)
     start, window = xy.astype(np.float32).reshape(-1, 1, 2), (KLT_WINDOW_PX,) * 2
     flow: Any = cv2.calcOpticalFlowPyrLK
     ahead, found, _ = flow(old, new, start, None, winSize=window)
-    back, found_back, _ = flow(new, old, ahead, None, winSize=window)
-    error = np.linalg.norm(back - start, axis=2)[:, 0]  # (N,)
-    kept = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < KLT_ERROR_PX)
+    kept = found[:, 0] > 0
+    if and_back:
+        back, found_back, _ = flow(new, old, ahead, None, winSize=window)
+        error = np.linalg.norm(back - start, axis=2)[:, 0]  # (N,)
+        kept &= (found_back[:, 0] > 0) & (error < KLT_ERROR_PX)
     return ahead[:, 0].astype(np.float64), kept
 
 
-CORNERS = 300  # followed from a keyframe (chosen)
+CORNERS = 150  # followed from a keyframe (chosen: 300 were slower and no better)
 CORNER_QUALITY = 0.01  # of the best corner's (OpenCV's usual value)
 CORNER_SPACING = 1 / 80  # between two corners, over the longer side (chosen)
 MIN_CORNERS = 20  # with fewer an image counts as textureless (chosen)

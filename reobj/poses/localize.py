@@ -118,7 +118,7 @@ def _follow_model_points(
     points, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5
     followed = [(points, model.obs_xy[seen])]
     for old, new in itertools.pairwise(grays):
-        ahead, kept = follow_points(old, new, xy)
+        ahead, kept = follow_points(old, new, xy, and_back=False)  # RANSAC takes out the rest
         points, xy = points[kept], ahead[kept]
         followed.append((points, (xy + 0.5) / scale))
     return followed

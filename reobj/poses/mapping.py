@@ -250,9 +250,10 @@ class _Search:
         Args:
             start: focal length over the longer side. told: by the matches.
         """
-        if not (told or self.fixed):
+        told = told or self.fixed
+        if not told:
             _set_focal(self.database, start, False)
-            best = confirmed(self._parts("incremental", False), [])
+            best = confirmed(self._parts("incremental", False), [], told)
             if best and best[0].calibrated:
                 if self._is_sure(best):
                     return best, []
@@ -262,7 +263,7 @@ class _Search:
         best = self._parts("incremental", True)
         if not self._is_sure(best):
             other = self._parts("global", True)
-            best, other = confirmed(best, other), confirmed(other, best)
+            best, other = confirmed(best, other, told), confirmed(other, best, told)
             best = max(other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1))
         if self.fixed or not best or best[0].problem or best[0].calibrated:
             return best, []

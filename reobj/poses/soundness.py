@@ -22,7 +22,10 @@ MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (cho
 # adjustment's covariance, is believed. Above, it may be one of many nearly equal solutions, and
 # another mapper must find the same (measured: right models of 40 keyframes and more .0001 to .002,
 # wrong ones of short stretches from .0015 on).
-SURE_CENTRE_SIGMA = 0.001
+SURE_CENTRE_SIGMA = 0.0012
+# Above this that is no proof if nothing but the model told the focal length: where the camera
+# zoomed, two mappers come to the same wrong scale (measured: one of .0045).
+MAX_UNTOLD_SIGMA = 0.004
 # The same: no centre further off, over the extent, no camera turned by more.
 SAME_CENTRE, SAME_TURN_DEG = 0.05, 5.0  # half of what examples/pose_breaks.py calls wrong
 SAME_IMAGES = 0.75  # of the part, that the other mapper must hold (chosen)
@@ -87,16 +90,20 @@ def measured(
     )
 
 
-def confirmed(parts: list[Part], others: list[Part]) -> list[Part]:
-    """Find a problem in parts of little parallax, unless another mapper came to the same."""
-    found = [
-        replace(part, problem="there is too little parallax to tell where the camera was")
-        if not part.problem
-        and part.centre_sigma > SURE_CENTRE_SIGMA
-        and not any(_same(part.arrays, other.arrays) for other in others)
-        else part
-        for part in parts
-    ]
+def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
+    """Find a problem in parts of little parallax, unless another mapper came to the same.
+
+    Args:
+        told: the focal length was known before, by the user or from the matches.
+    """
+    found = []
+    for part in parts:
+        sigma, proof = part.centre_sigma, told or part.centre_sigma <= MAX_UNTOLD_SIGMA
+        same = proof and any(_same(part.arrays, other.arrays) for other in others)
+        if not part.problem and sigma > SURE_CENTRE_SIGMA and not same:
+            why = "there is too little parallax to tell where the camera was"
+            part = replace(part, problem=why)
+        found.append(part)
     return sorted(found, key=lambda p: (bool(p.problem), -p.registered))
 
 

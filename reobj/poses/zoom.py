@@ -58,6 +58,7 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between images that follow each other.
 
     On both sides of each gap the next images are seen from the other side; at least two must tell.
+    Where the sides contradict each other, as images next to a change do, the clearer one counts.
     """
     count, found = len(arrays.ids), []
     ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
@@ -67,15 +68,23 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
         told = []
         for side, seen, sign in ((before, after[:TOLD_BY], 1), (after, before[-TOLD_BY:], -1)):
             points = _triangulate(arrays, ray, side)
-            for image in seen:
-                log, sigma = _log_focal(arrays, image, points)
-                told += [(sign * log, sigma)] if np.isfinite(log) else []
-        if len(told) >= TOLD_BY:
-            log, sigma = np.median(told, axis=0)
-            if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma):
-                ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
-                found.append((*ids, float(np.exp(log))))
+            values = np.array([_log_focal(arrays, image, points) for image in seen]) * [sign, 1]
+            told.append(values[np.isfinite(values[:, 0])])
+        every = np.concatenate(told)
+        if len(every) < TOLD_BY:
+            continue
+        log, sigma = np.median(every, axis=0)
+        if min(map(len, told)):
+            sides = [np.median(side, axis=0) for side in told]
+            if sides[0][0] * sides[1][0] < 0 and all(map(_is_zoom, *zip(*sides, strict=True))):
+                log, sigma = max(sides, key=lambda side: abs(side[0]))
+        if _is_zoom(log, sigma):
+            found.append((int(arrays.ids[k - 1]), int(arrays.ids[k]), float(np.exp(log))))
     return found
+
+
+def _is_zoom(log: float, sigma: float) -> bool:
+    return bool(abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma))
 
 
 def _triangulate(arrays: ModelArrays, ray: Array, side: range) -> Array:
