@@ -27,7 +27,7 @@ def config(**changes):
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
-    images, truth = textured_room(30, 0.08, size=(320, 240))
+    images, truth = textured_room(30, 0.12, -0.8, size=(320, 240))
     folder = tmp_path_factory.mktemp("walk")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("reobj.poses.estimate.MAX_KEYFRAMES", 12)
@@ -222,7 +222,7 @@ def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, mon
     assert poses.visibility[:, 1].max() < len(poses.points)
     seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of part 0 come first
     assert poses.visibility[seen == 0, 1].max() < poses.visibility[seen == 1, 1].min()
-    assert "broke between frames 23 and 28" in poses.messages[0]
+    assert "broke between frames 18 and 23" in poses.messages[0]
 
 
 def test_a_mirrored_half_is_a_part_of_its_own(tmp_path):

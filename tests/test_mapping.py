@@ -141,12 +141,13 @@ def test_a_focal_length_that_nothing_tells_is_kept_and_said(search):
     """No mapper's model determines it: the guess is held, and the user is told."""
     search.made = [part(calibrated=False)]
     _, (message,) = search.run(None, 0.8)
-    assert message.startswith("little parallax (rays meet at 2.4 deg)")
+    assert message.startswith("the images do not tell the focal length")
     assert "taken as 0.8 x" in message and "--camera" in message
     assert search.ran == [("incremental", False), ("incremental", True)]
 
 
-def test_a_part_that_is_refused_is_said_and_why(search):
+def test_a_part_that_is_refused_is_said_and_why(search, monkeypatch):
+    monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
     search.made = [part(1, 15), part(16, 27, problem="the camera hardly moved"), part(28, 30)]
     models, messages = search.run(0.8, 0.8)
     assert models == ["model"] * 2 and search.ran == [("incremental", True), ("global", True)]
@@ -201,7 +202,7 @@ def test_features_lie_where_the_dots_are(tmp_path):
 
 # ---- Refusals ------------------------------------------------------------------------------------
 
-TURNED = "mere turn|from clearly different places"
+TURNED = "mere turn|from clearly different places|keyframes connect"
 # images, words of the message
 REFUSED = {
     "two images": (lambda: textured_room(2, 0.5)[0], "only 2 different views"),

@@ -213,7 +213,8 @@ class _Search:
         zooms = list[tuple[int, int, float]]()
         for left in range(MAX_ROUNDS)[::-1]:
             best, messages = self._best(focal or guess, focal is not None)
-            others, changes = constant_focal([part.arrays for part in best])
+            known = [p for p in best if self.fixed or focal is not None or p.calibrated]
+            others, changes = constant_focal([part.arrays for part in known])
             if not len(others):
                 break
             if not left:
@@ -267,11 +268,10 @@ class _Search:
             best = max(other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1))
         if self.fixed or not best or best[0].problem or best[0].calibrated:
             return best, []
-        angle = f"{best[0].tri_angle_deg:.1f} deg" if best else "0 deg"
-        weak = f"little parallax (rays meet at {angle}): the focal length cannot be calibrated"
         return best, [
-            f"{weak} and is taken as {start:.3g} x the longer side; sizes and depths are "
-            "rough: give --camera fx,fy,cx,cy, or move the camera sideways around the objects"
+            "the images do not tell the focal length (a camera that moves should turn too): it is "
+            f"taken as {start:.3g} x the longer side, depths are rough; give --camera fx,fy,cx,cy, "
+            "or walk around the objects"
         ]
 
     def _one_camera(self, sound: list[Part]) -> list[Any]:

@@ -159,8 +159,7 @@ def _parallax_px(arrays: ModelArrays) -> float:
     ends = np.searchsorted(arrays.image, np.arange(len(arrays.ids) + 1))
     residuals = []
     for a, b in itertools.combinations(range(len(arrays.ids)), 2):
-        apart = int(arrays.ids[b] - arrays.ids[a])
-        if apart & (apart - 1) == 0:  # 1, 2, 4, 8 ... frames
+        if (b - a) & (b - a - 1) == 0:  # 1, 2, 4, 8 ... keyframes apart
             p, q = (arrays.point[ends[i] : ends[i + 1]] for i in (a, b))
             both, one, other = np.intersect1d(p, q, return_indices=True)
             if len(both) >= MIN_SHARED:

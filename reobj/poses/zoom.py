@@ -8,6 +8,8 @@ pose and its focal length.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy import sparse
 from scipy.spatial.transform import Rotation
@@ -21,7 +23,7 @@ MIN_POINTS = 20  # of such points seen in the image (chosen; two determine a foc
 # 1.5 .15-.30, right models below .03; one side alone up to .12)
 MIN_ZOOM = 0.12
 MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
-TOLD_BY = 2  # images on each side of a gap that are looked at, and must tell together (chosen)
+TOLD_BY = 2  # images on each side of a gap that are looked at (chosen)
 RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
 
 
@@ -57,34 +59,24 @@ def _beside(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
 def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between images that follow each other.
 
-    On both sides of each gap the next images are seen from the other side; at least two must tell.
-    Where the sides contradict each other, as images next to a change do, the clearer one counts.
+    On both sides of each gap the next images are seen from the other side; both sides must tell.
     """
-    count, found = len(arrays.ids), []
+    count, found = len(arrays.ids), list[tuple[int, int, float]]()
     ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
     ray = ray[:, 0] / np.linalg.norm(ray[:, 0], axis=1, keepdims=True)  # (M, 3) in world
     for k in range(1, count):
         before, after = range(max(0, k - WINDOW), k), range(k, min(k + WINDOW, count))
-        told = []
+        sides = list[list[list[float]]]()
         for side, seen, sign in ((before, after[:TOLD_BY], 1), (after, before[-TOLD_BY:], -1)):
             points = _triangulate(arrays, ray, side)
             values = np.array([_log_focal(arrays, image, points) for image in seen]) * [sign, 1]
-            told.append(values[np.isfinite(values[:, 0])])
-        every = np.concatenate(told)
-        if len(every) < TOLD_BY:
-            continue
-        log, sigma = np.median(every, axis=0)
-        if min(map(len, told)):
-            sides = [np.median(side, axis=0) for side in told]
-            if sides[0][0] * sides[1][0] < 0 and all(map(_is_zoom, *zip(*sides, strict=True))):
-                log, sigma = max(sides, key=lambda side: abs(side[0]))
-        if _is_zoom(log, sigma):
-            found.append((int(arrays.ids[k - 1]), int(arrays.ids[k]), float(np.exp(log))))
+            sides.append(values[np.isfinite(values[:, 0])].tolist())
+        if all(sides):  # one alone is biased by the noise of its depths
+            log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
+            if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma):
+                ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
+                found.append((*ids, float(np.exp(log))))
     return found
-
-
-def _is_zoom(log: float, sigma: float) -> bool:
-    return bool(abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma))
 
 
 def _triangulate(arrays: ModelArrays, ray: Array, side: range) -> Array:

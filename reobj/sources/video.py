@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,7 +151,7 @@ class Video:
             numbers = range(self.config.start, stop, self.config.every)
             times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
             decoded = ((i, float(times_s[i]), _read_image(self.files[i])) for i in numbers)
-        for index, time_s, image in decoded:
+        for index, time_s, image in decoded if self.is_live else _one_ahead(decoded):
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 self.skipped.append(index)
                 continue
@@ -349,3 +350,14 @@ def source_fingerprint(source: Any) -> str:
         return str(source)
     facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
+
+
+def _one_ahead(
+    decoded: Iterator[tuple[int, float, Image | None]],
+) -> Iterator[tuple[int, float, Image | None]]:
+    """Decode the next frame in a thread while the last one is used."""
+    with ThreadPoolExecutor(1) as pool:
+        ahead = pool.submit(next, decoded, None)
+        while (frame := ahead.result()) is not None:
+            ahead = pool.submit(next, decoded, None)
+            yield frame
