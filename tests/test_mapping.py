@@ -13,6 +13,7 @@ import numpy as np
 import pose_accuracy
 import pytest
 from pose_worlds import DotWorld, ate_percent, textured_room
+from test_consistency import fundamental
 
 import reobj_track as rt
 from reobj.cameras import read_sparse_model
@@ -164,6 +165,24 @@ def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):
     models, (message,) = search.run(0.8, 0.8)
     assert models == [] and "the focal length keeps changing" in message
     assert len(search.ran) == mapping.MAX_ROUNDS
+
+
+@pytest.mark.parametrize("shown, kept", [(0.8, True), (1.1, False)])
+def test_of_two_focal_lengths_the_given_camera_tells_which_is_right(
+    search, monkeypatch, shown, kept
+):
+    """The pictures of a zoom are left out; those that stay may be the zoomed ones."""
+    F = fundamental(shown, 40)
+    ids = np.column_stack([np.arange(1, 21), np.arange(2, 22)])[np.arange(40) % 20]
+    keypoints = dict.fromkeys(range(1, 31))
+    search.pairs = MatchedPairs(ids, [np.zeros((50, 2), np.int64)] * 40, keypoints, F)
+    found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
+    monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
+    search.fixed, search.made = True, [part(1, 21)]
+    search.made[0].arrays.camera = SimpleNamespace(width=640, height=480)
+    models, messages = search.run(None, 0.8)
+    assert (len(models) == 1) == kept
+    assert kept or "another focal length than that of the given camera" in messages[0]
 
 
 def test_a_given_camera_is_kept(walk, tmp_path):

@@ -35,12 +35,11 @@ from reobj.poses.consistency import (
 from reobj.poses.features import choose_pairs, extract_features, match_pairs
 from reobj.poses.soundness import (
     MIN_PART_IMAGES,
-    SURE_CENTRE_SIGMA,
     Part,
     confirmed,
     measured,
 )
-from reobj.poses.zoom import constant_focal
+from reobj.poses.zoom import MIN_ZOOM, constant_focal
 from reobj.types import Array, Image, IntArray
 
 HOW_TO_FILM = (
@@ -182,6 +181,7 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
+GOOD_CENTRE_SIGMA = 0.0012  # of such parts; SURE_CENTRE_SIGMA is for parts of less (chosen)
 PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
 MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
@@ -222,6 +222,9 @@ class _Search:
             zooms += changes
             self.ids = [i for i in self.ids if i not in set(others.tolist())]
             self.pairs = self.pairs.only(self.ids)
+        if self.fixed and zooms:  # which of the focal lengths is that of the camera?
+            why = "its pictures were taken at another focal length than that of the given camera"
+            best = [part if self._of_camera(part) else replace(part, problem=why) for part in best]
         sound = [part for part in best if not part.problem]
         if not sound:
             why = "no two keyframes show the same points from clearly different places"
@@ -282,9 +285,15 @@ class _Search:
             adjusted(part.model, False)
         return [part.model for part in sound]
 
+    def _of_camera(self, part: Part) -> bool:
+        """True unless a part's matches contradict the focal length that it was given."""
+        camera, inside = part.arrays.camera, self.pairs.only(part.arrays.ids.tolist())
+        told = focal_from_pairs(inside, (camera.width, camera.height))
+        return told is None or abs(np.log(told / part.focal)) < MIN_ZOOM
+
     def _is_sure(self, parts: list[Part]) -> bool:
         """True if parts of strong geometry hold and explain nearly all."""
-        sure = [p for p in parts if not p.problem and p.centre_sigma <= SURE_CENTRE_SIGMA]
+        sure = [p for p in parts if not p.problem and p.centre_sigma <= GOOD_CENTRE_SIGMA]
         registered, matched = sum(p.registered for p in sure), sum(map(len, self.pairs.inliers))
         return registered >= GOOD_REGISTERED and _explained(sure) >= GOOD_EXPLAINED * matched
 

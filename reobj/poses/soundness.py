@@ -20,9 +20,9 @@ MIN_POINTS = 100  # refuse a model with fewer (chosen)
 MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
 # A model whose cameras' centres all have a smaller sigma, over the extent of the path and by the
 # adjustment's covariance, is believed. Above, it may be one of many nearly equal solutions, and
-# another mapper must find the same (measured: right models of 40 keyframes and more .0001 to .002,
-# wrong ones of short stretches from .0015 on).
-SURE_CENTRE_SIGMA = 0.0012
+# another mapper must find the same (measured: right models of 40 keyframes and more .0001 to .0025,
+# wrong ones of short stretches from .0011 on).
+SURE_CENTRE_SIGMA = 0.001
 # Above this that is no proof if nothing but the model told the focal length: where the camera
 # zoomed, two mappers come to the same wrong scale (measured: one of .0045).
 MAX_UNTOLD_SIGMA = 0.004
