@@ -98,11 +98,11 @@ def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
     """
     found = []
     for part in parts:
-        sigma, proof = part.centre_sigma, told or part.centre_sigma <= MAX_UNTOLD_SIGMA
-        same = proof and any(_same(part.arrays, other.arrays) for other in others)
-        if not part.problem and sigma > SURE_CENTRE_SIGMA and not same:
-            why = "there is too little parallax to tell where the camera was"
-            part = replace(part, problem=why)
+        if not part.problem and part.centre_sigma > SURE_CENTRE_SIGMA:
+            proof = told or part.centre_sigma <= MAX_UNTOLD_SIGMA
+            if not (proof and any(_same(part.arrays, other.arrays) for other in others)):
+                why = "there is too little parallax to tell where the camera was"
+                part = replace(part, problem=why)
         found.append(part)
     return sorted(found, key=lambda p: (bool(p.problem), -p.registered))
 
