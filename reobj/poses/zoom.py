@@ -22,6 +22,7 @@ MIN_POINTS = 20  # of such points seen in the image (chosen; two determine a foc
 # Log of the focal length's change that is a zoom (measured, mean of both sides: zoomed by 1.25 to
 # 1.5 .15-.30, right models below .03; one side alone up to .12)
 MIN_ZOOM = 0.12
+MIN_SIDE = 0.04  # of that change by each side (chosen: few photos at an end told 1.3 alone)
 MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
 TOLD_BY = 2  # images on each side of a gap that are looked at (chosen)
 RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
@@ -63,7 +64,8 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
             sides.append(values[np.isfinite(values[:, 0])].tolist())
         if all(sides):  # one alone is biased by the noise of its depths
             log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
-            if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma):
+            each = [float(np.sign(log) * np.median(side, axis=0)[0]) for side in sides]
+            if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma) and min(each) > MIN_SIDE:
                 found[k] = log
     beside = [[found.get(k + n, 0.0) for n in range(-TOLD_BY, TOLD_BY + 1)] for k in found]
     return [
