@@ -222,9 +222,6 @@ class _Search:
             zooms += changes
             self.ids = [i for i in self.ids if i not in set(others.tolist())]
             self.pairs = self.pairs.only(self.ids)
-            if not self.fixed:  # that of all pictures was a mean
-                camera = known[0].arrays.camera
-                focal = focal_from_pairs(self.pairs, (camera.width, camera.height))
         if self.fixed and zooms:  # which of the focal lengths is that of the camera?
             why = "its pictures were taken at another focal length than that of the given camera"
             best = [part if self._of_camera(part) else replace(part, problem=why) for part in best]

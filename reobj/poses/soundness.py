@@ -23,6 +23,9 @@ MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (cho
 # another mapper must find the same (measured: right models of 40 keyframes and more .0001 to .0025,
 # wrong ones of short stretches from .0011 on).
 SURE_CENTRE_SIGMA = 0.001
+# Above this that is no proof if nothing but the model told the focal length: where the camera
+# zoomed, two mappers come to the same wrong scale (measured: one of .0045).
+MAX_UNTOLD_SIGMA = 0.004
 # The same: no centre further off, over the extent, no camera turned by more.
 SAME_CENTRE, SAME_TURN_DEG = 0.05, 5.0  # half of what examples/pose_breaks.py calls wrong
 SAME_IMAGES = 0.75  # of the part, that the other mapper must hold (chosen)
@@ -90,15 +93,14 @@ def measured(
 def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
     """Find a problem in parts of little parallax, unless another mapper came to the same.
 
-    That proves nothing where only the model told the focal length: both may err alike.
-
     Args:
         told: the focal length was known before, by the user or from the matches.
     """
     found = []
     for part in parts:
         if not part.problem and part.centre_sigma > SURE_CENTRE_SIGMA:
-            if not (told and any(_same(part.arrays, other.arrays) for other in others)):
+            proof = told or part.centre_sigma <= MAX_UNTOLD_SIGMA
+            if not (proof and any(_same(part.arrays, other.arrays) for other in others)):
                 why = "there is too little parallax to tell where the camera was"
                 part = replace(part, problem=why)
         found.append(part)

@@ -22,7 +22,6 @@ MIN_POINTS = 20  # of such points seen in the image (chosen; two determine a foc
 # Log of the focal length's change that is a zoom (measured, mean of both sides: zoomed by 1.25 to
 # 1.5 .15-.30, right models below .03; one side alone up to .12)
 MIN_ZOOM = 0.12
-MIN_SIDE = 0.04  # of that change by each side (chosen: few photos at an end told 1.3 alone)
 MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
 TOLD_BY = 2  # images on each side of a gap that are looked at (chosen)
 RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
@@ -38,6 +37,7 @@ def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int,
         before and after it and the ratio of their focal lengths.
     """
     changes = sorted(change for arrays in models for change in _changes(arrays))
+    changes = [c for c in changes if not any(_beside(c, other) for other in changes)]
     ids = np.array(sorted({int(i) for arrays in models for i in arrays.ids}), np.int64)
     log = np.zeros(len(ids))
     for _, after, ratio in changes:
@@ -46,13 +46,22 @@ def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int,
     return ids[~alike[alike.sum(1).argmax()]] if len(ids) else ids, changes
 
 
+def _beside(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
+    """True for the lesser of two changes of the same direction beside each other.
+
+    Images next to a change are bent by it.
+    """
+    adjacent = one is not other and (one[0] == other[1] or one[1] == other[0])
+    log, rival = np.log(one[2]), np.log(other[2])
+    return bool(adjacent and log * rival > 0 and abs(log) < abs(rival))
+
+
 def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between images that follow each other.
 
     On both sides of each gap the next images are seen from the other side; both sides must tell.
-    Beside a change the images are bent by it: the clearest counts.
     """
-    count, found = len(arrays.ids), dict[int, float]()
+    count, found = len(arrays.ids), list[tuple[int, int, float]]()
     ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
     ray = ray[:, 0] / np.linalg.norm(ray[:, 0], axis=1, keepdims=True)  # (M, 3) in world
     for k in range(1, count):
@@ -64,15 +73,10 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
             sides.append(values[np.isfinite(values[:, 0])].tolist())
         if all(sides):  # one alone is biased by the noise of its depths
             log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
-            each = [float(np.sign(log) * np.median(side, axis=0)[0]) for side in sides]
-            if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma) and min(each) > MIN_SIDE:
-                found[k] = log
-    beside = [[found.get(k + n, 0.0) for n in range(-TOLD_BY, TOLD_BY + 1)] for k in found]
-    return [
-        (int(arrays.ids[k - 1]), int(arrays.ids[k]), float(np.exp(log)))
-        for (k, log), near in zip(found.items(), beside, strict=True)
-        if abs(log) == np.abs(near).max()
-    ]
+            if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma):
+                ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
+                found.append((*ids, float(np.exp(log))))
+    return found
 
 
 def _triangulate(arrays: ModelArrays, ray: Array, side: range) -> Array:
