@@ -36,17 +36,18 @@ def adjusted(model: Any, calibrate: bool) -> Adjusted:
     """Adjust a model, with its intrinsics if the observations determine them.
 
     Args:
-        model: changed, or left behind. calibrate: its intrinsics are not known.
+        model: changed where its intrinsics stay; a copy is returned where they do not.
+        calibrate: its intrinsics are not known.
     """
     if calibrate:
         free = import_pycolmap().Reconstruction(model)
-        _refine(free, True)
+        refine(free, True)
         arrays = read_arrays(free)
         centre_sigma, focal_sigma = relative_sigmas(arrays, True)
         low, high = FOCAL_RANGE
         if focal_sigma <= MAX_FOCAL_SIGMA and low <= arrays.focal_over_size <= high:
             return Adjusted(free, arrays, True, centre_sigma)
-    _refine(model, False)
+    refine(model, False)
     arrays = read_arrays(model)
     return Adjusted(model, arrays, False, relative_sigmas(arrays, False)[0])
 
@@ -54,7 +55,7 @@ def adjusted(model: Any, calibrate: bool) -> Adjusted:
 MAX_CENTRE_SHIFT = 0.05  # of the principal point when it is freed, over the size (chosen)
 
 
-def _refine(model: Any, calibrate: bool) -> None:
+def refine(model: Any, calibrate: bool) -> None:
     """Adjust cameras and points once more, with a robust loss.
 
     Args:

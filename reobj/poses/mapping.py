@@ -1,10 +1,10 @@
 """Reconstruction of the keyframes by pycolmap, in a child process.
 
-`reconstruct` hands the keyframes over as files; the child (`mapping_child`)
-extracts features, matches pairs, estimates the focal length from them, runs one or two mappers,
-adjusts what they make, takes apart what does not hold together (`consistency`, `zoom`), and keeps
-the parts that are sound (`soundness`). Which frames are keyframes and where the frames between them
-are is not decided here.
+`reconstruct` hands the keyframes over as files. The child (`mapping_child`) extracts features,
+matches pairs, estimates the focal length from them and runs one or two mappers; it adjusts what
+they make, takes apart what does not hold together (`consistency`, `zoom`) and keeps the parts that
+are sound (`soundness`). Which frames are keyframes and where the frames between them are is not
+decided here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 
 from reobj.cameras import Camera, import_pycolmap
 from reobj.files import Progress, atomic
-from reobj.poses.adjustment import Adjusted, adjusted
+from reobj.poses.adjustment import Adjusted, adjusted, refine
 from reobj.poses.child import Child, send_progress, serve
 from reobj.poses.consistency import (
     MatchedPairs,
@@ -33,12 +33,7 @@ from reobj.poses.consistency import (
     read_pairs,
 )
 from reobj.poses.features import choose_pairs, extract_features, match_pairs
-from reobj.poses.soundness import (
-    MIN_PART_IMAGES,
-    Part,
-    confirmed,
-    measured,
-)
+from reobj.poses.soundness import MIN_PART_IMAGES, Part, confirmed, measured
 from reobj.poses.zoom import MIN_ZOOM, constant_focal
 from reobj.types import Array, Image, IntArray
 
@@ -211,17 +206,17 @@ class _Search:
             models of the parts, the largest first ([]: none is sound); messages.
         """
         zooms = list[tuple[int, int, float]]()
-        for left in range(MAX_ROUNDS)[::-1]:
+        for _ in range(MAX_ROUNDS):
             best, messages = self._best(focal or guess, focal is not None)
             known = [p for p in best if self.fixed or focal is not None or p.calibrated]
             others, changes = constant_focal([part.arrays for part in known])
             if not len(others):
                 break
-            if not left:
-                best = [replace(part, problem="the focal length keeps changing") for part in best]
             zooms += changes
             self.ids = [i for i in self.ids if i not in set(others.tolist())]
             self.pairs = self.pairs.only(self.ids)
+        else:
+            best = [replace(part, problem="the focal length keeps changing") for part in best]
         if self.fixed and zooms:  # which of the focal lengths is that of the camera?
             why = "its pictures were taken at another focal length than that of the given camera"
             best = [part if self._of_camera(part) else replace(part, problem=why) for part in best]
@@ -282,7 +277,7 @@ class _Search:
         for part in sound[1:]:
             own, camera = part.model.camera(1), sound[0].model.camera(1)
             own.model, own.params = camera.model, camera.params
-            adjusted(part.model, False)
+            refine(part.model, False)
         return [part.model for part in sound]
 
     def _of_camera(self, part: Part) -> bool:

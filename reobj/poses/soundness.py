@@ -1,6 +1,6 @@
 """What tells a sound model of a reconstruction from a wrong one, by its geometry alone.
 
-Parallax, triangulation angles, the spread of the cameras, the covariance of their centres. The
+Parallax, triangulation angles, the covariance of the cameras' centres, another mapper's model. The
 reprojection error is no help: wrong models had the smallest.
 """
 

@@ -24,6 +24,7 @@ MIN_POINTS = 20  # of such points seen in the image (chosen; two determine a foc
 MIN_ZOOM = 0.12
 MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
 TOLD_BY = 2  # images on each side of a gap that are looked at (chosen)
+UNLIKE = 10.0  # log of a change that nothing measures: no two sides of it are alike
 RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
 
 
@@ -33,15 +34,18 @@ def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int,
     Args:
         models: ids of images ascend in time.
     Returns:
-        ids of the images of the other focal lengths; and of each change the ids of the images
-        before and after it and the ratio of their focal lengths.
+        ids of the images of the other focal lengths, or of one that is not known to be the same;
+        of each change the ids of the images before and after it and the ratio of their focal
+        lengths.
     """
     changes = sorted(change for arrays in models for change in _changes(arrays))
     changes = [c for c in changes if not any(_beside(c, other) for other in changes)]
     ids = np.array(sorted({int(i) for arrays in models for i in arrays.ids}), np.int64)
+    starts = np.searchsorted(ids, [after for _, after, _ in changes])
     log = np.zeros(len(ids))
-    for _, after, ratio in changes:
-        log[ids >= after] += np.log(ratio)
+    for k, (start, (_, _, ratio)) in enumerate(zip(starts, changes, strict=True)):
+        told = not k or start - starts[k - 1] >= WINDOW  # else each bends the other's images
+        log[start:] += np.log(ratio) if told else UNLIKE
     alike = np.abs(log[:, None] - log) < MIN_ZOOM  # (R, R)
     return ids[~alike[alike.sum(1).argmax()]] if len(ids) else ids, changes
 
