@@ -74,7 +74,7 @@ PATHS = {
     "orbit": "a quarter round the dining table",
     "tour": "twice past every table and couch, another way for every seed",
     "table": "photos STEP_M apart, taken standing still, once round a table, weaving up and down",
-    "turn": "a walk that stops for 40 % of the frames, where the camera only turns",
+    "turn": "a walk that stops for two fifths of the frames, where the camera only turns",
     "corridor": "straight on along x, looking to one side",
 }
 PLANS = {

@@ -178,3 +178,12 @@ def test_api_reference_is_current() -> None:
     assert api_reference.reference() == (ROOT / "docs" / "api.md").read_text(), (
         "run: python examples/api_reference.py -o docs/api.md"
     )
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
+def test_every_example_says_how_it_is_used(script: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(script), "--help"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("usage:") and script.name in done.stdout
