@@ -363,6 +363,7 @@ class Priors:
     support: IntArray  # (C,) codes of SUPPORTS
     yaw_symmetric: BoolArray  # (C,)
     upright: BoolArray  # (C,)
+    on_floor: BoolArray  # (C,) stands on the floor
 
     def index(self, categories: Sequence[str | None]) -> IntArray:
         """Find the row of each category (O,), -1 where it is not in the table."""
@@ -398,7 +399,7 @@ def load_priors(path: str | Path | None = None) -> Priors:
     columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
     if not rows:
         columns = [np.zeros(s) for s in ((0, 3), (0, 3, 3), (0, 2), (0, 2, 2))]
-        columns += [np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0, bool)]
+        columns += [np.zeros(0, np.int64), *(np.zeros(0, bool) for _ in range(3))]
     return Priors(tuple(table), aliases, *columns)
 
 
@@ -416,7 +417,8 @@ def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
     ratios = (np.array(ratio[key], np.float64) for key in ("mean_log", "cov_log"))
     code = SUPPORTS.index(entry.get("support", "ellipsoid"))
     round_, upright = bool(entry.get("yaw_symmetric", False)), bool(entry.get("upright", True))
-    return log_mean, log_cov, *ratios, code, round_, upright
+    on_floor = entry.get("stands_on") == "floor"
+    return log_mean, log_cov, *ratios, code, round_, upright, on_floor
 
 
 # ---- Views: cameras, selection, tangent planes ----------------------------------------------
@@ -1013,6 +1015,9 @@ class _Problem(_Rows):
     size_var: Array  # (B, 3) its variance an axis, floored: the scale of the wall
     up: Array  # (B, 3) unit, or zeros
     tilt_info: Array  # (B, 3) 1 / rad^2 for the three components of up in object axes
+    vertical: Array  # (B, 3) 1 for the vertical axis
+    floor: Array  # (B, 4) plane n, d: n x = d that the solid stands on
+    floor_info: Array  # (B,) 1 / sigma^2 of its lower side over that plane, 0: stands elsewhere
 
 
 def rotations(rotvec: Array) -> Array:
@@ -1142,7 +1147,7 @@ class _Normal(NamedTuple):
 def _normal_equations(
     state: _State, edges: _Edges, prob: _Problem, loss: str, smooth: float = SMOOTH
 ) -> _Normal:
-    """Sum up cost, gradient and Gauss-Newton Hessian of edges, size prior and upright prior."""
+    """Sum up cost, gradient and Gauss-Newton Hessian of edges, priors of size, tilt and floor."""
     value, jacobian = _residuals(state, edges, prob.groups, True, smooth)
     rho, weight = _robust(value, loss)
     weighted = (jacobian * weight[..., None]).transpose(0, 2, 1)  # (B, 9, M)
@@ -1157,7 +1162,13 @@ def _normal_equations(
     hessian[:, 6:, 6:] += turn.transpose(0, 2, 1) @ (tilt[..., None] * turn)
     gradient[:, 6:] += (turn.transpose(0, 2, 1) @ (tilt * up)[..., None])[..., 0]
     cost = rho.sum(1) + size_cost + (tilt * up * up).sum(1)
-    return _Normal(cost, hessian, gradient)
+    half = prob.vertical * np.exp(state.log_half)  # (B, 3)
+    height = (prob.floor[:, :3] * state.center).sum(1) - prob.floor[:, 3] - half.sum(1)
+    row = np.concatenate([prob.floor[:, :3], -half], 1)  # (B, 6) its derivative
+    weighted_row = prob.floor_info[:, None] * row
+    hessian[:, :6, :6] += weighted_row[:, :, None] * row[:, None]
+    gradient[:, :6] += weighted_row * height[:, None]
+    return _Normal(cost + prob.floor_info * height**2, hessian, gradient)
 
 
 def _size_prior(state: _State, prob: _Problem) -> tuple[Array, Array, Array]:
@@ -1238,6 +1249,9 @@ START_CUT_VOTE = 0.3  # vote of a box that touches the border
 START_DEPTH_LOG = 0.3  # log, how well a box's extent tells the depth of a known size
 START_SIZE_LOG = 0.25  # log, how well it tells the size at a known depth
 START_CENTER = 0.1  # box sizes, sigma of a box's centre as the centre's image
+STANDING_REL = (
+    0.03  # sigma of a standing thing's lower side, over its height (chosen: legs, carpets)
+)
 # Size of an unknown category: the spread of the 110 indoor categories of priors.json.
 UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean
 UNKNOWN_SIZE_LOG = 0.9  # log, standard deviation of the common size
@@ -1276,6 +1290,8 @@ class _Spec:
     upright: BoolArray  # (O,)
     up: Array  # (3,) unit or zeros
     tilt_rad: float  # how uncertain `up` is
+    floor: Array  # (4,) plane n, d: n x = d
+    floor_sigma: Array  # (O,) of an object's lower side over it, inf: it may stand elsewhere
 
 
 def _gather_data(
@@ -1327,7 +1343,16 @@ def _prior_spec(
     wanted = np.where(codes == BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
     allowed = (wanted[:, None] == np.arange(3)) | (wanted < 0)[:, None]
     size_mean = mean - np.log(2.0) - world.log_scale
-    return _Spec(size_mean, cov, rows, natural, allowed, round_, upright, world.up, world.tilt_rad)
+    plane, floor_sigma = np.zeros(4), np.full(n, np.inf)
+    if priors is not None and world.floor is not None and world.scale_source != "none":
+        plane = np.append(world.floor.normal, world.floor.offset)
+        stands = known & priors.on_floor[rows]
+        own = STANDING_REL * 2.0 * np.exp(size_mean[:, 2])
+        floor_sigma = np.where(stands, np.hypot(world.floor.sigma, own), np.inf)
+    return _Spec(
+        size_mean, cov, rows, natural, allowed, round_, upright, world.up, world.tilt_rad,
+        plane, floor_sigma,
+    )  # fmt: skip
 
 
 def _shape_shift(log_half: Array, natural: IntArray, code: IntArray) -> Array:
@@ -1495,6 +1520,7 @@ def _problems(spec: _Spec, obj: IntArray, code: IntArray, axis: IntArray) -> _Pr
     shift = _shape_shift(mean, spec.natural[obj], code)
     tilt = np.full((len(obj), 3), 1.0 / spec.tilt_rad**2) * bool(np.any(spec.up))
     tilt[np.arange(len(obj)), axis] = 0.0
+    floor = np.broadcast_to(spec.floor, (len(obj), 4))
     up = np.broadcast_to(spec.up, (len(obj), 3))
     round_ = spec.round_[obj] | ((code == CYLINDER) & (spec.natural[obj] != CYLINDER))
     tie = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]) / ROUND_LOG**2
@@ -1502,7 +1528,10 @@ def _problems(spec: _Spec, obj: IntArray, code: IntArray, axis: IntArray) -> _Pr
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
     var = np.maximum(np.einsum("oii->oi", spec.size_cov), SIZE_WALL_LOG**2)[obj]
-    return _Problem(AXIS_GROUPS[code], mean + shift[:, None], info, var, up, tilt)
+    return _Problem(
+        AXIS_GROUPS[code], mean + shift[:, None], info, var, up, tilt,
+        np.eye(3)[axis], floor, spec.floor_sigma[obj] ** -2.0,
+    )  # fmt: skip
 
 
 def _minimise_all(
@@ -1973,7 +2002,9 @@ def _inlier_table(
     return inlier
 
 
-MAX_NOISE = 8.0  # noise factor above which the boxes are not of one static object
+MAX_NOISE = (
+    18.0  # noise factor above which the boxes are not of one static object (a third of the size)
+)
 MIN_INLIER_SHARE = 0.4  # of the views; below it the object is rejected
 ABSURD_SIZE = 6.0  # sigma of growth above the prior: rejected
 ODD_SIZE = 3.5  # sigma from the prior: said in the reason
@@ -2032,6 +2063,14 @@ def _status(
     return status, reason
 
 
+class Floor(NamedTuple):
+    """A plane that things stand on."""
+
+    normal: Array  # (3,) unit, upwards
+    offset: float  # normal @ x == offset on it, world units
+    sigma: float  # of its height, world units
+
+
 class _World(NamedTuple):
     """What is known about scale and gravity in one pass."""
 
@@ -2041,6 +2080,7 @@ class _World(NamedTuple):
     up: Array
     tilt_rad: float
     up_source: str
+    floor: Floor | None = None
 
 
 def _first_world(up: Sequence[float] | Array | None, metric: bool, cams: _Cameras) -> _World:
@@ -2083,6 +2123,7 @@ def fit_objects(
     score: npt.ArrayLike | None = None,
     metric: bool = True,
     known_size: Mapping[str | int, tuple[str | int, float]] | None = None,
+    floor: Floor | None = None,
     config: FitConfig | None = None,
 ) -> ObjectFits:
     """Fit one solid and its inscribed ellipsoid to every object's boxes, all objects at once.
@@ -2097,6 +2138,7 @@ def fit_objects(
         score: (F, O) detection scores, used to choose among many views.
         metric: True: world units are metres; False: one global scale is estimated from the priors.
         known_size: {category or object number: ("w" | "d" | "h", metres)}; overrides the scale.
+        floor: what categories stand on whose prior says so, once the scale is known.
         config: the few numbers that a user may change.
     Returns:
         ObjectFits in world units. It never raises on ugly numbers: such objects are "rejected".
@@ -2115,7 +2157,7 @@ def fit_objects(
     quality = quality + uncut  # (F, O), uncut boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
     sizes = _known_sizes(known_size, categories, live)
-    world = _first_world(up, metric and not sizes, cams)
+    world = _first_world(up, metric and not sizes, cams)._replace(floor=floor)
     if not len(live):
         return _report(None, boxes, usable, cams, live, world, image_size, cfg)
     seen = (boxes[:, live], usable[:, live], quality[:, live])

@@ -62,7 +62,6 @@ from reobj.files import atomic, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
-from reobj.identity.gaps import fill_gaps
 from reobj.identity.places import (
     CamerasOfFrames,
     EllipsoidMap,
@@ -80,7 +79,7 @@ from reobj.identity.reid import (
 from reobj.identity.sampling import SamplingLayout
 from reobj.objects import ObjectsConfig
 from reobj.options import add_flags, config_from_args, list_options
-from reobj.parts import link_and_fit, parts_message
+from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
@@ -185,7 +184,9 @@ class OutputConfig:
     overlay: bool = option(True, "write overlay.mp4")
     scene: bool = option(True, "write scene.html")
     fill_gaps: int = option(
-        5, "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never)"
+        5,
+        "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never); "
+        "six times as many where the object's solid tells its box",
     )
 
 
@@ -403,6 +404,7 @@ class Tracker:
         self._view: Array | None = None  # (3, 4) img_from_world of the latest frame
         self._image_size = (0, 0)
         self._latest: Tracks | None = None
+        self.detections = Detections.empty()
         self._lazy: LazyEmbeddings | None = None  # of the latest frame
 
     def update(
@@ -445,6 +447,7 @@ class Tracker:
         self._embed(detections, track_of, lazy)
         track_of = self._confirm(track_of)
         self._lazy, self._latest = lazy, self._report(detections, track_of)
+        self.detections = detections
         self._retire()
         confirmed = self._latest[self._latest.track_id > 0]
         if self._view is not None:
@@ -1088,7 +1091,7 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     started, poses = time.monotonic(), result.poses
     link_and_fit(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
-    result.tracks, result.out = fill_gaps(result.tracks, video.size, gap), workspace.out
+    result.tracks, result.out = fill(result, video.size, gap), workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
     result.embedding_row = detected[result.embedding_row]
     result.seconds["objects"] = time.monotonic() - started

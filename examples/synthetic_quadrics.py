@@ -84,7 +84,7 @@ def individual_priors(log_size: Array, sigma: float, support: str) -> tuple[Prio
     code = np.full(n, quadrics.SUPPORTS.index(support))
     flags = np.zeros(n, bool)
     ratio = (log_size @ diff.T, diff @ cov @ diff.T)
-    return Priors(tuple(names), {}, log_size, cov, *ratio, code, flags, ~flags), names
+    return Priors(tuple(names), {}, log_size, cov, *ratio, code, flags, ~flags, flags), names
 
 
 def scenes(
@@ -584,7 +584,7 @@ def ratio_priors(mean_log: Array, cov_log: Array) -> Priors:
     log_mean = np.concatenate([mean_log, np.zeros((len(names), 1))], 1)
     flags = np.ones(len(names), bool)
     code = np.zeros(len(names), np.int64)
-    return Priors(names, {}, log_mean, full, mean_log, cov_log, code, ~flags, flags)
+    return Priors(names, {}, log_mean, full, mean_log, cov_log, code, ~flags, flags, ~flags)
 
 
 def thesis_trial(rotation_deg: float, size: float, seed: int) -> list[float]:

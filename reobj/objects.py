@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
 from reobj.files import rounded
+from reobj.identity.locate import Fit
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
@@ -53,9 +54,6 @@ class ObjectsConfig:
         return tuple(filter(None, (name.strip() for name in self.moving.split(","))))
 
 
-Fit = Callable[[Views, list[int]], quadrics.ObjectFits]  # of the groups of views, their classes
-
-
 def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> Fit:
     """Bind priors, known sizes, gravity and the kind of solid to `quadrics.fit_objects`.
 
@@ -67,11 +65,14 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
 
-    def fit(views: Views, classes: list[int]) -> quadrics.ObjectFits:
+    def fit(
+        views: Views, classes: list[int], floor: quadrics.Floor | None = None
+    ) -> quadrics.ObjectFits:
         categories = [class_names[c] if c < len(class_names) else "" for c in classes]
         return quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, categories, priors, up=up,
             support=support, score=views.score, metric=poses.metric, known_size=known,
+            floor=floor,
         )  # fmt: skip
 
     return fit
@@ -111,11 +112,13 @@ def describe_objects(
     fits: quadrics.ObjectFits | None,
     views: Views | None,
     config: ObjectsConfig,
+    confidence: Mapping[int, float] | None = None,
 ) -> list[Object]:
     """Describe every identity of the tracks: class, visits, and its solid or why it has none.
 
     Args:
         fits, views: of the identities in ascending order; None without cameras.
+        confidence: of identities, where it is known.
     Returns:
         one `Object` an identity, by id.
     """
@@ -138,8 +141,22 @@ def describe_objects(
         )
         if fits is not None and views is not None:
             found = _with_solid(found, fits, i, views, iou[:, i], moving, config.min_views)
+        if confidence and identity in confidence and found.class_name not in moving:
+            found = _with_confidence(found, confidence[identity])
         objects.append(found)
     return objects
+
+
+DOUBTFUL = 0.5  # confidence below which an object is less likely there than not
+
+
+def _with_confidence(found: Object, confidence: float) -> Object:
+    """Add how sure an object is; a solid that is doubtful is kept, but not counted."""
+    made = dataclasses.replace(found, confidence=round(confidence, 3))
+    if confidence >= DOUBTFUL or found.status == "rejected":
+        return made
+    why = f"{100 * confidence:.0f} % likely: its detections are few, weak or in few of the frames"
+    return dataclasses.replace(made, status="doubtful", reason=why)
 
 
 def _with_solid(

@@ -7,7 +7,9 @@ own. Every part is treated like a video of its own; afterwards identities are nu
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,31 +17,36 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, place_of
 from reobj.files import shortened
-from reobj.identity.linking import link
-from reobj.objects import Fit, ObjectsConfig, describe_objects, describe_world, fitter
+from reobj.identity.evidence import logit
+from reobj.identity.gaps import fill_by_place, fill_gaps
+from reobj.identity.linking import FRAGMENT_GAP, link
+from reobj.identity.locate import Fit, confidence, locate
+from reobj.objects import ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.result import Result
-from reobj.types import Embeddings, IntArray, LinkEvent, Tracks, object_classes
+from reobj.types import Array, Embeddings, IntArray, LinkEvent, Tracks, object_classes, rows_by
 from reobj.views import gather_views
 
 
 def link_and_fit(result: Result, config: ObjectsConfig) -> None:
-    """Decide which tracklets are one object and fit its solid: in place.
+    """Decide which detections are one object and fit its solid: in place.
 
-    Sets tracks (identities), objects, fits and world. An object lies in one part: where the path
-    breaks, an identity ends. Only identities that the user gave may span parts; their solid is
-    fitted in the part that has most of their boxes.
+    Sets tracks (identities; detections that the tracker left out join them), objects, fits and
+    world. An object lies in one part: where the path breaks, an identity ends. Only identities that
+    the user gave may span parts; their solid is fitted in the part that has most of their boxes.
     """
-    poses, tracks = result.poses, result.tracks
+    poses = result.poses
     parts = [] if poses is None else [poses.of_part(k) for k in range(poses.part_count)]
-    part = np.zeros(len(tracks), np.int64) if poses is None else poses.part_of(tracks.frame)  # (N,)
     fit_in: list[Fit | None] = [None] * max(len(parts), 1)
+    priors = quadrics.load_priors(config.priors or None)
     if any(p.known.sum() >= config.min_views for p in parts):
         for k, own in enumerate(parts):  # a direction given as up is one of the largest part
             options = dataclasses.replace(config, up="") if k else config
             fit_in[k] = fitter(options, own, result.class_names)
-    events: list[LinkEvent] = []
+    linked = _Linked(result.tracks)
     if not result.identities_given:
-        tracks, events = _link_parts(result, parts, part, fit_in, config)
+        linked = _link_parts(result, parts, fit_in, priors, config)
+    tracks = linked.tracks
+    part = np.zeros(len(tracks), np.int64) if poses is None else poses.part_of(tracks.frame)  # (N,)
     fits: list[quadrics.ObjectFits | None] = [None] * len(fit_in)
     identity, row_of = np.unique(tracks.track_id, return_inverse=True)
     part_of_object = _part_with_most_boxes(tracks, row_of, len(identity), part, poses, config)
@@ -50,61 +57,158 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
             classes = object_classes(rows)
             group = np.searchsorted(list(classes), rows.track_id)
             views = gather_views(rows, parts[k], group, len(classes), config.min_score)
-            fits[k] = fit(views, list(classes.values()))
-        found = describe_objects(rows, result.class_names, fits[k], views, config)
+            fits[k] = fit(views, list(classes.values()), linked.floor.get(k))
+        found = describe_objects(
+            rows, result.class_names, fits[k], views, config, linked.confidence
+        )
         result.objects += [dataclasses.replace(o, part=k) for o in found]
     result.objects.sort(key=lambda o: o.id)
-    result.tracks, result.world = tracks, describe_world(poses, fits, events)
+    result.tracks, result.embedding_row = tracks, linked.rows_now(result.embedding_row)
+    result.world = describe_world(poses, fits, linked.events)
     result.fits = fits[0] if poses is None else join_fits(fits, part_of_object, poses)
+
+
+@dataclass(slots=True)
+class _Linked:
+    """Tracks with the identities of objects.
+
+    Attributes:
+        tracks: N rows. source: (N,) their rows before, -1: left out by the tracker; None: the same.
+        events: joins and splits. confidence: of identities that have solids in a part.
+        floor: of parts where it is known.
+    """
+
+    tracks: Tracks
+    source: IntArray | None = None
+    events: list[LinkEvent] = field(default_factory=list)
+    confidence: dict[int, float] = field(default_factory=dict)
+    floor: dict[int, quadrics.Floor | None] = field(default_factory=dict)
+
+    def rows_now(self, before: IntArray) -> IntArray:
+        """Return where rows of the table before linking are now."""
+        if self.source is None:
+            return before
+        now = np.full(int(self.source.max(initial=-1)) + 1, -1)
+        now[self.source[self.source >= 0]] = np.flatnonzero(self.source >= 0)
+        return np.asarray(now[before], np.int64)
 
 
 def _link_parts(
     result: Result,
     parts: Sequence[Poses],
-    part: IntArray,
     fit_in: Sequence[Fit | None],
+    priors: quadrics.Priors,
     config: ObjectsConfig,
-) -> tuple[Tracks, list[LinkEvent]]:
-    """Link each part alone, and number its identities after those of the parts before it.
-
-    Args:
-        part: (N,) of each row of the tracks.
-    """
-    tracks, events, taken = _cut_at_parts(result.tracks, part), list[LinkEvent](), 0
-    track_id = tracks.track_id.copy()
+) -> _Linked:
+    """Link each part alone, and number its identities after those of the parts before it."""
+    made, steps, sources, taken = _Linked(result.tracks), list[Tracks](), list[IntArray](), 0
+    table, source = _with_untracked(result.tracks, result.untracked)
+    part = np.zeros(len(table), np.int64)
+    if result.poses is not None:
+        part = result.poses.part_of(table.frame)
+    table = _cut_at_parts(table, part)
     for k, fit in enumerate(fit_in):
         rows = np.flatnonzero(part == k)
-        own = tracks[rows]
+        located = None
+        if config.link and fit is not None and parts[k].known.sum() >= config.min_views:
+            names, moving = result.class_names, config.moving_classes
+            located = locate(table[rows], names, parts[k], fit, priors, moving)
+            made.floor[k] = located.floor
+        solid = np.full(len(rows), -1) if located is None else located.solid
+        keep = (source[rows] >= 0) | (solid >= 0)
+        rows, solid = rows[keep], solid[keep]
+        own = _with_tracklets(table[rows], solid)
         if config.link:
-            located = fit is not None and parts[k].known.sum() >= config.min_views
             own, found = link(
-                own, result.class_names, *_embeddings_of(result, rows),
-                parts[k] if located else None, fit if located else None,
-                moving=config.moving_classes, min_score=config.min_score,
-                min_views=config.min_views,
+                own, result.class_names, *_embeddings_of(result, source[rows]),
+                None if located is None else parts[k], moving=config.moving_classes,
+                solid=None if located is None else solid,
+                overlap=None if located is None else located.overlap[keep],
             )  # fmt: skip
-            events += found
+            made.events += found
         else:
             own = own.with_identities(own.track_id)
-        track_id[rows] = own.track_id + taken
-        taken += int(own.track_id.max(initial=0))
-    return dataclasses.replace(tracks, track_id=track_id), events
+        own = dataclasses.replace(own, track_id=own.track_id + taken)
+        taken = int(own.track_id.max(initial=taken))
+        if located is not None:
+            made.confidence |= _confidences(own, solid, located.confidence)
+        steps.append(own)
+        sources.append(source[rows])
+    joined = concatenated(steps)
+    order = np.argsort(joined.frame, kind="stable")
+    made.tracks, made.source = joined[order], np.concatenate(sources)[order]
+    return made
+
+
+def _confidences(tracks: Tracks, solid: IntArray, of_solid: Array) -> dict[int, float]:
+    """Return the confidence of every identity: of its solid, or of its scores if it has none.
+
+    Args:
+        solid: (N,) of each row, or -1. of_solid: (S,).
+    """
+    found = {}
+    for rows in rows_by(tracks.track_id):
+        own = solid[rows][solid[rows] >= 0]
+        alone = confidence(logit(tracks.score[rows]).mean(), np.zeros(1))[0]
+        found[int(tracks.track_id[rows[0]])] = float(of_solid[own[0]] if len(own) else alone)
+    return found
+
+
+def concatenated(tables: Sequence[Tracks]) -> Tracks:
+    """Put tables behind each other."""
+    names = [f.name for f in dataclasses.fields(Tracks)]
+    return Tracks(*(np.concatenate([getattr(t, name) for t in tables]) for name in names))
+
+
+def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray]:
+    """Put the detections that the tracker left out among its rows, by frame.
+
+    Returns:
+        the table; (N,) the row of the tracks that each of its rows is, or -1.
+    """
+    table = concatenated([tracks, untracked])
+    source = np.append(np.arange(len(tracks)), np.full(len(untracked), -1))
+    order = np.argsort(table.frame, kind="stable")
+    return table[order], source[order]
+
+
+def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:
+    """Give rows in no tracklet that of the row before of their solid, or one of their own.
+
+    A tracklet ends where more than FRAGMENT_GAP frames lie between two rows.
+    """
+    tracklet = table.tracklet_id.copy()
+    fresh = int(tracklet.max(initial=0)) + 1
+    step = max(1, int(np.diff(np.unique(table.frame)).min(initial=2**31))) if len(table) else 1
+    for rows in rows_by(solid):
+        if solid[rows[0]] < 0:
+            continue
+        taken = set(zip(table.frame[rows].tolist(), tracklet[rows].tolist(), strict=True))
+        for before, row in itertools.pairwise([-1, *rows.tolist()]):
+            if tracklet[row]:
+                continue
+            near = before >= 0 and table.frame[row] - table.frame[before] <= FRAGMENT_GAP * step
+            if near and (int(table.frame[row]), int(tracklet[before])) not in taken:
+                tracklet[row] = tracklet[before]
+            else:
+                tracklet[row], fresh = fresh, fresh + 1
+    return dataclasses.replace(table, tracklet_id=tracklet)
 
 
 def _cut_at_parts(tracks: Tracks, part: IntArray) -> Tracks:
     """Cut tracklets where the part (N,) of their rows changes; later parts get new numbers."""
     tracklet = tracks.tracklet_id.copy()
     for k in range(1, int(part.max(initial=0)) + 1):
-        spanning = (part == k) & np.isin(tracklet, tracklet[part < k])
+        spanning = (part == k) & (tracklet > 0) & np.isin(tracklet, tracklet[part < k])
         piece = np.unique(tracklet[spanning], return_inverse=True)[1]
         tracklet[spanning] = tracklet.max() + 1 + piece
     return dataclasses.replace(tracks, tracklet_id=tracklet)
 
 
-def _embeddings_of(result: Result, rows: IntArray) -> tuple[Embeddings, IntArray]:
-    """Select the embeddings of some rows of the tracks, and number them by these rows."""
+def _embeddings_of(result: Result, source: IntArray) -> tuple[Embeddings, IntArray]:
+    """Select the embeddings of some rows of the tracks (-1: none), and number them by these."""
     number = np.full(len(result.tracks), -1)
-    number[rows] = np.arange(len(rows))
+    number[source[source >= 0]] = np.flatnonzero(source >= 0)
     row = number[result.embedding_row]
     foreground, background = result.embeddings.foreground, result.embeddings.background
     return Embeddings(foreground[row >= 0], background[row >= 0]), row[row >= 0]
@@ -129,6 +233,18 @@ def _part_with_most_boxes(
     votes = np.zeros((count, int(part.max(initial=0)) + 1))
     np.add.at(votes, (row_of, part), np.where(usable, 1.0, 1 / (len(tracks) + 1)))
     return np.asarray(votes.argmax(1), np.int64)
+
+
+def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
+    """Fill gaps between detections of an identity: by its solid where it has one."""
+    tracks = result.tracks
+    for part in result.parts() if max_gap else ():
+        if part.poses is not None and (own := part.located):
+            identity, support = np.array([o.id for o in own]), [str(o.support) for o in own]
+            tracks = fill_by_place(
+                tracks, part.poses, identity, part.ellipsoids(), support, max_gap
+            )
+    return fill_gaps(tracks, image_size, max_gap)
 
 
 OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are by object

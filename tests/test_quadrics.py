@@ -830,7 +830,7 @@ def test_covariance_follows_the_axes_of_a_thing_on_its_side() -> None:
     log_size, cov = np.log([[0.5, 0.2, 0.12]]), np.diag([0.01, 0.5, 0.5])[None] ** 2
     ratio = (np.zeros((1, 2)), np.eye(2)[None])
     flag = np.zeros(1, bool)
-    priors = q.Priors(("beam",), {}, log_size, cov, *ratio, np.array([1]), flag, flag)
+    priors = q.Priors(("beam",), {}, log_size, cov, *ratio, np.array([1]), flag, flag, ~flag)
     fits = q.fit_objects(boxes, cams, syn.IMAGE, ["beam"], priors, up=UP)
     assert fits.size[0, 2] == pytest.approx(0.5, rel=0.03)
     sigma = np.sqrt(np.diag(fits.cov[0]))[3:6]

@@ -1,7 +1,7 @@
-"""Gaps of tracks, filled after the video: Rauch-Tung-Striebel smoothing (filterpy).
+"""Gaps of tracks, filled after the video: by the objects' solids, else by smoothing (filterpy).
 
-The tracker cannot know what comes; afterwards both ends of a gap are known. Filled boxes are no
-detections: their score is 0, and neither fit nor linker sees them.
+The tracker cannot know what comes; afterwards both ends of a gap are known, and where the object
+is. Filled boxes are no detections: their score is 0, and neither fit nor linker sees them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from filterpy.kalman import KalmanFilter
 
-from reobj.types import Array, Tracks, box_iou, cxcywh_from_xyxy, xyxy_from_cxcywh
+import quadrics
+from reobj.cameras import Poses
+from reobj.types import Array, IntArray, Tracks, box_iou, cxcywh_from_xyxy, xyxy_from_cxcywh
 
 MIN_END_IOU = 0.3  # overlap of the boxes at both ends; less: it moved too far to say where it was
 WINDOW = 10  # frames on either side that the smoother reads; with 40 boxes move by 1.3 px at most
@@ -47,6 +49,65 @@ def fill_gaps(tracks: Tracks, image_size: tuple[int, int], max_gap: int) -> Trac
             parts.append(
                 Tracks(number, *ids, filled, np.zeros(len(number)), one * rows.class_id[i], -one)
             )
+    return _by_frame(parts)
+
+
+PLACE_GAPS = 6  # times `max_gap`: what a solid fills (chosen: a second at 30 frames/s)
+MIN_VISIBLE = 0.5  # share of the projected solid in the image that makes a box (chosen)
+
+
+def fill_by_place(
+    tracks: Tracks,
+    poses: Poses,
+    identity: IntArray,
+    solids: quadrics.Ellipsoids,
+    support: list[str],
+    max_gap: int,
+) -> Tracks:
+    """Fill gaps of up to PLACE_GAPS * `max_gap` frames with the boxes of projected solids.
+
+    A box keeps the offset from the projection that the detections at both ends have, by parts.
+
+    Args:
+        poses: of one part. identity: (O,) of the solids, which lie in that part.
+    """
+    frame = poses.frame[poses.known]  # (V,)
+    size = (poses.camera.width, poses.camera.height)
+    whole = quadrics.solid_boxes(
+        solids, support, poses.camera.K @ poses.cam_from_world[poses.known]
+    )
+    box = quadrics.clip_boxes(whole, size)  # (V, O, 4)
+    visible = _area(box) > MIN_VISIBLE * _area(whole)  # False where NaN
+    made = [tracks]
+    for number, own in enumerate(identity.tolist()):
+        rows = tracks[tracks.track_id == own]
+        at = np.searchsorted(frame, rows.frame)
+        located = np.isin(rows.frame, frame)
+        for i in range(len(rows) - 1):
+            between = np.arange(at[i] + 1, at[i + 1])
+            if not (0 < len(between) <= PLACE_GAPS * max_gap and located[i] and located[i + 1]):
+                continue
+            here = box[at[i] : at[i + 1] + 1, number]  # (n + 2, 4)
+            if not visible[at[i] : at[i + 1] + 1, number].all():
+                continue
+            side = np.tile(here[:, 2:] - here[:, :2], 2)
+            ends = (rows.xyxy[i : i + 2] - here[[0, -1]]) / side[[0, -1]]  # (2, 4)
+            share = np.linspace(0, 1, len(here))[1:-1, None]
+            filled = here[1:-1] + side[1:-1] * ((1 - share) * ends[0] + share * ends[1])
+            one = np.ones(len(between), np.int64)
+            ids = (one * own, one * rows.tracklet_id[i])
+            filled = filled.clip(0, np.tile(size, 2))
+            score = np.zeros(len(one))
+            made.append(Tracks(frame[between], *ids, filled, score, one * rows.class_id[i], -one))
+    return _by_frame(made)
+
+
+def _area(box: Array) -> Array:
+    return np.asarray(np.nan_to_num((box[..., 2:] - box[..., :2]).prod(-1), nan=-1.0))
+
+
+def _by_frame(parts: list[Tracks]) -> Tracks:
+    """Put tables behind each other and order their rows by frame."""
     names = [f.name for f in dataclasses.fields(Tracks)]
     merged = Tracks(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
     return merged[np.argsort(merged.frame, kind="stable")]

@@ -1,16 +1,14 @@
-"""From tracklets to objects over the whole video: by appearance, and by place in 3D."""
+"""From tracklets to objects over the whole video: by place where known, else by appearance."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-import quadrics
 from reobj.cameras import Poses, angle_deg, place_of, undistort_boxes, viewing_rays
-from reobj.identity.places import quick_fit, rough_sizes, usual_size
 from reobj.identity.reid import SimilarityCalibration, paired_cosine
 from reobj.types import (
     Array,
@@ -24,25 +22,14 @@ from reobj.types import (
     rows_by,
     unit_rows,
 )
-from reobj.views import Views, gather_views
 
 # Chosen on examples/room and redkitchen (docs/tracking.md), but for those with a source.
 LINK_PROBABILITY = 0.5  # join by appearance from this probability on, rivals considered: even odds
-VIEW_GAP = (
-    30  # frames; views of a fragment this far apart show how the appearance of one object varies
-)
+# frames; views of a fragment this far apart show how the appearance of one object varies
+VIEW_GAP = 30
 DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes on one object
-MIN_LINK_LOG_ODDS = -4.0  # never join by place what is less alike: 1 in 55
-MIN_CLASS_AGREEMENT = 0.1  # join by place only where the class shares agree in so much
-SAME_PLACE_IOU = 0.25  # cross-projected overlap from which two places may be one, and are not split
-KEEP_IOU = 0.4  # a join is kept if the joint solid overlaps the boxes by this
-KEEP_SHARE = 0.6  # in this share of the frames of either part (OA-SLAM: half)
-CUT_GAP = 5  # frames without a detection, after which a tracklet may be another object
-SPLIT_DROP = (
-    0.7  # a return is doubted where the joint solid overlaps less, a share of its own solid
-)
+FRAGMENT_GAP = 5  # frames without a detection, after which a tracklet may be another object
 LEAST_LOG_ODDS = -9.0  # said in the evidence where nothing speaks for one object
-APPEARANCE_SHARE = 0.4  # what certain appearance adds to the overlap (IoU) in the order of joins
 
 
 def link(
@@ -51,49 +38,65 @@ def link(
     embeddings: Embeddings,
     embedding_row: IntArray,
     poses: Poses | None = None,
-    fit: Callable[[Views, list[int]], quadrics.ObjectFits] | None = None,
     *,
     moving: Collection[str] = (),
-    min_score: float = 0.3,
-    min_views: int = 3,
+    solid: IntArray | None = None,
+    overlap: Array | None = None,
 ) -> tuple[Tracks, list[LinkEvent]]:
     """Decide over the whole video which tracklets are one object.
 
     Args:
         tracks: rows with the tracker's identities.
         embeddings, embedding_row: fused embeddings of n rows, and which rows (n,) these are.
-        poses, fit: None to decide by appearance alone.
+        poses: known cameras; views from another side say less.
         moving: names of the classes that move; they stay as the tracker has them.
-        min_score, min_views: boxes and objects below them say nothing about a place.
+        solid, overlap: (N,) the solid that shows in each row, or -1 (`locate`), and the IoU of its
+            projection with the box; rows of one solid are one object. None: appearance decides.
     Returns:
         the rows with the objects' identities, and every join and split with its evidence.
     """
     if not len(tracks):
         return tracks, []
-    linker = Linker(tracks, class_names, poses, fit, moving, min_score, min_views)
+    linker = Linker(tracks, class_names, poses, moving)
     linker.measure_appearance(embeddings, embedding_row)
-    return tracks.with_identities(linker.run()), linker.events
+    identity = linker.by_appearance()
+    if solid is not None:
+        solid = with_neighbours(tracks, solid)
+        identity = np.where(solid >= 0, solid, identity + solid.max(initial=-1) + 1)
+    return tracks.with_identities(identity), linker.changes(identity, overlap)
+
+
+def with_neighbours(tracks: Tracks, solid: IntArray) -> IntArray:
+    """Give rows without a solid (-1) that of the nearest row of their tracklet.
+
+    Not where another row of the frame shows that solid.
+    """
+    solid = solid.copy()
+    shown = set(zip(tracks.frame[solid >= 0].tolist(), solid[solid >= 0].tolist(), strict=True))
+    for rows in rows_by(tracks.tracklet_id):
+        known, open_ = rows[solid[rows] >= 0], rows[solid[rows] < 0]
+        if len(known) and len(open_):
+            apart = np.abs(tracks.frame[open_][:, None] - tracks.frame[known])
+            wanted = solid[known[apart.argmin(1)]]
+            for row, name in zip(open_.tolist(), wanted.tolist(), strict=True):
+                if (key := (int(tracks.frame[row]), name)) not in shown:
+                    solid[row] = name
+                    shown.add(key)
+    return solid
 
 
 class Linker:
-    """Join and split the fragments of a video's tracklets.
+    """Join and split the fragments of a video's tracklets by appearance.
 
     Two fragments seen in one frame are never the same object, and classes that move stay as the
-    tracker has them: neither their place nor what surrounds them lasts.
-    First by appearance: fragments are joined as long as their most similar views show one object
-    more likely than any rival (seen beside one of the two) or another object, the most similar
-    first. This replaces what the tracker decided when it first saw them.
-    Then, with poses, by place: tracklets are cut at gaps (where a tracker slips to a twin) and
-    where two solids explain boxes that one does not (where it slips to a neighbour); a join is
-    undone where two well-measured places differ; groups that explain each other's boxes are joined,
-    refitted and kept only if the joint solid overlaps the boxes of both in most frames (merge,
-    re-project, undo: the idea of OA-SLAM).
+    tracker has them: what surrounds them does not last. Fragments are joined as long as their most
+    similar views show one object more likely than any rival (seen beside one of the two) or another
+    object, the most similar first. This replaces what the tracker decided when it first saw them.
 
     Attributes:
         fragment: (N,) fragment of each row, 0 .. L - 1: a tracklet, or a piece of one.
-        group: (L,) object of each fragment. log_odds: (L, L) that two look like one object.
+        log_odds: (L, L) that two look like one object, -inf: unknown.
         co_occur: (L, L) seen in one frame; distinct: those of them that cannot be duplicates.
-        events: joins and splits so far.
     """
 
     def __init__(
@@ -101,37 +104,13 @@ class Linker:
         tracks: Tracks,
         class_names: Sequence[str],
         poses: Poses | None,
-        fit: Callable[[Views, list[int]], quadrics.ObjectFits] | None,
         moving: Collection[str],
-        min_score: float,
-        min_views: int,
     ) -> None:
-        self.tracks, self.poses, self.fit = tracks, poses, fit
-        self.min_score, self.min_views = min_score, min_views
-        self.located = np.empty(0) if poses is None else poses.frame[poses.known]  # (V,)
-        self.fragment = _cut_at_gaps(tracks, CUT_GAP)  # (N,)
+        self.tracks, self.poses = tracks, poses
+        self.fragment = cut_at_gaps(tracks, FRAGMENT_GAP)  # (N,)
         self._describe_fragments(class_names, moving)
-        if poses is not None:
-            count = len(self.tracklets)
-            views = gather_views(tracks, poses, self.fragment, count, min_score)
-            self.usual_size = usual_size(rough_sizes(views.boxes, views.img_from_world))
-            self._cut()
-            self._describe_fragments(class_names, moving)
         self.co_occur, self.distinct = self._co_occurrence()
         self.log_odds = np.full(self.co_occur.shape, -np.inf)
-        self.group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
-        self.events: list[LinkEvent] = []
-
-    def run(self) -> IntArray:
-        """Return the object of every row of the tracks, (N,), any numbering."""
-        if np.isfinite(self.log_odds).any():
-            self._join_by_appearance()
-        if self.poses is not None:
-            self._split()
-            rejected: set[tuple[int, ...]] = set()
-            while self._join_round(rejected):
-                pass
-        return np.asarray(self.group[self.fragment], np.int64)
 
     def _describe_fragments(self, class_names: Sequence[str], moving: Collection[str]) -> None:
         """Note tracklet, identity and class of every fragment and whether it moves, (L,) each."""
@@ -215,23 +194,46 @@ class Linker:
         cams = np.where(known[:, None, None], self.poses.cam_from_world[place], np.nan)
         return viewing_rays(undistort_boxes(self.tracks.xyxy[rows], camera), camera.K @ cams)
 
-    def _join_by_appearance(self) -> None:
-        """Group the tracklets anew by appearance and list what differs from the tracker."""
-        keep = np.where(self.moving, -self.identity, self.tracklets)
-        whole = np.unique(keep, return_inverse=True)[1]  # (L,) tracklet of each fragment
-        shares = class_shares(self.tracks, whole[self.fragment], int(whole.max()) + 1)
-        kind = shares.argmax(1)  # (T,)
-        kind[whole[self.moving]] = -1 - whole[self.moving]  # a kind of its own
-        log_odds = _max_between_groups(self.log_odds, whole)  # (T, T)
-        banned = _max_between_groups(self.co_occur, whole) | (kind[:, None] != kind)
-        distinct = _max_between_groups(self.distinct, whole)
-        found = _agglomerate(log_odds, banned, distinct, LINK_PROBABILITY)
-        before, self.group = self.group, found[whole]
-        self._list_changes(before, self.group, "join")
-        self._list_changes(self.group, before, "split")
+    def by_appearance(self) -> IntArray:
+        """Return the object of every row of the tracks, (N,), any numbering."""
+        group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
+        if np.isfinite(self.log_odds).any():
+            keep = np.where(self.moving, -self.identity, self.tracklets)
+            whole = np.unique(keep, return_inverse=True)[1]  # (L,) tracklet of each fragment
+            shares = class_shares(self.tracks, whole[self.fragment], int(whole.max()) + 1)
+            kind = shares.argmax(1)  # (T,)
+            kind[whole[self.moving]] = -1 - whole[self.moving]  # a kind of its own
+            log_odds = max_between_groups(self.log_odds, whole)  # (T, T)
+            banned = max_between_groups(self.co_occur, whole) | (kind[:, None] != kind)
+            distinct = max_between_groups(self.distinct, whole)
+            group = _agglomerate(log_odds, banned, distinct, LINK_PROBABILITY)[whole]
+        return np.asarray(group[self.fragment], np.int64)
 
-    def _list_changes(self, parts: IntArray, whole: IntArray, kind: str) -> None:
+    def changes(self, identity: IntArray, overlap: Array | None) -> list[LinkEvent]:
+        """List what differs from the tracker, with the evidence.
+
+        Args:
+            identity: (N,) of each row now. overlap: (N,) of its box with its solid, NaN: none.
+        """
+        count = len(self.tracklets)
+        names, number = np.unique(identity, return_inverse=True)
+        votes = np.zeros((count, len(names)))
+        np.add.at(votes, (self.fragment, number), 1)
+        now = votes.argmax(1)  # (L,) most of its rows
+        place = np.full(count, np.nan)
+        if overlap is not None:
+            for rows in rows_by(self.fragment):
+                known = overlap[rows][np.isfinite(overlap[rows])]
+                place[self.fragment[rows[0]]] = np.median(known) if len(known) else np.nan
+        before = np.unique(self.identity, return_inverse=True)[1]
+        joins = self._changes(before, now, "join", place)
+        return joins + self._changes(now, before, "split", place)
+
+    def _changes(
+        self, parts: IntArray, whole: IntArray, kind: str, place: Array
+    ) -> list[LinkEvent]:
         """List an event for each part but the first of the groups of `whole` that hold several."""
+        found = []
         for g in np.unique(whole):
             members = np.flatnonzero(whole == g)
             pieces = [members[parts[members] == part] for part in np.unique(parts[members])]
@@ -239,186 +241,13 @@ class Linker:
                 rest = np.setdiff1d(members, piece)
                 log_odds = max(float(self.log_odds[np.ix_(rest, piece)].max()), LEAST_LOG_ODDS)
                 ids = np.unique(self.tracklets[members if kind == "join" else piece]).tolist()
-                self.events.append(LinkEvent(kind, tuple(ids), None, log_odds, True))
-
-    def _cut(self) -> None:
-        """Cut fragments where the tracker slipped to another thing without missing a frame.
-
-        Repeated until no cut helps; `_split` takes back those with both sides in one place.
-        """
-        todo = np.flatnonzero(~self.moving)
-        while len(todo):
-            cuts = self._find_cuts(todo)
-            fresh = self.fragment.max() + 1 + np.arange(len(cuts))
-            for name, (fragment, frame) in zip(fresh, cuts, strict=True):
-                self.fragment[(self.fragment == fragment) & (self.tracks.frame >= frame)] = name
-            todo = np.concatenate([[fragment for fragment, _ in cuts], fresh]).astype(np.int64)
-
-    def _find_cuts(self, fragments: IntArray) -> list[tuple[int, int]]:
-        """Find fragments to cut, and the frame from which on.
-
-        Of 8 cuts the best one counts, if the solid of a half explains its boxes much better than
-        that of the whole does, as in `_split`.
-        """
-        least, frame = 2 * self.min_views, self.tracks.frame
-        usable = np.isin(frame, self.located) & (self.tracks.score >= self.min_score)
-        rows = [np.flatnonzero(usable & (self.fragment == fragment)) for fragment in fragments]
-        tries: list[tuple[int, int, Array]] = []
-        for i, joint in enumerate(self._own_iou(rows)):
-            span = np.linspace(least, len(joint) - least, 8 * (len(joint) >= 2 * least))
-            for at in np.unique(span.round().astype(np.int64)):
-                together = np.array([np.median(joint[:at]), np.median(joint[at:])])
-                if together.min() < SPLIT_DROP:  # no overlap is above 1
-                    tries.append((i, int(at), together))
-        halves = [half for i, at, _ in tries for half in (rows[i][:at], rows[i][at:])]
-        alone = self._own_iou(halves)
-        best: dict[int, tuple[float, int]] = {}
-        for (i, at, together), a, b in zip(tries, alone[::2], alone[1::2], strict=True):
-            total = float(a.sum() + b.sum())
-            worse = together < SPLIT_DROP * np.array([np.median(a), np.median(b)])
-            if worse.any() and total > best.get(i, (0.0, 0))[0]:
-                best[i] = total, at
-        return [(int(fragments[i]), int(frame[rows[i][at]])) for i, (_, at) in best.items()]
-
-    def _own_iou(self, groups: Sequence[IntArray]) -> list[Array]:
-        """Fit an ellipsoid of any size to each group of rows: its IoU with each of their boxes."""
-        if not groups:
-            return []
-        assert self.poses is not None
-        size = [len(rows) for rows in groups]
-        rows, label = np.concatenate(groups), np.repeat(np.arange(len(groups)), size)
-        views = gather_views(self.tracks[rows], self.poses, label, len(size), self.min_score)
-        seen = (views.boxes, views.img_from_world, views.image_size)
-        ellipsoids = quick_fit(*seen, self.usual_size).ellipsoids
-        solids = quadrics.solid_boxes(ellipsoids, "ellipsoid", views.img_from_world)
-        solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
-        at = np.searchsorted(self.located, self.tracks.frame[rows])
-        return np.split(
-            quadrics.box_iou(solids[at, label], views.boxes[at, label]), np.cumsum(size)[:-1]
-        )
-
-    def _cross_iou(self, labels: IntArray, count: int) -> tuple[Array, Array]:
-        """Fit all groups of fragments and compare each solid with the boxes of every group.
-
-        Args:
-            labels: (L,) group of each fragment, 0 .. count - 1.
-        Returns:
-            place: (G, G) median IoU of solid g in the frames of group h.
-            own: (V, G) IoU of each solid with its own boxes.
-        """
-        assert self.poses is not None and self.fit is not None
-        rows = labels[self.fragment]  # (N,)
-        views = gather_views(self.tracks, self.poses, rows, count, self.min_score)
-        classes = class_shares(self.tracks, rows, count).argmax(1)
-        fits = self.fit(views, classes.tolist())
-        solids = quadrics.solid_boxes(fits.ellipsoids, list(fits.support), views.img_from_world)
-        solids = quadrics.clip_boxes(solids, views.image_size)  # (V, G, 4)
-        place = np.zeros((count, count))
-        for h in range(count):  # over groups: each is one vectorised comparison
-            seen = np.flatnonzero(np.isfinite(views.boxes[:, h, 0]))
-            if len(seen):
-                iou = quadrics.box_iou(solids[seen], views.boxes[seen, h][:, None])  # (n, G)
-                place[:, h] = np.median(iou, 0)
-        return place, quadrics.box_iou(solids, views.boxes)
-
-    def _split(self) -> None:
-        """Undo returns whose places differ: fragments that their identity's solid does not explain.
-
-        Nothing is split on a poor fit alone: the fragment's own solid must explain its boxes much
-        better, and its place must not overlap those that the joint solid does explain.
-        """
-        count, groups = len(self.tracklets), int(self.group.max()) + 1
-        if groups == count:
-            return
-        place, own = self._cross_iou(np.arange(count), count)
-        _, joint = self._cross_iou(self.group, groups)
-        alone, together = (
-            np.array([self._median_iou(iou[:, g], self.fragment == a) for a, g in enumerate(of)])
-            for iou, of in ((own, np.arange(count)), (joint, self.group))
-        )  # (L,) each
-        worse = together < SPLIT_DROP * alone
-        length = np.bincount(self.fragment, minlength=count)
-        for g in np.flatnonzero(np.bincount(self.group) > 1):
-            members = np.flatnonzero(self.group == g)
-            anchors = members[~worse[members]]
-            anchors = anchors if len(anchors) else members[[np.argmax(length[members])]]
-            for fragment in np.setdiff1d(members[~self.moving[members]], anchors):
-                iou = float(max(place[anchors, fragment].max(), place[fragment, anchors].max()))
-                if iou < SAME_PLACE_IOU:
-                    log_odds = float(self.log_odds[anchors, fragment].max(initial=LEAST_LOG_ODDS))
-                    self.group[fragment] = self.group.max() + 1
-                    ids = (int(self.tracklets[anchors[0]]), int(self.tracklets[fragment]))
-                    self.events.append(LinkEvent("split", ids, iou, log_odds, True))
-
-    def _join_round(self, rejected: set[tuple[int, ...]]) -> bool:
-        """Join the best disjoint pairs of groups; returns whether another round could find more."""
-        labels, self.group = np.unique(self.group, return_inverse=True)
-        count = len(labels)
-        place, _ = self._cross_iou(self.group, count)
-        pairs = self._candidates(place, count, rejected)
-        if not pairs:
-            return False
-        proposal = np.arange(count)
-        for a, b, _, _ in pairs:
-            proposal[b] = a
-        kept_labels, column = np.unique(proposal, return_inverse=True)
-        _, own = self._cross_iou(column[self.group], len(kept_labels))
-        for a, b, iou, log_odds in pairs:
-            part = self.group[self.fragment]
-            kept = all(self._explains(own[:, column[a]], part == side) for side in (a, b))
-            ids = tuple(sorted(self.tracklets[(self.group == a) | (self.group == b)].tolist()))
-            self.events.append(LinkEvent("join", ids, iou, log_odds, kept))
-            rejected.add(ids)
-            if kept:
-                self.group[self.group == b] = a
-        return True
-
-    def _candidates(
-        self, place: Array, count: int, rejected: set[tuple[int, ...]]
-    ) -> list[tuple[int, int, float, float]]:
-        """List disjoint pairs of groups worth a joint fit, best first.
-
-        Returns:
-            (a, b, IoU of cross-projection, log odds of their appearance) each.
-        """
-        share = class_shares(self.tracks, self.group[self.fragment], count)  # (G, C)
-        confused = np.minimum(share[:, None], share).sum(-1) >= MIN_CLASS_AGREEMENT  # (G, G)
-        log_odds = _max_between_groups(self.log_odds, self.group)  # (G, G)
-        log_odds = np.where(np.isfinite(log_odds), log_odds, 0.0)  # unknown: even odds
-        score = np.maximum(place, place.T)
-        good = confused & (score >= SAME_PLACE_IOU) & (log_odds >= MIN_LINK_LOG_ODDS)
-        good &= ~_max_between_groups(self.co_occur, self.group)
-        still = ~np.isin(np.arange(count), self.group[self.moving])
-        good &= still[:, None] & still
-        a, b = np.nonzero(np.triu(good, 1))
-        rank = score + APPEARANCE_SHARE / (1 + np.exp(-log_odds))
-        pairs: list[tuple[int, int, float, float]] = []
-        used: set[int] = set()
-        for i in np.argsort(-rank[a, b], kind="stable"):
-            pair = (int(a[i]), int(b[i]))
-            ids = tuple(sorted(self.tracklets[np.isin(self.group, pair)].tolist()))
-            if ids not in rejected and not used & set(pair):
-                used |= set(pair)
-                pairs.append((*pair, float(score[pair]), float(log_odds[pair])))
-        return pairs
-
-    def _explains(self, own_iou: Array, rows: BoolArray) -> bool:
-        """Test whether a solid of IoU (V,) with its boxes overlaps those of rows in most frames."""
-        iou = own_iou[self._views_of(rows)]
-        return bool(len(iou) and np.mean(iou >= KEEP_IOU) >= KEEP_SHARE)
-
-    def _median_iou(self, own_iou: Array, rows: BoolArray) -> float:
-        """Return the median IoU of a solid with the boxes of rows; 0 if none has a pose."""
-        iou = own_iou[self._views_of(rows)]
-        return float(np.median(iou)) if len(iou) else 0.0
-
-    def _views_of(self, rows: BoolArray) -> BoolArray:
-        """Mark the frames with a pose (V,) in which one of the rows (N,) is seen."""
-        seen = self.tracks.frame[rows & (self.tracks.score >= self.min_score)]
-        return np.isin(self.located, seen)
+                known = place[piece][np.isfinite(place[piece])]
+                iou = float(np.median(known)) if len(known) else None
+                found.append(LinkEvent(kind, tuple(ids), iou, log_odds, True))
+        return found
 
 
-def _max_between_groups(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArray[Any]:
+def max_between_groups(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArray[Any]:
     """Reduce a matrix (L, L) to the largest entries (G, G) between members of groups (L,)."""
     order = np.argsort(group, kind="stable")
     starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 1))
@@ -462,7 +291,7 @@ def _agglomerate(
     return np.unique(group, return_inverse=True)[1]
 
 
-def _cut_at_gaps(tracks: Tracks, most: int) -> IntArray:
+def cut_at_gaps(tracks: Tracks, most: int) -> IntArray:
     """Cut tracklets where more than `most` frames pass without a detection.
 
     Returns:

@@ -75,8 +75,10 @@ class Object:
 
     Attributes:
         id: identity in the tracks, from 1. class_name: of the largest sum of scores; score: mean.
-        status: "ok", "prior_dominated" (some size rests on the category's prior) or "rejected".
-        reason: why it is not "ok", "" if it is. support: "box", "cylinder" or "ellipsoid".
+        status: "ok", "prior_dominated" (some size rests on the category's prior), "doubtful" (less
+            likely there than not) or "rejected" (no solid). reason: why it is not "ok".
+        confidence: probability that it is there, a thing of its own; None without cameras.
+        support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
         size: (3,) full extents of the solid along its own axes; size_m: the same in metres, None
             where the scale is unknown; size_rel_sigma: (3,) relative standard deviation.
@@ -109,11 +111,12 @@ class Object:
     tracklet_ids: list[int] = field(default_factory=list)
     visits: list[list[int]] = field(default_factory=list)
     part: int = 0
+    confidence: float | None = None
 
     @property
     def located(self) -> bool:
-        """True where a solid was fitted and not rejected."""
-        return self.status != "rejected"
+        """True where a solid was fitted, and is not doubtful."""
+        return self.status in ("ok", "prior_dominated")
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of objects.json."""
@@ -123,7 +126,7 @@ class Object:
     @staticmethod
     def from_json(entry: dict[str, Any]) -> Object:
         """Read an entry of objects.json; unknown keys are ignored."""
-        entry = {"part": 0, **entry}  # older files have no parts
+        entry = {"part": 0, "confidence": None, **entry}  # older files lack these
         values = {f.name: entry[_JSON_KEYS.get(f.name, f.name)] for f in dataclasses.fields(Object)}
         for name in ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov"):
             values[name] = None if values[name] is None else np.array(values[name], np.float64)
@@ -250,6 +253,8 @@ class Result:
 
     Attributes:
         tracks: all rows of the video in native pixels, with the objects' identities.
+        untracked: detections that the tracker left out, as rows of no tracklet; places in 3D may
+            tell later what they are of.
         class_names: names of the tracks' `class_id`.
         objects: one for each identity, by id. world: units, gravity, scale, joins and splits.
         poses: cameras, or None. fits: of the objects, in their order; None if nothing was fitted
@@ -270,6 +275,7 @@ class Result:
     fits: quadrics.ObjectFits | None = None
     embeddings: Embeddings = field(default_factory=Embeddings.empty)
     embedding_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    untracked: Tracks = field(default_factory=Tracks.empty)
     identities_given: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -399,6 +405,7 @@ class Result:
     def save_tracked(self, path: Path) -> None:
         """Write tracks and embeddings, before anything is linked or fitted, as npz."""
         columns = {f.name: getattr(self.tracks, f.name) for f in dataclasses.fields(Tracks)}
+        columns |= {f"untracked_{n}": getattr(self.untracked, n) for n in columns}
         columns |= {name: getattr(self.embeddings, name) for name in ("foreground", "background")}
         facts = {"class_names": self.class_names, "warnings": self.warnings,
                  "identities_given": self.identities_given,
@@ -416,6 +423,9 @@ class Result:
                 VideoInfo(**facts["video"]),
                 embeddings=Embeddings(data["foreground"], data["background"]),
                 embedding_row=data["embedding_row"],
+                untracked=Tracks(
+                    *(data[f"untracked_{f.name}"] for f in dataclasses.fields(Tracks))
+                ),
                 identities_given=bool(facts["identities_given"]),
                 warnings=list(facts["warnings"]),
             )
@@ -424,13 +434,14 @@ class Result:
 
     def summary(self) -> str:
         """Return the table that `run` prints: object, class, frames, size with sigma, status."""
+        counted = [o for o in self.objects if o.status != "doubtful"]
         scaled = any(o.size_m is not None for o in self.objects)
         unit = "m" if scaled else "units"
         lines = [
             f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  "
             f"{'width x depth x height, ' + unit:<26} {'sigma':>6}  status"
         ]
-        for o in self.objects:
+        for o in counted:
             size = o.size if o.size_m is None else o.size_m
             text = "-" if size is None else " x ".join(f"{s:.2f}" for s in size)
             text += " units" if scaled and size is not None and o.size_m is None else ""
@@ -441,10 +452,12 @@ class Result:
                 f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
                 f"{text:<26} {sigma:>6}  {o.status}{part}{reason}"
             )
-        counts = sorted(Counter(o.class_name for o in self.objects).items())
+        counts = sorted(Counter(o.class_name for o in counted).items())
         each = " (each part counted by itself)" if len(self.world.parts) > 1 else ""
         names = ", ".join(f"{n} {c}" for c, n in counts) or "none"
         lines.append(f"distinct objects: {names}{each}")
+        if (doubtful := len(self.objects) - len(counted)) > 0:
+            lines.append(f"doubtful: {doubtful} more, less likely there than not (objects.json)")
         lines += self._camera_lines()
         lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in self.seconds.items()))
         if self.out is not None:

@@ -15,7 +15,7 @@ from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
 from reobj.sources.video import Video, source_fingerprint
-from reobj.types import Array, Floats, Frame, IntArray, ReobjError, Tracks
+from reobj.types import Array, Detections, Floats, Frame, IntArray, ReobjError, Tracks
 
 
 def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
@@ -76,6 +76,22 @@ def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tra
     return Tracks(frame, none, none, xyxy, score, class_id, none - 1)
 
 
+def _untracked(
+    tracks: Tracks, frames: list[int], detected: list[Detections], scale: float
+) -> Tracks:
+    """Make rows, of no tracklet, of the detections (of each frame) that no row of the tracks is."""
+    index = np.concatenate([np.arange(len(found)) for found in detected])
+    frame = np.repeat(np.asarray(frames, np.int64), [len(found) for found in detected])
+    columns = [
+        np.concatenate([getattr(d, n) for d in detected]) for n in ("xyxy", "score", "class_id")
+    ]
+    columns[0] = columns[0] / scale
+    known = set(zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True))
+    free = [key not in known for key in zip(frame.tolist(), index.tolist(), strict=True)]
+    rows = _rows(frame, *columns)
+    return dataclasses.replace(rows, detection_index=index)[np.array(free, bool)]
+
+
 def collect_tracks(
     steps: Iterator[tuple[Frame, Tracks]], tracker: Any, video: Video, source: DetectionSource
 ) -> Result:
@@ -87,12 +103,14 @@ def collect_tracks(
     frames: list[int] = []
     found: list[Tracks] = []
     embedded: list[tuple[IntArray, Floats]] = []
+    detected: list[Detections] = []
     progress = Progress("track", video.expected)
     try:
         for frame, _ in steps:
             frames.append(frame.index)
             found.append(tracker.latest)
             embedded.append(tracker.latest_embeddings())
+            detected.append(tracker.detections)
             progress.step()
     except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
@@ -107,6 +125,7 @@ def collect_tracks(
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
     tracks = Tracks.concatenate(frames, found, video.scale)
     result = Result(tracks, source.class_names, VideoInfo.of(video))
+    result.untracked = _untracked(tracks, frames, detected, video.scale)
     result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
     result.warnings += [*source.messages, *video.messages]
     if video.is_live:

@@ -1,0 +1,263 @@
+"""Which detection is of which object: objects and their detections found in turn.
+
+Objects are solids. Which detection is of which solid, where the solids are, and which of them exist
+is decided by log odds (`evidence`): of every detection with its solid, against every frame that
+should show a solid and does not, and against every solid.
+
+ 1. pursue   from many proposed solids choose those that explain most of what is not yet explained
+ 2. assign   in every frame each detection to at most one solid and back; tracklets stay together
+ 3. refit    each solid to its detections
+ 4. thin     drop solids that bring less than they cost, as others explain their detections too
+ 5. merge    two solids where one explains the detections of both
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from reobj.identity.evidence import Detected, Evidence, Solids, gather_evidence
+from reobj.types import Array, IntArray
+
+# Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).
+MISSED = 0.5  # against a solid, for each frame that should show it and has no detection of it
+NEW_SOLID = 15.0  # against each solid: five frames and more must speak for it
+KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tracklet
+# A second detection of one solid in one frame (a part of it, or a box that suppression left): one
+# in ten detections of a thing
+SECOND_DETECTION = float(np.log(0.1))
+MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
+MIN_DETECTIONS = 3  # of a solid; fewer do not determine it
+MAX_ROUNDS = 10  # of steps 2 to 5 (chosen)
+
+# detections (K,), the solid of each (K,), the classes (S,) of the solids -> S solids
+Refit = Callable[[IntArray, IntArray, IntArray], Solids]
+SizeLogOdds = Callable[[Solids], Array]  # (S,) of the sizes by the categories
+
+
+@dataclass(frozen=True, slots=True)
+class Association:
+    """Solids and the detections that show them.
+
+    Attributes:
+        solids: S. owner: (N,) solid of each detection, or -1. evidence: of these solids.
+        size_log_odds: (S,) by the categories.
+    """
+
+    solids: Solids
+    owner: IntArray
+    evidence: Evidence
+    size_log_odds: Array
+
+    @property
+    def count(self) -> IntArray:
+        """(S,) detections of each solid."""
+        return np.bincount(self.owner[self.owner >= 0], minlength=len(self.solids))
+
+    def gains(self, detected: Detected) -> Array:
+        """Return the log odds (S,) of each solid: its detections, missed frames and size."""
+        own = self.evidence
+        mine = self.owner[own.row] == own.solid
+        solid, row = own.solid[mine], own.row[mine]
+        worth = own.log_odds[mine] + MISSED * own.expected[detected.view[row], solid]
+        return np.asarray(np.bincount(solid, worth, len(self.solids)) - self.costs())
+
+    def costs(self) -> Array:
+        """Return the log odds (S,) against each solid if nothing showed it."""
+        missed = MISSED * self.evidence.expected.sum(0)
+        return np.asarray(missed + NEW_SOLID - self.size_log_odds)
+
+
+class Associator:
+    """Find the solids of a scene and their detections.
+
+    Args:
+        detected: of all frames. refit: fits solids to detections. size_log_odds: what the
+            categories say of sizes.
+    """
+
+    def __init__(self, detected: Detected, refit: Refit, size_log_odds: SizeLogOdds) -> None:
+        self.detected, self.refit, self.size_log_odds = detected, refit, size_log_odds
+
+    def run(self, proposed: Solids) -> Association:
+        """Choose among proposed solids, then improve them and their detections in turn."""
+        chosen = self._pursue(self._empty(proposed))
+        now = self._assign(proposed[chosen], np.full(len(self.detected.view), -1))
+        for _ in range(MAX_ROUNDS):
+            before = now.owner
+            for step in (self._refitted, self._thinned, self._merged):
+                now = step(now)
+            if np.array_equal(now.owner, before):
+                break
+        return now
+
+    def _empty(self, solids: Solids) -> Association:
+        """Look at solids of which nothing is a detection yet."""
+        evidence, nothing = (
+            gather_evidence(solids, self.detected),
+            np.full_like(self.detected.view, -1),
+        )
+        return Association(solids, nothing, evidence, self.size_log_odds(solids))
+
+    def _pursue(self, of: Association) -> IntArray:
+        """Choose solids one by one: each explains most of what those before do not.
+
+        Returns:
+            the chosen solids, the best first.
+        """
+        view, evidence, cost = self.detected.view, of.evidence, of.costs()
+        positive = evidence.log_odds > 0
+        solid, row = evidence.solid[positive], evidence.row[positive]
+        log_odds = evidence.log_odds[positive]
+        if not len(solid):
+            return np.empty(0, np.int64)
+        key = solid * len(evidence.expected) + view[row]  # ascending: rows ascend with the views
+        first = np.flatnonzero(np.append(True, np.diff(key) != 0))
+        solid_of, view_of = solid[first], view[row[first]]
+        not_missed = MISSED * evidence.expected[view_of, solid_of]
+        explained, chosen = np.zeros(len(view)), list[int]()  # explained: log odds of each row
+        while True:
+            more = np.maximum(log_odds - explained[row], 0)
+            best = np.maximum.reduceat(more, first)  # of each solid in each view
+            gain = np.bincount(solid_of, np.where(best > 0, best + not_missed, 0), len(cost)) - cost
+            gain[chosen] = -np.inf
+            winner = int(gain.argmax())
+            if gain[winner] <= 0:
+                return np.array(chosen, np.int64)
+            chosen.append(winner)
+            low, high = np.searchsorted(solid, (winner, winner + 1))
+            at, own = view[row[low:high]], more[low:high]
+            top = np.zeros(len(evidence.expected))
+            np.maximum.at(top, at, own)
+            value = log_odds[low:high] + np.where(own >= top[at], 0, SECOND_DETECTION)
+            np.maximum.at(explained, row[low:high], value)
+
+    def _assign(self, solids: Solids, owner: IntArray) -> Association:
+        """Assign detections to solids frame by frame, given the neighbours in their tracklets.
+
+        Args:
+            owner: (N,) of the start, or -1.
+        """
+        detected, owner = self.detected, owner.copy()
+        evidence = gather_evidence(solids, detected)
+        expected = evidence.expected[detected.view[evidence.row], evidence.solid]
+        value = evidence.choice + MISSED * expected
+        order = np.argsort(evidence.row, kind="stable")
+        starts = np.searchsorted(evidence.row[order], detected.rows_of_view)
+        for low, high in itertools.pairwise(starts):
+            pairs = order[low:high]
+            solid, row = evidence.solid[pairs], evidence.row[pairs]
+            gain = value[pairs]
+            for beside in (detected.before[row], detected.after[row]):
+                gain = gain + KEPT_TRACKLET * ((beside >= 0) & (owner[beside] == solid))
+            owner[row] = -1
+            solid_at, i = np.unique(solid, return_inverse=True)
+            row_at, j = np.unique(row, return_inverse=True)
+            table = np.zeros((len(solid_at), len(row_at)))
+            table[i, j] = gain.clip(0)
+            i, j = linear_sum_assignment(table, maximize=True)
+            good = table[i, j] > 0
+            owner[row_at[j[good]]] = solid_at[i[good]]
+        return Association(solids, owner, evidence, self.size_log_odds(solids))
+
+    def _refitted(self, now: Association) -> Association:
+        """Fit the solids to their detections, in the class that most of them have."""
+        owned = np.flatnonzero(now.owner >= 0)
+        solid, label = now.owner[owned], self.detected.class_id[owned].clip(0)
+        votes = np.zeros((len(now.solids), int(label.max(initial=0)) + 1))
+        np.add.at(votes, (solid, label), self.detected.score[owned])
+        classes = np.where(votes.any(1), votes.argmax(1), now.solids.class_id)
+        fitted = self.refit(owned, solid, classes)
+        well = np.isfinite(fitted.ellipsoids.center_in_world).all(1)
+        both = Solids.concatenate([now.solids, fitted])
+        pick = np.arange(len(fitted)) + np.where(well, len(fitted), 0)
+        return self._assign(both[pick], now.owner)
+
+    def _thinned(self, now: Association) -> Association:
+        """Drop solids that bring less than they cost, as others would explain their detections."""
+        evidence, owner, view = now.evidence, now.owner, self.detected.view
+        owned = owner >= 0
+        busy = np.zeros_like(evidence.expected)
+        busy[view[owned], owner[owned]] = True
+        other = owned[evidence.row] & (owner[evidence.row] != evidence.solid)
+        row, solid = evidence.row[other], evidence.solid[other]
+        missed = MISSED * evidence.expected[view[row], solid]
+        worth = np.where(busy[view[row], solid], SECOND_DETECTION, missed)
+        instead = np.zeros(len(owner))
+        np.maximum.at(instead, row, evidence.log_odds[other] + worth)
+        lost = np.bincount(owner[owned], instead[owned], len(now.solids))
+        marginal = now.gains(self.detected) - lost  # (S,)
+        weak = np.flatnonzero((marginal < 0) | (now.count < MIN_DETECTIONS))
+        worst = weak[np.argsort(marginal[weak])][: (len(weak) + 1) // 2]  # others may hold then
+        return self._without(now, worst) if len(worst) else now
+
+    def _without(self, now: Association, gone: IntArray) -> Association:
+        """Assign anew without some of the solids."""
+        keep = np.setdiff1d(np.arange(len(now.solids)), gone)
+        number = np.full(len(now.solids) + 1, -1)
+        number[keep] = np.arange(len(keep))
+        return self._assign(now.solids[keep], number[now.owner])
+
+    def _merged(self, now: Association) -> Association:
+        """Merge pairs of near solids of a class where one explains the detections of both."""
+        gain = now.gains(self.detected)
+        strong, weak = _near_pairs(now.solids, gain)
+        if not len(strong):
+            return now
+        row, pair = self._joint_rows(now.owner, strong, weak)
+        fitted = self.refit(row, pair, now.solids.class_id[strong])
+        more = self._joint_gains(now.owner, strong, weak, fitted) - gain[strong] - gain[weak]
+        pick, gone, owner = np.arange(len(now.solids)), set[int](), now.owner.copy()
+        for p in np.argsort(-more):
+            i, j = int(strong[p]), int(weak[p])
+            untouched = pick[i] == i and pick[j] == j and not {i, j} & gone
+            if more[p] > 0 and untouched:
+                pick[i] = len(now.solids) + p
+                gone.add(j)
+                owner[row[pair == p]] = i
+        both = Solids.concatenate([now.solids, fitted])
+        merged = replace(now, solids=both[pick], owner=owner)
+        return self._without(merged, np.array(sorted(gone), np.int64)) if gone else now
+
+    def _joint_rows(
+        self, owner: IntArray, strong: IntArray, weak: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """List the rows of both of each pair, one a frame: rows (K,) and their pairs (K,)."""
+        view, found = self.detected.view, list[IntArray]()
+        for i, j in zip(strong, weak, strict=True):
+            mine, other = np.flatnonzero(owner == i), np.flatnonzero(owner == j)
+            found.append(np.append(mine, other[~np.isin(view[other], view[mine])]))
+        pair = np.repeat(np.arange(len(strong)), [len(rows) for rows in found])
+        return np.concatenate(found), pair
+
+    def _joint_gains(
+        self, owner: IntArray, strong: IntArray, weak: IntArray, fitted: Solids
+    ) -> Array:
+        """Return what one fitted solid brings for the detections of each pair, (P,)."""
+        view, alone = self.detected.view, self._empty(fitted)
+        evidence = alone.evidence
+        own = owner[evidence.row]
+        mine = (own == strong[evidence.solid]) | (own == weak[evidence.solid])
+        solid, row, log_odds = (x[mine] for x in (evidence.solid, evidence.row, evidence.log_odds))
+        key = solid * len(evidence.expected) + view[row]
+        order = np.lexsort((-log_odds, key))
+        leading = np.zeros(len(key), bool)  # the best of its solid in its frame
+        leading[order] = np.append(True, np.diff(key[order]) != 0)[: len(key)]
+        not_missed = MISSED * evidence.expected[view[row], solid]
+        worth = log_odds + np.where(leading, not_missed, SECOND_DETECTION)
+        gain = np.bincount(solid, worth.clip(0), len(strong)) - alone.costs()
+        return np.where(np.isfinite(fitted.ellipsoids.center_in_world).all(1), gain, -np.inf)
+
+
+def _near_pairs(solids: Solids, gain: Array) -> tuple[IntArray, IntArray]:
+    """List pairs (P,) of solids of a class near each other; of each that of more gain first."""
+    centre, width = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes[:, :2].mean(1)
+    apart = np.linalg.norm(centre[:, None] - centre, axis=2)  # (S, S)
+    near = apart < MERGE_REACH * (width[:, None] + width)
+    a, b = np.nonzero(np.triu(near & (solids.class_id[:, None] == solids.class_id), 1))
+    first = gain[a] >= gain[b]
+    return np.where(first, a, b), np.where(first, b, a)

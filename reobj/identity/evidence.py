@@ -1,0 +1,163 @@
+"""Log odds that detections show solids: what the association adds up.
+
+For a detection and a solid these are the odds that the detector saw this solid there, against a
+detection of something else: by its box beside the solid's projection, its score and its class. A
+box inside the projection may be of a thing that is half hidden; one outside may not.
+
+Axes: V frames with a pose, S solids, N detections, M pairs of a solid and a detection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import quadrics
+from reobj.types import Array, BoolArray, IntArray
+
+# Chosen on hololens_kitchen and redkitchen, but for those with a source (docs/association.md).
+EDGE_SIGMA = 0.08  # of an edge of a box, over the size of the box
+HIDDEN, WRONG = 0.2, 0.02  # shares of edges that are hidden, and that are anywhere (as quadrics.py)
+CLUTTER_LOG_SIZES = 3.0  # range of the log of the width and of the height of other boxes
+# Most that a box says for a solid against no solid: other boxes gather around things, they do not
+# lie anywhere. And for one solid against another.
+MAX_BOX_LOG_ODDS, MAX_BOX_CHOICE = 2.5, 8.0
+CLASS_KEPT = 0.85  # of the detections of a thing have its class; the others any
+MIN_VISIBLE = 0.05  # share of a projected box in the image from which detections are compared
+EXPECTED = 0.6  # and from which one is expected
+MIN_OVERLAP = 0.25  # of the smaller box, for a pair to be compared (chosen: speed)
+MIN_LOG_ODDS = -6.0  # of a pair that is kept (chosen: a tracklet is worth less)
+
+
+@dataclass(frozen=True, slots=True)
+class Detected:
+    """Detections in frames with a pose.
+
+    Attributes:
+        view: (N,) frame, 0 .. V - 1, ascending. box: (N, 4) xyxy in undistorted pixels.
+        score, class_id: (N,). before, after: (N,) the tracklet's rows before and after, or -1.
+        img_from_world: (V, 3, 4). image_size: (w, h) px.
+    """
+
+    view: IntArray
+    box: Array
+    score: Array
+    class_id: IntArray
+    before: IntArray
+    after: IntArray
+    img_from_world: Array
+    image_size: tuple[int, int]
+
+    @property
+    def rows_of_view(self) -> IntArray:
+        """(V + 1,) first row of every frame, and the end."""
+        return np.searchsorted(self.view, np.arange(len(self.img_from_world) + 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Solids:
+    """S solids, each of a class.
+
+    Attributes:
+        ellipsoids: centres, half extents, rotations. support: (S,) names. class_id: (S,).
+    """
+
+    ellipsoids: quadrics.Ellipsoids
+    support: npt.NDArray[np.str_]
+    class_id: IntArray
+
+    def __len__(self) -> int:
+        return len(self.class_id)
+
+    def __getitem__(self, keep: Any) -> Solids:
+        return Solids(self.ellipsoids[keep], self.support[keep], self.class_id[keep])
+
+    @staticmethod
+    def concatenate(sets: list[Solids]) -> Solids:
+        """Put sets of solids behind each other."""
+        names = ("center_in_world", "half_axes", "world_from_obj")
+        arrays = [np.concatenate([getattr(s.ellipsoids, name) for s in sets]) for name in names]
+        return Solids(
+            quadrics.Ellipsoids(*arrays),
+            np.concatenate([s.support for s in sets]),
+            np.concatenate([s.class_id for s in sets]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Pairs of a solid and a detection that may be of it, by solid and then by detection.
+
+    Attributes:
+        solid, row: (M,). log_odds: (M,) of the solid against no solid at all. choice: (M,) the
+            same without its limit, to choose among solids.
+        expected: (V, S) where a detection should be.
+    """
+
+    solid: IntArray
+    row: IntArray
+    log_odds: Array
+    choice: Array
+    expected: BoolArray
+
+
+def gather_evidence(solids: Solids, detected: Detected) -> Evidence:
+    """Compare the projections of solids with the detections of all frames."""
+    cams, size = detected.img_from_world, detected.image_size
+    whole = quadrics.solid_boxes(solids.ellipsoids, list(solids.support), cams)  # (V, S, 4)
+    seen = quadrics.clip_boxes(whole, size)
+    visible = np.nan_to_num(_area(seen) / _area(whole))  # (V, S)
+    share = np.bincount(detected.class_id.clip(0), detected.score) + 0.5
+    share /= share.sum()
+    of_detection = logit(detected.score)
+    starts = detected.rows_of_view
+    found: list[tuple[IntArray, IntArray, Array, Array]] = []
+    for v in range(len(cams)):
+        here = np.flatnonzero(visible[v] > MIN_VISIBLE)
+        rows = np.arange(starts[v], starts[v + 1])
+        i, j = np.nonzero(_overlapping(seen[v, here], detected.box[rows]))
+        solid, row = here[i], rows[j]
+        box = _box_log_odds(seen[v, solid], detected.box[row], size)
+        own, other = solids.class_id[solid], detected.class_id[row]
+        named = np.log(CLASS_KEPT * (own == other) / share[other.clip(0)] + 1 - CLASS_KEPT)
+        rest = of_detection[row] + named
+        choice = box.clip(max=MAX_BOX_CHOICE) + rest
+        keep = choice > MIN_LOG_ODDS
+        log_odds = box.clip(max=MAX_BOX_LOG_ODDS) + rest
+        found.append((solid[keep], row[keep], log_odds[keep], choice[keep]))
+    solid, row, log_odds, choice = (np.concatenate(column) for column in zip(*found, strict=True))
+    order = np.lexsort((row, solid))
+    return Evidence(solid[order], row[order], log_odds[order], choice[order], visible > EXPECTED)
+
+
+def _area(box: Array) -> Array:
+    return np.asarray((box[..., 2:] - box[..., :2]).prod(-1))
+
+
+def logit(score: Array) -> Array:
+    """Turn scores into log odds: detectors are calibrated about so (docs/association.md)."""
+    score = score.clip(1e-3, 1 - 1e-3)
+    return np.asarray(np.log(score / (1 - score)))
+
+
+def _overlapping(a: Array, b: Array) -> BoolArray:
+    """Mark pairs (A, B) of boxes that share enough of the smaller one's area."""
+    inter = np.minimum(a[:, None, 2:], b[:, 2:]) - np.maximum(a[:, None, :2], b[:, :2])
+    least = np.minimum(_area(a)[:, None], _area(b))
+    return np.asarray(inter.clip(0).prod(-1) > MIN_OVERLAP * least)
+
+
+def _box_log_odds(projected: Array, box: Array, image_size: tuple[int, int]) -> Array:
+    """Compare boxes (K, 4) with projections (K, 4): log density over that of boxes anywhere."""
+    size = (projected[:, 2:] - projected[:, :2] + box[:, 2:] - box[:, :2]) / 2  # (K, 2)
+    size = size.clip(1e-6)
+    inside = np.stack([box[:, :2] - projected[:, :2], projected[:, 2:] - box[:, 2:]], 1)
+    inside /= size[:, None]  # (K, 2, 2) how far each edge lies inside the projection
+    near = np.exp(-0.5 * (inside / EDGE_SIGMA) ** 2) / (np.sqrt(2 * np.pi) * EDGE_SIGMA)
+    hidden = (inside >= 0) & (inside <= 1)
+    density = (1 - HIDDEN - WRONG) * near + HIDDEN * hidden + WRONG / CLUTTER_LOG_SIZES
+    anywhere = np.log((size / image_size).prod(1)) - 2 * np.log(CLUTTER_LOG_SIZES)
+    return np.asarray(np.log(density).sum((1, 2)) - anywhere)

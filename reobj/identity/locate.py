@@ -1,0 +1,208 @@
+"""Objects of a part of the path by their place: the association, from tables and back.
+
+`locate` takes all detections, those in tracklets and those in none, and says which are of one
+solid. What moves, and what no solid explains, is left to appearance (`reobj.identity.linking`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+import quadrics
+from reobj.cameras import Poses, undistort_boxes
+from reobj.identity.association import Association, Associator, Refit
+from reobj.identity.evidence import Detected, Solids, logit
+from reobj.identity.linking import FRAGMENT_GAP, cut_at_gaps
+from reobj.identity.proposals import propose
+from reobj.poses.floor import floor_of
+from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
+from reobj.views import Views, gather_views
+
+# Log odds that an object is there: constant, by the mean log odds of its scores, by the share of the
+# frames that should show it and do. Fitted to 152 solids of seven recordings (docs/tracking.md)
+CONFIDENCE = (-0.9, 1.4, 2.9)
+DOUBLE_IOU = 0.6  # boxes of a class that overlap more are of one thing (NMS: .5 to .7)
+SIZE_SIGMAS = 6.0  # a size farther off counts as so many (chosen: a class may be wrong)
+
+# Fit(views of G groups, their classes (G,), floor) -> ObjectFits
+Fit = Callable[[Views, list[int], quadrics.Floor | None], quadrics.ObjectFits]
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """What the association of a part found: S solids and their rows.
+
+    Attributes:
+        solid: (N,) solid that each row shows, or -1. overlap: (N,) IoU of its projection with the
+            box, NaN where there is none. confidence: (S,) probability that it is there.
+        floor: that things stand on, None if unknown.
+    """
+
+    solid: IntArray
+    overlap: Array
+    confidence: Array
+    floor: quadrics.Floor | None
+
+
+def locate(
+    rows: Tracks,
+    class_names: Sequence[str],
+    poses: Poses,
+    fit: Fit,
+    priors: quadrics.Priors,
+    moving: Collection[str] = (),
+) -> Located:
+    """Associate the detections of a part with solids.
+
+    Args:
+        rows: all detections by frame, tracklet 0: in none. moving: names of classes that move.
+    """
+    names = np.array([*class_names, ""])
+    label = names[rows.class_id.clip(-1, len(class_names))]  # (N,)
+    fixed = ~np.isin(label, list(moving)) & np.isin(rows.frame, poses.frame[poses.known])
+    own = np.flatnonzero(fixed & ~_doubles(rows))
+    table, solid, overlap = rows[own], np.full(len(rows), -1), np.full(len(rows), np.nan)
+    tracked = table[table.tracklet_id > 0]
+    if not len(tracked):
+        return Located(solid, overlap, np.empty(0), None)
+    fragment = cut_at_gaps(tracked, FRAGMENT_GAP)
+    count = int(fragment.max()) + 1
+    views = gather_views(tracked, poses, fragment, count, 0.0)
+    classes = class_shares(tracked, fragment, count).argmax(1)
+    fits = fit(views, classes.tolist(), None)
+    kinds = Categories(priors, names, fits.scale)
+    floor = _floor(poses, fits)
+    usual, on_floor = kinds.usual_size(classes), kinds.on_floor(classes)
+    proposed = propose(fits, views, classes, usual, floor, on_floor)
+    detected = _detected(table, poses, views)
+    refit = _refit(detected, views, lambda v, c: fit(v, c, floor))
+    found = Associator(detected, refit, kinds.size_log_odds).run(proposed)
+    solid[own] = found.owner
+    owned = np.flatnonzero(found.owner >= 0)
+    support = list(found.solids.support)
+    boxes = quadrics.solid_boxes(found.solids.ellipsoids, support, views.img_from_world)
+    boxes = quadrics.clip_boxes(boxes, views.image_size)[detected.view[owned], found.owner[owned]]
+    overlap[own[owned]] = quadrics.box_iou(boxes, detected.box[owned])
+    return Located(solid, overlap, _confidence(found, detected), floor)
+
+
+def _doubles(rows: Tracks) -> BoolArray:
+    """Mark detections in no tracklet that a better one of their class overlaps: doubles."""
+    found = np.zeros(len(rows), bool)
+    for own in rows_by(rows.frame):
+        own = own[np.lexsort((-rows.score[own], rows.tracklet_id[own] == 0))]  # the best first
+        alike = box_iou(rows.xyxy[own], rows.xyxy[own]) > DOUBLE_IOU
+        alike &= rows.class_id[own][:, None] == rows.class_id[own]
+        for i in range(len(own)):
+            if not found[own[i]]:
+                found[own[i + 1 :]] |= alike[i, i + 1 :] & (rows.tracklet_id[own[i + 1 :]] == 0)
+    return found
+
+
+def _floor(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | None:
+    """Find the floor of a part whose scale and gravity the fits tell."""
+    if fits.scale.source == "none" or not fits.up.any():
+        return None
+    plane, _ = floor_of(poses, fits.up, fits.scale.value)
+    return None if plane is None else quadrics.Floor(plane.normal, plane.offset, plane.sigma)
+
+
+def confidence(mean_score: Array, share: Array) -> Array:
+    """Return the probability that objects are there, each a thing of its own.
+
+    Args:
+        mean_score: mean log odds of the scores of its detections.
+        share: of the frames that should show it and do; 0 where nothing tells which should.
+    """
+    constant, of_score, of_share = CONFIDENCE
+    return np.asarray(1 / (1 + np.exp(-constant - of_score * mean_score - of_share * share)))
+
+
+def _confidence(found: Association, detected: Detected) -> Array:
+    """Return the `confidence` (S,) of solids."""
+    owned = np.flatnonzero(found.owner >= 0)
+    solid, view = found.owner[owned], detected.view[owned]
+    count, expected = found.count.clip(1), found.evidence.expected
+    score = np.bincount(solid, logit(detected.score[owned]), len(found.solids)) / count
+    shown = np.bincount(solid, expected[view, solid], len(found.solids))
+    share = shown / expected.sum(0).clip(1)
+    return confidence(score, share)
+
+
+@dataclass(frozen=True, slots=True)
+class Categories:
+    """What categories say of sizes, in units of the world.
+
+    Attributes:
+        names: of the classes, and "" at the end. scale: metres per unit.
+    """
+
+    priors: quadrics.Priors
+    names: npt.NDArray[np.str_]
+    scale: quadrics.Scale
+
+    def rows(self, classes: IntArray) -> IntArray:
+        """Return the rows (G,) of classes in the priors, -1 unknown."""
+        return self.priors.index(self.names[classes.clip(-1, len(self.names) - 1)].tolist())
+
+    def usual_size(self, classes: IntArray) -> Array:
+        """Return width, depth and height (G, 3)."""
+        rows = self.rows(classes)
+        size = np.exp(self.priors.log_mean[rows])
+        return np.where(rows[:, None] >= 0, size, quadrics.UNKNOWN_SIZE_M) / self.scale.value
+
+    def on_floor(self, classes: IntArray) -> BoolArray:
+        """Mark the classes (G,) that stand on the floor."""
+        rows = self.rows(classes)
+        return np.asarray((rows >= 0) & self.priors.on_floor[rows], bool)
+
+    def size_log_odds(self, solids: Solids) -> Array:
+        """Return the log odds (S,) of the mean sizes, 0 at the usual size."""
+        rows = self.rows(solids.class_id)
+        usual = np.log(self.usual_size(solids.class_id)).mean(1)
+        sigma = np.inf if self.scale.source == "none" else self.scale.rel_sigma
+        variance = self.priors.log_cov[rows].mean((1, 2)) + sigma**2
+        size = np.log(2 * solids.ellipsoids.half_axes).mean(1)
+        off = np.nan_to_num(np.abs(size - usual) / np.sqrt(variance), nan=SIZE_SIGMAS)
+        return np.where(rows >= 0, -0.5 * off.clip(max=SIZE_SIGMAS) ** 2, 0.0)
+
+
+def _detected(table: Tracks, poses: Poses, views: Views) -> Detected:
+    """Arrange rows of frames with a pose, by frame."""
+    before, after = np.full((2, len(table)), -1)
+    order = np.lexsort((table.frame, table.tracklet_id))
+    tracklet = table.tracklet_id[order]
+    follows = (np.diff(tracklet) == 0) & (tracklet[1:] > 0)
+    after[order[:-1][follows]] = order[1:][follows]
+    before[order[1:][follows]] = order[:-1][follows]
+    return Detected(
+        np.searchsorted(views.frame, table.frame),
+        undistort_boxes(table.xyxy, poses.camera),
+        table.score,
+        table.class_id,
+        before,
+        after,
+        views.img_from_world,
+        views.image_size,
+    )
+
+
+def _refit(
+    detected: Detected, views: Views, fit: Callable[[Views, list[int]], quadrics.ObjectFits]
+) -> Refit:
+    """Make the function that fits solids to some of the detections."""
+
+    def refit(rows: IntArray, solid: IntArray, classes: IntArray) -> Solids:
+        boxes = np.full((len(views.frame), len(classes), 4), np.nan)
+        score = np.zeros(boxes.shape[:2])
+        at = detected.view[rows], solid
+        boxes[at], score[at] = detected.box[rows], detected.score[rows]
+        own = Views(views.frame, boxes, score, views.img_from_world, views.image_size)
+        fits = fit(own, classes.tolist())
+        return Solids(fits.ellipsoids, fits.support, classes)
+
+    return refit

@@ -1,0 +1,128 @@
+"""Where things might be: solids that the association chooses from.
+
+Of every fragment of a tracklet, and of fragments that look alike, the solid that is fitted to its
+boxes; and, as few views tell no distance, solids at several distances along the ray of its best
+box. Which of them are right other fragments tell, at other times.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+import quadrics
+from reobj.identity.evidence import Solids
+from reobj.types import Array, BoolArray, IntArray
+from reobj.views import Views
+
+# Distances that are tried, over that at which a box shows a thing of the usual size of its class:
+# nearer where a part is hidden (chosen; a step of a fifth is less than a chair's depth at 3 m)
+DISTANCES = np.geomspace(0.4, 1.6, 8)
+CUT_BOX = 0.3  # weight of the area of a box that touches the border, as the best view (chosen)
+STANDING_HEIGHTS = (0.3, 1.8)  # over the usual height, of what stands on the floor (chosen)
+
+
+def propose(
+    fits: quadrics.ObjectFits,
+    views: Views,
+    classes: IntArray,
+    usual_size: Array,
+    floor: quadrics.Floor | None,
+    on_floor: BoolArray,
+) -> Solids:
+    """Propose solids for groups of boxes.
+
+    Args:
+        fits, views: of G groups. classes: (G,).
+        usual_size: (G, 3) width, depth and height of their categories, in units of the world.
+        floor: None if unknown. on_floor: (G,) the category stands on it.
+    Returns:
+        the fits, and several solids along one ray of each group.
+    """
+    good = np.isfinite(fits.ellipsoids.center_in_world[:, 0])
+    made = [Solids(fits.ellipsoids[good], fits.support[good], classes[good])]
+    seen = np.isfinite(views.boxes[..., 0])  # (V, G)
+    group = np.flatnonzero(seen.any(0) & bool(fits.up.any()))
+    if not len(group):
+        return made[0]
+    view = _best_views(views)[group]
+    for standing in (True, False):
+        stands = on_floor[group] & (floor is not None)
+        pick = stands == standing
+        own = (views, view[pick], group[pick], usual_size[group[pick]])
+        found = _along_rays(*own, fits.up, floor if standing else None)
+        ellipsoids, of = found
+        made.append(Solids(ellipsoids, np.full(len(of), "cylinder"), classes[of]))
+    return Solids.concatenate(made)
+
+
+def _best_views(views: Views) -> IntArray:
+    """Return the view (G,) of each group whose box is largest, uncut ones first."""
+    box = views.boxes
+    inside = (box[..., :2] > 2).all(-1) & (box[..., 2:] < np.array(views.image_size) - 2).all(-1)
+    area = (box[..., 2:] - box[..., :2]).prod(-1) * np.where(inside, 1.0, CUT_BOX)
+    return np.asarray(np.nan_to_num(area, nan=-1.0).argmax(0), np.int64)
+
+
+def _along_rays(
+    views: Views,
+    view: IntArray,
+    group: IntArray,
+    usual_size: Array,
+    up: Array,
+    floor: quadrics.Floor | None,
+) -> tuple[quadrics.Ellipsoids, IntArray]:
+    """Put upright solids along the ray of one box of each of g groups.
+
+    They fill the box; and, wide as usual, they reach from its top down to the floor, or as far as
+    is usual: the lower part of the box is hidden then.
+
+    Returns:
+        ellipsoids; the group of each.
+    """
+    img = views.img_from_world[view]  # (g, 3, 4)
+    box = views.boxes[view, group]  # (g, 4)
+    inverse = np.linalg.inv(img[:, :, :3])
+    centre = -np.einsum("gij,gj->gi", inverse, img[:, :, 3])
+    middle = (box[:, :2] + box[:, 2:]) / 2
+    focal = np.sqrt(np.abs(np.linalg.det(img[:, :, :3])))  # px, of a camera in units of the world
+    extent = (box[:, 2:] - box[:, :2]) / focal[:, None]  # (g, 2) at depth 1
+    usual = np.column_stack([np.sqrt(usual_size[:, 0] * usual_size[:, 1]), usual_size[:, 2]])
+    depth = (usual / extent).min(1)[:, None] * DISTANCES  # (g, D)
+    size = extent[:, None] * depth[..., None]  # (g, D, 2) that fills the box
+    far = depth + size[..., 0] / 2  # of the solid's middle
+    ray = np.einsum("gij,gj->gi", inverse, np.column_stack([middle, np.ones(len(box))]))
+    top = np.einsum("gij,gj->gi", inverse, np.column_stack([middle[:, 0], box[:, 1], focal**0]))
+    point = centre[:, None] + ray[:, None] * far[..., None]  # (g, D, 3)
+    height = (centre[:, None] + top[:, None] * far[..., None]) @ up  # (g, D) of its upper side
+    narrow = np.broadcast_to(usual[:, None, 0], depth.shape)
+    if floor is None:
+        whole = np.broadcast_to(usual[:, None, 1], depth.shape)
+        kinds = [(size[..., 0], size[..., 1], point), (narrow, whole, None)]
+        good = [np.ones(depth.shape, bool), size[..., 1] < whole]
+    else:
+        # the floor's height below each point: n x = d
+        lift = (point @ floor.normal - floor.offset) / (floor.normal @ up)
+        whole = height - (point @ up - lift)
+        low, high = (share * usual[:, None, 1] for share in STANDING_HEIGHTS)
+        stands = (whole > low) & (whole < high)
+        kinds = [(size[..., 0], whole, None), (narrow, whole, None)]
+        good = [stands, stands]
+    axes = _upright_axes(up)
+    solids, of = [], []
+    for (wide, tall, at), keep in zip(kinds, good, strict=True):
+        if at is None:  # from the upper side downwards
+            at = point + ((height - tall / 2) - point @ up)[..., None] * up
+        half = np.stack([wide, wide, tall], -1)[keep] / 2
+        solids.append((at[keep], half))
+        of.append(np.broadcast_to(group[:, None], depth.shape)[keep])
+    centres, halves = (np.concatenate(column) for column in zip(*solids, strict=True))
+    return quadrics.Ellipsoids(
+        centres, halves, np.tile(axes, (len(centres), 1, 1))
+    ), np.concatenate(of)
+
+
+def _upright_axes(up: Array) -> Array:
+    """Return a rotation (3, 3) whose third column is up."""
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(up, first), up])
