@@ -183,6 +183,7 @@ class OutputConfig:
 
     overlay: bool = option(True, "write overlay.mp4")
     scene: bool = option(True, "write scene.html")
+    doubtful: bool = option(False, "show doubtful objects too, on the page and in overlay.mp4")
     fill_gaps: int = option(
         5,
         "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never); "
@@ -1102,7 +1103,8 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.save(workspace.out)
     if poses is not None:
         write_supplied_model(poses, video, workspace.out)
-    write_pictures(result, workspace.out, video, config.output.overlay, config.output.scene)
+    shown = result if config.output.doubtful else result.without_doubtful()
+    write_pictures(shown, workspace.out, video, config.output.overlay, config.output.scene)
     result.seconds["write"] = time.monotonic() - started
     return result
 

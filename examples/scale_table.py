@@ -42,7 +42,7 @@ import reobj_track as rt
 from quadrics import Array, IntArray
 
 COCO = rt.COCO_NAMES
-MIN_SCORE = 0.3  # as objects.min_score of the tool
+MIN_SCORE = 0.3  # of recorded detections that are used (chosen)
 MIN_VIEWS = 3  # as objects.min_views of the tool
 MIN_VISIBLE = 0.3  # of an object; less is no box of it
 ROOM_STEP = 8  # frames of a clip from one that is drawn to the next

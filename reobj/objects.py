@@ -17,11 +17,10 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
 from reobj.files import rounded
-from reobj.identity.locate import Fit
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
-from reobj.views import Views
+from reobj.views import Fit, Views
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +41,6 @@ class ObjectsConfig:
     up: str = option("", "direction against gravity in the world, x,y,z (default: estimated)")
     link: bool = option(True, "join and split the tracker's tracklets after the video")
     min_views: int = option(3, "an object seen in fewer frames with a pose gets no ellipsoid")
-    min_score: float = option(0.3, "boxes below this score do not shape the ellipsoid")
     moving: str = option(
         "person,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe",
         "classes that move, comma-separated: they are tracked, but get no ellipsoid",
@@ -147,6 +145,7 @@ def describe_objects(
     return objects
 
 
+MIN_SCORE = 0.05  # boxes of less, and filled gaps, shape nothing (of the weakest 1 in 25 is real)
 DOUBTFUL = 0.5  # confidence below which an object is less likely there than not
 
 

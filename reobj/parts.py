@@ -20,11 +20,11 @@ from reobj.files import shortened
 from reobj.identity.evidence import logit
 from reobj.identity.gaps import fill_by_place, fill_gaps
 from reobj.identity.linking import FRAGMENT_GAP, link
-from reobj.identity.locate import Fit, confidence, locate
-from reobj.objects import ObjectsConfig, describe_objects, describe_world, fitter
+from reobj.identity.locate import confidence, locate
+from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.result import Result
 from reobj.types import Array, Embeddings, IntArray, LinkEvent, Tracks, object_classes, rows_by
-from reobj.views import gather_views
+from reobj.views import Fit, gather_views
 
 
 def link_and_fit(result: Result, config: ObjectsConfig) -> None:
@@ -56,7 +56,7 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
         if len(rows) and fit is not None:
             classes = object_classes(rows)
             group = np.searchsorted(list(classes), rows.track_id)
-            views = gather_views(rows, parts[k], group, len(classes), config.min_score)
+            views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
             fits[k] = fit(views, list(classes.values()), linked.floor.get(k))
         found = describe_objects(
             rows, result.class_names, fits[k], views, config, linked.confidence
@@ -187,8 +187,10 @@ def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:
         for before, row in itertools.pairwise([-1, *rows.tolist()]):
             if tracklet[row]:
                 continue
-            near = before >= 0 and table.frame[row] - table.frame[before] <= FRAGMENT_GAP * step
-            if near and (int(table.frame[row]), int(tracklet[before])) not in taken:
+            continues = (
+                before >= 0 and table.frame[row] - table.frame[before] <= FRAGMENT_GAP * step
+            )
+            if continues and (int(table.frame[row]), int(tracklet[before])) not in taken:
                 tracklet[row] = tracklet[before]
             else:
                 tracklet[row], fresh = fresh, fresh + 1
@@ -227,7 +229,7 @@ def _part_with_most_boxes(
     Args:
         row_of: (N,) object of each row of the tracks. part: (N,) of each row.
     """
-    usable = tracks.score >= config.min_score
+    usable = tracks.score >= MIN_SCORE
     if poses is not None:
         usable &= place_of(poses, tracks.frame)[1]
     votes = np.zeros((count, int(part.max(initial=0)) + 1))

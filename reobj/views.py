@@ -5,10 +5,12 @@ Which rows make a group is decided by linking (tracklets) or by the identities (
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+import quadrics
 from reobj.cameras import Poses, undistort_boxes
 from reobj.types import Array, IntArray, Tracks
 
@@ -28,6 +30,10 @@ class Views:
     score: Array
     img_from_world: Array
     image_size: tuple[int, int]
+
+
+# views of G groups, their classes, what they may stand on -> fits of G objects
+Fit = Callable[[Views, list[int], quadrics.Floor | None], quadrics.ObjectFits]
 
 
 def gather_views(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
-from reobj.objects import describe_objects, describe_world, fitter
+from reobj.objects import MIN_SCORE, describe_objects, describe_world, fitter
 from reobj.parts import link_and_fit
 from reobj.results.result import VideoInfo
 from reobj.types import object_classes
@@ -70,7 +70,7 @@ def fitted(
     if poses is not None:
         classes = object_classes(tracks)
         group = np.searchsorted(list(classes), tracks.track_id)
-        views = gather_views(tracks, poses, group, len(classes), config.min_score)
+        views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
         fits = fitter(config, poses, names)(views, list(classes.values()))
     objects = describe_objects(tracks, names, fits, views, config)
     video = VideoInfo("walk.mp4", *SIZE, 30.0)

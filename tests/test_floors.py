@@ -20,20 +20,24 @@ PATHS = [
 FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
-    2: "reobj.files reobj.options reobj.identity.gaps reobj.identity.sampling reobj.sources.masks "
+    2: "reobj.files reobj.options reobj.identity.evidence reobj.identity.sampling "
+    "reobj.sources.masks "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded "
     "reobj.poses.child reobj.poses.uncertainty",
     4: "reobj.views reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
-    "reobj.identity.places reobj.poses.keyframes reobj.poses.features reobj.poses.soundness "
+    "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "
+    "reobj.poses.soundness "
     "reobj.poses.adjustment "
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
     "reobj.poses.checks reobj.poses.floor reobj.results.ply",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
+    "reobj.identity.association reobj.identity.proposals "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
     "reobj.poses.depth reobj.results.result",
-    6: "reobj.sources.detectors reobj.poses.estimate reobj.objects reobj.results.workspace "
+    6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
+    "reobj.results.workspace "
     "reobj.results.overlay reobj.results.solids",
     7: "reobj.parts reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
     "reobj.results.stages reobj.results.export reobj.results.scene",
@@ -41,7 +45,7 @@ FLOORS = {
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {"pycolmap", "onnxruntime", "jsonschema", "trimesh", "rerun"}  # optional, or slow to load
-LINES = {"reobj_track": 1300, "quadrics": 2250}  # at most; of any other room:
+LINES = {"reobj_track": 1300, "quadrics": 2300}  # at most; of any other room:
 ROOM_LINES = 600
 METHODS = 20  # of a class; but `Tracker` names every step of its `update`
 

@@ -90,20 +90,17 @@ def test_min_views_is_the_number_that_is_needed(min_views: int, rejected: bool) 
     assert ("seen in 4 frames with a camera pose; 5 are needed" in found.reason) == rejected
 
 
-def test_boxes_below_min_score_do_not_shape_the_ellipsoid() -> None:
-    """Three of four boxes are twice as high, of score .25."""
+@pytest.mark.parametrize(("score", "views"), [(0.0, 10), (0.25, 40)])
+def test_filled_gaps_do_not_shape_the_ellipsoid(score: float, views: int) -> None:
+    """Three of four boxes are twice as high: of score 0 they are filled in, and no views."""
     poses = walk(40)
     tracks = tracks_of(poses)
     weak = tracks.frame % 4 != 0
     tracks.xyxy[weak, 1] -= np.diff(tracks.xyxy[weak][:, [1, 3]])[:, 0]
-    tracks = with_columns(tracks, score=np.where(weak, 0.25, 0.9))
-    height = {}
-    for min_score in (0.3, 0.2):
-        result = fitted(tracks, poses, options(min_score=min_score))
-        height[min_score] = np.median([o.size.max() for o in result.objects if o.located])
-        assert {o.views for o in result.objects} == {10 if min_score == 0.3 else 40}
-    assert height[0.3] == pytest.approx(0.82, rel=0.1)
-    assert abs(height[0.2] - 0.82) > 0.1
+    result = fitted(with_columns(tracks, score=np.where(weak, score, 0.9)), poses, options())
+    height = np.median([o.size.max() for o in result.objects if o.located])
+    assert {o.views for o in result.objects} == {views}
+    assert (abs(height - 0.82) < 0.08) == (views == 10)
 
 
 def test_known_size_sets_the_scale() -> None:

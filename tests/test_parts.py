@@ -212,7 +212,7 @@ def test_up_is_a_direction_of_the_largest_part() -> None:
 def test_boxes_that_no_fit_can_use_do_not_choose_the_part() -> None:
     tracks = tracks_in_two_parts(two_parts())
     weak = (tracks.detection_index == 0) & (tracks.frame < BREAK)
-    given = unlinked(tracks=with_columns(tracks, score=np.where(weak, 0.1, 0.9)))
+    given = unlinked(tracks=with_columns(tracks, score=np.where(weak, 0.01, 0.9)))
     given.identities_given = True
     assert [(o.part, o.status) for o in finished(given).objects] == [
         (1, "ok"),

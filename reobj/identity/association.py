@@ -26,6 +26,8 @@ from reobj.types import Array, IntArray
 # Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).
 MISSED = 0.5  # against a solid, for each frame that should show it and has no detection of it
 NEW_SOLID = 15.0  # against each solid: five frames and more must speak for it
+# What a better box may add in step 1, so that no compromise between two things comes first
+PURSUED_CHOICE = 1.5
 KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tracklet
 # A second detection of one solid in one frame (a part of it, or a box that suppression left): one
 # in ten detections of a thing
@@ -110,9 +112,9 @@ class Associator:
             the chosen solids, the best first.
         """
         view, evidence, cost = self.detected.view, of.evidence, of.costs()
-        positive = evidence.log_odds > 0
-        solid, row = evidence.solid[positive], evidence.row[positive]
-        log_odds = evidence.log_odds[positive]
+        value = np.minimum(evidence.choice, evidence.log_odds + PURSUED_CHOICE)
+        positive = value > 0
+        solid, row, log_odds = evidence.solid[positive], evidence.row[positive], value[positive]
         if not len(solid):
             return np.empty(0, np.int64)
         key = solid * len(evidence.expected) + view[row]  # ascending: rows ascend with the views
@@ -256,8 +258,8 @@ class Associator:
 def _near_pairs(solids: Solids, gain: Array) -> tuple[IntArray, IntArray]:
     """List pairs (P,) of solids of a class near each other; of each that of more gain first."""
     centre, width = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes[:, :2].mean(1)
-    apart = np.linalg.norm(centre[:, None] - centre, axis=2)  # (S, S)
-    near = apart < MERGE_REACH * (width[:, None] + width)
-    a, b = np.nonzero(np.triu(near & (solids.class_id[:, None] == solids.class_id), 1))
+    distance = np.linalg.norm(centre[:, None] - centre, axis=2)  # (S, S)
+    adjacent = distance < MERGE_REACH * (width[:, None] + width)
+    a, b = np.nonzero(np.triu(adjacent & (solids.class_id[:, None] == solids.class_id), 1))
     first = gain[a] >= gain[b]
     return np.where(first, a, b), np.where(first, b, a)

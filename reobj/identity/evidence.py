@@ -156,8 +156,8 @@ def _box_log_odds(projected: Array, box: Array, image_size: tuple[int, int]) -> 
     size = size.clip(1e-6)
     inside = np.stack([box[:, :2] - projected[:, :2], projected[:, 2:] - box[:, 2:]], 1)
     inside /= size[:, None]  # (K, 2, 2) how far each edge lies inside the projection
-    near = np.exp(-0.5 * (inside / EDGE_SIGMA) ** 2) / (np.sqrt(2 * np.pi) * EDGE_SIGMA)
+    gaussian = np.exp(-0.5 * (inside / EDGE_SIGMA) ** 2) / (np.sqrt(2 * np.pi) * EDGE_SIGMA)
     hidden = (inside >= 0) & (inside <= 1)
-    density = (1 - HIDDEN - WRONG) * near + HIDDEN * hidden + WRONG / CLUTTER_LOG_SIZES
+    density = (1 - HIDDEN - WRONG) * gaussian + HIDDEN * hidden + WRONG / CLUTTER_LOG_SIZES
     anywhere = np.log((size / image_size).prod(1)) - 2 * np.log(CLUTTER_LOG_SIZES)
     return np.asarray(np.log(density).sum((1, 2)) - anywhere)

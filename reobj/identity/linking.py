@@ -29,6 +29,7 @@ LINK_PROBABILITY = 0.5  # join by appearance from this probability on, rivals co
 VIEW_GAP = 30
 DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes on one object
 FRAGMENT_GAP = 5  # frames without a detection, after which a tracklet may be another object
+MIN_CHANGED = 3  # rows of another identity that are said (chosen: fewer are slips of a frame)
 LEAST_LOG_ODDS = -9.0  # said in the evidence where nothing speaks for one object
 
 
@@ -61,23 +62,23 @@ def link(
     linker.measure_appearance(embeddings, embedding_row)
     identity = linker.by_appearance()
     if solid is not None:
-        solid = with_neighbours(tracks, solid)
+        solid = with_neighbours(tracks, solid, linker.fragment)
         identity = np.where(solid >= 0, solid, identity + solid.max(initial=-1) + 1)
     return tracks.with_identities(identity), linker.changes(identity, overlap)
 
 
-def with_neighbours(tracks: Tracks, solid: IntArray) -> IntArray:
-    """Give rows without a solid (-1) that of the nearest row of their tracklet.
+def with_neighbours(tracks: Tracks, solid: IntArray, fragment: IntArray) -> IntArray:
+    """Give rows (N,) without a solid (-1) that of the nearest row of their fragment (N,).
 
     Not where another row of the frame shows that solid.
     """
     solid = solid.copy()
     shown = set(zip(tracks.frame[solid >= 0].tolist(), solid[solid >= 0].tolist(), strict=True))
-    for rows in rows_by(tracks.tracklet_id):
+    for rows in rows_by(fragment):
         known, open_ = rows[solid[rows] >= 0], rows[solid[rows] < 0]
         if len(known) and len(open_):
-            apart = np.abs(tracks.frame[open_][:, None] - tracks.frame[known])
-            wanted = solid[known[apart.argmin(1)]]
+            gap = np.abs(tracks.frame[open_][:, None] - tracks.frame[known])
+            wanted = solid[known[gap.argmin(1)]]
             for row, name in zip(open_.tolist(), wanted.tolist(), strict=True):
                 if (key := (int(tracks.frame[row]), name)) not in shown:
                     solid[row] = name
@@ -215,33 +216,29 @@ class Linker:
         Args:
             identity: (N,) of each row now. overlap: (N,) of its box with its solid, NaN: none.
         """
-        count = len(self.tracklets)
-        names, number = np.unique(identity, return_inverse=True)
-        votes = np.zeros((count, len(names)))
-        np.add.at(votes, (self.fragment, number), 1)
-        now = votes.argmax(1)  # (L,) most of its rows
-        place = np.full(count, np.nan)
-        if overlap is not None:
-            for rows in rows_by(self.fragment):
-                known = overlap[rows][np.isfinite(overlap[rows])]
-                place[self.fragment[rows[0]]] = np.median(known) if len(known) else np.nan
-        before = np.unique(self.identity, return_inverse=True)[1]
-        joins = self._changes(before, now, "join", place)
-        return joins + self._changes(now, before, "split", place)
+        before, overlap = (
+            self.tracks.track_id,
+            np.full(len(identity), np.nan) if overlap is None else overlap,
+        )
+        joins = self._changes(before, identity, "join", overlap)
+        return joins + self._changes(identity, before, "split", overlap)
 
     def _changes(
-        self, parts: IntArray, whole: IntArray, kind: str, place: Array
+        self, parts: IntArray, whole: IntArray, kind: str, overlap: Array
     ) -> list[LinkEvent]:
-        """List an event for each part but the first of the groups of `whole` that hold several."""
+        """List an event for each part (N,) but the first of the groups of `whole` (N,).
+
+        Of rows alone nothing is said.
+        """
         found = []
-        for g in np.unique(whole):
-            members = np.flatnonzero(whole == g)
-            pieces = [members[parts[members] == part] for part in np.unique(parts[members])]
+        for rows in rows_by(whole):
+            pieces = [rows[own] for own in rows_by(parts[rows]) if len(own) >= MIN_CHANGED]
             for piece in pieces[1:]:
-                rest = np.setdiff1d(members, piece)
-                log_odds = max(float(self.log_odds[np.ix_(rest, piece)].max()), LEAST_LOG_ODDS)
-                ids = np.unique(self.tracklets[members if kind == "join" else piece]).tolist()
-                known = place[piece][np.isfinite(place[piece])]
+                rest = np.unique(self.fragment[np.setdiff1d(rows, piece)])
+                own = np.unique(self.fragment[piece])
+                log_odds = max(float(self.log_odds[np.ix_(rest, own)].max()), LEAST_LOG_ODDS)
+                ids = np.unique(self.tracks.tracklet_id[rows if kind == "join" else piece]).tolist()
+                known = overlap[piece][np.isfinite(overlap[piece])]
                 iou = float(np.median(known)) if len(known) else None
                 found.append(LinkEvent(kind, tuple(ids), iou, log_odds, True))
         return found

@@ -20,16 +20,13 @@ from reobj.identity.linking import FRAGMENT_GAP, cut_at_gaps
 from reobj.identity.proposals import propose
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
-from reobj.views import Views, gather_views
+from reobj.views import Fit, Views, gather_views
 
-# Log odds that an object is there: constant, by the mean log odds of its scores, by the share of the
-# frames that should show it and do. Fitted to 152 solids of seven recordings (docs/tracking.md)
+# Log odds that an object is there: constant, by the mean log odds of its scores, by the share of
+# the frames that should show it and do. Fitted to 152 solids of 7 recordings (docs/tracking.md)
 CONFIDENCE = (-0.9, 1.4, 2.9)
 DOUBLE_IOU = 0.6  # boxes of a class that overlap more are of one thing (NMS: .5 to .7)
 SIZE_SIGMAS = 6.0  # a size farther off counts as so many (chosen: a class may be wrong)
-
-# Fit(views of G groups, their classes (G,), floor) -> ObjectFits
-Fit = Callable[[Views, list[int], quadrics.Floor | None], quadrics.ObjectFits]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Where things might be: solids that the association chooses from.
 
-Of every fragment of a tracklet, and of fragments that look alike, the solid that is fitted to its
-boxes; and, as few views tell no distance, solids at several distances along the ray of its best
-box. Which of them are right other fragments tell, at other times.
+Of every fragment of a tracklet the solid that is fitted to its boxes; and, as few views tell no
+distance, solids at several distances along the rays of its best boxes. Which of them are right
+other fragments tell, at other times.
 """
 
 from __future__ import annotations
@@ -36,31 +36,39 @@ def propose(
         usual_size: (G, 3) width, depth and height of their categories, in units of the world.
         floor: None if unknown. on_floor: (G,) the category stands on it.
     Returns:
-        the fits, and several solids along one ray of each group.
+        the fits, and several solids along a few rays of each group.
     """
     good = np.isfinite(fits.ellipsoids.center_in_world[:, 0])
     made = [Solids(fits.ellipsoids[good], fits.support[good], classes[good])]
-    seen = np.isfinite(views.boxes[..., 0])  # (V, G)
-    group = np.flatnonzero(seen.any(0) & bool(fits.up.any()))
-    if not len(group):
-        return made[0]
-    view = _best_views(views)[group]
+    group, view = _best_views(views)
+    stands = on_floor[group] & (floor is not None)
     for standing in (True, False):
-        stands = on_floor[group] & (floor is not None)
-        pick = stands == standing
-        own = (views, view[pick], group[pick], usual_size[group[pick]])
-        found = _along_rays(*own, fits.up, floor if standing else None)
-        ellipsoids, of = found
-        made.append(Solids(ellipsoids, np.full(len(of), "cylinder"), classes[of]))
+        pick = (stands == standing) & bool(fits.up.any())
+        if pick.any():
+            own = (view[pick], group[pick], usual_size[group[pick]])
+            ellipsoids, of = _along_rays(views, *own, fits.up, floor if standing else None)
+            made.append(Solids(ellipsoids, np.full(len(of), "cylinder"), classes[of]))
     return Solids.concatenate(made)
 
 
-def _best_views(views: Views) -> IntArray:
-    """Return the view (G,) of each group whose box is largest, uncut ones first."""
+def _best_views(views: Views) -> tuple[IntArray, IntArray]:
+    """Choose views of each group, those with the largest boxes: one of each third of its views.
+
+    A tracklet may have slipped from one thing to another on its way.
+
+    Returns:
+        groups (P,) and views (P,).
+    """
     box = views.boxes
     inside = (box[..., :2] > 2).all(-1) & (box[..., 2:] < np.array(views.image_size) - 2).all(-1)
-    area = (box[..., 2:] - box[..., :2]).prod(-1) * np.where(inside, 1.0, CUT_BOX)
-    return np.asarray(np.nan_to_num(area, nan=-1.0).argmax(0), np.int64)
+    area = (box[..., 2:] - box[..., :2]).prod(-1) * np.where(inside, 1.0, CUT_BOX)  # (V, G)
+    seen = np.isfinite(area)
+    third = (3 * (seen.cumsum(0) - 1)) // seen.sum(0).clip(1)
+    best = [np.where(seen & (third == k), area, -1.0) for k in range(3)]
+    view = np.stack([a.argmax(0) for a in best])  # (3, G)
+    known = np.stack([a.max(0) > 0 for a in best])
+    part, group = np.nonzero(known)
+    return group, view[part, group]
 
 
 def _along_rays(
@@ -71,7 +79,7 @@ def _along_rays(
     up: Array,
     floor: quadrics.Floor | None,
 ) -> tuple[quadrics.Ellipsoids, IntArray]:
-    """Put upright solids along the ray of one box of each of g groups.
+    """Put upright solids along the rays of boxes, of views (g,) of groups (g,).
 
     They fill the box; and, wide as usual, they reach from its top down to the floor, or as far as
     is usual: the lower part of the box is hidden then.

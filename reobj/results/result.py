@@ -303,6 +303,16 @@ class Result:
             fits=None,
         )
 
+    def without_doubtful(self) -> Result:
+        """Return the objects that are likelier there than not, with their tracks; no fits."""
+        doubtful = [o.id for o in self.objects if o.status == "doubtful"]
+        return dataclasses.replace(
+            self,
+            objects=[o for o in self.objects if o.status != "doubtful"],
+            tracks=self.tracks[~np.isin(self.tracks.track_id, doubtful)],
+            fits=None,
+        )
+
     def parts(self) -> list[Result]:
         """Return `of_part` of all parts, the largest first: this result alone if it has one."""
         count = 1 if self.poses is None else self.poses.part_count
