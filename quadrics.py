@@ -1249,9 +1249,7 @@ START_CUT_VOTE = 0.3  # vote of a box that touches the border
 START_DEPTH_LOG = 0.3  # log, how well a box's extent tells the depth of a known size
 START_SIZE_LOG = 0.25  # log, how well it tells the size at a known depth
 START_CENTER = 0.1  # box sizes, sigma of a box's centre as the centre's image
-STANDING_REL = (
-    0.03  # sigma of a standing thing's lower side, over its height (chosen: legs, carpets)
-)
+STANDING_REL = 0.012  # sigma of a standing thing's lower side, over its height (chosen: carpets)
 # Size of an unknown category: the spread of the 110 indoor categories of priors.json.
 UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean
 UNKNOWN_SIZE_LOG = 0.9  # log, standard deviation of the common size

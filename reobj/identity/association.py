@@ -33,6 +33,7 @@ KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tra
 # in ten detections of a thing
 SECOND_DETECTION = float(np.log(0.1))
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
+COINCIDE = 0.5  # half widths; centres nearer than that are one thing, whatever else speaks for two
 MIN_DETECTIONS = 3  # of a solid; fewer do not determine it
 MAX_ROUNDS = 10  # of steps 2 to 5 (chosen)
 
@@ -213,6 +214,9 @@ class Associator:
         row, pair = self._joint_rows(now.owner, strong, weak)
         fitted = self.refit(row, pair, now.solids.class_id[strong])
         more = self._joint_gains(now.owner, strong, weak, fitted) - gain[strong] - gain[weak]
+        distance, width = _distances(now.solids)
+        one_place = distance[strong, weak] < COINCIDE * np.minimum(width[strong], width[weak])
+        more[one_place & np.isfinite(more)] = np.inf
         pick, gone, owner = np.arange(len(now.solids)), set[int](), now.owner.copy()
         for p in np.argsort(-more):
             i, j = int(strong[p]), int(weak[p])
@@ -255,10 +259,15 @@ class Associator:
         return np.where(np.isfinite(fitted.ellipsoids.center_in_world).all(1), gain, -np.inf)
 
 
+def _distances(solids: Solids) -> tuple[Array, Array]:
+    """Return the distances (S, S) between solids, and their mean half widths (S,)."""
+    centre, half = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes
+    return np.linalg.norm(centre[:, None] - centre, axis=2), half[:, :2].mean(1)
+
+
 def _near_pairs(solids: Solids, gain: Array) -> tuple[IntArray, IntArray]:
     """List pairs (P,) of solids of a class near each other; of each that of more gain first."""
-    centre, width = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes[:, :2].mean(1)
-    distance = np.linalg.norm(centre[:, None] - centre, axis=2)  # (S, S)
+    distance, width = _distances(solids)
     adjacent = distance < MERGE_REACH * (width[:, None] + width)
     a, b = np.nonzero(np.triu(adjacent & (solids.class_id[:, None] == solids.class_id), 1))
     first = gain[a] >= gain[b]

@@ -1,0 +1,267 @@
+"""Which detection is of which solid: evidence, proposals, the association of a whole scene."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
+
+import quadrics
+import reobj_track as rt
+from reobj.identity import association
+from reobj.identity.association import Association, Associator
+from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
+from reobj.identity.gaps import fill_by_place
+from reobj.identity.locate import confidence, locate
+from reobj.identity.proposals import propose
+from reobj.objects import fitter
+from reobj.types import class_shares
+from reobj.views import gather_views
+
+
+def chairs() -> Solids:
+    return Solids(chair_solids(), np.full(3, "box"), np.full(3, CHAIR))
+
+
+def detected_in(table: rt.Tracks, poses: rt.Poses) -> Detected:
+    """Rows of frames that all have a pose, in no tracklets."""
+    none = np.full(len(table), -1)
+    cams = poses.camera.K @ poses.cam_from_world
+    return Detected(table.frame, table.xyxy, table.score, table.class_id, none, none, cams, SIZE)
+
+
+def shifted(table: rt.Tracks, by: np.ndarray) -> rt.Tracks:
+    """Boxes moved by so many of their widths and heights."""
+    side = np.tile(table.xyxy[:, 2:] - table.xyxy[:, :2], 2)
+    return dataclasses.replace(table, xyxy=table.xyxy + by * side)
+
+
+def odds_of(table: rt.Tracks, poses: rt.Poses, solid: int = 0) -> float:
+    """Median of the log odds that the boxes of the first chair are of a solid; -inf: of none."""
+    own = table[table.detection_index == 0]
+    found = gather_evidence(chairs(), detected_in(own, poses))
+    odds = np.full(len(own), -np.inf)
+    mine = found.solid == solid
+    odds[found.row[mine]] = found.choice[mine]
+    return float(np.median(odds))
+
+
+# ---- Evidence ----
+
+
+def test_a_box_speaks_for_its_solid_and_not_for_the_next_one() -> None:
+    poses = walk(20)
+    table = table_of(poses)
+    assert odds_of(table, poses) > 8
+    assert odds_of(table, poses, solid=2) == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("inside", "outside"),
+    [([0.3, 0, 0, 0], [-0.3, 0, 0, 0]), ([0, 0, 0, -0.4], [0, 0, 0, 0.4])],
+)
+def test_a_thing_may_be_half_hidden_but_not_stick_out(
+    inside: list[float], outside: list[float]
+) -> None:
+    poses = walk(20)
+    table = table_of(poses)
+    hidden, larger = (odds_of(shifted(table, np.array(by)), poses) for by in (inside, outside))
+    assert odds_of(table, poses) >= hidden > larger + 1
+
+
+def test_scores_and_classes_count() -> None:
+    poses = walk(20)
+    table = table_of(poses)
+    weak = dataclasses.replace(table, score=np.full(len(table), 0.2))
+    assert odds_of(weak, poses) < odds_of(table, poses) - 2
+    cups = np.where(table.detection_index == 0, CUP, CHAIR)
+    named = dataclasses.replace(table, class_id=cups)
+    assert odds_of(table, poses) - 3 < odds_of(named, poses) < odds_of(table, poses)
+
+
+def test_a_solid_is_expected_where_most_of_it_is_in_the_image() -> None:
+    poses = walk(40)
+    cams = poses.camera.K @ poses.cam_from_world
+    whole = quadrics.solid_boxes(chair_solids(), "box", cams)
+    cut = quadrics.clip_boxes(whole, SIZE)
+    share = ((cut[..., 2:] - cut[..., :2]) / (whole[..., 2:] - whole[..., :2])).prod(-1)
+    found = gather_evidence(chairs(), detected_in(table_of(poses), poses))
+    np.testing.assert_array_equal(found.expected, np.nan_to_num(share) > EXPECTED)
+
+
+# ---- Proposals ----
+
+
+def proposed_for(table: rt.Tracks, poses: rt.Poses, floor: quadrics.Floor | None) -> Solids:
+    group = table.detection_index
+    views = gather_views(table, poses, group, 3, 0.0)
+    classes = class_shares(table, group, 3).argmax(1)
+    fits = fitter(rt.ObjectsConfig(), poses, NAMES)(views, classes.tolist())
+    usual = np.tile([0.56, 0.6, 0.835], (3, 1))
+    return propose(fits, views, classes, usual, floor, np.full(3, True))
+
+
+@pytest.mark.parametrize("floor", [None, quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.01)])
+def test_one_view_proposes_the_place_among_others(floor: quadrics.Floor | None) -> None:
+    """Of the backrests alone, in three frames without parallax."""
+    poses = walk(120)
+    table = table_of(poses)
+    table = table[(table.frame >= 60) & (table.frame < 63)]
+    table.xyxy[:, 3] = table.xyxy[:, 1] + 0.5 * (table.xyxy[:, 3] - table.xyxy[:, 1])
+    found = proposed_for(table, poses, floor)
+    centre, half = found.ellipsoids.center_in_world, found.ellipsoids.half_axes
+    for chair in chair_solids().center_in_world:
+        off = np.linalg.norm(centre - chair, axis=1)
+        assert off.min() < 0.25
+    if floor is not None:
+        rays = found.support == "cylinder"
+        np.testing.assert_allclose(centre[rays, 2], half[rays, 2], atol=0.02)  # they stand on it
+
+
+# ---- The whole ----
+
+
+def located(table: rt.Tracks, poses: rt.Poses) -> np.ndarray:
+    """The solid of each row."""
+    fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    return locate(table, NAMES, poses, fit, priors).solid
+
+
+def test_weak_detections_that_agree_belong_to_the_object() -> None:
+    """Two of three boxes are in no tracklet, of score .2."""
+    poses = walk()
+    table = table_of(poses)
+    weak = table.frame % 3 != 0
+    score, tracklet = np.where(weak, 0.2, 0.9), np.where(weak, 0, table.tracklet_id)
+    found = located(dataclasses.replace(table, score=score, tracklet_id=tracklet), poses)
+    assert len(np.unique(found[~weak])) == 3
+    assert all(len(np.unique(found[table.detection_index == k])) == 1 for k in range(3))
+
+
+def test_strong_detections_that_do_not_agree_are_clutter() -> None:
+    poses = walk()
+    table = table_of(poses)
+    rng = np.random.default_rng(0)
+    corner = rng.uniform(0, 400, (len(table), 2))
+    wild = table.detection_index == 2
+    xyxy = np.concatenate([corner, corner + rng.uniform(30, 200, corner.shape)], 1)
+    mixed = dataclasses.replace(table, xyxy=np.where(wild[:, None], xyxy, table.xyxy))
+    found = located(mixed, poses)
+    assert (found[wild] < 0).mean() > 0.8
+    assert (found[~wild] >= 0).all() and len(np.unique(found[~wild])) == 2
+
+
+def test_two_boxes_on_one_thing_are_one_thing() -> None:
+    """A second tracklet has the first chair too, in every frame, a little off."""
+    poses = walk()
+    table = table_of(poses)
+    again = table[table.detection_index == 0]
+    again.xyxy[:] += np.random.default_rng(3).normal(0, 3, again.xyxy.shape)
+    again = dataclasses.replace(again, tracklet_id=again.tracklet_id + 9, score=again.score - 0.3)
+    names = [f.name for f in dataclasses.fields(rt.Tracks)]
+    both = rt.Tracks(*(np.concatenate([getattr(t, n) for t in (table, again)]) for n in names))
+    found = located(both[np.argsort(both.frame, kind="stable")], poses)
+    assert np.unique(found).tolist() == [-1, 0, 1, 2]
+
+
+def test_twins_that_stand_close_stay_two() -> None:
+    poses = walk()
+    solids = chair_solids()
+    solids.center_in_world[1] = solids.center_in_world[0] + [0.35, 0, 0]
+    solids.half_axes[:2] = [0.15, 0.15, 0.41]
+    table = table_of(poses, solids)
+    found = located(dataclasses.replace(table, tracklet_id=np.ones(len(table), np.int64)
+                                        + table.detection_index), poses)  # fmt: skip
+    assert [len(np.unique(found[table.detection_index == k])) for k in range(3)] == [1, 1, 1]
+    assert len(np.unique(found)) == 3
+
+
+def association_of(solids: Solids, poses: rt.Poses) -> tuple[Associator, Association]:
+    """The chairs' detections with solids that are never refitted."""
+    table = table_of(poses)
+    detected = detected_in(table, poses)
+    made = Associator(
+        detected, lambda rows, solid, classes: solids[np.unique(solid)], lambda s: np.zeros(len(s))
+    )
+    return made, made._assign(solids, np.full(len(table), -1))
+
+
+def test_every_detection_goes_to_its_solid_one_to_one() -> None:
+    _, found = association_of(chairs(), walk(30))
+    np.testing.assert_array_equal(found.owner, table_of(walk(30)).detection_index)
+    assert (found.gains(detected_in(table_of(walk(30)), walk(30))) > 50).all()
+
+
+def test_a_double_is_dropped_and_its_detections_return() -> None:
+    three = chairs()
+    four = Solids.concatenate([three, three[[0]]])
+    made, found = association_of(four, walk(30))
+    for _ in range(3):
+        found = made._thinned(found)
+    assert len(found.solids) == 3 and (found.owner >= 0).all()
+
+
+def test_pursuit_chooses_what_is_there() -> None:
+    three = chairs()
+    away = dataclasses.replace(
+        three.ellipsoids,
+        center_in_world=three.ellipsoids.center_in_world + np.array([0.3, 0.2, 0.1]),
+    )
+    made, _ = association_of(three, walk(30))
+    many = Solids.concatenate([dataclasses.replace(three, ellipsoids=away), three])
+    assert sorted(made._pursue(made._empty(many)).tolist()) == [3, 4, 5]
+
+
+def test_missed_frames_speak_against_a_solid(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, found = association_of(chairs(), walk(30))
+    gain = found.gains(made.detected)
+    monkeypatch.setattr(association, "MISSED", association.MISSED + 1)
+    np.testing.assert_allclose(found.gains(made.detected), gain)  # none was missed
+    found.owner[made.detected.view < 10] = -1
+    lost = gain - found.gains(made.detected)
+    assert (lost > 10 * (association.MISSED - 1e-9)).all()
+
+
+def test_confidence_rises_with_score_and_share() -> None:
+    score, share = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
+    table = confidence(score[:, None], share)
+    assert (np.diff(table, axis=0) > 0).all() and (np.diff(table, axis=1) > 0).all()
+    assert table[0, 0] < 0.1 and table[2, 2] > 0.95
+
+
+# ---- What follows ----
+
+
+def test_things_on_the_floor_reach_down_to_it() -> None:
+    """Only the backrests are seen: with a floor their solids are whole, without they are not."""
+    poses = walk()
+    table = table_of(poses)
+    table.xyxy[:, 3] = table.xyxy[:, 1] + 0.5 * (table.xyxy[:, 3] - table.xyxy[:, 1])
+    views = gather_views(table, poses, table.detection_index, 3, 0.0)
+    fit = fitter(rt.ObjectsConfig(), poses, NAMES)
+    floor = quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.001)
+    low, high = (
+        fits.ellipsoids.center_in_world[:, 2] - fits.ellipsoids.half_axes[:, 2]
+        for fits in (fit(views, [CHAIR] * 3, floor), fit(views, [CHAIR] * 3, None))
+    )
+    assert (np.abs(low) < 0.06).all() and (high > 0.15).all()
+    cups = fit(views, [CUP] * 3, floor).ellipsoids
+    assert (cups.center_in_world[:, 2] - cups.half_axes[:, 2] > 0.15).all()  # they may stand high
+
+
+def test_gaps_are_filled_by_the_solid() -> None:
+    """While the first chair is missed the view turns: its boxes are those of its projection."""
+    poses = walk(60)
+    table = table_of(poses)
+    seen = (table.detection_index != 0) | (table.frame < 20) | (table.frame >= 40)
+    solids = chair_solids()
+    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3, 5)
+    made = filled[filled.score == 0]
+    true = table[~seen]
+    np.testing.assert_array_equal(made.frame, true.frame)
+    np.testing.assert_allclose(made.xyxy, true.xyxy.clip(0, np.tile(SIZE, 2)), atol=6)
+    assert set(made.track_id) == {1} and (made.detection_index == -1).all()
+    longer = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3, 3)
+    assert len(longer) == seen.sum()
