@@ -74,7 +74,7 @@ def objects(out: Path) -> list[dict[str, object]]:
 
 
 def located(out: Path) -> list[dict[str, object]]:
-    return [o for o in objects(out) if o["center"]]
+    return [o for o in objects(out) if o["status"] in ("ok", "prior_dominated")]
 
 
 def check_phone(folder: Path) -> None:
