@@ -20,7 +20,7 @@ from reobj.files import shortened
 from reobj.identity.evidence import logit
 from reobj.identity.gaps import fill_by_place, fill_gaps
 from reobj.identity.linking import FRAGMENT_GAP, link
-from reobj.identity.locate import confidence, locate
+from reobj.identity.locate import confidence, floor_under, locate
 from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.result import Result
 from reobj.types import Array, Embeddings, IntArray, LinkEvent, Tracks, object_classes, rows_by
@@ -57,7 +57,9 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
             classes = object_classes(rows)
             group = np.searchsorted(list(classes), rows.track_id)
             views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
-            fits[k] = fit(views, list(classes.values()), linked.floor.get(k))
+            fits[k] = first = fit(views, list(classes.values()), None)
+            if floor := floor_under(parts[k], first):
+                fits[k] = fit(views, list(classes.values()), floor)
         found = describe_objects(
             rows, result.class_names, fits[k], views, config, linked.confidence
         )
@@ -75,14 +77,12 @@ class _Linked:
     Attributes:
         tracks: N rows. source: (N,) their rows before, -1: left out by the tracker; None: the same.
         events: joins and splits. confidence: of identities that have solids in a part.
-        floor: of parts where it is known.
     """
 
     tracks: Tracks
     source: IntArray | None = None
     events: list[LinkEvent] = field(default_factory=list)
     confidence: dict[int, float] = field(default_factory=dict)
-    floor: dict[int, quadrics.Floor | None] = field(default_factory=dict)
 
     def rows_now(self, before: IntArray) -> IntArray:
         """Return where rows of the table before linking are now."""
@@ -113,7 +113,6 @@ def _link_parts(
         if config.link and fit is not None and parts[k].known.sum() >= config.min_views:
             names, moving = result.class_names, config.moving_classes
             located = locate(table[rows], names, parts[k], fit, priors, moving)
-            made.floor[k] = located.floor
         solid = np.full(len(rows), -1) if located is None else located.solid
         keep = (source[rows] >= 0) | (solid >= 0)
         rows, solid = rows[keep], solid[keep]

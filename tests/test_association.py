@@ -166,6 +166,19 @@ def test_two_boxes_on_one_thing_are_one_thing() -> None:
     assert np.unique(found).tolist() == [-1, 0, 1, 2]
 
 
+def test_one_thing_with_two_names_is_one_thing() -> None:
+    """In every frame the first chair is detected as a chair and as a couch, in two tracklets."""
+    poses = walk()
+    table = table_of(poses)
+    again = table[table.detection_index == 0]
+    couch = np.full(len(again), NAMES.index("couch"))
+    again = dataclasses.replace(again, tracklet_id=again.tracklet_id + 9, class_id=couch)
+    names = [f.name for f in dataclasses.fields(rt.Tracks)]
+    both = rt.Tracks(*(np.concatenate([getattr(t, n) for t in (table, again)]) for n in names))
+    found = located(both[np.argsort(both.frame, kind="stable")], poses)
+    assert np.unique(found).tolist() == [-1, 0, 1, 2]
+
+
 def test_twins_that_stand_close_stay_two() -> None:
     poses = walk()
     solids = chair_solids()

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from reobj.identity.evidence import Detected, Evidence, Solids, gather_evidence
-from reobj.types import Array, IntArray
+from reobj.types import Array, BoolArray, IntArray
 
 # Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).
 MISSED = 0.5  # against a solid, for each frame that should show it and has no detection of it
@@ -34,6 +34,7 @@ KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tra
 SECOND_DETECTION = float(np.log(0.1))
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
 COINCIDE = 0.5  # half widths; centres nearer than that are one thing, whatever else speaks for two
+ALIKE = float(np.log(1.4))  # of mean sizes; if so, also where the classes differ (laptop and tv)
 MIN_DETECTIONS = 3  # of a solid; fewer do not determine it
 MAX_ROUNDS = 10  # of steps 2 to 5 (chosen)
 
@@ -214,8 +215,7 @@ class Associator:
         row, pair = self._joint_rows(now.owner, strong, weak)
         fitted = self.refit(row, pair, now.solids.class_id[strong])
         more = self._joint_gains(now.owner, strong, weak, fitted) - gain[strong] - gain[weak]
-        distance, width = _distances(now.solids)
-        one_place = distance[strong, weak] < COINCIDE * np.minimum(width[strong], width[weak])
+        one_place = _coincide(now.solids)[strong, weak]
         more[one_place & np.isfinite(more)] = np.inf
         pick, gone, owner = np.arange(len(now.solids)), set[int](), now.owner.copy()
         for p in np.argsort(-more):
@@ -265,10 +265,22 @@ def _distances(solids: Solids) -> tuple[Array, Array]:
     return np.linalg.norm(centre[:, None] - centre, axis=2), half[:, :2].mean(1)
 
 
+def _coincide(solids: Solids) -> BoolArray:
+    """Mark pairs (S, S) of solids whose centres nearly coincide: no two things are in one place."""
+    distance, width = _distances(solids)
+    return np.asarray(distance < COINCIDE * np.minimum(width[:, None], width), bool)
+
+
 def _near_pairs(solids: Solids, gain: Array) -> tuple[IntArray, IntArray]:
-    """List pairs (P,) of solids of a class near each other; of each that of more gain first."""
+    """List pairs (P,) of solids near each other; of each that of more gain first.
+
+    They are of one class, or of about one size and in one place.
+    """
     distance, width = _distances(solids)
     adjacent = distance < MERGE_REACH * (width[:, None] + width)
-    a, b = np.nonzero(np.triu(adjacent & (solids.class_id[:, None] == solids.class_id), 1))
+    size = np.log(solids.ellipsoids.half_axes).mean(1)
+    alike = (np.abs(size[:, None] - size) < ALIKE) & _coincide(solids)
+    one_kind = (solids.class_id[:, None] == solids.class_id) | alike
+    a, b = np.nonzero(np.triu(adjacent & one_kind, 1))
     first = gain[a] >= gain[b]
     return np.where(first, a, b), np.where(first, b, a)

@@ -36,13 +36,11 @@ class Located:
     Attributes:
         solid: (N,) solid that each row shows, or -1. overlap: (N,) IoU of its projection with the
             box, NaN where there is none. confidence: (S,) probability that it is there.
-        floor: that things stand on, None if unknown.
     """
 
     solid: IntArray
     overlap: Array
     confidence: Array
-    floor: quadrics.Floor | None
 
 
 def locate(
@@ -65,14 +63,14 @@ def locate(
     table, solid, overlap = rows[own], np.full(len(rows), -1), np.full(len(rows), np.nan)
     tracked = table[table.tracklet_id > 0]
     if not len(tracked):
-        return Located(solid, overlap, np.empty(0), None)
+        return Located(solid, overlap, np.empty(0))
     fragment = cut_at_gaps(tracked, FRAGMENT_GAP)
     count = int(fragment.max()) + 1
     views = gather_views(tracked, poses, fragment, count, 0.0)
     classes = class_shares(tracked, fragment, count).argmax(1)
     fits = fit(views, classes.tolist(), None)
     kinds = Categories(priors, names, fits.scale)
-    floor = _floor(poses, fits)
+    floor = floor_under(poses, fits)
     usual, on_floor = kinds.usual_size(classes), kinds.on_floor(classes)
     proposed = propose(fits, views, classes, usual, floor, on_floor)
     detected = _detected(table, poses, views)
@@ -84,7 +82,7 @@ def locate(
     boxes = quadrics.solid_boxes(found.solids.ellipsoids, support, views.img_from_world)
     boxes = quadrics.clip_boxes(boxes, views.image_size)[detected.view[owned], found.owner[owned]]
     overlap[own[owned]] = quadrics.box_iou(boxes, detected.box[owned])
-    return Located(solid, overlap, _confidence(found, detected), floor)
+    return Located(solid, overlap, _confidence(found, detected))
 
 
 def _doubles(rows: Tracks) -> BoolArray:
@@ -100,8 +98,8 @@ def _doubles(rows: Tracks) -> BoolArray:
     return found
 
 
-def _floor(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | None:
-    """Find the floor of a part whose scale and gravity the fits tell."""
+def floor_under(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | None:
+    """Find the floor of a part whose scale and gravity the fits tell; None: it is unknown."""
     if fits.scale.source == "none" or not fits.up.any():
         return None
     plane, _ = floor_of(poses, fits.up, fits.scale.value)
