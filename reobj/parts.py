@@ -20,10 +20,10 @@ from reobj.files import shortened
 from reobj.identity.evidence import logit
 from reobj.identity.gaps import fill_by_place, fill_gaps
 from reobj.identity.linking import FRAGMENT_GAP, link
-from reobj.identity.locate import confidence, floor_under, locate
+from reobj.identity.locate import Located, confidence, floor_under, locate
 from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.result import Result
-from reobj.types import Array, Embeddings, IntArray, LinkEvent, Tracks, object_classes, rows_by
+from reobj.types import Embeddings, IntArray, LinkEvent, Tracks, object_classes, rows_by
 from reobj.views import Fit, gather_views
 
 
@@ -130,7 +130,7 @@ def _link_parts(
         own = dataclasses.replace(own, track_id=own.track_id + taken)
         taken = int(own.track_id.max(initial=taken))
         if located is not None:
-            made.confidence |= _confidences(own, solid, located.confidence)
+            made.confidence |= _confidences(own, solid, located)
         steps.append(own)
         sources.append(source[rows])
     joined = concatenated(steps)
@@ -139,17 +139,20 @@ def _link_parts(
     return made
 
 
-def _confidences(tracks: Tracks, solid: IntArray, of_solid: Array) -> dict[int, float]:
+def _confidences(tracks: Tracks, solid: IntArray, located: Located) -> dict[int, float]:
     """Return the confidence of every identity: of its solid, or of its scores if it has none.
 
     Args:
-        solid: (N,) of each row, or -1. of_solid: (S,).
+        solid: (N,) of each row, or -1.
     """
     found = {}
     for rows in rows_by(tracks.track_id):
         own = solid[rows][solid[rows] >= 0]
-        alone = confidence(logit(tracks.score[rows]).mean(), np.zeros(1))[0]
-        found[int(tracks.track_id[rows[0]])] = float(of_solid[own[0]] if len(own) else alone)
+        score = logit(tracks.score[rows]).mean(keepdims=True)
+        sure = located.confidence[own[:1]]
+        if not len(own):
+            sure = confidence(score, np.array([np.nan]), located.usual_score)
+        found[int(tracks.track_id[rows[0]])] = float(sure[0])
     return found
 
 

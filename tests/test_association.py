@@ -239,9 +239,11 @@ def test_missed_frames_speak_against_a_solid(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_confidence_rises_with_score_and_share() -> None:
     score, share = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
-    table = confidence(score[:, None], share)
+    table = confidence(score[:, None], share, 0.0)
     assert (np.diff(table, axis=0) > 0).all() and (np.diff(table, axis=1) > 0).all()
     assert table[0, 0] < 0.1 and table[2, 2] > 0.95
+    assert (confidence(score, share, 2.0) < confidence(score, share, 0.0)).all()
+    assert confidence(np.zeros(1), np.array([np.nan]), 0.0)[0] < 0.1  # no solid explains it
 
 
 # ---- What follows ----

@@ -23,8 +23,11 @@ from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_share
 from reobj.views import Fit, Views, gather_views
 
 # Log odds that an object is there: constant, by the mean log odds of its scores, by the share of
-# the frames that should show it and do. Fitted to 152 solids of 7 recordings (docs/tracking.md)
-CONFIDENCE = (-0.9, 1.4, 2.9)
+# the frames that should show it and do. Fitted to 154 solids of 7 recordings (docs/tracking.md)
+CONFIDENCE = (0.1, 1.4, 1.7)
+NO_SOLID = -2.4  # instead of the constant where no solid explains it (12 of 150 were real)
+# Share of a recording's mean score that is taken off: detectors differ in how high they score
+RELATIVE = 0.5
 DOUBLE_IOU = 0.6  # boxes of a class that overlap more are of one thing (NMS: .5 to .7)
 SIZE_SIGMAS = 6.0  # a size farther off counts as so many (chosen: a class may be wrong)
 
@@ -36,11 +39,13 @@ class Located:
     Attributes:
         solid: (N,) solid that each row shows, or -1. overlap: (N,) IoU of its projection with the
             box, NaN where there is none. confidence: (S,) probability that it is there.
+        usual_score: mean log odds of the scores of all their rows.
     """
 
     solid: IntArray
     overlap: Array
     confidence: Array
+    usual_score: float
 
 
 def locate(
@@ -63,7 +68,7 @@ def locate(
     table, solid, overlap = rows[own], np.full(len(rows), -1), np.full(len(rows), np.nan)
     tracked = table[table.tracklet_id > 0]
     if not len(tracked):
-        return Located(solid, overlap, np.empty(0))
+        return Located(solid, overlap, np.empty(0), 0.0)
     fragment = cut_at_gaps(tracked, FRAGMENT_GAP)
     count = int(fragment.max()) + 1
     views = gather_views(tracked, poses, fragment, count, 0.0)
@@ -82,7 +87,7 @@ def locate(
     boxes = quadrics.solid_boxes(found.solids.ellipsoids, support, views.img_from_world)
     boxes = quadrics.clip_boxes(boxes, views.image_size)[detected.view[owned], found.owner[owned]]
     overlap[own[owned]] = quadrics.box_iou(boxes, detected.box[owned])
-    return Located(solid, overlap, _confidence(found, detected))
+    return Located(solid, overlap, *_confidence(found, detected))
 
 
 def _doubles(rows: Tracks) -> BoolArray:
@@ -106,26 +111,28 @@ def floor_under(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | Non
     return None if plane is None else quadrics.Floor(plane.normal, plane.offset, plane.sigma)
 
 
-def confidence(mean_score: Array, share: Array) -> Array:
+def confidence(mean_score: Array, share: Array, usual_score: float) -> Array:
     """Return the probability that objects are there, each a thing of its own.
 
     Args:
-        mean_score: mean log odds of the scores of its detections.
-        share: of the frames that should show it and do; 0 where nothing tells which should.
+        mean_score: mean log odds of the scores of its detections. usual_score: of all solids'.
+        share: of the frames that should show it and do; NaN where no solid tells which should.
     """
     constant, of_score, of_share = CONFIDENCE
-    return np.asarray(1 / (1 + np.exp(-constant - of_score * mean_score - of_share * share)))
+    place = np.where(np.isnan(share), NO_SOLID, constant + of_share * share)
+    return np.asarray(1 / (1 + np.exp(-place - of_score * (mean_score - RELATIVE * usual_score))))
 
 
-def _confidence(found: Association, detected: Detected) -> Array:
-    """Return the `confidence` (S,) of solids."""
+def _confidence(found: Association, detected: Detected) -> tuple[Array, float]:
+    """Return the `confidence` (S,) of solids, and the mean log odds of all their scores."""
     owned = np.flatnonzero(found.owner >= 0)
     solid, view = found.owner[owned], detected.view[owned]
     count, expected = found.count.clip(1), found.evidence.expected
-    score = np.bincount(solid, logit(detected.score[owned]), len(found.solids)) / count
+    odds = logit(detected.score[owned])
+    score = np.bincount(solid, odds, len(found.solids)) / count
     shown = np.bincount(solid, expected[view, solid], len(found.solids))
-    share = shown / expected.sum(0).clip(1)
-    return confidence(score, share)
+    usual = float(odds.mean()) if len(odds) else 0.0
+    return confidence(score, shown / expected.sum(0).clip(1), usual), usual
 
 
 @dataclass(frozen=True, slots=True)
