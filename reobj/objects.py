@@ -150,11 +150,13 @@ DOUBTFUL = 0.5  # confidence below which an object is less likely there than not
 
 
 def _with_confidence(found: Object, confidence: float) -> Object:
-    """Add how sure an object is; a solid that is doubtful is kept, but not counted."""
+    """Add how sure an object is; one that is doubtful is kept with its solid, but not counted."""
     made = dataclasses.replace(found, confidence=round(confidence, 3))
-    if confidence >= DOUBTFUL or found.status == "rejected":
+    if confidence >= DOUBTFUL:
         return made
-    why = f"{100 * confidence:.0f} % likely: its detections are few, weak or in few of the frames"
+    why = f"{100 * confidence:.0f} % likely: its detections are weak, or in few of the frames"
+    if found.status == "rejected":
+        why += f"; {found.reason}"
     return dataclasses.replace(made, status="doubtful", reason=why)
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
+import reobj.objects
 import reobj_track as rt
 from reobj.objects import describe_objects, describe_world, fitter, parse_known_size, parse_up
 from reobj.views import Views, gather_views
@@ -305,3 +306,17 @@ def test_up_is_the_fits_or_the_poses(
     assert world.up_source == source
     flat = describe_world(poses, [None], [])
     assert flat.scale is None and flat.up_source == ("poses" if poses_know else "none")
+
+
+@pytest.mark.parametrize(("sure", "status"), [(0.9, "ok"), (0.4, "doubtful")])
+def test_what_is_less_likely_there_than_not_is_doubtful(sure: float, status: str) -> None:
+    """It keeps its solid, but it is neither located nor counted; without a solid it says why."""
+    poses = walk(40)
+    result = fitted(tracks_of(poses), poses, options())
+    found = reobj.objects._with_confidence(result.objects[0], sure)
+    assert (found.status, found.located) == (status, status == "ok")
+    assert found.center is not None and found.confidence == sure
+    none = dataclasses.replace(result.objects[0], status="rejected", reason="too few", center=None)
+    found = reobj.objects._with_confidence(none, sure)
+    assert found.status == ("rejected" if status == "ok" else "doubtful")
+    assert "too few" in found.reason
