@@ -133,9 +133,8 @@ def _link_parts(
             made.confidence |= _confidences(own, solid, located)
         steps.append(own)
         sources.append(source[rows])
-    joined = concatenated(steps)
-    order = np.argsort(joined.frame, kind="stable")
-    made.tracks, made.source = joined[order], np.concatenate(sources)[order]
+    order = np.argsort(np.concatenate([own.frame for own in steps]), kind="stable")
+    made.tracks, made.source = Tracks.joined(steps), np.concatenate(sources)[order]
     return made
 
 
@@ -156,22 +155,15 @@ def _confidences(tracks: Tracks, solid: IntArray, located: Located) -> dict[int,
     return found
 
 
-def concatenated(tables: Sequence[Tracks]) -> Tracks:
-    """Put tables behind each other."""
-    names = [f.name for f in dataclasses.fields(Tracks)]
-    return Tracks(*(np.concatenate([getattr(t, name) for t in tables]) for name in names))
-
-
 def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray]:
     """Put the detections that the tracker left out among its rows, by frame.
 
     Returns:
         the table; (N,) the row of the tracks that each of its rows is, or -1.
     """
-    table = concatenated([tracks, untracked])
     source = np.append(np.arange(len(tracks)), np.full(len(untracked), -1))
-    order = np.argsort(table.frame, kind="stable")
-    return table[order], source[order]
+    order = np.argsort(np.append(tracks.frame, untracked.frame), kind="stable")
+    return Tracks.joined([tracks, untracked]), source[order]
 
 
 def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:

@@ -179,6 +179,13 @@ class Tracks:
         table = Tracks(**all_of)
         return table[table.track_id > 0]
 
+    @staticmethod
+    def joined(tables: Sequence[Tracks]) -> Tracks:
+        """Put tables behind each other and order their rows by frame."""
+        names = [f.name for f in dataclasses.fields(Tracks)]
+        rows = Tracks(*(np.concatenate([getattr(t, name) for t in tables]) for name in names))
+        return rows[np.argsort(rows.frame, kind="stable")]
+
     def with_identities(self, track_id: IntArray) -> Tracks:
         """Return the rows with other identities, renumbered 1, 2, ... by first appearance."""
         _, first, inverse = np.unique(track_id, return_index=True, return_inverse=True)

@@ -153,6 +153,22 @@ def test_strong_detections_that_do_not_agree_are_clutter() -> None:
     assert (found[~wild] >= 0).all() and len(np.unique(found[~wild])) == 2
 
 
+def test_where_nothing_agrees_nothing_is_located() -> None:
+    """Boxes at random, of classes without priors, and a table of priors without rows."""
+    poses = walk(30)
+    table = table_of(poses)
+    corner = np.random.default_rng(1).uniform(0, 300, (len(table), 2))
+    side = np.random.default_rng(2).uniform(20, 300, corner.shape)
+    wild = dataclasses.replace(table, xyxy=np.concatenate([corner, corner + side], 1))
+    fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    names = ("about", "names", "aliases")
+    empty = {f.name: getattr(priors, f.name)[:0] for f in dataclasses.fields(priors)
+             if f.name not in names}  # fmt: skip
+    none = dataclasses.replace(priors, names=(), aliases={}, **empty)
+    for known in (priors, none):
+        assert (locate(wild, NAMES, poses, fit, known).solid < 0).mean() > 0.7
+
+
 def test_two_boxes_on_one_thing_are_one_thing() -> None:
     """A second tracklet has the first chair too, in every frame, a little off."""
     poses = walk()

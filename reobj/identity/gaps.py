@@ -6,8 +6,6 @@ is. Filled boxes are no detections: their score is 0, and neither fit nor linker
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import numpy.typing as npt
 from filterpy.kalman import KalmanFilter
@@ -49,7 +47,7 @@ def fill_gaps(tracks: Tracks, image_size: tuple[int, int], max_gap: int) -> Trac
             parts.append(
                 Tracks(number, *ids, filled, np.zeros(len(number)), one * rows.class_id[i], -one)
             )
-    return _by_frame(parts)
+    return Tracks.joined(parts)
 
 
 PLACE_GAPS = 6  # times `max_gap`: what a solid fills (chosen: a second at 30 frames/s)
@@ -99,18 +97,11 @@ def fill_by_place(
             filled = filled.clip(0, np.tile(size, 2))
             score = np.zeros(len(one))
             made.append(Tracks(frame[between], *ids, filled, score, one * rows.class_id[i], -one))
-    return _by_frame(made)
+    return Tracks.joined(made)
 
 
 def _area(box: Array) -> Array:
     return np.asarray(np.nan_to_num((box[..., 2:] - box[..., :2]).prod(-1), nan=-1.0))
-
-
-def _by_frame(parts: list[Tracks]) -> Tracks:
-    """Put tables behind each other and order their rows by frame."""
-    names = [f.name for f in dataclasses.fields(Tracks)]
-    merged = Tracks(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
-    return merged[np.argsort(merged.frame, kind="stable")]
 
 
 def smooth_boxes(at: npt.NDArray[np.int64], xyxy: Array) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -153,24 +154,28 @@ class Categories:
 
     def usual_size(self, classes: IntArray) -> Array:
         """Return width, depth and height (G, 3)."""
-        rows = self.rows(classes)
-        size = np.exp(self.priors.log_mean[rows])
-        return np.where(rows[:, None] >= 0, size, quadrics.UNKNOWN_SIZE_M) / self.scale.value
+        unknown = np.log(quadrics.UNKNOWN_SIZE_M)
+        log_size = _or_unknown(self.priors.log_mean, unknown)[self.rows(classes)]
+        return np.asarray(np.exp(log_size) / self.scale.value)
 
     def on_floor(self, classes: IntArray) -> BoolArray:
         """Mark the classes (G,) that stand on the floor."""
-        rows = self.rows(classes)
-        return np.asarray((rows >= 0) & self.priors.on_floor[rows], bool)
+        return np.asarray(_or_unknown(self.priors.on_floor, False)[self.rows(classes)], bool)
 
     def size_log_odds(self, solids: Solids) -> Array:
         """Return the log odds (S,) of the mean sizes, 0 at the usual size."""
         rows = self.rows(solids.class_id)
         usual = np.log(self.usual_size(solids.class_id)).mean(1)
         sigma = np.inf if self.scale.source == "none" else self.scale.rel_sigma
-        variance = self.priors.log_cov[rows].mean((1, 2)) + sigma**2
+        variance = _or_unknown(self.priors.log_cov, np.inf)[rows].mean((1, 2)) + sigma**2
         size = np.log(2 * solids.ellipsoids.half_axes).mean(1)
         off = np.nan_to_num(np.abs(size - usual) / np.sqrt(variance), nan=SIZE_SIGMAS)
-        return np.where(rows >= 0, -0.5 * off.clip(max=SIZE_SIGMAS) ** 2, 0.0)
+        return np.asarray(-0.5 * off.clip(max=SIZE_SIGMAS) ** 2)
+
+
+def _or_unknown(column: npt.NDArray[Any], unknown: Any) -> npt.NDArray[Any]:
+    """Append a row to a column of the priors: that of categories that are not in them."""
+    return np.concatenate([column, np.broadcast_to(unknown, (1, *column.shape[1:]))])
 
 
 def _detected(table: Tracks, poses: Poses, views: Views) -> Detected:
