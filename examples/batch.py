@@ -50,7 +50,7 @@ COLUMNS = ("path", "out", "detections", "poses", "tracks", "options", "command")
 FILES = ("detections", "poses", "tracks")
 MARKER = "batch.json"  # in the folder of a finished video; written last, whole or not at all
 FACTS = ("frames", "frames_with_pose", "objects", "ok", "prior_dominated", "rejected",
-         "metres_per_unit", "warnings")  # fmt: skip
+         "doubtful", "metres_per_unit", "warnings")  # fmt: skip
 SUMMARY = ("name", "status", "attempts", "seconds", *FACTS, "path", "out", "error")
 
 
@@ -166,8 +166,8 @@ def facts(found: rt.Result) -> dict[str, Any]:
     return {
         "frames": len(set(found.tracks.frame.tolist())),
         "frames_with_pose": found.world.registered_frames,
-        "objects": len(status),
-        **{s: status.count(s) for s in ("ok", "prior_dominated", "rejected")},
+        "objects": len(status) - status.count("doubtful"),
+        **{s: status.count(s) for s in ("ok", "prior_dominated", "rejected", "doubtful")},
         "metres_per_unit": found.world.scale.value if found.world.scale else None,
         "warnings": len(found.warnings),
     }

@@ -10,7 +10,7 @@ from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity import association
+from reobj.identity import association, evidence
 from reobj.identity.association import Association, Associator
 from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
 from reobj.identity.gaps import fill_by_place
@@ -89,6 +89,17 @@ def test_a_solid_is_expected_where_most_of_it_is_in_the_image() -> None:
     share = ((cut[..., 2:] - cut[..., :2]) / (whole[..., 2:] - whole[..., :2])).prod(-1)
     found = gather_evidence(chairs(), detected_in(table_of(poses), poses))
     np.testing.assert_array_equal(found.expected, np.nan_to_num(share) > EXPECTED)
+
+
+def test_many_solids_are_looked_at_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    detected = detected_in(table_of(walk(10)), walk(10))
+    five = Solids.concatenate([chairs(), chairs()[[2, 0]]])
+    whole = gather_evidence(five, detected)
+    monkeypatch.setattr(evidence, "SOLIDS_AT_ONCE", 2)
+    turns = gather_evidence(five, detected)
+    for name in ("solid", "row", "log_odds", "choice", "expected"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(turns, name))
+    assert len(np.unique(whole.solid)) == 5
 
 
 # ---- Proposals ----

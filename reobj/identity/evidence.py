@@ -104,14 +104,33 @@ class Evidence:
     expected: BoolArray
 
 
+SOLIDS_AT_ONCE = 500  # that are projected together (chosen: memory)
+
+
 def gather_evidence(solids: Solids, detected: Detected) -> Evidence:
     """Compare the projections of solids with the detections of all frames."""
+    share = np.asarray(np.bincount(detected.class_id.clip(0), detected.score) + 0.5, np.float64)
+    share /= share.sum()
+    starts = range(0, max(len(solids), 1), SOLIDS_AT_ONCE)
+    parts = [_gather(solids[k : k + SOLIDS_AT_ONCE], detected, share) for k in starts]
+    solid = np.concatenate([part.solid + k for k, part in zip(starts, parts, strict=True)])
+    row = np.concatenate([part.row for part in parts])
+    log_odds = np.concatenate([part.log_odds for part in parts])
+    choice = np.concatenate([part.choice for part in parts])
+    expected = np.concatenate([part.expected for part in parts], 1)
+    return Evidence(solid, row, log_odds, choice, expected)
+
+
+def _gather(solids: Solids, detected: Detected, share: Array) -> Evidence:
+    """Gather the evidence of some solids.
+
+    Args:
+        share: of the classes in all detections.
+    """
     cams, size = detected.img_from_world, detected.image_size
     whole = quadrics.solid_boxes(solids.ellipsoids, list(solids.support), cams)  # (V, S, 4)
     seen = quadrics.clip_boxes(whole, size)
     visible = np.nan_to_num(_area(seen) / _area(whole))  # (V, S)
-    share = np.bincount(detected.class_id.clip(0), detected.score) + 0.5
-    share /= share.sum()
     of_detection = logit(detected.score)
     starts = detected.rows_of_view
     found: list[tuple[IntArray, IntArray, Array, Array]] = []
