@@ -215,9 +215,9 @@ class LinkEvent:
     """A join or a split of tracklets and its evidence.
 
     Attributes:
-        kind: "join" or "split". tracklets: ids of all that it concerns. kept: False where the joint
-            solid did not explain the boxes of both.
-        place_iou: IoU of cross-projection, None where appearance alone decided.
+        kind: "join" or "split". tracklets: ids of all that it concerns. kept: always True; False
+            in files before 0.3, of a join that was tried and undone.
+        place_iou: median overlap of the boxes with their solid, None where appearance decided.
         appearance_log_odds: that it is one object, by its embeddings (`SimilarityCalibration`).
     """
 
