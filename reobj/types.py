@@ -216,7 +216,7 @@ class LinkEvent:
 
     Attributes:
         kind: "join" or "split". tracklets: ids of all that it concerns. kept: always True; False
-            in files before 0.3, of a join that was tried and undone.
+            in older files, of a join that was tried and undone.
         place_iou: median overlap of the boxes with their solid, None where appearance decided.
         appearance_log_odds: that it is one object, by its embeddings (`SimilarityCalibration`).
     """
