@@ -274,13 +274,18 @@ def class_shares(table: Tracks, group: IntArray, count: int) -> Array:
     return np.asarray(votes / np.maximum(votes.sum(1, keepdims=True), 1e-9))
 
 
+def box_area(xyxy: Array) -> Array:
+    """Return the area (...) of boxes (..., 4)."""
+    return np.asarray((xyxy[..., 2:] - xyxy[..., :2]).prod(-1), np.float64)
+
+
 def box_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
     """Return the intersection over union (A, B) of boxes a (A, 4) with boxes b (B, 4)."""
     a, b = a_xyxy[:, None], b_xyxy[None]  # (A, 1, 4), (1, B, 4)
     overlap = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])  # (A, B, 2)
     inter = overlap.clip(0).prod(-1)  # (A, B)
-    area_a, area_b = (a[..., 2:] - a[..., :2]).prod(-1), (b[..., 2:] - b[..., :2]).prod(-1)
-    return np.asarray(inter / np.maximum(area_a + area_b - inter, 1e-9), np.float64)
+    union = box_area(a) + box_area(b) - inter
+    return np.asarray(inter / np.maximum(union, 1e-9), np.float64)
 
 
 def cxcywh_from_xyxy(xyxy: Array) -> Array:

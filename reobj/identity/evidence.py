@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.types import Array, BoolArray, IntArray
+from reobj.types import Array, BoolArray, IntArray, box_area
 
 # Chosen on hololens_kitchen and redkitchen, but for those with a source (docs/association.md).
 EDGE_SIGMA = 0.08  # of an edge of a box, over the size of the box
@@ -130,7 +130,7 @@ def _gather(solids: Solids, detected: Detected, share: Array) -> Evidence:
     cams, size = detected.img_from_world, detected.image_size
     whole = quadrics.solid_boxes(solids.ellipsoids, list(solids.support), cams)  # (V, S, 4)
     seen = quadrics.clip_boxes(whole, size)
-    visible = np.nan_to_num(_area(seen) / _area(whole))  # (V, S)
+    visible = np.nan_to_num(box_area(seen) / box_area(whole))  # (V, S)
     of_detection = logit(detected.score)
     starts = detected.rows_of_view
     found: list[tuple[IntArray, IntArray, Array, Array]] = []
@@ -152,10 +152,6 @@ def _gather(solids: Solids, detected: Detected, share: Array) -> Evidence:
     return Evidence(solid[order], row[order], log_odds[order], choice[order], visible > EXPECTED)
 
 
-def _area(box: Array) -> Array:
-    return np.asarray((box[..., 2:] - box[..., :2]).prod(-1))
-
-
 def logit(score: Array) -> Array:
     """Turn scores into log odds: detectors are calibrated about so (docs/association.md)."""
     score = score.clip(1e-3, 1 - 1e-3)
@@ -165,7 +161,7 @@ def logit(score: Array) -> Array:
 def _overlapping(a: Array, b: Array) -> BoolArray:
     """Mark pairs (A, B) of boxes that share enough of the smaller one's area."""
     inter = np.minimum(a[:, None, 2:], b[:, 2:]) - np.maximum(a[:, None, :2], b[:, :2])
-    least = np.minimum(_area(a)[:, None], _area(b))
+    least = np.minimum(box_area(a)[:, None], box_area(b))
     return np.asarray(inter.clip(0).prod(-1) > MIN_OVERLAP * least)
 
 

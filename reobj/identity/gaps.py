@@ -12,7 +12,15 @@ from filterpy.kalman import KalmanFilter
 
 import quadrics
 from reobj.cameras import Poses
-from reobj.types import Array, IntArray, Tracks, box_iou, cxcywh_from_xyxy, xyxy_from_cxcywh
+from reobj.types import (
+    Array,
+    IntArray,
+    Tracks,
+    box_area,
+    box_iou,
+    cxcywh_from_xyxy,
+    xyxy_from_cxcywh,
+)
 
 MIN_END_IOU = 0.3  # overlap of the boxes at both ends; less: it moved too far to say where it was
 WINDOW = 10  # frames on either side that the smoother reads; with 40 boxes move by 1.3 px at most
@@ -75,7 +83,7 @@ def fill_by_place(
         solids, support, poses.camera.K @ poses.cam_from_world[poses.known]
     )
     box = quadrics.clip_boxes(whole, size)  # (V, O, 4)
-    visible = _area(box) > MIN_VISIBLE * _area(whole)  # False where NaN
+    visible = box_area(box) > MIN_VISIBLE * box_area(whole)  # False where NaN
     made = [tracks]
     for number, own in enumerate(identity.tolist()):
         rows = tracks[tracks.track_id == own]
@@ -98,10 +106,6 @@ def fill_by_place(
             score = np.zeros(len(one))
             made.append(Tracks(frame[between], *ids, filled, score, one * rows.class_id[i], -one))
     return Tracks.joined(made)
-
-
-def _area(box: Array) -> Array:
-    return np.asarray(np.nan_to_num((box[..., 2:] - box[..., :2]).prod(-1), nan=-1.0))
 
 
 def smooth_boxes(at: npt.NDArray[np.int64], xyxy: Array) -> Array:

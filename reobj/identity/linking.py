@@ -204,9 +204,9 @@ class Linker:
             shares = class_shares(self.tracks, whole[self.fragment], int(whole.max()) + 1)
             kind = shares.argmax(1)  # (T,)
             kind[whole[self.moving]] = -1 - whole[self.moving]  # a kind of its own
-            log_odds = max_between_groups(self.log_odds, whole)  # (T, T)
-            banned = max_between_groups(self.co_occur, whole) | (kind[:, None] != kind)
-            distinct = max_between_groups(self.distinct, whole)
+            log_odds = _max_between_groups(self.log_odds, whole)  # (T, T)
+            banned = _max_between_groups(self.co_occur, whole) | (kind[:, None] != kind)
+            distinct = _max_between_groups(self.distinct, whole)
             group = _agglomerate(log_odds, banned, distinct, LINK_PROBABILITY)[whole]
         return np.asarray(group[self.fragment], np.int64)
 
@@ -216,12 +216,10 @@ class Linker:
         Args:
             identity: (N,) of each row now. overlap: (N,) of its box with its solid, NaN: none.
         """
-        before, overlap = (
-            self.tracks.track_id,
-            np.full(len(identity), np.nan) if overlap is None else overlap,
-        )
-        joins = self._changes(before, identity, "join", overlap)
-        return joins + self._changes(identity, before, "split", overlap)
+        before = self.tracks.track_id
+        known = np.full(len(identity), np.nan) if overlap is None else overlap
+        joins = self._changes(before, identity, "join", known)
+        return joins + self._changes(identity, before, "split", known)
 
     def _changes(
         self, parts: IntArray, whole: IntArray, kind: str, overlap: Array
@@ -244,7 +242,7 @@ class Linker:
         return found
 
 
-def max_between_groups(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArray[Any]:
+def _max_between_groups(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArray[Any]:
     """Reduce a matrix (L, L) to the largest entries (G, G) between members of groups (L,)."""
     order = np.argsort(group, kind="stable")
     starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 1))

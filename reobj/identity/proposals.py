@@ -124,9 +124,8 @@ def _along_rays(
         solids.append((at[keep], half))
         of.append(np.broadcast_to(group[:, None], depth.shape)[keep])
     centres, halves = (np.concatenate(column) for column in zip(*solids, strict=True))
-    return quadrics.Ellipsoids(
-        centres, halves, np.tile(axes, (len(centres), 1, 1))
-    ), np.concatenate(of)
+    ellipsoids = quadrics.Ellipsoids(centres, halves, np.tile(axes, (len(centres), 1, 1)))
+    return ellipsoids, np.concatenate(of)
 
 
 def _upright_axes(up: Array) -> Array:
