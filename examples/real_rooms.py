@@ -1,0 +1,784 @@
+#!/usr/bin/env python3
+"""Score the whole chain on recordings of rooms whose objects are known, in one table.
+
+    python examples/real_rooms.py DATA -o OUT [--only NAME...] [--seeds 901 902]
+    python examples/real_rooms.py DATA -o OUT --without all   # leaves out one thing after the other
+    python examples/real_rooms.py DATA -o OUT --docs docs     # and fill in docs/tracking.md
+
+DATA holds hololens_kitchen, redkitchen_7scenes, office_loop, livingroom13 and studio_room; the
+example clip and rendered rooms (of --seeds, made by render_room.py) need none. Every recording runs
+at the defaults in a process of its own. OUT keeps what `run` keeps: detections, cameras and tracks
+of an earlier call are used again, so give another OUT once the detector, the cameras or the tracker
+changed; objects are made anew each time. Writes OUT/real_rooms.md and .json.
+
+What is counted. An object is *listed* if it is not `doubtful`; solids are those of listed objects.
+    IDF1       boxes of all identities in tracks.txt, doubtful ones too. hololens_kitchen: of six
+               classes at IoU >= .3, its truth is of whole objects; those less visible than .3 need
+               not be found. redkitchen and rendered rooms: as `eval`. The rest: listed objects at
+               IoU >= .4, frame by frame.
+    found      hololens_kitchen: chairs with a solid of that class within .35 m (a third of the
+               longest side, if that is more), measured over ground and one to one; `eval`: true
+               objects whose identity has a solid; else true objects that some listed object shows
+    doubles    solids in reach of a true chair that another one has; listed objects beyond the first
+    elsewhere  solids of chairs near no chair; listed objects that show nothing of their class.
+               An object shows a true one if in half of its frames it overlaps it (IoU >= .4) and
+               has its class or one that may be taken for it; areas that are not annotated are left
+               out.
+    centre, size   medians over objects found; own cameras are aligned with the true ones first
+    confidence     an object is real if nothing shows a true object better, in 3D
+               (hololens_kitchen) or in 2D; objects of classes that are not annotated do not count
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib
+import json
+import multiprocessing
+import resource
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import render_room
+from synthetic_quadrics import table, write_table
+
+import quadrics
+import reobj_track as rt
+from reobj.results.evaluation import SCORED, LabelledBoxes, read_result, read_truth
+from reobj.results.solids import align_with_truth
+from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
+
+ROOM = Path(__file__).resolve().parent / "room"
+YOLO, FEMTO, RECORDED = "detections_yolov8s.csv", "detections_femto.csv", "detections.npz"
+TRUE = "true_boxes.csv"
+DETECTOR = rt.DetectConfig()
+BOXES = {
+    "": DETECTOR.model,
+    YOLO: "YOLOv8s",
+    FEMTO: "deimv2-femto",
+    RECORDED: "recorded",
+    TRUE: "true",
+}
+LISTED = ("office_loop", "livingroom13", "studio_room")  # with a list of objects in 2D
+Figures = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run: a recording, whose boxes, whose cameras."""
+
+    name: str
+    data: str  # folder in DATA; "" for the example clip
+    boxes: str = ""  # recorded detections; "" for the default detector
+    supplied: bool = False  # poses and intrinsics
+    min_score: float = DETECTOR.min_score
+    seed: int | None = None  # of a rendered room
+
+    @property
+    def title(self) -> list[str]:
+        """Return the recording, its boxes and its cameras."""
+        boxes = BOXES[self.boxes] + (
+            f" from {self.min_score:g}" if self.min_score != DETECTOR.min_score else ""
+        )
+        where = self.data or ("examples/room" if self.seed is None else f"rendered {self.seed}")
+        return [where, boxes, "supplied" if self.supplied else "own"]
+
+
+CASES = [
+    Case("kitchen-true", "hololens_kitchen", TRUE, supplied=True),
+    Case("kitchen-yolo", "hololens_kitchen", YOLO, supplied=True),
+    Case("kitchen-femto", "hololens_kitchen", FEMTO, supplied=True, min_score=0.05),
+    Case("kitchen-own", "hololens_kitchen", YOLO),
+    Case("redkitchen", "redkitchen_7scenes", YOLO, supplied=True),
+    *(Case(f"{data.split('_')[0]}-yolo", data, YOLO) for data in LISTED),
+    *(Case(f"{data.split('_')[0]}-femto", data) for data in LISTED),
+    Case("room", "", RECORDED),
+    Case("room-femto", ""),
+]
+
+
+def nothing(*_: Any) -> None:
+    """Stand in for what finds something."""
+
+
+def untracked(rows: rt.Tracks) -> BoolArray:
+    """Mark all detections that the tracker left out."""
+    return np.asarray(rows.tracklet_id == 0)
+
+
+# What can be left out, by name: values and functions that take the place of others meanwhile.
+EVIDENCE, ASSOCIATION = "reobj.identity.evidence", "reobj.identity.association"
+WITHOUT: dict[str, dict[str, Any]] = {
+    "hidden edges": {f"{EVIDENCE}.HIDDEN": 0.0},
+    "hidden edges in the fit": {
+        "quadrics.CAUCHY_HIDDEN": quadrics.CAUCHY,
+        "quadrics.HUBER_HIDDEN": quadrics.HUBER,
+        "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
+    },
+    "limit of a box": {f"{EVIDENCE}.MAX_BOX_LOG_ODDS": 8.0},
+    "classes": {f"{EVIDENCE}.CLASS_KEPT": 0.0},
+    "sizes": {"reobj.identity.locate.SIZE_SIGMAS": 0.0},
+    "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
+    "tracklets": {f"{ASSOCIATION}.KEPT_TRACKLET": 0.0},
+    "untracked detections": {"reobj.identity.locate._doubles": untracked},
+    "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
+    "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
+    "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
+    "floor": {"reobj.identity.locate.floor_under": nothing, "reobj.parts.floor_under": nothing},
+}
+
+
+def leave_out(name: str) -> None:
+    """Switch a mechanism off, in this process."""
+    for path, value in WITHOUT[name].items():
+        module, _, attribute = path.rpartition(".")
+        owner = importlib.import_module(module)
+        if not hasattr(owner, attribute):
+            raise SystemExit(f"error: --without {name}: {path} is no longer there")
+        setattr(owner, attribute, value)
+
+
+# ---- Runs --------------------------------------------------------------------------------------
+
+
+def run_case(case: Case, data: Path, out: Path) -> Figures:
+    """Run the tool on a recording; returns seconds and the peak memory of this process."""
+    folder, config = data / case.data, configured(case, data, out)
+    source: Path | None = folder / "images"
+    if not case.data:
+        folder = ROOM if case.seed is None else rendered(case.seed, out)
+        source = folder / "room.mp4"
+    detections = folder / case.boxes if case.boxes else None
+    result = rt.run(source, out / case.name, config, detections=detections)
+    return spent(result)
+
+
+def configured(case: Case, data: Path, out: Path) -> rt.Config:
+    """Make the options of a case: the defaults, without pictures."""
+    config = rt.Config(
+        detect=rt.DetectConfig(min_score=case.min_score),
+        output=rt.OutputConfig(overlay=False, scene=False),
+    )
+    if not case.supplied:
+        return config
+    poses, folder = out / f"poses-{case.data}", data / case.data
+    write_poses(folder, poses)
+    camera = str(folder / "intrinsics.json")
+    return dataclasses.replace(config, poses=rt.PosesConfig(mode=str(poses), camera=camera))
+
+
+def write_poses(folder: Path, out: Path) -> None:
+    """Write poses_c2w.txt, 4x4 world_from_cam a line, as one NAME.pose.txt for each image."""
+    world_from_cam = np.loadtxt(folder / "poses_c2w.txt").reshape(-1, 4, 4)
+    names = sorted(path.stem for path in (folder / "images").iterdir())
+    if (folder / "images.txt").exists():  # the order of the rows
+        names = [Path(line).stem for line in (folder / "images.txt").read_text().split()]
+    out.mkdir(parents=True, exist_ok=True)
+    for name, pose in zip(names, world_from_cam, strict=True):
+        np.savetxt(out / f"{name}.pose.txt", pose)
+
+
+def rendered(seed: int, out: Path) -> Path:
+    """Render a room, once."""
+    folder = out / f"rendered-{seed}-clip"
+    if not (folder / "room.mp4").exists():
+        render_room.main(["--seed", str(seed), "--plan", "varied", "-o", str(folder)])
+    return folder
+
+
+def spent(result: rt.Result) -> Figures:
+    """Return the seconds of a run, and the peak memory of this process."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # MB, where Linux counts KiB
+    seconds = {k: round(v, 2) for k, v in result.seconds.items()}
+    return {"objects_s": seconds["objects"], "seconds": seconds, "peak_mb": round(peak)}
+
+
+def measure(case: Case, data: Path, out: Path, without: str = "") -> Figures:
+    """Run and score a case; without a mechanism: the objects of a run are made again."""
+    if not without:
+        return run_case(case, data, out) | score_case(case, data, out, out / case.name)
+    leave_out(without)
+    folder = out / f"{case.name} without {without}".replace(" ", "-")
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(out / case.name, folder)
+    result = rt.refit(folder, configured(case, data, out))
+    return spent(result) | score_case(case, data, out, folder)
+
+
+def score_case(case: Case, data: Path, out: Path, folder: Path) -> Figures:
+    """Score an output folder by the truth that there is for it."""
+    truth = data / case.data
+    if not case.data:
+        truth = ROOM if case.seed is None else rendered(case.seed, out)
+    if (truth / "gt_amodal.txt").exists():
+        return score_solids(truth, folder)
+    if (truth / "objects_2d.json").exists():
+        return score_lists(truth, folder)
+    figures = score_as_eval(truth, folder)
+    if not case.data and case.seed is None:
+        names = [o.class_name for o in rt.Result.load(folder).without_doubtful().objects]
+        counts = Counter(names)
+        figures["counts"] = {name: counts[name] for name in ("chair", "tv", "cup")}
+    return figures
+
+
+# ---- Identities and lists of objects, in 2D ----------------------------------------------------
+
+
+def frames_of(truth: LabelledBoxes, found: LabelledBoxes) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield the rows of truth (G,) and result (P,) of every frame that has both."""
+    true_rows = {int(truth.frame[rows[0]]): rows for rows in rows_by(truth.frame)}
+    for rows in rows_by(found.frame):
+        if (frame := int(found.frame[rows[0]])) in true_rows:
+            yield true_rows[frame], rows
+
+
+def shares_inside(a_xyxy: Array, b_xyxy: Array) -> Array:
+    """Return the share (A, B) of each box b that lies inside each box a."""
+    low = np.maximum(a_xyxy[:, None, :2], b_xyxy[:, :2])
+    inter = (np.minimum(a_xyxy[:, None, 2:], b_xyxy[:, 2:]) - low).clip(0).prod(-1)
+    return np.asarray(inter / np.maximum(box_area(b_xyxy), 1e-9))
+
+
+def common_frames(truth: IntArray, found: IntArray) -> tuple[Array, IntArray, IntArray]:
+    """Count pairs (K,) of a true and a found identity: table (G, P), its rows, its columns."""
+    true_ids, g = np.unique(truth, return_inverse=True)
+    ids, p = np.unique(found, return_inverse=True)
+    common = np.zeros((len(true_ids), len(ids)))
+    np.add.at(common, (g, p), 1)
+    return common, true_ids, ids
+
+
+INSIDE = 0.7  # share of a box in that of a hidden object: it is that one's, too
+
+
+def identity_f1(truth: LabelledBoxes, found: LabelledBoxes, min_iou: float) -> float:
+    """Compute IDF1 within classes; boxes on nothing but IGNORED truth are left out."""
+    left_out = np.zeros(len(found), bool)
+    true_id, found_id = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for t, f in frames_of(truth, found):
+        same = truth.name[t][:, None] == found.name[f]  # (G, P)
+        hit = same & (box_iou(truth.xyxy[t], found.xyxy[f]) >= min_iou)
+        inside = same & (shares_inside(truth.xyxy[t], found.xyxy[f]) >= INSIDE)
+        clear = truth.role[t] == SCORED
+        left_out[f] = (hit | inside)[~clear].any(0) & ~hit[clear].any(0)
+        g, p = np.nonzero(hit & clear[:, None])
+        true_id.append(truth.identity[t[g]])
+        found_id.append(found.identity[f[p]])
+    common, *_ = common_frames(np.concatenate(true_id), np.concatenate(found_id))
+    right = common[linear_sum_assignment(-common)].sum()
+    return float(2 * right / max((truth.role == SCORED).sum() + (~left_out).sum(), 1))
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is known of a true object in 2D; `names`: classes that it may have."""
+
+    names: frozenset[str]
+    ignore: bool = False  # an area that is not annotated: for `names`, or for all if there is none
+    needed: bool = True  # False: it may be found
+
+    @staticmethod
+    def read(path: Path) -> dict[int, Kind]:
+        """Read an objects_2d.json, by identity."""
+        kinds = {}
+        for entry in json.loads(path.read_text()):
+            ignore = entry["class"] == "ignore"
+            own = [entry["class"], *entry["also_ok"]]
+            names = frozenset(entry.get("ignore_classes", ()) if ignore else own)
+            kinds[entry["id"]] = Kind(names, ignore, entry.get("recall", True))
+        return kinds
+
+    def fits(self, name: str) -> bool:
+        """Say whether an object of this class may be this one."""
+        return name in self.names or (self.ignore and not self.names)
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """Which of O objects show which of G true ones (K of them no areas).
+
+    Attributes:
+        shows: (O,) identity of the true object, or -1. unjudged: (O,) lies where nothing is
+            annotated. common: (K, O) frames. boxes: (O,) that count. true_ids: (K,).
+    """
+
+    shows: IntArray
+    unjudged: BoolArray
+    common: IntArray
+    boxes: IntArray
+    true_ids: IntArray
+
+    def best(self, able: BoolArray | None = None) -> BoolArray:
+        """Mark the object (O,) with the most frames of each true one; able: (O,) candidates."""
+        best = np.zeros(len(self.shows), bool)
+        for k, true_id in enumerate(self.true_ids):
+            own = (self.shows == true_id) & (True if able is None else able)
+            if own.any():
+                best[np.where(own, self.common[k], -1).argmax()] = True
+        return best
+
+
+def judge(
+    truth: LabelledBoxes,
+    kinds: dict[int, Kind],
+    found: LabelledBoxes,
+    objects: Sequence[rt.Object],
+    min_iou: float = 0.4,
+) -> Verdicts:
+    """Say for every object which true one it shows in at least half of its frames."""
+    row_of = {o.id: row for row, o in enumerate(objects)}
+    true_ids = [k for k in kinds if not kinds[k].ignore]
+    column = {k: i for i, k in enumerate(kinds)}
+    fits = np.array([[kind.fits(o.class_name) for o in objects] for kind in kinds.values()], bool)
+    fits = fits.reshape(len(kinds), len(objects))
+    area = np.array([kind.ignore for kind in kinds.values()], bool)  # (G,)
+    xyxy = np.clip(found.xyxy, 0, np.tile(truth.xyxy[:, 2:].max(0), 2))  # in the image
+    use = (xyxy[:, 2:] > xyxy[:, :2]).all(1) & np.isin(found.identity, list(row_of))
+    found = dataclasses.replace(found, xyxy=xyxy)[use]
+    mine = np.array([row_of[i] for i in found.identity.tolist()], np.int64)  # (N,) object
+    boxes = np.bincount(mine, minlength=len(objects))
+    common, outside = np.zeros(fits.shape, np.int64), np.zeros(len(objects), np.int64)
+    for t, f in frames_of(truth, found):
+        g, o = np.array([column[i] for i in truth.identity[t].tolist()]), mine[f]
+        able, here = fits[np.ix_(g, o)], area[g][:, None]  # (G, P), (G, 1)
+        hit = able & ~here & (box_iou(truth.xyxy[t], found.xyxy[f]) >= min_iou)
+        a, b = np.nonzero(hit)
+        np.add.at(common, (g[a], o[b]), 1)
+        within = able & here & (shares_inside(truth.xyxy[t], found.xyxy[f]) >= 0.5)
+        np.add.at(outside, o[within.any(0) & ~hit.any(0)], 1)
+    common = common[~area]
+    most = common.max(0, initial=0)
+    true = (most > 0) & (most >= 0.5 * (boxes - outside))
+    shows = np.full(len(objects), -1)
+    if len(true_ids):
+        shows = np.where(true, np.array(true_ids)[common.argmax(0)], -1)
+    unjudged = ~true & (boxes > 0) & (outside >= 0.5 * boxes)
+    return Verdicts(shows, unjudged, common, boxes - outside, np.array(true_ids, np.int64))
+
+
+NEEDED_FRAMES = 10  # of a true object that a list must hold
+
+
+def score_lists(truth_folder: Path, folder: Path) -> Figures:
+    """Score the list of objects by true boxes with identities and areas (objects_2d.json)."""
+    kinds = Kind.read(truth_folder / "objects_2d.json")
+    truth = read_truth(truth_folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
+    result, found = rt.Result.load(folder), read_result(folder)
+    every = judge(truth, kinds, found, result.objects)
+    listed = [o for o in result.objects if o.status != "doubtful"]
+    verdicts = judge(truth, kinds, found, listed)
+    frames = {k: int((truth.identity == k).sum()) for k in kinds}
+    needed = {k for k, kind in kinds.items() if kind.needed and not kind.ignore}
+    must = {k for k in needed if frames[k] >= NEEDED_FRAMES}
+    shown = verdicts.shows[verdicts.shows >= 0].tolist()
+    judged = int((~verdicts.unjudged).sum())
+    pairs = linear_sum_assignment(-verdicts.common)
+    optional = np.array([k not in needed for k in verdicts.true_ids.tolist()], bool)
+    right = verdicts.common[pairs]
+    true_boxes = sum(frames[k] for k in needed) + right[optional[pairs[0]]].sum()
+    return {
+        "idf1": float(2 * right.sum() / max(true_boxes + verdicts.boxes.sum(), 1)),
+        "true": len(must),
+        "found": len(must & set(shown)),
+        "doubles": len(shown) - len(set(shown)),
+        "elsewhere": judged - len(shown),
+        "precision": len(shown) / max(judged, 1),
+        "recall": len(must & set(shown)) / max(len(must), 1),
+        "sure": sure_of(result.objects, every.best(), ~every.unjudged),
+    }
+
+
+Sure = tuple[float, bool, bool]  # confidence, is it real, has it a solid
+
+
+def sure_of(objects: Sequence[rt.Object], real: BoolArray, counts: BoolArray) -> list[Sure]:
+    """List the confidence of objects that count beside the truth."""
+    able = zip(objects, real.tolist(), counts.tolist(), strict=True)
+    sure = [(o.confidence, r, o.center is not None) for o, r, c in able if c]
+    return [(c, r, solid) for c, r, solid in sure if c is not None]
+
+
+# ---- Solids ------------------------------------------------------------------------------------
+
+REACH_M, REACH_OF_SIDE = 0.35, 1 / 3  # of a true object's centre, and of its longest side
+WALK_KINDS = ("chair", "dining table", "couch", "backpack", "potted plant", "cup")
+MIN_VISIBLE, AMODAL_IOU = 0.3, 0.3
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Objects with solids in the truth's world."""
+
+    objects: list[rt.Object]
+    center: Array  # (S, 3)
+    rotation: Array  # (S, 3, 3) truth_from_obj
+    size: Array  # (S, 3) extents along own axes
+
+    @staticmethod
+    def of(result: rt.Result, truth_poses: Path) -> Placed:
+        """Bring solids, those of doubtful objects too, to the truth's world, part by part."""
+        placed = Placed([], np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
+        for part in result.parts():
+            own = [o for o in part.objects if o.center is not None]
+            try:
+                scale, turn, shift = align_with_truth(part, truth_poses)
+            except rt.ReobjError:
+                continue  # a part of hardly any frame
+            axes = np.empty((0, 3, 3))
+            if own:
+                wxyz = np.array([o.quat_wxyz for o in own])
+                axes = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix()
+            center = np.array([o.center for o in own]).reshape(-1, 3)
+            size = np.array([o.size for o in own]).reshape(-1, 3)
+            placed = Placed(
+                placed.objects + own,
+                np.append(placed.center, scale * center @ turn.T + shift, 0),
+                np.append(placed.rotation, turn @ axes, 0),
+                np.append(placed.size, scale * size, 0),
+            )
+        return placed
+
+    def __getitem__(self, keep: BoolArray) -> Placed:
+        own = [o for o, k in zip(self.objects, keep.tolist(), strict=True) if k]
+        return Placed(own, self.center[keep], self.rotation[keep], self.size[keep])
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Solids beside true objects of their class: M pairs, and what is left over.
+
+    Attributes:
+        true, solid: (M,). center_error: (M,) m. size_error: (M, 3) relative.
+        doubles, elsewhere: how many other solids lie in reach of a true one, and of none.
+    """
+
+    true: IntArray
+    solid: IntArray
+    center_error: Array
+    size_error: Array
+    doubles: int
+    elsewhere: int
+
+
+def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
+    """Match solids to true objects of their class one to one, in reach over ground (x, z)."""
+    center = np.array([t["center"] for t in true], np.float64).reshape(-1, 3)
+    size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
+    axes = np.array([t["R"] for t in true], np.float64).reshape(-1, 3, 3)
+    names = np.array([o.class_name for o in placed.objects], str)
+    same = np.array([t["coco"] or "" for t in true], str)[:, None] == names
+    apart = placed.center - center[:, None]  # (G, S, 3)
+    flat, full = np.linalg.norm(apart[..., [0, 2]], axis=2), np.linalg.norm(apart, axis=2)
+    reach = np.maximum(REACH_M, REACH_OF_SIDE * size.max(1, initial=0))
+    able = same & (flat <= reach[:, None])
+    a, b = linear_sum_assignment(np.where(able, full, 1e3))
+    a, b = a[able[a, b]], b[able[a, b]]
+    other = np.setdiff1d(np.flatnonzero(same.any(0)), b)
+    nearest = np.where(same, flat, np.inf)[:, other].argmin(0) if len(true) else other
+    double = able[nearest, other]
+    extents = [matched_extents(axes[i], placed, j) for i, j in zip(a, b, strict=True)]
+    errors = np.abs(np.reshape(extents, (-1, 3)) / size[a] - 1)
+    return Matched(a, b, full[a, b], errors, int(double.sum()), int((~double).sum()))
+
+
+def matched_extents(axes: Array, placed: Placed, solid: int) -> Array:
+    """Return the extents (3,) of a solid along true axes, each along the one nearest to it."""
+    _, own = linear_sum_assignment(-np.abs(axes.T @ placed.rotation[solid]))
+    return np.asarray(placed.size[solid][own])
+
+
+def score_solids(truth_folder: Path, folder: Path) -> Figures:
+    """Score identities against boxes of whole objects, and solids of chairs (hololens_kitchen)."""
+    classes = json.loads((truth_folder / "gt_amodal_format.json").read_text())["classes"]
+    names = [classes.get(str(i), "") for i in range(max(map(int, classes)) + 1)]
+    true = json.loads((truth_folder / "objects_gt.json").read_text())["objects"]
+    boxes = read_truth(truth_folder / "gt_amodal.txt", names, MIN_VISIBLE), read_result(folder)
+    truth, found = (x[np.isin(x.name, WALK_KINDS)] for x in boxes)
+    placed = Placed.of(rt.Result.load(folder), truth_folder / "poses_c2w.txt")
+    listed = placed[np.array([o.status != "doubtful" for o in placed.objects], bool)]
+    chairs = [t for t in true if t["coco"] == "chair"]
+    matched = match_solids(chairs, listed)
+    return {
+        "idf1_chairs": identity_f1(
+            truth[truth.name == "chair"], found[found.name == "chair"], AMODAL_IOU
+        ),
+        "idf1": identity_f1(truth, found, AMODAL_IOU),
+        "true": len(chairs),
+        "found": len(matched.true),
+        "doubles": matched.doubles,
+        "elsewhere": matched.elsewhere,
+        "centre_m": median(matched.center_error),
+        "size_error": median(matched.size_error),
+        "sure": sure_of_solids(true, placed, truth, found, rt.Result.load(folder).objects),
+    }
+
+
+def median(values: Array) -> float | None:
+    """Return the median, None of nothing."""
+    return float(np.median(values)) if values.size else None
+
+
+def sure_of_solids(
+    true: Sequence[dict[str, Any]],
+    placed: Placed,
+    truth: LabelledBoxes,
+    found: LabelledBoxes,
+    objects: Sequence[rt.Object],
+) -> list[Sure]:
+    """Say which objects are real: by their solids; those without by boxes of what is left."""
+    matched = match_solids([t for t in true if t["coco"]], placed)
+    real_ids = {placed.objects[i].id for i in matched.solid.tolist()}
+    taken = [t["id"] for t in true if t["coco"]]
+    taken = [taken[i] for i in matched.true.tolist()]
+    verdicts = judge(truth, kinds_of(truth), found, objects, AMODAL_IOU)
+    bare = np.array([o.center is None for o in objects], bool)
+    real = np.array([o.id in real_ids for o in objects], bool)
+    real |= verdicts.best(bare & ~np.isin(verdicts.shows, taken))
+    return sure_of(objects, real, np.array([o.class_name in WALK_KINDS for o in objects], bool))
+
+
+def kinds_of(truth: LabelledBoxes) -> dict[int, Kind]:
+    """Make kinds of true objects that have the class of their boxes."""
+    return {
+        int(truth.identity[rows[0]]): Kind(frozenset([str(truth.name[rows[0]])]))
+        for rows in rows_by(truth.identity)
+    }
+
+
+def score_as_eval(truth_folder: Path, folder: Path) -> Figures:
+    """Score an output folder as `eval` does."""
+    solids = truth_folder / "gt_objects.json"
+    if not solids.exists():
+        solids = truth_folder / "objects_gt.json"
+    beside = (truth_folder / name for name in ("poses_c2w.txt", "poses.txt"))
+    poses = next((path for path in beside if path.exists()), None)
+    scores = rt.evaluate(folder, truth_folder / "gt_mot.txt", solids, poses)
+    tracks, in_3d = scores["tracks"]["all"], scores["objects"]
+    truth = read_truth(truth_folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
+    objects = rt.Result.load(folder).objects
+    verdicts = judge(truth, kinds_of(truth), read_result(folder), objects)
+    annotated = np.array([o.class_name in truth.name for o in objects], bool)
+    return {
+        "idf1": tracks["IDF1"],
+        "ids": tracks["ids_per_object"],
+        "true": in_3d["true"],
+        "found": in_3d["found"],
+        "centre_m": in_3d.get("center_error_median"),
+        "size_error": in_3d.get("size_error_median"),
+        "o3d": in_3d.get("o3d_found"),
+        "sure": sure_of(objects, verdicts.best(), annotated),
+    }
+
+
+# ---- Tables and the picture --------------------------------------------------------------------
+
+
+def percent(value: float) -> str:
+    """Format a share."""
+    return f"{100 * value:.0f} %"
+
+
+def short(value: float) -> str:
+    """Format a score as .449."""
+    return f"{value:.3f}".removeprefix("0")
+
+
+# Key of the figures, column of the table, format
+COLUMNS: list[tuple[str, str, Callable[[Any], str]]] = [
+    ("idf1_chairs", "IDF1 chairs", short),
+    ("idf1", "IDF1", short),
+    ("ids", "identities per object", "{:.2f}".format),
+    ("found", "found", str),
+    ("doubles", "doubles", str),
+    ("elsewhere", "elsewhere", str),
+    ("precision", "precision", short),
+    ("recall", "recall", short),
+    ("centre_m", "centre, m", short),
+    ("size_error", "size", percent),
+    ("o3d", "O3D", short),
+    ("objects_s", "objects step, s", "{:.1f}".format),
+    ("peak_mb", "peak, MB", str),
+]
+
+
+def cells(figures: Figures) -> list[str]:
+    """Format the columns of a row."""
+    row = ["-" if figures.get(key) is None else form(figures[key]) for key, _, form in COLUMNS]
+    at = [key for key, *_ in COLUMNS].index("found")
+    row[at] = f"{row[at]} of {figures['true']}"
+    if counts := figures.get("counts"):
+        row[at] += "; listed " + ", ".join(f"{count} {name}" for name, count in counts.items())
+    return row
+
+
+def figures_table(first: Sequence[str], rows: Sequence[tuple[Sequence[str], Figures]]) -> str:
+    """Format rows of figures, without the columns that none of them has."""
+    lines = [[*start, *cells(figures)] for start, figures in rows]
+    head = [*first, *(title for _, title, _ in COLUMNS)]
+    used = [i for i in range(len(head)) if any(line[i] != "-" for line in lines)]
+    return table([head[i] for i in used], [[line[i] for i in used] for line in lines])
+
+
+BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+
+def reliability(sure: Sequence[Sure]) -> list[tuple[int, float, float, float, float]]:
+    """Bin objects by confidence.
+
+    Returns:
+        of every bin: objects, mean confidence, share that is real, and the 95 % interval of it
+        (Wilson, JASA 1927); NaN in an empty bin.
+    """
+    confidence, real = np.array([row[:2] for row in sure], np.float64).reshape(-1, 2).T
+    bin_of = np.digitize(confidence, BINS[1:-1])
+    rows, z2 = [], 1.96**2
+    for k in range(len(BINS) - 1):
+        own = bin_of == k
+        n = int(own.sum())
+        if not n:
+            rows.append((0, np.nan, np.nan, np.nan, np.nan))
+            continue
+        share = float(real[own].mean())
+        middle = (share + z2 / (2 * n)) / (1 + z2 / n)
+        reach = np.sqrt(z2 * (share * (1 - share) / n + z2 / (4 * n**2))) / (1 + z2 / n)
+        rows.append((n, float(confidence[own].mean()), share, middle - reach, middle + reach))
+    return rows
+
+
+def reliability_table(sure: Sequence[Sure]) -> str:
+    """Format the bins: of all objects, and of those with and without a solid."""
+    groups = [list(sure), [s for s in sure if s[2]], [s for s in sure if not s[2]]]
+    lines = []
+    for k, bins in enumerate(zip(*map(reliability, groups), strict=True)):
+        n, *numbers = bins[0]
+        mean, share, low, high = map(short, numbers)
+        of = [f"{round(b[0] * b[2])} of {b[0]}" if b[0] else "-" for b in bins]
+        whole = [mean, f"{share} ({low} to {high})"] if n else ["-", "-"]
+        lines.append([f"{BINS[k]:g} to {BINS[k + 1]:g}", *whole, *of])
+    head = ["confidence", "mean", "real (95 %)", "real, of all", "with a solid", "without"]
+    return table(head, lines)
+
+
+def draw_reliability(sure: Sequence[Sure], path: Path) -> None:
+    """Draw the share of real objects over their confidence."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    rows = np.array([row for row in reliability(sure) if row[0]])
+    count, mean, share, low, high = rows.T
+    figure, axes = plt.subplots(figsize=(3.6, 3.4), dpi=110, layout="constrained")
+    axes.plot([0, 1], [0, 1], ":", color="0.5", lw=1)
+    axes.errorbar(mean, share, [share - low, high - share], fmt="o-", ms=5, lw=1.4, capsize=3)
+    for n, x, y in zip(count, mean, share, strict=True):
+        axes.annotate(f"{n:.0f}", (x, y), (6, -12), textcoords="offset points", fontsize=8)
+    axes.set(xlim=(0, 1), ylim=(-0.02, 1.02), xlabel="confidence", ylabel="share that is real")
+    axes.spines[["top", "right"]].set_visible(False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+# ---- Command line ------------------------------------------------------------------------------
+
+
+def every_without(names: Sequence[str]) -> list[str]:
+    """Name what is left out, in turn; "all" for everything that can be."""
+    unknown = set(names) - {*WITHOUT, "all"}
+    if unknown:
+        known = ", ".join(WITHOUT)
+        raise SystemExit(f"error: --without {', '.join(sorted(unknown))}: not among all, {known}")
+    return list(WITHOUT) if "all" in names else list(names)
+
+
+def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
+    """Choose cases whose names begin with one of these; all if none is given."""
+    found = [c for c in cases if not names or any(c.name.startswith(name) for name in names)]
+    if not found:
+        raise SystemExit(f"error: --only: not among {', '.join(c.name for c in cases)}")
+    return found
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run, score, and print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    add: Callable[..., Any] = parser.add_argument
+    add("data", type=Path, help="folder of the recordings")
+    add("-o", "--out", type=Path, required=True, help="folder for the runs and the tables")
+    text = "\n".join(f"{c.name:<14} {', '.join(c.title)}" for c in CASES)
+    add("--only", nargs="+", default=[], metavar="NAME", help=f"beginnings of names:\n{text}")
+    add("--seeds", nargs="*", type=int, default=[], help="also rooms rendered with these seeds")
+    text = "leave these out in turn: all, " + ", ".join(WITHOUT)
+    add("--without", nargs="+", default=[], metavar="NAME", help=text)
+    add("--docs", type=Path, help="folder with tracking.md to fill in, and img/ for the picture")
+    add("--jobs", type=int, default=1, help="processes at once")
+    args = parser.parse_args(argv)
+    rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
+    cases, left_out = chosen([*CASES, *rooms], args.only), every_without(args.without)
+    args.out.mkdir(parents=True, exist_ok=True)
+    context = multiprocessing.get_context("spawn")  # memory and patches end with a process
+    with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
+        made: dict[str, list[Figures]] = {}
+        for without in ("", *left_out):
+            tasks = [pool.submit(measure, case, args.data, args.out, without) for case in cases]
+            made[without] = [task.result() for task in tasks]
+            report(cases, made, args.out)
+    if args.docs:
+        publish(cases, made, args.docs)
+    return 0
+
+
+def tables(cases: Sequence[Case], made: dict[str, list[Figures]]) -> dict[str, str]:
+    """Format the tables by name: the recordings, what is left out in turn, confidence."""
+    whole = list(zip((c.title for c in cases), made[""], strict=True))
+    sure = [row for figures in made[""] for row in figures["sure"]]
+    found = {
+        "real rooms": figures_table(["recording", "boxes", "cameras"], whole),
+        "confidence": reliability_table(sure),
+    }
+    if len(made) > 1:
+        rows = [
+            ([", ".join(case.title), without or "nothing"], made[without][k])
+            for k, case in enumerate(cases)
+            for without in made
+        ]
+        found["left out"] = figures_table(["recording", "without"], rows)
+    return found
+
+
+def report(cases: Sequence[Case], made: dict[str, list[Figures]], out: Path) -> None:
+    """Print the tables so far and write them beside the figures."""
+    text = "\n\n".join(tables(cases, made).values())
+    print(text, flush=True)
+    (out / "real_rooms.md").write_text(text + "\n")
+    figures = {w: dict(zip((c.name for c in cases), of, strict=True)) for w, of in made.items()}
+    (out / "real_rooms.json").write_text(json.dumps(figures, indent=1))
+
+
+def publish(cases: Sequence[Case], made: dict[str, list[Figures]], docs: Path) -> None:
+    """Fill the tables into docs/tracking.md and draw the picture beside it."""
+    for name, text in tables(cases, made).items():
+        write_table(docs / "tracking.md", name, text)
+    sure = [row for figures in made[""] for row in figures["sure"]]
+    draw_reliability(sure, docs / "img" / "confidence.png")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
