@@ -14,8 +14,7 @@ changed; objects are made anew each time. Writes OUT/real_rooms.md and .json.
 What is counted. An object is *listed* if it is not `doubtful`; solids are those of listed objects.
     IDF1       boxes of all identities in tracks.txt, doubtful ones too. hololens_kitchen: of six
                classes at IoU >= .3, its truth is of whole objects; those less visible than .3 need
-               not be found. redkitchen and rendered rooms: as `eval`. The rest: listed objects at
-               IoU >= .4, frame by frame.
+               not be found. Lists of objects: at IoU >= .4. The rest: as `eval`.
     found      hololens_kitchen: chairs with a solid of that class within .35 m (a third of the
                longest side, if that is more), measured over ground and one to one; `eval`: true
                objects whose identity has a solid; else true objects that some listed object shows
@@ -386,12 +385,12 @@ def score_lists(truth_folder: Path, folder: Path) -> Figures:
     must = {k for k in needed if frames[k] >= NEEDED_FRAMES}
     shown = verdicts.shows[verdicts.shows >= 0].tolist()
     judged = int((~verdicts.unjudged).sum())
-    pairs = linear_sum_assignment(-verdicts.common)
-    optional = np.array([k not in needed for k in verdicts.true_ids.tolist()], bool)
-    right = verdicts.common[pairs]
+    pairs = linear_sum_assignment(-every.common)
+    optional = np.array([k not in needed for k in every.true_ids.tolist()], bool)
+    right = every.common[pairs]
     true_boxes = sum(frames[k] for k in needed) + right[optional[pairs[0]]].sum()
     return {
-        "idf1": float(2 * right.sum() / max(true_boxes + verdicts.boxes.sum(), 1)),
+        "idf1": float(2 * right.sum() / max(true_boxes + every.boxes.sum(), 1)),
         "true": len(must),
         "found": len(must & set(shown)),
         "doubles": len(shown) - len(set(shown)),

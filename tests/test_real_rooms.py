@@ -1,0 +1,334 @@
+"""examples/real_rooms.py: its scores on hand-made results, and a whole run of a simulated walk."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import real_rooms as rr
+from simulated import CAMERA, SIZE, chair_solids, walk
+
+import quadrics
+import reobj_track as rt
+from reobj.results.evaluation import IGNORED, SCORED, LabelledBoxes, score_tracks
+from reobj.results.result import VideoInfo
+
+FRAMES = 20
+
+
+def boxes(*rows: tuple) -> LabelledBoxes:
+    """Rows of frame, identity, left, class and maybe role: boxes of 10 x 10 px."""
+    frame, identity, left, name = (
+        np.array(column) for column in zip(*(r[:4] for r in rows), strict=True)
+    )
+    xyxy = np.stack([left, 0 * left, left + 10, 0 * left + 10], 1).astype(float)
+    role = np.array([r[4] if len(r) > 4 else SCORED for r in rows])
+    return LabelledBoxes(frame, identity, xyxy, name.astype(str), role)
+
+
+def thing(identity: int, name: str = "chair", **more) -> rt.Object:
+    return rt.Object(identity, name, 0.9, more.pop("status", "rejected"), "", **more)
+
+
+# ---- Identities -----
+
+
+def test_identity_f1_of_hand_made_boxes() -> None:
+    truth = boxes(
+        *((f, 1, 0, "chair") for f in range(1, 11)), *((f, 2, 50, "cup") for f in range(1, 6))
+    )
+    split = ((f, 7 if f < 8 else 8, 2, "chair") for f in range(1, 11))  # 7 of 10 are right
+    wrong = ((f, 9, 50, "bottle") for f in range(1, 6))  # another class
+    found = boxes(*split, *wrong)
+    assert rr.identity_f1(truth, found, 0.3) == pytest.approx(2 * 7 / (15 + 15))
+    assert rr.identity_f1(truth, found, 0.7) == 0  # two pixels aside: IoU 2 / 3
+
+
+def test_boxes_on_hidden_truth_alone_are_left_out() -> None:
+    seen = [(f, 1, 0, "chair") for f in range(1, 6)]
+    hidden = [(f, 2, 30, "chair", IGNORED) for f in range(1, 6)]
+    found = [(f, 1, 0, "chair") for f in range(1, 6)]
+    on_hidden = [(f, 2, 31, "chair") for f in range(1, 6)]
+    of_other_class = [(f, 3, 31, "cup") for f in range(1, 6)]
+    assert rr.identity_f1(boxes(*seen, *hidden), boxes(*found, *on_hidden), 0.3) == 1
+    score = rr.identity_f1(boxes(*seen, *hidden), boxes(*found, *of_other_class), 0.3)
+    assert score == pytest.approx(2 * 5 / (5 + 10))
+    near = [(f, 2, 2, "chair", IGNORED) for f in range(1, 6)]  # a seen chair is there too
+    assert rr.identity_f1(boxes(*seen, *near), boxes(*found), 0.3) == 1
+
+
+def test_identity_f1_is_that_of_eval() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        left = 6 * np.arange(4) + rng.integers(0, 5, (8, 4))  # (F, 4)
+        given = [rng.permutation(4) if rng.random() < 0.4 else np.arange(4) for _ in left]
+        moved = left + rng.integers(-3, 4, left.shape)
+        each = list(np.ndindex(left.shape))
+        truth = boxes(*((f + 1, k, left[f, k], "chair") for f, k in each))
+        found = boxes(*((f + 1, given[f][k], moved[f, k], "chair") for f, k in each))
+        idf1 = score_tracks(truth, found)["IDF1"]
+        assert rr.identity_f1(truth, found, 0.5) == pytest.approx(idf1)
+
+
+# ---- Lists of objects ------
+
+KINDS = {
+    1: rr.Kind(frozenset({"chair", "bench"})),
+    2: rr.Kind(frozenset({"cup"}), needed=False),
+    3: rr.Kind(frozenset({"book"}), ignore=True),
+}
+
+
+def judged(objects: list[rt.Object], *rows: tuple) -> rr.Verdicts:
+    truth = [(f, i, 20 * i, "") for f in range(1, 11) for i in (1, 2, 3)]
+    return rr.judge(boxes(*truth), KINDS, boxes(*rows), objects)
+
+
+@pytest.mark.parametrize(
+    ("name", "left", "shows", "unjudged"),
+    [
+        ("chair", 21, 1, False),
+        ("bench", 21, 1, False),  # may be taken for it
+        ("cup", 21, -1, False),  # of another class
+        ("chair", 26, -1, False),  # overlaps too little: IoU .25
+        ("book", 62, -1, True),  # in an area that is not annotated
+        ("chair", 62, -1, False),  # there, but chairs are annotated
+        ("chair", 0, -1, False),
+    ],
+)
+def test_verdict_of_an_object(name: str, left: int, shows: int, unjudged: bool) -> None:
+    verdicts = judged([thing(5, name)], *((f, 5, left, name) for f in range(1, 11)))
+    assert (verdicts.shows[0], verdicts.unjudged[0]) == (shows, unjudged)
+
+
+def test_half_of_the_frames_decide_and_areas_do_not_count() -> None:
+    def mixed(on_it: int, on_area: int, name: str = "chair") -> rr.Verdicts:
+        place = [21] * on_it + [62] * on_area + [0] * (10 - on_it - on_area)
+        return judged([thing(5, name)], *((f, 5, x, name) for f, x in enumerate(place, 1)))
+
+    assert mixed(5, 0).shows[0] == 1
+    assert mixed(4, 0).shows[0] == -1
+    truth = [(f, i, 20 * i, "") for f in range(1, 11) for i in (1, 3)]
+    any_class = {1: KINDS[1], 3: rr.Kind(frozenset(), ignore=True)}
+    rows = [(f, 5, 21 if f < 4 else 62 if f < 8 else 0, "chair") for f in range(1, 11)]
+    verdicts = rr.judge(boxes(*truth), any_class, boxes(*rows), [thing(5)])
+    assert verdicts.shows[0] == 1  # 3 of the 6 frames outside the area
+
+
+def test_the_object_with_the_most_frames_is_best() -> None:
+    rows = [(f, 5 if f < 5 else 6, 21, "chair") for f in range(1, 11)] + [(1, 7, 0, "chair")]
+    verdicts = judged([thing(5), thing(6), thing(7)], *rows)
+    assert verdicts.best().tolist() == [False, True, False]
+    assert verdicts.best(np.array([True, False, True])).tolist() == [True, False, False]
+
+
+def test_score_of_a_list_without_doubtful_objects(tmp_path: Path) -> None:
+    entries = [
+        {"id": 1, "class": "chair", "also_ok": [], "recall": True},
+        {"id": 2, "class": "cup", "also_ok": [], "recall": True},  # too few frames to be needed
+        {"id": 3, "class": "tv", "also_ok": [], "recall": True},
+        {"id": 4, "class": "ignore", "also_ok": [], "recall": False},
+    ]
+    (tmp_path / "objects_2d.json").write_text(json.dumps(entries))
+    seen = [(f, i, 20 * i) for f in range(1, 13) for i in (1, 3, 4)] + [(1, 2, 40)]
+    lines = [f"{f},{i},{x},0,10,10,1,{56 if i == 1 else 62},1" for f, i, x in seen]
+    (tmp_path / "gt_mot.txt").write_text("\n".join(lines))
+    objects = [
+        thing(1, confidence=0.9), thing(2, confidence=0.6), thing(3, "tv", confidence=0.8),
+        thing(4, confidence=0.7), thing(5, "tv", status="doubtful", confidence=0.3),
+    ]  # fmt: skip
+    # 1 and 2: both the chair; 3: a tv where none is; 4: in the area; 5: the true tv, doubtful
+    place = {1: (20, range(7)), 2: (20, range(7, 12)), 3: (0, range(9)), 4: (80, range(4))}
+    place[5] = (60, range(12))
+    rows = sorted((f, i, x) for i, (x, frames) in place.items() for f in frames)
+    frame, identity, left = np.array(rows).T
+    xyxy = np.stack([left, 0 * left, left + 10, 0 * left + 10], 1).astype(float)
+    n = len(rows)
+    columns = (xyxy, np.full(n, 0.9), np.zeros(n, int), np.arange(n))
+    tracks = rt.Tracks(frame, identity, identity, *columns)
+    rt.Result(tracks, rt.COCO_NAMES, VideoInfo("a", 640, 480, 30.0), objects).save(tmp_path)
+    score = rr.score_lists(tmp_path, tmp_path)
+    counts = {k: score[k] for k in ("true", "found", "doubles", "elsewhere")}
+    assert counts == {"true": 2, "found": 1, "doubles": 1, "elsewhere": 1}
+    assert score["precision"] == pytest.approx(2 / 3) and score["recall"] == 0.5
+    # true: 12 + 1 + 12 boxes; found: all but the 4 in the area; right: 7 of the chair, 12 of the tv
+    assert score["idf1"] == pytest.approx(2 * 19 / (25 + 33))
+    real = {(c, r) for c, r, _ in score["sure"]}
+    assert real == {(0.9, True), (0.6, False), (0.8, False), (0.3, True)}
+
+
+# ---- Solids ------
+
+
+def row_of_chairs(count: int) -> list[dict]:
+    size, turn = [0.5, 0.9, 0.6], np.eye(3).tolist()
+    return [
+        {"coco": "chair", "center": [2.0 * i, 0, 0], "R": turn, "size": size} for i in range(count)
+    ]
+
+
+def placed(*solids: tuple[str, tuple[float, float, float]], turn: np.ndarray) -> rr.Placed:
+    """Chairs of .5 x .9 x .6 m, their axes named in another order; 10 % too wide."""
+    objects = [thing(i, name, center=np.array(at)) for i, (name, at) in enumerate(solids)]
+    centers = np.array([at for _, at in solids], float).reshape(-1, 3)
+    size = np.abs(turn.T @ [0.55, 0.9, 0.6])
+    n = len(solids)
+    return rr.Placed(objects, centers, np.tile(turn, (n, 1, 1)), np.tile(size, (n, 1)))
+
+
+def test_solids_are_found_doubled_or_elsewhere() -> None:
+    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    solids = placed(
+        ("chair", (0.1, 0, 0)), ("chair", (0.2, 0, 0)),  # the second is a double
+        ("chair", (2.0, 1.0, 0)),  # too high, which is no matter over ground
+        ("chair", (3.6, 0, 0)),  # .4 m from the third
+        ("cup", (4.0, 0, 0)), turn=turn,
+    )  # fmt: skip
+    found = rr.match_solids(row_of_chairs(3), solids)
+    assert found.true.tolist() == [0, 1] and found.solid.tolist() == [0, 2]
+    assert found.center_error == pytest.approx([0.1, 1.0])
+    assert found.size_error == pytest.approx(np.array([[0.1, 0, 0]] * 2))
+    assert (found.doubles, found.elsewhere) == (1, 1)
+
+
+def test_the_nearest_is_matched_one_to_one_and_large_things_have_a_wide_reach() -> None:
+    sofa = [
+        {"coco": "couch", "center": [0, 0, 0], "R": np.eye(3).tolist(), "size": [2.1, 0.7, 0.9]}
+    ]
+    solids = placed(("couch", (0.6, 0, 0)), ("couch", (0.3, 0, 0)), turn=np.eye(3))
+    found = rr.match_solids(sofa, solids)
+    assert found.solid.tolist() == [1] and (found.doubles, found.elsewhere) == (1, 0)
+    none = rr.match_solids(sofa, solids[np.zeros(2, bool)])
+    assert len(none.true) == none.doubles == none.elsewhere == 0
+
+
+# ---- Tables ------
+
+
+def test_reliability_has_wilsons_interval() -> None:
+    sure = [(0.85, k < 8, True) for k in range(10)] + [(0.1, False, False), (0.2, True, True)]
+    bins = rr.reliability(sure)
+    assert bins[4] == pytest.approx((10, 0.85, 0.8, 0.4902, 0.9433), abs=1e-4)
+    assert [b[0] for b in bins] == [1, 1, 0, 0, 10]
+    lines = rr.reliability_table(sure).splitlines()
+    assert lines[2].startswith("| 0 to 0.2 | .100 | .000 (.000 to .793) | 0 of 1 | - | 0 of 1 |")
+    assert lines[-1].endswith("| 8 of 10 | 8 of 10 | - |")
+
+
+def test_table_has_no_empty_columns() -> None:
+    rows = [(["a"], {"idf1": 0.5, "found": 1, "true": 2}), (["b"], {"found": 0, "true": 3})]
+    lines = rr.figures_table(["recording"], rows).splitlines()
+    assert lines[0] == "| recording | IDF1 | found |"
+    assert lines[2:] == ["| a | .500 | 1 of 2 |", "| b | - | 0 of 3 |"]
+
+
+def test_picture(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rr.draw_reliability([(0.9, True, True), (0.1, False, True)], tmp_path / "a.png")
+    assert cv2.imread(str(tmp_path / "a.png")).std() > 5
+
+
+# ---- What is left out, and runs ------
+
+
+@pytest.mark.parametrize("name", rr.WITHOUT)
+def test_what_is_left_out_is_still_there(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mechanism that was renamed or removed must not be measured as if left out."""
+    before = {}
+    for path in rr.WITHOUT[name]:
+        module, _, attribute = path.rpartition(".")
+        owner = importlib.import_module(module)
+        before[path] = owner, attribute, getattr(owner, attribute)
+        monkeypatch.setattr(owner, attribute, before[path][2])  # put back afterwards
+    rr.leave_out(name)
+    assert all(getattr(owner, name) is not old for owner, name, old in before.values())
+
+
+def test_left_out_under_a_name_that_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(rr.WITHOUT, "gone", {"quadrics.GONE": 0})
+    with pytest.raises(SystemExit, match="no longer there"):
+        rr.leave_out("gone")
+
+
+def test_names_are_checked() -> None:
+    assert [c.name for c in rr.chosen(rr.CASES, ["studio"])] == ["studio-yolo", "studio-femto"]
+    assert rr.every_without(["all"]) == list(rr.WITHOUT)
+    with pytest.raises(SystemExit, match="--only"):
+        rr.chosen(rr.CASES, ["attic"])
+    with pytest.raises(SystemExit, match="attic"):
+        rr.every_without(["attic"])
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hololens_kitchen of three simulated chairs."""
+    folder = tmp_path_factory.mktemp("data") / "hololens_kitchen"
+    (folder / "images").mkdir(parents=True)
+    poses, solids = walk(FRAMES), chair_solids()
+    xyxy = quadrics.solid_boxes(solids, "box", CAMERA.K @ poses.cam_from_world)  # (F, 3, 4)
+    for f in range(FRAMES):
+        image = np.random.default_rng(f).integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8)
+        cv2.imwrite(str(folder / f"images/{f + 10:05d}.jpg"), image)
+    bottom = [0, 0, 0, 1]
+    world_from_cam = [np.linalg.inv(np.vstack([c, bottom])) for c in poses.cam_from_world]
+    np.savetxt(folder / "poses_c2w.txt", np.reshape(world_from_cam, (FRAMES, 16)))
+    fx, fy, cx, cy = CAMERA.params
+    k = {"model": "PINHOLE", "w": SIZE[0], "h": SIZE[1], "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    (folder / "intrinsics.json").write_text(json.dumps(k))
+    (folder / "gt_amodal_format.json").write_text(json.dumps({"classes": {"1": "chair"}}))
+    rows, truth = ["frame,x1,y1,x2,y2,score,class"], []
+    for f, i in np.ndindex(FRAMES, 3):
+        x1, y1, x2, y2 = xyxy[f, i]
+        rows.append(f"{f},{x1},{y1},{x2},{y2},0.9,chair")
+        truth.append(f"{f + 1},{i + 1},{x1},{y1},{x2 - x1},{y2 - y1},1,1,1")
+    (folder / "true_boxes.csv").write_text("\n".join(rows))
+    (folder / "gt_amodal.txt").write_text("\n".join(truth))
+    true = [
+        {"id": i + 1, "coco": "chair", "center": center.tolist(), "R": turn.tolist(), "size": size}
+        for i, (center, turn, size) in enumerate(
+            zip(
+                solids.center_in_world,
+                solids.world_from_obj,
+                (2 * solids.half_axes).tolist(),
+                strict=True,
+            )
+        )
+    ]
+    (folder / "objects_gt.json").write_text(json.dumps({"objects": true}))
+    return folder.parent
+
+
+def test_whole_table_of_a_simulated_walk(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = [str(data), "-o", str(tmp_path), "--only", "kitchen-true", "--without", "alternation"]
+    assert rr.main(args) == 0
+    made = json.loads((tmp_path / "real_rooms.json").read_text())
+    whole, without = (made[k]["kitchen-true"] for k in ("", "alternation"))
+    for score in (whole, without):
+        assert (score["true"], score["found"], score["doubles"], score["elsewhere"]) == (3, 3, 0, 0)
+        assert score["idf1"] > 0.95 and score["centre_m"] < 0.05 and score["size_error"] < 0.1
+        assert score["objects_s"] > 0 and score["peak_mb"] > 50
+    assert all(real and solid for _, real, solid in whole["sure"]) and len(whole["sure"]) == 3
+    text = (tmp_path / "real_rooms.md").read_text()
+    assert capsys.readouterr().out.endswith(text)
+    assert "| hololens_kitchen | true | supplied |" in text and "| alternation |" in text
+    assert len(list((tmp_path / "poses-hololens_kitchen").glob("*.pose.txt"))) == FRAMES
+
+
+def test_solids_of_each_part_come_into_the_true_world(parted: rt.Result, tmp_path: Path) -> None:
+    """Two worlds of other units and directions, both of the same three chairs."""
+    true = walk(len(parted.poses.frame), 200.0).cam_from_world
+    bottom = [0, 0, 0, 1]
+    poses = [np.linalg.inv(np.vstack([c, bottom])).ravel() for c in true]
+    np.savetxt(tmp_path / "poses_c2w.txt", poses)
+    solids, truth = rr.Placed.of(parted, tmp_path / "poses_c2w.txt"), chair_solids()
+    assert len(solids.objects) == 6
+    apart = np.linalg.norm(solids.center[:, None] - truth.center_in_world, axis=2)
+    assert sorted(apart.argmin(1)) == [0, 0, 1, 1, 2, 2] and apart.min(1).max() < 0.05
+    sizes = np.sort(solids.size, axis=1), np.sort(2 * truth.half_axes[0])
+    assert np.abs(np.log(sizes[0] / sizes[1])).max() < 0.15
