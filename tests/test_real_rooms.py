@@ -305,18 +305,21 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_whole_table_of_a_simulated_walk(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    args = [str(data), "-o", str(tmp_path), "--only", "kitchen-true", "--without", "alternation"]
-    assert rr.main(args) == 0
-    made = json.loads((tmp_path / "real_rooms.json").read_text())
+    (tmp_path / "tracking.md").write_text("<!-- table left out -->\n<!-- end left out -->\n")
+    args = [str(data), "-o", str(tmp_path), "--only", "kitchen-true", "--docs", str(tmp_path)]
+    assert rr.main([*args, "--without", "alternation"]) == 0
+    made = json.loads((tmp_path / "left_out.json").read_text())
     whole, without = (made[k]["kitchen-true"] for k in ("", "alternation"))
     for score in (whole, without):
         assert (score["true"], score["found"], score["doubles"], score["elsewhere"]) == (3, 3, 0, 0)
         assert score["idf1"] > 0.95 and score["centre_m"] < 0.05 and score["size_error"] < 0.1
         assert score["objects_s"] > 0 and score["peak_mb"] > 50
     assert all(real and solid for _, real, solid in whole["sure"]) and len(whole["sure"]) == 3
-    text = (tmp_path / "real_rooms.md").read_text()
+    text = (tmp_path / "left_out.md").read_text()
     assert capsys.readouterr().out.endswith(text)
-    assert "| hololens_kitchen | true | supplied |" in text and "| alternation |" in text
+    for without in ("nothing", "alternation"):
+        assert f"| hololens_kitchen, true, supplied | {without} |" in text
+    assert text in (tmp_path / "tracking.md").read_text()
     assert len(list((tmp_path / "poses-hololens_kitchen").glob("*.pose.txt"))) == FRAMES
 
 
