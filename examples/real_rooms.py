@@ -200,7 +200,7 @@ def write_poses(folder: Path, out: Path) -> None:
 def rendered(seed: int, out: Path) -> Path:
     """Render a room, once."""
     folder = out / f"rendered-{seed}-clip"
-    if not (folder / "room.mp4").exists():
+    if not (folder / "gt_objects.json").exists():  # written after the video
         render_room.main(["--seed", str(seed), "--plan", "varied", "-o", str(folder)])
     return folder
 
@@ -668,34 +668,33 @@ def reliability(sure: Sequence[Sure]) -> list[tuple[int, float, float, float, fl
     return rows
 
 
-def reliability_table(sure: Sequence[Sure]) -> str:
-    """Format the bins: of all objects, and of those with and without a solid."""
-    groups = [list(sure), [s for s in sure if s[2]], [s for s in sure if not s[2]]]
+def reliability_table(groups: dict[str, list[Sure]]) -> str:
+    """Format the bins of the first group, and how many are real in the others."""
     lines = []
-    for k, bins in enumerate(zip(*map(reliability, groups), strict=True)):
+    for k, bins in enumerate(zip(*map(reliability, groups.values()), strict=True)):
         n, *numbers = bins[0]
         mean, share, low, high = map(short, numbers)
         of = [f"{round(b[0] * b[2])} of {b[0]}" if b[0] else "-" for b in bins]
         whole = [mean, f"{share} ({low} to {high})"] if n else ["-", "-"]
         lines.append([f"{BINS[k]:g} to {BINS[k + 1]:g}", *whole, *of])
-    head = ["confidence", "mean", "real (95 %)", "real, of all", "with a solid", "without"]
-    return table(head, lines)
+    return table(["confidence", "mean", "real (95 %)", *(f"real: {g}" for g in groups)], lines)
 
 
-def draw_reliability(sure: Sequence[Sure], path: Path) -> None:
-    """Draw the share of real objects over their confidence."""
+def draw_reliability(groups: dict[str, list[Sure]], path: Path) -> None:
+    """Draw the share of real objects over their confidence, a line for each group."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    rows = np.array([row for row in reliability(sure) if row[0]])
-    count, mean, share, low, high = rows.T
-    figure, axes = plt.subplots(figsize=(3.6, 3.4), dpi=110, layout="constrained")
+    figure, axes = plt.subplots(figsize=(3.8, 3.4), dpi=110, layout="constrained")
     axes.plot([0, 1], [0, 1], ":", color="0.5", lw=1)
-    axes.errorbar(mean, share, [share - low, high - share], fmt="o-", ms=5, lw=1.4, capsize=3)
-    for n, x, y in zip(count, mean, share, strict=True):
-        axes.annotate(f"{n:.0f}", (x, y), (6, -12), textcoords="offset points", fontsize=8)
+    for name, sure in groups.items():
+        count, mean, share, low, high = np.array([row for row in reliability(sure) if row[0]]).T
+        error = [share - low, high - share]
+        label = f"{name}, {count.sum():.0f} objects"
+        axes.errorbar(mean, share, error, fmt="o-", ms=5, lw=1.4, capsize=3, label=label)
+    axes.legend(frameon=False, fontsize=8)
     axes.set(xlim=(0, 1), ylim=(-0.02, 1.02), xlabel="confidence", ylabel="share that is real")
     axes.spines[["top", "right"]].set_visible(False)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -762,13 +761,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         for title, rows in found.items():
             write_table(args.docs / "tracking.md", title, rows)
         if not left_out:
-            draw_reliability(all_sure(made[""]), args.docs / "img" / "confidence.png")
+            groups = sure_by_group(cases, made[""])
+            drawn = {k: v for k, v in groups.items() if v and k in ("other boxes", DETECTOR.model)}
+            draw_reliability(drawn, args.docs / "img" / "confidence.png")
     return 0
 
 
-def all_sure(figures: Sequence[Figures]) -> list[Sure]:
-    """List the confidence of the objects of all runs."""
-    return [row for of in figures for row in of["sure"]]
+def sure_by_group(cases: Sequence[Case], figures: Sequence[Figures]) -> dict[str, list[Sure]]:
+    """List the confidence of the objects of all runs, and by what they were detected."""
+    groups: dict[str, list[Sure]] = {"all": [], "other boxes": [], DETECTOR.model: []}
+    for case, of in zip(cases, figures, strict=True):
+        boxes = DETECTOR.model if BOXES[case.boxes] == DETECTOR.model else "other boxes"
+        groups[boxes] += of["sure"]
+        groups["all"] += of["sure"]
+    return groups | {"without a solid": [row for row in groups["all"] if not row[2]]}
 
 
 def tables(cases: Sequence[Case], made: dict[str, list[Figures]]) -> dict[str, str]:
@@ -783,7 +789,7 @@ def tables(cases: Sequence[Case], made: dict[str, list[Figures]]) -> dict[str, s
     rows = [(case.title, figures) for case, figures in zip(cases, made[""], strict=True)]
     return {
         "real rooms": figures_table(["recording", "boxes", "cameras"], rows),
-        "confidence": reliability_table(all_sure(made[""])),
+        "confidence": reliability_table(sure_by_group(cases, made[""])),
     }
 
 

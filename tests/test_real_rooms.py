@@ -225,9 +225,18 @@ def test_reliability_has_wilsons_interval() -> None:
     assert bins[4] == pytest.approx((10, 0.85, 0.8, 0.4902, 0.9433), abs=1e-4)
     assert [b[0] for b in bins] == [1, 1, 0, 0, 10]
     assert rr.reliability([(0.0, False, True), (1.0, True, True)])[4][0] == 1
-    lines = rr.reliability_table(sure).splitlines()
-    assert lines[2].startswith("| 0 to 0.2 | .100 | .000 (.000 to .793) | 0 of 1 | - | 0 of 1 |")
-    assert lines[-1].endswith("| 8 of 10 | 8 of 10 | - |")
+    lines = rr.reliability_table({"all": sure, "bare": sure[10:11]}).splitlines()
+    assert lines[0].endswith("| real: all | real: bare |")
+    assert lines[2] == "| 0 to 0.2 | .100 | .000 (.000 to .793) | 0 of 1 | 0 of 1 |"
+    assert lines[-1].endswith("| 8 of 10 | - |")
+
+
+def test_objects_are_grouped_by_detector() -> None:
+    strong, weak = (next(c for c in rr.CASES if c.boxes == b) for b in (rr.YOLO, rr.FEMTO))
+    figures = [{"sure": [(0.9, True, True)]}, {"sure": [(0.3, False, False), (0.5, True, True)]}]
+    groups = rr.sure_by_group([strong, weak], figures)
+    sizes = {name: len(sure) for name, sure in groups.items()}
+    assert sizes == {"all": 3, "other boxes": 1, "deimv2-femto": 2, "without a solid": 1}
 
 
 def test_table_has_no_empty_columns() -> None:
@@ -239,7 +248,7 @@ def test_table_has_no_empty_columns() -> None:
 
 def test_picture(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    rr.draw_reliability([(0.9, True, True), (0.1, False, True)], tmp_path / "a.png")
+    rr.draw_reliability({"all": [(0.9, True, True), (0.1, False, True)]}, tmp_path / "a.png")
     assert cv2.imread(str(tmp_path / "a.png")).std() > 5
 
 
