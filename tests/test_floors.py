@@ -21,7 +21,7 @@ FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
     2: "reobj.files reobj.options reobj.identity.evidence reobj.identity.sampling "
-    "reobj.sources.masks "
+    "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded "
     "reobj.poses.child reobj.poses.uncertainty",
