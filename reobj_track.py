@@ -1258,8 +1258,9 @@ def _cmd_models(args: argparse.Namespace) -> int:
     if not args.names:
         for row in list_models():
             w = row.weights
-            facts = f"{w.name:<20} {w.role:<9} {w.size / 1e6:5.1f} MB  {w.licence:<11}"
-            print(f"{facts} {row.state:<13} {w.note}")
+            size = f"{w.size / 1e6:.1f}" if w.size else "?"
+            facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
+            print(f"{facts} {row.state:<9} {w.note}")
     return 0
 
 
