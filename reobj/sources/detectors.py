@@ -334,8 +334,9 @@ def open_detections(
         threads: of onnxruntime (0: all cores). offline: never download weights.
     """
     if detections is None or detections == "":
+        path = model_path(config.model, offline)
         detector = OnnxDetector("", config, threads, offline)
-        key = _cache_key(config, detector.path.name, detector.path.stat().st_size)
+        key = _cache_key(config, path.name, path.stat().st_size)
         return dataclasses.replace(as_source(detector), key=key, slow=True)
     if isinstance(detections, str | Path):
         recorded = as_source(read_detections(detections, video, config))
