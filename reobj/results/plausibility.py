@@ -84,10 +84,10 @@ def _unexplained(result: Result, high_score: float) -> str:
     count, total = len(_distinct(listed)), len(_distinct(strong))
     if total < BOXES_MIN or 2 * count >= total:
         return ""
-    look = "look at the doubtful objects (--set output.doubtful=true), or " if doubtful else ""
+    shown = "look at the doubtful objects (--set output.doubtful=true), or " if doubtful else ""
     return (
         f"{total - count} of {total} boxes of score {high_score:g} or more belong to no listed "
-        f"object: {look}try {OTHER_BOXES}"
+        f"object: {shown}try {OTHER_BOXES}"
     )
 
 

@@ -76,8 +76,7 @@ class Object:
     Attributes:
         id: identity in the tracks, from 1. class_name: of the largest sum of scores; score: mean.
         status: "ok", "prior_dominated" (some size rests on the category's prior), "doubtful" (less
-            likely there than not), "rejected" (no solid) or "tracked" (in 2D only: no cameras).
-            reason: why it is not "ok"; "" where tracked.
+            likely there than not), "rejected" (no solid), "tracked" (in 2D: no cameras). reason: why.
         confidence: probability that it is there, a thing of its own; None without cameras.
         support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
@@ -444,10 +443,7 @@ class Result:
             raise ReobjError(f"{path}: {written_by(path.parent.parent)} ({error!r})") from error
 
     def summary(self) -> str:
-        """Return the table that `run` prints: object, class, frames, size with sigma, status.
-
-        Where nothing has a size, as in 2D, it has no columns for them.
-        """
+        """Return the table that `run` prints: object, class, frames, any size and sigma, status."""
         counted = [o for o in self.objects if o.status != "doubtful"]
         scaled = any(o.size_m is not None for o in self.objects)
         sized = any(o.size is not None for o in counted)
