@@ -76,7 +76,7 @@ class Object:
     Attributes:
         id: identity in the tracks, from 1. class_name: of the largest sum of scores; score: mean.
         status: "ok", "prior_dominated" (some size rests on the category's prior), "doubtful" (less
-            likely there than not), "rejected" (no solid), "tracked" (in 2D: no cameras). reason: why.
+            likely there than not), "rejected" (no solid), "tracked" (2D: no cameras). reason: why.
         confidence: probability that it is there, a thing of its own; None without cameras.
         support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
