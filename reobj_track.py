@@ -92,6 +92,7 @@ from reobj.poses.stage import (
 )
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, export
+from reobj.results.plausibility import implausible
 from reobj.results.result import (
     Object,
     Part,
@@ -1097,8 +1098,7 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.embedding_row = detected[result.embedding_row]
     result.seconds["objects"] = time.monotonic() - started
     result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
-    for warning in result.warnings:
-        log.warning(warning)
+    result.warnings += implausible(result, config.tracker.high_score, config.objects.moving_classes)
     started = time.monotonic()
     result.save(workspace.out)
     if poses is not None:
@@ -1106,6 +1106,8 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     shown = result if config.output.doubtful else result.without_doubtful()
     write_pictures(shown, workspace.out, video, config.output.overlay, config.output.scene)
     result.seconds["write"] = time.monotonic() - started
+    for warning in result.warnings:
+        log.warning(warning)
     return result
 
 
@@ -1258,8 +1260,9 @@ def _cmd_models(args: argparse.Namespace) -> int:
     if not args.names:
         for row in list_models():
             w = row.weights
-            facts = f"{w.name:<20} {w.role:<9} {w.size / 1e6:5.1f} MB  {w.licence:<11}"
-            print(f"{facts} {row.state:<13} {w.note}")
+            size = f"{w.size / 1e6:.1f}" if w.size else "?"
+            facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
+            print(f"{facts} {row.state:<9} {w.note}")
     return 0
 
 

@@ -49,8 +49,8 @@ ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = ("path", "out", "detections", "poses", "tracks", "options", "command")
 FILES = ("detections", "poses", "tracks")
 MARKER = "batch.json"  # in the folder of a finished video; written last, whole or not at all
-FACTS = ("frames", "frames_with_pose", "objects", "ok", "prior_dominated", "rejected",
-         "doubtful", "metres_per_unit", "warnings")  # fmt: skip
+KINDS = ("ok", "prior_dominated", "rejected", "doubtful", "tracked")  # statuses of objects
+FACTS = ("frames", "frames_with_pose", "objects", *KINDS, "metres_per_unit", "warnings")
 SUMMARY = ("name", "status", "attempts", "seconds", *FACTS, "path", "out", "error")
 
 
@@ -167,7 +167,7 @@ def facts(found: rt.Result) -> dict[str, Any]:
         "frames": len(set(found.tracks.frame.tolist())),
         "frames_with_pose": found.world.registered_frames,
         "objects": len(status) - status.count("doubtful"),
-        **{s: status.count(s) for s in ("ok", "prior_dominated", "rejected", "doubtful")},
+        **{s: status.count(s) for s in KINDS},
         "metres_per_unit": found.world.scale.value if found.world.scale else None,
         "warnings": len(found.warnings),
     }

@@ -114,6 +114,8 @@ def describe_objects(
 ) -> list[Object]:
     """Describe every identity of the tracks: class, visits, and its solid or why it has none.
 
+    Without cameras there is nothing to fit: all are "tracked".
+
     Args:
         fits, views: of the identities in ascending order; None without cameras.
         confidence: of identities, where it is known.
@@ -131,8 +133,8 @@ def describe_objects(
             identity,
             class_names[class_id] if 0 <= class_id < len(class_names) else "object",
             round(float(rows.score.mean()), 4),
-            "rejected",
-            "no camera poses",
+            "tracked",
+            "",
             frames_seen=len(np.unique(rows.frame)),
             tracklet_ids=np.unique(rows.tracklet_id).tolist(),
             visits=sorted([int(f.min()), int(f.max())] for f in spans),

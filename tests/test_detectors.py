@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.sources import detectors
+from reobj.sources import detectors, weights
 from reobj.sources.detectors import DetectionCache, DetectionSource, as_source, open_detections
 from reobj.sources.recorded import RecordedDetections
 from reobj.types import Image
@@ -348,8 +349,8 @@ def test_borders(
     image = np.full_like(IMAGE, 200)
     if portrait:
         inside, image = inside.transpose(0, 2, 1), image.transpose(1, 0, 2)
-    for weights, value in ((inside, 200), (1 - inside, 114)):
-        path = model(tmp_path, outputs, seen=(*at, weights))
+    for share, value in ((inside, 200), (1 - inside, 114)):
+        path = model(tmp_path, outputs, seen=(*at, share))
         expected = SCORE + value * unit / 2  # half of the input
         assert rt.OnnxDetector(path)(image).score[0] == pytest.approx(expected, rel=1e-3)
 
@@ -381,7 +382,6 @@ def test_detections_are_selected(tmp_path: Path) -> None:
     assert two.score.tolist() == pytest.approx([0.9, 0.7])
     for min_score, count in ((0.5, 4), (0.51, 3), (0.0625, 5), (0.063, 4)):  # at least, not above
         assert len(rt.OnnxDetector(path, rt.DetectConfig(min_score=min_score))(IMAGE)) == count
-    assert len(rt.OnnxDetector(path, rt.DetectConfig(nms_iou=0.99))(IMAGE)) == 5
     with pytest.raises(rt.ReobjError, match="no class sofa among cup, bowl, tv"):
         rt.OnnxDetector(path, rt.DetectConfig(classes="sofa"))
 
@@ -427,6 +427,54 @@ def test_other_networks_are_refused(
     with pytest.raises(rt.ReobjError, match=expected) as caught:
         rt.OnnxDetector(model(tmp_path, outputs, shape))
     assert "m.onnx" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def known(
+    monkeypatch: pytest.MonkeyPatch, path: Path, layout: str, alias: str = ""
+) -> weights.Weights:
+    """Put a model into the table of weights, as the only one."""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    row = weights.Weights("toy", "detector", path.name, "", digest, 0, "MIT", "", layout, alias)
+    monkeypatch.setattr(weights, "WEIGHTS", (row,))
+    monkeypatch.setenv("REOBJ_MODELS", str(path.parent))
+    return row
+
+
+def spoilt(**change: Any) -> dict[str, Any]:
+    return detr() | change
+
+
+@pytest.mark.parametrize(
+    ("outputs", "sizes", "fault"),
+    [
+        (detr(), True, ""),
+        (detr(), False, "its layout is SSD with built-in NMS"),  # would count classes from 1
+        (spoilt(boxes=[[[0.1, 0.1, 0.5, 0.5]] * 2]), True, "boxes that are not in pixels"),
+        (spoilt(boxes=[[BOX, [np.nan] * 4]]), True, "boxes that are no numbers"),
+        (spoilt(scores=[[SCORE, -2.0]]), True, "scores outside 0..1"),  # logits
+        (spoilt(scores=[[SCORE, 1.5]]), True, "scores outside 0..1"),
+        (spoilt(labels=np.array([[LABEL, 90]])), True, "classes beyond its 80"),
+        ({"logits": np.zeros((1, 1000))}, True, "known layouts"),
+    ],
+)
+def test_a_known_model_that_is_not_what_it_was_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outputs: Any, sizes: bool, fault: str
+) -> None:
+    """One line that names the small detector; by its path it is taken as it is."""
+    path = model(tmp_path, outputs, sizes=sizes)
+    known(monkeypatch, path, "DEIM")
+    if not fault:
+        np.testing.assert_allclose(rt.OnnxDetector("toy")(IMAGE).xyxy, [BOX])
+        return
+    with pytest.raises(rt.ReobjError, match=fault) as caught:
+        rt.OnnxDetector("toy")
+    assert "\n" not in str(caught.value) and str(caught.value).endswith("--detector fast")
+    if "logits" not in outputs:
+        rt.OnnxDetector(path)
+    known(monkeypatch, path, "DEIM", "fast")
+    with pytest.raises(rt.ReobjError, match=fault) as caught:
+        rt.OnnxDetector("fast")
+    assert not str(caught.value).endswith("--detector fast")  # it is that one
 
 
 def test_no_onnx_file(tmp_path: Path) -> None:
@@ -687,9 +735,36 @@ def test_a_model_is_a_source(
     assert len(list((tmp_path / "cache").iterdir())) == 1
     keys = {source.key, open_detections(clip, config).key}
     assert len(keys) == 1 and "" not in keys and str(tmp_path) in source.key
-    for change in ({"min_score": 0.2}, {"nms_iou": 0.5}, {"classes": "tv"}):
+    for change in ({"min_score": 0.2}, {"tiles": "2x2"}, {"classes": "tv"}):
         keys.add(open_detections(clip, rt.DetectConfig(model=str(path), **change)).key)
     assert len(keys) == 4
+
+
+def test_masks_of_a_model_reach_the_tracker_and_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In `run` with a -seg model: in the first run, and in the second from the disk."""
+    (tmp_path / "im").mkdir()
+    for index in range(4):
+        cv2.imwrite(str(tmp_path / f"im/{index}.png"), IMAGE)
+    path, given = model(tmp_path, yolo_seg(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}"), []
+    update = rt.Tracker.update
+
+    def noted(self: Any, detections: rt.Detections, *args: Any, **more: Any) -> Any:
+        given.append(detections.masks)
+        return update(self, detections, *args, **more)
+
+    monkeypatch.setattr(rt.Tracker, "update", noted)
+    for coast in (30, 31):  # another option: tracked again
+        config = rt.Config(
+            detect=rt.DetectConfig(model=str(path)), tracker=rt.TrackerConfig(coast_frames=coast)
+        )
+        rt.run(tmp_path / "im", tmp_path / "out", config, in_3d=False)
+    expected = np.zeros((160, 320), bool)
+    expected[40:120, 80:120] = True
+    assert len(given) == 8
+    for masks in given:
+        assert masks.shape == (1, 160, 320) and (masks[0] != expected).sum() <= 80
 
 
 def test_no_detections_named_and_no_network(
@@ -697,7 +772,8 @@ def test_no_detections_named_and_no_network(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("REOBJ_MODELS", raising=False)
-    with pytest.raises(rt.ReobjError, match="model deimv2-femto is not here and --offline"):
+    expected = "deimv2-n is not in .*, and --offline .*; or take .* --detector fast$"
+    with pytest.raises(rt.ReobjError, match=expected):
         open_detections(clip, rt.DetectConfig(), offline=True)
 
 
@@ -791,7 +867,11 @@ def test_real_weights_agree_with_yolov8s(
             * (a.class_id[:, None] == b.class_id[None])
         )
         best += overlap.max(1, initial=0).tolist()
-        assert b.masks is None or b.masks.shape == (len(b), 480, 640)
+        assert (b.masks is not None) == ("seg" in name)
+        for mask, box in zip(b.masks if b.masks is not None else (), b.xyxy, strict=False):
+            (x1, y1), (x2, y2) = np.floor(box[:2]).astype(int), np.ceil(box[2:]).astype(int)
+            own = mask[y1:y2, x1:x2]
+            assert mask.shape == (480, 640) and own.mean() > 0.4 and own.sum() == mask.sum()
     hit = [value for value in best if value > 0.5]
     assert len(best) > 30 and len(hit) / len(best) >= recall, (len(hit), len(best))
     assert np.mean(hit) >= iou

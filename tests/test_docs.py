@@ -131,7 +131,7 @@ def need(page: str) -> None:
     """Skip where this machine lacks what the page says it needs."""
     if page == "scannet_scene":
         try:
-            rt.model_path("deimv2-femto", offline=True)
+            rt.model_path("fast", offline=True)
         except rt.ReobjError as error:
             pytest.skip(f"no weights here: {error}")
     if page == "training":

@@ -21,7 +21,7 @@ FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
     2: "reobj.files reobj.options reobj.identity.evidence reobj.identity.sampling "
-    "reobj.sources.masks "
+    "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded "
     "reobj.poses.child reobj.poses.uncertainty",
@@ -38,7 +38,7 @@ FLOORS = {
     "reobj.poses.depth reobj.results.result",
     6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
     "reobj.results.workspace "
-    "reobj.results.overlay reobj.results.solids",
+    "reobj.results.overlay reobj.results.solids reobj.results.plausibility",
     7: "reobj.parts reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
     "reobj.results.stages reobj.results.export reobj.results.scene",
     8: "reobj_track",

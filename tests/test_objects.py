@@ -42,7 +42,7 @@ def test_without_poses_objects_are_the_tracks() -> None:
     result = fitted(tracks, None)
     assert [o.id for o in result.objects] == [1, 2, 3]
     for found in result.objects:
-        assert (found.status, found.reason) == ("rejected", "no camera poses")
+        assert (found.status, found.reason) == ("tracked", "") and not found.located
         assert found.center is None and found.size_m is None and found.views == 0
         assert found.tracklet_ids == [found.id, found.id + 10] and found.frames_seen == 8
         assert found.visits == [[0, 4], [5, 7]] and found.score == 0.9

@@ -66,7 +66,7 @@ def test_every_option_says_what_it_does() -> None:
     flags = [f.metadata["flag"] for f in options.values() if f.metadata["flag"]]
     assert len(set(flags)) == len(flags) and all(flag.startswith("--") for flag in flags)
     text = list_options(rt.Config())
-    assert "tracker.coast_frames=30 " in text and "detect.model=deimv2-f" in text
+    assert "tracker.coast_frames=30 " in text and "detect.model=deimv2-n " in text
 
 
 # ---- How they are set ----
@@ -328,10 +328,12 @@ def _(lab: Lab) -> None:
             assert find(lab, value)[0].score.tolist() == pytest.approx(expected)
 
 
-@shows("detect.nms_iou")
+@shows("detect.tiles")
 def _(lab: Lab) -> None:
-    """Two chairs overlap by .74."""
-    assert [len(by_network(lab, value)[0]) for value in (0.7, 0.8)] == [1, 2]
+    """The same box in every tile, at four places; those of the whole image and of one coincide."""
+    boxes = ((32, 32, 20, 20, 0.9, 1),)
+    lab.patch.setattr(Session, "BOXES", boxes)
+    assert [len(by_network(lab, value)[0]) for value in ("", "2x1", "2x2")] == [1, 3, 5]
 
 
 @shows("detect.classes")

@@ -81,6 +81,10 @@ def test_track_writes_identities(
     assert validate_objects(tmp_path / "out/objects.json") == []
     out = capsys.readouterr().out
     assert "distinct objects: 2" in out and "overlay.mp4" in out
+    assert "reject" not in out and "sigma" not in out
+    objects = json.loads((tmp_path / "out/objects.json").read_text())["objects"]
+    assert [(o["status"], o["reason"], o["size"]) for o in objects] == [("tracked", "", None)] * 2
+    assert len(re.findall(r"^ +\d+  object +12 +1  tracked$", out, re.M)) == 2
 
 
 def test_run_without_parallax_keeps_the_2d_results(
@@ -96,7 +100,7 @@ def test_run_without_parallax_keeps_the_2d_results(
     assert cli("run", clip, "-o", tmp_path / "out", "--detections", detections, *QUICK) == 0
     captured = capsys.readouterr()
     assert "warning: no camera poses" in captured.err and "--poses" in captured.err
-    assert "distinct objects: 2" in captured.out
+    assert "distinct objects: 2" in captured.out and captured.out.count("tracked\n") == 2
     assert not (tmp_path / "out/poses.txt").exists()
 
 
@@ -105,7 +109,10 @@ def test_poses_none_stays_in_2d(
 ) -> None:
     args = ("run", clip, "-o", tmp_path / "out", "--detections", detections, *QUICK)
     assert cli(*args, "--poses", "none") == 0
-    assert "warning" not in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "warning" not in said.err and said.out.count("tracked") == 2
+    assert cli("objects", tmp_path / "out", *QUICK[2:]) == 0
+    assert capsys.readouterr().out.count("tracked") == 2
 
 
 def test_same_input_same_bytes(clip: Path, detections: Path, tmp_path: Path) -> None:

@@ -461,6 +461,11 @@ def test_identities_only_still_open(browser: Browser, tmp_path: Path) -> None:
     browser.settle()
     assert browser.eval("document.querySelectorAll('.crops img').length") == 8
     assert browser.eval("S.objects[1].row.querySelectorAll('.bar span').length") == 2
+    rows = "[...document.querySelectorAll('.row')].map((row) => row.className.split(' ')[1])"
+    assert set(browser.eval(rows)) == {"tracked"}
+    assert "tracked" in browser.eval("$('panel').innerText")
+    colors = "[S.objects[0].row, $('list')].map((e) => getComputedStyle(e).color)"
+    assert len(set(browser.eval(colors))) == 1  # not dimmed: there is nothing to set it apart from
     browser.picture(SCREENSHOTS / "flat.png")
     assert complaints(browser) == []
 

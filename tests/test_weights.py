@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import http.server
 import os
+import re
+import subprocess
 import sys
 import threading
 import urllib.parse
@@ -13,11 +16,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import reobj_track as rt
 from reobj.sources import weights
+from reobj.sources.onnx_layouts import LAYOUTS
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 needs_shared = pytest.mark.skipif(
@@ -25,6 +30,7 @@ needs_shared = pytest.mark.skipif(
 )
 BLOB = np.random.default_rng(0).integers(0, 256, 300_000, dtype=np.uint8).tobytes()
 SHA256 = hashlib.sha256(BLOB).hexdigest()
+GIT_BLOB = hashlib.sha1(b"blob 300000\0" + BLOB).hexdigest()  # as `git hash-object` has it
 
 
 class Handler(http.server.BaseHTTPRequestHandler):
@@ -40,7 +46,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
             return
         body = BLOB[::-1] if mode == "wrong" else BLOB + b"more" * (mode == "long")
         self.send_response(200)
-        if mode != "cut without a length":
+        if not mode.endswith("without a length"):
             self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         with contextlib.suppress(OSError):  # who stops reading
@@ -94,6 +100,81 @@ def test_another_file_than_expected_is_not_kept(server: Any) -> None:
         assert list(server.folder.iterdir()) == []
 
 
+def test_a_git_blob_id_verifies_a_file_of_unknown_size(
+    server: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a download, as a file that is here, and in the table."""
+    toy = dataclasses.replace(weights.WEIGHTS[0], digest=GIT_BLOB, size=0)
+    monkeypatch.setattr(weights, "WEIGHTS", (toy,))
+    for server.mode in ("wrong", "long", "cut without a length"):
+        with pytest.raises(
+            rt.ReobjError, match=f"git blob id is .*, expected {GIT_BLOB}"
+        ) as caught:
+            rt.model_path("toy")
+        assert "\n" not in str(caught.value) and "not kept" in str(caught.value)
+        assert "--detector fast" in str(caught.value) and list(server.folder.iterdir()) == []
+    server.mode = "cut"  # its length was announced
+    with pytest.raises(rt.ReobjError, match="cut after 100000 of 300000 bytes"):
+        rt.model_path("toy")
+    server.mode = "good"
+    assert rt.model_path("toy") == server.target and server.target.read_bytes() == BLOB
+    assert "size unknown" in caplog.text and f"git blob id {GIT_BLOB}" in caplog.text
+    assert [row.state for row in rt.list_models()] == ["verified"]
+    server.target.write_bytes(BLOB[:-1])
+    assert [row.state for row in rt.list_models()] == ["changed"]
+    with pytest.raises(rt.ReobjError, match=f"git blob id is .*, expected {GIT_BLOB}: delete the"):
+        rt.model_path("toy")
+
+
+def test_a_git_blob_id_is_gits(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(BLOB)
+    done = subprocess.run(
+        ["git", "hash-object", tmp_path / "a"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == GIT_BLOB
+    row = dataclasses.replace(weights.WEIGHTS[0], digest=GIT_BLOB)
+    assert row.digest_of(tmp_path / "a") == GIT_BLOB
+
+
+def test_a_download_of_unknown_size_ends(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    toy = dataclasses.replace(weights.WEIGHTS[0], digest=GIT_BLOB, size=0)
+    monkeypatch.setattr(weights, "WEIGHTS", (toy,))
+    monkeypatch.setattr(weights, "DOWNLOAD_MAX", 100_000)
+    written: list[int] = []
+    monkeypatch.setattr(weights.Progress, "step", lambda self, n: written.append(n))
+    for server.mode in ("good", "without a length"):
+        with pytest.raises(rt.ReobjError, match="not kept"):
+            rt.model_path("toy")
+        assert sum(written) < 200  # of 300 kB
+        written.clear()
+
+
+def test_another_detector_is_named_but_not_taken(
+    server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The default cannot be had, though the small one is here: one line and exit code 2."""
+    small = dataclasses.replace(weights.WEIGHTS[0], name="small", file="small.onnx", alias="fast")
+    default = dataclasses.replace(weights.WEIGHTS[0], name="deimv2-n", file="n.onnx")
+    monkeypatch.setattr(weights, "WEIGHTS", (default, small))
+    server.folder.mkdir()
+    (server.folder / "small.onnx").write_bytes(BLOB)
+    assert rt.model_path("fast") == rt.model_path("small") == server.folder / "small.onnx"
+    (tmp_path / "im").mkdir()
+    cv2.imwrite(str(tmp_path / "im/0.png"), np.zeros((48, 64, 3), np.uint8))
+    server.mode = "404"
+    command = ["run", str(tmp_path / "im"), "-o", str(tmp_path / "out")]
+    for offline, asked in (["--offline"], 0), ([], 1):
+        assert rt.main([*command, *offline]) == 2
+        error = capsys.readouterr().err.splitlines()[-1]
+        for part in ("deimv2-n is not in", str(server.folder), default.url, "--detector fast"):
+            assert part in error
+        assert len(server.asked) == asked and not (tmp_path / "out/tracks.txt").exists()
+    monkeypatch.setattr(weights, "WEIGHTS", (dataclasses.replace(default, alias="fast"),))
+    with pytest.raises(rt.ReobjError) as caught:
+        rt.model_path("fast")  # nothing smaller to name
+    assert "--detector" not in str(caught.value)
+
+
 @pytest.mark.parametrize("mode", ["cut", "cut without a length"])
 def test_a_cut_download_leaves_nothing_and_starts_again(server: Any, mode: str) -> None:
     server.mode = mode
@@ -136,7 +217,7 @@ def test_no_network_says_what_to_do(server: Any) -> None:
 
 
 def test_offline_forbids_the_download(server: Any) -> None:
-    expected = "model toy is not here and --offline forbids the download.*REOBJ_MODELS"
+    expected = f"model toy is not in {server.folder}, and --offline forbids the.*REOBJ_MODELS"
     with pytest.raises(rt.ReobjError, match=expected):
         rt.model_path("toy", offline=True)
     assert server.asked == [] and not server.folder.exists()
@@ -211,7 +292,7 @@ def test_a_changed_file_is_refused_but_not_deleted(server: Any) -> None:
         with pytest.raises(rt.ReobjError, match="delete the file to fetch it again"):
             rt.model_path(name)
     assert rt.model_path(server.target) == server.target  # by its path: as it is
-    assert [row.state for row in rt.list_models()] == ["wrong sha256"]
+    assert [row.state for row in rt.list_models()] == ["changed"]
     assert server.target.read_bytes() == b"changed"
 
 
@@ -247,9 +328,14 @@ def test_nowhere_to_write(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_table_of_weights() -> None:
     names = [row.name for row in weights.WEIGHTS]
-    assert len(set(names)) == len(names) and rt.DetectConfig().model in names
+    assert len(set(names)) == len(names) and rt.DetectConfig().model == "deimv2-n" == names[0]
+    fast = weights.known_weights(weights.FAST)
+    assert fast is not None and fast.name == "deimv2-femto" and weights.known_weights("") is None
     for row in weights.WEIGHTS:
-        assert len(row.sha256) == 64 and row.size > 0 and row.role in ("detector", "backbone")
+        assert re.fullmatch("[0-9a-f]{64}|[0-9a-f]{40}", row.digest)
+        assert row.role in ("detector", "backbone") and (row.size > 0 or len(row.digest) == 40)
+        layouts = [layout for layout in LAYOUTS if layout.name.startswith(row.layout)]
+        assert len(layouts) == 1 if row.role == "detector" else row.layout == ""
         if row.url:
             assert "AGPL" not in row.licence
             assert urllib.parse.urlparse(row.url).scheme == "https"
@@ -267,9 +353,11 @@ def test_what_comes_along_needs_no_network(tmp_path: Path, monkeypatch: pytest.M
 @needs_shared
 def test_table_agrees_with_the_files(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REOBJ_MODELS", str(SHARED / "models"))
-    for row in rt.list_models():
+    here = [row for row in rt.list_models() if row.state != "missing"]
+    assert {"deimv2-femto", "deimv2-atto", "reobj"} <= {row.weights.name for row in here}
+    for row in here:
         assert row.state == "verified" and row.path, row
-        assert row.path.stat().st_size == row.weights.size
+        assert row.path.stat().st_size == row.weights.size or not row.weights.size
 
 
 # ---- Sessions ------------------------------------------------------------------------------------

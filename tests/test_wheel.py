@@ -126,7 +126,7 @@ def test_the_command_runs_from_another_folder(installed: Path, tmp_path: Path) -
     assert (site_packages(installed) / f"reobj_track-{version}.dist-info").is_dir()
     models = call(tool, "models", cwd=tmp_path).splitlines()
     states = {line.split()[0]: line for line in models}
-    assert "verified" in states["reobj"] and "missing" in states["deimv2-femto"]
+    assert "verified" in states["reobj"] and "missing" in states["deimv2-n"]
     detections = ("--detections", ROOM / "detections.npz")
     options = ("--stop", "40", "--offline", "--set", "output.overlay=false")
     call(tool, "run", ROOM / "room.mp4", *detections, *options, "-o", "out", cwd=tmp_path)

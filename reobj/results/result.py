@@ -76,7 +76,7 @@ class Object:
     Attributes:
         id: identity in the tracks, from 1. class_name: of the largest sum of scores; score: mean.
         status: "ok", "prior_dominated" (some size rests on the category's prior), "doubtful" (less
-            likely there than not) or "rejected" (no solid). reason: why it is not "ok".
+            likely there than not), "rejected" (no solid), "tracked" (2D: no cameras). reason: why.
         confidence: probability that it is there, a thing of its own; None without cameras.
         support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
@@ -443,24 +443,23 @@ class Result:
             raise ReobjError(f"{path}: {written_by(path.parent.parent)} ({error!r})") from error
 
     def summary(self) -> str:
-        """Return the table that `run` prints: object, class, frames, size with sigma, status."""
+        """Return the table that `run` prints: object, class, frames, any size and sigma, status."""
         counted = [o for o in self.objects if o.status != "doubtful"]
         scaled = any(o.size_m is not None for o in self.objects)
-        unit = "m" if scaled else "units"
-        lines = [
-            f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  "
-            f"{'width x depth x height, ' + unit:<26} {'sigma':>6}  status"
-        ]
+        sized = any(o.size is not None for o in counted)
+        sizes = f"{'width x depth x height, ' + ('m' if scaled else 'units'):<26} {'sigma':>6}  "
+        lines = [f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  {sizes * sized}status"]
         for o in counted:
             size = o.size if o.size_m is None else o.size_m
             text = "-" if size is None else " x ".join(f"{s:.2f}" for s in size)
             text += " units" if scaled and size is not None and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
+            sizes = f"{text:<26} {sigma:>6}  "
             reason = f" ({o.reason})" if o.reason else ""
             part = f", part {o.part}" if len(self.world.parts) > 1 else ""
             lines.append(
                 f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
-                f"{text:<26} {sigma:>6}  {o.status}{part}{reason}"
+                f"{sizes * sized}{o.status}{part}{reason}"
             )
         counts = sorted(Counter(o.class_name for o in counted).items())
         each = " (each part counted by itself)" if len(self.world.parts) > 1 else ""

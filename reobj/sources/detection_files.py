@@ -45,14 +45,17 @@ class DetectConfig:
     """Choose the detector and which detections are used, recorded ones included."""
 
     model: str = option(
-        "deimv2-femto", "detector: a name of `models`, or a .onnx file", "--detector"
+        "deimv2-n",
+        "detector: a name of `models`, fast (deimv2-femto), or a .onnx file",
+        "--detector",
+    )
+    tiles: str = option(
+        "",
+        "detect in so many overlapping tiles too, COLUMNSxROWS such as 2x2: finds smaller things, "
+        "for 1 + COLUMNS * ROWS times the time",
+        "--detector-tiles",
     )
     min_score: float = option(0.1, "drop detections with a lower score (ByteTrack: .1)")
-    nms_iou: float = option(
-        0.6,
-        "drop boxes that overlap a better one of their class by more than this (IoU; NanoDet: .6), "
-        "where the detector leaves that to us",
-    )
     classes: str = option("", "comma-separated class names to keep (default: all)", "--classes")
     class_names: str = option("", "text file, one class name a line, where they are not COCO's")
     max_detections: int = option(100, "most detections that are kept in a frame, best scores first")

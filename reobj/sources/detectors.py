@@ -21,6 +21,7 @@ import numpy as np
 
 from reobj.files import save_npz
 from reobj.sources.detection_files import (
+    NORMALISED_MAX,
     DetectConfig,
     class_filter,
     load_class_names,
@@ -31,13 +32,15 @@ from reobj.sources.onnx_layouts import (
     LAYOUTS,
     MAX_CANDIDATES,
     PAD_VALUE,
+    Geometry,
     Layout,
     Trial,
     fit_image,
 )
 from reobj.sources.recorded import RecordedDetections, pack_detections, read_npz
+from reobj.sources.tiles import detect_in_tiles, parse_tiles
 from reobj.sources.video import Video, source_fingerprint
-from reobj.sources.weights import model_path, onnx_session
+from reobj.sources.weights import known_weights, model_path, onnx_session
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -51,13 +54,14 @@ from reobj.types import (
 )
 
 DYNAMIC_SIDE = 640  # px, longer side that models for any size are fed (YOLO11 was trained so)
+NMS_IOU = 0.6  # boxes of a class that overlap by more are one, where NMS is left to us (NanoDet)
 SIZE_MULTIPLE = 32  # px; such models want multiples of their largest stride
 
 
 class OnnxDetector:
     """Detect objects with an ONNX model, whose layout is read from its inputs and outputs.
 
-        detector = OnnxDetector("deimv2-femto")
+        detector = OnnxDetector("fast")
         detections = detector(image)  # BGR; boxes in its pixels
 
     Args:
@@ -77,7 +81,9 @@ class OnnxDetector:
         offline: bool = False,
     ) -> None:
         self.config = config or DetectConfig()
-        self.path = model_path(path_or_name or self.config.model, offline)
+        name = path_or_name or self.config.model
+        self._grid, weights = parse_tiles(self.config.tiles), known_weights(name)
+        self.path = model_path(name, offline)
         self._session = onnx_session(self.path, threads)
         self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
         _, shape, kind = self._inputs[0]
@@ -89,15 +95,26 @@ class OnnxDetector:
             outputs = zip(self._session.get_outputs(), trial.outputs, strict=True)
             found = ", ".join(f"{output.name} {array.shape}" for output, array in outputs)
             known = "; ".join(layout.name for layout in LAYOUTS)
-            raise self._refusal(f"outputs {found}; known layouts: {known}")
+            text = f"outputs {found}; known layouts: {known}{weights.fallback if weights else ''}"
+            raise self._refusal(text)
         self._layout = accepting[0]
         self.layout = self._layout.name
         self.class_names = self._names(self._layout.classes(trial))
+        if weights is not None and (fault := self._fault(trial, weights.layout)):
+            text = f"{self.path} does not behave like a detector of the layout {weights.layout}"
+            raise ReobjError(f"{text}: {fault}{weights.fallback}")
         wanted = self.config.classes
         self._allowed = class_filter(wanted, self.class_names) if wanted else None
 
     def __call__(self, image: Image) -> Detections:
         """Detect the objects in one BGR image (H, W, 3); best first, boxes clipped to the image."""
+        if self._grid == (1, 1):
+            return self._detect(image)
+        found = detect_in_tiles(self._detect, image, self._grid)
+        return found[: self.config.max_detections]
+
+    def _detect(self, image: Image) -> Detections:
+        """Run the network once, on the whole of an image."""
         size = self._input_size(image.shape[1], image.shape[0])
         canvas, geometry = fit_image(image, size, self._layout.fit)
         outputs = self._session.run(None, self._feeds(canvas, geometry.image_size, self._layout))
@@ -115,6 +132,20 @@ class OnnxDetector:
         """Make the error that this is no known detector."""
         return ReobjError(f"{self.path}: no known object detector: {reason}")
 
+    def _fault(self, trial: Trial, expected: str) -> str:
+        """Say what a trial on grey shows that a model of our table cannot give; "": nothing."""
+        if not self.layout.startswith(expected):
+            return f"its layout is {self.layout}"
+        same = Geometry(trial.size, trial.size, (1.0, 1.0), (0, 0))
+        found = self._layout.decode(trial.outputs, same)
+        if not np.isfinite(found.xyxy).all() or not ((found.score >= 0) & (found.score <= 1)).all():
+            return "boxes that are no numbers, or scores outside 0..1"
+        if len(found.xyxy) and np.abs(found.xyxy).max() <= NORMALISED_MAX:
+            return "boxes that are not in pixels"
+        labels = found.class_id - self._layout.first
+        count = len(self.class_names)
+        return f"classes beyond its {count}" if labels.max(initial=0) >= count else ""
+
     def _select(self, boxes: Array, score: Array, label: IntArray) -> IntArray:
         """Select rows by score, area, class and NMS; best first."""
         good = (score >= self.config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
@@ -124,7 +155,7 @@ class OnnxDetector:
         rows = np.flatnonzero(good)
         rows = rows[np.argsort(-score[rows], kind="stable")][:MAX_CANDIDATES]
         if self._layout.nms:
-            rows = rows[nms(boxes[rows], label[rows], self.config.nms_iou)]
+            rows = rows[nms(boxes[rows], label[rows], NMS_IOU)]
         return rows[: self.config.max_detections]
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
@@ -304,7 +335,7 @@ def open_detections(
     """
     if detections is None or detections == "":
         path = model_path(config.model, offline)
-        detector = OnnxDetector(path, config, threads)
+        detector = OnnxDetector("", config, threads, offline)
         key = _cache_key(config, path.name, path.stat().st_size)
         return dataclasses.replace(as_source(detector), key=key, slow=True)
     if isinstance(detections, str | Path):

@@ -29,20 +29,43 @@ class Weights:
     """Describe a file of pre-trained weights.
 
     Attributes:
-        name, file: either names it on the command line. role: "detector" or "backbone".
+        name, file, alias: each names it on the command line. role: "detector" or "backbone".
         url: where to download it, pinned at a commit; "": it comes along in reobj/models.
-        sha256, size: of the whole file, bytes.
+        digest: of the whole file, as hex: sha256 (64 digits), or git blob id (40 digits: what git
+            itself knows the file by). size: bytes; 0: unknown.
         note: for the table; AP on 164 images of COCO val2017, ms an image with one thread.
+        layout: of a detector, how the name of its layout in `onnx_layouts` begins.
     """
 
     name: str
     role: str
     file: str
     url: str
-    sha256: str
+    digest: str
     size: int
     licence: str
     note: str = ""
+    layout: str = ""
+    alias: str = ""
+
+    @property
+    def digest_kind(self) -> str:
+        """Name the kind of `digest`."""
+        return "sha256" if len(self.digest) == 64 else "git blob id"
+
+    def digest_of(self, path: Path) -> str:
+        """Hash a file the way that `digest` was made."""
+        with path.open("rb") as file:
+            if self.digest_kind == "sha256":
+                return hashlib.file_digest(file, "sha256").hexdigest()
+            blob = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
+            return hashlib.file_digest(file, lambda: blob).hexdigest()
+
+    @property
+    def fallback(self) -> str:
+        """Name the detector to take instead, as the end of an error message; "": none."""
+        other = self.role == "detector" and self.alias != FAST
+        return f"; or take the small detector: --detector {FAST}" if other else ""
 
 
 _GITHUB = "https://github.com/"
@@ -50,22 +73,31 @@ _DEIM = _GITHUB + "Kazuhito00/DEIMv2-ONNX-Sample/raw/f88d4382abca74edb26ed4c7f46
 _YOLOX = (_GITHUB + "Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
           "3d4f1119d0694200671c08069ecb847aa0d8495a/")  # fmt: skip
 _PICODET = _GITHUB + "hpc203/picodet-onnxruntime/raw/dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/"
+FAST = "fast"  # alias of the detector that is named where the default one is not to be had
 WEIGHTS: tuple[Weights, ...] = (
+    Weights("deimv2-n", "detector", "deimv2_hgnetv2_n_coco.onnx",
+            _DEIM + "model/deimv2_hgnetv2_n_coco.onnx",
+            "facaa27741d600e993b80f981b86997adbf7d556", 0,
+            "Apache-2.0", "default; COCO, AP 43.0 by its authors, not run by us", "DEIM"),
+    Weights("deimv2-pico", "detector", "deimv2_hgnetv2_pico_coco.onnx",
+            _DEIM + "model/deimv2_hgnetv2_pico_coco.onnx",
+            "e049f81944cdb9a4e0fd07de741abadcce9de516", 0,
+            "Apache-2.0", "COCO, AP 38.5 by its authors, not run by us", "DEIM"),
     Weights("deimv2-femto", "detector", "deimv2_hgnetv2_femto_coco.onnx",
             _DEIM + "model/deimv2_hgnetv2_femto_coco.onnx",
             "c6ad358f750132b891165e034c2ba507abefc5ebe1c1d2732a0acbcacc47e52c", 4116144,
-            "Apache-2.0", "default; COCO, AP 33.2, 39 ms"),
+            "Apache-2.0", "`--detector fast`; COCO, AP 33.2, 39 ms", "DEIM", FAST),
     Weights("deimv2-atto", "detector", "deimv2_hgnetv2_atto_coco.onnx",
             _DEIM + "model/deimv2_hgnetv2_atto_coco.onnx",
             "b114aa6610ac7c2bd9b3186ffb001afa872430db957407ef2473f7148d00646e", 2248408,
-            "Apache-2.0", "smallest; COCO, AP 25.5, 21 ms"),
+            "Apache-2.0", "smallest; COCO, AP 25.5, 21 ms", "DEIM"),
     Weights("yolox-nano", "detector", "yolox_nano_416.onnx", _YOLOX + "model/yolox_nano.onnx",
             "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14", 3660092,
-            "Apache-2.0", "COCO, AP 28.6, 27 ms"),
+            "Apache-2.0", "COCO, AP 28.6, 27 ms", "YOLOX"),
     Weights("picodet-s-416", "detector", "picodet_s_416_coco.onnx",
             _PICODET + "picodet_s_416_coco.onnx",
             "cdab77bdde16e4f76bec734c4e5791801d1739e4c7ec1995e0e110e04300d0c2", 4040573,
-            "Apache-2.0", "COCO, AP 33.5, 46 ms"),
+            "Apache-2.0", "COCO, AP 33.5, 46 ms", "PicoDet"),
     Weights("reobj", "backbone", "reobj.onnx", "",
             "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 392965,
             "MIT", "ours, comes along: foreground and background, trained with its head"),
@@ -74,7 +106,7 @@ WEIGHTS: tuple[Weights, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class ModelRow:
-    """Tell whether a known file is here: `state` "verified", "wrong sha256" or "missing"."""
+    """Tell whether a known file is here: `state` "verified", "changed" or "missing"."""
 
     weights: Weights
     state: str
@@ -106,9 +138,11 @@ def _find_model(*files: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def known_weights(name: str | Path) -> Weights | None:
+    """Look a name up in the table; None: it is not there, or is a file that exists."""
+    if Path(name).expanduser().is_file():
+        return None
+    return next((w for w in WEIGHTS if str(name) in (w.name, w.file, w.alias or w.name)), None)
 
 
 def list_models() -> list[ModelRow]:
@@ -117,7 +151,7 @@ def list_models() -> list[ModelRow]:
     for weights in WEIGHTS:
         path, state = _find_model(weights.file), "missing"
         if path is not None:
-            state = "verified" if _sha256(path) == weights.sha256 else "wrong sha256"
+            state = "verified" if weights.digest_of(path) == weights.digest else "changed"
         rows.append(ModelRow(weights, state, path))
     return rows
 
@@ -135,44 +169,50 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
     path, name = Path(name_or_path).expanduser(), str(name_or_path)
     if path.is_file():
         return path
-    weights = next((w for w in WEIGHTS if name in (w.name, w.file)), None)
+    weights = known_weights(name)
     found = _find_model(*([weights.file] if weights else [name, name + ".onnx"]))
     if found is None:
         if weights is not None:
             return _fetch(weights, offline)
         known = ", ".join(w.name for w in WEIGHTS)
         raise ReobjError(f"model {name}: no such file, nor one of the known names ({known})")
-    if weights is not None and (digest := _sha256(found)) != weights.sha256:
+    if weights is not None and (digest := weights.digest_of(found)) != weights.digest:
         raise ReobjError(
-            f"{found}: sha256 is {digest}, expected {weights.sha256}: delete the file to fetch it "
-            "again, or give its path instead of its name to use it as it is"
+            f"{found}: {weights.digest_kind} is {digest}, expected {weights.digest}: delete the "
+            "file to fetch it again, or give its path instead of its name to use it as it is"
         )
     return found
 
 
 def _fetch(weights: Weights, offline: bool) -> Path:
-    """Download weights into the first writable folder; keep the file only if its sha256 fits."""
+    """Download weights into the first writable folder; keep the file only if its digest fits."""
+    expected = f"{weights.digest_kind} {weights.digest}"
+    missing = f"model {weights.name} is not in {' nor '.join(map(str, _model_folders()))},"
     by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
     if offline:
-        raise ReobjError(f"model {weights.name} is not here and --offline forbids the download: "
-                         f"fetch {weights.url} elsewhere and {by_hand}")  # fmt: skip
+        raise ReobjError(f"{missing} and --offline forbids the download: "
+                         f"fetch {weights.url} elsewhere and {by_hand}{weights.fallback}"
+                         )  # fmt: skip
+    size = f"{weights.size / 1e6:.1f} MB" if weights.size else "size unknown"
     log.warning(
-        "fetching %s: %.1f MB, licence %s, from %s, sha256 %s",
-        weights.name, weights.size / 1e6, weights.licence, weights.url, weights.sha256,
+        "fetching %s: %s, licence %s, from %s, %s",
+        weights.name, size, weights.licence, weights.url, expected,
     )  # fmt: skip
     target = _writable_folder() / weights.file
     try:
         with atomic(target) as part:
             _download(weights, part)
-            if (digest := _sha256(part)) != weights.sha256:
+            if (digest := weights.digest_of(part)) != weights.digest:
                 raise ReobjError(
-                    f"{weights.url}: sha256 is {digest}, expected {weights.sha256}: not kept; run "
-                    "again; if it happens again the source has changed: do not use it"
+                    f"{weights.url}: {weights.digest_kind} is {digest}, expected {weights.digest}: "
+                    "not kept; run again; if it happens again the source has changed: do not use "
+                    f"it{weights.fallback}"
                 )
     except (OSError, http.client.HTTPException) as error:  # the server, the network or the disk
         raise ReobjError(
-            f"{weights.url}: download failed ({error}): run again, or get a file with sha256 "
-            f"{weights.sha256} on another machine and {by_hand}"
+            f"{missing} and {weights.url}: download failed ({error}): run again, or get a file "
+            f"with {expected} on another machine and {by_hand}"
+            f"{weights.fallback}"
         ) from error
     return target
 
@@ -189,24 +229,26 @@ def _writable_folder() -> Path:
 
 
 DOWNLOAD_CHUNK = 1 << 16  # bytes; chosen: small enough for a moving progress line
+DOWNLOAD_MAX = 100_000_000  # bytes of a file of unknown size; chosen: several times the largest
 DOWNLOAD_TIMEOUT_S = 30  # chosen: no byte for so long, and the connection counts as cut
 
 
 def _download(weights: Weights, part: Path) -> None:
     """Write the file behind the URL to `part`; a connection cut early is an error."""
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
-    progress, done = Progress("fetch kB", weights.size // 1000), 0
     with (
         urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response,
         part.open("wb") as file,
     ):
-        while done < weights.size and (chunk := response.read(DOWNLOAD_CHUNK)):
+        size, done = weights.size or min(response.length or 0, DOWNLOAD_MAX), 0
+        progress = Progress("fetch kB", size // 1000)
+        while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
             file.write(chunk)
             done += len(chunk)
             progress.step(len(chunk) // 1000)
     progress.close()
-    if done < weights.size:
-        raise ConnectionError(f"connection cut after {done} of {weights.size} bytes")
+    if done < size:
+        raise ConnectionError(f"connection cut after {done} of {size} bytes")
 
 
 def onnx_session(path: Path, threads: int = 0) -> Any:

@@ -1,0 +1,176 @@
+"""Results that look wrong as a whole: said once, in one line, with what to try; others are not."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from simulated import BREAK, SIZE, two_parts, unlinked, walk
+
+import reobj_track as rt
+from reobj.results.plausibility import implausible
+from reobj.results.result import VideoInfo
+from reobj.results.workspace import Workspace
+
+MOVING = rt.ObjectsConfig().moving_classes
+HIGH = 0.4
+FRIDGE, CHAIR, PERSON = (rt.COCO_NAMES.index(n) for n in ("refrigerator", "chair", "person"))
+
+
+def rows(count: int, track_id: int, class_id: int = CHAIR, score: float = 0.9) -> rt.Tracks:
+    """Boxes of one object in the first frames."""
+    n = np.arange(count)
+    columns = (np.zeros((count, 4)), np.full(count, score), np.full(count, class_id))
+    return rt.Tracks(n, 0 * n + track_id, 0 * n + track_id, *columns, 0 * n + track_id)
+
+
+def result(
+    classes: dict[int, int],
+    status: str = "ok",
+    poses: rt.Poses | None = None,
+    boxes: int = 10,
+) -> rt.Result:
+    """So many objects of each class, of one status."""
+    kinds = np.repeat(list(classes), list(classes.values())).tolist()
+    tracks = [rows(boxes, i, kind) for i, kind in enumerate(kinds, 1)]
+    objects = [
+        rt.Object(i, rt.COCO_NAMES[kind], 0.9, status, "") for i, kind in enumerate(kinds, 1)
+    ]
+    table = rt.Tracks.joined([rt.Tracks.empty(), *tracks])
+    return rt.Result(table, rt.COCO_NAMES, VideoInfo("v", *SIZE, 30.0), objects, poses=poses)
+
+
+def said(found: rt.Result, **change: object) -> list[str]:
+    lines = implausible(dataclasses.replace(found, **change), HIGH, MOVING)
+    assert all("\n" not in line for line in lines)
+    return lines
+
+
+def lost(share: float, **change: object) -> rt.Poses:
+    """A walk of 40 frames of which so many have no pose."""
+    poses = walk()
+    poses.cam_from_world[: round(40 * share)] = np.nan
+    return dataclasses.replace(poses, **change)
+
+
+@pytest.mark.parametrize(
+    ("classes", "warned"),
+    [
+        ({FRIDGE: 9, CHAIR: 5}, True),  # office_loop with a small detector
+        ({FRIDGE: 8, CHAIR: 7}, True),
+        ({FRIDGE: 8, CHAIR: 8}, False),  # half is not more than half
+        ({FRIDGE: 7, CHAIR: 1}, False),  # few
+        ({CHAIR: 4, FRIDGE: 2}, False),  # a table
+        ({CHAIR: 14, FRIDGE: 14}, False),
+        ({PERSON: 20, FRIDGE: 4}, False),  # people come in crowds
+        ({CHAIR: 20}, False),  # nothing else was looked for
+        ({}, False),
+    ],
+)
+def test_most_objects_of_one_class(classes: dict[int, int], warned: bool) -> None:
+    lines = said(result(classes))
+    assert len(lines) == warned
+    if warned:
+        n = classes[FRIDGE]
+        expected = f"{n} of {sum(classes.values())} listed objects are of the class refrigerator"
+        assert lines[0].startswith(expected) and "check that" in lines[0]
+        assert "--detector" in lines[0] and "--detections" in lines[0]
+    assert said(result(classes), identities_given=True) == []
+
+
+def test_one_class_that_only_other_boxes_contradict() -> None:
+    """Boxes of other classes in no track show that others were looked for."""
+    assert len(said(result({CHAIR: 20}), untracked=rows(1, 0, FRIDGE, 0.1))) == 1
+
+
+def test_doubtful_objects_are_not_counted() -> None:
+    found = result({FRIDGE: 9, CHAIR: 5}, boxes=2)
+    found.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in found.objects[:2]]
+    assert said(found) == []
+
+
+@pytest.mark.parametrize(
+    ("status", "count", "warned"),
+    [("prior_dominated", 3, True), ("rejected", 5, True), ("prior_dominated", 2, False),
+     ("ok", 5, False), ("doubtful", 9, False)],
+)  # fmt: skip
+def test_nothing_measured(status: str, count: int, warned: bool) -> None:
+    found = result({CHAIR: count}, status, walk(), boxes=1)
+    assert len(said(found)) == warned
+    if warned:
+        (line,) = said(found)
+        assert f"none of the {count} listed objects is measured" in line and "sideways" in line
+        assert "--camera" not in line  # these cameras were supplied
+        found.poses = dataclasses.replace(walk(), source="pycolmap")
+        assert "--camera" in said(found)[0] and "--poses" in said(found)[0]
+        found.objects[1] = dataclasses.replace(found.objects[1], status="ok")
+    assert said(found) == []
+    assert said(found, poses=lost(1)) == said(found, poses=None) == []  # nothing could be
+
+
+def test_people_are_never_measured() -> None:
+    assert said(result({PERSON: 9}, "rejected", walk())) == []
+
+
+@pytest.mark.parametrize(("share", "warned"), [(0, 0), (0.5, 0), (0.55, 1), (0.9, 1), (1, 0)])
+def test_most_frames_without_a_camera(share: float, warned: bool) -> None:
+    """Where none has one, the poses say why."""
+    for source, remedy in (("user", "--poses is of this video"), ("pycolmap", "slower turns")):
+        lines = said(result({CHAIR: 3}, poses=lost(share, source=source)))
+        assert len(lines) == warned
+        if warned:
+            assert f"only {40 - round(40 * share)} of 40 frames have a camera" in lines[0]
+            assert remedy in lines[0] and ("--camera" in lines[0]) == (source == "pycolmap")
+
+
+@pytest.mark.parametrize(
+    ("untracked", "score", "warned"),
+    [(60, 0.9, False), (61, 0.4, True), (61, 0.39, False), (500, 0.1, False)],
+)
+def test_most_strong_boxes_unexplained(untracked: int, score: float, warned: bool) -> None:
+    found = result({CHAIR: 3, FRIDGE: 3}, status="tracked")  # 60 boxes of objects
+    lines = said(found, untracked=rows(untracked, 0, CHAIR, score))
+    assert len(lines) == warned
+    if warned:
+        assert lines[0].startswith(f"{untracked} of {60 + untracked} boxes of score 0.4 or more")
+        assert "--detector" in lines[0] and "doubtful" not in lines[0]
+
+
+def test_boxes_of_doubtful_objects_are_unexplained_and_filled_ones_are_none() -> None:
+    found = result({CHAIR: 3, FRIDGE: 3})
+    for k in range(4):
+        found.objects[k] = dataclasses.replace(found.objects[k], status="doubtful")
+    (line,) = said(found)
+    assert line.startswith("40 of 60 boxes") and "output.doubtful=true" in line
+    filled = dataclasses.replace(rows(90, 6, score=0.0), detection_index=np.full(90, -1))
+    assert said(found, tracks=rt.Tracks.joined([found.tracks, filled])) == [line]
+    # a box that joined a solid after the video is still among the untracked ones
+    assert said(found, untracked=found.tracks[found.tracks.track_id == 6]) == [line]
+    assert implausible(found, 0.95, MOVING) == []  # another scale of scores
+    few = result({CHAIR: 3}, boxes=5)
+    few.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in few.objects[:2]]
+    assert said(few) == []
+
+
+def test_it_is_said_once_and_everywhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By `objects`, as by `run`: on stderr, in objects.json and on the page."""
+    poses = two_parts()
+    poses.cam_from_world[6:BREAK] = np.nan
+    poses.cam_from_world[BREAK + 12 :] = np.nan
+    (tmp_path / "im").mkdir()
+    for i in range(64):
+        cv2.imwrite(str(tmp_path / f"im/{i:03d}.png"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    workspace, given = Workspace(tmp_path / "out"), unlinked(poses)
+    workspace.bind(rt.Video(tmp_path / "im"))
+    workspace.save_last(given, poses)
+    text = "only 17 of 64 frames have a camera"
+    for _ in range(2):
+        assert rt.main(["objects", str(tmp_path / "out"), "--set", "output.overlay=0"]) == 0
+        assert capsys.readouterr().err.count(text) == 1
+        kept = json.loads((tmp_path / "out/objects.json").read_text())["warnings"]
+        assert sum(text in line for line in kept) == 1
+        assert (tmp_path / "out/scene.html").read_text().count(text) == 1
