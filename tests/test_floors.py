@@ -44,7 +44,9 @@ FLOORS = {
     8: "reobj_track",
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
-LAZY = {"pycolmap", "onnxruntime", "jsonschema", "trimesh", "rerun"}  # optional, or slow to load
+LAZY = {  # optional, or slow to load
+    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun",
+}  # fmt: skip
 LINES = {"reobj_track": 1300, "quadrics": 2300}  # at most; of any other room:
 ROOM_LINES = 600
 METHODS = 20  # of a class; but `Tracker` names every step of its `update`
@@ -162,7 +164,7 @@ def loaded_by(code: str) -> set[str]:
 def test_the_tool_loads_nothing_heavy_or_optional() -> None:
     heavy = LAZY | {"torch", "matplotlib", "onnx", "supervision", "ray", "pandas"}
     loaded = loaded_by("import reobj_track")
-    assert {"numpy", "scipy", "cv2", "filterpy", "reobj", "quadrics"} <= loaded
+    assert {"numpy", "scipy", "cv2", "reobj", "quadrics"} <= loaded
     assert loaded & heavy == set()
 
 

@@ -9,7 +9,8 @@ from test_consistency import Scene
 
 from reobj.poses.adjustment import _bundle_adjust, adjusted
 from reobj.poses.arrays import read_arrays
-from reobj.poses.soundness import Part, confirmed
+from reobj.poses.mapping import _only
+from reobj.poses.soundness import MIN_JOINT, Part, confirmed
 from reobj.poses.uncertainty import relative_sigmas
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -131,6 +132,47 @@ def test_weak_geometry_needs_the_same_from_another_mapper(other, sure):
     weak = part(Scene().model(), 0.002)
     (found,) = confirmed([weak], [part(moved(**other), 0.002)], True)
     assert (not found.problem) == sure and ("parallax" in found.problem) != sure
+
+
+def piece(first, last):
+    """Some images of the scene in a world and scale of their own."""
+    model = moved()
+    model.transform(pycolmap.Sim3d(1 + 0.1 * first, pycolmap.Rotation3d(), [first, 0, 0]))
+    return part(_only(model, set(range(first, last))), 0.002)
+
+
+@pytest.mark.parametrize(
+    "ends, joint, sure",
+    [
+        ([(1, 7), (7, 13)], None, True),  # two pieces, by all that both sides see
+        ([(7, 13), (1, 4), (4, 7)], None, True),  # in any order
+        ([(1, 7), (7, 13)], MIN_JOINT, True),
+        ([(1, 7), (7, 13)], MIN_JOINT - 1, False),
+        ([(1, 7), (8, 13)], None, True),  # without an image
+        ([(1, 5), (9, 13)], None, False),  # without a third of them
+        ([(1, 9), (9, 11)], None, False),  # a pair lies as it likes
+    ],
+)
+def test_pieces_of_another_mapper_count_where_points_prove_how_they_are_joined(ends, joint, sure):
+    scene = Scene()
+    if joint is not None:  # other points that both sides see are two
+        arrays, seen = read_arrays(scene.model()), scene.seen
+        told = arrays.told_by(np.arange(6)) & arrays.told_by(np.arange(6, 12))
+        ids = np.flatnonzero(seen.sum(0) >= 2)[told]  # as the model has them
+        both = np.flatnonzero(seen[:6].any(0) & seen[6:].any(0))
+        scene.untie(6, int(np.flatnonzero(both == ids[joint])[0]))
+    weak = part(scene.model(), 0.002)
+    (found,) = confirmed([weak], [piece(*end) for end in ends], True)
+    assert (not found.problem) == sure
+
+
+def test_points_are_told_by_images_whose_rays_spread():
+    scene = Scene(count=4, points=50)
+    scene.seen[:] = True
+    scene.poses[1] = scene.poses[0]  # from one place
+    scene.seen[3, 10:] = False
+    told = read_arrays(scene.model()).told_by
+    assert [told(np.array(rows)).sum() for rows in ([0], [0, 1], [0, 2], [2, 3])] == [0, 0, 50, 10]
 
 
 def test_two_mappers_prove_less_where_nothing_told_the_focal_length():

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from filterpy.kalman import KalmanFilter
 
 import quadrics
 from reobj.cameras import Poses
@@ -115,6 +114,8 @@ def smooth_boxes(at: npt.NDArray[np.int64], xyxy: Array) -> Array:
         (F, 4) boxes of all frames from the first to the last.
     Ref: Rauch, Tung and Striebel, AIAA Journal 1965.
     """
+    from filterpy.kalman import KalmanFilter  # brings scipy.stats: .4 s
+
     box = cxcywh_from_xyxy(xyxy)
     side = float(np.median(np.sqrt(box[:, 2] * box[:, 3])))
     measured: list[Array | None] = [None] * (int(at[-1]) + 1)

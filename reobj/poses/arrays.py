@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from reobj.types import Array, IntArray
+from reobj.types import Array, BoolArray, IntArray
 
 # n - |sum of u|^2 / n of the unit rays u to a point that tell its depth: 1 - cos(angle) for two
 MIN_RAY_SPREAD = 1 - np.cos(np.radians(1.5))  # (COLMAP's min_tri_angle)
@@ -59,6 +59,17 @@ class ModelArrays:
         )
         found.data[:] = 1  # a point may be observed twice in an image
         return found
+
+    def told_by(self, rows: IntArray) -> BoolArray:
+        """Mark the points (N,) whose depth some images alone tell, by `MIN_RAY_SPREAD`."""
+        mine = np.isin(self.image, rows)
+        image, count = self.image[mine], len(self.xyz)
+        ray = self.xyz[self.point[mine]] - self.centre[image]  # (m, 3)
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        entries = (np.ones(len(image)), (self.point[mine], np.arange(len(image))))
+        sums = sparse.csr_matrix(entries, (count, len(image))) @ np.insert(ray, 3, 1, 1)  # (N, 4)
+        spread = sums[:, 3] - (sums[:, :3] ** 2).sum(1) / np.maximum(sums[:, 3], 1)
+        return np.asarray(spread >= MIN_RAY_SPREAD, bool)
 
     def in_cam(self) -> Array:
         """Return the observed points (M, 3) in the frames of their images."""

@@ -7,6 +7,7 @@ reprojection error is no help: wrong models had the smallest.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reobj.poses.arrays import FOCAL_RANGE, ModelArrays
+from reobj.types import IntArray
 
 MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
 MIN_POINTS = 100  # refuse a model with fewer (chosen)
@@ -29,6 +31,10 @@ MAX_UNTOLD_SIGMA = 0.004
 # The same: no centre further off, over the extent, no camera turned by more.
 SAME_CENTRE, SAME_TURN_DEG = 0.05, 5.0  # half of what examples/pose_breaks.py calls wrong
 SAME_IMAGES = 0.75  # of the part, that the other mapper must hold (chosen)
+MIN_SAME = 3  # images of a piece of it; fewer lie as they like (chosen)
+# Points whose depth each of two pieces tells that prove how they are joined: they fix rotation,
+# shift and scale (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
+MIN_JOINT = 100
 MIN_TRI_ANGLE_DEG = 1.5  # median; refuse a model with less (chosen; COLMAP's points: 1.5)
 MIN_REGISTERED = 0.5  # share of the keyframes that makes a model worth having ...
 MIN_PART_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
@@ -100,21 +106,35 @@ def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
     for part in parts:
         if not part.problem and part.centre_sigma > SURE_CENTRE_SIGMA:
             proof = told or part.centre_sigma <= MAX_UNTOLD_SIGMA
-            if not (proof and any(_same(part.arrays, other.arrays) for other in others)):
+            if not (proof and _found_by(part.arrays, [other.arrays for other in others])):
                 why = "there is too little parallax to tell where the camera was"
                 part = replace(part, problem=why)
         found.append(part)
     return sorted(found, key=lambda p: (bool(p.problem), -p.registered))
 
 
-def _same(one: ModelArrays, other: ModelArrays) -> bool:
-    """Tell whether another model has the cameras of one in the same places.
+def _found_by(one: ModelArrays, others: Sequence[ModelArrays]) -> bool:
+    """Tell whether another mapper has the cameras of a model in the same places, maybe in pieces.
+
+    A piece says nothing but how its own cameras lie. What joins it to the rest are points whose
+    depth both sides tell: of two worlds that look alike in part there are few, and none where
+    only one image, or a pair without a third, ties two scales.
+    """
+    pieces = sorted((_same(one, other) for other in others), key=len, reverse=True)
+    held, todo = pieces[0] if pieces else np.empty(0, np.int64), pieces[1:]
+    while joined := [p for p in todo if (one.told_by(held) & one.told_by(p)).sum() >= MIN_JOINT]:
+        held, todo = np.union1d(held, joined[0]), [p for p in todo if p is not joined[0]]
+    return len(held) >= SAME_IMAGES * len(one.ids)
+
+
+def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
+    """Return the images that another model has, rows (n,) of one; none unless in the same places.
 
     One is brought to the other by the mean of the relative orientations, then scale and shift.
     """
     ids = np.intersect1d(one.ids, other.ids)
-    if len(ids) < max(3, SAME_IMAGES * len(one.ids)):
-        return False
+    if len(ids) < MIN_SAME:
+        return np.empty(0, np.int64)
     rows = np.searchsorted(one.ids, ids), np.searchsorted(other.ids, ids)
     a, b = (v.cam_from_world[r][:, :, :3] for v, r in zip((one, other), rows, strict=True))
     relative = Rotation.from_matrix(np.swapaxes(b, 1, 2) @ a)
@@ -124,7 +144,7 @@ def _same(one: ModelArrays, other: ModelArrays) -> bool:
     moved, end = mean.apply(a - a.mean(0)), b - b.mean(0)
     moved *= (moved * end).sum() / max((moved**2).sum(), 1e-12)
     off = np.linalg.norm(moved - end, axis=1).max() / np.linalg.norm(np.ptp(end, axis=0))
-    return bool(off <= SAME_CENTRE and turn.max() <= SAME_TURN_DEG)
+    return rows[0][: len(ids) if off <= SAME_CENTRE and turn.max() <= SAME_TURN_DEG else 0]
 
 
 ANGLE_SAMPLE = 2000  # points of which the median angle is taken, at least (chosen: time)
