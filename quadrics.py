@@ -519,21 +519,17 @@ class _Edges(_Rows):
     share: Array  # (O, V, E) how many views share this one's errors; gain holds 1 / sqrt(share)
 
 
-def _tangent_planes(
-    boxes: Array, cams: Array, image_size: tuple[float, float], cfg: FitConfig
-) -> _Edges:
+def _tangent_planes(boxes: Array, cams: Array, one_sided: BoolArray, cfg: FitConfig) -> _Edges:
     """Back-project the box edges of gathered views.
 
     Args:
         boxes: (O, V, 4), NaN where there is no view; cams: (O, V, 3, 4), with metric depth.
+        one_sided: (O, V, 4) edges that only say that the solid reaches them.
     """
     lines = np.zeros((*boxes.shape, 3))  # (O, V, E, 3): l.(u, v, 1) is the signed distance in px,
     lines[..., [0, 2], 0] = -1, 1  # positive outside the box
     lines[..., [1, 3], 1] = -1, 1
     lines[..., :2, 2], lines[..., 2:, 2] = boxes[..., :2], -boxes[..., 2:]
-    low = boxes[..., :2] <= cfg.border_px
-    high = boxes[..., 2:] >= np.array(image_size) - cfg.border_px
-    border = np.concatenate([low, high], -1)  # (O, V, E)
     size = np.tile(boxes[..., 2:] - boxes[..., :2], 2)  # (O, V, E) px across the edge
     sigma = np.hypot(cfg.edge_noise_px, cfg.edge_noise_rel * size)
     plane = np.einsum("ovek,ovkj->ovej", lines, cams)  # (O, V, E, 4)
@@ -544,7 +540,7 @@ def _tangent_planes(
     sigma_px = np.where(used, sigma, 1.0)
     gain = np.where(used, norm / sigma_px, 0.0)
     depth_row = np.where(used.any(-1)[..., None], cams[..., 2, :], [0.0, 0.0, 0.0, 1.0])
-    own = (clean[..., :3], clean[..., 3], gain, border & used, used, depth_row, sigma_px)
+    own = (clean[..., :3], clean[..., 3], gain, one_sided & used, used, depth_row, sigma_px)
     return _Edges(*own, np.ones_like(gain))
 
 
@@ -1293,15 +1289,16 @@ class _Spec:
 
 
 def _gather_data(
-    boxes: Array, usable: BoolArray, quality: Array, cams: _Cameras,
-    image_size: tuple[float, float], cfg: FitConfig,
+    boxes: Array, one_sided: BoolArray, usable: BoolArray, quality: Array, cams: _Cameras,
+    cfg: FitConfig,
 ) -> _Data:  # fmt: skip
     """Choose each object's views and back-project their edges."""
     index = _select_views(usable, quality, cams, cfg.max_views)  # (O, V)
     seen = (index >= 0)[..., None]
-    picked = np.where(seen, boxes[index, np.arange(len(index))[:, None]], np.nan)  # (O, V, 4)
+    own = index, np.arange(len(index))[:, None]
+    picked = np.where(seen, boxes[own], np.nan)  # (O, V, 4)
     mats = np.where(seen[..., None], cams.matrix[index], np.nan)  # (O, V, 3, 4)
-    edges = _tangent_planes(picked, mats, image_size, cfg)
+    edges = _tangent_planes(picked, mats, one_sided[own], cfg)
     ray, extent = _rays(np.where(seen, picked, [0.0, 0.0, 1.0, 1.0]), cams, index)
     center = np.where(seen, cams.center[index], 0.0)  # (O, V, 3)
     # Errors of a detector, of occlusion and of a solid that only resembles the object repeat in
@@ -1784,8 +1781,6 @@ CAMERA_ROLL_DEG = 6.0  # deg, spread of a hand-held camera's roll
 CAMERA_PITCH_DEG = 35.0  # deg, same of its pitch
 CAMERA_UP_VIEWS = 4.0  # views of independent roll that a video is worth
 UPRIGHT_TILT_DEG = 1.5  # deg, how upright an object stands when gravity is known
-MAX_TILT_DEG = 20.0  # deg, objects less sure of their vertical do not vote on gravity
-MIN_UP_OBJECTS = 3  # upright objects needed to trust the estimate
 SCALE_MIN_PARALLAX_DEG = 3.0  # deg, objects seen from narrower angles give no scale
 UNKNOWN_SCALE_LOG = 3.0  # log, prior spread of the global scale when the poses have none
 SCENE_LOG = 0.5  # log, scale of what priors leave out; twice the median spread of their axes
@@ -1819,7 +1814,7 @@ class ObjectFits:
     prior_share: Array  # (O, 3) posterior / prior sigma of each log axis; near 1 = prior's
     scale: Scale
     up: Array  # (3,) unit, or zeros when unknown
-    up_source: str  # "given" | "objects" | "cameras" | "none"
+    up_source: str  # "given" | "floor" | "cameras" | "none"
 
     def __len__(self) -> int:
         return len(self.status)
@@ -1852,34 +1847,6 @@ def camera_up(img_from_world: Array) -> tuple[Array, float]:
     level = np.eye(3) - np.outer(best, best)
     worst = np.linalg.eigvalsh(level @ info @ level)[1]  # the less certain of the two tilts
     return best, float(1.0 / np.sqrt(worst))
-
-
-def _refine_up(fit: _Fit, spec: _Spec) -> tuple[Array, float] | None:
-    """Estimate "up" from the third axes of upright objects: robust mean and its sigma in rad.
-
-    Each axis is weighted by its tilt variance without the rough prior; None if there are too few.
-    """
-    upright = spec.upright[fit.obj] & (spec.natural[fit.obj] >= 0) & (fit.axis == 2)
-    cov = _safe_inverse(fit.hessian + ROTATION_CAP)
-    tilt = np.einsum("bii->bi", cov)[:, 6:8]  # (B, 2) rad^2 about the two level axes
-    info = np.maximum(1.0 / tilt - 1.0 / spec.tilt_rad**2, 1e-12).min(1)
-    # an object that its solid fits badly (hidden in part, odd shape) stands askew in the fit
-    sigma2 = 1.0 / info + (np.deg2rad(UPRIGHT_TILT_DEG) * (1.0 + fit.noise**2)) ** 2
-    axis = fit.state.rot[:, :, 2] * np.sign(fit.state.rot[:, :, 2] @ spec.up)[:, None]
-    use = upright & (sigma2 < np.deg2rad(MAX_TILT_DEG) ** 2)
-    if use.sum() < MIN_UP_OBJECTS:
-        return None
-    axis, sigma2 = axis[use], sigma2[use]  # (N, 3), (N,)
-    rough = 1.0 / spec.tilt_rad**2
-    up, square = spec.up, np.zeros(len(axis))
-    for _ in range(20):  # reweighted mean direction, Cauchy; the rough up is one more vote
-        weight = 1.0 / sigma2 / (1.0 + square)
-        spread = max(float((weight * square).sum() / weight.sum()), 1.0)
-        up = rough * spec.up + (axis * weight[:, None]).sum(0) / spread
-        up = up / np.linalg.norm(up)
-        square = ((axis - up) ** 2).sum(1) / sigma2 / 2.0
-    info = float(weight.sum()) / spread
-    return (up, float(1.0 / np.sqrt(info + rough))) if info > rough else None
 
 
 def _scale_from_priors(fit: _Fit, data: _Data, spec: _Spec) -> tuple[float, float] | None:
@@ -1984,15 +1951,16 @@ def _vertical_axis_last(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntAr
 
 
 def _inlier_table(
-    solids: Ellipsoids, codes: IntArray, noise: Array, boxes: Array, usable: BoolArray,
-    cams: _Cameras, image_size: tuple[float, float], cfg: FitConfig,
+    solids: Ellipsoids, codes: IntArray, noise: Array, boxes: Array, one_sided: BoolArray,
+    usable: BoolArray, cams: _Cameras, cfg: FitConfig,
 ) -> BoolArray:  # fmt: skip
     """Apply the inlier test (F, O) to every usable box, also to those that the fit did not use."""
     inlier = np.zeros(usable.shape, bool)
     frame, obj = np.nonzero(usable)
     for part in _chunks(len(frame), 60000):  # boxes, to bound the memory
         f, o = frame[part], obj[part]
-        edges = _tangent_planes(boxes[f, o][:, None], cams.matrix[f][:, None], image_size, cfg)
+        seen, cam, cut = boxes[f, o][:, None], cams.matrix[f][:, None], one_sided[f, o][:, None]
+        edges = _tangent_planes(seen, cam, cut, cfg)
         own = solids[o]
         state = _State(own.center_in_world, np.log(own.half_axes), own.world_from_obj)
         value = _residuals(state, edges, AXIS_GROUPS[codes[o]], jacobian=False)[0]
@@ -2081,17 +2049,22 @@ class _World(NamedTuple):
     floor: Floor | None = None
 
 
-def _first_world(up: Sequence[float] | Array | None, metric: bool, cams: _Cameras) -> _World:
-    """Collect what is known before the first pass: gravity as given, or rough from the cameras."""
+def _first_world(
+    up: Sequence[float] | Array | None, metric: bool, cams: _Cameras, floor: Floor | None
+) -> _World:
+    """Collect what is known at first: gravity as given, of the floor, or rough from the cameras."""
     scale = (0.0, 0.0, "poses") if metric else (0.0, UNKNOWN_SCALE_LOG, "none")
     given = np.zeros(3) if up is None else np.nan_to_num(np.asarray(up, np.float64).reshape(3))
     size = float(np.linalg.norm(given))
+    upright = float(np.deg2rad(UPRIGHT_TILT_DEG))
     if size > 0:
-        return _World(*scale, given / size, float(np.deg2rad(UPRIGHT_TILT_DEG)), "given")
+        return _World(*scale, given / size, upright, "given", floor)
+    if floor is not None:
+        return _World(*scale, floor.normal, upright, "floor", floor)
     rough, sigma = camera_up(cams.matrix)
     if not rough.any():
         return _World(*scale, rough, np.inf, "none")
-    return _World(*scale, rough, float(np.hypot(sigma, np.deg2rad(UPRIGHT_TILT_DEG))), "cameras")
+    return _World(*scale, rough, float(np.hypot(sigma, upright)), "cameras")
 
 
 def _check_input(
@@ -2119,6 +2092,7 @@ def fit_objects(
     support: str | Sequence[str | None] | None = None,
     *,
     score: npt.ArrayLike | None = None,
+    hidden: npt.ArrayLike | None = None,
     metric: bool = True,
     known_size: Mapping[str | int, tuple[str | int, float]] | None = None,
     floor: Floor | None = None,
@@ -2130,10 +2104,12 @@ def fit_objects(
         boxes_xyxy: (F, O, 4) px, NaN where unseen. img_from_world: (F, 3, 4), NaN where unknown.
         image_size: (width, height) px; edges on the border count one-sided.
         categories, priors: category of each object, `load_priors()`.
-        up: (3,) world direction against gravity; None: estimated from cameras and objects.
+        up: (3,) world direction against gravity; None: that of the floor, or of the cameras.
         support: None (by category, by the evidence where the category is unknown), "evidence"
             (always by the evidence), "box" | "cylinder" | "ellipsoid", or one an object.
         score: (F, O) detection scores, used to choose among many views.
+        hidden: (F, O, 4) left, upper, right, lower edges where something nearer begins: the object
+            may go on behind it.
         metric: True: world units are metres; False: one global scale is estimated from the priors.
         known_size: {category or object number: ("w" | "d" | "h", metres)}; overrides the scale.
         floor: what categories stand on whose prior says so, once the scale is known.
@@ -2150,50 +2126,47 @@ def fit_objects(
     cams = _cameras(given)
     usable = _usable_boxes(boxes, cams)
     quality = np.nan_to_num(np.asarray(1.0 if score is None else score, np.float64))
-    far = np.array(image_size) - cfg.border_px
-    uncut = (boxes[..., :2] > cfg.border_px).all(-1) & (boxes[..., 2:] < far).all(-1)
-    quality = quality + uncut  # (F, O), uncut boxes first
+    low = boxes[..., :2] <= cfg.border_px
+    high = boxes[..., 2:] >= np.array(image_size) - cfg.border_px
+    one_sided = np.concatenate([low, high], -1)  # (F, O, 4)
+    if hidden is not None:
+        one_sided |= np.asarray(hidden, bool)
+    quality = quality + ~one_sided.any(-1)  # (F, O), whole boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
     sizes = _known_sizes(known_size, categories, live)
-    world = _first_world(up, metric and not sizes, cams)._replace(floor=floor)
+    world = _first_world(up, metric and not sizes, cams, floor)
     if not len(live):
-        return _report(None, boxes, usable, cams, live, world, image_size, cfg)
-    seen = (boxes[:, live], usable[:, live], quality[:, live])
-    data = _gather_data(*seen, cams, image_size, cfg)
+        return _report(None, boxes, one_sided, usable, cams, live, world, cfg)
+    seen = (boxes[:, live], one_sided[:, live], usable[:, live], quality[:, live])
+    data = _gather_data(*seen, cams, cfg)
     names = [None if categories is None else categories[int(k)] for k in live]
     fit, spec, world = _solve_passes(data, names, priors, codes[live], sizes, world, cfg)
-    return _report((fit, spec, data), boxes, usable, cams, live, world, image_size, cfg)
+    return _report((fit, spec, data), boxes, one_sided, usable, cams, live, world, cfg)
 
 
 def _solve_passes(
     data: _Data, names: Sequence[str | None], priors: Priors | None, codes: IntArray,
     sizes: list[tuple[int, int, float]], world: _World, cfg: FitConfig,
 ) -> tuple[_Fit, _Spec, _World]:  # fmt: skip
-    """Fit once; if that tells scale or gravity, fit again with them."""
+    """Fit once; if that tells the scale, fit again with it."""
     spec = _prior_spec(names, priors, codes, world)
     fit = _fit_all(data, spec, cfg)
-    better = world
-    if world.scale_source == "none":
+    if world.scale_source != "none":
+        return fit, spec, world
+    found, source = _scale_from_known(fit, sizes), "known_size"
+    if found is None:
         metric = _prior_spec(names, priors, codes, world._replace(scale_sigma=0.0))
-        found, source = _scale_from_known(fit, sizes), "known_size"
-        if found is None:
-            found, source = _scale_from_priors(fit, data, metric), "priors"
-        if found is not None:
-            better = better._replace(log_scale=found[0], scale_sigma=found[1], scale_source=source)
-    if world.up_source == "cameras":
-        upright = _refine_up(fit, spec)
-        if upright is not None:
-            tilt = float(np.hypot(np.deg2rad(UPRIGHT_TILT_DEG), upright[1]))
-            better = better._replace(up=upright[0], tilt_rad=tilt, up_source="objects")
-    if better is not world:
-        spec = _prior_spec(names, priors, codes, better)
-        fit = _fit_all(data, spec, cfg)
-    return fit, spec, better
+        found, source = _scale_from_priors(fit, data, metric), "priors"
+    if found is None:
+        return fit, spec, world
+    world = world._replace(log_scale=found[0], scale_sigma=found[1], scale_source=source)
+    spec = _prior_spec(names, priors, codes, world)
+    return _fit_all(data, spec, cfg), spec, world
 
 
 def _report(
-    solved: tuple[_Fit, _Spec, _Data] | None, boxes: Array, usable: BoolArray, cams: _Cameras,
-    live: IntArray, world: _World, image_size: tuple[float, float], cfg: FitConfig,
+    solved: tuple[_Fit, _Spec, _Data] | None, boxes: Array, one_sided: BoolArray, usable: BoolArray,
+    cams: _Cameras, live: IntArray, world: _World, cfg: FitConfig,
 ) -> ObjectFits:  # fmt: skip
     """Spread the fits of the live objects over all O objects and judge them."""
     n = boxes.shape[1]
@@ -2224,7 +2197,7 @@ def _report(
         verdict, why = _status(fit, spec, share[live], post, angle[live], seen)
         for row, k in enumerate(live.tolist()):
             status[k], reason[k], names[k] = verdict[row], why[row], SUPPORTS[fit.code[row]]
-        own = (boxes[:, live], usable[:, live], cams, image_size, cfg)
+        own = (boxes[:, live], one_sided[:, live], usable[:, live], cams, cfg)
         inlier[:, live] = _inlier_table(found, fit.code, fit.noise, *own)
     scale = Scale(float(np.exp(world.log_scale)), world.scale_sigma, world.scale_source)
     return ObjectFits(

@@ -69,8 +69,8 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
         categories = [class_names[c] if c < len(class_names) else "" for c in classes]
         return quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, categories, priors, up=up,
-            support=support, score=views.score, metric=poses.metric, known_size=known,
-            floor=floor,
+            support=support, score=views.score, hidden=views.hidden, metric=poses.metric,
+            known_size=known, floor=floor,
         )  # fmt: skip
 
     return fit

@@ -21,6 +21,7 @@ from reobj.identity.evidence import logit
 from reobj.identity.gaps import fill_by_place, fill_gaps
 from reobj.identity.linking import FRAGMENT_GAP, link
 from reobj.identity.locate import Located, confidence, floor_under, locate
+from reobj.identity.occlusion import hidden_edges
 from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.result import Result
 from reobj.types import Embeddings, IntArray, LinkEvent, Tracks, object_classes, rows_by
@@ -58,8 +59,9 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
             group = np.searchsorted(list(classes), rows.track_id)
             views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
             fits[k] = first = fit(views, list(classes.values()), None)
-            if floor := floor_under(parts[k], first):
-                fits[k] = fit(views, list(classes.values()), floor)
+            floor = floor_under(parts[k], first)
+            views = dataclasses.replace(views, hidden=hidden_edges(views, first.ellipsoids))
+            fits[k] = fit(views, list(classes.values()), floor)
         found = describe_objects(
             rows, result.class_names, fits[k], views, config, linked.confidence
         )
@@ -173,19 +175,19 @@ def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:
     """
     tracklet = table.tracklet_id.copy()
     fresh = int(tracklet.max(initial=0)) + 1
-    step = max(1, int(np.diff(np.unique(table.frame)).min(initial=2**31))) if len(table) else 1
+    longest = FRAGMENT_GAP * table.frame_step
+    taken = set(zip(table.frame.tolist(), tracklet.tolist(), strict=True))
     for rows in rows_by(solid):
         if solid[rows[0]] < 0:
             continue
-        taken = set(zip(table.frame[rows].tolist(), tracklet[rows].tolist(), strict=True))
         for before, row in itertools.pairwise([-1, *rows.tolist()]):
             if tracklet[row]:
                 continue
-            continues = (
-                before >= 0 and table.frame[row] - table.frame[before] <= FRAGMENT_GAP * step
-            )
-            if continues and (int(table.frame[row]), int(tracklet[before])) not in taken:
+            continues = before >= 0 and table.frame[row] - table.frame[before] <= longest
+            key = int(table.frame[row]), int(tracklet[before])
+            if continues and key not in taken:
                 tracklet[row] = tracklet[before]
+                taken.add(key)
             else:
                 tracklet[row], fresh = fresh, fresh + 1
     return dataclasses.replace(table, tracklet_id=tracklet)

@@ -152,6 +152,12 @@ class Tracks:
     def __getitem__(self, keep: Any) -> Tracks:
         return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
+    @property
+    def frame_step(self) -> int:
+        """Frames from one that was read to the next: more than 1 with `--every`."""
+        frames = np.unique(self.frame)
+        return int(np.diff(frames).min()) if len(frames) > 1 else 1
+
     @staticmethod
     def empty() -> Tracks:
         """Make the tracks of a frame or video without any."""

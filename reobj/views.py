@@ -12,7 +12,7 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, undistort_boxes
-from reobj.types import Array, IntArray, Tracks
+from reobj.types import Array, BoolArray, IntArray, Tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,8 @@ class Views:
 
     Attributes:
         frame: (V,) source frames. boxes: (V, G, 4) xyxy in undistorted pixels, NaN where unseen.
-        score: (V, G), 0 where unseen. img_from_world: (V, 3, 4) K @ cam_from_world.
+        score: (V, G), 0 where unseen. hidden: (V, G, 4) edges of boxes where something nearer
+        begins. img_from_world: (V, 3, 4) K @ cam_from_world.
         image_size: (w, h) px.
     """
 
@@ -30,6 +31,7 @@ class Views:
     score: Array
     img_from_world: Array
     image_size: tuple[int, int]
+    hidden: BoolArray | None = None
 
 
 # views of G groups, their classes, what they may stand on -> fits of G objects

@@ -11,10 +11,11 @@ from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
 import quadrics
 import reobj_track as rt
 from reobj.identity import association, evidence
+from reobj.identity import locate as locating
 from reobj.identity.association import Association, Associator
 from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
 from reobj.identity.gaps import fill_by_place
-from reobj.identity.locate import confidence, locate
+from reobj.identity.locate import Categories, confidence, locate
 from reobj.identity.proposals import propose
 from reobj.objects import fitter
 from reobj.types import class_shares
@@ -225,6 +226,15 @@ def test_every_detection_goes_to_its_solid_one_to_one() -> None:
     assert (found.gains(detected_in(table_of(walk(30)), walk(30))) > 50).all()
 
 
+def test_a_detection_without_any_evidence_loses_its_solid() -> None:
+    made, found = association_of(chairs(), walk(30))
+    away = dataclasses.replace(
+        found.solids.ellipsoids, center_in_world=found.solids.ellipsoids.center_in_world + 50.0
+    )
+    gone = dataclasses.replace(found.solids, ellipsoids=away)
+    assert (made._assign(gone, found.owner).owner == -1).all()
+
+
 def test_a_double_is_dropped_and_its_detections_return() -> None:
     three = chairs()
     four = Solids.concatenate([three, three[[0]]])
@@ -253,6 +263,23 @@ def test_missed_frames_speak_against_a_solid(monkeypatch: pytest.MonkeyPatch) ->
     found.owner[made.detected.view < 10] = -1
     lost = gain - found.gains(made.detected)
     assert (lost > 10 * (association.MISSED - 1e-9)).all()
+
+
+def test_a_size_is_held_against_its_category_axis_by_axis() -> None:
+    """A chair turned by 90 deg, a pancake of the usual mean size; where no scale is known."""
+    priors, names = quadrics.load_priors(), np.array([*NAMES, ""])
+    metres = Categories(priors, names, quadrics.Scale(1.0, 0.0, "poses"))
+    usual = metres.usual_size(np.array([CHAIR]))[0] / 2
+    half = np.stack([usual, usual[[1, 0, 2]], usual * [2, 2, 0.25], usual * 5])
+    solids = Solids(
+        quadrics.Ellipsoids(np.zeros((4, 3)), half, np.tile(np.eye(3), (4, 1, 1))),
+        np.full(4, "box"),
+        np.full(4, CHAIR),
+    )
+    fits, turned, pancake, giant = metres.size_log_odds(solids)
+    assert fits == turned == 0 and pancake < -10 and giant == -0.5 * locating.SIZE_SIGMAS**2
+    unknown = Categories(priors, names, quadrics.Scale(1.0, 0.0, "none")).size_log_odds(solids)
+    assert unknown[3] > -0.5 and unknown[2] < -10
 
 
 def test_confidence_rises_with_score_and_share() -> None:

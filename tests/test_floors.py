@@ -33,7 +33,7 @@ FLOORS = {
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
     "reobj.poses.checks reobj.poses.floor reobj.results.ply",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
-    "reobj.identity.association reobj.identity.proposals "
+    "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
     "reobj.poses.depth reobj.results.result",
     6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
@@ -47,7 +47,7 @@ FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split(
 LAZY = {  # optional, or slow to load
     "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun",
 }  # fmt: skip
-LINES = {"reobj_track": 1300, "quadrics": 2300}  # at most; of any other room:
+LINES = {"reobj_track": 1300, "quadrics": 2270}  # at most; of any other room:
 ROOM_LINES = 600
 METHODS = 20  # of a class; but `Tracker` names every step of its `update`
 

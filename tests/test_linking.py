@@ -10,7 +10,7 @@ from simulated import looking_at
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.linking import link
+from reobj.identity.linking import FRAGMENT_GAP, cut_at_gaps, link
 from reobj.identity.locate import locate
 from reobj.objects import fitter
 
@@ -59,6 +59,14 @@ def views_of(table: rt.Tracks, chair: np.ndarray, twins: float) -> np.ndarray:
     own[1] = twins * own[0] + np.sqrt(1 - twins**2) * own[1]
     rows = own[chair] + np.random.default_rng(1).normal(0, 0.03, (len(table), 12))
     return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("every", [1, 8])
+def test_fragments_end_at_long_gaps_of_frames_that_were_read(every: int) -> None:
+    frame = np.array([0, 1, 2, 2 + FRAGMENT_GAP, 3 + 2 * FRAGMENT_GAP, 4 + 2 * FRAGMENT_GAP])
+    one, none = np.ones(6, np.int64), np.zeros((6, 4))
+    table = rt.Tracks(frame * every, one, one, none, none[:, 0], one, one)
+    assert cut_at_gaps(table).tolist() == [0, 0, 0, 0, 1, 1]
 
 
 def linked(

@@ -20,6 +20,7 @@ from simulated import (
     finished,
     into_part,
     tracks_in_two_parts,
+    tracks_of,
     two_parts,
     unlinked,
     walk,
@@ -147,6 +148,52 @@ def test_embeddings_stay_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(reobj.parts, "link", noted)
     finished(given)
     assert seen == frame.tolist()
+
+
+@pytest.mark.parametrize("every", [1, 8])
+def test_a_tracklet_is_once_in_a_frame(every: int) -> None:
+    """It slips from the first chair to the second; what they lose there is in no tracklet."""
+    poses = walk(60)
+    poses = dataclasses.replace(poses, frame=poses.frame * every)
+    table, chair = tracks_of(poses), tracks_of(poses).detection_index
+    late = table.frame >= 30 * every
+    tracklet = np.where(late, np.array([0, 1, 3])[chair], chair + 1)
+    table = with_columns(table, tracklet_id=tracklet, track_id=tracklet)
+    given = unlinked(poses, table[tracklet > 0])
+    given.untracked = table[tracklet == 0]
+    tracks = finished(given).tracks
+    for column in (tracks.track_id, tracks.tracklet_id):
+        assert len(set(zip(tracks.frame.tolist(), column.tolist(), strict=True))) == len(tracks)
+    owner = [np.unique(tracks.track_id[tracks.detection_index == k]) for k in range(3)]
+    assert [len(ids) for ids in owner] == [1, 1, 1] and len(tracks) == len(table)
+    again = tracks.tracklet_id[(tracks.detection_index == 0) & (tracks.frame >= 30 * every)]
+    assert len(np.unique(again)) == 1  # pieced together although nothing tracked it
+
+
+def test_two_solids_do_not_share_a_tracklet_that_slipped() -> None:
+    """It shows one in frame 0 and the other in frame 1; in frame 2 neither is in a tracklet."""
+    none, chair = np.zeros((4, 4)), np.full(4, CHAIR)
+    tracklet = np.array([1, 1, 0, 0])
+    table = rt.Tracks(np.array([0, 1, 2, 2]), tracklet, tracklet, none, none[0], chair, chair)
+    found = reobj.parts._with_tracklets(table, np.array([0, 1, 0, 1])).tracklet_id
+    assert found.tolist() == [1, 1, 1, 2]
+
+
+def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lower third of every chair is hidden, and something says so."""
+    given = unlinked(walk(), tracks_of(walk()))
+    box = given.tracks.xyxy
+    box[:, 3] -= 0.35 * (box[:, 3] - box[:, 1])
+    heights = []
+    for hidden in ([False] * 4, [False, False, False, True]):
+        monkeypatch.setattr(
+            reobj.parts,
+            "hidden_edges",
+            lambda v, e, own=hidden: np.broadcast_to(own, v.boxes.shape),
+        )
+        found = finished(dataclasses.replace(given), link=False).objects
+        heights.append([o.size[2] for o in found if o.size is not None])
+    assert len(heights[1]) == 3 and (np.array(heights[1]) > 1.2 * np.array(heights[0])).all()
 
 
 def test_identities_of_the_user_may_span_parts() -> None:

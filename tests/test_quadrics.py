@@ -767,14 +767,18 @@ def test_no_priors_no_scale(room) -> None:
     assert fits.scale.source == "none" and (fits.status != "rejected").all()
 
 
-def test_gravity_is_found_from_cameras_and_objects(room) -> None:
+def test_gravity_is_given_or_that_of_the_floor_or_of_the_cameras(room) -> None:
     boxes, cams, _, names = room
     turn = np.eye(4)
     turn[:3, :3] = q.rotations(np.array([[0.7, -1.1, 0.4]]))[0]
-    fits = q.fit_objects(boxes, cams @ turn, syn.IMAGE, names, q.load_priors())
     expected = turn[:3, :3].T @ np.array(UP)
-    assert fits.up_source == "objects"
-    assert np.rad2deg(np.arccos(fits.up @ expected)) < 3.0
+    floor = q.Floor(expected, 0.0, 0.01)
+    found = {"cameras": {}, "floor": {"floor": floor}, "given": {"floor": floor, "up": [0, 0, 1]}}
+    for source, known in found.items():
+        fits = q.fit_objects(boxes, cams @ turn, syn.IMAGE, names, q.load_priors(), **known)
+        assert fits.up_source == source
+        up = np.array([0, 0, 1]) if source == "given" else expected
+        assert np.rad2deg(np.arccos(fits.up @ up)) < (10.0 if source == "cameras" else 1e-3)
 
 
 def test_moving_the_world_moves_the_result(room) -> None:

@@ -146,8 +146,10 @@ class Associator:
         Args:
             owner: (N,) of the start, or -1.
         """
-        detected, owner = self.detected, owner.copy()
+        detected = self.detected
         evidence = gather_evidence(solids, detected)
+        seen = np.bincount(evidence.row, minlength=len(owner)) > 0
+        owner = np.where(seen, owner, -1)
         expected = evidence.expected[detected.view[evidence.row], evidence.solid]
         value = evidence.choice + MISSED * expected
         order = np.argsort(evidence.row, kind="stable")

@@ -36,7 +36,7 @@ def fill_gaps(tracks: Tracks, image_size: tuple[int, int], max_gap: int) -> Trac
         the tracks with rows of score 0 and detection index -1 in the gaps, ordered by frame.
     """
     parts = [tracks]
-    step = max(1, int(np.diff(np.unique(tracks.frame)).min(initial=2**31))) if len(tracks) else 1
+    step = tracks.frame_step
     for identity in np.unique(tracks.track_id):
         rows = tracks[tracks.track_id == identity]
         missing = np.diff(rows.frame) // step - 1  # (n - 1,) frames after each row

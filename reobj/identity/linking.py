@@ -28,7 +28,7 @@ LINK_PROBABILITY = 0.5  # join by appearance from this probability on, rivals co
 # frames; views of a fragment this far apart show how the appearance of one object varies
 VIEW_GAP = 30
 DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes on one object
-FRAGMENT_GAP = 5  # frames without a detection, after which a tracklet may be another object
+FRAGMENT_GAP = 5  # frames read without a detection, after which a tracklet may be another object
 MIN_CHANGED = 3  # rows of another identity that are said (chosen: fewer are slips of a frame)
 LEAST_LOG_ODDS = -9.0  # said in the evidence where nothing speaks for one object
 
@@ -108,7 +108,7 @@ class Linker:
         moving: Collection[str],
     ) -> None:
         self.tracks, self.poses = tracks, poses
-        self.fragment = cut_at_gaps(tracks, FRAGMENT_GAP)  # (N,)
+        self.fragment = cut_at_gaps(tracks)  # (N,)
         self._describe_fragments(class_names, moving)
         self.co_occur, self.distinct = self._co_occurrence()
         self.log_odds = np.full(self.co_occur.shape, -np.inf)
@@ -286,15 +286,16 @@ def _agglomerate(
     return np.unique(group, return_inverse=True)[1]
 
 
-def cut_at_gaps(tracks: Tracks, most: int) -> IntArray:
-    """Cut tracklets where more than `most` frames pass without a detection.
+def cut_at_gaps(tracks: Tracks) -> IntArray:
+    """Cut tracklets where more than FRAGMENT_GAP frames that were read pass without a detection.
 
     Returns:
         fragment of each row (N,), numbered from 0.
     """
     order = np.lexsort((tracks.frame, tracks.tracklet_id))
     tracklet, frame = tracks.tracklet_id[order], tracks.frame[order]
-    begins = np.append(True, (np.diff(tracklet) != 0) | (np.diff(frame) > most))[: len(order)]
+    gone = np.diff(frame) > FRAGMENT_GAP * tracks.frame_step
+    begins = np.append(True, (np.diff(tracklet) != 0) | gone)[: len(order)]
     fragment = np.empty(len(order), np.int64)
     fragment[order] = np.cumsum(begins) - 1
     return fragment

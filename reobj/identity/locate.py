@@ -17,7 +17,7 @@ import quadrics
 from reobj.cameras import Poses, undistort_boxes
 from reobj.identity.association import Association, Associator, Refit
 from reobj.identity.evidence import Detected, Solids, logit
-from reobj.identity.linking import FRAGMENT_GAP, cut_at_gaps
+from reobj.identity.linking import cut_at_gaps
 from reobj.identity.proposals import propose
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
@@ -30,6 +30,7 @@ NO_SOLID = -2.4  # instead of the constant where no solid explains it (12 of 150
 # Share of a recording's mean score that is taken off: detectors differ in how high they score
 RELATIVE = 0.5
 DOUBLE_IOU = 0.6  # boxes of a class that overlap more are of one thing (NMS: .5 to .7)
+UNKNOWN_LOG = 3.0  # sigma of log sizes of which nothing is known (chosen: a factor of 20)
 SIZE_SIGMAS = 6.0  # a size farther off counts as so many (chosen: a class may be wrong)
 
 
@@ -70,7 +71,7 @@ def locate(
     tracked = table[table.tracklet_id > 0]
     if not len(tracked):
         return Located(solid, overlap, np.empty(0), 0.0)
-    fragment = cut_at_gaps(tracked, FRAGMENT_GAP)
+    fragment = cut_at_gaps(tracked)
     count = int(fragment.max()) + 1
     views = gather_views(tracked, poses, fragment, count, 0.0)
     classes = class_shares(tracked, fragment, count).argmax(1)
@@ -163,14 +164,14 @@ class Categories:
         return np.asarray(_or_unknown(self.priors.on_floor, False)[self.rows(classes)], bool)
 
     def size_log_odds(self, solids: Solids) -> Array:
-        """Return the log odds (S,) of the mean sizes, 0 at the usual size."""
+        """Return the log odds (S,) of the sizes, 0 at the usual size, turned by 90 deg or not."""
         rows = self.rows(solids.class_id)
-        usual = np.log(self.usual_size(solids.class_id)).mean(1)
-        sigma = np.inf if self.scale.source == "none" else self.scale.rel_sigma
-        variance = _or_unknown(self.priors.log_cov, np.inf)[rows].mean((1, 2)) + sigma**2
-        size = np.log(2 * solids.ellipsoids.half_axes).mean(1)
-        off = np.nan_to_num(np.abs(size - usual) / np.sqrt(variance), nan=SIZE_SIGMAS)
-        return np.asarray(-0.5 * off.clip(max=SIZE_SIGMAS) ** 2)
+        sigma = UNKNOWN_LOG if self.scale.source == "none" else self.scale.rel_sigma
+        cov = _or_unknown(self.priors.log_cov, UNKNOWN_LOG**2 * np.eye(3))[rows] + sigma**2
+        size = np.log(2 * solids.ellipsoids.half_axes)
+        off = size[:, [[0, 1, 2], [1, 0, 2]]] - np.log(self.usual_size(solids.class_id))[:, None]
+        square = np.einsum("ski,sij,skj->sk", off, np.linalg.inv(cov), off).min(1)  # (S,)
+        return np.asarray(-0.5 * np.nan_to_num(square, nan=np.inf).clip(max=SIZE_SIGMAS**2))
 
 
 def _or_unknown(column: npt.NDArray[Any], unknown: Any) -> npt.NDArray[Any]:

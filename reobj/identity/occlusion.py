@@ -1,0 +1,71 @@
+"""What hides what: edges of boxes where something nearer begins.
+
+An object ends at an edge of its box, or behind what is nearer. The second shows: just outside the
+edge something nearer is in the way, just inside it is not.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+import quadrics
+from reobj.types import Array, BoolArray
+from reobj.views import Views
+
+EDGE_POINTS = (np.arange(8) + 0.5) / 8  # along an edge (chosen)
+# Sizes of the box outside its edge, where something nearer must be, and inside, where it must not
+# (chosen: the outline of what hides is known no better)
+BESIDE = (0.1, -0.2)
+MIN_COVERED = 0.5  # share of these points that nearer things cover (chosen)
+
+
+def hidden_edges(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
+    """Find the edges of boxes where something nearer begins.
+
+    Args:
+        ellipsoids: of the G groups of the views, NaN where unknown: they hide nothing.
+    Returns:
+        (V, G, 4) left, upper, right and lower edge.
+    """
+    hidden = np.zeros(views.boxes.shape, bool)
+    known = np.isfinite(ellipsoids.half_axes.sum(1) + ellipsoids.center_in_world.sum(1))
+    seen = np.isfinite(views.boxes.sum(2)) & known  # (V, G)
+    column = np.cumsum(known) - 1  # (G,) among the S known ones
+    solids = ellipsoids[known]
+    for v in np.flatnonzero(seen.any(1)):
+        camera, own = views.img_from_world[v], np.flatnonzero(seen[v])  # (D,)
+        depth = solids.center_in_world @ camera[2, :3] + camera[2, 3]  # (S,)
+        covered = []
+        for beyond in BESIDE:
+            points = _beside_edges(views.boxes[v, own], beyond)  # (D, 4, P, 2)
+            entry = _entry_depths(points.reshape(-1, 2), camera, solids)
+            entry = entry.reshape(*points.shape[:3], -1)  # (D, 4, P, S)
+            entry[np.arange(len(own)), :, :, column[own]] = np.inf  # nothing hides itself
+            nearer = entry.min(3) < depth[column[own], None, None]
+            covered.append(nearer.mean(2) >= MIN_COVERED)
+        hidden[v, own] = covered[0] & ~covered[1]
+    return hidden
+
+
+def _beside_edges(box: Array, beyond: float) -> Array:
+    """Return points (D, 4, P, 2) along the edges of boxes (D, 4), `beyond` box sizes outside."""
+    low, high = box[:, None, :2], box[:, None, 2:]  # (D, 1, 2)
+    along = low + (high - low) * EDGE_POINTS[:, None]  # (D, P, 2)
+    off = beyond * (high - low)
+    first, last = (np.broadcast_to(edge, along.shape) for edge in (low - off, high + off))
+    sides = [(first, along), (along, first), (last, along), (along, last)]
+    return np.stack([np.stack([x[..., 0], y[..., 1]], -1) for x, y in sides], 1)
+
+
+def _entry_depths(points: Array, camera: Array, solids: quadrics.Ellipsoids) -> Array:
+    """Return the depths (K, S) where rays of image points (K, 2) enter boxes; inf: nowhere."""
+    inverse = np.linalg.inv(camera[:, :3])
+    ray = np.column_stack([points, np.ones(len(points))]) @ inverse.T  # (K, 3), of depth 1
+    start = -inverse @ camera[:, 3] - solids.center_in_world  # (S, 3)
+    start = np.einsum("sij,si->sj", solids.world_from_obj, start)
+    ray = np.einsum("sij,ki->ksj", solids.world_from_obj, ray)  # (K, S, 3)
+    faces = np.stack([-solids.half_axes - start, solids.half_axes - start])[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = faces / ray  # (2, K, S, 3)
+    enter, leave = ends.min(0).max(2), ends.max(0).min(2)  # (K, S)
+    return np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)

@@ -1,0 +1,86 @@
+"""What hides what: edges of boxes where something nearer begins, and what the fit makes of them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
+
+import quadrics
+import reobj_track as rt
+from reobj.identity.occlusion import hidden_edges
+from reobj.objects import fitter
+from reobj.views import Views, gather_views
+
+LEFT, UPPER, RIGHT, LOWER = range(4)
+
+
+def scene(counter: np.ndarray) -> tuple[quadrics.Ellipsoids, Views]:
+    """A chair at the origin and a counter before it, (3,) half sizes, seen from -y; whole boxes."""
+    poses = walk(5, arc_deg=8.0)
+    centre = np.array([[0, 0, 0.41], [0, -1.0, counter[2]]])
+    solids = quadrics.Ellipsoids(
+        centre, np.array([[0.28, 0.3, 0.41], counter]), np.tile(np.eye(3), (2, 1, 1))
+    )
+    cams = poses.camera.K @ poses.cam_from_world
+    boxes = quadrics.solid_boxes(solids, "box", cams)
+    return solids, Views(poses.frame, boxes, np.ones(boxes.shape[:2]), cams, SIZE)
+
+
+def cut_below(views: Views) -> None:
+    """Cut the boxes of the first solid where those of the second begin."""
+    views.boxes[:, 0, 3] = views.boxes[:, 1, 1]
+
+
+def test_the_edge_at_a_counter_is_hidden_and_no_other() -> None:
+    solids, views = scene(np.array([1.5, 0.1, 0.3]))
+    cut_below(views)
+    found = hidden_edges(views, solids)
+    expected = np.zeros((5, 2, 4), bool)
+    expected[:, 0, LOWER] = True
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_what_is_farther_away_hides_nothing() -> None:
+    solids, views = scene(np.array([1.5, 0.1, 0.3]))
+    solids.center_in_world[1, 1] = 0.4
+    views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
+    cut_below(views)
+    assert not hidden_edges(views, solids)[:, 0].any()
+    solids.center_in_world[0, 1] = 1.0
+    assert hidden_edges(views, solids)[:, 0, LOWER].all()
+
+
+def test_what_covers_the_whole_box_hides_no_edge() -> None:
+    """The chair is seen although a solid is in the way: that is no wall."""
+    solids, views = scene(np.array([1.5, 0.1, 0.9]))
+    assert not hidden_edges(views, solids).any()
+
+
+def test_an_unknown_solid_hides_nothing() -> None:
+    solids, views = scene(np.array([1.5, 0.1, 0.3]))
+    cut_below(views)
+    solids.center_in_world[1] = solids.half_axes[1] = np.nan
+    assert not hidden_edges(views, solids).any()
+
+
+@pytest.mark.parametrize("edge", [UPPER, LOWER])
+def test_behind_a_hidden_edge_the_fit_goes_on(edge: int) -> None:
+    """A third of each box is hidden; how tall a chair usually is tells the rest."""
+    poses = walk()
+    table = table_of(poses)
+    side = 0.35 * (table.xyxy[:, 3] - table.xyxy[:, 1])
+    table.xyxy[:, edge] += side if edge == UPPER else -side
+    views = gather_views(table, poses, table.detection_index, 3, 0.0)
+    hidden = np.zeros(views.boxes.shape, bool)
+    hidden[..., edge] = True
+    fit = fitter(rt.ObjectsConfig(), poses, NAMES)
+    cut, whole = (
+        fit(dataclasses.replace(views, hidden=mask), [CHAIR] * 3, None) for mask in (None, hidden)
+    )
+    true = 2 * chair_solids().half_axes[:, 2]
+    assert (cut.size[:, 2] < 0.8 * true).all()
+    np.testing.assert_allclose(whole.size[:, 2], true, rtol=0.15)
+    assert (whole.cov[:, 5, 5] > 2 * cut.cov[:, 5, 5]).all()  # and it is said
