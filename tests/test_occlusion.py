@@ -44,7 +44,7 @@ def test_the_edge_at_a_counter_is_hidden_and_no_other() -> None:
 
 
 def test_what_is_farther_away_hides_nothing() -> None:
-    solids, views = scene(np.array([1.5, 0.1, 0.3]))
+    solids, views = scene(np.array([1.5, 0.1, 0.15]))
     solids.center_in_world[1, 1] = 0.4
     views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
     cut_below(views)
