@@ -2108,8 +2108,7 @@ def fit_objects(
         support: None (by category, by the evidence where the category is unknown), "evidence"
             (always by the evidence), "box" | "cylinder" | "ellipsoid", or one an object.
         score: (F, O) detection scores, used to choose among many views.
-        hidden: (F, O, 4) left, upper, right, lower edges where something nearer begins: the object
-            may go on behind it.
+        hidden: (F, O, 4) edges left, upper, right, lower behind which the object may go on.
         metric: True: world units are metres; False: one global scale is estimated from the priors.
         known_size: {category or object number: ("w" | "d" | "h", metres)}; overrides the scale.
         floor: what categories stand on whose prior says so, once the scale is known.

@@ -61,11 +61,12 @@ import reobj_track as rt
 from reobj.results.evaluation import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.results.solids import align_with_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
+from reobj.views import Views
 
 ROOM = Path(__file__).resolve().parent / "room"
 YOLO, FEMTO, RECORDED = "detections_yolov8s.csv", "detections_femto.csv", "detections.npz"
 TRUE = "true_boxes.csv"
-DETECTOR = rt.DetectConfig()
+DETECTOR = rt.DetectConfig(model="deimv2-femto")  # the default one cannot be had everywhere
 BOXES = {
     "": DETECTOR.model,
     YOLO: "YOLOv8s",
@@ -120,6 +121,11 @@ def nothing(*_: Any) -> None:
     """Stand in for what finds something."""
 
 
+def all_visible(views: Views, *_: Any) -> BoolArray:
+    """Stand in for what finds hidden edges."""
+    return np.zeros(views.boxes.shape, bool)
+
+
 def untracked(rows: rt.Tracks) -> BoolArray:
     """Mark all detections that the tracker left out."""
     return np.asarray(rows.tracklet_id == 0)
@@ -134,6 +140,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
         "quadrics.HUBER_HIDDEN": quadrics.HUBER,
         "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
     },
+    "edges behind nearer things": {"reobj.parts.hidden_edges": all_visible},
     "limit of a box": {f"{EVIDENCE}.MAX_BOX_LOG_ODDS": 8.0},
     "classes": {f"{EVIDENCE}.CLASS_KEPT": 0.0},
     "sizes": {"reobj.identity.locate.SIZE_SIGMAS": 0.0},
@@ -175,14 +182,12 @@ def run_case(case: Case, data: Path, out: Path) -> Figures:
 def configured(case: Case, data: Path, out: Path) -> rt.Config:
     """Make the options of a case: the defaults, without pictures."""
     config = rt.Config(
-        detect=rt.DetectConfig(min_score=case.min_score),
+        detect=dataclasses.replace(DETECTOR, min_score=case.min_score),
         output=rt.OutputConfig(overlay=False, scene=False),
     )
     if not case.supplied:
         return config
-    poses, folder = out / f"poses-{case.data}", data / case.data
-    write_poses(folder, poses)
-    camera = str(folder / "intrinsics.json")
+    poses, camera = out / f"poses-{case.data}", str(data / case.data / "intrinsics.json")
     return dataclasses.replace(config, poses=rt.PosesConfig(mode=str(poses), camera=camera))
 
 
@@ -741,6 +746,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
     cases, left_out = chosen([*CASES, *rooms], args.only), every_without(args.without)
     args.out.mkdir(parents=True, exist_ok=True)
+    for folder in {case.data for case in cases if case.supplied}:
+        write_poses(args.data / folder, args.out / f"poses-{folder}")
     context = multiprocessing.get_context("spawn")  # memory and patches end with a process
     with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
         made: dict[str, list[Figures]] = {}
@@ -748,7 +755,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             tasks = [pool.submit(measure, case, args.data, args.out, without) for case in cases]
             made[without] = []
             for case, task in zip(cases, tasks, strict=True):
-                made[without].append(task.result())
+                try:
+                    made[without].append(task.result())
+                except rt.ReobjError as error:
+                    raise SystemExit(f"error: {case.name}: {error}") from None
                 print(f"done: {case.name} without {without or 'nothing'}", file=sys.stderr)
     name = "left_out" if left_out else "real_rooms"
     found = tables(cases, made)

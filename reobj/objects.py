@@ -17,6 +17,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
 from reobj.files import rounded
+from reobj.identity.evidence import CLASS_KEPT
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
@@ -131,13 +132,14 @@ def describe_objects(
         spans = [rows.frame[r] for r in rows_by(rows.tracklet_id)]
         found = Object(
             identity,
-            class_names[class_id] if 0 <= class_id < len(class_names) else "object",
+            name_of(class_names, class_id),
             round(float(rows.score.mean()), 4),
             "tracked",
             "",
             frames_seen=len(np.unique(rows.frame)),
             tracklet_ids=np.unique(rows.tracklet_id).tolist(),
             visits=sorted([int(f.min()), int(f.max())] for f in spans),
+            classes=_likeliest(rows, class_names, len(np.unique(tracks.class_id))),
         )
         if fits is not None and views is not None:
             found = _with_solid(found, fits, i, views, iou[:, i], moving, config.min_views)
@@ -145,6 +147,31 @@ def describe_objects(
             found = _with_confidence(found, confidence[identity])
         objects.append(found)
     return objects
+
+
+VIEWS_ALIKE = 10  # frames in which a detector errs alike count as one (chosen: a third of a second)
+
+
+def _likeliest(rows: Tracks, class_names: Sequence[str], count: int) -> dict[str, float]:
+    """Return the probability of the likeliest two classes of an object, from all its detections.
+
+    A detector names a thing wrongly in 1 - CLASS_KEPT of its detections, all other classes alike.
+
+    Args:
+        count: of classes that any object of the video may have.
+    """
+    classes, column = np.unique(rows.class_id, return_inverse=True)
+    votes = np.bincount(column, rows.score) / VIEWS_ALIKE
+    log_odds = votes * np.log(CLASS_KEPT / (1 - CLASS_KEPT) * max(count - 1, 1))
+    share = np.exp(log_odds - log_odds.max())
+    share /= share.sum() + (count - len(classes)) * np.exp(-log_odds.max())
+    best = np.argsort(-share, kind="stable")[:2]
+    return {name_of(class_names, int(classes[k])): round(float(share[k]), 3) for k in best}
+
+
+def name_of(class_names: Sequence[str], class_id: int) -> str:
+    """Return the name of a class, "object" where it has none."""
+    return class_names[class_id] if 0 <= class_id < len(class_names) else "object"
 
 
 MIN_SCORE = 0.05  # boxes of less, and filled gaps, shape nothing (of the weakest 1 in 25 is real)

@@ -24,7 +24,15 @@ from reobj.identity.locate import Located, confidence, floor_under, locate
 from reobj.identity.occlusion import hidden_edges
 from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.result import Result
-from reobj.types import Embeddings, IntArray, LinkEvent, Tracks, object_classes, rows_by
+from reobj.types import (
+    Embeddings,
+    IntArray,
+    LinkEvent,
+    Tracks,
+    frame_step,
+    object_classes,
+    rows_by,
+)
 from reobj.views import Fit, gather_views
 
 
@@ -175,7 +183,7 @@ def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:
     """
     tracklet = table.tracklet_id.copy()
     fresh = int(tracklet.max(initial=0)) + 1
-    longest = FRAGMENT_GAP * table.frame_step
+    longest = FRAGMENT_GAP * frame_step(table)
     taken = set(zip(table.frame.tolist(), tracklet.tolist(), strict=True))
     for rows in rows_by(solid):
         if solid[rows[0]] < 0:

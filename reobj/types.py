@@ -152,12 +152,6 @@ class Tracks:
     def __getitem__(self, keep: Any) -> Tracks:
         return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
-    @property
-    def frame_step(self) -> int:
-        """Frames from one that was read to the next: more than 1 with `--every`."""
-        frames = np.unique(self.frame)
-        return int(np.diff(frames).min()) if len(frames) > 1 else 1
-
     @staticmethod
     def empty() -> Tracks:
         """Make the tracks of a frame or video without any."""
@@ -261,6 +255,12 @@ def as_detections(found: Any) -> Detections:
     if len(set(lengths)) > 1 or not np.isfinite(made.xyxy).all():
         raise ReobjError(f"{lengths} boxes, scores, classes, masks do not fit, or hold NaN")
     return made
+
+
+def frame_step(table: Tracks) -> int:
+    """Return the frames from one that was read to the next: more than 1 with `--every`."""
+    frames = np.unique(table.frame)
+    return int(np.diff(frames).min()) if len(frames) > 1 else 1
 
 
 def object_classes(table: Tracks) -> dict[int, int]:

@@ -104,6 +104,30 @@ def test_filled_gaps_do_not_shape_the_ellipsoid(score: float, views: int) -> Non
     assert (abs(height - 0.82) < 0.08) == (views == 10)
 
 
+def classes_of(labels: list[int], score: float = 0.8, others: int = 0) -> dict[str, float]:
+    """Classes of one object with these labels, beside one of `others` more classes."""
+    label = np.array([*labels, *range(60, 60 + others)])
+    n, one = len(label), np.ones(len(label), np.int64)
+    identity = np.where(np.arange(n) < len(labels), 1, 2)
+    box = np.tile([10.0, 10, 50, 50], (n, 1))
+    tracks = rt.Tracks(np.arange(n), identity, one, box, np.full(n, score), label, one)
+    return describe_objects(tracks, rt.COCO_NAMES, None, None, rt.ObjectsConfig())[0].classes
+
+
+def test_an_object_says_its_two_likeliest_classes() -> None:
+    chair, couch, bench = 56, 57, 13
+    torn = classes_of([chair] * 11 + [couch] * 9 + [bench])
+    assert list(torn) == ["chair", "couch"] and 0.5 < torn["chair"] < 0.75
+    assert sum(torn.values()) < 1  # the bench has a little
+    sure = classes_of([chair] * 60 + [couch] * 20)
+    assert sure["chair"] > 0.95 > torn["chair"]
+    weak = classes_of([chair] * 60 + [couch] * 20, score=0.1)
+    assert sure["chair"] > weak["chair"] > weak["couch"]
+    assert classes_of([chair]) == {"chair": 1.0}  # no other class in the video
+    once = classes_of([chair], others=9)
+    assert list(once) == ["chair"] and 0.1 < once["chair"] < 0.3  # one box says little
+
+
 def test_known_size_sets_the_scale() -> None:
     """A world of half the size and without metric poses: the chairs' .82 m say so."""
     poses = walk()

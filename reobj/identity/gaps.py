@@ -18,6 +18,7 @@ from reobj.types import (
     box_area,
     box_iou,
     cxcywh_from_xyxy,
+    frame_step,
     xyxy_from_cxcywh,
 )
 
@@ -36,7 +37,7 @@ def fill_gaps(tracks: Tracks, image_size: tuple[int, int], max_gap: int) -> Trac
         the tracks with rows of score 0 and detection index -1 in the gaps, ordered by frame.
     """
     parts = [tracks]
-    step = tracks.frame_step
+    step = frame_step(tracks)
     for identity in np.unique(tracks.track_id):
         rows = tracks[tracks.track_id == identity]
         missing = np.diff(rows.frame) // step - 1  # (n - 1,) frames after each row

@@ -19,6 +19,7 @@ from reobj.types import (
     Tracks,
     box_iou,
     class_shares,
+    frame_step,
     rows_by,
     unit_rows,
 )
@@ -294,7 +295,7 @@ def cut_at_gaps(tracks: Tracks) -> IntArray:
     """
     order = np.lexsort((tracks.frame, tracks.tracklet_id))
     tracklet, frame = tracks.tracklet_id[order], tracks.frame[order]
-    gone = np.diff(frame) > FRAGMENT_GAP * tracks.frame_step
+    gone = np.diff(frame) > FRAGMENT_GAP * frame_step(tracks)
     begins = np.append(True, (np.diff(tracklet) != 0) | gone)[: len(order)]
     fragment = np.empty(len(order), np.int64)
     fragment[order] = np.cumsum(begins) - 1

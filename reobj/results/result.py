@@ -78,7 +78,7 @@ class Object:
         status: "ok", "prior_dominated" (some size rests on the category's prior), "doubtful" (less
             likely there than not), "rejected" (no solid), "tracked" (2D: no cameras). reason: why.
         confidence: probability that it is there, a thing of its own; None without cameras.
-        support: "box", "cylinder" or "ellipsoid".
+        classes: probabilities of the likeliest two. support: "box", "cylinder" or "ellipsoid".
         center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
         size: (3,) full extents of the solid along its own axes; size_m: the same in metres, None
             where the scale is unknown; size_rel_sigma: (3,) relative standard deviation.
@@ -112,6 +112,7 @@ class Object:
     visits: list[list[int]] = field(default_factory=list)
     part: int = 0
     confidence: float | None = None
+    classes: dict[str, float] = field(default_factory=dict)
 
     @property
     def located(self) -> bool:
@@ -126,7 +127,7 @@ class Object:
     @staticmethod
     def from_json(entry: dict[str, Any]) -> Object:
         """Read an entry of objects.json; unknown keys are ignored."""
-        entry = {"part": 0, "confidence": None, **entry}  # older files lack these
+        entry = {"part": 0, "confidence": None, "classes": {}, **entry}  # older files lack these
         values = {f.name: entry[_JSON_KEYS.get(f.name, f.name)] for f in dataclasses.fields(Object)}
         for name in ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov"):
             values[name] = None if values[name] is None else np.array(values[name], np.float64)
