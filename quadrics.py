@@ -1814,7 +1814,7 @@ class ObjectFits:
     prior_share: Array  # (O, 3) posterior / prior sigma of each log axis; near 1 = prior's
     scale: Scale
     up: Array  # (3,) unit, or zeros when unknown
-    up_source: str  # "given" | "floor" | "cameras" | "none"
+    up_source: str  # "given" | "cameras" | "none"
 
     def __len__(self) -> int:
         return len(self.status)
@@ -2052,19 +2052,17 @@ class _World(NamedTuple):
 def _first_world(
     up: Sequence[float] | Array | None, metric: bool, cams: _Cameras, floor: Floor | None
 ) -> _World:
-    """Collect what is known at first: gravity as given, of the floor, or rough from the cameras."""
+    """Collect what is known at first: gravity as given, or rough from the cameras."""
     scale = (0.0, 0.0, "poses") if metric else (0.0, UNKNOWN_SCALE_LOG, "none")
     given = np.zeros(3) if up is None else np.nan_to_num(np.asarray(up, np.float64).reshape(3))
     size = float(np.linalg.norm(given))
     upright = float(np.deg2rad(UPRIGHT_TILT_DEG))
     if size > 0:
         return _World(*scale, given / size, upright, "given", floor)
-    if floor is not None:
-        return _World(*scale, floor.normal, upright, "floor", floor)
     rough, sigma = camera_up(cams.matrix)
     if not rough.any():
-        return _World(*scale, rough, np.inf, "none")
-    return _World(*scale, rough, float(np.hypot(sigma, upright)), "cameras")
+        return _World(*scale, rough, np.inf, "none", floor)
+    return _World(*scale, rough, float(np.hypot(sigma, upright)), "cameras", floor)
 
 
 def _check_input(
@@ -2104,7 +2102,7 @@ def fit_objects(
         boxes_xyxy: (F, O, 4) px, NaN where unseen. img_from_world: (F, 3, 4), NaN where unknown.
         image_size: (width, height) px; edges on the border count one-sided.
         categories, priors: category of each object, `load_priors()`.
-        up: (3,) world direction against gravity; None: that of the floor, or of the cameras.
+        up: (3,) world direction against gravity; None: roughly that of level cameras.
         support: None (by category, by the evidence where the category is unknown), "evidence"
             (always by the evidence), "box" | "cylinder" | "ellipsoid", or one an object.
         score: (F, O) detection scores, used to choose among many views.
