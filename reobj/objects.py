@@ -65,14 +65,19 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
     support = None if config.support == "auto" else config.support
 
     def fit(
-        views: Views, classes: list[int], floor: quadrics.Floor | None = None
+        views: Views,
+        classes: list[int],
+        floor: quadrics.Floor | None = None,
+        measured_up: Array | None = None,
     ) -> quadrics.ObjectFits:
         categories = [class_names[c] if c < len(class_names) else "" for c in classes]
-        return quadrics.fit_objects(
-            views.boxes, views.img_from_world, views.image_size, categories, priors, up=up,
-            support=support, score=views.score, hidden=views.hidden, metric=poses.metric,
-            known_size=known, floor=floor,
+        fits = quadrics.fit_objects(
+            views.boxes, views.img_from_world, views.image_size, categories, priors,
+            up=measured_up if up is None else up, support=support, score=views.score,
+            hidden=views.hidden, metric=poses.metric, known_size=known, floor=floor,
         )  # fmt: skip
+        known_up = up is not None or measured_up is None
+        return fits if known_up else dataclasses.replace(fits, up_source="floor")
 
     return fit
 

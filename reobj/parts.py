@@ -66,10 +66,11 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
             classes = object_classes(rows)
             group = np.searchsorted(list(classes), rows.track_id)
             views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
-            fits[k] = first = fit(views, list(classes.values()), None)
+            fits[k] = first = fit(views, list(classes.values()), None, None)
             floor = floor_under(parts[k], first)
             views = dataclasses.replace(views, hidden=hidden_edges(views, first.ellipsoids))
-            fits[k] = fit(views, list(classes.values()), floor)
+            up = None if floor is None else floor.normal
+            fits[k] = fit(views, list(classes.values()), floor, up)
         found = describe_objects(
             rows, result.class_names, fits[k], views, config, linked.confidence
         )

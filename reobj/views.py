@@ -34,8 +34,8 @@ class Views:
     hidden: BoolArray | None = None
 
 
-# views of G groups, their classes, what they may stand on -> fits of G objects
-Fit = Callable[[Views, list[int], quadrics.Floor | None], quadrics.ObjectFits]
+# views of G groups, their classes, what they may stand on, up where none is given -> G fits
+Fit = Callable[[Views, list[int], quadrics.Floor | None, Array | None], quadrics.ObjectFits]
 
 
 def gather_views(

@@ -27,6 +27,7 @@ from simulated import (
     with_columns,
 )
 
+import quadrics
 import reobj.parts
 import reobj_track as rt
 from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
@@ -194,6 +195,19 @@ def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> Non
         found = finished(dataclasses.replace(given), link=False).objects
         heights.append([o.size[2] for o in found if o.size is not None])
     assert len(heights[1]) == 3 and (np.array(heights[1]) > 1.2 * np.array(heights[0])).all()
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_the_last_fit_stands_on_the_floor(given: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gravity is that of the floor, unless the poses know it."""
+    normal = np.array([0.0, np.sin(0.05), np.cos(0.05)])
+    floor = quadrics.Floor(normal, 0.0, 0.01)
+    monkeypatch.setattr(reobj.parts, "floor_under", lambda poses, fits: floor)
+    poses = walk() if given else dataclasses.replace(walk(), up_in_world=None)
+    world = finished(unlinked(poses, tracks_of(poses)), link=False).world
+    assert world.up_source == ("given" if given else "floor")
+    up = poses.up_in_world if given else normal
+    np.testing.assert_allclose(world.up_in_world, up, atol=1e-5)
 
 
 def test_identities_of_the_user_may_span_parts() -> None:

@@ -75,13 +75,13 @@ def locate(
     count = int(fragment.max()) + 1
     views = gather_views(tracked, poses, fragment, count, 0.0)
     classes = class_shares(tracked, fragment, count).argmax(1)
-    fits = fit(views, classes.tolist(), None)
+    fits = fit(views, classes.tolist(), None, None)
     kinds = Categories(priors, names, fits.scale)
     floor = floor_under(poses, fits)
     usual, on_floor = kinds.usual_size(classes), kinds.on_floor(classes)
     proposed = propose(fits, views, classes, usual, floor, on_floor)
     detected = _detected(table, poses, views)
-    refit = _refit(detected, views, lambda v, c: fit(v, c, floor))
+    refit = _refit(detected, views, lambda v, c: fit(v, c, floor, None))
     found = Associator(detected, refit, kinds.size_log_odds).run(proposed)
     solid[own] = found.owner
     owned = np.flatnonzero(found.owner >= 0)
