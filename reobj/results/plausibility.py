@@ -15,7 +15,7 @@ from reobj.types import IntArray, Tracks
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
 # Fewer of a class are normal, even if little else is listed: six chairs at a table, seven plants in
-# a living room (livingroom13). Partitions taken for refrigerators were 9 of 14 (office_loop).
+# a living room (livingroom13). Partitions taken for refrigerators were 14 of 19 (office_loop).
 SAME_CLASS_MIN = 8
 MEASURABLE_MIN = 3  # objects; chosen: one or two that nobody walked around say nothing of a run
 BOXES_MIN = 50  # chosen: of fewer strong boxes a few more or less make the majority

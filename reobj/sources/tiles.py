@@ -15,9 +15,8 @@ import numpy as np
 from reobj.types import Array, Detections, Image, IntArray, ReobjError, box_iou
 
 MAX_TILES = 8  # a side; chosen: each tile costs a run of the network a frame
-TILE_OVERLAP = (
-    0.25  # of a tile's side, with its neighbour (SAHI: .2): what is smaller is cut by one
-)
+# Of a tile's side, with its neighbour (SAHI: .2): what is smaller is whole in one of them
+TILE_OVERLAP = 0.25
 CUT = 0.01  # of a tile's side: boxes that come so near to an edge inside the image are cut off
 FUSION_IOU = 0.55  # above it boxes of a class are one (Solovyev et al.)
 
