@@ -188,7 +188,7 @@ class OutputConfig:
     fill_gaps: int = option(
         5,
         "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never); "
-        "six times as many where the object's solid tells its box",
+        "an object's solid fills all frames from about where it was seen in others",
     )
 
 

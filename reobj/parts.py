@@ -248,9 +248,7 @@ def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
     for part in result.parts() if max_gap else ():
         if part.poses is not None and (own := part.located):
             identity, support = np.array([o.id for o in own]), [str(o.support) for o in own]
-            tracks = fill_by_place(
-                tracks, part.poses, identity, part.ellipsoids(), support, max_gap
-            )
+            tracks = fill_by_place(tracks, part.poses, identity, part.ellipsoids(), support)
     return fill_gaps(tracks, image_size, max_gap)
 
 

@@ -311,17 +311,32 @@ def test_things_on_the_floor_reach_down_to_it() -> None:
     assert (cups.center_in_world[:, 2] - cups.half_axes[:, 2] > 0.15).all()  # they may stand high
 
 
-def test_gaps_are_filled_by_the_solid() -> None:
+def test_frames_are_filled_by_the_solid() -> None:
     """While the first chair is missed the view turns: its boxes are those of its projection."""
     poses = walk(60)
     table = table_of(poses)
-    seen = (table.detection_index != 0) | (table.frame < 20) | (table.frame >= 40)
-    solids = chair_solids()
-    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3, 5)
+    seen = (table.detection_index != 0) | (table.frame < 28) | (table.frame >= 33)
+    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), chair_solids(), ["box"] * 3)
     made = filled[filled.score == 0]
     true = table[~seen]
     np.testing.assert_array_equal(made.frame, true.frame)
     np.testing.assert_allclose(made.xyxy, true.xyxy.clip(0, np.tile(SIZE, 2)), atol=6)
     assert set(made.track_id) == {1} and (made.detection_index == -1).all()
-    longer = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3, 3)
-    assert len(longer) == seen.sum()
+
+
+def test_frames_are_filled_only_from_where_it_was_seen() -> None:
+    """Seen in one frame: filled where the camera is within 10 deg and 1.25 times the distance."""
+    poses = walk(60)
+    table = table_of(poses)
+    seen = (table.detection_index != 0) | (table.frame == 30)
+    solids = chair_solids()
+    center = np.array([-m[:, :3].T @ m[:, 3] for m in poses.cam_from_world])
+    ray = center - solids.center_in_world[0]
+    length = np.linalg.norm(ray, axis=1)
+    angle = np.degrees(np.arccos((ray @ ray[30] / length / length[30]).clip(-1, 1)))
+    near = (angle < 10) & (np.abs(np.log(length / length[30])) < np.log(1.25))
+    assert 5 < near.sum() < 40  # the walk sees it from farther aside too
+    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3)
+    assert filled.frame[filled.score == 0].tolist() == [f for f in np.flatnonzero(near) if f != 30]
+    never = table[seen & (table.detection_index != 0)]  # no detection, nothing to fill from
+    assert len(fill_by_place(never, poses, np.array([1]), solids[:1], ["box"])) == len(never)
