@@ -184,7 +184,9 @@ class OutputConfig:
 
     overlay: bool = option(True, "write overlay.mp4")
     scene: bool = option(True, "write scene.html")
-    doubtful: bool = option(False, "show doubtful objects too, on the page and in overlay.mp4")
+    doubtful: bool = option(
+        False, "show doubtful objects too: in tracks.txt, on the page, in overlay.mp4"
+    )
     fill_gaps: int = option(
         5,
         "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never); "
@@ -1100,7 +1102,7 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
     result.warnings += implausible(result, config.tracker.high_score, config.objects.moving_classes)
     started = time.monotonic()
-    result.save(workspace.out)
+    result.save(workspace.out, config.output.doubtful)
     if poses is not None:
         write_supplied_model(poses, video, workspace.out)
     shown = result if config.output.doubtful else result.without_doubtful()

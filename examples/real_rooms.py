@@ -13,7 +13,7 @@ changed; objects are made anew each time. Writes OUT/real_rooms.md and .json, wi
 OUT/left_out.md and .json.
 
 What is counted. An object is *listed* if it is not `doubtful`; solids are those of listed objects.
-    IDF1       boxes of all identities in tracks.txt, doubtful ones too. hololens_kitchen: of six
+    IDF1       boxes of listed identities, as in tracks.txt. hololens_kitchen: of six
                classes at IoU >= .3, its truth is of whole objects; those less visible than .3 need
                not be found. Lists of objects: at IoU >= .4. The rest: as `eval`, on
                redkitchen_7scenes of the classes that are annotated completely.
@@ -167,6 +167,9 @@ def leave_out(name: str) -> None:
 # ---- Runs --------------------------------------------------------------------------------------
 
 
+WITH_DOUBTFUL = "with_doubtful"  # folder in a run's: the same with the tracks of doubtful objects
+
+
 def run_case(case: Case, data: Path, out: Path) -> Figures:
     """Run the tool on a recording; returns seconds and the peak memory of this process."""
     folder, config = data / case.data, configured(case, data, out)
@@ -176,6 +179,7 @@ def run_case(case: Case, data: Path, out: Path) -> Figures:
         source = folder / "room.mp4"
     detections = folder / case.boxes if case.boxes else None
     result = rt.run(source, out / case.name, config, detections=detections)
+    result.save(out / case.name / WITH_DOUBTFUL, doubtful=True)
     return spent(result)
 
 
@@ -226,6 +230,7 @@ def measure(case: Case, data: Path, out: Path, without: str = "") -> Figures:
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(out / case.name, folder)
     result = rt.refit(folder, configured(case, data, out))
+    result.save(folder / WITH_DOUBTFUL, doubtful=True)
     return spent(result) | score_case(case, data, out, folder)
 
 
@@ -388,21 +393,21 @@ def score_lists(truth_folder: Path, folder: Path) -> Figures:
     """Score the list of objects by true boxes with identities and areas (objects_2d.json)."""
     kinds = Kind.read(truth_folder / "objects_2d.json")
     truth = read_truth(truth_folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
-    result, found = rt.Result.load(folder), read_result(folder)
-    every = judge(truth, kinds, found, result.objects)
+    result = rt.Result.load(folder)
+    every = judge(truth, kinds, read_result(folder / WITH_DOUBTFUL), result.objects)
     listed = [o for o in result.objects if o.status != "doubtful"]
-    verdicts = judge(truth, kinds, found, listed)
+    verdicts = judge(truth, kinds, read_result(folder), listed)
     frames = {k: int((truth.identity == k).sum()) for k in kinds}
     needed = {k for k, kind in kinds.items() if kind.needed and not kind.ignore}
     must = {k for k in needed if frames[k] >= NEEDED_FRAMES}
     shown = verdicts.shows[verdicts.shows >= 0].tolist()
     judged = int((~verdicts.unjudged).sum())
-    pairs = linear_sum_assignment(-every.common)
-    optional = np.array([k not in needed for k in every.true_ids.tolist()], bool)
-    right = every.common[pairs]
+    pairs = linear_sum_assignment(-verdicts.common)
+    optional = np.array([k not in needed for k in verdicts.true_ids.tolist()], bool)
+    right = verdicts.common[pairs]
     true_boxes = sum(frames[k] for k in needed) + right[optional[pairs[0]]].sum()
     return {
-        "idf1": float(2 * right.sum() / max(true_boxes + every.boxes.sum(), 1)),
+        "idf1": float(2 * right.sum() / max(true_boxes + verdicts.boxes.sum(), 1)),
         "true": len(must),
         "found": len(must & set(shown)),
         "doubles": len(shown) - len(set(shown)),
@@ -517,8 +522,12 @@ def score_solids(truth_folder: Path, folder: Path) -> Figures:
     classes = json.loads((truth_folder / "gt_amodal_format.json").read_text())["classes"]
     names = [classes.get(str(i), "") for i in range(max(map(int, classes)) + 1)]
     true = json.loads((truth_folder / "objects_gt.json").read_text())["objects"]
-    boxes = read_truth(truth_folder / "gt_amodal.txt", names, MIN_VISIBLE), read_result(folder)
-    truth, found = (x[np.isin(x.name, WALK_KINDS)] for x in boxes)
+    boxes = (
+        read_truth(truth_folder / "gt_amodal.txt", names, MIN_VISIBLE),
+        read_result(folder),
+        read_result(folder / WITH_DOUBTFUL),
+    )
+    truth, found, every = (x[np.isin(x.name, WALK_KINDS)] for x in boxes)
     placed = Placed.of(rt.Result.load(folder), truth_folder / "poses_c2w.txt")
     listed = placed[np.array([o.status != "doubtful" for o in placed.objects], bool)]
     chairs = [t for t in true if t["coco"] == "chair"]
@@ -534,7 +543,7 @@ def score_solids(truth_folder: Path, folder: Path) -> Figures:
         "elsewhere": matched.elsewhere,
         "centre_m": median(matched.center_error),
         "size_error": median(matched.size_error),
-        "sure": sure_of_solids(true, placed, truth, found, rt.Result.load(folder).objects),
+        "sure": sure_of_solids(true, placed, truth, every, rt.Result.load(folder).objects),
     }
 
 
@@ -583,7 +592,7 @@ def score_as_eval(truth_folder: Path, folder: Path) -> Figures:
     truth = read_truth(truth_folder / "gt_mot.txt", rt.COCO_NAMES, 0.0)
     names = sorted(classes or set(truth.name))
     objects = rt.Result.load(folder).objects
-    verdicts = judge(truth, kinds_of(truth), read_result(folder), objects)
+    verdicts = judge(truth, kinds_of(truth), read_result(folder / WITH_DOUBTFUL), objects)
     annotated = np.array([o.class_name in names for o in objects], bool)
     return {
         "idf1_chairs": tracks["chair"]["IDF1"],

@@ -25,6 +25,7 @@ from reobj.identity.occlusion import hidden_edges
 from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.result import Result
 from reobj.types import (
+    BoolArray,
     Embeddings,
     IntArray,
     LinkEvent,
@@ -141,7 +142,8 @@ def _link_parts(
         own = dataclasses.replace(own, track_id=own.track_id + taken)
         taken = int(own.track_id.max(initial=taken))
         if located is not None:
-            made.confidence |= _confidences(own, solid, located)
+            posed = np.isin(own.frame, parts[k].frame[parts[k].known])
+            made.confidence |= _confidences(own, solid, posed, located)
         steps.append(own)
         sources.append(source[rows])
     order = np.argsort(np.concatenate([own.frame for own in steps]), kind="stable")
@@ -149,14 +151,20 @@ def _link_parts(
     return made
 
 
-def _confidences(tracks: Tracks, solid: IntArray, located: Located) -> dict[int, float]:
-    """Return the confidence of every identity: of its solid, or of its scores if it has none.
+def _confidences(
+    tracks: Tracks, solid: IntArray, posed: BoolArray, located: Located
+) -> dict[int, float]:
+    """Return the confidence of identities: of its solid, or of its scores if it has none.
+
+    Nothing speaks for or against what was seen only in frames without a pose.
 
     Args:
-        solid: (N,) of each row, or -1.
+        solid: (N,) of each row, or -1. posed: (N,) its frame has a pose.
     """
     found = {}
     for rows in rows_by(tracks.track_id):
+        if not posed[rows].any():
+            continue
         own = solid[rows][solid[rows] >= 0]
         score = logit(tracks.score[rows]).mean(keepdims=True)
         sure = located.confidence[own[:1]]

@@ -180,6 +180,20 @@ def test_two_solids_do_not_share_a_tracklet_that_slipped() -> None:
     assert found.tolist() == [1, 1, 1, 2]
 
 
+def test_what_is_seen_without_cameras_alone_is_not_doubted() -> None:
+    """The third chair shows only after frame 40, whose cameras are not known: no word about it."""
+    poses = walk(60)
+    poses.cam_from_world[40:] = np.nan
+    poses = dataclasses.replace(poses, status=np.where(np.arange(60) < 40, poses.status, "missing"))
+    table = tracks_of(poses)
+    third = table.detection_index == 2
+    found = finished(unlinked(poses, table[~third | (table.frame >= 40)])).objects
+    sure = {o.class_name: [x.confidence for x in found] for o in found}["chair"]
+    assert len(sure) == 3 and sure.count(None) == 1
+    (alone,) = (o for o in found if o.confidence is None)
+    assert alone.status == "rejected" and "camera" in alone.reason
+
+
 def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lower third of every chair is hidden, and something says so."""
     given = unlinked(walk(), tracks_of(walk()))

@@ -33,6 +33,20 @@ def saved(chairs: rt.Result, tmp_path: Path) -> Path:
 # ---- Written, then read ----
 
 
+def test_doubtful_objects_are_in_the_list_and_not_in_the_tracks(
+    chairs: rt.Result, tmp_path: Path
+) -> None:
+    first, *rest = chairs.objects
+    objects = [dataclasses.replace(first, status="doubtful", confidence=0.3), *rest]
+    result = copy_of(chairs, objects=objects)
+    for asked in (False, True):
+        result.save(tmp_path, doubtful=asked)
+        found = rt.Result.load(tmp_path)
+        assert [o.id for o in found.objects] == [o.id for o in objects]
+        assert (first.id in found.tracks.track_id) == asked
+        assert set(found.tracks.track_id) >= {o.id for o in rest}
+
+
 def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> None:
     poses = dataclasses.replace(chairs.poses, points=np.eye(3), colors=np.eye(3, dtype=np.uint8),
                                 messages=("a gap",))  # fmt: skip

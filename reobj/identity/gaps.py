@@ -103,7 +103,7 @@ def fill_by_place(
         apart = np.maximum(angle, np.abs(farther))
         to, like = to[apart.min(1) < 1], rows[apart.argmin(1)[apart.min(1) < 1]]
         ids, one = (like.track_id, like.tracklet_id), np.ones(len(to), np.int64)
-        made.append(Tracks(frame[to], *ids, box[to, i], 0.0 * one, like.class_id, -one))
+        made.append(Tracks(frame[to], *ids, box[to, i], np.zeros(len(to)), like.class_id, -one))
     return Tracks.joined(made)
 
 

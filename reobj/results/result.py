@@ -334,18 +334,19 @@ class Result:
         )
         return quadrics.Ellipsoids(center, half_axes, axes)
 
-    def save(self, out: str | Path) -> None:
+    def save(self, out: str | Path, doubtful: bool = False) -> None:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
 
-        Of several parts each has its own poses and objects: poses_part1.txt, objects_part1.ply, ...
-        Each file appears only when it is complete. Those of an earlier run are removed,
-        pictures too: `write_pictures` makes new ones from the video.
+        Doubtful objects are in objects.json, in tracks.txt only if `doubtful`. Of several parts
+        each has its own poses and objects: poses_part1.txt, objects_part1.ply, ... Each file
+        appears only when it is complete. Those of an earlier run are removed, pictures too:
+        `write_pictures` makes new ones from the video.
         """
         self.out = out = Path(out)
         remove_stale(out)
         if self.poses is None:
             (out / LAST_POSES).unlink(missing_ok=True)
-        write_mot(out / "tracks.txt", self.tracks)
+        write_mot(out / "tracks.txt", (self if doubtful else self.without_doubtful()).tracks)
         self._write_objects(out / "objects.json")
         if self.poses is not None:
             save_poses(out / LAST_POSES, self.poses)
