@@ -2050,10 +2050,12 @@ class _World(NamedTuple):
 
 
 def _first_world(
-    up: Sequence[float] | Array | None, metric: bool, cams: _Cameras, floor: Floor | None
+    up: Sequence[float] | Array | None, metric: bool | Scale, cams: _Cameras, floor: Floor | None
 ) -> _World:
-    """Collect what is known at first: gravity as given, or rough from the cameras."""
+    """Collect what is known at first: scale and gravity as given, or gravity as cameras tell it."""
     scale = (0.0, 0.0, "poses") if metric else (0.0, UNKNOWN_SCALE_LOG, "none")
+    if isinstance(metric, Scale):
+        scale = (float(np.log(metric.value)), metric.rel_sigma, metric.source)
     given = np.zeros(3) if up is None else np.nan_to_num(np.asarray(up, np.float64).reshape(3))
     size = float(np.linalg.norm(given))
     upright = float(np.deg2rad(UPRIGHT_TILT_DEG))
@@ -2091,7 +2093,7 @@ def fit_objects(
     *,
     score: npt.ArrayLike | None = None,
     hidden: npt.ArrayLike | None = None,
-    metric: bool = True,
+    metric: bool | Scale = True,
     known_size: Mapping[str | int, tuple[str | int, float]] | None = None,
     floor: Floor | None = None,
     config: FitConfig | None = None,
@@ -2107,8 +2109,9 @@ def fit_objects(
             (always by the evidence), "box" | "cylinder" | "ellipsoid", or one an object.
         score: (F, O) detection scores, used to choose among many views.
         hidden: (F, O, 4) edges left, upper, right, lower behind which the object may go on.
-        metric: True: world units are metres; False: one global scale is estimated from the priors.
-        known_size: {category or object number: ("w" | "d" | "h", metres)}; overrides the scale.
+        metric: True: world units are metres; False: one global scale is estimated from the priors;
+            a Scale: it is known.
+        known_size: {category or object number: ("w" | "d" | "h", metres)}; overrides True.
         floor: what categories stand on whose prior says so, once the scale is known.
         config: the few numbers that a user may change.
     Returns:
@@ -2130,8 +2133,9 @@ def fit_objects(
         one_sided |= np.asarray(hidden, bool)
     quality = quality + ~one_sided.any(-1)  # (F, O), whole boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
-    sizes = _known_sizes(known_size, categories, live)
-    world = _first_world(up, metric and not sizes, cams, floor)
+    known = isinstance(metric, Scale) and metric.source != "none"
+    sizes = [] if known else _known_sizes(known_size, categories, live)
+    world = _first_world(up, metric if known else bool(metric is True and not sizes), cams, floor)
     if not len(live):
         return _report(None, boxes, one_sided, usable, cams, live, world, cfg)
     seen = (boxes[:, live], one_sided[:, live], usable[:, live], quality[:, live])

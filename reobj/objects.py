@@ -21,7 +21,7 @@ from reobj.identity.evidence import CLASS_KEPT
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
-from reobj.views import Fit, Views
+from reobj.views import NOTHING_KNOWN, Fit, Scene, Views
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,19 +64,15 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
 
-    def fit(
-        views: Views,
-        classes: list[int],
-        floor: quadrics.Floor | None = None,
-        measured_up: Array | None = None,
-    ) -> quadrics.ObjectFits:
+    def fit(views: Views, classes: list[int], scene: Scene = NOTHING_KNOWN) -> quadrics.ObjectFits:
         categories = [class_names[c] if c < len(class_names) else "" for c in classes]
         fits = quadrics.fit_objects(
             views.boxes, views.img_from_world, views.image_size, categories, priors,
-            up=measured_up if up is None else up, support=support, score=views.score,
-            hidden=views.hidden, metric=poses.metric, known_size=known, floor=floor,
+            up=scene.up if up is None else up, support=support, score=views.score,
+            hidden=views.hidden, metric=poses.metric if scene.scale is None else scene.scale,
+            known_size=known, floor=scene.floor,
         )  # fmt: skip
-        known_up = up is not None or measured_up is None
+        known_up = up is not None or scene.up is None
         return fits if known_up else dataclasses.replace(fits, up_source="floor")
 
     return fit

@@ -34,7 +34,7 @@ from reobj.types import (
     object_classes,
     rows_by,
 )
-from reobj.views import Fit, gather_views
+from reobj.views import NOTHING_KNOWN, Fit, Scene, gather_views
 
 
 def link_and_fit(result: Result, config: ObjectsConfig) -> None:
@@ -67,11 +67,11 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
             classes = object_classes(rows)
             group = np.searchsorted(list(classes), rows.track_id)
             views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
-            fits[k] = first = fit(views, list(classes.values()), None, None)
+            fits[k] = first = fit(views, list(classes.values()), NOTHING_KNOWN)
             floor = floor_under(parts[k], first)
             views = dataclasses.replace(views, hidden=hidden_edges(views, first.ellipsoids))
             up = None if floor is None else floor.normal
-            fits[k] = fit(views, list(classes.values()), floor, up)
+            fits[k] = fit(views, list(classes.values()), Scene(floor, up))
         found = describe_objects(
             rows, result.class_names, fits[k], views, config, linked.confidence
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,8 +35,22 @@ class Views:
     hidden: BoolArray | None = None
 
 
-# views of G groups, their classes, what they may stand on, up where none is given -> G fits
-Fit = Callable[[Views, list[int], quadrics.Floor | None, Array | None], quadrics.ObjectFits]
+class Scene(NamedTuple):
+    """What is known of a part before its objects are fitted.
+
+    Attributes:
+        floor: that things may stand on. up: (3,) unit, against gravity, where the user gives none.
+        scale: metres per unit; None: the poses are metric, or the categories tell.
+    """
+
+    floor: quadrics.Floor | None = None
+    up: Array | None = None
+    scale: quadrics.Scale | None = None
+
+
+NOTHING_KNOWN = Scene()
+# views of G groups, their classes, what is known besides -> G fits
+Fit = Callable[[Views, list[int], Scene], quadrics.ObjectFits]
 
 
 def gather_views(

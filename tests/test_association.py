@@ -19,7 +19,7 @@ from reobj.identity.locate import Categories, confidence, locate
 from reobj.identity.proposals import propose
 from reobj.objects import fitter
 from reobj.types import class_shares
-from reobj.views import gather_views
+from reobj.views import Scene, gather_views
 
 
 def chairs() -> Solids:
@@ -304,10 +304,10 @@ def test_things_on_the_floor_reach_down_to_it() -> None:
     floor = quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.001)
     low, high = (
         fits.ellipsoids.center_in_world[:, 2] - fits.ellipsoids.half_axes[:, 2]
-        for fits in (fit(views, [CHAIR] * 3, floor), fit(views, [CHAIR] * 3, None))
+        for fits in (fit(views, [CHAIR] * 3, Scene(floor)), fit(views, [CHAIR] * 3, Scene()))
     )
     assert (np.abs(low) < 0.06).all() and (high > 0.15).all()
-    cups = fit(views, [CUP] * 3, floor).ellipsoids
+    cups = fit(views, [CUP] * 3, Scene(floor)).ellipsoids
     assert (cups.center_in_world[:, 2] - cups.half_axes[:, 2] > 0.15).all()  # they may stand high
 
 

@@ -78,7 +78,7 @@ def test_behind_a_hidden_edge_the_fit_goes_on(edge: int) -> None:
     hidden[..., edge] = True
     fit = fitter(rt.ObjectsConfig(), poses, NAMES)
     cut, whole = (
-        fit(dataclasses.replace(views, hidden=mask), [CHAIR] * 3, None) for mask in (None, hidden)
+        fit(dataclasses.replace(views, hidden=mask), [CHAIR] * 3) for mask in (None, hidden)
     )
     true = 2 * chair_solids().half_axes[:, 2]
     assert (cut.size[:, 2] < 0.8 * true).all()

@@ -6,6 +6,7 @@ solid. What moves, and what no solid explains, is left to appearance (`reobj.ide
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +22,7 @@ from reobj.identity.linking import cut_at_gaps
 from reobj.identity.proposals import propose
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
-from reobj.views import Fit, Views, gather_views
+from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
 
 # Log odds that an object is there: constant, by the mean log odds of its scores, by the share of
 # the frames that should show it and do. Fitted to 154 solids of 7 recordings (docs/tracking.md)
@@ -75,13 +76,14 @@ def locate(
     count = int(fragment.max()) + 1
     views = gather_views(tracked, poses, fragment, count, 0.0)
     classes = class_shares(tracked, fragment, count).argmax(1)
-    fits = fit(views, classes.tolist(), None, None)
+    fits = fit(views, classes.tolist(), NOTHING_KNOWN)
     kinds = Categories(priors, names, fits.scale)
     floor = floor_under(poses, fits)
     usual, on_floor = kinds.usual_size(classes), kinds.on_floor(classes)
     proposed = propose(fits, views, classes, usual, floor, on_floor)
     detected = _detected(table, poses, views)
-    refit = _refit(detected, views, lambda v, c: fit(v, c, floor, None))
+    scene = Scene(floor, scale=None if poses.metric else fits.scale)
+    refit = _refit(detected, views, lambda v, c: fit(v, c, scene))
     found = Associator(detected, refit, kinds.size_log_odds).run(proposed)
     solid[own] = found.owner
     owned = np.flatnonzero(found.owner >= 0)
@@ -202,15 +204,26 @@ def _detected(table: Tracks, poses: Poses, views: Views) -> Detected:
 def _refit(
     detected: Detected, views: Views, fit: Callable[[Views, list[int]], quadrics.ObjectFits]
 ) -> Refit:
-    """Make the function that fits solids to some of the detections."""
+    """Make the function that fits solids to some of the detections, each set of them once."""
+    found: dict[tuple[bytes, int], Solids] = {}
 
     def refit(rows: IntArray, solid: IntArray, classes: IntArray) -> Solids:
-        boxes = np.full((len(views.frame), len(classes), 4), np.nan)
-        score = np.zeros(boxes.shape[:2])
-        at = detected.view[rows], solid
-        boxes[at], score[at] = detected.box[rows], detected.score[rows]
-        own = Views(views.frame, boxes, score, views.img_from_world, views.image_size)
-        fits = fit(own, classes.tolist())
-        return Solids(fits.ellipsoids, fits.support, classes)
+        order = np.lexsort((rows, solid))
+        rows, start = rows[order], np.searchsorted(solid[order], np.arange(len(classes) + 1))
+        sets = [rows[a:b].tobytes() for a, b in itertools.pairwise(start)]
+        keys = list(zip(sets, classes.tolist(), strict=True))
+        new = [k for k, key in enumerate(keys) if key not in found]
+        if new:
+            boxes = np.full((len(views.frame), len(new), 4), np.nan)
+            score = np.zeros(boxes.shape[:2])
+            for column, k in enumerate(new):
+                own = rows[start[k] : start[k + 1]]
+                at = detected.view[own], column
+                boxes[at], score[at] = detected.box[own], detected.score[own]
+            seen = Views(views.frame, boxes, score, views.img_from_world, views.image_size)
+            fits = fit(seen, classes[new].tolist())
+            made = Solids(fits.ellipsoids, fits.support, classes[new])
+            found.update((keys[k], made[[column]]) for column, k in enumerate(new))
+        return Solids.concatenate([found[key] for key in keys])
 
     return refit
