@@ -133,13 +133,30 @@ class Progress:
         return time.monotonic() - self.started
 
 
-def without_password(text: str) -> str:
-    """Remove user and password from the URLs in a text: what is left may be shown and written.
+def without_secrets(text: str) -> str:
+    """Leave of the URLs in a text what may be shown and written: scheme, host and path.
 
-    >>> without_password("rtsp://me:secret@10.0.0.7/stream")
+    User and password go, also a password with "@" or "/" in it, and all after the path: queries
+    and parameters, where cameras take passwords too. Where nothing tells which is which, only the
+    scheme is left.
+
+    >>> without_secrets("rtsp://me:secret@10.0.0.7/stream?pwd=x")
     'rtsp://10.0.0.7/stream'
     """
-    return re.sub(r"(?<=://)[^/@\s]*@", "", text)
+    return URL.sub(_public_part, text)
+
+
+URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]*:/+)(\S*)", re.IGNORECASE)
+PARAMETERS = re.compile(r"[?#;&=]")  # begin what is no path: also rtsp://host/user=me&password=x
+
+
+def _public_part(url: re.Match[str]) -> str:
+    """Cut a URL to scheme, host and path."""
+    scheme, rest = url.groups()
+    user, _, rest = rest.rpartition("@")
+    if PARAMETERS.search(user):  # of a password, or the "@" is one of a query
+        return f"{scheme}..."
+    return scheme + PARAMETERS.split(rest)[0]
 
 
 def shortened(items: Sequence[Any]) -> str:

@@ -367,6 +367,24 @@ def test_a_changed_source_has_another_fingerprint(movie: Path, tmp_path: Path) -
     assert fingerprint("rtsp://camera/1") == "rtsp://camera/1" and fingerprint(0) == "0"
 
 
+def test_a_file_whose_name_looks_like_a_glob_is_itself(tmp_path: Path) -> None:
+    fingerprint = video_room.source_fingerprint
+    for name in ("det[1].txt", "det1.txt"):
+        (tmp_path / name).write_text("1")
+    before = fingerprint(tmp_path / "det[1].txt")
+    (tmp_path / "det1.txt").write_text("changed")
+    assert fingerprint(tmp_path / "det[1].txt") == before
+    (tmp_path / "det[1].txt").write_text("changed")
+    assert fingerprint(tmp_path / "det[1].txt") != before
+
+
+def test_fingerprints_of_urls_tell_them_apart_and_no_secret() -> None:
+    urls = [f"http://me:secret@cam/v.mp4?id={i}&pwd=secret" for i in range(2)]
+    first, second = map(video_room.source_fingerprint, urls)
+    assert first != second and first.startswith("http://cam/v.mp4 ")
+    assert "secret" not in first + second and video_room.source_fingerprint(urls[0]) == first
+
+
 # ---- Cameras -------------------------------------------------------------------------------------
 
 SIZE = (64, 48)
@@ -518,7 +536,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
 def stream(request: pytest.FixtureRequest) -> Iterator[tuple[Stream, str]]:
     server = Stream(*request.param)
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-    yield server, f"http://me:secret@127.0.0.1:{server.server_port}/camera.mjpg"
+    yield server, f"http://me:secret@127.0.0.1:{server.server_port}/camera.mjpg?pwd=secret"
     server.shutdown()
     server.server_close()
 
@@ -604,7 +622,8 @@ def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path
         assert {entry["id"] for entry in data["objects"]} == {1, 2}
         assert any(w.startswith("live: ") and "dropped" in w for w in data["warnings"])
         assert "identities only" in errors and "distinct objects: 2" in text
-        written = "".join(p.read_text() for p in out.rglob("*.json")) + text + errors
+        files = [p for p in out.rglob("*") if p.suffix in (".json", ".html", ".txt")]
+        written = "".join(p.read_text() for p in files) + text + errors
         assert "secret" not in written and str(server.server_port) in written
         assert not list(out.rglob(".part*"))
         (out / "tracks.txt").unlink()

@@ -67,7 +67,7 @@ def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Wor
     arrays = (poses.cam_from_world, poses.points, poses.visibility, poses.part)
     digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     facts = (poses.camera, poses.metric, poses.messages)
-    content = source_fingerprint(video.source)
+    content = video.fingerprint
     return workspace.path("points", content, video.config, *facts, config, maps, digest)
 
 
@@ -100,7 +100,7 @@ def reconstruct_cached(
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
     if camera := parse_camera(config.camera, video.size):  # the content of a file, not its name
         config = dataclasses.replace(config, camera=camera_line(camera))
-    content = source_fingerprint(video.source)
+    content = video.fingerprint
     own = dataclasses.replace(config, depth="")
     path = workspace.path("poses", content, video.config, own, digest)
     model = path.with_suffix(".sparse")

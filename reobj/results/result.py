@@ -33,7 +33,7 @@ from reobj.files import (
     rounded,
     save_npz,
     shortened,
-    without_password,
+    without_secrets,
 )
 from reobj.poses.floor import Floor
 from reobj.results.ply import write_ply
@@ -507,7 +507,7 @@ class Result:
         data = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "command": without_password(" ".join(sys.argv)),
+            "command": " ".join(map(without_secrets, sys.argv)),
             "reobj_track": __version__,
             "versions": versions,
             "conventions": CONVENTIONS,

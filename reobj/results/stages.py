@@ -14,13 +14,13 @@ from reobj.files import Progress, load_npz, save_npz
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
-from reobj.sources.video import Video, source_fingerprint
+from reobj.sources.video import Video
 from reobj.types import Array, Detections, Floats, Frame, IntArray, ReobjError, Tracks
 
 
 def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
     """Return what the detections of a video depend on."""
-    return (source_fingerprint(video.source), video.config, source.key)
+    return (video.fingerprint, video.config, source.key)
 
 
 def keep_detections(source: DetectionSource, video: Video, workspace: Workspace) -> DetectionSource:

@@ -26,7 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reobj.files import shortened, without_password
+from reobj.files import shortened, without_secrets
 from reobj.types import Array, Frame, Image, ReobjError, option
 
 IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
@@ -95,7 +95,8 @@ class Video:
     `LIVE_QUEUE` newest ones.
 
     Attributes:
-        source: what was given, without a URL's password.
+        source: what was given, of a URL only scheme, host and path.
+        fingerprint: changes with the source or its files; does not tell what a URL hides.
         files, names: paths and file names of images by frame number, [] for videos.
         times_s: (F,) of images whose names are time stamps, else None: they come at 30 Hz.
         has_images: False where frames have none (`ImagelessVideo`).
@@ -112,7 +113,7 @@ class Video:
 
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
         self._address, self.config = str(source), config or InputConfig()
-        self.source = without_password(self._address)
+        self.source = without_secrets(self._address)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
@@ -120,6 +121,7 @@ class Video:
         self.read = self.dropped = 0
         self._opened: Any = None  # capture of a live source, until it is iterated
         self._is_url = bool(STREAM_URL.match(self._address))
+        self.fingerprint = source_fingerprint(source)
         self.files = [] if self._is_url else _image_files(self.source)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
@@ -337,17 +339,28 @@ def shrunk(image: Image, size_px: int) -> Image:
     return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
 
 
+HASH_ROUNDS = 100_000  # chosen: .05 s, once a run, and for every guess at a password
+
+
 def source_fingerprint(source: Any) -> str:
     """Hash names, sizes and times of a file, a folder's files or a glob's matches.
 
     Returns:
-        16 hex digits; of a camera or stream its name as it is.
+        16 hex digits; of a camera its number; of a URL what may be shown of it, and a slow hash of
+        the rest: two queries of a server are two sources.
     """
-    path = Path(str(source))
-    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(source)))
-    files = sorted(p for p in found if p.is_file()) or [path] * path.is_file()
+    text, path = str(source), Path(str(source))
+    if STREAM_URL.match(text):
+        shown = without_secrets(text)
+        rest = hashlib.pbkdf2_hmac("sha256", text.encode(), shown.encode(), HASH_ROUNDS)
+        return shown if shown == text else f"{shown} {rest.hex()[:16]}"
+    if path.is_file():  # also one whose name looks like a glob: det[1].txt
+        files = [path]
+    else:
+        found = path.iterdir() if path.is_dir() else map(Path, glob.glob(text))
+        files = sorted(p for p in found if p.is_file())
     if not files:
-        return str(source)
+        return text
     facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 
