@@ -58,7 +58,7 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.files import atomic, load_npz, save_npz
+from reobj.files import atomic, load_cached, load_npz, save_npz
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
@@ -336,7 +336,7 @@ class TrackState:
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 4  # of the files of Tracker.save
+STATE_VERSION = 5  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -897,7 +897,7 @@ class Tracker:
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
         """Read a tracker that `save` wrote; embedder: as the saved one had."""
         try:
-            arrays, facts = load_npz(Path(path))
+            arrays, facts = load_npz(Path(path), sealed=True)
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
             tracker = cls(TrackerConfig(**facts["config"]), embedder)
@@ -1060,8 +1060,9 @@ def _track_video(
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
     path = workspace.path("tracks", *detections_key(source, video), *setup)
-    if source.key and not video.is_live and path.exists():
-        return Result.load_tracked(path)
+    keep = source.key and not video.is_live
+    if keep and (known := load_cached(path, Result.load_tracked)) is not None:
+        return known
     started, on = time.monotonic(), (config.threads, config.offline, config.device)
     tracker = Tracker(config.tracker, make_embedder(config.embed.model, config.embed.head, *on))
     steps = track(video, source, tracker, poses=poses)

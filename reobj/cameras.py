@@ -282,8 +282,8 @@ def save_poses(path: Path, poses: Poses) -> None:
 
 def load_poses(path: Path) -> Poses:
     """Read what `save_poses` wrote."""
-    data, facts = load_npz(path)
-    arrays = {k: data[k] for k in _POSE_ARRAYS if k in data}  # older files lack the last
+    data, facts = load_npz(path, sealed=True)
+    arrays = {k: data[k] for k in _POSE_ARRAYS}
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
     return Poses(

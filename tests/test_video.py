@@ -265,7 +265,7 @@ class FakeFile:
     def get(self, what: int) -> float:
         values = {cv2.CAP_PROP_FPS: 10.0, cv2.CAP_PROP_FRAME_COUNT: float(self.announced),
                   cv2.CAP_PROP_POS_MSEC: 100.0 * self.n * self.times}  # fmt: skip
-        return values[what]
+        return values.get(what, 0.0)
 
     def grab(self) -> bool:
         self.n += 1
@@ -383,6 +383,62 @@ def test_fingerprints_of_urls_tell_them_apart_and_no_secret() -> None:
     first, second = map(video_room.source_fingerprint, urls)
     assert first != second and first.startswith("http://cam/v.mp4 ")
     assert "secret" not in first + second and video_room.source_fingerprint(urls[0]) == first
+
+
+def claiming(kind: str, width: int, height: int, folder: Path) -> bytes:
+    """A small image whose header says another size."""
+    path = folder / f"small.{kind}"
+    cv2.imwrite(str(path), np.zeros((7, 5, 3), np.uint8))
+    data = bytearray(path.read_bytes())
+    if kind == "jpg":
+        at = data.index(b"\xff\xc0")
+        data[at + 5 : at + 9] = struct.pack(">HH", height, width)
+    else:
+        at, form = {"png": (16, ">II"), "bmp": (18, "<ii")}[kind]
+        data[at : at + 8] = struct.pack(form, width, height)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "bmp"])
+def test_an_image_of_gigabytes_is_refused_by_its_header(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / f"a.{kind}").write_bytes(claiming(kind, 30_000, 30_000, tmp_path))
+    monkeypatch.setattr(cv2, "imdecode", None)
+    with pytest.raises(rt.ReobjError, match=f"a.{kind}: 900000000 pixels, at most 268435456"):
+        rt.Video(tmp_path / f"a.{kind}")
+
+
+@pytest.mark.parametrize("size", [(37, 21), (1, 300), (300, 2)])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.png", []),
+        ("a.bmp", []),
+        ("a.jpg", []),
+        ("a.jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]),
+        ("a.tif", []),
+        ("a.webp", [cv2.IMWRITE_WEBP_QUALITY, 80]),
+        ("a.webp", [cv2.IMWRITE_WEBP_QUALITY, 101]),  # lossless
+    ],
+)
+def test_headers_tell_the_number_of_pixels(
+    name: str, options: list[int], size: tuple[int, int], tmp_path: Path
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (*size[::-1], 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / name), noise, options)
+    data = (tmp_path / name).read_bytes()
+    assert video_room.claimed_pixels(data) == size[0] * size[1]
+    for end in range(0, len(data), 3):  # cut anywhere: no error
+        video_room.claimed_pixels(data[:end])
+
+
+def test_a_name_that_is_no_utf8_is_one_line(tmp_path: Path, movie: Path) -> None:
+    path = os.fsencode(tmp_path) + b"/room\xff.mp4"
+    Path(os.fsdecode(path)).write_bytes(movie.read_bytes())
+    with pytest.raises(rt.ReobjError, match="this name is no UTF-8; rename the file") as caught:
+        rt.Video(os.fsdecode(path))
+    str(caught.value).encode()  # can be printed
 
 
 # ---- Cameras -------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ claims is judged later, by `checks`.
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -399,8 +400,9 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     if not (found[0] / "images.bin").exists():
         return _read_colmap_text(found[0])
     try:
+        _check_counts(found[0])
         model = read_sparse_model(found[0])
-    except (ValueError, RuntimeError, LookupError, MemoryError) as error:
+    except (ValueError, RuntimeError, LookupError, MemoryError, struct.error) as error:
         reason = str(error).splitlines()[0]
         raise ReobjError(f"{found[0]}: not a COLMAP model ({reason}); write it again") from None
     if not model.names:
@@ -411,6 +413,36 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
         model.cam_from_world, camera, model.names, points=model.points, colors=model.colors,
         visibility=seen,
     )  # fmt: skip
+
+
+# Records of COLMAP's binary files: bytes before a name, or before the number of what follows; the
+# format of that number; bytes of each that follows
+RECORDS = {
+    "cameras.bin": (24, "", 0),
+    "images.bin": (64, "<Q", 24),  # with a name
+    "points3D.bin": (43, "<Q", 8),
+    "frames.bin": (64, "<I", 16),
+    "rigs.bin": (8, "", 0),
+}
+
+
+def _check_counts(folder: Path) -> None:
+    """Refuse a binary model that claims more than it holds: pycolmap takes memory for the claim."""
+    for name, (head, number, size) in RECORDS.items():
+        if not (folder / name).exists():
+            continue
+        data = (folder / name).read_bytes()
+        (count,), at = struct.unpack_from("<Q", data), 8
+        if at + count * head > len(data):
+            raise ValueError(f"{name} claims {count} records in {len(data)} bytes")
+        for _ in range(count if number else 0):
+            at += head
+            if name == "images.bin":
+                at = data.index(b"\0", at) + 1
+            (n,) = struct.unpack_from(number, data, at)
+            at += struct.calcsize(number) + n * size
+            if at > len(data):
+                raise ValueError(f"{name} claims {n} entries in {len(data)} bytes")
 
 
 def _read_colmap_text(folder: Path) -> PoseFile:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from reobj.files import Progress, load_npz, save_npz
+from reobj.files import Progress, load_cached, load_npz, save_npz
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
@@ -44,8 +44,8 @@ def detect_all(
         own = source.recorded
         return source, _rows(own.frame, own.xyxy, own.score, own.class_id)
     path = workspace.path("boxes", *detections_key(source, video))
-    if source.key and path.exists():
-        found, _ = load_npz(path)
+    if source.key and (cached := load_cached(path, lambda p: load_npz(p, sealed=True))):
+        found, _ = cached
         return source, _rows(*(found[n] for n in ("frame", "xyxy", "score", "class_id")))
     if source.cache is None:  # it cannot be known again: for this run only
         folder = workspace.cache / "detections-once"

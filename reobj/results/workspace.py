@@ -15,7 +15,7 @@ from typing import Any
 
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
-from reobj.files import atomic, load_json, part_path, part_paths
+from reobj.files import atomic, load_cached, load_json, part_path, part_paths
 from reobj.results.result import LAST_POSES, Result, load_last_poses, remove_stale, written_by
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
@@ -76,7 +76,7 @@ class Workspace:
             "frames": video.facts() if isinstance(video, ImagelessVideo) else None,
         }
         if path.exists():
-            old = load_json(path)
+            old = load_cached(path, load_json)
             old = old if isinstance(old, dict) else {}
             if old.get("content") != fingerprint["content"]:
                 if not overwrite:

@@ -235,7 +235,7 @@ class DetectionCache:
         self.folder, self.image_size = Path(folder), image_size
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._fresh: dict[int, Detections] = {}  # by frame, not on disk yet
-        chunks = sorted(self.folder.glob("chunk_*.npz"))
+        chunks = sorted(p for p in self.folder.glob("chunk_*.npz") if p.stem[6:].isdecimal())
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
             try:
@@ -246,7 +246,7 @@ class DetectionCache:
 
     def _load(self, path: Path) -> None:
         """Take the frames of a file over, packed as they are stored."""
-        chunk, done = read_npz(path, self.image_size, self.image_size)
+        chunk, done = read_npz(path, self.image_size, self.image_size, sealed=True)
         self._stored |= dict.fromkeys(done.tolist(), chunk)
 
     def get(self, index: int) -> Detections | None:

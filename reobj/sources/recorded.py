@@ -115,15 +115,17 @@ def write_detections_npz(
 
 
 def read_npz(
-    path: Path, size: tuple[int, int], working_size: tuple[int, int]
+    path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
 ) -> tuple[RecordedDetections, IntArray]:
     """Read our own format, as `pack_detections` makes it, for a video of (w, h) `size`.
 
+    Args:
+        sealed: as of `load_npz`.
     Returns:
         The detections, unchecked, and the numbers of the frames that were `done`, also those
         without a detection (where the file does not say: the frame of every detection).
     """
-    data, _ = load_npz(path)
+    data, _ = load_npz(path, sealed)
     count = len(data.get("frame", ()))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
