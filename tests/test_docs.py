@@ -1,4 +1,4 @@
-"""docs/: tutorials are executed, the site is built, the reference is whole, links lead somewhere."""
+"""docs/: tutorials are executed, the site is built, the reference is whole, links lead on."""
 
 from __future__ import annotations
 
@@ -173,6 +173,13 @@ def test_links_lead_somewhere() -> None:
             if "://" not in target and not (page.parent / target).exists():
                 missing.append(f"{page.relative_to(ROOT)}: {target}")
     assert missing == []
+
+
+def test_readme_is_read_in_two_minutes() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert len(text) <= 7500
+    assert len(re.findall(r"^\|--", text, re.M)) == 1  # one table; all others are in docs/
+    assert (ROOT / "docs/img/room.webp").stat().st_size < 1_000_000
 
 
 def shown(page: str) -> list[str]:
