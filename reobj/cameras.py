@@ -142,6 +142,12 @@ RIGID_TOLERANCE = 1e-3  # of R R' from the identity; chosen: float32 poses of de
 WORLD_MAX = 1e9  # of a camera's place; chosen: the Earth in cm fits, in any unit it is a mistake
 
 
+def usable(camera: Camera) -> bool:
+    """Tell whether a camera has a size, finite parameters and focal lengths above 0."""
+    sized = min(camera.width, camera.height) > 0 and bool(np.isfinite(camera.params).all())
+    return sized and bool((np.diag(camera.K)[:2] > 0).all())
+
+
 PART_MAX = 1000  # chosen: each has a map of its own; a walk of an hour has a few
 
 
@@ -176,8 +182,7 @@ def checked_pose(
                          "z forward")  # fmt: skip
     if not isinstance(camera, Camera):
         raise ReobjError("cam_from_world without a camera: give camera=rt.Camera(...) as well")
-    focal = np.diag(camera.K)[:2] if min(camera.width, camera.height) > 0 else np.zeros(2)
-    if not (np.isfinite(camera.params).all() and (focal > 0).all()):
+    if not usable(camera):
         raise ReobjError(f"{camera}: expected a size, and focal lengths above 0, in pixels")
     return pose
 

@@ -148,11 +148,22 @@ NUMBERS = (
 )  # columns that hold numbers
 
 
+WHOLE_MAX = 2.0**53  # of frame and identity; beyond, a float skips whole numbers
+
+
 def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
     """Read MOT rows (frame from 1, id, left, top, w, h[, score[, class]]), or CSV with a header."""
     columns, cells, lines, is_mot = _table_cells(path)
     texts = {role: [row[i] for row in cells] for i, role in enumerate(columns)}
     column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
+    for role in ("frame", "id"):
+        whole = np.abs(column.get(role, np.zeros(0))) <= WHOLE_MAX
+        if role == "frame" and role in column:
+            whole &= column[role] % 1 == 0
+        if not whole.all():
+            line = int(lines[whole.argmin()])
+            raise ReobjError(f"{path}, line {line}: {role} {texts[role][whole.argmin()]}, expected "
+                             "a whole number")  # fmt: skip
     if is_mot and (column["id"] % 1 != 0).any():
         raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
                          "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
@@ -360,6 +371,8 @@ def _coco_dataset(
         return {}, name_of, ["no dataset JSON beside it: image_id is taken as the 0-based frame"]
     if data.get("categories") and not names:
         name_of = {c["id"]: c["name"] for c in data["categories"]}
+        if not all(isinstance(name, str) for name in name_of.values()):
+            raise ReobjError(f"{path}: a category without a name, expected {{id, name}}")
     row = {name: i for i, name in enumerate(video.names)}
     frame_of = {
         image["id"]: row.get(Path(image["file_name"]).name, -1) if row else image.get("frame_id", i)
@@ -494,6 +507,9 @@ def read_tracks(
         _check(found, path, limit, video.frame_count)
     else:
         found = read_detections(path, video, limit)
+    kind = found.identity.dtype.kind
+    if len(found.identity) and (kind not in "iu" or found.identity.max() > WHOLE_MAX):
+        raise ReobjError(f"{path}: identities are {found.identity.dtype}, expected whole numbers")
     if len(found) and (not len(found.identity) or found.identity.min() < 0):
         raise ReobjError(f"{path}: not every box has an identity: no file of tracks")
     start, stop, every = video.config.start, video.config.stop, video.config.every
@@ -547,7 +563,7 @@ def _read_cvat(path: Path, video: Video) -> RecordedDetections:
     except ReobjError as error:
         raise ReobjError(f"{path}: {error}") from error
     except Exception as error:  # zip and zlib have their own for damaged files, and so has expat
-        raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r})") from None
+        raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r:.200})") from None
     if not tracks:
         raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
     names, class_id = np.unique(labels, return_inverse=True)
