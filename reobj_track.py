@@ -1060,8 +1060,7 @@ def _track_video(
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
     path = workspace.path("tracks", *detections_key(source, video), *setup)
-    keep = source.key and not video.is_live
-    if keep and (known := load_cached(path, Result.load_tracked)) is not None:
+    if source.key and not video.is_live and (known := load_cached(path, Result.load_tracked)):
         return known
     started, on = time.monotonic(), (config.threads, config.offline, config.device)
     tracker = Tracker(config.tracker, make_embedder(config.embed.model, config.embed.head, *on))

@@ -313,6 +313,33 @@ def test_coordinates_beyond_any_image(tmp_path: Path, video: rt.Video) -> None:
         read(tmp_path, "a.txt", LINE + "1,-1,10,20,1e8,40,.9\n", video)
 
 
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"xyxy": np.array([["1", "2", "30", "40"]])}, "array xyxy is of <U2, expected fiu"),
+        ({"frame": np.array([0.5])}, "array frame is of float64, expected iu"),
+        ({"class_names": np.array([1])}, "array class_names is of int64, expected U"),
+        ({"class_names": np.array("x")}, "array class_names is"),
+        ({"mask_offsets": np.array([0, 9])}, "mask_counts and mask_offsets do not fit"),
+        ({"mask_offsets": np.array([5, 0])}, "mask_counts and mask_offsets do not fit"),
+    ],
+)
+def test_npz_of_other_kinds(
+    tmp_path: Path, video: rt.Video, change: dict[str, Any], expected: str
+) -> None:
+    one = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.array([0.9]), np.array([0]))
+    rt.write_detections_npz(tmp_path / "a.npz", [(0, one)], ["x"], (640, 480))
+    np.savez(tmp_path / "a.npz", **(dict(np.load(tmp_path / "a.npz")) | change))
+    with pytest.raises(rt.ReobjError, match=rf"a\.npz: {expected}"):
+        rt.read_detections(tmp_path / "a.npz", video)
+
+
+@pytest.mark.parametrize("frame", ["3.7", "1e30", "-1e300"])
+def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -> None:
+    with pytest.raises(rt.ReobjError, match=r"line 2: frame .*, expected a whole number"):
+        read(tmp_path, "a.txt", LINE + f"{frame},-1,10,20,30,40,.9\n", video)
+
+
 def test_zip_that_unpacks_to_too_much(
     tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch
 ) -> None:
