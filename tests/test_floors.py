@@ -45,7 +45,7 @@ FLOORS = {
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {  # optional, or slow to load
-    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun",
+    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "supervision",
 }  # fmt: skip
 LINES = {"reobj_track": 1300, "quadrics": 2270}  # at most; of any other room:
 ROOM_LINES = 600
