@@ -90,6 +90,7 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
+from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, export
 from reobj.results.plausibility import implausible
@@ -1034,11 +1035,22 @@ def run(
 
 
 def refit(
-    out: str | Path, config: Config | None = None, tracks: str | Path | None = None
+    out: str | Path,
+    config: Config | None = None,
+    tracks: str | Path | None = None,
+    edits: str | Path | None = None,
 ) -> Result:
-    """Link and fit again from what an output folder holds; tracks: identities from this file."""
+    """Link and fit again from what an output folder holds.
+
+    Args:
+        tracks: file of identities instead. edits: file of corrections by hand, which replaces those
+            that the folder keeps.
+    """
+    if tracks and edits:
+        raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")
     workspace = Workspace.open(out)
     result, video = workspace.load_last(), workspace.video()
+    result.edits = read_edits(edits) if edits else None
     config = dataclasses.replace(config or Config(), input=video.config)
     if tracks:
         poses = result.poses
@@ -1095,6 +1107,7 @@ def _given_tracks(
 def _finish(result: Result, video: Video, workspace: Workspace, config: Config) -> Result:
     """Link tracklets, fit one solid an object, and write all files of the output folder."""
     started, poses = time.monotonic(), result.poses
+    result.edits = result.edits or kept_edits(workspace.out)
     link_and_fit(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
     result.tracks, result.out = fill(result, video.size, gap), workspace.out
@@ -1107,8 +1120,8 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.save(workspace.out, config.output.doubtful)
     if poses is not None:
         write_supplied_model(poses, video, workspace.out)
-    shown = result if config.output.doubtful else result.without_doubtful()
-    write_pictures(shown, workspace.out, video, config.output.overlay, config.output.scene)
+    shown = config.output
+    write_pictures(result, workspace.out, video, shown.overlay, shown.scene, shown.doubtful)
     result.seconds["write"] = time.monotonic() - started
     for warning in result.warnings:
         log.warning(warning)
@@ -1148,6 +1161,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "only check objects.json against its schema (needs jsonschema)"
     add("--validate", action="store_true", help=text)
     add("--tracks", help=TRACKS_HELP)
+    add("--edits", help="corrections by hand, saved by scene.html; later fits keep them")
     text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
     add = _command(sub, "eval", text, _cmd_eval).add_argument
     add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
@@ -1235,7 +1249,8 @@ def _cmd_objects(args: argparse.Namespace) -> int:
         faults = validate_objects(out / "objects.json" if out.is_dir() else out)
         print("\n".join(faults) or "valid")
         return 2 if faults else 0
-    print(refit(args.out, config_from_args(Config(), args), args.tracks).summary())
+    config = config_from_args(Config(), args)
+    print(refit(args.out, config, args.tracks, args.edits).summary())
     return 0
 
 

@@ -253,6 +253,18 @@ def rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
+def decimals(sigma: float) -> int:
+    """Return how many decimals a value of standard deviation `sigma` is worth.
+
+    The last digit is worth a sigma at most and more than a tenth of it: the error of rounding makes
+    the sigma 4 % larger at most (1 / 12 in variance). The page's `decimals` is the same.
+
+    >>> decimals(0.2), decimals(0.046), decimals(0.009), decimals(30)
+    (1, 2, 3, 0)
+    """
+    return max(0, math.ceil(-math.log10(sigma))) if 0 < sigma < math.inf else 2
+
+
 def numbers(values: Array) -> list[float]:
     """Round to six significant digits, for JSON: far below any accuracy, and stable text."""
     return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]

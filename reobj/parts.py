@@ -23,12 +23,14 @@ from reobj.identity.linking import FRAGMENT_GAP, link
 from reobj.identity.locate import Located, confidence, floor_under, locate
 from reobj.identity.occlusion import hidden_edges
 from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
+from reobj.results.edits import Edits, apply_edits
 from reobj.results.result import Result
 from reobj.types import (
     BoolArray,
     Embeddings,
     IntArray,
     LinkEvent,
+    ReobjError,
     Tracks,
     frame_step,
     object_classes,
@@ -43,6 +45,11 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
     Sets tracks (identities; detections that the tracker left out join them), objects, fits and
     world. An object lies in one part: where the path breaks, an identity ends. Only identities that
     the user gave may span parts; their solid is fitted in the part that has most of their boxes.
+    The result's edits come after the linker; those of an earlier fit that do not find their objects
+    any more are left out, with a warning.
+
+    Raises:
+        ReobjError: an edit made now does not find its object.
     """
     poses = result.poses
     parts = [] if poses is None else [poses.of_part(k) for k in range(poses.part_count)]
@@ -55,6 +62,8 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
     linked = _Linked(result.tracks, located=[None] * len(fit_in))
     if not result.identities_given:
         linked = _link_parts(result, parts, fit_in, priors, config)
+    if result.edits is not None:
+        linked = _edited(linked, result, result.edits)
     tracks = linked.tracks
     part = np.zeros(len(tracks), np.int64) if poses is None else poses.part_of(tracks.frame)  # (N,)
     fits: list[quadrics.ObjectFits | None] = [None] * len(fit_in)
@@ -82,7 +91,10 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
         )
         result.objects += [dataclasses.replace(o, part=k) for o in found]
     result.objects.sort(key=lambda o: o.id)
-    result.tracks, result.embedding_row = tracks, linked.rows_now(result.embedding_row)
+    row = linked.rows_now(result.embedding_row)
+    foreground, background = result.embeddings.foreground, result.embeddings.background
+    result.embeddings = Embeddings(foreground[row >= 0], background[row >= 0])
+    result.tracks, result.embedding_row = tracks, row[row >= 0]
     result.world = describe_world(poses, fits, linked.events)
     result.fits = fits[0] if poses is None else join_fits(fits, part_of_object, poses)
 
@@ -106,12 +118,35 @@ class _Linked:
     solid_of: dict[int, int] = field(default_factory=dict)
 
     def rows_now(self, before: IntArray) -> IntArray:
-        """Return where rows of the table before linking are now."""
+        """Return where rows of the table before linking are now, -1: deleted."""
         if self.source is None:
             return before
-        now = np.full(int(self.source.max(initial=-1)) + 1, -1)
+        now = np.full(max(self.source.max(initial=-1), before.max(initial=-1)) + 1, -1)
         now[self.source[self.source >= 0]] = np.flatnonzero(self.source >= 0)
         return np.asarray(now[before], np.int64)
+
+
+def _edited(linked: _Linked, result: Result, edits: Edits) -> _Linked:
+    """Correct identities and classes by hand; an object that the user names is surely there."""
+    before = linked.tracks
+    try:
+        made = apply_edits(before, result.class_names, edits)
+    except ReobjError as error:
+        if not edits.kept:
+            raise
+        result.warnings.append(f"{error}; no correction of this file was applied")
+        result.edits = None
+        return linked
+    result.class_names = made.class_names
+    result.warnings += made.messages
+    confidence: dict[int, float] = {}
+    for now, then in set(zip(made.tracks.track_id.tolist(), before.track_id.tolist(), strict=True)):
+        if then in linked.confidence:
+            sure = 1.0 if now in made.confirmed else linked.confidence[then]
+            confidence[now] = max(sure, confidence.get(now, 0.0))
+    source = np.arange(len(before)) if linked.source is None else linked.source
+    rows = (made.tracks[made.keep], source[made.keep])
+    return _Linked(*rows, linked.events, confidence)
 
 
 def _link_parts(

@@ -25,6 +25,7 @@ from reobj import __version__
 from reobj.cameras import Poses, load_poses, save_poses, write_tum
 from reobj.files import (
     atomic,
+    decimals,
     load_json,
     load_npz,
     numbers,
@@ -36,6 +37,7 @@ from reobj.files import (
     without_secrets,
 )
 from reobj.poses.floor import Floor
+from reobj.results.edits import Edits, write_edits
 from reobj.results.ply import write_ply
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
@@ -118,6 +120,20 @@ class Object:
     def located(self) -> bool:
         """True where a solid was fitted, and is not doubtful."""
         return self.status in ("ok", "prior_dominated")
+
+    @property
+    def sides(self) -> list[tuple[str, str]]:
+        """Width, depth and height and their sigmas as text; [] if unknown.
+
+        In metres where the scale is known, along the object's own axes x, y, z (z is upwards), with
+        as many decimals as the best known of the three is worth.
+        """
+        size = self.size if self.size_m is None else self.size_m
+        if size is None or self.size_rel_sigma is None:
+            return []
+        sigma = size * self.size_rel_sigma
+        digits = decimals(float(sigma.min()))
+        return [(f"{a:.{digits}f}", f"{b:.{digits}f}") for a, b in zip(size, sigma, strict=True)]
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of objects.json."""
@@ -264,6 +280,7 @@ class Result:
             `embedding_row` (n,) of the tracks that the tracker embedded.
         identities_given: the user gave the identities; nothing may join, split or renumber them.
         seconds: wall time by stage. warnings: what the user should know.
+        edits: corrections by hand that count; None: none.
         out: the folder that it was saved to or loaded from.
     """
 
@@ -280,6 +297,7 @@ class Result:
     identities_given: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    edits: Edits | None = None
     out: Path | None = None
 
     @property
@@ -348,6 +366,8 @@ class Result:
             (out / LAST_POSES).unlink(missing_ok=True)
         write_mot(out / "tracks.txt", (self if doubtful else self.without_doubtful()).tracks)
         self._write_objects(out / "objects.json")
+        if self.edits is not None:
+            write_edits(out, self.edits)
         if self.poses is not None:
             save_poses(out / LAST_POSES, self.poses)
             write_trajectories(out, self.poses)
@@ -453,7 +473,7 @@ class Result:
         lines = [f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  {sizes * sized}status"]
         for o in counted:
             size = o.size if o.size_m is None else o.size_m
-            text = "-" if size is None else " x ".join(f"{s:.2f}" for s in size)
+            text = " x ".join(side for side, _ in o.sides) or "-"
             text += " units" if scaled and size is not None and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "

@@ -1,5 +1,7 @@
 """scene.html: one self-contained page of objects, cameras, points and pictures.
 
+The page's sources are in page/, beside this file: page.html names the others, they are put in here.
+
 `write_pictures` is the one loop over the video that makes the overlay and the pictures of the page.
 """
 
@@ -8,37 +10,40 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 import quadrics
-from reobj.cameras import Poses, invert_rigid, place_of
+from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded
-from reobj.results.overlay import Overlay, draw_tracks
+from reobj.poses.floor import NOISE
+from reobj.results.overlay import Overlay
 from reobj.results.result import Object, Result, World, significant
 from reobj.sources.video import IMAGE_FPS, Video, shrunk
-from reobj.types import Frame, Image, IntArray, Tracks, object_color
+from reobj.types import Frame, Image, IntArray, Tracks, object_color, rows_by
 
 # Chosen so that the page of a video of three minutes with 50 objects stays below 10 MB.
 SCENE_CROPS = 8  # pictures of each object in scene.html
 SCENE_MAX_CROPS = 480  # and of all objects together
 SCENE_CROP_PX = 112  # longer side of these pictures
-SCENE_FRAMES = 60  # video frames in scene.html, shown beside the time slider
-SCENE_FRAME_PX = 320  # longer side of these frames
-JPEG_QUALITY = 80
+SCENE_FRAMES = 60  # video frames in scene.html, behind the solids and beside the time slider
+SCENE_FRAME_PX = 640  # longer side of these frames
+WEBP_QUALITY = 60  # half of a JPEG's bytes; every browser shows it since 2020
 CROP_MARGIN = 0.1  # of the box's sides, on every side: shows what the object stands on
 
 
 class Pictures:
-    """Cut small JPEGs for the scene page while the video is read: objects and whole frames.
+    """Cut small pictures for the scene page while the video is read: objects and whole frames.
 
     Attributes:
         wanted: rows of the tracks to cut, in their order. whole: numbers of the frames to keep.
         crops: [frame number, base64] of each object's pictures, by identity, by time.
-        frames: [frame number, base64] of whole frames with their boxes.
+        frames: [frame number, base64] of whole frames, without the distortion of the lens.
     """
 
     def __init__(self, result: Result, video: Video) -> None:
@@ -54,8 +59,14 @@ class Pictures:
             for o in ranked[:SCENE_MAX_CROPS]
         }
         self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
-        shown = scene_frames(result)
+        shown, cameras = scene_steps(result), result.poses
+        if cameras is not None and cameras.known.any():
+            shown = shown[cameras.known[np.searchsorted(cameras.frame, shown)]]
         self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
+        self.camera = None if cameras is None else cameras.camera
+        self.grid: npt.NDArray[np.float32] | None = (
+            None  # of the undistorted picture in the small one
+        )
 
     def take(self, frame: Frame) -> None:
         """Cut the wanted boxes from this frame, and keep it if it is wanted as a whole."""
@@ -66,19 +77,40 @@ class Pictures:
             x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
             x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
             if x1 < x2 and y1 < y2:
-                crop = _jpeg(frame.image[y1:y2, x1:x2], SCENE_CROP_PX)
+                crop = _webp(frame.image[y1:y2, x1:x2], SCENE_CROP_PX)
                 self.crops[int(obj)].append((frame.index, crop))
         if frame.index in self.whole:
-            image = shrunk(frame.image, SCENE_FRAME_PX)
-            low, high = np.searchsorted(self.tracks.frame, [frame.index, frame.index + 1])
-            scale = self.scale * image.shape[1] / width
-            draw_tracks(image, self.tracks[slice(low, high)], {}, scale)
-            self.frames.append((frame.index, _jpeg(image, SCENE_FRAME_PX)))
+            image = self._undistorted(shrunk(frame.image, SCENE_FRAME_PX))
+            self.frames.append((frame.index, _webp(image, SCENE_FRAME_PX)))
+
+    def _undistorted(self, image: Image) -> Image:
+        """Remove the lens's distortion from a small picture, so that solids lie where they are."""
+        camera = self.camera
+        if camera is None or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+            return image
+        if self.grid is None:
+            self.grid = _distorted_grid(camera, image.shape[1], image.shape[0])
+        x, y = np.moveaxis(self.grid, -1, 0)
+        return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR), np.uint8)
 
 
-def _jpeg(image: Image, size_px: int) -> str:
-    """Encode a small JPEG as base64."""
-    data = cv2.imencode(".jpg", shrunk(image, size_px), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.float32]:
+    """Find where the pixels of a pinhole picture lie in the lens's, (height, width, 2) float32.
+
+    In pixels of OpenCV: the first one's centre is (0, 0).
+    """
+    small = camera.resized((width, height))
+    xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2) + 0.5
+    rays = np.hstack([xy, np.ones((len(xy), 1))]) @ np.linalg.inv(small.K).T  # (N, 3)
+    found = np.asarray(small.to_pycolmap().img_from_cam(rays), np.float64) - 0.5
+    return np.nan_to_num(found, nan=-1.0).reshape(height, width, 2).astype(np.float32)
+
+
+def _webp(image: Image, size_px: int) -> str:
+    """Encode a small WebP picture as base64."""
+    data = cv2.imencode(".webp", shrunk(image, size_px), [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])[
+        1
+    ]
     return base64.b64encode(data.tobytes()).decode()
 
 
@@ -112,24 +144,39 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
     return np.asarray(rows[chosen], np.int64)
 
 
-def scene_frames(result: Result) -> IntArray:
-    """List the frames that the time slider of the page goes through, before thinning."""
-    return np.unique(result.tracks.frame) if result.poses is None else result.poses.frame
-
-
 SCENE_STEPS = 1500  # positions of the time slider; of longer videos every n-th frame (chosen)
 
 
-def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) -> None:
-    """Write scene.html: ellipsoids, cameras, points and pictures in one page that needs no network.
+def scene_steps(result: Result) -> IntArray:
+    """List the frames that the time slider of the page goes through, (S,)."""
+    frames = np.unique(result.tracks.frame) if result.poses is None else result.poses.frame
+    return frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]
 
-    The page is `scene.html` beside this file; its data are objects.json's entries without
-    covariance, and base64 of little-endian float32 / uint8 arrays.
+
+def page_text() -> str:
+    """Return the page without its data: page.html, with `@{file}` replaced by these files."""
+    folder = Path(__file__).with_name("page")
+    text = (folder / "page.html").read_text(encoding="utf-8")
+
+    def text_of(found: re.Match[str]) -> str:
+        return (folder / found[1]).read_text(encoding="utf-8").strip()
+
+    return re.sub(r"@\{([\w.]+)\}", text_of, text)
+
+
+def write_scene(
+    result: Result, pictures: Pictures, path: Path, video: Video, doubtful: bool = False
+) -> None:
+    """Write scene.html: solids, cameras, points and pictures in one page that needs no network.
+
+    Its data are objects.json's entries, and base64 of little-endian float32 / uint8 arrays.
+
+    Args:
+        doubtful: show the doubtful objects at first; a switch of the page shows and hides them.
     """
-    frames = scene_frames(result)
-    steps = frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]  # (S,)
-    seconds = video.config.every / (video.fps or IMAGE_FPS) * len(frames) / max(1, len(steps))
-    poses = result.poses
+    steps, poses = scene_steps(result), result.poses  # (S,)
+    count = len(np.unique(result.tracks.frame) if poses is None else poses.frame)
+    seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
     of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
     thin = math.ceil(0 if poses is None else len(poses.points) / SCENE_POINTS) or 1
     data = {
@@ -140,16 +187,31 @@ def write_scene(result: Result, pictures: Pictures, path: Path, video: Video) ->
             for link in result.world.to_json()["links"]
         ],
         "objects": [_scene_object(o, result.tracks, steps, pictures) for o in result.objects],
-        "thumbs": pictures.frames,
+        "thumbs": [[frame, data, _boxes_in(result, frame)] for frame, data in pictures.frames],
+        "doubtful": doubtful,
+        "size": {"width": result.video.width, "height": result.video.height},
+        "edits": [] if result.edits is None else result.edits.entries,
         "why_flat": _why_flat(result),
         "steps": {"frame": steps.tolist(), "seconds": seconds, "part": of_part.tolist()},
         **_scene_cameras(result, steps),
         "parts": [_scene_part(k, part, thin) for k, part in enumerate(result.parts())],
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    head, tail = Path(__file__).with_name("scene.html").read_text().split("@DATA@")
-    with atomic(path) as part:
-        part.write_text(head + text.replace("<", "\\u003c") + tail)  # no name can end the script
+    head, tail = page_text().split("@DATA@")
+    with atomic(path) as part:  # no name can end the script
+        part.write_text(head + text.replace("<", "\\u003c") + tail, encoding="utf-8")
+
+
+def _boxes_in(result: Result, frame: int) -> list[list[float]]:
+    """List the boxes of a frame as identity, x1, y1, x2, y2, undistorted, native pixels."""
+    low, high = np.searchsorted(result.tracks.frame, [frame, frame + 1])
+    rows = result.tracks[slice(low, high)]
+    box = rows.xyxy if result.poses is None else undistort_boxes(rows.xyxy, result.poses.camera)
+    good = np.isfinite(box).all(1)
+    return [
+        [i, *b]
+        for i, b in zip(rows.track_id[good].tolist(), box[good].round(1).tolist(), strict=True)
+    ]
 
 
 SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .4 MB of the page)
@@ -162,11 +224,12 @@ def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
         return {"camera": None, "poses": ""}
     size, K = {"width": poses.camera.width, "height": poses.camera.height}, poses.camera.K
     shown = invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)])
-    return {"camera": size | {"fx": K[0, 0], "fy": K[1, 1]}, "poses": base64_text(shown, "<f4")}
+    inside = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return {"camera": size | inside, "poses": base64_text(shown, "<f4")}
 
 
 def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
-    """Collect every `thin`-th point, scale and upward direction of one part, and its name."""
+    """Collect every `thin`-th point, scale, floor, up and sigma of points of a part; its name."""
     poses, up = part.poses, part.world.up_in_world
     count, spans = len(part.objects), ", ".join(p.span_text for p in part.world.parts)
     facts = {
@@ -178,6 +241,14 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
         return facts | {"points": "", "colors": "", "up": [0, 0, 1]}
     if up is None:
         up = quadrics.camera_up(poses.camera.K @ poses.cam_from_world[poses.known])[0]
+    floor = None if number else part.world.floor  # that of the largest part
+    if floor is not None:
+        facts["floor"] = {"normal": floor.normal.tolist(), "offset": floor.offset}
+    eye = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
+    some = (poses.points[:: len(poses.points) // 500 + 1], eye[:: len(eye) // 50 + 1])
+    if len(some[0]):  # as for the floor: a share of the distance
+        distance = np.linalg.norm(some[0][:, None] - some[1], axis=2).min(1)
+        facts["point_sigma"] = NOISE * float(np.median(distance))
     return facts | {
         "points": base64_text(poses.points[::thin], "<f4"),
         "colors": base64_text(poses.colors[::thin], "u1"),
@@ -190,15 +261,26 @@ def _scene_object(
 ) -> dict[str, Any]:
     """Describe an object for the page.
 
-    Its entry of objects.json without covariance, its colour, its pictures, and the steps in which
-    it is seen (first, last, first, last ...).
+    Its entry of objects.json, its colour, its pictures, its size as text, the steps in which it is
+    seen (first, last, first, last ...), and its visits, each with its best box, by which an edit
+    names it (first, last, frame, x1, y1, x2, y2).
     """
-    seen = np.isin(steps, tracks.frame[tracks.track_id == found.id])
+    own = tracks[tracks.track_id == found.id]
+    seen = np.isin(steps, own.frame)
     runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
     runs[1::2] -= 1
-    return {k: v for k, v in found.to_json().items() if k != "cov"} | {
+    detected = own[own.score > 0] if own.score.any() else own  # without filled gaps
+    visits = []
+    for rows in rows_by(detected.tracklet_id):
+        best = rows[detected.score[rows].argmax()]
+        box = detected.xyxy[best].round(1).tolist()
+        visits.append([*detected.frame[rows[[0, -1]]].tolist(), int(detected.frame[best]), *box])
+    return found.to_json() | {
+        "cov": "" if found.cov is None else base64_text(found.cov, "<f4"),
         "color": object_color(found.id)[::-1],
+        "sides": found.sides,
         "seen": runs.tolist(),
+        "visits": sorted(visits),
         "crops": pictures.crops[found.id],
     }
 
@@ -226,15 +308,23 @@ def _scene_facts(world: World) -> str:
 
 
 def write_pictures(
-    result: Result, out: Path, video: Video, overlay: bool = True, scene: bool = True
+    result: Result,
+    out: Path,
+    video: Video,
+    overlay: bool = True,
+    scene: bool = True,
+    doubtful: bool = False,
 ) -> None:
     """Write overlay.mp4 and scene.html in one pass over the video.
+
+    Doubtful objects are in the page, where a switch shows them, and in the overlay if `doubtful`.
 
     Each file appears only when it is complete. A live source cannot be read again, and frames may
     have no images: no overlay then, and a page without pictures.
     """
     visible = video.has_images and not video.is_live
-    film = Overlay(result, out / "overlay.mp4", video) if overlay and visible else None
+    shown = result if doubtful else result.without_doubtful()
+    film = Overlay(shown, out / "overlay.mp4", video) if overlay and visible else None
     pictures = Pictures(result, video) if scene else None
     sinks = [sink for sink in (film, pictures) if sink is not None and visible]
     progress, complete = Progress("pictures", video.expected), False
@@ -249,4 +339,4 @@ def write_pictures(
         if film is not None:
             film.close(complete)
     if pictures is not None:
-        write_scene(result, pictures, out / "scene.html", video)
+        write_scene(result, pictures, out / "scene.html", video, doubtful)

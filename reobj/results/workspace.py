@@ -16,6 +16,7 @@ from typing import Any
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
 from reobj.files import atomic, load_cached, load_json, part_path, part_paths
+from reobj.results.edits import EDITS
 from reobj.results.result import LAST_POSES, Result, load_last_poses, remove_stale, written_by
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
@@ -85,7 +86,7 @@ class Workspace:
                         f"not of {video.source}; choose another -o, or say --overwrite"
                     )
                 remove_stale(self.out)
-                for name in ("tracks.txt", "objects.json", LAST_TRACKS, LAST_POSES):
+                for name in ("tracks.txt", "objects.json", EDITS, LAST_TRACKS, LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
             part.write_text(json.dumps(fingerprint))
@@ -116,8 +117,14 @@ class Workspace:
         return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
     def save_last(self, tracked: Result, poses: Poses | None) -> None:
-        """Keep the latest tracks and poses for `objects OUT`, `eval` and `export`."""
+        """Keep the latest tracks and poses for `objects OUT`, `eval` and `export`.
+
+        Given identities take the place of earlier corrections, which are removed.
+        """
         tracked.save_tracked(self.out / LAST_TRACKS)
+        if tracked.identities_given and (self.out / EDITS).exists():
+            (self.out / EDITS).unlink()
+            tracked.warnings.append(f"{self.out / EDITS} removed: the given identities replace it")
         if poses is None:
             (self.out / LAST_POSES).unlink(missing_ok=True)
         else:

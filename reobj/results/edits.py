@@ -1,0 +1,259 @@
+"""Corrections by hand: merge, split, rename, delete objects; edits.json, which the page saves.
+
+An edit names an object by one of its boxes, so that it still finds the object when the linker
+numbers identities anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reobj.files import atomic, load_json, shortened
+from reobj.types import Array, BoolArray, IntArray, ReobjError, Tracks, box_iou
+
+FORMAT = "reobj-edits"
+FORMAT_VERSION = 1
+EDITS = "edits.json"  # in an output folder
+FIELDS = {  # of an edit, beside `do`
+    "merge": ("object", "with"),
+    "split": ("object", "visits"),
+    "rename": ("object", "class"),
+    "delete": ("object",),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BoxRef:
+    """A box that shows an object.
+
+    Attributes:
+        frame: number of the source's frame. box: (4,) x1, y1, x2, y2, native pixels.
+        id: of the object when the edit was made; 0: of no interest.
+    """
+
+    frame: int
+    box: tuple[float, ...]
+    id: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """One correction; the file's entry is `entry`.
+
+    Attributes:
+        do: "merge", "split", "rename" or "delete". object: what it is about.
+        other: merge: the one that `object` is the same as. visits: split: a box of each visit that
+            becomes another object. class_name: rename.
+    """
+
+    do: str
+    object: BoxRef
+    other: BoxRef | None = None
+    visits: tuple[BoxRef, ...] = ()
+    class_name: str = ""
+
+    @property
+    def text(self) -> str:
+        """Say what is done, for messages."""
+        other = f" with {self.other.id}" if self.other else ""
+        return f"{self.do} {self.object.id}{other}"
+
+
+@dataclass(frozen=True, slots=True)
+class Edits:
+    """The edits of a file, in the order in which they are made.
+
+    Attributes:
+        edits: of them. entries: the same as the file has them. path: of the file, for messages.
+        kept: they were made earlier, and may not fit any more.
+    """
+
+    edits: tuple[Edit, ...]
+    entries: list[dict[str, Any]]
+    path: Path
+    kept: bool = False
+
+
+def read_edits(path: str | Path) -> Edits:
+    """Read a file of edits.
+
+    Raises:
+        ReobjError: it is no such file, with the edit at fault.
+    """
+    path = Path(path)
+    data = load_json(path)
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise ReobjError(f'{path}: no edits; expected "format": "{FORMAT}", as scene.html saves it')
+    if data.get("version") != FORMAT_VERSION or not isinstance(data.get("edits"), list):
+        expected = f'"version": {FORMAT_VERSION} and a list "edits"'
+        raise ReobjError(f"{path}: version {data.get('version')}; expected {expected}")
+    edits = []
+    for number, entry in enumerate(data["edits"], 1):
+        try:
+            edits.append(_parse(entry))
+        except (KeyError, TypeError, ValueError) as error:
+            what = f"{path}, edit {number}: {error if str(error) else 'cannot be read'}"
+            raise ReobjError(f"{what}; expected {_expected(entry)}") from error
+    return Edits(tuple(edits), data["edits"], path)
+
+
+def _expected(entry: Any) -> str:
+    """Say what an edit of this kind consists of."""
+    do = entry.get("do") if isinstance(entry, dict) else None
+    if not isinstance(do, str) or do not in FIELDS:
+        return f'"do": one of {", ".join(FIELDS)}'
+    return ", ".join(FIELDS[do]) + ' (an object or visit: "id", "frame", "box": [x1, y1, x2, y2])'
+
+
+def _parse(entry: Any) -> Edit:
+    do = entry["do"]
+    fields = FIELDS[do]
+    if set(entry) != {"do", *fields}:
+        raise ValueError(f"has {shortened(sorted(set(entry) - {'do'}))}")
+    name = entry.get("class", "")
+    if not isinstance(name, str) or ("class" in fields and not name.strip()):
+        raise ValueError(f"class {name!r} is no name")
+    if not name.isprintable():
+        raise ValueError(f"class {name!r} has characters that cannot be printed")
+    visits = tuple(_box_ref(item) for item in entry.get("visits", ()))
+    if "visits" in fields and not visits:
+        raise ValueError("visits is empty")
+    other = _box_ref(entry["with"]) if "with" in fields else None
+    return Edit(do, _box_ref(entry["object"]), other, visits, name.strip())
+
+
+def _box_ref(item: Any) -> BoxRef:
+    box = tuple(float(value) for value in item["box"])
+    if len(box) != 4 or not np.isfinite(box).all():
+        raise ValueError(f"box {item['box']} is no box")
+    if type(item["frame"]) is not int or type(item.get("id", 0)) is not int:
+        raise ValueError(f"frame {item['frame']}, id {item.get('id')}: whole numbers")
+    return BoxRef(item["frame"], box, item.get("id", 0))
+
+
+def write_edits(folder: Path, edits: Edits) -> None:
+    """Keep edits in an output folder, for later fits; none: remove those that it has."""
+    path = folder / EDITS
+    if not edits.edits:
+        path.unlink(missing_ok=True)
+        return
+    data = {"format": FORMAT, "version": FORMAT_VERSION, "edits": edits.entries}
+    with atomic(path) as part:
+        part.write_text(json.dumps(data, indent=1) + "\n")
+
+
+def kept_edits(folder: Path) -> Edits | None:
+    """Read the edits that an output folder keeps; None if it has none."""
+    path = folder / EDITS
+    return dataclasses.replace(read_edits(path), kept=True) if path.exists() else None
+
+
+@dataclass(frozen=True, slots=True)
+class Edited:
+    """Tracks after corrections.
+
+    Attributes:
+        tracks: the N rows with their new identities and classes. keep: (N,) False: deleted.
+        class_names: of the tracks. confirmed: identities that the user says are there.
+        messages: what the user should know.
+    """
+
+    tracks: Tracks
+    keep: BoolArray
+    class_names: tuple[str, ...]
+    confirmed: set[int]
+    messages: list[str]
+
+
+def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> Edited:
+    """Correct identities and classes of tracks.
+
+    A merged object keeps the lower identity; what is split off gets the next free one; nothing else
+    is renumbered. Where both of two merged objects have a box in a frame, the weaker is left out.
+
+    Raises:
+        ReobjError: an edit finds no such box, with its number.
+    """
+    made = _Tables(tracks, class_names)
+    for number, edit in enumerate(edits.edits, 1):
+        where = f"{edits.path}, edit {number} ({edit.text})"
+        try:
+            made.make(edit, where)
+        except LookupError as error:
+            hint = "were these edits made for another result? make them anew in scene.html"
+            raise ReobjError(f"{where}: {error.args[0]}; {hint}") from error
+    count = len(edits.edits)
+    if count:
+        text = f"{count} correction{'s' * (count != 1)} by hand applied ({EDITS})"
+        made.messages.append(text)
+    table = dataclasses.replace(tracks, track_id=made.identity, class_id=made.class_id)
+    confirmed = made.confirmed & set(made.identity[made.keep].tolist())
+    return Edited(table, made.keep, tuple(made.names), confirmed, made.messages)
+
+
+SAME_BOX_IOU = 0.9  # chosen: a box rounded to .1 px, 10 px wide, overlaps itself by .98
+
+
+class _Tables:
+    """Columns of tracks while edits change them."""
+
+    def __init__(self, tracks: Tracks, class_names: tuple[str, ...]) -> None:
+        self.tracks, self.names = tracks, list(class_names)
+        self.identity, self.class_id = tracks.track_id.copy(), tracks.class_id.copy()  # (N,)
+        self.keep = np.ones(len(tracks), bool)
+        self.confirmed: set[int] = set()
+        self.messages: list[str] = []
+
+    def make(self, edit: Edit, where: str) -> None:
+        """Make one edit; LookupError where it finds nothing."""
+        own = int(self.identity[self._row_of(edit.object)])
+        if edit.do == "delete":
+            self.keep &= self.identity != own
+        elif edit.do == "rename":
+            if edit.class_name not in self.names:
+                self.names.append(edit.class_name)
+            self.class_id[self.identity == own] = self.names.index(edit.class_name)
+            self.confirmed.add(own)
+        elif edit.do == "split":
+            self._split(own, edit.visits)
+        elif edit.other is not None:
+            self._merge(own, int(self.identity[self._row_of(edit.other)]), where)
+
+    def _row_of(self, ref: BoxRef) -> int:
+        """Find the row of a box; of several alike, that of the identity named, then the nearest."""
+        rows = np.flatnonzero(self.keep & (self.tracks.frame == ref.frame))
+        iou: Array = box_iou(self.tracks.xyxy[rows], np.array([ref.box]))[:, 0]  # (n,)
+        rows, iou = rows[iou >= SAME_BOX_IOU], iou[iou >= SAME_BOX_IOU]
+        if not len(rows):
+            box = ", ".join(f"{value:.1f}" for value in ref.box)
+            raise LookupError(f"no object has the box {box} in frame {ref.frame}")
+        return int(rows[np.lexsort((-iou, self.identity[rows] != ref.id))[0]])
+
+    def _merge(self, first: int, second: int, where: str) -> None:
+        kept, gone = sorted((first, second))
+        self.confirmed |= {kept}
+        if kept == gone:  # the linker has come to see it by itself
+            return
+        rows: IntArray = np.flatnonzero(self.keep & np.isin(self.identity, [kept, gone]))
+        rows = rows[np.lexsort((self.identity[rows], -self.tracks.score[rows]))]
+        best = rows[np.unique(self.tracks.frame[rows], return_index=True)[1]]
+        self.identity[rows] = kept
+        self.keep[np.setdiff1d(rows, best)] = False
+        if (both := len(rows) - len(best)) > 0:
+            plural = f"{both} frame{'s' * (both != 1)}"
+            self.messages.append(f"{where}: both are seen in {plural}; the weaker box is left out")
+
+    def _split(self, own: int, visits: tuple[BoxRef, ...]) -> None:
+        found = [row for visit in visits if self.identity[row := self._row_of(visit)] == own]
+        pieces = self.tracks.tracklet_id[np.array(found, np.int64)]
+        off = self.keep & (self.identity == own) & np.isin(self.tracks.tracklet_id, pieces)
+        if not (self.keep & (self.identity == own) & ~off).any():
+            raise LookupError("these are all visits of the object")
+        if off.any():  # else it is apart already
+            self.identity[off] = self.identity[self.keep].max() + 1

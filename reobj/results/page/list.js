@@ -1,0 +1,129 @@
+// The list of objects and the panel of the chosen one.
+const nameOf = (o) => `${o.class} ${o.id}`;
+const NOTE = { ok: "", prior_dominated: "", rejected: "no solid", doubtful: "doubtful",
+  tracked: "in 2D only" };
+
+function bar(o) {                                // when the object was seen, over the part's frames
+  const first = S.steps.frame[steps[0]], span = S.steps.frame[steps.at(-1)] - first + 1;
+  return el("span", { className: "bar" }, ...o.visits.map(([a, b]) => el("span",
+    { style: `left: ${100 * (a - first) / span}%; width: ${100 * (b - a + 1) / span}%` })),
+  el("span", { className: "head" }));
+}
+
+function row(o) {
+  const made = el("button", { className: `row ${o.status}`, onclick: () => select(o),
+    title: o.reason || o.status.replace("_", " ") }, el("i"), el("b", {}, nameOf(o)),
+  el("small", {}, [(o.status === "prior_dominated" ? "≈ " : "") + sizeText(o), S.why_flat ? "" : NOTE[o.status], o.edited ? "edited" : ""]
+    .filter(Boolean).map((text) => ` · ${text}`).join("")), bar(o));
+  made.style.setProperty("--own", rgb(o));
+  return made;
+}
+
+const bySize = (o) => o.size ? -o.size[0] * o.size[1] * o.size[2] : 0;
+const ORDER = {
+  id: (a, b) => a.id - b.id,
+  name: (a, b) => a.class.localeCompare(b.class) || a.id - b.id,
+  size: (a, b) => bySize(a) - bySize(b) || a.id - b.id,
+  seen: (a, b) => b.frames_seen - a.frames_seen || a.id - b.id,
+  first: (a, b) => a.visits[0][0] - b.visits[0][0] || a.id - b.id,
+};
+
+function filterList() {
+  const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
+  for (const o of here) {
+    const text = `${nameOf(o)} ${o.status} ${o.reason}`.toLowerCase();
+    o.row.hidden = state.hidden.has(o.class) || !words.every((word) => text.includes(word))
+      || o.status === "doubtful" && !$("doubtful").checked;
+    o.row.classList.toggle("now", state.step >= 0 && seenAt(o, state.step));
+  }
+}
+
+function fillList() {
+  here.forEach((o) => { o.row = row(o); });
+  $("rows").replaceChildren(...[...here].sort(ORDER[$("sort").value]).map((o) => o.row));
+  const names = [...new Set(here.map((o) => o.class))].sort();
+  $("classes").querySelector("summary").textContent = `classes (${names.length})`;
+  $("classes").querySelector("div").replaceChildren(...names.map((name) => {
+    const box = el("input", { type: "checkbox", checked: !state.hidden.has(name), onchange: () => {
+      state.hidden[box.checked ? "delete" : "add"](name);
+      filterList();
+      redraw();
+    } });
+    const count = here.filter((o) => o.class === name && o.status !== "doubtful").length;
+    return el("label", {}, box, `${name} ${count}`);
+  }));
+  const ends = steps.length ? [steps[0], steps.at(-1)].map(frameOf) : [0, 0];
+  $("legend").replaceChildren(el("span", {}, `bars: seen in frames ${ends[0]}`),
+    el("span", {}, el("b", {}, "| "), "now"), el("span", {}, `${ends[1]}`));
+  const doubtful = here.filter((o) => o.status === "doubtful").length;
+  $("notes").replaceChildren(
+    ...(doubtful ? [el("p", { className: "dim" }, `${doubtful} doubtful object`
+      + `${doubtful > 1 ? "s" : ""}, less likely there than not: `, el("button", { onclick: () => {
+        $("doubtful").checked = !$("doubtful").checked;
+        $("doubtful").onchange();
+      } }, "show or hide"))] : []),
+    ...(S.warnings.length ? [el("p", {}, el("b", {}, "Notes"))] : []),
+    ...S.warnings.map((text) => el("p", { className: "dim" }, text)));
+  filterList();
+}
+
+function evidence(link) {
+  const owners = (t) => objects.filter((o) => o.tracks.includes(t)).map((o) => o.id)
+    .join(" and ");
+  const names = [...new Set(link.tracklets)].map((t) => `${t} (object ${owners(t)})`).join(", ");
+  if (link.place_iou === null) {
+    return (link.kind === "split" ? `split: ${names} told from the rest`
+      : `merge of tracklets ${names}`) + ` by appearance alone (likeness ${link.appearance_log_odds})`;
+  }
+  if (link.kind === "split") {
+    return `split: parts of tracklets ${names} show different places (overlap ${link.place_iou})`;
+  }
+  return `merge of tracklets ${names}: overlap of places ${link.place_iou}, likeness ${link.appearance_log_odds}`
+    + (link.kept ? "" : "; tried and undone: the joint solid does not explain the boxes of both");
+}
+
+function facts(o) {
+  const { scale } = S.parts[o.part], unitName = o.size_m ? "m" : "units";
+  const rows = [["status", o.status.replace("_", " ") + (o.reason ? `: ${o.reason}` : "")]];
+  ["width", "depth", "height"].forEach((name, i) => { if (o.sides.length) rows.push(
+    [name, `${o.sides[i].join(" ± ")} ${unitName} (${percent(o.size_rel_sigma[i])})`]); });
+  if (o.sides.length) rows.push(
+    ["scale", scale && scale.source !== "none" ? `from ${scale.source.replace("_", " ")}, ± `
+      + percent(scale.rel_sigma || 0) : "unknown"], ["shape", o.support]);
+  if (o.confidence !== null) rows.push(["confidence", percent(o.confidence)]);
+  const [, second] = Object.entries(o.classes);
+  if (second && second[1] >= 0.05) rows.push(["class", Object.entries(o.classes)
+    .map(([name, p]) => `${name} ${percent(p)}`).join(", ")]);
+  rows.push(["seen", `frames: ${o.frames_seen}, visits: ${o.visits.length}`], ["score", o.score]);
+  if (o.parallax_deg !== null) rows.push(["parallax", `${o.parallax_deg}°`]);
+  if (o.reprojection_iou_median !== null) rows.push(["box overlap", o.reprojection_iou_median]);
+  if (o.dropped_boxes) rows.push(["boxes left out", o.dropped_boxes]);
+  return rows.concat([["tracklets", o.tracks.join(", ")]]);
+}
+
+function select(o) {
+  if (state.merging && o && o !== state.merging) {
+    edit(edits.merge(state.merging, o));
+    return;
+  }
+  if (!state.merging) hint("");
+  state.selected = o === state.selected ? null : o;  // a second time: no more
+  here.forEach((x) => x.row.classList.toggle("selected", x === state.selected));
+  $("panel").replaceChildren();
+  redraw();
+  if (!state.selected) return;
+  o.row.scrollIntoView({ block: "nearest" });
+  const links = S.links.filter((l) => l.tracklets.some((t) => o.tracks.includes(t)));
+  const crop = ([frame, data]) => el("figure",
+    { onclick: () => goTo(S.steps.frame.findLastIndex((f) => f <= frame)) },
+    el("img", { src: picture(data), alt: `${o.class} in frame ${frame}` }), `${frame}`);
+  $("panel").style.setProperty("--own", rgb(o));
+  $("panel").append(
+    el("button", { id: "close", title: "close (Esc)", onclick: () => select(o) }, "×"),
+    el("h2", {}, el("i"), nameOf(o)), bar(o),
+    el("div", { className: "crops" }, ...o.crops.map(crop)),
+    el("dl", {}, ...facts(o).flatMap(([k, v]) => [el("dt", {}, k), el("dd", {}, v)])),
+    ...editButtons(o), ...visitRows(o),
+    ...(links.length ? [el("h3", {}, "Merges and splits"),
+      el("ul", {}, ...links.map((l) => el("li", {}, evidence(l))))] : []));
+}

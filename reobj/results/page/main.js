@@ -1,0 +1,143 @@
+// Start: the part that is shown, buttons, keys, mouse and fingers.
+const press = (id, on) => $(id).setAttribute("aria-pressed", String(Boolean(on)));
+function hint(text) {
+  $("hint").textContent = text;
+  $("hint").hidden = !text;
+}
+
+function gather() {                              // the objects of the part
+  here = objects.filter((o) => o.part === state.part);
+  solid = here.filter((o) => o.center);
+}
+
+function enter(part) {                           // show one part of the cameras' path, a world
+  if (here) select(null);
+  if (state.ride) setRide(false);
+  Object.assign(state, { part, step: -1, measured: [] });
+  setFollow(false);
+  level = levelFrame(part);
+  gather();
+  steps = [...S.steps.part.keys()].filter((i) => S.steps.part[i] === part);
+  cams = S.steps.frame.map((_, i) => S.steps.part[i] === part ? camera(i) : null);
+  posed = cams.filter(Boolean);
+  $("part").value = part;
+  $("facts").textContent = S.parts[part].facts;
+  $("slider").max = Math.max(steps.length - 1, 0);
+  $("slider").value = 0;
+  $("clock").textContent = "";
+  $("frame").hidden = true;
+  $("list").style.removeProperty("--now");
+  fillList();
+  if (renderer) { fillScene(); VIEWS.reset(); }
+}
+
+// ---- Buttons ----
+const KEYS = [
+  ["Space", "play, stop", () => play()],
+  ["ArrowLeft", "a step back", () => onward(-1)],
+  ["ArrowRight", "a step on", () => onward(1)],
+  ["r", "Reset: the whole room", () => VIEWS.reset()],
+  ["1", "Top: from above", () => VIEWS.top()],
+  ["2", "Front: from the side", () => VIEWS.front()],
+  ["f", "Follow the moving camera", () => setFollow(!state.follow)],
+  ["a", "ride along: look through the camera", () => setRide(!state.ride)],
+  ["m", "measure", () => setMeasure(!state.measuring)],
+  ["Delete", "delete the chosen object", () => state.selected && edit(edits.delete(state.selected))],
+  ["u", "undo a correction", undo],
+  ["Escape", "leave: merging, measuring, riding, the chosen object", leave],
+  ["?", "this help", () => $("help").open ? $("help").close() : $("help").showModal()],
+];
+const IN_2D = ["Space", "ArrowLeft", "ArrowRight", "Delete", "u", "Escape", "?"];
+
+function leave() {                               // the innermost thing
+  if (state.merging) { state.merging = null; hint(""); }
+  else if (state.measuring) setMeasure(false);
+  else if (state.ride) setRide(false);
+  else if (state.follow) setFollow(false);
+  else if (state.selected) select(state.selected);
+}
+
+addEventListener("keydown", (e) => {
+  if (e.ctrlKey || e.metaKey || e.altKey) {
+    if (e.key === "z" && !e.target.matches("input[type=text], input[type=search]")) undo();
+    return;
+  }
+  if (e.target.matches("input[type=text], input[type=search], select")) return;
+  if (e.target.matches("#slider") && e.key.startsWith("Arrow")) return;
+  if (e.target.matches("button, summary, input[type=checkbox]") && e.key === " ") return;
+  if (document.querySelector("dialog[open]") && e.key !== "?") return;
+  const name = e.key === " " ? "Space" : e.key.length === 1 ? e.key.toLowerCase() : e.key;
+  const key = KEYS.find(([own]) => own === name);
+  if (!key || !renderer && !IN_2D.includes(name)) return;
+  e.preventDefault();
+  key[2]();
+});
+
+for (const id of ["reset", "top", "front"]) $(id).onclick = VIEWS[id];
+$("follow").onclick = () => setFollow(!state.follow);
+$("ride").onclick = () => setRide(!state.ride);
+$("measure").onclick = () => setMeasure(!state.measuring);
+$("help-button").onclick = () => $("help").showModal();
+$("play").onclick = play;
+$("slider").oninput = () => goTo(steps[+$("slider").value]);
+$("part").onchange = () => enter(+$("part").value);
+$("search").oninput = filterList;
+$("sort").onchange = fillList;
+for (const id of ["solids", "ellipsoids", "names", "points", "cameras", "grid", "boxes"]) {
+  $(id).onchange = redraw;
+}
+$("doubtful").onchange = () => {
+  if (state.selected?.status === "doubtful") select(state.selected);
+  filterList();
+  redraw();
+};
+$("help").append(el("h2", {}, "Keys, mouse, fingers"),
+  el("p", {}, "Drag turns; right button, shift or two fingers move; wheel or pinch zooms. A click "
+    + "on an object chooses it, a double click turns about it."),
+  el("dl", {}, ...KEYS.flatMap(([key, text]) => [el("dt", {}, el("kbd", {},
+    { ArrowLeft: "←", ArrowRight: "→", Escape: "Esc" }[key] || key)), el("dd", {}, text)])),
+  el("p", { className: "dim" }, "Sizes are width × depth × height, along the object's own axes "
+    + "(height is the upright one), rounded as their standard deviation allows."),
+  el("div", { className: "act" }, el("button", { className: "main",
+    onclick: () => $("help").close() }, "Close")));
+
+// ---- A click is a press and a release at one place ----
+let pressed = null;
+canvas.addEventListener("pointerdown", (e) => {
+  $("show").open = false;
+  pressed = pressed || !e.isPrimary ? null : { x: e.clientX, y: e.clientY };
+});
+canvas.addEventListener("pointermove", (e) => {
+  if (pressed && Math.hypot(e.clientX - pressed.x, e.clientY - pressed.y) > 6) pressed = null;
+});
+canvas.addEventListener("pointerup", (e) => {
+  if (!pressed || e.button !== 0) { pressed = null; return; }
+  pressed = null;
+  const { left, top } = canvas.getBoundingClientRect(), at = [e.clientX - left, e.clientY - top];
+  if (state.measuring) measureAt(...at); else select(pick(...at));
+});
+canvas.addEventListener("dblclick", () => lookAt(state.selected));
+addEventListener("resize", redraw);
+dark.addEventListener("change", () => {
+  if (!renderer) return;
+  fillScene();
+  redraw();
+});
+
+// ---- Start ----
+document.title = $("title").textContent = `${S.title}: ${S.objects.filter(
+  (o) => o.status !== "doubtful").length} objects`
+  + (S.parts.length > 1 ? ` in ${S.parts.length} parts` : "");
+$("part").append(...S.parts.map(({ name }, value) => el("option", { value }, name)));
+$("part").hidden = S.parts.length < 2;
+$("doubtful").checked = S.doubtful;
+$("doubtful-label").hidden = !S.objects.some((o) => o.status === "doubtful");
+objects = S.objects.map((o) => ({ ...o, ids: [o.id] }));
+if (S.why_flat || !prepare()) {
+  document.body.classList.add("flat");
+  $("view").prepend(el("p", { id: "why" }, `No 3D view: ${S.why_flat || "no WebGL here"}. Below: `
+    + "when each identity is seen; click one for its pictures."));
+}
+for (const id of ["follow", "ride", "measure"]) press(id, false);
+enter(0);
+fillEdits();

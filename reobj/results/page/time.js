@@ -1,0 +1,105 @@
+// Time: the slider, play, the frames of the video, Follow and Ride along.
+const frameOf = (step) => S.steps.frame[step];
+const pictured = () => S.thumbs.map(([frame]) => S.steps.frame.indexOf(frame))
+  .filter((step) => S.steps.part[step] === state.part && cams[step]);
+
+function pictureAt(step) {                       // [frame, picture, boxes]: the last one until then
+  const first = frameOf(steps[0]);
+  return S.thumbs.findLast(([frame]) => first <= frame && frame <= frameOf(step));
+}
+
+function boxesOf(thumb) {                        // detections of a frame, in its pixels
+  return thumb[2].map(([id, x1, y1, x2, y2]) => [objects.find((o) => o.ids.includes(id)),
+    { x: x1, y: y1, width: x2 - x1, height: y2 - y1 }]).filter(([o]) => o)
+    .map(([o, box]) => svg("rect", { class: "box", ...box, stroke: rgb(o) }));
+}
+
+function goTo(step) {
+  if (S.steps.part[step] !== state.part) enter(S.steps.part[step]);
+  if (state.ride && pictured().length) {         // only frames with a picture show whether it fits
+    const gap = (s) => Math.abs(s - step);
+    step = pictured().reduce((a, b) => gap(b) < gap(a) ? b : a);
+  }
+  const before = cams[state.step], after = cams[step];
+  state.step = step;
+  $("slider").value = steps.indexOf(step);
+  const thumb = pictureAt(step), [first, last] = [steps[0], steps.at(-1)].map(frameOf);
+  $("clock").textContent = `frame ${frameOf(step)}`
+    + (after || S.why_flat ? "" : " (no pose)");
+  $("frame").hidden = !thumb;
+  if (thumb) {
+    $("frame").querySelector("img").src = picture(thumb[1]);
+    const drawing = $("frame").querySelector("svg");
+    const size = S.camera || S.size;
+    drawing.setAttribute("viewBox", `0 0 ${size.width} ${size.height}`);
+    drawing.replaceChildren(...boxesOf(thumb).map((box) => { box.style.strokeDasharray = "none";
+      return box; }));
+  }
+  $("list").style.setProperty("--now", `${100 * (frameOf(step) - first) / (last - first + 1)}%`);
+  here.forEach((o) => o.row.classList.toggle("now", seenAt(o, step)));
+  if (state.follow && after && !state.ride) followTo(before, after);
+  redraw();
+}
+
+// ---- Play ----
+let playing = null;
+function onward(by = 1) {
+  const list = state.ride && pictured().length ? pictured() : steps;
+  const at = list.findLastIndex((step) => step <= state.step);
+  goTo(list[(at + by + list.length) % list.length]);
+}
+function play() {
+  $("play").textContent = playing ? "▶" : "⏸";
+  if (playing) { playing = clearInterval(playing); return; }
+  const stride = state.ride ? Math.max(1, steps.length / Math.max(pictured().length, 1)) : 1;
+  playing = setInterval(onward, S.steps.seconds * 1000 * stride);
+}
+
+// ---- Follow: the moving camera stays in view, and one turns with it ----
+const yawOf = (cam) => Math.atan2(cam.forward[1], cam.forward[0]);
+function followTo(before, after) {
+  const offset = orbit.position.clone().sub(controls.target);
+  if (before) offset.applyAxisAngle(orbit.up, yawOf(after) - yawOf(before));
+  controls.target.set(...add(after.at, after.forward, room.radius / 4));
+  orbit.position.copy(controls.target).add(offset);
+  controls.update();
+}
+function setFollow(on) {
+  state.follow = on;
+  press("follow", on);
+  if (!on) return;
+  setRide(false);
+  if (state.step < 0 || !cams[state.step]) goTo(steps.find((step) => cams[step]) ?? steps[0]);
+  const cam = cams[state.step];
+  if (!cam) return;
+  const back = unit([-cam.forward[0], -cam.forward[1], 0.55]);
+  controls.target.set(...add(cam.at, cam.forward, room.radius / 4));
+  orbit.position.copy(controls.target).add(V.set(...times(back, 0.9 * room.radius)));
+  controls.update();
+}
+
+// ---- Ride along: the video frame behind the solids, seen from its own camera ----
+function setRide(on) {
+  if (Boolean(state.ride) === on) return;
+  state.ride = on;
+  press("ride", on);
+  if (on) setFollow(false);
+  if (playing) { play(); play(); }               // at the pace of the pictures
+  document.body.classList.toggle("riding", on);
+  if (on) goTo(Math.max(state.step, steps[0]));
+  redraw();
+}
+
+function placePicture(inside) {
+  const thumb = inside && pictureAt(state.step), back = $("back");
+  back.hidden = !thumb || thumb[0] !== frameOf(state.step);
+  $("drawn").querySelectorAll(".box").forEach((box) => box.remove());
+  if (back.hidden) return;
+  const { scale, x, y } = pictureRect(), { width, height } = S.camera;
+  if (back.dataset.frame !== String(thumb[0])) back.src = picture(thumb[1]);
+  back.dataset.frame = thumb[0];
+  Object.assign(back.style, { left: `${x}px`, top: `${y}px`, width: `${width * scale}px`,
+    height: `${height * scale}px` });
+  if ($("boxes").checked) $("drawn").append(...boxesOf(thumb).map((box) => {
+    box.setAttribute("transform", `translate(${x} ${y}) scale(${scale})`); return box; }));
+}
