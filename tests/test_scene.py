@@ -640,6 +640,7 @@ def test_corrections_made_in_the_page_are_applied(
         "rename", "delete", "split"
     ]  # fmt: skip
     assert complaints(browser) == []
+    browser.click(700, 780)  # else the browser does not ask
     before = browser.asked
     browser.open(out / "scene.html")  # unsaved corrections: the browser asks
     assert browser.asked == before + 1
