@@ -496,7 +496,7 @@ def test_a_distance_has_the_sigma_of_both_ends_and_of_the_scale(
     assert [number for _, number in ends] == [1, 3]
     rows = np.array(browser.eval("level.rows"))  # level from world; both in metres here
     height = browser.eval("level.height")
-    places = [(np.array(at) + [0, 0, height]) @ rows for at, _ in ends]
+    places = [(np.array(at) + np.array([0, 0, height])) @ rows for at, _ in ends]
     along = (places[1] - places[0]) / np.linalg.norm(places[1] - places[0])
     variance = (0.1 * np.linalg.norm(places[1] - places[0])) ** 2
     for place, (_, number) in zip(places, ends, strict=True):
@@ -557,7 +557,7 @@ def test_decimals_are_the_same_in_both_languages(
 def test_the_list_says_names_and_sizes_and_can_be_searched(browser: Browser, page: Path) -> None:
     browser.open(page)
     objects = data_of(page)["objects"]
-    sides = " × ".join(side for side, _ in objects[0]["sides"])
+    sides = " \u00d7 ".join(side for side, _ in objects[0]["sides"])
     mark = "≈ " if objects[0]["status"] == "prior_dominated" else ""
     first = browser.eval("here[0].row.innerText").strip()
     assert first == f"chair 1 · {mark}{sides} m"

@@ -184,37 +184,34 @@ def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> E
     for number, edit in enumerate(edits.edits, 1):
         where = f"{edits.path}, edit {number} ({edit.text})"
         try:
-            made.make(edit, where)
+            made.make(edit)
         except LookupError as error:
             hint = "were these edits made for another result? make them anew in scene.html"
             raise ReobjError(f"{where}: {error.args[0]}; {hint}") from error
-    count = len(edits.edits)
-    if count:
-        text = f"{count} correction{'s' * (count != 1)} by hand applied ({EDITS})"
-        made.messages.append(text)
+    keep, messages = made.without_duplicates(str(edits.path))
+    if (count := len(edits.edits)) > 0:
+        messages.append(f"{count} correction{'s' * (count != 1)} by hand applied ({EDITS})")
     table = dataclasses.replace(tracks, track_id=made.identity, class_id=made.class_id)
-    confirmed = made.confirmed & set(made.identity[made.keep].tolist())
-    return Edited(table, made.keep, tuple(made.names), confirmed, made.messages)
+    confirmed = made.confirmed & set(made.identity[keep].tolist())
+    return Edited(table, keep, tuple(made.names), confirmed, messages)
 
 
 SAME_BOX_IOU = 0.9  # chosen: a box rounded to .1 px, 10 px wide, overlaps itself by .98
 
 
 class _Tables:
-    """Columns of tracks while edits change them."""
+    """Columns of tracks while edits change them; deleted rows have identity 0."""
 
     def __init__(self, tracks: Tracks, class_names: tuple[str, ...]) -> None:
         self.tracks, self.names = tracks, list(class_names)
         self.identity, self.class_id = tracks.track_id.copy(), tracks.class_id.copy()  # (N,)
-        self.keep = np.ones(len(tracks), bool)
         self.confirmed: set[int] = set()
-        self.messages: list[str] = []
 
-    def make(self, edit: Edit, where: str) -> None:
+    def make(self, edit: Edit) -> None:
         """Make one edit; LookupError where it finds nothing."""
         own = int(self.identity[self._row_of(edit.object)])
         if edit.do == "delete":
-            self.keep &= self.identity != own
+            self.identity[self.identity == own] = 0
         elif edit.do == "rename":
             if edit.class_name not in self.names:
                 self.names.append(edit.class_name)
@@ -222,12 +219,14 @@ class _Tables:
             self.confirmed.add(own)
         elif edit.do == "split":
             self._split(own, edit.visits)
-        elif edit.other is not None:
-            self._merge(own, int(self.identity[self._row_of(edit.other)]), where)
+        elif edit.other is not None:  # merge; one already where the linker sees it by itself now
+            kept, gone = sorted((own, int(self.identity[self._row_of(edit.other)])))
+            self.identity[self.identity == gone] = kept
+            self.confirmed.add(kept)
 
     def _row_of(self, ref: BoxRef) -> int:
         """Find the row of a box; of several alike, that of the identity named, then the nearest."""
-        rows = np.flatnonzero(self.keep & (self.tracks.frame == ref.frame))
+        rows = np.flatnonzero((self.identity > 0) & (self.tracks.frame == ref.frame))
         iou: Array = box_iou(self.tracks.xyxy[rows], np.array([ref.box]))[:, 0]  # (n,)
         rows, iou = rows[iou >= SAME_BOX_IOU], iou[iou >= SAME_BOX_IOU]
         if not len(rows):
@@ -235,25 +234,29 @@ class _Tables:
             raise LookupError(f"no object has the box {box} in frame {ref.frame}")
         return int(rows[np.lexsort((-iou, self.identity[rows] != ref.id))[0]])
 
-    def _merge(self, first: int, second: int, where: str) -> None:
-        kept, gone = sorted((first, second))
-        self.confirmed |= {kept}
-        if kept == gone:  # the linker has come to see it by itself
-            return
-        rows: IntArray = np.flatnonzero(self.keep & np.isin(self.identity, [kept, gone]))
-        rows = rows[np.lexsort((self.identity[rows], -self.tracks.score[rows]))]
-        best = rows[np.unique(self.tracks.frame[rows], return_index=True)[1]]
-        self.identity[rows] = kept
-        self.keep[np.setdiff1d(rows, best)] = False
-        if (both := len(rows) - len(best)) > 0:
-            plural = f"{both} frame{'s' * (both != 1)}"
-            self.messages.append(f"{where}: both are seen in {plural}; the weaker box is left out")
-
     def _split(self, own: int, visits: tuple[BoxRef, ...]) -> None:
         found = [row for visit in visits if self.identity[row := self._row_of(visit)] == own]
         pieces = self.tracks.tracklet_id[np.array(found, np.int64)]
-        off = self.keep & (self.identity == own) & np.isin(self.tracks.tracklet_id, pieces)
-        if not (self.keep & (self.identity == own) & ~off).any():
+        off = (self.identity == own) & np.isin(self.tracks.tracklet_id, pieces)
+        if not ((self.identity == own) & ~off).any():
             raise LookupError("these are all visits of the object")
         if off.any():  # else it is apart already
-            self.identity[off] = self.identity[self.keep].max() + 1
+            self.identity[off] = self.identity.max() + 1
+
+    def without_duplicates(self, where: str) -> tuple[BoolArray, list[str]]:
+        """Choose the rows (N,) that stay: of one object's boxes in a frame the best scored one.
+
+        Returns:
+            also what to say about the others.
+        """
+        keep, messages = self.identity > 0, list[str]()
+        for number in np.unique(self.identity[keep]).tolist():
+            rows: IntArray = np.flatnonzero(self.identity == number)
+            rows = rows[np.argsort(-self.tracks.score[rows], kind="stable")]
+            best = rows[np.unique(self.tracks.frame[rows], return_index=True)[1]]
+            keep[np.setdiff1d(rows, best)] = False
+            if (both := len(rows) - len(best)) > 0:
+                frames = f"{both} frame{'s' * (both != 1)}"
+                text = f"what is now object {number} is seen twice in {frames}"
+                messages.append(f"{where}: {text}; the weaker box is left out")
+        return keep, messages

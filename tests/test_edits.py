@@ -1,0 +1,290 @@
+"""Corrections by hand: the file, what it makes of tracks, and `objects OUT --edits`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import SIZE, tracks_of, unlinked, walk, with_columns
+
+import reobj_track as rt
+from reobj.parts import link_and_fit
+from reobj.results.edits import EDITS, apply_edits, kept_edits, read_edits
+from reobj.results.workspace import Workspace
+
+NAMES = ("chair", "cup")
+
+
+def table() -> rt.Tracks:
+    """Objects 1 to 3 in ten frames each, 20 px apart; object 2 in two visits, 3 in three."""
+    rows = []
+    for obj in (1, 2, 3):
+        for frame in range(10):
+            tracklet = 10 * obj + (obj > 1) * (frame > 4) + (obj > 2) * (frame > 7)
+            rows.append([frame, obj, tracklet, 20.0 * obj + frame, 0.5 + 0.1 * obj])
+    frame, obj, tracklet, x, score = np.array(sorted(rows)).T
+    box = np.column_stack([x, x, x + 18, x + 18])
+    ints = (a.astype(np.int64) for a in (frame, obj, tracklet))
+    zero = np.zeros(len(x), np.int64)
+    return rt.Tracks(*ints, box, score, zero, zero)
+
+
+def ref(obj: int, frame: int, named: int | None = None) -> dict[str, Any]:
+    """What the page writes: a box, rounded; the id that the object has there."""
+    x = 20.04 * obj + frame
+    return {"id": named or obj, "frame": frame, "box": [x, x, x + 18, x + 18]}
+
+
+def write(path: Path, *edits: dict[str, Any], **more: Any) -> Path:
+    path.write_text(json.dumps({"format": "reobj-edits", "version": 1, "edits": edits, **more}))
+    return path
+
+
+def applied(tmp_path: Path, *edits: dict[str, Any], tracks: rt.Tracks | None = None) -> Any:
+    path = write(tmp_path / "e.json", *edits)
+    return apply_edits(table() if tracks is None else tracks, NAMES, read_edits(path))
+
+
+def members(made: Any) -> dict[int, set[int]]:
+    """Tracklets of each object that is left."""
+    kept = made.tracks[made.keep]
+    return {int(i): set(kept.tracklet_id[kept.track_id == i].tolist()) for i in set(kept.track_id)}
+
+
+ALL = {1: {10}, 2: {20, 21}, 3: {30, 31, 32}}
+MERGE = {"do": "merge", "object": ref(3, 4), "with": ref(1, 9)}
+SPLIT = {"do": "split", "object": ref(3, 2), "visits": [ref(3, 6), ref(3, 9)]}
+RENAME = {"do": "rename", "object": ref(2, 0), "class": "mug"}
+DELETE = {"do": "delete", "object": ref(2, 7)}
+
+
+@pytest.mark.parametrize(
+    ("edits", "left"),
+    [
+        ((), ALL),
+        ((DELETE,), {1: {10}, 3: {30, 31, 32}}),
+        ((SPLIT,), {1: {10}, 2: {20, 21}, 3: {30}, 4: {31, 32}}),
+        # the page's second edit names what the first one made
+        ((SPLIT, {"do": "merge", "object": ref(3, 6, 4), "with": ref(2, 6)}),
+         {1: {10}, 2: {20, 21, 31, 32} - {21}, 3: {30}}),
+        ((SPLIT, SPLIT), {1: {10}, 2: {20, 21}, 3: {30}, 4: {31, 32}}),  # it is apart already
+        ((MERGE, MERGE), {1: {30, 31, 32}, 2: {20, 21}}),  # and this is one already
+        ((MERGE, {**SPLIT, "object": ref(1, 3)}), {1: {10, 30}, 2: {20, 21}, 3: {31, 32}}),
+        ((DELETE, SPLIT), {1: {10}, 3: {30}, 4: {31, 32}}),
+    ],
+)  # fmt: skip
+def test_identities_after_edits(
+    tmp_path: Path, edits: tuple[dict[str, Any], ...], left: dict[int, set[int]]
+) -> None:
+    """Of two boxes in one frame the better scored one stays: those of higher numbers here."""
+    made = applied(tmp_path, *edits)
+    assert members(made) == left
+    frames = made.tracks[made.keep]
+    pairs = list(zip(frames.frame.tolist(), frames.track_id.tolist(), strict=True))
+    assert len(pairs) == len(set(pairs))
+
+
+def test_a_merge_says_that_both_were_seen_at_once(tmp_path: Path) -> None:
+    made = applied(tmp_path, MERGE)
+    assert "what is now object 1 is seen twice in 10 frames" in made.messages[0]
+    assert "1 correction by hand applied" in made.messages[1] and made.confirmed == {1}
+
+
+def test_a_new_class_joins_the_names(tmp_path: Path) -> None:
+    made = applied(tmp_path, RENAME, {"do": "rename", "object": ref(1, 3), "class": "cup"})
+    assert made.class_names == ("chair", "cup", "mug") and made.confirmed == {1, 2}
+    for obj, class_id in ((1, 1), (2, 2), (3, 0)):
+        assert set(made.tracks.class_id[made.tracks.track_id == obj]) == {class_id}
+
+
+def test_of_equal_boxes_that_of_the_number_counts(tmp_path: Path) -> None:
+    tracks = table()
+    tracks = with_columns(tracks, xyxy=np.tile([10.0, 10, 50, 50], (len(tracks), 1)))
+    for number in (1, 2, 3):
+        edit = {"do": "delete", "object": {"id": number, "frame": 4, "box": [10, 10, 50, 50]}}
+        assert set(members(applied(tmp_path, edit, tracks=tracks))) == {1, 2, 3} - {number}
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ({**DELETE, "object": ref(7, 2)}, "no object has the box 142.3"),
+        ({**DELETE, "object": ref(2, 77)}, "in frame 77"),
+        ({**SPLIT, "visits": [ref(3, 1), ref(3, 6), ref(3, 9)]}, "all visits of the object"),
+        ({**MERGE, "with": ref(1, 30)}, "edit 1 (merge 3 with 1)"),
+    ],
+)
+def test_what_is_not_found_is_said(tmp_path: Path, edit: dict[str, Any], said: str) -> None:
+    with pytest.raises(rt.ReobjError) as error:
+        applied(tmp_path, edit)
+    assert said in str(error.value) and "anew in scene.html" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[]", '"format": "reobj-edits"'),
+        ('{"format": "reobj-objects"}', "as scene.html saves it"),
+        ('{"format": "reobj-edits", "version": 2, "edits": []}', "version 2"),
+        ('{"format": "reobj-edits", "version": 1}', 'a list "edits"'),
+        ("{,", "line 1: not valid JSON"),
+        ([3], 'edit 1: .*"do": one of merge, split, rename, delete'),
+        ([{"do": "paint"}], '"do": one of merge'),
+        ([{"do": ["merge"]}], '"do": one of merge'),
+        ([DELETE, {"do": "delete"}], "edit 2: has ; expected object"),
+        ([{**DELETE, "why": 1}], "edit 1: has object, why"),
+        ([{**RENAME, "class": " "}], "class ' ' is no name"),
+        ([{**RENAME, "class": "a\nb"}], "cannot be printed"),
+        ([{**RENAME, "class": 3}], "class 3 is no name"),
+        ([{**SPLIT, "visits": []}], "visits is empty"),
+        ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3]}}], "is no box"),
+        ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3, "x"]}}], "edit 1"),
+        ([{**DELETE, "object": {"frame": 1.5, "box": [1, 2, 3, 4]}}], "whole numbers"),
+        ([{**DELETE, "object": {"box": [1, 2, 3, 4]}}], "edit 1: 'frame'"),
+        ([{**DELETE, "object": 6}], "edit 1"),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path: Path, text: Any, said: str) -> None:
+    path = tmp_path / "edits.json"
+    if isinstance(text, str):
+        path.write_text(text)
+    else:
+        write(path, *text)
+    with pytest.raises(rt.ReobjError, match=said) as error:
+        read_edits(path)
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+# ---- In an output folder ----
+
+
+@pytest.fixture
+def folder(parted_folder: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(parted_folder, tmp_path / "out")
+
+
+def box_of(out: Path, number: int) -> dict[str, Any]:
+    """The reference of an object in an output folder: its first box."""
+    rows = np.loadtxt(out / "tracks.txt", delimiter=",")
+    frame, _, x, y, w, h = rows[(rows[:, 1] == number) & (rows[:, 6] > 0)][0, :6]
+    return {"id": number, "frame": int(frame) - 1, "box": [x, y, x + w, y + h]}
+
+
+def listed(out: Path) -> list[tuple[int, str]]:
+    return [(o.id, o.class_name) for o in rt.Result.load(out).objects]
+
+
+def state(out: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+
+def test_edits_stay_with_the_folder(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    """A merge over the break of the cameras, a new name, a deletion; later fits keep them."""
+    before = rt.Result.load(folder)
+    path = write(
+        tmp_path / "e.json",
+        {"do": "merge", "object": box_of(folder, 1), "with": box_of(folder, 5)},
+        {"do": "rename", "object": box_of(folder, 2), "class": "stool"},
+        {"do": "delete", "object": box_of(folder, 6)},
+    )
+    assert rt.main(["objects", str(folder), "--edits", str(path)]) == 0
+    expected = [(1, "chair"), (2, "stool"), (3, "chair"), (4, "chair")]
+    result = rt.Result.load(folder)
+    assert listed(folder) == expected
+    assert len(result.objects[0].visits) == 2 and result.objects[0].part == 0
+    assert result.objects[1].confidence == 1.0
+    assert result.objects[2].confidence == before.objects[2].confidence
+    assert set(result.tracks.track_id) == {1, 2, 3, 4}
+    assert "3 corrections by hand applied" in capsys.readouterr().err
+    assert kept_edits(folder).entries == json.loads(path.read_text())["edits"]  # type: ignore[union-attr]
+    for options in ([], ["--support", "cylinder"]):
+        assert rt.main(["objects", str(folder), *options]) == 0
+        assert listed(folder) == expected
+        assert "3 corrections by hand applied" in capsys.readouterr().err
+    assert rt.main(["objects", str(folder), "--edits", str(write(path))]) == 0  # none any more
+    assert [o.id for o in rt.Result.load(folder).objects] == [1, 2, 3, 4, 5, 6]
+    assert not (folder / EDITS).exists()
+
+
+def test_the_same_edits_make_the_same_files(folder: Path, tmp_path: Path) -> None:
+    edit = {"do": "delete", "object": box_of(folder, 6)}
+    path = write(tmp_path / "e.json", edit)
+    made = []
+    for _ in range(2):
+        rt.refit(folder, edits=path)
+        made.append({k: v for k, v in state(folder).items() if k != "overlay.mp4"})
+    assert made[0] == made[1]
+
+
+@pytest.mark.parametrize("bad", ["missing", "no json", "no box"])
+def test_bad_edits_write_nothing(folder: Path, tmp_path: Path, capsys: Any, bad: str) -> None:
+    path = tmp_path / "e.json"
+    if bad == "no json":
+        path.write_text("x")
+    if bad == "no box":
+        lost = {"do": "delete", "object": {"id": 1, "frame": 3, "box": [0, 0, 5, 5]}}
+        write(path, lost)
+    before = state(folder)
+    assert rt.main(["objects", str(folder), "--edits", str(path)]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith(f"error: {path}")
+    assert state(folder) == before
+
+
+def test_edits_that_fit_no_more_are_left_out_with_a_warning(folder: Path, capsys: Any) -> None:
+    lost = {"do": "delete", "object": {"id": 1, "frame": 3, "box": [0, 0, 5, 5]}}
+    write(folder / EDITS, lost)
+    assert rt.main(["objects", str(folder)]) == 0
+    said = capsys.readouterr().err
+    assert "edit 1 (delete 1): no object has the box" in said
+    assert "no correction of this file was applied" in said
+    assert len(rt.Result.load(folder).objects) == 6 and (folder / EDITS).exists()
+    assert '"edits":[]' in (folder / "scene.html").read_text()
+
+
+def test_given_identities_replace_edits(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    path = write(tmp_path / "e.json", {"do": "delete", "object": box_of(folder, 6)})
+    both = ["objects", str(folder), "--tracks", str(folder / "tracks.txt"), "--edits", str(path)]
+    before = state(folder)
+    assert rt.main(both) == 2 and "one at a time" in capsys.readouterr().err
+    assert state(folder) == before
+    assert rt.main(["objects", str(folder), "--edits", str(path)]) == 0
+    shutil.copy(folder / "tracks.txt", tmp_path / "tracks.txt")
+    assert rt.main(["objects", str(folder), "--tracks", str(tmp_path / "tracks.txt")]) == 0
+    assert "edits.json removed" in capsys.readouterr().err
+    assert not (folder / EDITS).exists() and len(rt.Result.load(folder).objects) == 5
+    last = write(tmp_path / "e.json", {"do": "delete", "object": box_of(folder, 5)})
+    assert rt.main(["objects", str(folder), "--edits", str(last)]) == 0  # upon given identities
+    assert len(rt.Result.load(folder).objects) == 4
+
+
+def test_another_video_takes_no_edits_along(folder: Path, tmp_path: Path) -> None:
+    write(folder / EDITS)
+    (tmp_path / "frames").mkdir()
+    shutil.copy(Path(__file__).parent.parent / "docs/img/scene.jpg", tmp_path / "frames/0.jpg")
+    Workspace(folder).bind(rt.Video(tmp_path / "frames"), overwrite=True)
+    assert not (folder / EDITS).exists()
+
+
+def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
+    """Of a deleted object they are gone; the others lie at their rows."""
+    poses = walk()
+    tracks = tracks_of(poses)
+    result = unlinked(poses, tracks)
+    rows = np.arange(0, len(tracks), 4)
+    result.embedding_row = rows
+    vectors = np.random.default_rng(0).normal(size=(len(rows), 8)).astype(np.float16)
+    result.embeddings = rt.Embeddings(vectors, vectors[:, :0])
+    box = tracks.xyxy[tracks.track_id == 2][0].tolist()
+    edit = {"do": "delete", "object": {"id": 2, "frame": 0, "box": box}}
+    result.edits = read_edits(write(tmp_path / "e.json", edit))
+    link_and_fit(result, rt.ObjectsConfig(link=False))
+    kept = tracks.track_id[rows] != 2
+    assert len(result.tracks) == 80 and SIZE == (640, 480)
+    np.testing.assert_array_equal(result.embeddings.foreground, vectors[kept])
+    np.testing.assert_array_equal(result.tracks.xyxy[result.embedding_row], tracks.xyxy[rows[kept]])
