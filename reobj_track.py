@@ -187,7 +187,7 @@ class OutputConfig:
     overlay: bool = option(True, "write overlay.mp4")
     scene: bool = option(True, "write scene.html")
     doubtful: bool = option(
-        False, "show doubtful objects too: in tracks.txt, on the page, in overlay.mp4"
+        False, "show doubtful objects too: in tracks.txt, in overlay.mp4, on the page at first"
     )
     fill_gaps: int = option(
         5,
@@ -1042,9 +1042,7 @@ def refit(
 ) -> Result:
     """Link and fit again from what an output folder holds.
 
-    Args:
-        tracks: file of identities instead. edits: file of corrections by hand, which replaces those
-            that the folder keeps.
+    tracks: file of identities instead; edits: of corrections by hand, instead of those kept there.
     """
     if tracks and edits:
         raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")

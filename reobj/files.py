@@ -265,6 +265,16 @@ def decimals(sigma: float) -> int:
     return max(0, math.ceil(-math.log10(sigma))) if 0 < sigma < math.inf else 2
 
 
+def texts_with_sigma(values: Array, sigma: Array) -> list[tuple[str, str]]:
+    """Write values (N,) and their sigmas with the decimals that the best known of them is worth.
+
+    >>> texts_with_sigma(np.array([0.444, 0.5]), np.array([0.05, 0.2]))
+    [('0.44', '0.05'), ('0.50', '0.20')]
+    """
+    digits = decimals(float(np.min(sigma)))
+    return [(f"{a:.{digits}f}", f"{b:.{digits}f}") for a, b in zip(values, sigma, strict=True)]
+
+
 def numbers(values: Array) -> list[float]:
     """Round to six significant digits, for JSON: far below any accuracy, and stable text."""
     return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]

@@ -27,6 +27,7 @@ import reobj.objects
 import reobj.poses.estimate as estimate
 import reobj.poses.mapping as mapping
 import reobj.poses.stage as stage
+import reobj.results.scene as scene
 import reobj.sources.detectors as detectors
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
@@ -841,15 +842,20 @@ def _(lab: Lab) -> None:
 
 @shows("output.doubtful")
 def _(lab: Lab) -> None:
-    """Nothing is likelier than 1.1: all are in the file, and shown if asked for."""
+    """Nothing is likelier than 1.1: all are in the file and the page; in the film if asked for."""
     for value, count in ((False, 0), (True, 2)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(reobj.objects, "DOUBTFUL", 1.1)
             shown = Mock()
             patch.setattr(rt, "write_pictures", shown)
             assert {found.status for found in lab.refit(value).objects} == {"doubtful"}
-        (result, *_), _ = shown.call_args
-        assert len(result.objects) == len(np.unique(result.tracks.track_id)) == count
+        result, out, video, *_, doubtful = shown.call_args[0]
+        assert len(result.objects) == 2 and doubtful == value
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(scene, "Overlay", film := Mock())
+            patch.setattr(scene, "write_scene", page := Mock())
+            scene.write_pictures(result, out, video, doubtful=doubtful)
+        assert len(film.call_args[0][0].objects) == count and page.call_args[0][-1] == value
 
 
 @shows("output.fill_gaps")

@@ -14,7 +14,15 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 ROOM = ROOT / "examples" / "room"
 BESIDE = ("priors.json", "quadrics.py", "reobj_track.py")  # in site-packages, as in the repository
-DATA = ("*.onnx", "*.html", "*.json", "py.typed")  # of the package, besides its modules
+DATA = (
+    "*.onnx",
+    "*.html",
+    "*.css",
+    "*.js",
+    "*.txt",
+    "*.json",
+    "py.typed",
+)  # of the package, besides its modules
 
 PROGRAM = """\
 import quadrics

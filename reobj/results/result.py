@@ -25,7 +25,6 @@ from reobj import __version__
 from reobj.cameras import Poses, load_poses, save_poses, write_tum
 from reobj.files import (
     atomic,
-    decimals,
     load_json,
     load_npz,
     numbers,
@@ -34,6 +33,7 @@ from reobj.files import (
     rounded,
     save_npz,
     shortened,
+    texts_with_sigma,
     without_secrets,
 )
 from reobj.poses.floor import Floor
@@ -41,15 +41,7 @@ from reobj.results.edits import Edits, write_edits
 from reobj.results.ply import write_ply
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
-from reobj.types import (
-    Array,
-    Embeddings,
-    Floats,
-    IntArray,
-    LinkEvent,
-    ReobjError,
-    Tracks,
-)
+from reobj.types import Array, Embeddings, Floats, IntArray, LinkEvent, ReobjError, Tracks
 
 FORMAT = "reobj-objects"
 FORMAT_VERSION = 1  # of objects.json
@@ -123,17 +115,11 @@ class Object:
 
     @property
     def sides(self) -> list[tuple[str, str]]:
-        """Width, depth and height and their sigmas as text; [] if unknown.
-
-        In metres where the scale is known, along the object's own axes x, y, z (z is upwards), with
-        as many decimals as the best known of the three is worth.
-        """
+        """Width, depth, height (own axes x, y, z) and sigmas as text, m or units; [] if unknown."""
         size = self.size if self.size_m is None else self.size_m
         if size is None or self.size_rel_sigma is None:
             return []
-        sigma = size * self.size_rel_sigma
-        digits = decimals(float(sigma.min()))
-        return [(f"{a:.{digits}f}", f"{b:.{digits}f}") for a, b in zip(size, sigma, strict=True)]
+        return texts_with_sigma(size, size * self.size_rel_sigma)
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of objects.json."""
@@ -472,9 +458,8 @@ class Result:
         sizes = f"{'width x depth x height, ' + ('m' if scaled else 'units'):<26} {'sigma':>6}  "
         lines = [f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  {sizes * sized}status"]
         for o in counted:
-            size = o.size if o.size_m is None else o.size_m
             text = " x ".join(side for side, _ in o.sides) or "-"
-            text += " units" if scaled and size is not None and o.size_m is None else ""
+            text += " units" if scaled and o.sides and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "
             reason = f" ({o.reason})" if o.reason else ""
