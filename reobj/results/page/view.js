@@ -68,7 +68,7 @@ function solidOf(o) {                            // group of an object: faces, e
   group.parts = {
     faces: new THREE.Mesh(FACES[o.support], pale(0.06)),
     ellipsoid: new THREE.Mesh(FACES.ellipsoid, pale(0.16)),
-    halo: new THREE.LineSegments2(wire, lineOf(css("--halo"), 7)),
+    halo: new THREE.LineSegments2(wire, lineOf(css("--halo"), 6)),
     wire: new THREE.LineSegments2(wire, lineOf(ink, 1.8,
       doubt ? { dashed: true, dashSize: 0.12, gapSize: 0.1 } : {})),
   };
@@ -279,7 +279,7 @@ function draw() {
     ellipsoid.visible = $("ellipsoids").checked || !$("solids").checked;
     halo.visible = chosen;
     wire.material.opacity = lit ? 1 : 0.35;
-    wire.material.linewidth = chosen ? 3 : inside ? 2.4 : 1.8;
+    wire.material.linewidth = chosen ? 2.4 : inside ? 2.4 : 1.8;
     faces.material.opacity = lit && !inside ? 0.06 : 0.02;
     ellipsoid.material.opacity = (lit ? 0.16 : 0.05) * (inside ? 0.6 : 1);
   }
