@@ -355,5 +355,5 @@ def parts_message(poses: Poses) -> list[str]:
         f"the cameras come in {len(parts)} parts that do not connect ({where}): each has its own "
         "frame and scale, and what is seen in two parts is listed as two objects. A recording that "
         "overlaps more, with slower turns, or --poses gives one part; identities can be joined by "
-        "hand (`export OUT --to cvat`, `objects OUT --tracks`)"
+        "hand (in scene.html, then `objects OUT --edits`)"
     ]

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from simulated import SIZE, tracks_of, unlinked, walk, with_columns
@@ -266,7 +267,7 @@ def test_given_identities_replace_edits(folder: Path, tmp_path: Path, capsys: An
 def test_another_video_takes_no_edits_along(folder: Path, tmp_path: Path) -> None:
     write(folder / EDITS)
     (tmp_path / "frames").mkdir()
-    shutil.copy(Path(__file__).parent.parent / "docs/img/scene.jpg", tmp_path / "frames/0.jpg")
+    cv2.imwrite(str(tmp_path / "frames/0.png"), np.zeros((48, 64, 3), np.uint8))
     Workspace(folder).bind(rt.Video(tmp_path / "frames"), overwrite=True)
     assert not (folder / EDITS).exists()
 

@@ -328,7 +328,7 @@ def test_up_of_the_poses_is_that_of_the_largest_part() -> None:
 def test_the_message_says_what_it_means_and_what_helps() -> None:
     (text,) = parts_message(two_parts())
     for words in ("2 parts", "part 0: frames 0-39", "part 1: frames 40-63", "own frame and scale",
-                  "two objects", "overlaps more", "--poses", "--to cvat"):  # fmt: skip
+                  "two objects", "overlaps more", "--poses", "objects OUT --edits"):  # fmt: skip
         assert words in text
 
 

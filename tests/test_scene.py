@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from simulated import fitted, into_part, tracks_of, walk, with_columns
 
 import quadrics
+import reobj.results.scene as scene
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import decimals
@@ -198,7 +199,7 @@ def poses_of_walk() -> rt.Poses:
     cam_from_world[5] = np.nan
     rng = np.random.default_rng(0)
     return rt.Poses(
-        camera=rt.Camera("PINHOLE", WIDTH, HEIGHT, (250.0, 250.0, WIDTH / 2, HEIGHT / 2)),
+        camera=rt.Camera("PINHOLE", WIDTH, HEIGHT, (250.0, 250.0, WIDTH / 2 + 10, HEIGHT / 2 - 8)),
         frame=np.arange(FRAMES),
         time_s=np.arange(FRAMES) / 25,
         cam_from_world=cam_from_world,
@@ -347,7 +348,7 @@ def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
     assert browser.eval(seen) == [1, 3, 4]
     browser.eval("goTo(5)")
     assert browser.eval("$('clock').textContent") == "frame 5 (no pose)"
-    browser.eval("$('play').click()")
+    browser.eval("S.steps.seconds = .2; $('play').click()")
     moved = "new Promise(f => setInterval(() => state.step !== 5 && f(state.step), 20))"
     assert browser.eval(moved) == 6
     browser.eval("$('play').click()")
@@ -389,6 +390,19 @@ def test_wires_are_the_solids(browser: Browser, page: Path) -> None:
             }})(solid.find(o => o.id === {obj["id"]}))""")
         shift = np.array([scale["x"], scale["y"]] * 2)
         np.testing.assert_allclose((np.array(found) - shift) / scale["scale"], true, atol=0.6)
+
+
+def test_a_box_has_twelve_edges_along_its_axes(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    ends = np.array(browser.eval("EDGES.box")).reshape(-1, 2, 3)
+    assert len(ends) == len({tuple(sorted(map(tuple, e))) for e in ends.tolist()}) == 12
+    assert (np.abs(ends) == 1).all() and ((ends[:, 0] != ends[:, 1]).sum(1) == 1).all()
+    for kind in ("cylinder", "ellipsoid"):
+        around = np.array(browser.eval(f"EDGES.{kind}")).reshape(-1, 3)
+        radius = (
+            np.hypot(*around[:, :2].T) if kind == "cylinder" else np.linalg.norm(around, axis=1)
+        )
+        np.testing.assert_allclose(radius, 1)
 
 
 def test_riding_along_shows_the_frame_of_the_camera(browser: Browser, page: Path) -> None:
@@ -448,11 +462,17 @@ def test_keys(browser: Browser, page: Path) -> None:
 def test_the_followed_camera_stays_in_view(browser: Browser, page: Path) -> None:
     browser.open(page)
     browser.eval("setFollow(true)")
+    from_behind = set()
     for step in (2, 12, 22):
         browser.eval(f"goTo({step})")
+        turned = browser.eval(f"""((a, b) => (a - b + 9.5 * Math.PI) % (2 * Math.PI))(yawOf(
+            {{ forward: orbit.position.clone().sub(controls.target).toArray() }}),
+            yawOf(cams[{step}]))""")
+        from_behind.add(round(turned, 6))
         x, y, _ = browser.eval(f"project(cams[{step}].at)")
         width, height = browser.eval("[canvas.clientWidth, canvas.clientHeight]")
         assert 0.2 * width < x < 0.8 * width and 0.1 * height < y < 0.9 * height
+    assert len(from_behind) == 1  # it turns with the camera
 
 
 def test_first_sight_is_framed_by_points_and_path(browser: Browser, page: Path) -> None:
@@ -812,7 +832,7 @@ def test_the_page_holds_the_scene(page: Path) -> None:
     cov = np.frombuffer(base64.b64decode(data["objects"][0]["cov"]), "<f4").reshape(9, 9)
     assert (np.diag(cov) > 0).all() and data["objects"][3]["cov"] == data["why_flat"] == ""
     assert data["camera"] == {"width": 320, "height": 240, "fx": 250, "fy": 250,
-                              "cx": 160, "cy": 120}  # fmt: skip
+                              "cx": 170, "cy": 112}  # fmt: skip
     assert 0.02 < part["point_sigma"] < 0.1 and "floor" not in part  # too few points for a floor
 
 
@@ -966,6 +986,15 @@ def test_the_best_picture_comes_first() -> None:
     assert diverse_rows(tracks, found, None, 3)[0] == own[7]
     weak = with_columns(tracks, score=np.where(np.arange(len(tracks)) == own[7], 0.01, 0.9))
     assert diverse_rows(weak, found, None, 3)[0] != own[7]
+
+
+def test_doubtful_objects_take_no_pictures_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
+    result.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in result.objects[:2]]
+    monkeypatch.setattr(scene, "SCENE_MAX_CROPS", 18)
+    pictures = Pictures(result, VIDEO)
+    of = result.tracks.track_id[pictures.wanted]
+    assert np.bincount(of, minlength=5).tolist() == [0, 1, 1, 8, 8]
 
 
 def test_pictures_are_cut_of_wanted_frames_only() -> None:

@@ -50,23 +50,21 @@ class Pictures:
         self.tracks, self.scale = result.tracks, video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
-        count = SCENE_MAX_CROPS // max(len(result.objects), 1)
-        count = min(max(count, 1), SCENE_CROPS)
-        ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         poses = [part.poses for part in result.parts()]
-        chosen = {
-            o.id: diverse_rows(result.tracks, o, poses[o.part], count)
-            for o in ranked[:SCENE_MAX_CROPS]
-        }
-        self.wanted = np.sort(np.concatenate([*chosen.values(), np.empty(0, np.int64)]))
+        chosen, left = [np.empty(0, np.int64)], SCENE_MAX_CROPS
+        ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
+        for doubtful in (False, True):  # what is left of the pictures is for these
+            group = [o for o in ranked if (o.status == "doubtful") == doubtful]
+            count = min(max(left // max(len(group), 1), 1), SCENE_CROPS)
+            rows = [diverse_rows(result.tracks, o, poses[o.part], count) for o in group[:left]]
+            chosen, left = chosen + rows, left - sum(map(len, rows))
+        self.wanted = np.sort(np.concatenate(chosen))
         shown, cameras = scene_steps(result), result.poses
         if cameras is not None and cameras.known.any():
             shown = shown[cameras.known[np.searchsorted(cameras.frame, shown)]]
         self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
         self.camera = None if cameras is None else cameras.camera
-        self.grid: npt.NDArray[np.float32] | None = (
-            None  # of the undistorted picture in the small one
-        )
+        self.grid: npt.NDArray[np.float32] | None = None  # of undistorted pixels, made once
 
     def take(self, frame: Frame) -> None:
         """Cut the wanted boxes from this frame, and keep it if it is wanted as a whole."""
@@ -108,9 +106,8 @@ def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.f
 
 def _webp(image: Image, size_px: int) -> str:
     """Encode a small WebP picture as base64."""
-    data = cv2.imencode(".webp", shrunk(image, size_px), [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])[
-        1
-    ]
+    quality = [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY]
+    data = cv2.imencode(".webp", shrunk(image, size_px), quality)[1]
     return base64.b64encode(data.tobytes()).decode()
 
 
