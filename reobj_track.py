@@ -1040,10 +1040,7 @@ def refit(
     tracks: str | Path | None = None,
     edits: str | Path | None = None,
 ) -> Result:
-    """Link and fit again from what an output folder holds.
-
-    tracks: file of identities instead; edits: of corrections by hand, instead of those kept there.
-    """
+    """Link and fit again what a folder holds; tracks: other identities; edits: corrections."""
     if tracks and edits:
         raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")
     workspace = Workspace.open(out)

@@ -16,7 +16,7 @@ from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_co
 import quadrics
 import reobj_track as rt
 from reobj.results.ply import write_ply
-from reobj.results.result import VideoInfo, validate_objects, write_mot
+from reobj.results.result import VideoInfo, sides, validate_objects, write_mot
 
 
 def copy_of(result: rt.Result, **changes: object) -> rt.Result:
@@ -231,7 +231,7 @@ def test_summary_is_the_table_that_run_prints(chairs: rt.Result, saved: Path) ->
         chairs.objects[2], status="rejected", reason="too far", size=None, size_m=None,
         size_rel_sigma=None)]  # fmt: skip
     text = result.summary()
-    (w, d, h), size = (side for side, _ in chairs.objects[0].sides), chairs.objects[0].size_m
+    (w, d, h), size = (side for side, _ in sides(chairs.objects[0])), chairs.objects[0].size_m
     assert re.search(rf"1  chair +40 +1 +{w} x {d} x {h} +\d+ %  ok$", text, re.M)
     assert size is not None and np.allclose([float(w), float(d), float(h)], size, atol=0.0051)
     assert re.search(r"3  chair +40 +1 +- +-  rejected \(too far\)$", text, re.M)
@@ -245,10 +245,10 @@ def test_sizes_have_the_decimals_that_the_best_known_side_is_worth(chairs: rt.Re
         chairs.objects[0], size=np.array([4.1234, 2.0, 1.0]), size_m=np.array([0.41234, 0.2, 0.1]),
         size_rel_sigma=np.array([0.1, 0.3, 0.6]),
     )  # fmt: skip
-    assert found.sides == [("0.41", "0.04"), ("0.20", "0.06"), ("0.10", "0.06")]
+    assert sides(found) == [("0.41", "0.04"), ("0.20", "0.06"), ("0.10", "0.06")]
     units = dataclasses.replace(found, size_m=None)  # of arbitrary length
-    assert units.sides == [("4.1", "0.4"), ("2.0", "0.6"), ("1.0", "0.6")]
-    assert dataclasses.replace(units, size=None, size_rel_sigma=None).sides == []
+    assert sides(units) == [("4.1", "0.4"), ("2.0", "0.6"), ("1.0", "0.6")]
+    assert sides(dataclasses.replace(units, size=None, size_rel_sigma=None)) == []
 
 
 # ---- The schema ----

@@ -113,14 +113,6 @@ class Object:
         """True where a solid was fitted, and is not doubtful."""
         return self.status in ("ok", "prior_dominated")
 
-    @property
-    def sides(self) -> list[tuple[str, str]]:
-        """Width, depth, height (own axes x, y, z) and sigmas as text, m or units; [] if unknown."""
-        size = self.size if self.size_m is None else self.size_m
-        if size is None or self.size_rel_sigma is None:
-            return []
-        return texts_with_sigma(size, size * self.size_rel_sigma)
-
     def to_json(self) -> dict[str, Any]:
         """Return the entry of objects.json."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -134,6 +126,14 @@ class Object:
         for name in ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov"):
             values[name] = None if values[name] is None else np.array(values[name], np.float64)
         return Object(**values)
+
+
+def sides(found: Object) -> list[tuple[str, str]]:
+    """Write width, depth, height (own axes x, y, z), m or units, and their sigmas; [] if unknown."""
+    size = found.size if found.size_m is None else found.size_m
+    if size is None or found.size_rel_sigma is None:
+        return []
+    return texts_with_sigma(size, size * found.size_rel_sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,8 +265,7 @@ class Result:
         embeddings: (n, E1) and (n, E2), fused: foreground and background of the rows
             `embedding_row` (n,) of the tracks that the tracker embedded.
         identities_given: the user gave the identities; nothing may join, split or renumber them.
-        seconds: wall time by stage. warnings: what the user should know.
-        edits: corrections by hand that count; None: none.
+        seconds: wall time by stage. warnings: what the user should know. edits: made by hand.
         out: the folder that it was saved to or loaded from.
     """
 
@@ -458,8 +457,8 @@ class Result:
         sizes = f"{'width x depth x height, ' + ('m' if scaled else 'units'):<26} {'sigma':>6}  "
         lines = [f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  {sizes * sized}status"]
         for o in counted:
-            text = " x ".join(side for side, _ in o.sides) or "-"
-            text += " units" if scaled and o.sides and o.size_m is None else ""
+            text = " x ".join(side for side, _ in sides(o)) or "-"
+            text += " units" if scaled and o.size is not None and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "
             reason = f" ({o.reason})" if o.reason else ""

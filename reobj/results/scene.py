@@ -23,7 +23,7 @@ from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.poses.floor import NOISE
 from reobj.results.overlay import Overlay
-from reobj.results.result import Object, Result, World, significant
+from reobj.results.result import Object, Result, World, sides, significant
 from reobj.sources.video import IMAGE_FPS, Video, shrunk
 from reobj.types import Frame, Image, IntArray, Tracks, object_color, rows_by
 
@@ -275,7 +275,7 @@ def _scene_object(
     return found.to_json() | {
         "cov": "" if found.cov is None else base64_text(found.cov, "<f4"),
         "color": object_color(found.id)[::-1],
-        "sides": found.sides,
+        "sides": sides(found),
         "seen": runs.tolist(),
         "visits": sorted(visits),
         "crops": pictures.crops[found.id],

@@ -115,14 +115,15 @@ function gridOf() {                              // on the floor, or under every
   const step = level.metres && span < 30 && span > 3 ? 0.5 : nice(span / 10), thin = [], bold = [];
   const from = [0, 1].map((i) => Math.floor((low[i] - 0.05 * span) / step));
   const to = [0, 1].map((i) => Math.ceil((high[i] + 0.05 * span) / step));
-  const z = level.floor ? 0 : low[2];
+  const bottoms = solid.filter((o) => o.status !== "doubtful").map((o) => level.place(o.center)[2]
+    - level.size * Math.hypot(...axesOf(o.quat_wxyz).map((a, i) => level.turn(a)[2] * o.half_axes[i])));
+  const z = level.floor ? 0 : Math.min(low[2], bottoms.length ? quantile(bottoms, 0.1) : low[2]);
   for (let i = from[0]; i <= to[0]; i++) (i % 2 ? thin : bold).push(
     i * step, from[1] * step, z, i * step, to[1] * step, z);
   for (let j = from[1]; j <= to[1]; j++) (j % 2 ? thin : bold).push(
     from[0] * step, j * step, z, to[0] * step, j * step, z);
   const group = new THREE.Group(), color = css("--grid");
   group.add(lines(thin.length ? thin : bold, color, 0.8, 0.35), lines(bold, color, 1, 0.6));
-  state.gridStep = step;
   return group;
 }
 
