@@ -129,7 +129,7 @@ class Object:
 
 
 def sides(found: Object) -> list[tuple[str, str]]:
-    """Write width, depth, height (own axes x, y, z), m or units, and their sigmas; [] if unknown."""
+    """Write width, depth, height (own axes x, y, z; m or units) and sigmas; [] if unknown."""
     size = found.size if found.size_m is None else found.size_m
     if size is None or found.size_rel_sigma is None:
         return []
