@@ -200,9 +200,8 @@ def write_scene(
 
 
 def _boxes_in(result: Result, frame: int) -> list[list[float]]:
-    """List the boxes of a frame as identity, x1, y1, x2, y2, undistorted, native pixels."""
-    low, high = np.searchsorted(result.tracks.frame, [frame, frame + 1])
-    rows = result.tracks[slice(low, high)]
+    """List the detections of a frame: identity, x1, y1, x2, y2, undistorted, native pixels."""
+    rows = result.tracks[(result.tracks.frame == frame) & (result.tracks.score > 0)]
     box = rows.xyxy if result.poses is None else undistort_boxes(rows.xyxy, result.poses.camera)
     good = np.isfinite(box).all(1)
     return [
