@@ -422,7 +422,10 @@ def test_riding_along_shows_the_frame_of_the_camera(browser: Browser, page: Path
     np.testing.assert_allclose([float(x.removesuffix("px")) for x in box], expected, atol=0.01)
     browser.eval("$('boxes').click()")
     browser.settle()
-    assert browser.eval("document.querySelectorAll('#drawn .box').length") == 4
+    count = "document.querySelectorAll('#drawn .box').length"
+    assert browser.eval(count) == 4
+    assert browser.eval(f"S.objects[2].status = 'doubtful'; replay(); draw(); {count}") == 3
+    browser.eval("S.objects[2].status = 'ok'; replay(); draw()")
     browser.picture(SCREENSHOTS / "ride.png")
     for key, step in (("ArrowRight", 12), ("ArrowLeft", 8)):
         browser.press(key)

@@ -7,7 +7,6 @@ const floats = (b64) => new Float32Array(bytes(b64).buffer);
 const picture = (b64) => `data:image/webp;base64,${b64}`;
 const percent = (x) => `${Math.round(100 * x)} %`;
 const rgb = (o) => `rgb(${o.color})`;
-const ESTIMATED = ["ok", "prior_dominated"];
 
 function el(tag, props = {}, ...children) {
   const node = Object.assign(document.createElement(tag), props);
@@ -84,5 +83,6 @@ function pointsOf(part) {                        // level places and colours
 
 const seenAt = (o, step) => o.seen.some((s, i) => i % 2 === 0 && s <= step
   && step <= o.seen[i + 1]);
-const shown = () => solid.filter((o) => !state.hidden.has(o.class)
-  && ($("doubtful").checked || o.status !== "doubtful"));
+const allowed = (o) => !state.hidden.has(o.class)
+  && ($("doubtful").checked || o.status !== "doubtful");
+const shown = () => solid.filter(allowed);

@@ -32,8 +32,7 @@ function filterList() {
   const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
   for (const o of here) {
     const text = `${nameOf(o)} ${o.status} ${o.reason}`.toLowerCase();
-    o.row.hidden = state.hidden.has(o.class) || !words.every((word) => text.includes(word))
-      || o.status === "doubtful" && !$("doubtful").checked;
+    o.row.hidden = !allowed(o) || !words.every((word) => text.includes(word));
     o.row.classList.toggle("now", state.step >= 0 && seenAt(o, state.step));
   }
 }

@@ -10,7 +10,7 @@ function pictureAt(step) {                       // [frame, picture, boxes]: the
 
 function boxesOf(thumb) {                        // detections of a frame, in its pixels
   return thumb[2].map(([id, x1, y1, x2, y2]) => [objects.find((o) => o.ids.includes(id)),
-    { x: x1, y: y1, width: x2 - x1, height: y2 - y1 }]).filter(([o]) => o)
+    { x: x1, y: y1, width: x2 - x1, height: y2 - y1 }]).filter(([o]) => o && allowed(o))
     .map(([o, box]) => svg("rect", { class: "box", ...box, stroke: rgb(o) }));
 }
 
