@@ -244,13 +244,13 @@ class _Tables:
             self.identity[off] = self.identity.max() + 1
 
     def without_duplicates(self, where: str) -> tuple[BoolArray, list[str]]:
-        """Choose the rows (N,) that stay: of one object's boxes in a frame the best scored one.
+        """Choose the rows (N,) that stay: of a merged object's boxes in a frame the best scored one.
 
         Returns:
             also what to say about the others.
         """
         keep, messages = self.identity > 0, list[str]()
-        for number in np.unique(self.identity[keep]).tolist():
+        for number in sorted(self.confirmed):
             rows: IntArray = np.flatnonzero(self.identity == number)
             rows = rows[np.argsort(-self.tracks.score[rows], kind="stable")]
             best = rows[np.unique(self.tracks.frame[rows], return_index=True)[1]]
