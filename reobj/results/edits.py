@@ -244,7 +244,7 @@ class _Tables:
             self.identity[off] = self.identity.max() + 1
 
     def without_duplicates(self, where: str) -> tuple[BoolArray, list[str]]:
-        """Choose the rows (N,) that stay: of a merged object's boxes in a frame the best scored one.
+        """Choose the rows (N,) that stay: of a merged object's boxes in a frame the best scored.
 
         Returns:
             also what to say about the others.
