@@ -32,7 +32,7 @@ import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import decimals
 from reobj.results.result import VideoInfo
-from reobj.results.scene import Pictures, diverse_rows, write_pictures, write_scene
+from reobj.results.scene import Pictures, diverse_rows, page_text, write_pictures, write_scene
 from reobj.types import object_color
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -815,6 +815,19 @@ def test_no_name_can_leave_the_data(page: Path) -> None:
     assert data_of(page)["objects"][1]["class"] == EVIL
     hosts = set(re.findall(r"https?://([\w.]+)", text))
     assert hosts == {"www.w3.org"} and "default-src 'none'" in text  # names of XML
+
+
+def test_the_page_carries_the_licence_of_three() -> None:
+    """Its text goes with the code; without data the page leaves room for 3 MB of them."""
+    text, folder = page_text(), Path(scene.__file__).with_name("page")
+    licence = (folder / "three.LICENSE.txt").read_text().strip()
+    assert "Permission is hereby granted" in licence and licence in text
+    assert text.index(licence) < text.index((folder / "three.min.js").read_text().strip())
+    assert len(text) < 7e5 and "@{" not in text and text.count("@DATA@") == 1
+    own = text.split((folder / "three.min.js").read_text().strip())[1]
+    used = set(re.findall(r"THREE\.(\w+)", own))
+    assert used == set(re.findall(r"\b[A-Z]\w+", "".join(
+        re.findall(r"{(.*?)}", (folder / "three.entry.js").read_text(), re.S))))  # fmt: skip
 
 
 def test_the_page_holds_the_scene(page: Path) -> None:
