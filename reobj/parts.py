@@ -139,14 +139,16 @@ def _edited(linked: _Linked, result: Result, edits: Edits) -> _Linked:
         return linked
     result.class_names = made.class_names
     result.warnings += made.messages
-    confidence: dict[int, float] = {}
+    confidence, origin = dict[int, float](), dict[int, set[int]]()
     for now, then in set(zip(made.tracks.track_id.tolist(), before.track_id.tolist(), strict=True)):
+        origin.setdefault(now, set()).add(then)
         if then in linked.confidence:
             sure = 1.0 if now in made.confirmed else linked.confidence[then]
             confidence[now] = max(sure, confidence.get(now, 0.0))
     source = np.arange(len(before)) if linked.source is None else linked.source
     rows = (made.tracks[made.keep], source[made.keep])
-    return _Linked(*rows, linked.events, confidence)
+    solid_of = {i: solid for i, solid in linked.solid_of.items() if origin.get(i) == {i}}
+    return _Linked(*rows, linked.events, confidence, linked.located, solid_of)
 
 
 def _link_parts(
