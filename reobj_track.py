@@ -92,6 +92,7 @@ from reobj.poses.stage import (
 )
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, export
+from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import (
     Object,
@@ -182,16 +183,21 @@ class TrackerConfig:
 class OutputConfig:
     """Files written."""
 
-    overlay: bool = option(True, "write overlay.mp4")
+    overlay: str = option(
+        "solids", "what overlay.mp4 (or .webm) shows over boxes: solids, ellipses, trails; or none"
+    )
     scene: bool = option(True, "write scene.html")
     doubtful: bool = option(
-        False, "show doubtful objects too: in tracks.txt, on the page, in overlay.mp4"
+        False, "show doubtful objects too: in tracks.txt, on the page, in the film"
     )
     fill_gaps: int = option(
         5,
         "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never); "
         "an object's solid fills all frames from about where it was seen in others",
     )
+
+    def __post_init__(self) -> None:
+        film_layers(self.overlay)  # a wrong word is said before anything is computed
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ FLOORS = {
     "reobj.poses.soundness "
     "reobj.poses.adjustment "
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
-    "reobj.poses.checks reobj.poses.floor reobj.results.ply",
+    "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
@@ -45,7 +45,7 @@ FLOORS = {
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {  # optional, or slow to load
-    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun",
+    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "av",
 }  # fmt: skip
 LINES = {"reobj_track": 1300, "quadrics": 2270}  # at most; of any other room:
 ROOM_LINES = 600

@@ -92,6 +92,8 @@ def value_of(config: rt.Config, name: str) -> Any:
 
 def other_value(default: Any) -> Any:
     """A value that is not the default, of its type."""
+    if default == "solids":  # the one text that is checked where it is set
+        return "trails"
     if isinstance(default, bool):
         return not default
     return f"{default}x" if isinstance(default, str) else type(default)(default + 3)
@@ -126,8 +128,8 @@ def test_flags_set_their_options(seen: list[rt.Config]) -> None:
     [("true", True), ("On", True), ("1", True), ("no", False), ("off", False), ("FALSE", False)],
 )
 def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> None:
-    assert rt.main(["run", "a.mp4", "-o", "out", "--set", f"output.overlay={text}"]) == 0
-    assert seen[0].output.overlay is value
+    assert rt.main(["run", "a.mp4", "-o", "out", "--set", f"output.scene={text}"]) == 0
+    assert seen[0].output.scene is value
 
 
 @pytest.mark.parametrize(
@@ -140,7 +142,8 @@ def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> N
         ("tracker.n_init=three", "expected =INT, found 'three'"),
         ("tracker.n_init=2.5", "expected =INT, found '2.5'"),
         ("tracker.high_score=much", "expected =FLOAT, found 'much'"),
-        ("output.overlay=maybe", "expected =BOOL, found 'maybe'"),
+        ("output.scene=maybe", "expected =BOOL, found 'maybe'"),
+        ("output.overlay=solid", "expected boxes, solids, ellipses, trails"),
         ("tracker.n_init", "expected =INT, found None"),
     ],
 )
@@ -178,7 +181,7 @@ class Lab:
 
     def refit(self, value: Any, **others: Any) -> rt.Result:
         """Link, fit and write again what the room's folder holds."""
-        config = self.config(value, output__overlay=False, output__scene=False)
+        config = self.config(value, output__overlay="none", output__scene=False)
         for name, other in others.items():
             config = with_option(config, name.replace("__", "."), other)
         out = self.path / f"out-{value}".replace("/", "_")
@@ -372,7 +375,7 @@ def _(lab: Lab) -> None:
 def run_on_nothing(lab: Lab, value: Any) -> None:
     """Track six images in which nothing is found."""
     folder, out = lab.path / "images", lab.path / "out"
-    config = lab.config(value, output__overlay=False, output__scene=False)
+    config = lab.config(value, output__overlay="none", output__scene=False)
     rt.run(images(folder, 6), out, config, detections=lambda image: [], in_3d=False)
 
 
@@ -587,7 +590,7 @@ def _(lab: Lab) -> None:
         assert stage.supplied_poses(video, lab.config(mode).poses) is None
     asked = lab.caught(rt, "reconstruct_cached", "video")
     for mode, count in (("none", 0), ("auto", 1)):
-        config = lab.config(mode, embed__model="none", output__overlay=False, output__scene=False)
+        config = lab.config(mode, embed__model="none", output__overlay="none", output__scene=False)
         rt.run(video.source, lab.path / mode, config, detections=lambda image: [])
         assert len(asked) == count
 
@@ -735,7 +738,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
         embed=rt.EmbedConfig(model="none"),
         tracker=rt.TrackerConfig(coast_frames=4, remember=False),
         poses=rt.PosesConfig(mode=path, camera=CAMERA_TEXT),
-        output=rt.OutputConfig(overlay=False, scene=False),
+        output=rt.OutputConfig(overlay="none", scene=False),
     )
     source = images(base / "images", 24)
     rt.run(source, base / "out", config, detections=base / "det.csv")
@@ -807,17 +810,20 @@ def _(lab: Lab) -> None:
 
 @shows("output.overlay")
 def _(lab: Lab) -> None:
-    for value in (True, False):
+    """No film; one with edges of solids, and one with ellipses and trails besides boxes."""
+    sizes = {}
+    for value in ("none", "solids", "ellipses,trails"):
         config = lab.config(value, output__scene=False)
-        out = shutil.copytree(lab.room, lab.path / f"out{value}")
+        out = shutil.copytree(lab.room, lab.path / f"out-{value}")
         rt.refit(out, config)
-        assert (out / "overlay.mp4").exists() == value
+        sizes[value] = sum(path.stat().st_size for path in out.glob("overlay.*"))
+    assert sizes["none"] == 0 and 0 < sizes["solids"] != sizes["ellipses,trails"] > 0
 
 
 @shows("output.scene")
 def _(lab: Lab) -> None:
     for value in (True, False):
-        config = lab.config(value, output__overlay=False)
+        config = lab.config(value, output__overlay="none")
         out = shutil.copytree(lab.room, lab.path / f"out{value}")
         rt.refit(out, config)
         assert (out / "scene.html").exists() == value

@@ -1,6 +1,6 @@
 """Result of a run, typed: objects, their world, tracks and cameras; writes and reads its files.
 
-Start at `Result`. Nothing is computed here; the pictures (overlay.mp4, scene.html) need the video
+Start at `Result`. Nothing is computed here; the pictures (the film, scene.html) need the video
 and have rooms of their own.
 """
 
@@ -53,7 +53,8 @@ FORMAT = "reobj-objects"
 FORMAT_VERSION = 1  # of objects.json
 LAST_POSES = "cache/last-poses.npz"  # in an output folder
 STALE = (  # files of an earlier run, which another run may not write; cameras.csv: before 0.2
-    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html",
+    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm",
+    "scene.html",
 )  # fmt: skip
 CONVENTIONS = {
     "pose": "cam_from_world",
@@ -472,7 +473,8 @@ class Result:
         lines += self._camera_lines()
         lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in self.seconds.items()))
         if self.out is not None:
-            files = [self.out / n for n in ("scene.html", "overlay.mp4", "objects.json")]
+            shown = ("scene.html", "overlay.mp4", "overlay.webm", "objects.json")
+            files = [self.out / name for name in shown]
             lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
         return "\n".join(lines)
 

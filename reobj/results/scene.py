@@ -17,7 +17,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, invert_rigid, place_of
 from reobj.files import Progress, atomic, base64_text, rounded
-from reobj.results.overlay import Overlay, draw_tracks
+from reobj.results.overlay import Overlay, draw_tracks, film_layers
 from reobj.results.result import Object, Result, World, significant
 from reobj.sources.video import IMAGE_FPS, Video, shrunk
 from reobj.types import Frame, Image, IntArray, Tracks, object_color
@@ -226,15 +226,19 @@ def _scene_facts(world: World) -> str:
 
 
 def write_pictures(
-    result: Result, out: Path, video: Video, overlay: bool = True, scene: bool = True
+    result: Result, out: Path, video: Video, overlay: str = "solids", scene: bool = True
 ) -> None:
-    """Write overlay.mp4 and scene.html in one pass over the video.
+    """Write the film and scene.html in one pass over the video.
+
+    Args:
+        overlay: what the film shows (`film_layers`); "none": no film.
 
     Each file appears only when it is complete. A live source cannot be read again, and frames may
     have no images: no overlay then, and a page without pictures.
     """
     visible = video.has_images and not video.is_live
-    film = Overlay(result, out / "overlay.mp4", video) if overlay and visible else None
+    drawn = film_layers(overlay) and visible
+    film = Overlay(result, out / "overlay.mp4", video, overlay) if drawn else None
     pictures = Pictures(result, video) if scene else None
     sinks = [sink for sink in (film, pictures) if sink is not None and visible]
     progress, complete = Progress("pictures", video.expected), False
