@@ -123,8 +123,16 @@ def test_pictures_come_back_in_order(tmp_path: Path, encoder: str) -> None:
 
 
 def test_same_pictures_same_bytes(tmp_path: Path, encoder: str) -> None:
-    a, b = (written(tmp_path / name, pictures(9)) for name in ("a.mp4", "b.mp4"))
-    assert a.read_bytes() == b.read_bytes()
+    """Wherever they lie in memory, and however often: noise that moves, as x264 had it wrong."""
+    rng = np.random.default_rng(0)
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (SIZE[1], 400, 3), np.uint8), (0, 0), 2)
+    made = set()
+    for _ in range(8):
+        junk = [bytearray(int(n)) for n in rng.integers(1, 90_000, 20)]
+        images = [wide[:, 4 * i : 4 * i + SIZE[0]].copy() for i in range(12)]
+        made.add(written(tmp_path / "a.mp4", images).read_bytes())
+        del junk
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize("fps", [30000 / 1001, 12.0, 1.0])

@@ -20,12 +20,12 @@ PATHS = [
 FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
-    2: "reobj.files reobj.options reobj.identity.evidence reobj.identity.sampling "
+    2: "reobj.files reobj.identity.evidence reobj.identity.sampling "
     "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
-    3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded "
-    "reobj.poses.child reobj.poses.uncertainty",
-    4: "reobj.views reobj.sources.imageless reobj.sources.detection_files "
+    3: "reobj.cameras reobj.options reobj.sources.video reobj.sources.weights "
+    "reobj.sources.recorded reobj.poses.child reobj.poses.uncertainty",
+    4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
     "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "
     "reobj.poses.soundness "
@@ -45,7 +45,7 @@ FLOORS = {
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {  # optional, or slow to load
-    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "av",
+    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "av", "shtab",
 }  # fmt: skip
 LINES = {"reobj_track": 1300, "quadrics": 2270}  # at most; of any other room:
 ROOM_LINES = 600

@@ -9,7 +9,9 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import re
 import shutil
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,7 +32,14 @@ import reobj.poses.stage as stage
 import reobj.sources.detectors as detectors
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
-from reobj.options import every_option, list_options, with_option
+from reobj.options import (
+    every_option,
+    list_options,
+    read_config,
+    value_of,
+    with_option,
+    write_config,
+)
 from reobj.results.workspace import Workspace
 from reobj.sources.weights import own_models
 
@@ -85,11 +94,6 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[rt.Config]:
     return configs
 
 
-def value_of(config: rt.Config, name: str) -> Any:
-    section, _, field = name.rpartition(".")
-    return getattr(getattr(config, section) if section else config, field)
-
-
 def other_value(default: Any) -> Any:
     """A value that is not the default, of its type."""
     if default == "solids":  # the one text that is checked where it is set
@@ -137,6 +141,9 @@ def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> N
     [
         ("tracker.coast_frame=3", "no such option; did you mean tracker.coast_frames?"),
         ("traker.n_init=3", "no such option; did you mean tracker.n_init?"),
+        ("hgh=.3", "did you mean tracker.high_score?"),  # a word of the field is enough
+        ("coast=3", "did you mean tracker.coast_frames?"),
+        ("fps_max=3", "no such option; did you mean"),
         ("quite.else=3", "no such option; did you mean"),
         ("input=3", "no such option; did you mean"),
         ("tracker.n_init=three", "expected =INT, found 'three'"),
@@ -153,6 +160,76 @@ def test_a_wrong_set_is_one_line(
     assert rt.main(["run", "a.mp4", "-o", "out", "--set", item]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and expected in said and f"--set {item.partition('=')[0]}" in said
+
+
+# ---- Files of options ----
+
+
+def test_a_file_keeps_every_option(tmp_path: Path) -> None:
+    """All changed at once; then each value is what it was, and of its type."""
+    config = rt.Config()
+    for name in every_option(config):
+        config = with_option(config, name, other_value(value_of(config, name)))
+    write_config(config, tmp_path / "a.toml")
+    assert read_config(rt.Config(), tmp_path / "a.toml") == config
+    assert tomllib.loads((tmp_path / "a.toml").read_text())["tracker"]["n_init"] == 6
+
+
+def test_a_file_holds_what_differs_only(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    write_config(rt.Config(), path)
+    assert tomllib.loads(path.read_text()) == {}
+    config = rt.Config(threads=3, tracker=rt.TrackerConfig(n_init=4))
+    write_config(config, path)
+    assert path.read_text().splitlines()[1:] == ["threads = 3", "", "[tracker]", "n_init = 4"]
+
+
+@pytest.mark.parametrize(
+    "text", ['a "b" c', "back\\slash", "größe \U0001f600", "tab\tline\nend\x7f\x01", "", "#no"]
+)
+def test_any_text_survives_a_file(tmp_path: Path, text: str) -> None:
+    config = with_option(rt.Config(), "objects.priors", text)
+    write_config(config, tmp_path / "a.toml")
+    assert read_config(rt.Config(), tmp_path / "a.toml") == config
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[tracker]\nn_int = 3", r"tracker\.n_int: no such option; did you mean tracker\.n_init\?"),
+        ("[traker]\nn_init = 3", r"did you mean tracker\.n_init\?"),
+        ("[tracker]\nn_init = 2.5", r"tracker\.n_init: expected =INT, found 2\.5"),
+        ("[tracker]\nn_init = true", r"tracker\.n_init: expected =INT, found True"),
+        ("[tracker]\nremember = 'maybe'", "tracker.remember: expected =BOOL"),
+        ("tracker = 3", "tracker: no such option"),
+        ("[tracker", r"not valid TOML \(Expected"),
+        ("[output]\noverlay = 'solid'", r"output\.overlay=solid: expected"),
+    ],
+)
+def test_a_wrong_file_is_one_line(
+    tmp_path: Path, text: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    out = tmp_path / "out"
+    assert rt.main(["run", "a.mp4", "-o", str(out), "--config", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert re.search(expected, said) and said.count("\n") == 1 and not out.exists()
+    assert "a.toml" in said or "output.overlay" in said
+    assert rt.main(["run", "a.mp4", "-o", str(out), "--config", str(tmp_path / "no.toml")]) == 2
+    assert "no.toml: cannot be read" in capsys.readouterr().err
+
+
+def test_flags_override_the_file(tmp_path: Path, seen: list[rt.Config]) -> None:
+    """And --set overrides flags; --save-config keeps what came out."""
+    path, kept = tmp_path / "a.toml", tmp_path / "b.toml"
+    path.write_text("threads = 2\n[input]\nevery = 5\nstart = 7\n[tracker]\nhigh_score = 1\n")
+    words = ["--every", "3", "--set", "input.start=8", "--save-config", str(kept)]
+    assert rt.main(["run", "a.mp4", "-o", "out", "--config", str(path), *words]) == 0
+    (config,) = seen
+    assert (config.threads, config.input.every, config.input.start) == (2, 3, 8)
+    assert config.tracker.high_score == 1.0 and type(config.tracker.high_score) is float
+    assert read_config(rt.Config(), kept) == config
 
 
 # ---- Every one is obeyed ----

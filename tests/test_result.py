@@ -233,10 +233,28 @@ def test_summary_is_the_table_that_run_prints(chairs: rt.Result, saved: Path) ->
         size_rel_sigma=None)]  # fmt: skip
     text = result.summary()
     assert re.search(r"1  chair +40 +1 +0\.\d\d x 0\.\d\d x 0\.\d\d +\d+ %  ok$", text, re.M)
-    assert re.search(r"3  chair +40 +1 +- +-  rejected \(too far\)$", text, re.M)
+    assert re.search(r"3  chair +40 +1 +- +-  rejected$", text, re.M)
+    assert "\nrejected: too far: 3\n" in text
     assert "width x depth x height, m" in text and "distinct objects: 3 chair" in text
     assert "cameras: 40 of 40 frames (user)" in text and "seconds: track 1.2" in text
     assert f"look at: {saved / 'objects.json'}" in text
+
+
+def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
+    """However many objects there are, with reasons, in parts; each reason is said once."""
+    reason = "size along x, y rests on the prior"
+    result = copy_of(chairs, out=None)
+    result.objects = [
+        dataclasses.replace(chairs.objects[0], id=i, class_name=f"dining table {i % 40}",
+                            status="prior_dominated", reason=reason)
+        for i in range(1, 121)
+    ]  # fmt: skip
+    lines = result.summary().splitlines()
+    assert max(map(len, lines)) <= 100 and len(lines) < 150
+    assert sum(reason in line for line in lines) == 1
+    first = next(k for k, line in enumerate(lines) if reason in line)
+    assert lines[first].startswith(f"prior_dominated: {reason}: 1, 2, 3,")
+    assert any(line.endswith(" 120") for line in lines[first:])
 
 
 # ---- The schema ----

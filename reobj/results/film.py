@@ -24,8 +24,11 @@ from reobj.types import Image
 
 H264_SIZE_PX = 1280  # longer side; larger videos are shrunk (chosen: HD, so that it plays)
 VP8_SIZE_PX = 640  # the same for the slow encoder (chosen: a film takes less time than tracking)
-# x264's own quality, files half as large as MPEG-4's; one thread: with more, bytes vary by the run
-H264 = {"preset": "veryfast", "crf": "23", "threads": "1"}
+# x264's own quality, files half as large as MPEG-4's. Without lookahead: with it, the same pictures
+# give other bytes every few runs (seen with PyAV 18.1, one thread and no B-frames too).
+H264 = {
+    "preset": "veryfast", "crf": "23", "x264-params": "bframes=0:threads=1:rc-lookahead=0:mbtree=0",
+}  # fmt: skip
 KEYFRAME_S = 2  # between frames that a player can jump to (chosen)
 WEBM_HEAD = 1 << 16  # bytes that hold all before the first frame (FFmpeg: under 1000)
 MAX_DENOMINATOR = 1001  # of frame rates: 30000/1001
@@ -108,7 +111,9 @@ class _H264:
         self.stream.gop_size = max(1, round(KEYFRAME_S * fps))
 
     def write(self, image: Image) -> None:
-        frame = self.av.VideoFrame.from_ndarray(image, format="bgr24")
+        # OpenCV converts: FFmpeg's result depends on where in memory the picture happens to lie
+        planes = cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420)
+        frame = self.av.VideoFrame.from_ndarray(planes, format="yuv420p")
         self.file.mux(self.stream.encode(frame))
 
     def close(self) -> None:

@@ -34,6 +34,7 @@ from reobj.files import (
     save_npz,
     shortened,
     without_password,
+    wrapped,
 )
 from reobj.poses.floor import Floor
 from reobj.results.ply import write_ply
@@ -458,16 +459,20 @@ class Result:
             text += " units" if scaled and size is not None and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "
-            reason = f" ({o.reason})" if o.reason else ""
             part = f", part {o.part}" if len(self.world.parts) > 1 else ""
             lines.append(
                 f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
-                f"{sizes * sized}{o.status}{part}{reason}"
+                f"{sizes * sized}{o.status}{part}"
             )
+        reasons: dict[str, list[int]] = {}  # each once, with the objects that it holds for
+        for o in counted:
+            reasons.setdefault(f"{o.status}: {o.reason}" * bool(o.reason), []).append(o.id)
+        for reason, ids in reasons.items():
+            lines += wrapped(f"{reason}: {', '.join(map(str, ids))}") if reason else []
         counts = sorted(Counter(o.class_name for o in counted).items())
         each = " (each part counted by itself)" if len(self.world.parts) > 1 else ""
         names = ", ".join(f"{n} {c}" for c, n in counts) or "none"
-        lines.append(f"distinct objects: {names}{each}")
+        lines += wrapped(f"distinct objects: {names}{each}")
         if (doubtful := len(self.objects) - len(counted)) > 0:
             lines.append(f"doubtful: {doubtful} more, less likely there than not (objects.json)")
         lines += self._camera_lines()
@@ -497,7 +502,7 @@ class Result:
             scale = [f"scale {_scale_text(part.scale)}"] if part.scale else []
             cameras = f"{part.registered_frames} of {part.frames} frames"
             facts = [part.span_text, cameras, f"{count} object{'s' * (count != 1)}", *scale]
-            lines.append(f"part {k}: " + "; ".join(facts))
+            lines += wrapped(f"part {k}: " + "; ".join(facts))
         return lines
 
     def _write_objects(self, path: Path) -> None:

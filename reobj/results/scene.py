@@ -241,7 +241,7 @@ def write_pictures(
     film = Overlay(result, out / "overlay.mp4", video, overlay) if drawn else None
     pictures = Pictures(result, video) if scene else None
     sinks = [sink for sink in (film, pictures) if sink is not None and visible]
-    progress, complete = Progress("pictures", video.expected), False
+    progress, complete = Progress("write", video.expected), False
     try:
         for frame in video if sinks else ():
             for sink in sinks:
@@ -249,7 +249,7 @@ def write_pictures(
             progress.step()
         complete = True
     finally:
-        progress.close()
+        progress.close(complete)
         if film is not None:
             film.close(complete)
     if pictures is not None:
