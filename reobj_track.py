@@ -92,7 +92,7 @@ from reobj.poses.stage import (
     write_supplied_model,
 )
 from reobj.results.evaluation import evaluate, score_report
-from reobj.results.export import EXPORTS, export
+from reobj.results.export import EXPORTS, Viewer, export
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import (
@@ -985,6 +985,7 @@ def run(
     tracks: str | Path | None = None,
     in_3d: bool = True,
     overwrite: bool = False,
+    show: bool = False,
 ) -> Result:
     """Run the chain on a video: detect, track, poses, objects; write the output folder's files.
 
@@ -996,6 +997,7 @@ def run(
             config.detect.model.
         tracks: file of identities that take the place of detector, tracker and linker.
         in_3d: False for identities only, without cameras and ellipsoids.
+        show: follow the tracking in rerun's viewer, and see the result there.
     Returns:
         Result; if the reconstruction fails, without cameras and ellipsoids, and with a warning.
     Raises:
@@ -1007,6 +1009,7 @@ def run(
     video = open_video(source, config.input, config.poses, tracks or detections)
     workspace = Workspace(out, overwrite)
     workspace.bind(video, overwrite)
+    viewer = Viewer(VideoInfo.of(video)) if show else None
     seconds: dict[str, float] = {}
     in_3d = in_3d and config.poses.mode != "none"
     poses = supplied_poses(video, config.poses, workspace) if in_3d else None
@@ -1031,11 +1034,15 @@ def run(
         poses, model = reconstruct_cached(video, config.poses, workspace, rows)
         seconds["poses"] = time.monotonic() - started
     if not tracks:
-        result = _track_video(video, workspace, config, found, poses, seconds)
+        result = _track_video(video, workspace, config, found, poses, seconds, viewer)
     workspace.save_last(result, poses)
     workspace.publish_model(model)
     result.poses, result.seconds = poses, seconds
-    return _finish(result, video, workspace, config)
+    result = _finish(result, video, workspace, config)
+    if viewer is not None:
+        viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
+        viewer.close()
+    return result
 
 
 def refit(
@@ -1071,6 +1078,7 @@ def _track_video(
     source: DetectionSource,
     poses: Poses | None,
     seconds: dict[str, float],
+    viewer: Viewer | None = None,
 ) -> Result:
     """Track all frames, or take the tracks from the cache; a live source is never cached."""
     poses = poses if poses is not None and poses.known.any() else None
@@ -1082,6 +1090,8 @@ def _track_video(
     embedder = make_embedder(embed.model, embed.head, config.threads, config.offline)
     tracker = Tracker(config.tracker, embedder)
     steps = track(video, source, tracker, poses=poses)
+    if viewer is not None:
+        steps = viewer.follow(steps, source.class_names, video, poses)
     result = collect_tracks(steps, tracker, video, source)
     seconds["track"] = time.monotonic() - started
     result.save_tracked(path)
@@ -1147,7 +1157,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _cmd_run(args: argparse.Namespace) -> int:
-    given = {"detections": args.detections, "tracks": args.tracks, "overwrite": args.overwrite}
+    given = {name: getattr(args, name) for name in ("detections", "tracks", "overwrite", "show")}
     config = config_from_args(Config(), args)
     print(run(args.video, args.out, config, in_3d=args.command == "run", **given).summary())
     return 0
