@@ -17,7 +17,7 @@ from reobj.options import add_flags, list_options
 from reobj.types import ReobjError
 
 Command = Callable[[argparse.Namespace], int]
-SHELLS = ("bash", "zsh", "tcsh")
+SHELLS = ("bash", "zsh")  # shtab's script for tcsh knows no flags of commands
 TRACKS_HELP = "identities from a file instead of the tracker: CVAT XML, COCO-VID JSON, MOT, CSV"
 
 
@@ -55,7 +55,10 @@ class _Completion(argparse.Action):
     """--completion SHELL: print the script that completes the installed program's words, stop."""
 
     def __call__(self, parser: argparse.ArgumentParser, _: Any, shell: Any, *__: Any) -> None:
-        print(completion(parser, str(shell)))
+        try:
+            print(completion(parser, str(shell)))
+        except ReobjError as error:
+            parser.exit(2, f"error: {error}\n")
         parser.exit()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import errno
 import importlib
+import io
 import json
 import pkgutil
 import re
@@ -588,6 +589,24 @@ def test_poses_in_the_wrong_direction_are_refused(
     assert not (tmp_path / "out/objects.json").exists()
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_every_stage_is_shown_and_ends_at_100_percent(
+    clip: Path, detections: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, "--embed", "none")
+    for stages in (["track", "objects", "write"], ["objects", "write"]):  # tracks are cached then
+        screen = Terminal()
+        monkeypatch.setattr("sys.stderr", screen)
+        assert cli(*args) == 0
+        lines = [line.split("\r")[-1] for line in screen.getvalue().strip().split("\n")]
+        assert [line.split()[0] for line in lines] == stages
+        assert all("100 %" in line for line in lines if not line.startswith("objects"))
+
+
 def test_disk_full_leaves_nothing_half_written(
     clip: Path,
     detections: Path,
@@ -660,6 +679,154 @@ def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None
         cli(*([command] if command else []), "--help")
     assert stop.value.code == 0
     assert "usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS[:-1])  # bare `models` lists the weights
+def test_a_bare_command_prints_short_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """What it does, one example that is right, and where all flags are."""
+    assert cli(*([command] if command else [])) == 2
+    said = capsys.readouterr().err
+    lines = said.splitlines()
+    assert len(lines) <= 16 and max(map(len, lines)) <= 100 and said.count("Example: ") == 1
+    words = re.search(r"Example: reobj_track\.py ([^;\n]*[^;.\n])", said)[1].split()
+    args = rt._parser().parse_args(words)
+    assert args.command == (command or "run")
+    assert "--help" in said or all(name in said for name in COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        ("rnu a.mp4", "did you mean run?"),
+        ("run a.mp4 -o out --evry 3", "--evry 3; did you mean --every?"),
+        ("run a.mp4 -o out --detectons d.txt", "did you mean --detections?"),
+        ("export out --to gbl", "did you mean glb?"),
+        ("run a.mp4 -o out --every three", "--every: invalid int value: 'three'"),
+        ("run a.mp4", "required: -o/--out"),
+        ("run a.mp4 -o out --config", "--config: expected one argument"),
+        ("track a.mp4 -o out --known-size chair=.8m", "unrecognized arguments: --known-size"),
+    ],
+)
+def test_a_wrong_word_is_one_line_with_the_right_one(
+    args: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli(*args.split())
+    said = capsys.readouterr().err
+    assert stop.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
+    assert expected in said and "--help)" in said
+
+
+def test_a_wrong_class_is_one_line_with_the_right_one(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = "".join(f"{i},100,60,140,110,.9,chair\n" for i in range(FRAMES))
+    (tmp_path / "det.csv").write_text("frame,x1,y1,x2,y2,score,class\n" + rows)
+    args = ("run", clip, "-o", tmp_path / "out", "--detections", tmp_path / "det.csv", *QUICK)
+    for flag, value in (("--classes", "chiar"), ("--known-size", "chiar=.82m")):
+        assert cli(*args, flag, value) == 2
+        assert_one_clear_line(capsys, f"{flag}.* no .*class.*; did you mean chair?")
+    assert not (tmp_path / "out/tracks.txt").exists()
+
+
+def test_known_sizes_and_other_options_stay_with_the_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`objects OUT` takes the options of the last run there; a flag replaces one."""
+    frames, det, path = rendered_tracks(tmp_path, "right")
+    rows = det.read_text().splitlines()
+    table = [row.split(",") for row in rows]
+    det = tmp_path / "det.csv"
+    det.write_text("frame,x1,y1,x2,y2,score,class\n" + "".join(
+        f"{int(f) - 1},{x},{y},{float(x) + float(w)},{float(y) + float(h)},{s},sports ball\n"
+        for f, _, x, y, w, h, s in table
+    ))  # fmt: skip
+    out = tmp_path / "out"
+    args = ("--detections", det, "--poses", path, "--camera", "300,300,160,120", *QUICK)
+    known = ("--known-size", "sports ball=2m", "--support", "ellipsoid")
+    assert cli("run", frames, "-o", out, *args, *known) == 0
+
+    def scale() -> tuple[float, str]:
+        data = json.loads((out / "objects.json").read_text())
+        assert {o["support"] for o in data["objects"]} == {"ellipsoid"}
+        return data["world"]["scale"]["metres_per_unit"], data["world"]["scale"]["source"]
+
+    four = (pytest.approx(4, rel=0.1), "known_size")  # the balls are half a unit high
+    assert scale() == four
+    assert cli("objects", out) == 0 and scale() == four
+    assert cli("export", out, "--to", "cvat", "-o", tmp_path / "a.xml") == 0
+    assert cli("objects", out, "--tracks", tmp_path / "a.xml") == 0 and scale() == four
+    assert rt.refit(out).world.scale.source == "known_size"
+    assert not list(out.glob("overlay.*"))  # nor does it forget what it need not write
+    assert cli("objects", out, "--known-size", "Sports_Ball=1m") == 0
+    assert scale() == (pytest.approx(2, rel=0.1), "known_size")
+    assert cli("objects", out, "--known-size", "") == 0 and scale()[1] == "poses"
+    capsys.readouterr()
+    assert cli("objects", out, "--known-size", "sports bal=1m") == 2
+    assert_one_clear_line(capsys, "sports bal: no such class; did you mean sports ball")
+
+
+def test_a_size_that_sets_nothing_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A class that the detector has, but no object with a solid."""
+    frames, _, path = rendered_tracks(tmp_path, "right")
+    (tmp_path / "names.txt").write_text("ball\ndoor\n")
+    mot = (tmp_path / "det.txt").read_text().splitlines()
+    (tmp_path / "det.txt").write_text("\n".join(f"{line},1,1,-1" for line in mot))
+    args = ("--detections", tmp_path / "det.txt", "--poses", path, "--camera", "300,300,160,120")
+    names = ("--set", f"detect.class_names={tmp_path / 'names.txt'}")
+    size = ("--known-size", "door=2m")
+    assert cli("run", frames, "-o", tmp_path / "out", *args, *QUICK, *names, *size) == 0
+    assert "warning: --known-size door: no door with a solid" in capsys.readouterr().err
+    assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
+
+
+def test_a_camera_line_of_colmap_is_taken_as_it_is(tmp_path: Path) -> None:
+    """`--camera "$(cat examples/room/camera.txt)"`."""
+    line = (ROOT / "examples/room/camera.txt").read_text().strip()
+    args = list(posed_run(tmp_path, "right"))
+    args[args.index("--camera") + 1] = "1 PINHOLE 320 240 300 300 160 120"
+    assert cli(*args) == 0
+    assert rt.Result.load(tmp_path / "out").poses.camera.K[0, 0] == 300
+    room = ("poses", ROOT / "examples/room/room.mp4", "-o", tmp_path / "room", "--stop", 20)
+    assert cli(*room, "--poses", ROOT / "examples/room/poses.txt", "--camera", line) == 0
+    camera = (tmp_path / "room/sparse/cameras.txt").read_text()
+    assert "PINHOLE 640 480 492.7567" in camera
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The script names the program that pip installs; bash itself completes a flag with it."""
+    pytest.importorskip("shtab", reason="pip install '.[completion]'")
+    with pytest.raises(SystemExit) as stop:
+        cli("--completion", shell)
+    script = capsys.readouterr().out
+    assert stop.value.code == 0 and "reobj-track" in script and "--known-size" in script
+    if shell == "bash":
+        ask = (
+            'COMP_WORDS=(reobj-track run --kno); COMP_CWORD=2; COMP_LINE="reobj-track run --kno"; '
+            "COMP_POINT=21; $(complete -p reobj-track | sed 's/.*-F \\([^ ]*\\).*/\\1/') "
+            'reobj-track --kno run; echo "${COMPREPLY[@]}"'
+        )
+        done = subprocess.run(["bash", "-c", script + "\n" + ask], capture_output=True, text=True)
+        assert done.stdout.split() == ["--known-size"], done.stderr
+
+
+def test_completion_without_shtab(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    with pytest.raises(SystemExit) as stop:
+        cli("--completion", "bash")
+    said = capsys.readouterr().err
+    assert stop.value.code == 2 and "pip install 'reobj-track[completion]'" in said
+    assert said.count("\n") == 1
+
+
+def test_tables_fit_100_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli("models") == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
 
 
 def test_eval_of_no_output_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
