@@ -997,7 +997,7 @@ def run(
             config.detect.model.
         tracks: file of identities that take the place of detector, tracker and linker.
         in_3d: False for identities only, without cameras and ellipsoids.
-        show: follow the tracking in rerun's viewer, and see the result there.
+        show: in rerun's viewer, live.
     Returns:
         Result; if the reconstruction fails, without cameras and ellipsoids, and with a warning.
     Raises:
@@ -1048,10 +1048,9 @@ def run(
 def refit(
     out: str | Path, config: Config | None = None, tracks: str | Path | None = None
 ) -> Result:
-    """Link and fit again from what an output folder holds.
+    """Link and fit again what an output folder holds; tracks: identities from this file.
 
-    Args:
-        config: default: the options of the last run there. tracks: identities from this file.
+    config: default: the options of the last run there.
     """
     workspace = Workspace.open(out)
     result, video = workspace.load_last(), workspace.video()
