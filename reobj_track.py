@@ -996,8 +996,7 @@ def run(
         detections: file with recorded detections, or a callable image -> detections; default:
             config.detect.model.
         tracks: file of identities that take the place of detector, tracker and linker.
-        in_3d: False for identities only, without cameras and ellipsoids.
-        show: in rerun's viewer, live.
+        in_3d: False for identities only, in 2D. show: live in rerun's viewer.
     Returns:
         Result; if the reconstruction fails, without cameras and ellipsoids, and with a warning.
     Raises:
@@ -1048,10 +1047,7 @@ def run(
 def refit(
     out: str | Path, config: Config | None = None, tracks: str | Path | None = None
 ) -> Result:
-    """Link and fit again what an output folder holds; tracks: identities from this file.
-
-    config: default: the options of the last run there.
-    """
+    """Link and fit again what OUT holds, by default with its last options; tracks: identities."""
     workspace = Workspace.open(out)
     result, video = workspace.load_last(), workspace.video()
     config = dataclasses.replace(config or _last_config(out), input=video.config)

@@ -71,7 +71,13 @@ def test_the_suffix_is_that_of_the_format(tmp_path: Path, encoder: str) -> None:
     assert path.name == {"h264": "overlay.mp4", "vp8": "overlay.webm"}[encoder]
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
     magic = {"h264": (4, b"ftyp"), "vp8": (0, b"\x1aE\xdf\xa3")}[encoder]
-    assert path.read_bytes()[magic[0] : magic[0] + 4] == magic[1]
+    data = path.read_bytes()
+    assert data[magic[0] : magic[0] + 4] == magic[1]
+    if encoder == "h264":  # what all browsers decode, and can play while it loads
+        with import_av().open(str(path)) as file:
+            (stream,) = file.streams
+            assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert data.index(b"moov") < data.index(b"mdat")
 
 
 class Listener(http.server.BaseHTTPRequestHandler):
