@@ -993,8 +993,7 @@ def run(
         source: video file, folder of images, glob, camera index or URL of a stream (Ctrl-C ends a
             live one: its files are written); None: no images, only detections and poses.
         out: output folder; results of earlier stages found there are used again.
-        detections: file with recorded detections, or a callable image -> detections; default:
-            config.detect.model.
+        detections: recorded ones, or a callable image -> detections; default: config.detect.model.
         tracks: file of identities that take the place of detector, tracker and linker.
         in_3d: False for identities only, in 2D. show: live in rerun's viewer.
     Returns:

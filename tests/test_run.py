@@ -743,7 +743,7 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
     ))  # fmt: skip
     out = tmp_path / "out"
     args = ("--detections", det, "--poses", path, "--camera", "300,300,160,120", *QUICK)
-    known = ("--known-size", "sports ball=2m", "--support", "ellipsoid")
+    known = ("--known-size", "sports ball=22cm", "--support", "ellipsoid")
     assert cli("run", frames, "-o", out, *args, *known) == 0
 
     def scale() -> tuple[float, str]:
@@ -751,15 +751,15 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
         assert {o["support"] for o in data["objects"]} == {"ellipsoid"}
         return data["world"]["scale"]["metres_per_unit"], data["world"]["scale"]["source"]
 
-    four = (pytest.approx(4, rel=0.1), "known_size")  # the balls are half a unit high
-    assert scale() == four
-    assert cli("objects", out) == 0 and scale() == four
+    known_scale = (pytest.approx(0.44, rel=0.1), "known_size")  # the balls are half a unit high
+    assert scale() == known_scale
+    assert cli("objects", out) == 0 and scale() == known_scale
     assert cli("export", out, "--to", "cvat", "-o", tmp_path / "a.xml") == 0
-    assert cli("objects", out, "--tracks", tmp_path / "a.xml") == 0 and scale() == four
+    assert cli("objects", out, "--tracks", tmp_path / "a.xml") == 0 and scale() == known_scale
     assert rt.refit(out).world.scale.source == "known_size"
     assert not list(out.glob("overlay.*"))  # nor does it forget what it need not write
-    assert cli("objects", out, "--known-size", "Sports_Ball=1m") == 0
-    assert scale() == (pytest.approx(2, rel=0.1), "known_size")
+    assert cli("objects", out, "--known-size", "Sports_Ball=11cm") == 0
+    assert scale() == (pytest.approx(0.22, rel=0.1), "known_size")
     assert cli("objects", out, "--known-size", "") == 0 and scale()[1] == "poses"
     capsys.readouterr()
     assert cli("objects", out, "--known-size", "sports bal=1m") == 2

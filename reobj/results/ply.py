@@ -35,7 +35,7 @@ def write_ply(
     meshes = {None: _sphere_mesh(PLY_DETAIL), "box": _box_mesh(), "cylinder": _cylinder_mesh()}
     for k, (identity, shape) in enumerate(zip(object_id, shapes, strict=True)):
         unit, triangles = meshes.get(shape, meshes[None])  # (P, 3), (T, 3)
-        points = (unit) @ ellipsoids.world_from_obj[k].T
+        points = (ellipsoids.half_axes[k] * unit) @ ellipsoids.world_from_obj[k].T
         vertex = np.zeros(len(unit), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
         vertex["xyz"] = points + ellipsoids.center_in_world[k]
         vertex["rgb"] = object_color(identity)[::-1]
