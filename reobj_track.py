@@ -57,9 +57,9 @@ import numpy.typing as npt
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera, Poses, viewing_rays
+from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.commands import make_parser, short_help
-from reobj.files import Progress, atomic, load_npz, save_npz, wrapped
+from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
@@ -126,6 +126,7 @@ from reobj.types import (
     ReobjError,
     Tracks,
     as_detections,
+    as_frame,
     box_iou,
     cxcywh_from_xyxy,
     log,
@@ -213,6 +214,7 @@ class Config:
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     threads: int = option(0, "threads of onnxruntime and OpenCV (0: all cores)", "--threads")
+    device: str = option("cpu", "of networks: cpu, cuda, coreml, ... (onnxruntime)", "--device")
     offline: bool = option(False, "never download weights", "--offline")
 
 
@@ -341,7 +343,7 @@ class TrackState:
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 4  # of the files of Tracker.save
+STATE_VERSION = 5  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -432,24 +434,28 @@ class Tracker:
         """Track the detections of the next frame.
 
         Args:
-            detections: `Detections`, an (N, 6) array x1, y1, x2, y2, confidence, class, or an
-                object with xyxy, confidence, class_id and mask (supervision).
-            frame: (H, W, 3) BGR image: camera motion, and the input of the embedder.
-            embeddings: of all detections: an (D, E) array or `Embeddings`.
+            detections: `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics'
+                Results or Boxes; supervision's Detections; or a dict of boxes, scores, labels.
+            frame: (H, W, 3) uint8 BGR image: camera motion, and the input of the embedder.
+            embeddings: of all detections: an (D, E) array or `Embeddings`, of one width E always.
             cam_from_world: (3, 4) pose of this frame, with `camera`: objects are known by their
-                place in 3D.
+                place in 3D. NaN: not known.
             points: (N, 3) in world, seen in this frame: how far away a new track is.
             part: of the cameras' path; each has a world of its own, and places in it.
         Returns:
             The detections that belong to a confirmed track; decided once.
+        Raises:
+            ReobjError: something that cannot be meant; the tracker stays as it was.
         """
-        self.frame_number += 1
         detections = as_detections(detections)
-        given = as_embeddings(embeddings, len(detections))
+        frame = None if frame is None else as_frame(frame, detections.masks)
+        given = as_embeddings(embeddings, len(detections), self.state.embedding.shape[1])
+        pose = checked_pose(cam_from_world, camera, points, part)
+        self.frame_number += 1
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, frame, detections, weight)
         self._enter(part)
-        self._predict(frame, cam_from_world, camera)
+        self._predict(frame, pose, camera)
         track_of = self._associate(detections, lazy)  # (D,) row of the track's state, or -1
         self._update_states(detections, track_of)
         track_of = self._spawn(detections, track_of)
@@ -488,9 +494,7 @@ class Tracker:
             self.part, self._last_pose, self.state.ends[:] = part, None, np.nan
             self.maps += [EllipsoidMap() for _ in range(part + 1 - len(self.maps))]
 
-    def _predict(
-        self, frame: Image | None, cam_from_world: Array | None, camera: Camera | None
-    ) -> None:
+    def _predict(self, frame: Image | None, pose: Array | None, camera: Camera | None) -> None:
         """Predict all tracks, then move them by the camera's own motion.
 
         That is what the image shows, or without an image the known rotation; with a pose, tracks
@@ -500,10 +504,7 @@ class Tracker:
         state.mean, state.cov = kalman_predict(state.mean, state.cov, self.config)
         state.mean[:, 2:, 0] = state.mean[:, 2:, 0].clip(1.0)  # a size stays positive
         state.reach[:] = 0
-        self._view, before, pose = None, state.mean[..., 0].copy(), None
-        if cam_from_world is not None and camera is not None and np.isfinite(cam_from_world).all():
-            pose = np.asarray(cam_from_world, np.float64)
-        self._pose = pose
+        self._view, self._pose, before = None, pose, state.mean[..., 0].copy()
         if frame is not None and self.config.camera_motion:
             motion = self._camera_motion(frame)
             state.mean, state.cov = warp_states(state.mean, state.cov, motion)
@@ -775,6 +776,7 @@ class Tracker:
         """Add embeddings (n, E) of tracks t to the gallery, and calibrate with its first views."""
         identity, gallery = self.state.identity[t], self.gallery
         if len(gallery.count):
+            gallery.reserve(len(self.last_seen), embedding.shape[1])
             first = gallery.rows[identity, 0] * (gallery.count[identity, None] > 1)
             parts = part_cosines(embedding, first, gallery.foreground_width)
             self.reid_calibration.add_frame(*parts, class_id)
@@ -902,7 +904,7 @@ class Tracker:
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
         """Read a tracker that `save` wrote; embedder: as the saved one had."""
         try:
-            arrays, facts = load_npz(Path(path))
+            arrays, facts = load_npz(Path(path), sealed=True)
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
             tracker = cls(TrackerConfig(**facts["config"]), embedder)
@@ -1015,7 +1017,8 @@ def run(
         result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
         boxes, names = result.tracks, result.class_names
     else:
-        found = open_detections(video, config.detect, detections, config.threads, config.offline)
+        on = (config.threads, config.offline, config.device)
+        found = open_detections(video, config.detect, detections, *on)
         found, boxes = keep_detections(found, video, workspace), Tracks.empty()
         if in_3d and not video.is_live:
             started = time.monotonic()
@@ -1076,13 +1079,12 @@ def _track_video(
 ) -> Result:
     """Track all frames, or take the tracks from the cache; a live source is never cached."""
     poses = poses if poses is not None and poses.known.any() else None
-    key = (*detections_key(source, video), config.embed, config.tracker, poses_key(poses))
-    path = workspace.path("tracks", *key)
-    if source.key and not video.is_live and path.exists():
-        return Result.load_tracked(path)
-    started, embed = time.monotonic(), config.embed
-    embedder = make_embedder(embed.model, embed.head, config.threads, config.offline)
-    tracker = Tracker(config.tracker, embedder)
+    setup = (config.embed, config.tracker, config.device, poses_key(poses))
+    path = workspace.path("tracks", *detections_key(source, video), *setup)
+    if source.key and not video.is_live and (known := load_cached(path, Result.load_tracked)):
+        return known
+    started, on = time.monotonic(), (config.threads, config.offline, config.device)
+    tracker = Tracker(config.tracker, make_embedder(config.embed.model, config.embed.head, *on))
     steps = track(video, source, tracker, poses=poses)
     if viewer is not None:
         steps = viewer.follow(steps, source.class_names, video, poses)

@@ -124,7 +124,7 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
     """Run one video in a worker, unless a worker that was killed since has finished it."""
     sys.path.insert(0, root)
     import reobj_track as rt
-    from reobj.files import atomic
+    from reobj.files import atomic, without_secrets
 
     if done := finished(item):
         return done
@@ -144,8 +144,9 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
         return {"status": "failed", "error": last[-1].removeprefix("error: ")}
     result = {"status": "done", "error": "", "seconds": round(time.monotonic() - started, 1)}
     result |= facts(rt.Result.load(out))
+    argv = list(map(without_secrets, item.argv))
     with atomic(out / MARKER) as part:
-        part.write_text(json.dumps({"key": item.key, "argv": item.argv, "result": result}))
+        part.write_text(json.dumps({"key": item.key, "argv": argv, "result": result}))
     return result
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Run the whole chain on recordings and print one table row each (the table of the README).
+"""Run the whole chain on recordings and print one table row each (a table of docs/tracking.md).
 
     python examples/real_data.py FOLDER... -o OUT [--detector NAME]
 

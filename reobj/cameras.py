@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from reobj.files import atomic, load_npz, save_npz
-from reobj.types import Array, BoolArray, IntArray, ReobjError
+from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers
 
 
 def import_pycolmap() -> Any:
@@ -138,6 +138,55 @@ def checked_camera(camera: Camera, where: str) -> Camera:
     return camera
 
 
+RIGID_TOLERANCE = 1e-3  # of R R' from the identity; chosen: float32 poses of devices are at 1e-6
+WORLD_MAX = 1e9  # of a camera's place; chosen: the Earth in cm fits, in any unit it is a mistake
+
+
+def usable(camera: Camera) -> bool:
+    """Tell whether a camera has a size, finite parameters and focal lengths above 0."""
+    sized = min(camera.width, camera.height) > 0 and bool(np.isfinite(camera.params).all())
+    return sized and bool((np.diag(camera.K)[:2] > 0).all())
+
+
+PART_MAX = 1000  # chosen: each has a map of its own; a walk of an hour has a few
+
+
+def checked_pose(
+    cam_from_world: Any, camera: Camera | None, points: Any = None, part: Any = 0
+) -> Array | None:
+    """Return the pose (3, 4) of one frame; None where it is not known: None, or holds NaN.
+
+    Args:
+        points: (N, 3) in world, or None. part: of the path, whose world that is.
+    Raises:
+        ReobjError: no rigid pose, no camera that it can be of, no points, no number of a part.
+    """
+    if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
+        raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
+    if not isinstance(part, int | np.integer) or not 0 <= part <= PART_MAX:
+        raise ReobjError(f"part {part!r}, expected the number of a part of the path, from 0")
+    if cam_from_world is None:
+        return None
+    pose = as_numbers(cam_from_world, "cam_from_world").astype(np.float64)
+    if pose.shape != (3, 4):
+        raise ReobjError(f"cam_from_world of shape {pose.shape}, expected (3, 4): [R | t]")
+    if np.isnan(pose).any():
+        return None
+    offset, rotation = pose[:, 3], pose[:, :3]
+    if (np.abs(offset) > WORLD_MAX).any() or (np.abs(rotation) > 1 + RIGID_TOLERANCE).any():
+        raise ReobjError(f"cam_from_world {pose.tolist()} is beyond any camera's place")
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ReobjError(f"cam_from_world: its rotation is none (off by {off:.2g}, determinant "
+                         f"{np.linalg.det(rotation):.2g}); expected [R | t], x right, y down, "
+                         "z forward")  # fmt: skip
+    if not isinstance(camera, Camera):
+        raise ReobjError("cam_from_world without a camera: give camera=rt.Camera(...) as well")
+    if not usable(camera):
+        raise ReobjError(f"{camera}: expected a size, and focal lengths above 0, in pixels")
+    return pose
+
+
 def scaled_camera(camera: Camera, scale: float) -> Camera:
     """Return the pinhole part of a camera for images resized by `scale`, without distortion."""
     K = camera.K
@@ -238,8 +287,8 @@ def save_poses(path: Path, poses: Poses) -> None:
 
 def load_poses(path: Path) -> Poses:
     """Read what `save_poses` wrote."""
-    data, facts = load_npz(path)
-    arrays = {k: data[k] for k in _POSE_ARRAYS if k in data}  # older files lack the last
+    data, facts = load_npz(path, sealed=True)
+    arrays = {k: data[k] for k in _POSE_ARRAYS}
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
     return Poses(

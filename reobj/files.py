@@ -8,20 +8,25 @@ from __future__ import annotations
 import base64
 import contextlib
 import difflib
+import hashlib
 import json
 import math
+import os
 import re
 import sys
 import textwrap
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from reobj.types import Array, ReobjError
+from reobj.types import Array, ReobjError, log
+
+T = TypeVar("T")
 
 
 @contextlib.contextmanager
@@ -34,9 +39,20 @@ def atomic(path: Path) -> Iterator[Path]:
     part = path.with_name(f".part-{path.name}")
     try:
         yield part
+        _sync(part)
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file is on the disk: renamed before, a power cut leaves it empty."""
+    with contextlib.suppress(OSError):  # a folder, or a file system that has no such thing
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def part_path(path: Path, part: int) -> Path:
@@ -53,12 +69,20 @@ def part_paths(path: Path) -> list[Path]:
     return sorted(path.parent.glob(f"{path.stem}_part[0-9]*{path.suffix}"))
 
 
+TEXT_MAX = 1 << 28  # characters of a file; chosen: a million detections with masks have 2e8
+NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
+
+
 def read_text(path: Path) -> str:
-    """Read a UTF-8 file, with or without a byte order mark."""
+    """Read a UTF-8 file of at most TEXT_MAX characters, with or without a byte order mark."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        with path.open(encoding="utf-8-sig") as file:
+            text = file.read(TEXT_MAX + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ReobjError(f"{path}: cannot be read as text ({error})") from error
+    if len(text) > TEXT_MAX:
+        raise ReobjError(f"{path}: more than {TEXT_MAX >> 20} MB of text; cut it into pieces")
+    return text
 
 
 def load_json(path: Path) -> Any:
@@ -67,33 +91,74 @@ def load_json(path: Path) -> Any:
         return json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
+    except ReobjError:
+        raise
+    except (RecursionError, ValueError) as error:  # nested too deep; a number of 4,300 digits
+        raise ReobjError(f"{path}: no JSON that can be meant ({error})") from error
+
+
+def check_unpacked(size: int, most: int) -> None:
+    """Refuse what is packed before it takes memory: a small zip may hold gigabytes."""
+    if size > most:
+        raise ReobjError(f"unpacks to {size >> 20} MB, at most {most >> 20} MB are taken")
 
 
 def save_npz(path: Path, arrays: Mapping[str, Any], **metadata: Any) -> None:
     """Write arrays, and metadata as JSON, to a compressed npz file; same input, same bytes."""
+    own: dict[str, Any] = {name: np.asarray(values) for name, values in arrays.items()}
+    metadata = metadata | {"digest": _digest(own, metadata)}
     try:
         with atomic(path) as part, part.open("wb") as file:
-            np.savez_compressed(file, **arrays, metadata=np.array(json.dumps(metadata)))
+            np.savez_compressed(file, **own, metadata=np.array(json.dumps(metadata)))
     except OSError as error:  # zipfile's own does not name the file
         raise ReobjError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def load_npz(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def _digest(arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> str:
+    """Hash the content of an npz file."""
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {values.dtype.str} {np.shape(arrays[name])}".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def load_npz(path: Path, sealed: bool = False) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a file that `save_npz` wrote, or any npz file without pickled objects.
 
+    Args:
+        sealed: refuse one that is not as `save_npz` wrote it: what is in it is then not checked.
     Returns:
         the arrays, and the metadata ({} if the file has none).
     Raises:
-        ReobjError: damaged, or no npz file.
+        ReobjError: damaged, no npz file, or of more than NPZ_MAX bytes.
     """
     try:
+        with zipfile.ZipFile(path) as file:
+            check_unpacked(sum(member.file_size for member in file.infolist()), NPZ_MAX)
         with np.load(path, allow_pickle=False) as file:
             arrays: dict[str, Any] = dict(file)
         text = arrays.pop("metadata", arrays.pop("facts", "{}"))  # facts: before 0.2
-        metadata: dict[str, Any] = json.loads(str(text))
+        metadata: dict[str, Any] = dict(json.loads(str(text)))
+        digest = metadata.pop("digest", "")
+        if sealed and digest != _digest(arrays, metadata):
+            raise ValueError("its content is not what was written")
     except Exception as error:  # zip, zlib and numpy each have their own for damaged files
         raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
     return arrays, metadata
+
+
+def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
+    """Read a file of the cache; None where there is none, or a damaged one: said, and removed."""
+    if not path.exists():
+        return None
+    try:
+        return read(path)
+    except (ReobjError, OSError) as error:
+        log.warning("%s; computed again", error)
+        path.unlink(missing_ok=True)
+        return None
 
 
 REDRAW_S = 0.1  # chosen: as often as an eye follows, too seldom to cost time
@@ -175,13 +240,30 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
-def without_password(text: str) -> str:
-    """Remove user and password from the URLs in a text: what is left may be shown and written.
+def without_secrets(text: str) -> str:
+    """Leave of the URLs in a text what may be shown and written: scheme, host and path.
 
-    >>> without_password("rtsp://me:secret@10.0.0.7/stream")
+    User and password go, also a password with "@" or "/" in it, and all after the path: queries
+    and parameters, where cameras take passwords too. Where nothing tells which is which, only the
+    scheme is left.
+
+    >>> without_secrets("rtsp://me:secret@10.0.0.7/stream?pwd=x")
     'rtsp://10.0.0.7/stream'
     """
-    return re.sub(r"(?<=://)[^/@\s]*@", "", text)
+    return URL.sub(_public_part, text)
+
+
+URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]*:/+)(\S*)", re.IGNORECASE)
+PARAMETERS = re.compile(r"[?#;&=]")  # begin what is no path: also rtsp://host/user=me&password=x
+
+
+def _public_part(url: re.Match[str]) -> str:
+    """Cut a URL to scheme, host and path."""
+    scheme, rest = url.groups()
+    user, _, rest = rest.rpartition("@")
+    if PARAMETERS.search(user):  # of a password, or the "@" is one of a query
+        return f"{scheme}..."
+    return scheme + PARAMETERS.split(rest)[0]
 
 
 def shortened(items: Sequence[Any]) -> str:

@@ -52,7 +52,7 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
         for k, own in enumerate(parts):  # a direction given as up is one of the largest part
             options = dataclasses.replace(config, up="") if k else config
             fit_in[k] = fitter(options, own, result.class_names)
-    linked = _Linked(result.tracks)
+    linked = _Linked(result.tracks, located=[None] * len(fit_in))
     if not result.identities_given:
         linked = _link_parts(result, parts, fit_in, priors, config)
     tracks = linked.tracks
@@ -67,9 +67,14 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
             classes = object_classes(rows)
             group = np.searchsorted(list(classes), rows.track_id)
             views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
-            fits[k] = first = fit(views, list(classes.values()), NOTHING_KNOWN)
-            floor = floor_under(parts[k], first)
-            views = dataclasses.replace(views, hidden=hidden_edges(views, first.ellipsoids))
+            located = linked.located[k]
+            if located is None:
+                first = fit(views, list(classes.values()), NOTHING_KNOWN)
+                floor, ellipsoids = floor_under(parts[k], first), first.ellipsoids
+            else:
+                solid = np.array([linked.solid_of.get(identity, -1) for identity in classes])
+                floor, ellipsoids = located.floor, located.ellipsoids[solid]
+            views = dataclasses.replace(views, hidden=hidden_edges(views, ellipsoids))
             up = None if floor is None else floor.normal
             fits[k] = fit(views, list(classes.values()), Scene(floor, up))
         found = describe_objects(
@@ -89,12 +94,16 @@ class _Linked:
     Attributes:
         tracks: N rows. source: (N,) their rows before, -1: left out by the tracker; None: the same.
         events: joins and splits. confidence: of identities that have solids in a part.
+        located: of each part, None where nothing was associated. solid_of: number of the solid that
+            an identity has there.
     """
 
     tracks: Tracks
     source: IntArray | None = None
     events: list[LinkEvent] = field(default_factory=list)
     confidence: dict[int, float] = field(default_factory=dict)
+    located: list[Located | None] = field(default_factory=list)
+    solid_of: dict[int, int] = field(default_factory=dict)
 
     def rows_now(self, before: IntArray) -> IntArray:
         """Return where rows of the table before linking are now."""
@@ -144,6 +153,10 @@ def _link_parts(
         if located is not None:
             posed = np.isin(own.frame, parts[k].frame[parts[k].known])
             made.confidence |= _confidences(own, solid, posed, located)
+            shown = solid >= 0
+            ids = own.track_id[shown].tolist()
+            made.solid_of |= dict(zip(ids, solid[shown].tolist(), strict=True))
+        made.located.append(located)
         steps.append(own)
         sources.append(source[rows])
     order = np.argsort(np.concatenate([own.frame for own in steps]), kind="stable")

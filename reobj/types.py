@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -86,25 +86,27 @@ class Detections:
 
     @staticmethod
     def from_array(rows: npt.ArrayLike) -> Detections:
-        """Make from (N, 6) rows x1, y1, x2, y2, confidence, class.
+        """Make from (N, 6) rows x1, y1, x2, y2, confidence, class; [] is a frame without any.
 
         >>> Detections.from_array([[0, 0, 10, 20, 0.9, 56]]).class_id
         array([56])
         """
-        rows = np.asarray(rows, np.float64) if np.size(rows) else np.empty((0, 6))
-        if rows.ndim != 2 or rows.shape[1] != 6:
-            expected = "(N, 6): x1, y1, x2, y2, confidence, class"
-            raise ReobjError(f"detections of shape {rows.shape}, expected {expected}")
-        return Detections(rows[:, :4], rows[:, 4], rows[:, 5].astype(np.int64))
+        return _checked(*_row_parts(rows))
 
     @staticmethod
     def from_supervision(found: Any) -> Detections:
-        """Make from an object with xyxy (N, 4), confidence, class_id and mask, as supervision's.
-
-        What is None there counts as score 1, class 0, no mask. `Tracker.update` takes such objects
-        as they are; `Tracks.to_supervision` goes back.
-        """
+        """Make from supervision's `Detections`; what is None there: score 1, class 0, no mask."""
         return as_detections(found)
+
+    def to_supervision(self) -> Any:
+        """Return the same as supervision's `Detections`, which must be installed."""
+        try:
+            import supervision
+        except ImportError as error:
+            raise ReobjError("to_supervision needs supervision: pip install supervision") from error
+        return supervision.Detections(
+            xyxy=self.xyxy, mask=self.masks, confidence=self.score, class_id=self.class_id
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,26 +237,192 @@ class LinkEvent:
         return LinkEvent(*found, entry["kept"])
 
 
+# ---- What other libraries hand over -------------------------------------------------------------
+
+EXPECTED = (
+    "expected (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics Results or Boxes; "
+    "supervision Detections; a dict of boxes, scores, labels; or rt.Detections"
+)
+COORDINATE_MAX = 1e7  # px; chosen: a thousand times the widest images; beyond it is a mistake
+CLASS_MAX = 32_767  # chosen: above ImageNet-21k's 21,841; a class costs each track 8 bytes
+DETECTIONS_MAX = 3_000  # in a frame; chosen: pairs with as many tracks take 72 MB a matrix
+MASK_THRESHOLD = 0.5  # of masks that are probabilities (torchvision, Mask R-CNN)
+
+
 def as_detections(found: Any) -> Detections:
-    """Take detections as they come: ours, (N, 6) rows, or an object like supervision's."""
+    """Convert the detections of one frame, as the libraries of the field hand them over.
+
+    Takes `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class, as array, tensor or list;
+    ultralytics' `Results` and `Boxes`; supervision's `Detections`; dicts of boxes, scores, labels
+    and masks (torchvision, transformers); and a list of one of these, which is what a model returns
+    for a batch of one image. Class ids stay what they are (torchvision counts COCO's from 1).
+    Nothing is reshaped, clipped, reordered or dropped.
+
+    Returns:
+        The same object where it is ours already.
+    Raises:
+        ReobjError: anything else, or values that cannot be meant: inverted boxes, coordinates that
+            are not finite or beyond 1e7, scores outside [0, 1], classes that are no index.
+    """
+    if isinstance(found, list | tuple) and len(found) == 1 and _is_whole(found[0]):
+        found = found[0]
     if isinstance(found, Detections):
-        made = found
-    elif hasattr(found, "xyxy"):
-        count, masks = len(found.xyxy), getattr(found, "mask", None)
-        score, label = getattr(found, "confidence", None), getattr(found, "class_id", None)
-        made = Detections(
-            np.asarray(found.xyxy, np.float64).reshape(-1, 4),
-            np.asarray(np.ones(count) if score is None else score, np.float64),
-            np.asarray(np.zeros(count) if label is None else label, np.int64),
-            None if masks is None else np.asarray(masks, bool),
-        )
-    else:
-        made = Detections.from_array(found)
-    masks = made.xyxy if made.masks is None else made.masks
-    lengths = [len(values) for values in (made.xyxy, made.score, made.class_id, masks)]
-    if len(set(lengths)) > 1 or not np.isfinite(made.xyxy).all():
-        raise ReobjError(f"{lengths} boxes, scores, classes, masks do not fit, or hold NaN")
+        made = _checked(found.xyxy, found.score, found.class_id, found.masks)
+        same = all(getattr(made, f.name) is getattr(found, f.name) for f in _FIELDS)
+        return found if same else made
+    if isinstance(found, Mapping):
+        return _checked(*_mapping_parts(found))
+    if hasattr(found, "orig_shape") and hasattr(found, "boxes"):
+        return _checked(*_ultralytics_parts(found))
+    return _checked(*(_box_parts(found) if hasattr(found, "xyxy") else _row_parts(found)))
+
+
+_FIELDS = dataclasses.fields(Detections)
+
+
+def _is_whole(found: Any) -> bool:
+    """Tell whether it is the detections of a frame, not a row of them."""
+    return isinstance(found, Mapping) or any(hasattr(found, name) for name in ("xyxy", "boxes"))
+
+
+def _row_parts(rows: Any) -> tuple[Any, ...]:
+    """Split (N, 6) rows into boxes, scores and classes."""
+    rows = as_numbers(rows, "detections")
+    if rows.ndim == 1 and not rows.size:
+        rows = np.empty((0, 6))
+    if rows.ndim != 2 or rows.shape[1] != 6:
+        raise ReobjError(f"detections are an array of shape {rows.shape}; {EXPECTED}")
+    return rows[:, :4], rows[:, 4], rows[:, 5], None
+
+
+def _mapping_parts(found: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Take boxes, scores, labels and masks (N, H, W) or (N, 1, H, W) of a dict."""
+    missing = [key for key in ("boxes", "scores", "labels") if key not in found]
+    if missing:
+        raise ReobjError(f"detections are a dict without {', '.join(missing)}; {EXPECTED}")
+    masks = None if found.get("masks") is None else as_numbers(found["masks"], "masks")
+    if masks is not None and masks.ndim == 4 and masks.shape[1] == 1:
+        masks = masks[:, 0]
+    return found["boxes"], found["scores"], found["labels"], masks
+
+
+def _box_parts(found: Any) -> tuple[Any, ...]:
+    """Take xyxy, confidence, class_id and mask (supervision) or xyxy, conf and cls (Boxes)."""
+    count, parts = len(found.xyxy), [found.xyxy]
+    for names, usual in ((("confidence", "conf"), np.ones), (("class_id", "cls"), np.zeros)):
+        has = next((name for name in names if hasattr(found, name)), None)
+        if has is None:
+            raise ReobjError(f"detections have xyxy, but no {' or '.join(names)}; {EXPECTED}")
+        values = getattr(found, has)
+        parts.append(usual(count) if values is None else values)
+    return *parts, getattr(found, "mask", None)
+
+
+def _ultralytics_parts(found: Any) -> tuple[Any, ...]:
+    """Take the boxes of ultralytics' `Results`, and its masks at the size of the image."""
+    if found.boxes is None:
+        raise ReobjError(f"ultralytics Results without boxes (another task?); {EXPECTED}")
+    parts, masks = _box_parts(found.boxes), getattr(found, "masks", None)
+    if masks is None:
+        return parts
+    height, width = (int(side) for side in found.orig_shape)
+    maps = as_numbers(masks.data, "masks").astype(np.float32)  # (N, h, w) of the padded input
+    if maps.ndim != 3 or not maps.shape[1] * maps.shape[2]:
+        raise ReobjError(f"masks are an array of shape {maps.shape}, expected (N, h, w)")
+    scale = min(maps.shape[1] / height, maps.shape[2] / width)
+    h, w = max(round(height * scale), 1), max(round(width * scale), 1)
+    top, left = (maps.shape[1] - h) // 2, (maps.shape[2] - w) // 2
+    maps = maps[:, top : top + h, left : left + w]
+    full = np.zeros((len(maps), height, width), bool)  # (N, H, W)
+    for mask, own in zip(full, maps, strict=True):
+        mask[:] = cv2.resize(own, (width, height)) > MASK_THRESHOLD
+    return *parts[:3], full
+
+
+def as_numbers(values: Any, what: str) -> npt.NDArray[Any]:
+    """Convert arrays, lists and tensors of any library, by numpy's own protocol, to numbers."""
+    if isinstance(values, np.ndarray) and values.dtype.kind in "fiub":
+        return values
+    if hasattr(values, "detach") and hasattr(values, "cpu"):  # a tensor, perhaps on a GPU
+        values = values.detach().cpu()
+    try:
+        made = np.asarray(values)
+        if made.dtype.kind == "O":
+            made = made.astype(np.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        reason = str(error).partition("\n")[0]
+        raise ReobjError(f"{what} are no array of numbers ({reason}); {EXPECTED}") from error
+    if made.dtype.kind not in "fiub" or made.ndim == 0:
+        kind = type(values).__name__ if made.ndim == 0 else made.dtype.name
+        raise ReobjError(f"{what} are {kind}, no array of numbers; {EXPECTED}")
     return made
+
+
+def _checked(xyxy: Any, score: Any, class_id: Any, masks: Any) -> Detections:
+    """Make `Detections` of parts that fit each other and can be meant; else say what is wrong."""
+    xyxy, score, class_id = (
+        as_numbers(part, what)
+        for part, what in ((xyxy, "boxes"), (score, "scores"), (class_id, "classes"))
+    )
+    count = len(xyxy)
+    if xyxy.shape != (count, 4):
+        raise ReobjError(
+            f"boxes are an array of shape {xyxy.shape}, expected (N, 4) x1, y1, x2, y2"
+        )
+    for part, what in ((score, "scores"), (class_id, "classes")):
+        if part.shape != (count,):
+            raise ReobjError(f"{what} are an array of shape {part.shape}, expected ({count},): one "
+                             "for each box")  # fmt: skip
+    if count > DETECTIONS_MAX:
+        raise ReobjError(f"{count} detections in a frame, at most {DETECTIONS_MAX} are taken: "
+                         "keep the best")  # fmt: skip
+    if masks is not None:
+        masks = as_numbers(masks, "masks")
+        masks = masks if masks.dtype == bool else masks > MASK_THRESHOLD
+        if masks.ndim != 3 or len(masks) != count:
+            raise ReobjError(f"masks are an array of shape {masks.shape}, expected ({count}, H, W) "
+                             "at the size of the frame")  # fmt: skip
+    xyxy, score = xyxy.astype(np.float64, copy=False), score.astype(np.float64, copy=False)
+    _check_values(xyxy, score, class_id)
+    return Detections(xyxy, score, class_id.astype(np.int64, copy=False), masks)
+
+
+def _check_values(xyxy: Array, score: Array, class_id: npt.NDArray[Any]) -> None:
+    """Refuse boxes (N, 4), scores (N,) and classes (N,) that cannot be meant."""
+    wide = ~(np.abs(xyxy) <= COORDINATE_MAX).all(1)  # NaN too
+    inverted = (xyxy[:, 2:] < xyxy[:, :2]).any(1)
+    unlikely = ~((score >= 0) & (score <= 1))
+    unnamed = ~((class_id >= 0) & (class_id <= CLASS_MAX) & (class_id == np.floor(class_id)))
+    for bad, values, expected in (
+        (wide, xyxy, f"finite coordinates in pixels, at most {COORDINATE_MAX:g}"),
+        (inverted, xyxy, "x1 <= x2 and y1 <= y2: corners, not x, y, width, height"),
+        (unlikely, score, "a confidence in [0, 1]"),
+        (unnamed, class_id, f"a class number from 0 to {CLASS_MAX}"),
+    ):
+        if bad.any():
+            row = int(bad.argmax())
+            raise ReobjError(f"detection {row}: {values[row]}, expected {expected}")
+
+
+def as_frame(image: Any, masks: BoolArray | None = None) -> Image:
+    """Return a BGR image (H, W, 3) uint8 as it is, or in C order where it was a view.
+
+    Raises:
+        ReobjError: anything else: gray, with alpha, or of another type; or masks (D, H, W) of
+            another size.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape[2:] != (3,):
+        kind = type(image).__name__
+        if isinstance(image, np.ndarray):
+            kind = f"an array {image.shape} of {image.dtype}"
+        raise ReobjError(f"the frame is {kind}, expected a BGR image (H, W, 3) of uint8, as "
+                         "cv2.imread gives it")  # fmt: skip
+    if not image.size:
+        raise ReobjError(f"the frame has no pixels: {image.shape}, expected (H, W, 3)")
+    if masks is not None and masks.shape[1:] != image.shape[:2]:
+        raise ReobjError(f"masks of (h, w) {masks.shape[1:]}, expected {image.shape[:2]}, as the "
+                         "frame has")  # fmt: skip
+    return np.ascontiguousarray(image)
 
 
 def frame_step(table: Tracks) -> int:

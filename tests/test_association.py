@@ -19,7 +19,7 @@ from reobj.identity.locate import Categories, confidence, locate
 from reobj.identity.proposals import propose
 from reobj.objects import fitter
 from reobj.types import class_shares
-from reobj.views import Scene, gather_views
+from reobj.views import Scene, Views, gather_views
 
 
 def chairs() -> Solids:
@@ -196,6 +196,36 @@ def test_a_thing_that_is_detected_twice_is_one_thing(off_px: float, name: str) -
     )
     found = located(rt.Tracks.joined([table, again]), poses)
     assert np.unique(found).tolist() == [-1, 0, 1, 2]
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_no_detections_are_fitted_twice_and_the_first_scale_holds(metric: bool) -> None:
+    """The first fit finds the scale; what follows asks for sets of detections not fitted yet."""
+    poses = dataclasses.replace(walk(), metric=metric)
+    table = table_of(poses)
+    table = dataclasses.replace(table, tracklet_id=1 + table.detection_index)
+    fit, asked = fitter(rt.ObjectsConfig(), poses, NAMES), []
+    scales = []
+
+    def noted(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
+        fits = fit(views, classes, scene)
+        asked.extend((views.boxes[:, k].tobytes(), c) for k, c in enumerate(classes))
+        scales.append((scene.scale, fits.scale))
+        return fits
+
+    found = locate(table, NAMES, poses, noted, quadrics.load_priors())
+    assert len(scales) > 1 and len(found.confidence) == 3
+    later = asked[3:]  # of the refits
+    assert len(set(later)) == len(later)
+    (none, first), *others = scales
+    assert none is None and all(known == (None if metric else first) for known, _ in others)
+    assert all(used == first for _, used in others)
+    places = found.ellipsoids.center_in_world
+    assert len(places) == 4 and np.isnan(places[3]).all()
+    order = np.argsort(
+        found.solid[[np.flatnonzero(table.detection_index == k)[0] for k in range(3)]]
+    )
+    np.testing.assert_allclose(places[:3], chair_solids().center_in_world[order], atol=0.05)
 
 
 def test_twins_that_stand_close_stay_two() -> None:

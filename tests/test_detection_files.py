@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -284,7 +285,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
          r"entry 0: mask of .h, w. \[48, 64\] in a video of \(480, 640\)"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": [8, 9]})),
          r"entry 0: mask of 17 pixels in a video of \(640, 480\)"),
-        ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: NaN"),
+        ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: .*NaN, infinite"),
         ("d.json", json.dumps(coco_entries(image_id="x")), "not as expected"),
         ("d.json", "[1, 2]", "not as expected"),
         ("d.npz", "no zip", "d.npz: damaged"),
@@ -296,6 +297,70 @@ def test_bad_files_give_one_clear_line(
     with pytest.raises(rt.ReobjError, match=expected) as caught:
         read(tmp_path, name, text, video)
     assert name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_class_numbers_are_numbers_of_classes(tmp_path: Path, video: rt.Video) -> None:
+    """One name is made for each number up to the largest."""
+    line = LINE.strip() + ",{}\n"
+    assert len(read(tmp_path, "a.txt", line.format(32767), video).class_names) == 32767
+    for number in ("2000000000", "9" * 30, "9" * 5000):
+        with pytest.raises(rt.ReobjError, match=r"a\.txt: "):
+            read(tmp_path, "a.txt", line.format(number), video)
+
+
+def test_coordinates_beyond_any_image(tmp_path: Path, video: rt.Video) -> None:
+    with pytest.raises(rt.ReobjError, match=r"line 2: .*beyond 1e7 pixels"):
+        read(tmp_path, "a.txt", LINE + "1,-1,10,20,1e8,40,.9\n", video)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"xyxy": np.array([["1", "2", "30", "40"]])}, "array xyxy is of <U2, expected fiu"),
+        ({"frame": np.array([0.5])}, "array frame is of float64, expected iu"),
+        ({"class_names": np.array([1])}, "array class_names is of int64, expected U"),
+        ({"class_names": np.array("x")}, "array class_names is"),
+        ({"mask_offsets": np.array([0, 9])}, "mask_counts and mask_offsets do not fit"),
+        ({"mask_offsets": np.array([5, 0])}, "mask_counts and mask_offsets do not fit"),
+    ],
+)
+def test_npz_of_other_kinds(
+    tmp_path: Path, video: rt.Video, change: dict[str, Any], expected: str
+) -> None:
+    one = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.array([0.9]), np.array([0]))
+    rt.write_detections_npz(tmp_path / "a.npz", [(0, one)], ["x"], (640, 480))
+    np.savez(tmp_path / "a.npz", **(dict(np.load(tmp_path / "a.npz")) | change))
+    with pytest.raises(rt.ReobjError, match=rf"a\.npz: {expected}"):
+        rt.read_detections(tmp_path / "a.npz", video)
+
+
+@pytest.mark.parametrize("frame", ["3.7", "1e30", "-1e300"])
+def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -> None:
+    with pytest.raises(rt.ReobjError, match=r"line 2: frame .*, expected a whole number"):
+        read(tmp_path, "a.txt", LINE + f"{frame},-1,10,20,30,40,.9\n", video)
+
+
+def test_zip_that_unpacks_to_too_much(
+    tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(detection_files, "XML_MAX", 1 << 20)
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("annotations.xml", b" " * (3 << 20))
+    (tmp_path / "a.xml").write_bytes(b" " * (3 << 20))
+    for name in ("a.zip", "a.xml"):
+        with pytest.raises(rt.ReobjError, match=f"{name}: unpacks to 3 MB, at most 1 MB"):
+            rt.read_tracks(tmp_path / name, video)
+
+
+def test_a_damaged_zip_is_one_line(tmp_path: Path, video: rt.Video) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("annotations.xml", "<annotations/>" * 99)
+    data = bytearray((tmp_path / "a.zip").read_bytes())
+    data[50] ^= 255  # zlib.error
+    (tmp_path / "a.zip").write_bytes(data)
+    with pytest.raises(rt.ReobjError, match=r"a\.zip: no annotations of CVAT") as caught:
+        rt.read_tracks(tmp_path / "a.zip", video)
+    assert "\n" not in str(caught.value)
 
 
 def test_missing_file_and_unknown_class(tmp_path: Path, video: rt.Video) -> None:
@@ -311,7 +376,7 @@ def test_missing_file_and_unknown_class(tmp_path: Path, video: rt.Video) -> None
         ({"mask_offsets": [0, 1], "mask_counts": np.uint32([99])}, "row 0: mask of 99 pixels"),
         ({"class_id": [7]}, "row 0: class 7, but there are only 1 class names"),
         ({"class_id": [-1]}, "row 0: class -1"),
-        ({"score": [np.nan]}, "row 0: NaN or infinite value"),
+        ({"score": [np.nan]}, "row 0: .*NaN, infinite or beyond"),
     ],
 )
 def test_bad_npz(tmp_path: Path, video: rt.Video, change: dict[str, Any], expected: str) -> None:

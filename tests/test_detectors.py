@@ -645,6 +645,30 @@ def test_class_names_of_a_function() -> None:
         as_source(Own())(frame(9))
 
 
+@pytest.mark.parametrize(
+    ("stated", "names"),
+    [
+        ({0: "cup", 1: "wok"}, ("cup", "wok")),  # ultralytics
+        ({0: "cup", 2: "wok"}, ("cup", "class 1", "wok")),
+        (["cup", "wok"], ("cup", "wok")),
+        (None, rt.COCO_NAMES),
+        (lambda: 1, rt.COCO_NAMES),  # a method of that name
+    ],
+)
+def test_a_model_states_its_class_names(stated: Any, names: tuple[str, ...]) -> None:
+    class Model:
+        def __call__(self, image: Image) -> Any:
+            return []
+
+    Model.names = stated  # type: ignore[attr-defined]
+    assert as_source(Model()).class_names == names
+
+
+def test_a_wrong_answer_names_the_frame() -> None:
+    with pytest.raises(rt.ReobjError, match=r"frame 7: detections are an array of shape \(1, 5\)"):
+        as_source(lambda image: [[*BOX, 0.5]])(frame(7))
+
+
 @pytest.mark.parametrize("other", ["det.txt", None, 3])
 def test_what_is_no_detector_is_refused(other: Any) -> None:
     with pytest.raises(rt.ReobjError, match="is no detector: expected a function"):
@@ -719,12 +743,14 @@ def test_a_model_is_a_source(
     """Named by the options, run with the threads asked for, kept on disk under a key."""
     threads, make = [], detectors.onnx_session
     monkeypatch.setattr(
-        detectors, "onnx_session", lambda path, n: threads.append(n) or make(path, n)
+        detectors,
+        "onnx_session",
+        lambda path, n, on: threads.append((n, on)) or make(path, n),
     )
     path = model(tmp_path, yolov8(), names="{0: 'cup', 1: 'bowl', 2: 'tv'}")
     config = rt.DetectConfig(model=str(path))
     source = open_detections(clip, config, threads=1)
-    assert source.class_names == ("cup", "bowl", "tv") and threads == [1]
+    assert source.class_names == ("cup", "bowl", "tv") and threads == [(1, "cpu")]
     np.testing.assert_allclose(source(frame()).xyxy, [BOX], atol=1e-3)
     direct = as_source(rt.OnnxDetector(path))
     np.testing.assert_array_equal(direct(frame()).xyxy, source(frame()).xyxy)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -482,5 +483,25 @@ def test_embeddings_as_they_come() -> None:
     plain = as_embeddings(np.ones((2, 4)), 2)
     assert plain is not None
     assert plain.foreground.shape == (2, 4) and plain.background.shape == (2, 0)
-    with pytest.raises(rt.ReobjError, match="one row a detection"):
-        as_embeddings(both, 3)
+    assert as_embeddings(both, 2, width=5) is both
+    assert as_embeddings([], 0, width=5) is not None
+
+
+@pytest.mark.parametrize(
+    ("given", "width", "message"),
+    [
+        (rt.Embeddings(np.ones((3, 4)), np.ones((3, 1))), 0, r"\(3, 4\), expected \(2, E\)"),
+        (np.ones((4, 2)), 0, r"\(4, 2\), expected \(2, E\): one row a detection"),
+        (np.ones(8), 0, r"\(8,\), expected \(2, E\)"),  # not two rows of four
+        (np.ones((2, 2, 2)), 0, r"\(2, 2, 2\), expected"),
+        (rt.Embeddings(np.ones((2, 4)), np.ones((1, 4))), 0, r"\(1, 4\), expected"),
+        (np.ones((2, 4)), 5, "width 4, expected 5, as in the frames before"),
+        (np.ones((2, 0)), 0, "width 0, expected at least 1"),
+        (np.array([[1, np.nan], [0, 1]]), 0, "not finite"),
+        (np.array([[1, 1e39], [0, 1]]), 0, "not finite as float32"),
+        ([["a"], ["b"]], 0, "no array of numbers"),
+    ],
+)
+def test_embeddings_that_do_not_fit_are_refused(given: Any, width: int, message: str) -> None:
+    with pytest.raises(rt.ReobjError, match=message):
+        as_embeddings(given, 2, width)

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import math
+import os
 import struct
 import time
 from pathlib import Path
@@ -31,6 +32,18 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
         part.write_text("new")
         assert path.read_text() == "whole"
     assert path.read_text() == "new" and list(path.parent.iterdir()) == [path]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    replace, sync = Path.replace, os.fsync
+    monkeypatch.setattr(os, "fsync", lambda handle: done.append("sync") or sync(handle))
+    monkeypatch.setattr(Path, "replace", lambda *a: done.append("rename") or replace(*a))
+    with files.atomic(tmp_path / "a.txt") as part:
+        part.write_text("whole")
+    assert done == ["sync", "rename"]
 
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
@@ -76,6 +89,21 @@ def test_json_names_the_line(tmp_path: Path) -> None:
         files.load_json(path)
 
 
+def test_text_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "TEXT_MAX", 3 << 20)
+    with pytest.raises(rt.ReobjError, match=r"/dev/zero: more than 3 MB of text"):
+        files.read_text(Path("/dev/zero"))
+    (tmp_path / "a.txt").write_text("x" * (3 << 20))
+    assert len(files.read_text(tmp_path / "a.txt")) == 3 << 20
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000, "9" * 5000])
+def test_json_that_no_one_writes(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(rt.ReobjError, match=r"a\.json: no JSON that can be meant"):
+        files.load_json(tmp_path / "a.json")
+
+
 def test_npz_round_trip(tmp_path: Path) -> None:
     arrays = {"a": np.arange(6.0).reshape(2, 3), "names": np.array(["x", "yy"])}
     files.save_npz(tmp_path / "a.npz", arrays, version=2, of={"up": None})
@@ -101,6 +129,49 @@ def test_damaged_npz(tmp_path: Path) -> None:
         path.write_bytes(data)
         with pytest.raises(rt.ReobjError, match=r"a\.npz: damaged, or no npz file"):
             files.load_npz(path)
+
+
+def test_npz_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused by its table of contents: nothing is unpacked."""
+    files.save_npz(tmp_path / "a.npz", {"a": np.zeros(3 << 20, np.uint8)})
+    assert (tmp_path / "a.npz").stat().st_size < 9000
+    monkeypatch.setattr(files, "NPZ_MAX", 2 << 20)
+    monkeypatch.setattr(np, "load", None)
+    with pytest.raises(rt.ReobjError, match=r"a\.npz: .*unpacks to 3 MB, at most 2 MB are taken"):
+        files.load_npz(tmp_path / "a.npz")
+
+
+def test_a_sealed_npz_is_as_it_was_written(tmp_path: Path) -> None:
+    path, arrays = tmp_path / "a.npz", {"a": np.arange(6), "b": np.float32([[1, 2]])}
+    files.save_npz(path, arrays, version=2)
+    found, metadata = files.load_npz(path, sealed=True)
+    assert metadata == {"version": 2} and found["a"].tolist() == [0, 1, 2, 3, 4, 5]
+    stored = dict(np.load(path))
+    for name, other in {
+        "a": np.arange(6)[::-1],
+        "b": np.float32([[1], [2]]),  # the same bytes in another shape, or another type
+        "c": np.arange(2),
+        "metadata": np.array(str(stored["metadata"]).replace('"version": 2', '"version": 3')),
+    }.items():
+        np.savez(path, **(stored | {name: other}))
+        files.load_npz(path)  # of other tools: not sealed
+        with pytest.raises(rt.ReobjError, match="its content is not what was written"):
+            files.load_npz(path, sealed=True)
+    np.savez(path, **arrays)
+    with pytest.raises(rt.ReobjError, match="its content is not what was written"):
+        files.load_npz(path, sealed=True)
+
+
+def test_a_damaged_cache_file_is_said_and_removed(tmp_path: Path, caplog: Any) -> None:
+    path = tmp_path / "a.json"
+    assert files.load_cached(path, files.load_json) is None and not caplog.records
+    path.write_text("[1]")
+    assert files.load_cached(path, files.load_json) == [1]
+    path.write_text("[1")
+    assert files.load_cached(path, files.load_json) is None and not path.exists()
+    (record,) = caplog.records
+    assert "a.json, line 1: not valid JSON" in record.message
+    assert record.message.endswith("; computed again")
 
 
 def test_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,12 +292,25 @@ def test_progress_is_silent_without_a_terminal(
     [
         ("rtsp://me:secret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
         ("run http://token@a/b rtsp://u:p@c -o out", "run http://a/b rtsp://c -o out"),
-        ("http://a/b@c", "http://a/b@c"),  # part of the path
-        ("me@home.org", "me@home.org"),
+        ("rtsp://me:se@cret@10.0.0.7:554/a/b", "rtsp://10.0.0.7:554/a/b"),
+        ("rtsp://me:se/cret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
+        ("rtsp://me:1/2@3/4@cam/stream", "rtsp://cam/stream"),
+        ("rtsp://me:s?c@cam/stream", "rtsp://..."),  # or a query with "@": nothing tells
+        ("http://cam/v.mp4?user=me@x.org&pwd=secret", "http://..."),
+        ("http://cam/v.mp4?user=me&pwd=secret", "http://cam/v.mp4"),
+        ("http://cam/v.mp4#t=secret", "http://cam/v.mp4"),
+        ("rtsp://cam:554/user=me_password=secret_channel=1", "rtsp://cam:554/user"),
+        ("rtsp://me:s=c@cam/stream", "rtsp://..."),
+        ("http://cam?pwd=a@secret", "http://..."),
+        ("rtsp://cam/stream;key=secret", "rtsp://cam/stream"),
+        ("RTSP://me:secret@cam/1 is gone", "RTSP://cam/1 is gone"),
+        ("http:/me:secret@cam/1", "http:/cam/1"),  # as pathlib writes it
+        ("me@home.org and/or C:\\a", "me@home.org and/or C:\\a"),
+        ("/data/room=1?/a@b.mp4", "/data/room=1?/a@b.mp4"),  # a file
     ],
 )
 def test_passwords_are_not_shown(text: str, expected: str) -> None:
-    assert files.without_password(text) == expected
+    assert files.without_secrets(text) == expected
 
 
 def test_lists_are_shortened() -> None:

@@ -45,7 +45,8 @@ FLOORS = {
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {  # optional, or slow to load
-    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "av", "shtab",
+    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "supervision", "av",
+    "shtab",
 }  # fmt: skip
 LINES = {"reobj_track": 1300, "quadrics": 2270}  # at most; of any other room:
 ROOM_LINES = 600

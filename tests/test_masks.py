@@ -60,6 +60,19 @@ def test_coco_strings() -> None:
     assert masks.coco_runs("52203").tolist() == [5, 2, 2, 2, 5]  # 0 is a difference of 0, 3 of 3
 
 
+def test_endless_run_lengths_are_refused() -> None:
+    """They never end, and every character would take longer than the one before."""
+    assert masks.coco_runs(coco_string([2**32 - 1, 5])).tolist() == [2**32 - 1, 5]
+    with pytest.raises(ValueError, match="a run length of more than 35 bits"):
+        masks.coco_runs("o" * 1_000_000)
+
+
+@pytest.mark.parametrize("x", [float("nan"), float("inf"), 1e300, -1.1e7])
+def test_polygons_beyond_any_image_are_refused(x: float) -> None:
+    with pytest.raises(ValueError, match="corners that are not finite, or beyond"):
+        masks.polygon_runs([[1, 2, 3, 4, 5, 6], [x, 2, 3, 4, 5, 6]], (20, 10))
+
+
 def test_polygons_lie_where_their_corners_are() -> None:
     """Centre and area of an ellipse; half a pixel of shift would be three times the tolerance."""
     angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)

@@ -54,7 +54,7 @@ CAMERA = rt.Camera("PINHOLE", 320, 240, (300.0, 300.0, 160.0, 120.0))
 def test_options_are_few_enough_to_read() -> None:
     sections = [f for f in dataclasses.fields(rt.Config) if f.default is dataclasses.MISSING]
     solver = dataclasses.fields(quadrics.FitConfig)
-    assert len(every_option(rt.Config())) + len(sections) + len(solver) <= 60
+    assert len(every_option(rt.Config())) + len(sections) + len(solver) <= 61
     assert len(solver) == 8
 
 
@@ -446,7 +446,7 @@ def _(lab: Lab) -> None:
     assert [len(by_network(lab, value)[0]) for value in (3, 9)] == [3, 4]
 
 
-# ---- embed, threads, offline: what reaches the networks of a run ----
+# ---- embed, threads, device, offline: what reaches the networks of a run ----
 
 
 def run_on_nothing(lab: Lab, value: Any) -> None:
@@ -490,6 +490,22 @@ def _(lab: Lab) -> None:
     embedder = lab.caught(rt, "make_embedder", "threads")
     run_on_nothing(lab, 3)
     assert counts[:1] == [3] and detector[:1] == [3] and embedder == [3]
+
+
+@shows("device")
+def _(lab: Lab) -> None:
+    """Where detector and embedder run; one that is not here is refused."""
+    detector = lab.caught(rt, "open_detections", "device")
+    embedder = lab.caught(rt, "make_embedder", "device")
+    with pytest.raises(rt.ReobjError, match="--device no-such-device: unknown"):
+        run_on_nothing(lab, "no-such-device")
+    assert detector[:1] == embedder == ["no-such-device"]
+    asked: list[Any] = []
+    lab.patch.setattr(detectors, "onnx_session", lambda *given: asked.append(given) or Session())
+    (lab.path / "model.onnx").touch()
+    video, config = rt.Video(lab.path / "images"), rt.DetectConfig(str(lab.path / "model.onnx"))
+    keys = [rt.open_detections(video, config, device=d).key for d in ("cuda", "cpu")]
+    assert [device for _, _, device in asked] == ["cuda", "cpu"] and keys[0] != keys[1]
 
 
 @shows("offline")

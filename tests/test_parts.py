@@ -8,6 +8,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -209,6 +210,25 @@ def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> Non
         found = finished(dataclasses.replace(given), link=False).objects
         heights.append([o.size[2] for o in found if o.size is not None])
     assert len(heights[1]) == 3 and (np.array(heights[1]) > 1.2 * np.array(heights[0])).all()
+
+
+def test_the_last_fit_begins_with_the_places_of_the_association(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What hides is known from there; where nothing is associated a first fit tells."""
+    for link in (True, False):
+        seen = Mock(wraps=reobj.parts.hidden_edges)
+        monkeypatch.setattr(reobj.parts, "hidden_edges", seen)
+        calls = Mock(wraps=quadrics.fit_objects)
+        monkeypatch.setattr(quadrics, "fit_objects", calls)
+        result = finished(unlinked(walk(), tracks_of(walk())), link=link)
+        (_, ellipsoids), _ = seen.call_args
+        center = [o.center for o in result.objects]
+        np.testing.assert_allclose(ellipsoids.center_in_world, center, atol=0.05)
+        hidden = [call.kwargs["hidden"] is not None for call in calls.call_args_list]
+        assert hidden == [False] * (len(hidden) - 1) + [True]
+        assert link or len(hidden) == 2
+        monkeypatch.undo()
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -12,7 +13,8 @@ from pose_worlds import FOCAL, FRAMES, PINHOLE, SIZE, FakeVideo, blank, some_cam
 from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
-from reobj.cameras import invert_rigid, write_colmap, write_tum
+from reobj.cameras import import_pycolmap, invert_rigid, write_colmap, write_tum
+from reobj.poses import readers
 
 CAMERA = f"{FOCAL},{FOCAL},320,240"
 K = [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]]
@@ -459,6 +461,29 @@ def test_damaged_files_are_refused_in_one_clear_line(tmp_path, write, file, dama
     with pytest.raises(rt.ReobjError, match=message) as refused:
         read(path, camera=CAMERA if write is as_tum else "")
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "frames.bin"])
+@pytest.mark.parametrize("what", ["records", "entries"])
+def test_a_binary_model_that_claims_more_than_it_holds(tmp_path, name, what):
+    """A claim of 2^40 points would take 40 TB before the first is read."""
+    pc = import_pycolmap()
+    truth = pc.synthesize_dataset(pc.SyntheticDatasetOptions())
+    truth.write_binary(str(tmp_path))
+    readers._check_counts(tmp_path)
+    data, at = bytearray((tmp_path / name).read_bytes()), 0
+    if what == "entries":
+        head, number, size = readers.RECORDS[name]
+        if not size:
+            pytest.skip("records of one size")
+        at = 8 + head
+        at = data.index(b"\0", at) + 1 if name == "images.bin" else at
+        data[at : at + struct.calcsize(number)] = struct.pack(number, 2**31)
+    else:
+        data[:8] = struct.pack("<Q", 2**40)
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(rt.ReobjError, match=f"not a COLMAP model .{name} claims [0-9]+ {what} in"):
+        rt.read_poses(tmp_path, blank(9))
 
 
 def test_a_binary_model_of_zero_images_is_refused(tmp_path):

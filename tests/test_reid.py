@@ -122,6 +122,12 @@ def test_gallery_parts_of_what_is_not_known() -> None:
             assert part.shape == (1, len(identity)) and np.isnan(part).all()
 
 
+def test_identities_after_the_last_with_a_view_are_unknown() -> None:
+    """They were confirmed in frames without an image; room is made 16 at a time."""
+    fore, _, _ = filled((0, 90)).parts(at_degrees(0), np.array([0, 16, 40]), UNKNOWN)
+    np.testing.assert_allclose(fore, [[1, np.nan, np.nan]], rtol=1e-6)
+
+
 # ---- Cosines ----
 
 

@@ -431,7 +431,7 @@ def test_a_damaged_file_of_this_version_is_no_other_version(saved: Path) -> None
     with pytest.raises(rt.ReobjError, match=r"last-poses\.npz: is damaged: run the video again"):
         rt.Result.load(saved)
     (saved / "cache/last-poses.npz").write_bytes(b"PK")
-    with pytest.raises(rt.ReobjError, match=r"last-poses\.npz: damaged"):
+    with pytest.raises(rt.ReobjError, match=r"last-poses\.npz: is damaged: run"):
         rt.Result.load(saved)
 
 

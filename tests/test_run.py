@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import doctest
 import errno
 import importlib
@@ -22,7 +23,9 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj
 import reobj_track as rt
+from reobj.poses import stage
 from reobj.results.result import validate_objects
+from reobj.results.stages import detect_all
 from reobj.results.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -850,6 +853,88 @@ def test_damaged_cache_is_said(
     np.savez(tmp_path / "out/cache/last-tracks.npz", frame=np.arange(3))
     assert cli("objects", tmp_path / "out") == 2
     assert_one_clear_line(capsys, r"last-tracks\.npz: is damaged: run the video again")
+
+
+def test_a_damaged_cache_is_computed_again(
+    clip: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Cut, or whole but with another content: one line, and the same result."""
+    out = tmp_path / "out"
+    args = ("track", clip, "-o", out, "--detections", detections, "--embed", "none")
+    assert cli(*args) == 0
+    expected, files = (out / "tracks.txt").read_bytes(), list((out / "cache").glob("tracks-*.npz"))
+    assert len(files) == 1
+    whole = files[0].read_bytes()
+    stored = dict(np.load(files[0]))
+    other = io.BytesIO()
+    np.savez(other, **(stored | {"xyxy": stored["xyxy"][:2] * np.nan}))
+    for bad in (whole[:-9], b"", other.getvalue()):
+        files[0].write_bytes(bad)
+        capsys.readouterr()
+        assert cli(*args) == 0
+        warnings = capsys.readouterr().err.strip().splitlines()
+        assert sum("computed again" in line for line in warnings) == 1
+        assert (out / "tracks.txt").read_bytes() == expected and files[0].read_bytes() == whole
+    (out / "cache/source.json").write_text("{")
+    assert cli(*args, "--overwrite") == 0
+
+
+def test_damaged_boxes_are_detected_again(clip: Path, tmp_path: Path) -> None:
+    video, workspace, asked = rt.Video(clip), Workspace(tmp_path / "out"), []
+
+    def detect(frame: rt.Frame) -> rt.Detections:
+        asked.append(frame.index)
+        return rt.Detections.from_array([[100, 60, 140, 110, 0.9, 56]])
+
+    source = rt.DetectionSource(detect, key="mine")
+    for _ in range(2):
+        _, rows = detect_all(source, video, workspace)
+        assert len(rows) == FRAMES == len(asked)
+    (path,) = workspace.cache.glob("boxes-*.npz")
+    stored = dict(np.load(path))
+    np.savez(path, **(stored | {"xyxy": stored["xyxy"] * np.nan}))
+    _, rows = detect_all(source, video, workspace)
+    assert np.isfinite(rows.xyxy).all() and len(asked) == 2 * FRAMES
+
+
+def test_damaged_poses_are_computed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A reconstruction, and the points of supplied poses."""
+    (tmp_path / "im").mkdir()
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / f"im/{i}.png"), np.zeros((48, 64, 3), np.uint8))
+    video, workspace = rt.Video(tmp_path / "im"), Workspace(tmp_path / "out")
+    camera = rt.Camera("PINHOLE", 64, 48, (60.0, 60.0, 32.0, 24.0))
+    cams = np.eye(4)[None, :3].repeat(2, 0)
+    made = rt.Poses(
+        camera, np.arange(2), np.arange(2) / 30, cams, np.array(["pnp"] * 2), "pycolmap"
+    )
+    calls = []
+
+    def estimate(*args: object, **more: object) -> rt.Poses:
+        calls.append("estimate")
+        (workspace.cache / "sfm/sparse").mkdir(parents=True)
+        return made
+
+    def points(poses: rt.Poses, *args: object, **more: object) -> rt.Poses:
+        calls.append("points")
+        return dataclasses.replace(poses, points=np.ones((1, 3)), colors=np.zeros((1, 3), np.uint8))
+
+    monkeypatch.setattr(stage, "estimate_poses", estimate)
+    monkeypatch.setattr(stage, "triangulate", points)
+    stages = {
+        "poses": lambda: stage.reconstruct_cached(video, rt.PosesConfig(), workspace)[0],
+        "points": lambda: stage.with_points(made, video, rt.PosesConfig(), workspace),
+    }
+    for name, compute in stages.items():
+        calls.clear(), caplog.clear()
+        compute(), compute()
+        assert len(calls) == 1 and not caplog.records
+        (path,) = workspace.cache.glob(f"{name}-*.npz")
+        np.savez(path, **(dict(np.load(path)) | {"frame": np.arange(9)}))
+        assert compute().known.all() and len(calls) == 2
+        assert [r.message.endswith("computed again") for r in caplog.records] == [True]
 
 
 def test_a_closed_pipe_is_no_error(clip: Path, detections: Path, tmp_path: Path) -> None:

@@ -426,11 +426,69 @@ def test_embeddings_stay_with_their_boxes() -> None:
     np.testing.assert_allclose(tracker.state.embedding, views, atol=1e-6)
 
 
-def test_wrong_number_of_embeddings_is_refused() -> None:
-    with pytest.raises(rt.ReobjError, match="one row a detection"):
-        rt.Tracker().update(
-            rows((0, 0, 5, 5)), embeddings=rt.Embeddings(np.ones((2, 4)), np.ones((2, 0)))
-        )
+K640 = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
+AT_ORIGIN = np.eye(4)[:3]
+BEYOND, MIRRORED = AT_ORIGIN.copy(), AT_ORIGIN.copy()
+BEYOND[0, 3], MIRRORED[0, 0] = 1e200, -1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"detections": np.ones((2, 5))}, r"expected \(N, 6\)"),
+        ({"frame": np.zeros((48, 64), np.uint8)}, "expected a BGR image"),
+        ({"frame": np.zeros((48, 65, 3), np.uint8)}, r"masks of \(h, w\) \(48, 64\), expected"),
+        ({"embeddings": np.ones((3, 4))}, "one row a detection"),
+        ({"embeddings": np.ones((2, 5))}, "width 5, expected 4, as in the frames before"),
+        ({"cam_from_world": np.eye(4)}, r"shape \(4, 4\), expected \(3, 4\)"),
+        ({"cam_from_world": BEYOND}, "beyond any camera's place"),
+        ({"cam_from_world": MIRRORED}, "its rotation is none .*determinant -1"),
+        ({"cam_from_world": np.zeros((3, 4))}, "its rotation is none"),
+        ({"camera": None}, "without a camera"),
+        ({"camera": rt.Camera("PINHOLE", 640, 480, (0.0, 0.0, 0.0, 0.0))}, "focal lengths above 0"),
+        ({"camera": rt.Camera("PINHOLE", 0, 0, (500.0, 500.0, 0.0, 0.0))}, "expected a size"),
+        ({"camera": rt.Camera("PINHOLE", 640, 480, (np.nan, 5.0, 0.0, 0.0))}, "expected a size"),
+        ({"points": np.ones(3)}, r"points of shape \(3,\), expected \(N, 3\)"),
+        ({"points": np.full((1, 3), np.nan)}, "finite"),
+        ({"part": -1}, "part -1, expected"),
+        ({"part": 10**9}, "part 1000000000, expected"),
+        ({"part": 0.5}, "part 0.5, expected"),
+    ],
+)
+def test_what_cannot_be_meant_leaves_the_tracker_as_it_was(
+    wrong: dict[str, Any], message: str
+) -> None:
+    found = rows((10, 10, 50, 90), (60, 10, 90, 90))
+    found = rt.Detections(found.xyxy, found.score, found.class_id, np.ones((2, 48, 64), bool))
+    good = {
+        "detections": found,
+        "frame": np.zeros((48, 64, 3), np.uint8),
+        "embeddings": np.eye(2, 4),
+        "cam_from_world": AT_ORIGIN,
+        "camera": K640,
+        "points": np.ones((5, 3)),
+    }
+    tracker, untouched = (rt.Tracker(rt.TrackerConfig(n_init=1)) for _ in range(2))
+    for each in (tracker, untouched):
+        each.update(**good)
+    with pytest.raises(rt.ReobjError, match=message) as caught:
+        tracker.update(**good | wrong)
+    assert "\n" not in str(caught.value)
+    after, expected = tracker.update(**good), untouched.update(**good)
+    np.testing.assert_array_equal(after.to_array(), expected.to_array())
+    assert after.frame.tolist() == [1, 1]
+
+
+def test_a_pose_with_nan_is_none() -> None:
+    tracker = rt.Tracker()
+    tracker.update([], cam_from_world=np.full((3, 4), np.nan), camera=K640)
+    assert tracker._pose is None
+
+
+def test_frames_of_one_pixel_are_frames() -> None:
+    tracker = rt.Tracker()
+    for size in ((1, 1), (1, 640), (480, 1), (2, 3)):
+        tracker.update(rows((0, 0, 5, 5)), np.zeros((*size, 3), np.uint8))
 
 
 def test_tracker_is_deterministic() -> None:

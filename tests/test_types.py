@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 import reobj_track as rt
 from reobj.types import (
     as_detections,
+    as_frame,
     box_iou,
     class_shares,
     cxcywh_from_xyxy,
@@ -77,27 +82,202 @@ def test_detections_are_selected_with_their_masks() -> None:
     assert rt.Detections.from_array([]).xyxy.shape == rt.Detections.empty().xyxy.shape == (0, 4)
 
 
+ROWS = np.array([[10, 20, 110, 220, 0.9, 56], [300, 40, 400, 200, 0.7, 2.0]])
+PARTS = (ROWS[:, :4], ROWS[:, 4], ROWS[:, 5])
+
+
+class Tensor:
+    """An array as torch shows it: on a device, asked for by `__array__` once it is on the CPU."""
+
+    def __init__(self, values: Any, where: str = "cuda:0") -> None:
+        self.values, self.where = np.asarray(values), where
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def detach(self) -> Tensor:
+        return Tensor(self.values, self.where)
+
+    def cpu(self) -> Tensor:
+        return Tensor(self.values, "cpu")
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        if self.where != "cpu":
+            raise TypeError(f"can't convert {self.where} device type tensor to numpy")
+        return self.values.astype(dtype or self.values.dtype)
+
+
+def ultralytics(masks: Any = None, **other: Any) -> Any:
+    """A Results: its boxes are attributes of another object."""
+    xyxy, conf, cls = map(Tensor, PARTS)
+    boxes = SimpleNamespace(xyxy=xyxy, conf=conf, cls=cls)
+    return SimpleNamespace(**{"boxes": boxes, "masks": masks, "orig_shape": (480, 640)} | other)
+
+
+def torchvision(**other: Any) -> dict[str, Any]:
+    boxes, scores, labels = map(Tensor, PARTS)
+    return {"boxes": boxes, "scores": scores, "labels": labels} | other
+
+
+def supervision(**other: Any) -> Any:
+    given = {"xyxy": PARTS[0], "confidence": PARTS[1], "class_id": PARTS[2], "mask": None}
+    return SimpleNamespace(**given | other)
+
+
 @pytest.mark.parametrize(
-    "wrong",
+    "found",
     [
-        rt.Detections(np.zeros((2, 4)), np.ones(1), np.zeros(2, np.int64)),
-        rt.Detections(np.zeros((2, 4)), np.ones(2), np.zeros(3, np.int64)),
-        rt.Detections(
-            np.zeros((1, 4)), np.ones(1), np.zeros(1, np.int64), np.zeros((2, 3, 3), bool)
-        ),
-        [[0, 0, np.nan, 1, 0.5, 1]],
+        ROWS,
+        ROWS.tolist(),
+        tuple(map(tuple, ROWS.tolist())),
+        ROWS.astype(object),
+        Tensor(ROWS),
+        Tensor(ROWS.astype(np.float32), "cpu"),
+        rt.Detections(*PARTS[:2], PARTS[2].astype(np.int64)),
+        ultralytics(),
+        ultralytics().boxes,
+        [ultralytics()],  # what a model returns: a batch of one
+        torchvision(),
+        [torchvision(masks=None)],
+        supervision(),
     ],
 )
-def test_detections_that_do_not_fit_are_refused(wrong: object) -> None:
-    with pytest.raises(rt.ReobjError, match="do not fit, or hold NaN"):
-        as_detections(wrong)
+def test_detections_as_the_field_has_them(found: Any) -> None:
+    made = as_detections(found)
+    np.testing.assert_allclose(made.xyxy, PARTS[0])
+    np.testing.assert_allclose(made.score, PARTS[1])
+    assert made.class_id.tolist() == [56, 2] and made.masks is None
+    kinds = (made.xyxy.dtype, made.score.dtype, made.class_id.dtype)
+    assert kinds == (np.float64, np.float64, np.int64)
+    assert as_detections(made) is made
 
 
-@pytest.mark.parametrize("shape", [(2, 5), (6, 5), (6,), (1, 2, 6)])
-def test_rows_of_another_width_are_refused(shape: tuple[int, ...]) -> None:
-    """Six rows of five numbers are not five rows of six."""
+@pytest.mark.parametrize("none", [[], np.empty((0, 6)), np.empty(0), supervision(
+    xyxy=np.empty((0, 4)), confidence=None, class_id=None)])  # fmt: skip
+def test_a_frame_without_detections(none: Any) -> None:
+    assert as_detections(none).xyxy.shape == (0, 4) and len(as_detections(none)) == 0
+
+
+def test_masks_of_a_padded_input_come_back_to_the_image() -> None:
+    """640 x 480 in a square of 320: rows 40 to 280 are the image, at half its size."""
+    data = np.zeros((2, 320, 320), np.float32)
+    data[0, 40 + 10 : 40 + 110, 5:55] = 1
+    data[1, :40] = 1  # in the border: nothing of the image
+    masks = as_detections(ultralytics(SimpleNamespace(data=Tensor(data)))).masks
+    assert masks is not None and masks.shape == (2, 480, 640)
+    expected = np.zeros((480, 640), bool)
+    expected[20:220, 10:110] = True
+    assert np.array_equal(masks[0], expected) and not masks[1].any()
+
+
+def test_masks_may_be_probabilities() -> None:
+    soft = np.full((2, 1, 4, 5), 0.4)
+    soft[1, 0, 2, 3] = 0.6
+    masks = as_detections(torchvision(masks=Tensor(soft))).masks
+    assert masks is not None and masks.dtype == bool and np.argwhere(masks).tolist() == [[1, 2, 3]]
+
+
+def changed(row: int, column: int, value: float) -> np.ndarray:
+    rows = ROWS.copy()
+    rows[row, column] = value
+    return rows
+
+
+XYXY, SCORE, LABEL = PARTS
+REFUSED = [
+    (ROWS[:, :5], r"shape \(2, 5\); expected \(N, 6\) rows"),
+    (np.ones((6, 5)), r"shape \(6, 5\); expected \(N, 6\)"),  # not five rows of six
+    (np.ones((6, 7)), r"shape \(6, 7\); expected"),  # rows of trackers have an identity
+    (np.ones(6), r"shape \(6,\); expected"),
+    (np.ones((1, 2, 6)), r"shape \(1, 2, 6\); expected"),
+    ([ROWS, ROWS], r"shape \(2, 2, 6\); expected"),  # of two frames
+    (np.empty((0, 5)), r"shape \(0, 5\); expected"),
+    (None, "are NoneType, no array of numbers; expected"),
+    ("det.txt", "are str, no array"),
+    (ROWS.astype(str), "are str.*, no array"),
+    (ROWS.astype(complex), "are complex128, no array"),
+    ([[1, 2], [3]], "no array of numbers .*inhomogeneous"),
+    (object(), "no array of numbers"),
+    ({"boxes": XYXY}, "a dict without scores, labels; expected"),
+    (SimpleNamespace(xyxy=XYXY), "xyxy, but no confidence or conf"),
+    (SimpleNamespace(xyxy=XYXY, conf=SCORE), "xyxy, but no class_id or cls"),
+    (ultralytics(boxes=None), "Results without boxes"),
+    (ultralytics(SimpleNamespace(data=np.ones((2, 9)))), r"masks are an array of shape \(2, 9\)"),
+    (supervision(xyxy=XYXY[:, :3]), r"boxes are an array of shape \(2, 3\), expected \(N, 4\)"),
+    (supervision(confidence=SCORE[:1]), r"scores are .* \(1,\), expected \(2,\)"),
+    (torchvision(labels=LABEL[:, None]), r"classes are .* \(2, 1\), expected \(2,\)"),
+    (supervision(mask=np.ones((1, 4, 4), bool)), r"masks are .* expected \(2, H, W\)"),
+    (torchvision(masks=np.ones((2, 3, 4, 4))), r"masks are .* \(2, 3, 4, 4\), expected"),
+    (changed(1, 0, np.nan), "detection 1: .*expected finite coordinates"),
+    (changed(0, 2, np.inf), "detection 0: .*expected finite"),
+    (changed(0, 3, 1.1e7), r"at most 1e\+07"),
+    (changed(1, 2, 299), "detection 1: .*x1 <= x2 and y1 <= y2: corners, not x, y, width"),
+    (changed(1, 4, 9), r"detection 1: 9.0, expected a confidence in \[0, 1\]"),
+    (changed(0, 4, -1), "detection 0: -1.0, expected a confidence"),
+    (changed(0, 4, np.nan), "nan, expected a confidence"),
+    (changed(0, 5, -1), "-1.0, expected a class number from 0"),
+    (changed(0, 5, 2e9), "expected a class number from 0 to 32767"),  # gigabytes of votes
+    (changed(0, 5, 1.5), "1.5, expected a class number"),
+    (np.repeat(ROWS, 1501, 0), "3002 detections in a frame, at most 3000"),
+]
+
+
+@pytest.mark.parametrize(("found", "message"), REFUSED)
+def test_what_cannot_be_meant_is_refused_in_one_line(found: Any, message: str) -> None:
+    with pytest.raises(rt.ReobjError, match=message) as caught:
+        as_detections(found)
+    assert "\n" not in str(caught.value)
+
+
+def test_rows_alone_are_rows() -> None:
     with pytest.raises(rt.ReobjError, match=r"expected \(N, 6\)"):
-        rt.Detections.from_array(np.ones(shape))
+        rt.Detections.from_array(np.ones((6, 5)))
+
+
+def test_detections_go_to_supervision(monkeypatch: pytest.MonkeyPatch) -> None:
+    masks = np.zeros((2, 9, 9), bool)
+    masks[1, 2:4] = True
+    own = rt.Detections(*PARTS[:2], PARTS[2].astype(np.int64), masks)
+    monkeypatch.setitem(sys.modules, "supervision", None)
+    with pytest.raises(rt.ReobjError, match="pip install supervision"):
+        own.to_supervision()
+    monkeypatch.undo()
+    pytest.importorskip("supervision")
+    back = as_detections(own.to_supervision())
+    for name in ("xyxy", "score", "class_id", "masks"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(own, name))
+
+
+# ---- Frames ----
+
+
+def test_frames_are_bgr_bytes() -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    assert as_frame(image) is image
+    assert as_frame(image[:, ::-1]).flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((4, 6), np.uint8),  # gray
+        np.zeros((4, 6, 1), np.uint8),
+        np.zeros((4, 6, 4), np.uint8),  # with alpha
+        np.zeros((3, 4, 6), np.uint8),  # channels first
+        np.zeros((4, 6, 3)),
+        np.zeros((4, 6, 3), bool),
+        [[[0, 0, 0]]],
+        "room.jpg",
+    ],
+)
+def test_other_images_are_refused(image: Any) -> None:
+    with pytest.raises(rt.ReobjError, match=r"expected a BGR image \(H, W, 3\) of uint8"):
+        as_frame(image)
+
+
+def test_a_frame_without_pixels_is_refused() -> None:
+    with pytest.raises(rt.ReobjError, match="no pixels"):
+        as_frame(np.zeros((0, 6, 3), np.uint8))
 
 
 # ---- Tables of tracks ----

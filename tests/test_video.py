@@ -265,7 +265,7 @@ class FakeFile:
     def get(self, what: int) -> float:
         values = {cv2.CAP_PROP_FPS: 10.0, cv2.CAP_PROP_FRAME_COUNT: float(self.announced),
                   cv2.CAP_PROP_POS_MSEC: 100.0 * self.n * self.times}  # fmt: skip
-        return values[what]
+        return values.get(what, 0.0)
 
     def grab(self) -> bool:
         self.n += 1
@@ -365,6 +365,80 @@ def test_a_changed_source_has_another_fingerprint(movie: Path, tmp_path: Path) -
     seen.add(fingerprint(folder))  # size
     assert len(seen) == 6 and {len(f) for f in seen} == {16}
     assert fingerprint("rtsp://camera/1") == "rtsp://camera/1" and fingerprint(0) == "0"
+
+
+def test_a_file_whose_name_looks_like_a_glob_is_itself(tmp_path: Path) -> None:
+    fingerprint = video_room.source_fingerprint
+    for name in ("det[1].txt", "det1.txt"):
+        (tmp_path / name).write_text("1")
+    before = fingerprint(tmp_path / "det[1].txt")
+    (tmp_path / "det1.txt").write_text("changed")
+    assert fingerprint(tmp_path / "det[1].txt") == before
+    (tmp_path / "det[1].txt").write_text("changed")
+    assert fingerprint(tmp_path / "det[1].txt") != before
+
+
+def test_fingerprints_of_urls_tell_them_apart_and_no_secret() -> None:
+    urls = [f"http://me:secret@cam/v.mp4?id={i}&pwd=secret" for i in range(2)]
+    first, second = map(video_room.source_fingerprint, urls)
+    assert first != second and first.startswith("http://cam/v.mp4 ")
+    assert "secret" not in first + second and video_room.source_fingerprint(urls[0]) == first
+
+
+def claiming(kind: str, width: int, height: int, folder: Path) -> bytes:
+    """A small image whose header says another size."""
+    path = folder / f"small.{kind}"
+    cv2.imwrite(str(path), np.zeros((7, 5, 3), np.uint8))
+    data = bytearray(path.read_bytes())
+    if kind == "jpg":
+        at = data.index(b"\xff\xc0")
+        data[at + 5 : at + 9] = struct.pack(">HH", height, width)
+    else:
+        at, form = {"png": (16, ">II"), "bmp": (18, "<ii")}[kind]
+        data[at : at + 8] = struct.pack(form, width, height)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "bmp"])
+def test_an_image_of_gigabytes_is_refused_by_its_header(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / f"a.{kind}").write_bytes(claiming(kind, 30_000, 30_000, tmp_path))
+    monkeypatch.setattr(cv2, "imdecode", None)
+    with pytest.raises(rt.ReobjError, match=f"a.{kind}: 900000000 pixels, at most 268435456"):
+        rt.Video(tmp_path / f"a.{kind}")
+
+
+@pytest.mark.parametrize("size", [(37, 21), (1, 300), (300, 2)])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.png", []),
+        ("a.bmp", []),
+        ("a.jpg", []),
+        ("a.jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]),
+        ("a.tif", []),
+        ("a.webp", [cv2.IMWRITE_WEBP_QUALITY, 80]),
+        ("a.webp", [cv2.IMWRITE_WEBP_QUALITY, 101]),  # lossless
+    ],
+)
+def test_headers_tell_the_number_of_pixels(
+    name: str, options: list[int], size: tuple[int, int], tmp_path: Path
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (*size[::-1], 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / name), noise, options)
+    data = (tmp_path / name).read_bytes()
+    assert video_room.claimed_pixels(data) == size[0] * size[1]
+    for end in range(0, len(data), 3):  # cut anywhere: no error
+        video_room.claimed_pixels(data[:end])
+
+
+def test_a_name_that_is_no_utf8_is_one_line(tmp_path: Path, movie: Path) -> None:
+    path = os.fsencode(tmp_path) + b"/room\xff.mp4"
+    Path(os.fsdecode(path)).write_bytes(movie.read_bytes())
+    with pytest.raises(rt.ReobjError, match="this name is no UTF-8; rename the file") as caught:
+        rt.Video(os.fsdecode(path))
+    str(caught.value).encode()  # can be printed
 
 
 # ---- Cameras -------------------------------------------------------------------------------------
@@ -518,7 +592,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
 def stream(request: pytest.FixtureRequest) -> Iterator[tuple[Stream, str]]:
     server = Stream(*request.param)
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-    yield server, f"http://me:secret@127.0.0.1:{server.server_port}/camera.mjpg"
+    yield server, f"http://me:secret@127.0.0.1:{server.server_port}/camera.mjpg?pwd=secret"
     server.shutdown()
     server.server_close()
 
@@ -604,7 +678,8 @@ def test_ctrl_c_leaves_complete_files(stream: tuple[Stream, str], tmp_path: Path
         assert {entry["id"] for entry in data["objects"]} == {1, 2}
         assert any(w.startswith("live: ") and "dropped" in w for w in data["warnings"])
         assert "identities only" in errors and "distinct objects: 2" in text
-        written = "".join(p.read_text() for p in out.rglob("*.json")) + text + errors
+        files = [p for p in out.rglob("*") if p.suffix in (".json", ".html", ".txt")]
+        written = "".join(p.read_text() for p in files) + text + errors
         assert "secret" not in written and str(server.server_port) in written
         assert not list(out.rglob(".part*"))
         (out / "tracks.txt").unlink()

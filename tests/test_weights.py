@@ -383,6 +383,46 @@ def test_onnxruntime_is_asked_for_when_it_is_missing(monkeypatch: pytest.MonkeyP
         weights.onnx_session(Path("any.onnx"))
 
 
+REOBJ = weights.own_models() / "reobj.onnx"
+
+
+def test_devices_that_are_not_here_are_named() -> None:
+    import onnxruntime
+
+    assert weights.onnx_session(REOBJ, 1, "cpu").get_providers() == ["CPUExecutionProvider"]
+    with pytest.raises(rt.ReobjError, match=r"--device gpu: unknown; known are cpu, cuda"):
+        weights.onnx_session(REOBJ, 1, "gpu")
+    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
+        pytest.skip("this onnxruntime has CUDA")
+    with pytest.raises(rt.ReobjError, match=r"--device cuda: .* has cpu only; .*onnxruntime-gpu"):
+        weights.onnx_session(REOBJ, 1, "cuda")
+
+
+@pytest.mark.parametrize("starts", [True, False])
+def test_a_device_is_onnxruntimes_provider(monkeypatch: pytest.MonkeyPatch, starts: bool) -> None:
+    """onnxruntime goes on with the CPU where a provider does not start: that must be said."""
+    import onnxruntime
+
+    own = "CoreMLExecutionProvider"
+    asked = []
+
+    class Session:
+        def __init__(self, path: str, options: Any, providers: list[str]) -> None:
+            asked.append(providers)
+
+        def get_providers(self) -> list[str]:
+            return asked[-1] if starts else asked[-1][1:]
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [own])
+    if starts:
+        weights.onnx_session(REOBJ, 1, "coreml")
+    else:
+        with pytest.raises(rt.ReobjError, match=f"--device coreml: {own} did not start"):
+            weights.onnx_session(REOBJ, 1, "coreml")
+    assert asked == [[own, "CPUExecutionProvider"]]
+
+
 def test_imagenet_constants_are_those_of_torchvision() -> None:
     np.testing.assert_allclose(np.divide(weights.IMAGENET_MEAN, 255), [0.485, 0.456, 0.406])
     np.testing.assert_allclose(np.divide(weights.IMAGENET_STD, 255), [0.229, 0.224, 0.225])

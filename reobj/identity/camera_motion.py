@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from reobj.sources.video import resized
+from reobj.sources.video import shrunk
 from reobj.types import Array, Floats, Image
 
 FLOW_SIZE_PX = 320  # longer side of the image in which corners are followed (chosen, for speed)
@@ -50,7 +50,7 @@ class CameraMotion:
         In pixels of `image`; the identity for a first image and after a change of size.
         """
         shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
-        small = resized(image, [round(side * shrink) for side in image.shape[1::-1]])
+        small = shrunk(image, FLOW_SIZE_PX)
         gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         new_from_old, residual_flow = np.eye(3), np.empty((0, 4))
         if self.gray is not None and self.corners is not None and self.gray.shape == gray.shape:

@@ -35,13 +35,13 @@ CROP_BACKBONE = "mobilenetv2_feat"  # its ConvBlock comes along (re-OBJ: a ResNe
 
 
 def make_embedder(
-    model: str, head: str = "", threads: int = 0, offline: bool = False
+    model: str, head: str = "", threads: int = 0, offline: bool = False, device: str = "cpu"
 ) -> Embedder | None:
     """Make the embedder that `EmbedConfig.model` and `.head` name.
 
     Args:
         model: "none"; "crops" or "crops:BACKBONE" for a `CropEmbedder`; else as of `Embedder`.
-        head, threads, offline: as of `Embedder`.
+        head, threads, offline, device: as of `Embedder`.
     Returns:
         None for "none": the tracker then goes by motion.
     """
@@ -49,8 +49,8 @@ def make_embedder(
         return None
     kind, _, backbone = model.partition(":")
     if kind == "crops":
-        return CropEmbedder(backbone or CROP_BACKBONE, head, None, threads, offline)
-    return Embedder(model, head, None, threads, offline)
+        return CropEmbedder(backbone or CROP_BACKBONE, head, None, threads, offline, device)
+    return Embedder(model, head, None, threads, offline, device)
 
 
 EDGE_SHARE = 1 / 28  # sigma of the masks' soft edge over the crop's side (chosen: 8 px of 224)
@@ -71,7 +71,7 @@ class CropEmbedder(Embedder):
             input (any batch) and a spatial output.
         head: ConvBlock (.onnx); "": crops_BACKBONE_head.onnx beside the backbone's file, else the
             one that comes along; "none": none.
-        layout, threads, offline: as of `Embedder`.
+        layout, threads, offline, device: as of `Embedder`.
     Raises:
         ReobjError: the model has no spatial output, or (when called) the ConvBlock does not fit it.
     """
@@ -83,12 +83,13 @@ class CropEmbedder(Embedder):
         layout: SamplingLayout | None = None,
         threads: int = 0,
         offline: bool = False,
+        device: str = "cpu",
     ) -> None:
-        super().__init__(model, "none", layout, threads, offline)
+        super().__init__(model, "none", layout, threads, offline, device)
         self.model = f"crops:{model}"
         self.backbone.use_output_at_stride(CROP_STRIDE, self.layout.crop_px)
         self.head = None if self.trained else trained_head(self.model, head)
-        self.conv_block = onnx_session(self.head, threads) if self.head else None
+        self.conv_block = onnx_session(self.head, threads, device) if self.head else None
         if self.conv_block is not None:
             self.layout = self.layout.updated(onnx_metadata(self.conv_block))
 

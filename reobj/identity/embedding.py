@@ -34,6 +34,7 @@ from reobj.types import (
     Image,
     IntArray,
     ReobjError,
+    as_numbers,
     cxcywh_from_xyxy,
     option,
     unit_rows,
@@ -75,6 +76,7 @@ class Embedder:
         layout: where the map of an untrained backbone is sampled.
         threads: of onnxruntime; 0: all cores.
         offline: never download weights.
+        device: cpu, cuda, coreml, ... that onnxruntime has.
     Raises:
         ReobjError: the model is not found, or has no spatial output.
 
@@ -90,9 +92,10 @@ class Embedder:
         layout: SamplingLayout | None = None,
         threads: int = 0,
         offline: bool = False,
+        device: str = "cpu",
     ) -> None:
         self.model = model
-        self.backbone = Backbone(model, head, layout or SamplingLayout(), threads, offline)
+        self.backbone = Backbone(model, head, layout or SamplingLayout(), threads, offline, device)
         self.layout = self.backbone.layout
         self._latest: _LatestFrame | None = None
 
@@ -249,10 +252,16 @@ class Backbone:
     """
 
     def __init__(
-        self, model: str, head: str, layout: SamplingLayout, threads: int, offline: bool
+        self,
+        model: str,
+        head: str,
+        layout: SamplingLayout,
+        threads: int,
+        offline: bool,
+        device: str = "cpu",
     ) -> None:
         path = model_path(model, offline=offline)
-        self.session = onnx_session(path, threads)
+        self.session = onnx_session(path, threads, device)
         spatial = [o.name for o in self.session.get_outputs() if len(o.shape) == 4]
         if not spatial or len(self.session.get_inputs()[0].shape) != 4:
             raise ReobjError(
@@ -265,7 +274,7 @@ class Backbone:
         self.channels_last = bool(metadata)
         self.multiple = int(metadata.get("multiple", 32))  # sides of the input, pixels
         file = path.parent / metadata["head"] if metadata else trained_head(model, head)
-        self.head: Any = onnx_session(file, threads) if file else None
+        self.head: Any = onnx_session(file, threads, device) if file else None
         self.layout = layout
         if self.head is not None:
             self.layout = layout.updated(metadata or onnx_metadata(self.head))
@@ -333,22 +342,32 @@ def trained_head(model: str, head: str = "") -> Path | None:
 # ---- Embeddings on request ---------------------------------------------------------------------
 
 
-def as_embeddings(embeddings: Embeddings | npt.ArrayLike | None, count: int) -> Embeddings | None:
+def as_embeddings(
+    embeddings: Embeddings | npt.ArrayLike | None, count: int, width: int = 0
+) -> Embeddings | None:
     """Take embeddings as they come, a (D, E) array as foreground alone; None stays None.
 
+    Args:
+        width: E of both parts together in the frames before; 0: there were none.
     Raises:
-        ReobjError: they are not `count` rows.
+        ReobjError: they are not `count` finite rows of this width.
     """
     if embeddings is None:
         return None
     if not isinstance(embeddings, Embeddings):
-        rows = np.asarray(embeddings, np.float64).reshape(count, -1) if count else np.empty((0, 0))
+        rows = as_numbers(embeddings, "embeddings")
+        rows = rows.reshape(0, 0) if rows.ndim == 1 and not rows.size else rows
         embeddings = Embeddings(rows, np.empty((count, 0)))
-    if len(embeddings.foreground) != count:
-        raise ReobjError(
-            f"{len(embeddings.foreground)} embeddings for {count} detections: "
-            "give one row a detection"
-        )
+    for part in (embeddings.foreground, embeddings.background):
+        if part.ndim != 2 or len(part) != count:
+            raise ReobjError(f"embeddings are an array of shape {part.shape}, expected ({count}, "
+                             "E): one row a detection")  # fmt: skip
+        if not (np.abs(part) <= np.finfo(np.float32).max).all():  # NaN too
+            raise ReobjError("embeddings are not finite as float32")
+    found = embeddings.foreground.shape[1] + embeddings.background.shape[1]
+    if count and (not found or width not in (0, found)):
+        expected = f"{width}, as in the frames before" if width else "at least 1"
+        raise ReobjError(f"embeddings of width {found}, expected {expected}")
     return embeddings
 
 

@@ -100,8 +100,8 @@ def fill_by_place(
         toward = ray[:, i] / distance[:, i, None]
         angle = np.arccos((toward[to] @ toward[at].T).clip(-1, 1)) / SAME_ANGLE  # (T, n)
         farther = np.log(distance[to, None, i] / distance[at, i]) / SAME_LOG_DISTANCE
-        apart = np.maximum(angle, np.abs(farther))
-        to, like = to[apart.min(1) < 1], rows[apart.argmin(1)[apart.min(1) < 1]]
+        change = np.maximum(angle, np.abs(farther))
+        to, like = to[change.min(1) < 1], rows[change.argmin(1)[change.min(1) < 1]]
         ids, one = (like.track_id, like.tracklet_id), np.ones(len(to), np.int64)
         made.append(Tracks(frame[to], *ids, box[to, i], np.zeros(len(to)), like.class_id, -one))
     return Tracks.joined(made)

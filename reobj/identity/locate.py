@@ -42,13 +42,20 @@ class Located:
     Attributes:
         solid: (N,) solid that each row shows, or -1. overlap: (N,) IoU of its projection with the
             box, NaN where there is none. confidence: (S,) probability that it is there.
-        usual_score: mean log odds of the scores of all their rows.
+        usual_score: mean log odds of the scores of all their rows. floor: of the part, or None.
+        ellipsoids: (S,) of the solids, and NaN at the end.
     """
 
     solid: IntArray
     overlap: Array
     confidence: Array
     usual_score: float
+    floor: quadrics.Floor | None
+    ellipsoids: quadrics.Ellipsoids
+
+
+_UNKNOWN = quadrics.Ellipsoids(*(np.full(s, np.nan) for s in ((1, 3), (1, 3), (1, 3, 3))))
+_NO_SOLID = Solids(_UNKNOWN, np.array([""]), np.array([-1]))
 
 
 def locate(
@@ -71,7 +78,7 @@ def locate(
     table, solid, overlap = rows[own], np.full(len(rows), -1), np.full(len(rows), np.nan)
     tracked = table[table.tracklet_id > 0]
     if not len(tracked):
-        return Located(solid, overlap, np.empty(0), 0.0)
+        return Located(solid, overlap, np.empty(0), 0.0, None, _UNKNOWN)
     fragment = cut_at_gaps(tracked)
     count = int(fragment.max()) + 1
     views = gather_views(tracked, poses, fragment, count, 0.0)
@@ -91,7 +98,9 @@ def locate(
     boxes = quadrics.solid_boxes(found.solids.ellipsoids, support, views.img_from_world)
     boxes = quadrics.clip_boxes(boxes, views.image_size)[detected.view[owned], found.owner[owned]]
     overlap[own[owned]] = quadrics.box_iou(boxes, detected.box[owned])
-    return Located(solid, overlap, *_confidence(found, detected))
+    solids = Solids.concatenate([found.solids, _NO_SOLID])
+    sure = _confidence(found, detected)
+    return Located(solid, overlap, *sure, floor, solids.ellipsoids)
 
 
 def _doubles(rows: Tracks) -> BoolArray:
@@ -224,6 +233,6 @@ def _refit(
             fits = fit(seen, classes[new].tolist())
             made = Solids(fits.ellipsoids, fits.support, classes[new])
             found.update((keys[k], made[[column]]) for column, k in enumerate(new))
-        return Solids.concatenate([found[key] for key in keys])
+        return Solids.concatenate([_NO_SOLID[:0], *(found[key] for key in keys)])
 
     return refit

@@ -32,29 +32,35 @@ def hidden_edges(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
     seen = np.isfinite(views.boxes.sum(2)) & known  # (V, G)
     column = np.cumsum(known) - 1  # (G,) among the S known ones
     solids = ellipsoids[known]
+    outline = quadrics.solid_boxes(solids, "box", views.img_from_world)  # (V, S, 4)
     for v in np.flatnonzero(seen.any(1)):
         camera, own = views.img_from_world[v], np.flatnonzero(seen[v])  # (D,)
+        points = _beside_edges(views.boxes[v, own])  # (2, D, 4, P, 2)
+        beside = (outline[v, :, :2] > points.max((0, 1, 2, 3))).any(1)
+        beside |= (outline[v, :, 2:] < points.min((0, 1, 2, 3))).any(1)
+        front = np.flatnonzero(~beside)  # (N,) solids that some of the rays may meet
         depth = solids.center_in_world @ camera[2, :3] + camera[2, 3]  # (S,)
-        covered = []
-        for beyond in BESIDE:
-            points = _beside_edges(views.boxes[v, own], beyond)  # (D, 4, P, 2)
-            entry = _entry_depths(points.reshape(-1, 2), camera, solids)
-            entry = entry.reshape(*points.shape[:3], -1)  # (D, 4, P, S)
-            entry[np.arange(len(own)), :, :, column[own]] = np.inf  # nothing hides itself
-            nearer = entry.min(3) < depth[column[own], None, None]
-            covered.append(nearer.mean(2) >= MIN_COVERED)
+        entry = _entry_depths(points.reshape(-1, 2), camera, solids[front])
+        entry = entry.reshape(*points.shape[:4], -1)  # (2, D, 4, P, N)
+        itself = front == column[own, None]  # (D, N)
+        entry = np.where(itself[:, None, None], np.inf, entry)
+        nearest = entry.min(4, initial=np.inf)
+        covered = (nearest < depth[column[own], None, None]).mean(3) >= MIN_COVERED  # (2, D, 4)
         hidden[v, own] = covered[0] & ~covered[1]
     return hidden
 
 
-def _beside_edges(box: Array, beyond: float) -> Array:
-    """Return points (D, 4, P, 2) along the edges of boxes (D, 4), `beyond` box sizes outside."""
+def _beside_edges(box: Array) -> Array:
+    """Return points (2, D, 4, P, 2) along the edges of boxes (D, 4), for each of `BESIDE`."""
     low, high = box[:, None, :2], box[:, None, 2:]  # (D, 1, 2)
     along = low + (high - low) * EDGE_POINTS[:, None]  # (D, P, 2)
-    off = beyond * (high - low)
-    first, last = (np.broadcast_to(edge, along.shape) for edge in (low - off, high + off))
-    sides = [(first, along), (along, first), (last, along), (along, last)]
-    return np.stack([np.stack([x[..., 0], y[..., 1]], -1) for x, y in sides], 1)
+    found = []
+    for beyond in BESIDE:
+        off = beyond * (high - low)
+        first, last = (np.broadcast_to(edge, along.shape) for edge in (low - off, high + off))
+        sides = [(first, along), (along, first), (last, along), (along, last)]
+        found.append(np.stack([np.stack([x[..., 0], y[..., 1]], -1) for x, y in sides], 1))
+    return np.stack(found)
 
 
 def _entry_depths(points: Array, camera: Array, solids: quadrics.Ellipsoids) -> Array:

@@ -60,7 +60,7 @@ class Gallery:
             identity: (N,). rows: (N, E) unit rows.
             viewing_ray: (N, 3) direction in the world in which it was seen, NaN: unknown.
         """
-        self._grow(int(identity.max(initial=-1)) + 1, rows.shape[1])
+        self.reserve(int(identity.max(initial=-1)) + 1, rows.shape[1])
         own = self.rows[identity]  # (N, K, E)
         similarity = np.einsum("nke,ne->nk", own, rows)  # (N, K)
         similarity[np.arange(self.views) >= self.count[identity][:, None]] = UNUSED
@@ -90,6 +90,7 @@ class Gallery:
         if not rows.size or not len(identity) or self.rows.shape[2] != rows.shape[1]:
             unknown = np.full(shape[:2], np.nan)
             return unknown, unknown, unknown
+        self.reserve(int(identity.max()) + 1, rows.shape[1])  # some may have no view at all
         views = self.rows[identity].reshape(-1, rows.shape[1])  # (I * K, E)
         empty = np.arange(self.views) >= self.count[identity][:, None]  # (I, K)
         fused = np.where(empty, UNUSED, (rows @ views.T).reshape(shape))  # (N, I, K)
@@ -101,7 +102,8 @@ class Gallery:
         )
         return fore, back, angle
 
-    def _grow(self, identities: int, width: int) -> None:
+    def reserve(self, identities: int, width: int) -> None:
+        """Make room for so many identities, and rows of this width if there are none yet."""
         if self.rows.shape[2] == 0:
             self.rows = np.zeros((len(self.count), self.views, width), np.float32)
         if identities > len(self.count):

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json, read_text
+from reobj.sources.video import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError
 from reobj.views import VisiblePoints
 
@@ -74,10 +75,7 @@ class DepthMaps:
 
 def _read_map(path: Path) -> Any:
     """Read a depth map as it is stored, (h, w) uint16."""
-    try:
-        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error):
-        image = None
+    image = read_image(path, cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.uint16:
         raise ReobjError(f"{path}: no depth map; expected a 16-bit PNG with one channel")
     return image

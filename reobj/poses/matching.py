@@ -85,7 +85,7 @@ def rows_by_number(given: Sequence[str], frame: IntArray, names: Sequence[str]) 
 def _last_numbers(names: Sequence[str]) -> IntArray:
     """Read the last whole number in each name without suffix, -1 where there is none."""
     digits = [re.findall(r"\d+", Path(name).stem) for name in names]
-    return np.array([int(d[-1]) if d else -1 for d in digits], np.int64)
+    return np.array([int(d[-1][-18:]) if d else -1 for d in digits], np.int64)  # of int64: 18
 
 
 EVEN_TIMES = 0.1  # of a step: how far times of numbered frames may be from even ones (chosen)

@@ -8,6 +8,7 @@ claims is judged later, by `checks`.
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,10 +21,12 @@ from scipy.spatial.transform import Rotation
 from reobj.cameras import (
     CV_FROM_GL,
     NO_SCALE,
+    WORLD_MAX,
     Camera,
     Poses,
     invert_rigid,
     read_sparse_model,
+    usable,
 )
 from reobj.files import load_json, read_text, spans
 from reobj.poses.intrinsics import (
@@ -59,6 +62,8 @@ def read_poses(
         if given.camera is None:
             raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
         intrinsics = fitted_camera(given.camera, size, str(path))
+    if not usable(intrinsics):
+        raise ReobjError(f"{path}: {intrinsics}: expected finite numbers, focal lengths above 0")
     numbers = [(frame.index, frame.time_s) for frame in video]
     if not numbers:
         raise ReobjError("the video has no frame that can be read: poses belong to nothing")
@@ -71,6 +76,8 @@ def read_poses(
         exact, use = interpolated(given.cam_from_world, given.stamps_s, time_s)
         poses[use & (row >= 0)] = exact[row[use] >= 0]
     known = np.isfinite(poses).all((1, 2))
+    if (np.abs(poses[known]) >= WORLD_MAX).any():
+        raise ReobjError(f"{path}: a camera is more than {WORLD_MAX:g} units away from the origin")
     if not known.any():
         count = len(given.cam_from_world)
         raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({what})")
@@ -306,7 +313,8 @@ def _read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     intrinsic = path / "intrinsic" / "intrinsic_color.txt"
     camera = None
     if intrinsic.exists():
-        K, _ = _read_table(intrinsic, (3, 4), "a 3x3 or 4x4 matrix")
+        K, where_K = _read_table(intrinsic, (3, 4), "a 3x3 or 4x4 matrix")
+        _raise_where([len(K) != K.shape[1]], where_K, f"{len(K)} rows, expected 3x3 or 4x4")
         camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
     up = np.array([0, 0, 1.0]) if folder.name == "pose" else None
     names = tuple(file.stem for file in files)
@@ -368,6 +376,9 @@ def _read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     except (KeyError, TypeError, ValueError, IndexError) as error:
         what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
         raise ReobjError(f"{path}: {what}") from None
+    if not np.isfinite(applied).all():
+        raise ReobjError(f"{path}: applied_transform is not finite")
+    applied[:3] = _checked_rigid(applied[None], [f"{path}, applied_transform"])[0]
     gl_from_world = invert_rigid(_checked_rigid(matrix, where)) @ applied  # (N, 3, 4)
     return PoseFile(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
 
@@ -399,8 +410,9 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     if not (found[0] / "images.bin").exists():
         return _read_colmap_text(found[0])
     try:
+        _check_counts(found[0])
         model = read_sparse_model(found[0])
-    except (ValueError, RuntimeError, LookupError, MemoryError) as error:
+    except (ValueError, RuntimeError, LookupError, MemoryError, struct.error) as error:
         reason = str(error).splitlines()[0]
         raise ReobjError(f"{found[0]}: not a COLMAP model ({reason}); write it again") from None
     if not model.names:
@@ -411,6 +423,36 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
         model.cam_from_world, camera, model.names, points=model.points, colors=model.colors,
         visibility=seen,
     )  # fmt: skip
+
+
+# Records of COLMAP's binary files: bytes before a name, or before the number of what follows; the
+# format of that number; bytes of each that follows
+RECORDS = {
+    "cameras.bin": (24, "", 0),
+    "images.bin": (64, "<Q", 24),  # with a name
+    "points3D.bin": (43, "<Q", 8),
+    "frames.bin": (64, "<I", 16),
+    "rigs.bin": (8, "", 0),
+}
+
+
+def _check_counts(folder: Path) -> None:
+    """Refuse a binary model that claims more than it holds: pycolmap takes memory for the claim."""
+    for name, (head, number, size) in RECORDS.items():
+        if not (folder / name).exists():
+            continue
+        data = (folder / name).read_bytes()
+        (count,), at = struct.unpack_from("<Q", data), 8
+        if at + count * head > len(data):
+            raise ValueError(f"{name} claims {count} records in {len(data)} bytes")
+        for _ in range(count if number else 0):
+            at += head
+            if name == "images.bin":
+                at = data.index(b"\0", at) + 1
+            (n,) = struct.unpack_from(number, data, at)
+            at += struct.calcsize(number) + n * size
+            if at > len(data):
+                raise ValueError(f"{name} claims {n} entries in {len(data)} bytes")
 
 
 def _read_colmap_text(folder: Path) -> PoseFile:

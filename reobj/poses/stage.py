@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
-from reobj.files import part_path
+from reobj.files import load_cached, part_path
 from reobj.poses.checks import check_poses
 from reobj.poses.depth import add_depth
 from reobj.poses.estimate import PosesConfig, estimate_poses
@@ -47,8 +47,8 @@ def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: Work
     ):
         return poses
     path = _points_path(poses, video, config, workspace)
-    if path.exists():
-        return load_poses(path)
+    if (known := load_cached(path, load_poses)) is not None:
+        return known
     if not len(poses.visibility) and not (config.depth and poses.metric):
         size_px, seed = config.size_px, config.seed
         poses = triangulate(
@@ -67,7 +67,7 @@ def _points_path(poses: Poses, video: Video, config: PosesConfig, workspace: Wor
     arrays = (poses.cam_from_world, poses.points, poses.visibility, poses.part)
     digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
     facts = (poses.camera, poses.metric, poses.messages)
-    content = source_fingerprint(video.source)
+    content = video.fingerprint
     return workspace.path("points", content, video.config, *facts, config, maps, digest)
 
 
@@ -100,14 +100,13 @@ def reconstruct_cached(
     digest = hashlib.sha256(boxes.round(1).tobytes()).hexdigest()
     if camera := parse_camera(config.camera, video.size):  # the content of a file, not its name
         config = dataclasses.replace(config, camera=camera_line(camera))
-    content = source_fingerprint(video.source)
+    content = video.fingerprint
     own = dataclasses.replace(config, depth="")
     path = workspace.path("poses", content, video.config, own, digest)
     model = path.with_suffix(".sparse")
-    if path.exists():
-        poses = load_poses(path)
-        models = [part_path(model, k) for k in range(poses.part_count)]
-        return _with_depth(poses, models, video, config, workspace)
+    if (known := load_cached(path, load_poses)) is not None:
+        models = [part_path(model, k) for k in range(known.part_count)]
+        return _with_depth(known, models, video, config, workspace)
     work = workspace.cache / "sfm"
     boxes_of = (lambda frame: boxes[boxes[:, 0] == frame, 1:]) if len(boxes) else None
     poses = estimate_poses(video, config, work, boxes_to_mask=boxes_of)

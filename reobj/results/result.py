@@ -33,7 +33,7 @@ from reobj.files import (
     rounded,
     save_npz,
     shortened,
-    without_password,
+    without_secrets,
     wrapped,
 )
 from reobj.poses.floor import Floor
@@ -429,8 +429,8 @@ class Result:
     @staticmethod
     def load_tracked(path: Path) -> Result:
         """Read what `save_tracked` wrote."""
-        data, facts = load_npz(path)
         try:
+            data, facts = load_npz(path, sealed=True)
             return Result(
                 Tracks(*(data[f.name] for f in dataclasses.fields(Tracks))),
                 tuple(facts["class_names"]),
@@ -444,7 +444,7 @@ class Result:
                 warnings=list(facts["warnings"]),
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise ReobjError(f"{path}: {written_by(path.parent.parent)} ({error!r})") from error
+            raise ReobjError(f"{path}: {written_by(path.parent.parent)}") from error
 
     def summary(self) -> str:
         """Return the table that `run` prints: object, class, frames, any size and sigma, status."""
@@ -514,7 +514,7 @@ class Result:
         data = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
-            "command": without_password(" ".join(sys.argv)),
+            "command": " ".join(map(without_secrets, sys.argv)),
             "reobj_track": __version__,
             "versions": versions,
             "conventions": CONVENTIONS,
@@ -576,8 +576,8 @@ def load_last_poses(out: Path) -> Poses | None:
         return None
     try:
         return load_poses(path)
-    except (KeyError, TypeError) as error:
-        raise ReobjError(f"{path}: {written_by(out)} ({error!r})") from error
+    except (KeyError, TypeError, ReobjError) as error:
+        raise ReobjError(f"{path}: {written_by(out)}") from error
 
 
 def validate_objects(path: Path) -> list[str]:

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from reobj.files import Progress, load_npz, save_npz
+from reobj.files import Progress, load_cached, load_npz, save_npz
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
-from reobj.sources.video import Video, source_fingerprint
+from reobj.sources.video import Video
 from reobj.types import Array, Detections, Floats, Frame, IntArray, ReobjError, Tracks
 
 
 def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
     """Return what the detections of a video depend on."""
-    return (source_fingerprint(video.source), video.config, source.key)
+    return (video.fingerprint, video.config, source.key)
 
 
 def keep_detections(source: DetectionSource, video: Video, workspace: Workspace) -> DetectionSource:
@@ -44,8 +44,8 @@ def detect_all(
         own = source.recorded
         return source, _rows(own.frame, own.xyxy, own.score, own.class_id)
     path = workspace.path("boxes", *detections_key(source, video))
-    if source.key and path.exists():
-        found, _ = load_npz(path)
+    if source.key and (cached := load_cached(path, lambda p: load_npz(p, sealed=True))):
+        found, _ = cached
         return source, _rows(*(found[n] for n in ("frame", "xyxy", "score", "class_id")))
     if source.cache is None:  # it cannot be known again: for this run only
         folder = workspace.cache / "detections-once"

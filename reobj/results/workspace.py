@@ -15,10 +15,10 @@ from typing import Any
 
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
-from reobj.files import atomic, load_json, part_path, part_paths
+from reobj.files import atomic, load_cached, load_json, part_path, part_paths
 from reobj.results.result import LAST_POSES, Result, load_last_poses, remove_stale, written_by
 from reobj.sources.imageless import ImagelessVideo
-from reobj.sources.video import InputConfig, Video, source_fingerprint
+from reobj.sources.video import InputConfig, Video
 from reobj.types import ReobjError
 
 LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
@@ -72,12 +72,12 @@ class Workspace:
         path, source = self.out / SOURCE, Path(str(video.source))
         fingerprint = {
             "source": str(source.absolute()) if source.exists() else str(video.source),
-            "content": source_fingerprint(video.source),
+            "content": video.fingerprint,
             "input": dataclasses.asdict(video.config),
             "frames": video.facts() if isinstance(video, ImagelessVideo) else None,
         }
         if path.exists():
-            old = load_json(path)
+            old = load_cached(path, load_json)
             old = old if isinstance(old, dict) else {}
             if old.get("content") != fingerprint["content"]:
                 if not overwrite:

@@ -23,12 +23,14 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from reobj.files import did_you_mean, load_json, load_npz, read_text, shortened
+from reobj.files import check_unpacked, did_you_mean, load_json, load_npz, read_text, shortened
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, read_npz
 from reobj.sources.video import Video
 from reobj.types import (
+    CLASS_MAX,
     COCO_NAMES,
+    COORDINATE_MAX,
     Array,
     BoolArray,
     IntArray,
@@ -147,11 +149,22 @@ NUMBERS = (
 )  # columns that hold numbers
 
 
+WHOLE_MAX = 2.0**53  # of frame and identity; beyond, a float skips whole numbers
+
+
 def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
     """Read MOT rows (frame from 1, id, left, top, w, h[, score[, class]]), or CSV with a header."""
     columns, cells, lines, is_mot = _table_cells(path)
     texts = {role: [row[i] for row in cells] for i, role in enumerate(columns)}
     column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
+    for role in ("frame", "id"):
+        whole = np.abs(column.get(role, np.zeros(0))) <= WHOLE_MAX
+        if role == "frame" and role in column:
+            whole &= column[role] % 1 == 0
+        if not whole.all():
+            line = int(lines[whole.argmin()])
+            raise ReobjError(f"{path}, line {line}: {role} {texts[role][whole.argmin()]}, expected "
+                             "a whole number")  # fmt: skip
     if is_mot and (column["id"] % 1 != 0).any():
         raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
                          "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
@@ -159,7 +172,10 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
         column["x2"], column["y2"] = column["x1"] + column["w"], column["y1"] + column["h"]
     xyxy = np.stack([column[role] for role in ("x1", "y1", "x2", "y2")], 1)  # (N, 4)
     count = len(lines)
-    class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
+    try:
+        class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
+    except (OverflowError, ReobjError) as error:
+        raise ReobjError(f"{path}: {error}") from error
     messages = [f"{len(new)} class names not in the list: {shortened(new)}"] if new else []
     if "frame" not in column:
         column["frame"] = _frames_at(column["time"], video, path)
@@ -287,6 +303,8 @@ def _table_classes(
     ids = np.array([int(cell) if cell.isdigit() else -1 for cell in cells], np.int64)
     if not any(cells) or (is_mot and ids.min() < 1):
         return np.zeros_like(ids), ("object",), []
+    if is_mot and ids.max() > CLASS_MAX:
+        raise ReobjError(f"class number {ids.max()}, expected at most {CLASS_MAX}")
     if is_mot:
         return ids - 1, [*names, *(f"class {i + 1}" for i in range(len(names), ids.max()))], []
     names = names or COCO_NAMES
@@ -354,6 +372,8 @@ def _coco_dataset(
         return {}, name_of, ["no dataset JSON beside it: image_id is taken as the 0-based frame"]
     if data.get("categories") and not names:
         name_of = {c["id"]: c["name"] for c in data["categories"]}
+        if not all(isinstance(name, str) for name in name_of.values()):
+            raise ReobjError(f"{path}: a category without a name, expected {{id, name}}")
     row = {name: i for i, name in enumerate(video.names)}
     frame_of = {
         image["id"]: row.get(Path(image["file_name"]).name, -1) if row else image.get("frame_id", i)
@@ -389,14 +409,16 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
 
     Errors for what cannot be meant, messages for single rows.
     """
-    finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
+    with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
+        finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
+    finite &= (np.abs(found.xyxy) <= COORDINATE_MAX).all(1)
     named = np.isin(found.class_id, np.arange(len(found.class_names)))
     pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,) 0: no mask
     fits = (pixels == 0) | (pixels == math.prod(found.size))
     for row in np.flatnonzero(~(finite & named & fits))[:1]:
         text = f"mask of {pixels[row]} pixels in a video of {found.size}"
         if not finite[row]:
-            text = f"NaN or infinite value in {found.xyxy[row]}, {found.score[row]}"
+            text = f"{found.xyxy[row]}, {found.score[row]}: NaN, infinite or beyond 1e7 pixels"
         elif not named[row]:
             text = unnamed_class(int(found.class_id[row]), len(found.class_names))
         raise ReobjError(f"{path}, {found.unit} {found.line[row]}: {text}")
@@ -456,6 +478,7 @@ def _usable(found: RecordedDetections, path: Path, frame_count: int) -> BoolArra
     return np.logical_not(empty | outside | missing)
 
 
+XML_MAX = 1 << 27  # bytes; chosen: 800,000 boxes; the parser takes ten times as much
 CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
 SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
 
@@ -485,6 +508,9 @@ def read_tracks(
         _check(found, path, limit, video.frame_count)
     else:
         found = read_detections(path, video, limit)
+    kind = found.identity.dtype.kind
+    if len(found.identity) and (kind not in "iu" or found.identity.max() > WHOLE_MAX):
+        raise ReobjError(f"{path}: identities are {found.identity.dtype}, expected whole numbers")
     if len(found) and (not len(found.identity) or found.identity.min() < 0):
         raise ReobjError(f"{path}: not every box has an identity: no file of tracks")
     start, stop, every = video.config.start, video.config.stop, video.config.every
@@ -523,17 +549,22 @@ def _lend(known: Tracks, tracks: Tracks, unnamed: bool) -> Tracks:
 def _read_cvat(path: Path, video: Video) -> RecordedDetections:
     """Read the boxes of "CVAT for video 1.1" that are not "outside"; identity is track id + 1."""
     try:
+        check_unpacked(path.stat().st_size, XML_MAX)
         text = path.read_bytes()
         if zipfile.is_zipfile(path):
-            text = zipfile.ZipFile(path).read("annotations.xml")
+            with zipfile.ZipFile(path) as packed:
+                check_unpacked(packed.getinfo("annotations.xml").file_size, XML_MAX)
+                text = packed.read("annotations.xml")
         tracks = [(t, b) for t in ET.fromstring(text).iter("track") for b in t.iter("box")]
         tracks = [(t, b) for t, b in tracks if b.attrib.get("outside") != "1"]
         xyxy = [[float(b.attrib[k]) for k in CVAT_BOX] for _, b in tracks]
         frame = np.array([int(b.attrib["frame"]) for _, b in tracks], np.int64)
         ids = np.array([int(t.attrib["id"]) + 1 for t, _ in tracks], np.int64)
         labels = [t.attrib["label"] for t, _ in tracks]
-    except (OSError, ET.ParseError, KeyError, ValueError) as error:
-        raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r})") from None
+    except ReobjError as error:
+        raise ReobjError(f"{path}: {error}") from error
+    except Exception as error:  # zip and zlib have their own for damaged files, and so has expat
+        raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r:.200})") from None
     if not tracks:
         raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
     names, class_id = np.unique(labels, return_inverse=True)

@@ -11,7 +11,7 @@ import ast
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,7 @@ from reobj.types import (
     IntArray,
     ReobjError,
     as_detections,
+    as_frame,
     log,
 )
 
@@ -67,6 +68,7 @@ class OnnxDetector:
     Args:
         path_or_name: file or name of a model ("": `config.model`).
         threads: of onnxruntime (0: all cores). offline: never download.
+        device: cpu, cuda, coreml, ... (`onnx_session`).
     Attributes:
         class_names: names by class id. layout: name of the layout found. path: the file.
     Raises:
@@ -79,12 +81,13 @@ class OnnxDetector:
         config: DetectConfig | None = None,
         threads: int = 0,
         offline: bool = False,
+        device: str = "cpu",
     ) -> None:
         self.config = config or DetectConfig()
         name = path_or_name or self.config.model
         self._grid, weights = parse_tiles(self.config.tiles), known_weights(name)
         self.path = model_path(name, offline)
-        self._session = onnx_session(self.path, threads)
+        self._session = onnx_session(self.path, threads, device)
         self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
         _, shape, kind = self._inputs[0]
         if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
@@ -108,6 +111,7 @@ class OnnxDetector:
 
     def __call__(self, image: Image) -> Detections:
         """Detect the objects in one BGR image (H, W, 3); best first, boxes clipped to the image."""
+        image = as_frame(image)
         if self._grid == (1, 1):
             return self._detect(image)
         found = detect_in_tiles(self._detect, image, self._grid)
@@ -231,7 +235,7 @@ class DetectionCache:
         self.folder, self.image_size = Path(folder), image_size
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._fresh: dict[int, Detections] = {}  # by frame, not on disk yet
-        chunks = sorted(self.folder.glob("chunk_*.npz"))
+        chunks = sorted(p for p in self.folder.glob("chunk_*.npz") if p.stem[6:].isdecimal())
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
             try:
@@ -242,7 +246,7 @@ class DetectionCache:
 
     def _load(self, path: Path) -> None:
         """Take the frames of a file over, packed as they are stored."""
-        chunk, done = read_npz(path, self.image_size, self.image_size)
+        chunk, done = read_npz(path, self.image_size, self.image_size, sealed=True)
         self._stored |= dict.fromkeys(done.tolist(), chunk)
 
     def get(self, index: int) -> Detections | None:
@@ -325,18 +329,20 @@ def open_detections(
     detections: str | Path | Callable[[Image], Any] | None = None,
     threads: int = 0,
     offline: bool = False,
+    device: str = "cpu",
 ) -> DetectionSource:
     """Open what finds the objects in a video.
 
     Args:
         detections: a file for `read_detections`; a function, of which `config` gives only the class
             names, or anything else that `as_source` takes; or None: the ONNX model of `config`.
-        threads: of onnxruntime (0: all cores). offline: never download weights.
+        threads: of onnxruntime (0: all cores). offline: never download weights. device: of the
+            ONNX model, cpu, cuda, coreml, ...
     """
     if detections is None or detections == "":
         path = model_path(config.model, offline)
-        detector = OnnxDetector("", config, threads, offline)
-        key = _cache_key(config, path.name, path.stat().st_size)
+        detector = OnnxDetector("", config, threads, offline, device)
+        key = _cache_key(config, path.name, path.stat().st_size, device)
         return dataclasses.replace(as_source(detector), key=key, slow=True)
     if isinstance(detections, str | Path):
         recorded = as_source(read_detections(detections, video, config))
@@ -356,8 +362,10 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
 
     Args:
         detector: a DetectionSource, RecordedDetections (asked by frame number), an OnnxDetector, or
-            any function of a BGR image that returns what `as_detections` takes, boxes in its px.
-        class_names: of a function; ahead of its own attribute `class_names` and of COCO's.
+            any function of a BGR image (H, W, 3) uint8 that returns what `Tracker.update` takes,
+            boxes in its px.
+        class_names: of a function; ahead of its own attribute `class_names` or `names`
+            (ultralytics) and of COCO's.
     """
     if isinstance(detector, DetectionSource):
         return detector
@@ -369,13 +377,25 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
-    names = tuple(class_names or getattr(detector, "class_names", COCO_NAMES))
+    names = tuple(class_names) or _own_names(detector)
 
     def detect(frame: Frame) -> Detections:
-        found = as_detections(detector(frame.image))
+        try:
+            found = as_detections(detector(frame.image))
+        except ReobjError as error:
+            raise ReobjError(f"frame {frame.index}: {error}") from error
         if len(found) and found.class_id.max() >= len(names):
             text = unnamed_class(int(found.class_id.max()), len(names))
             raise ReobjError(f"frame {frame.index}: {text}")
         return found
 
     return DetectionSource(detect, names)
+
+
+def _own_names(detector: Any) -> tuple[str, ...]:
+    """Return the class names that a detector states, a list or a dict by id; else COCO's."""
+    names = getattr(detector, "class_names", None) or getattr(detector, "names", None)
+    if isinstance(names, Mapping):
+        ids = range(max((int(i) for i in names), default=-1) + 1)
+        return tuple(str(names.get(i, f"class {i}")) for i in ids) or COCO_NAMES
+    return tuple(map(str, names)) if isinstance(names, list | tuple) else COCO_NAMES

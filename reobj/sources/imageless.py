@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reobj.sources.video import IMAGE_FPS, InputConfig, Video, times_of_names
+from reobj.sources.video import IMAGE_FPS, InputConfig, Video, source_fingerprint, times_of_names
 from reobj.types import Frame, ReobjError
 
 NO_IMAGE: Any = None
@@ -44,6 +44,7 @@ class ImagelessVideo(Video):
         count: int = 0,
     ) -> None:
         self.source, self.config = str(source), config or InputConfig()
+        self.fingerprint = source_fingerprint(source)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.size = self.working_size = (int(size[0]), int(size[1]))

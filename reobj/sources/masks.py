@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.types import BoolArray
+from reobj.types import COORDINATE_MAX, BoolArray
 
 Counts = npt.NDArray[np.uint32]
 NO_RUNS: Counts = np.empty(0, np.uint32)
@@ -32,6 +32,9 @@ def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
     return np.broadcast_to(flat, size[0] * size[1]).reshape(size).T
 
 
+RUN_BITS = 35  # seven characters: any uint32 with its sign; endless ones take quadratic time
+
+
 def coco_runs(text: str) -> Counts:
     """Decode COCO's compressed run lengths (maskApi.c of pycocotools, rleFrString).
 
@@ -44,6 +47,8 @@ def coco_runs(text: str) -> Counts:
         value |= (byte - 48 & 0x1F) << shift
         shift += 5
         if byte - 48 & 0x20:
+            if shift >= RUN_BITS:
+                raise ValueError(f"a run length of more than {RUN_BITS} bits")
             continue
         value -= (byte - 48 >> 4 & 1) << shift  # sign
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
@@ -56,6 +61,11 @@ POLYGON_BITS = 4  # sub-pixel bits of cv2.fillPoly; chosen: 1/16 px, finer than 
 
 def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Counts:
     """Fill polygons (x, y, x, y, ... in px, corner convention) in a (w, h) image."""
+    flat = np.concatenate([np.empty(0), *(np.asarray(ring, np.float64).ravel() for ring in rings)])
+    if not (np.abs(flat) <= COORDINATE_MAX).all():
+        raise ValueError(
+            f"a polygon with corners that are not finite, or beyond {COORDINATE_MAX:g}"
+        )
     canvas = np.zeros(size[::-1], np.uint8)
     for ring in rings:  # for OpenCV the centre of the first pixel is (0, 0), here (0.5, 0.5)
         corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)

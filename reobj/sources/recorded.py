@@ -114,16 +114,22 @@ def write_detections_npz(
     save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
 
 
+KINDS = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_names": "U",
+         "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
+
+
 def read_npz(
-    path: Path, size: tuple[int, int], working_size: tuple[int, int]
+    path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
 ) -> tuple[RecordedDetections, IntArray]:
     """Read our own format, as `pack_detections` makes it, for a video of (w, h) `size`.
 
+    Args:
+        sealed: as of `load_npz`.
     Returns:
         The detections, unchecked, and the numbers of the frames that were `done`, also those
         without a detection (where the file does not say: the frame of every detection).
     """
-    data, _ = load_npz(path)
+    data, _ = load_npz(path, sealed)
     count = len(data.get("frame", ()))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
@@ -133,12 +139,21 @@ def read_npz(
         found = data[key].shape if key in data else "missing"
         if found != shape and (key != "class_names" or found == "missing"):
             raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
+    for key, kinds in KINDS.items():
+        if data[key].dtype.kind not in kinds and data[key].size:
+            raise ReobjError(f"{path}: array {key} is of {data[key].dtype}, expected {kinds}")
+    if data["class_names"].ndim != 1:
+        raise ReobjError(f"{path}: array class_names is {data['class_names'].shape}, expected (C,)")
+    offsets, runs = data["mask_offsets"].astype(np.int64), data["mask_counts"]
+    ordered = (np.diff(offsets, prepend=0) >= 0).all() and offsets[-1:].max(initial=0) <= runs.size
+    if runs.ndim != 1 or not ordered or (runs < 0).any():
+        raise ReobjError(f"{path}: mask_counts and mask_offsets do not fit each other")
     if (made_for := tuple(data["image_size"].tolist())) != size:
         raise ReobjError(f"{path}: made for images of {made_for} px, but the video is {size} px")
     recorded = RecordedDetections(
         data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
         data["score"].astype(np.float64), data["class_id"].astype(np.int64),
-        np.split(data["mask_counts"], data["mask_offsets"][1:])[:count],
+        np.split(runs.astype(np.uint32), offsets[1:])[:count],
         tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
     )  # fmt: skip
     return recorded, data.get("done", recorded.frame)

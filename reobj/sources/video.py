@@ -14,6 +14,7 @@ import math
 import os
 import queue
 import re
+import struct
 import sys
 import threading
 import time
@@ -25,8 +26,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from reobj.files import shortened, without_password
+from reobj.files import shortened, without_secrets
 from reobj.types import Array, Frame, Image, ReobjError, option
 
 IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
@@ -95,7 +97,8 @@ class Video:
     `LIVE_QUEUE` newest ones.
 
     Attributes:
-        source: what was given, without a URL's password.
+        source: what was given, of a URL only scheme, host and path.
+        fingerprint: changes with the source or its files; does not tell what a URL hides.
         files, names: paths and file names of images by frame number, [] for videos.
         times_s: (F,) of images whose names are time stamps, else None: they come at 30 Hz.
         has_images: False where frames have none (`ImagelessVideo`).
@@ -112,7 +115,7 @@ class Video:
 
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
         self._address, self.config = str(source), config or InputConfig()
-        self.source = without_password(self._address)
+        self.source = without_secrets(self._address)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
@@ -120,6 +123,7 @@ class Video:
         self.read = self.dropped = 0
         self._opened: Any = None  # capture of a live source, until it is iterated
         self._is_url = bool(STREAM_URL.match(self._address))
+        self.fingerprint = source_fingerprint(source)
         self.files = [] if self._is_url else _image_files(self.source)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
@@ -150,7 +154,7 @@ class Video:
             stop = min(self.config.stop or self.frame_count, self.frame_count)
             numbers = range(self.config.start, stop, self.config.every)
             times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
-            decoded = ((i, float(times_s[i]), _read_image(self.files[i])) for i in numbers)
+            decoded = ((i, float(times_s[i]), read_image(self.files[i])) for i in numbers)
         for index, time_s, image in decoded if self.is_live else _one_ahead(decoded):
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 self.skipped.append(index)
@@ -253,6 +257,8 @@ class Video:
 
     def _open(self) -> Any:
         """Open the source with OpenCV, which turns frames upright by the file's rotation tag."""
+        if any("\ud800" <= letter <= "\udfff" for letter in self._address):  # OpenCV crashes
+            raise ReobjError(f"{self.source!r}: this name is no UTF-8; rename the file")
         if not self.is_live and not self._is_url and not Path(self.source).is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
@@ -273,7 +279,7 @@ class Video:
         Returns:
             (w, h) in px, frame rate in Hz, and number of frames (0: unknown).
         """
-        images: Iterator[Image | None] = map(_read_image, self.files)
+        images: Iterator[Image | None] = map(read_image, self.files)
         fps, count = IMAGE_FPS, len(self.files)
         if self.times_s is not None and count > 1:
             fps = float((count - 1) / np.ptp(self.times_s))
@@ -281,6 +287,10 @@ class Video:
             capture = self._open()
             images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
             fps = float(capture.get(cv2.CAP_PROP_FPS))
+            pixels = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+            if pixels > PIXELS_MAX:
+                raise ReobjError(f"{self.source}: frames of {pixels:.0f} pixels, at most "
+                                 f"{PIXELS_MAX} are taken")  # fmt: skip
             if not self._address.isdigit():
                 count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
             self.is_live = self.is_live and not count  # a URL may be that of a file
@@ -313,14 +323,76 @@ def by_number(name: str) -> str:
     return re.sub(r"\d+", lambda n: n[0].zfill(20), name)
 
 
-def _read_image(path: Path) -> Image | None:
-    """Read an image file as BGR, turned upright by its EXIF tag; None if it is no image."""
+PIXELS_MAX = 1 << 28  # of an image; chosen: above the 200 megapixels of phones; 800 MB as BGR
+
+
+def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
+    """Read an image file as OpenCV's `flags` say; None if it is no image.
+
+    Raises:
+        ReobjError: it claims more than PIXELS_MAX pixels: a small file may hold gigabytes.
+    """
     try:
         data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        if (pixels := claimed_pixels(data.tobytes())) > PIXELS_MAX:
+            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are taken")
+        image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
-    return None if image is None else np.asarray(image, np.uint8)
+    return None if image is None else np.asarray(image)
+
+
+def claimed_pixels(data: bytes) -> int:
+    """Read from its header how many pixels an image of IMAGE_SUFFIXES has; 0: not to be told."""
+    width = height = 0
+    with contextlib.suppress(struct.error, IndexError):
+        if data.startswith(b"\x89PNG"):
+            width, height = struct.unpack_from(">II", data, 16)
+        elif data.startswith(b"BM"):
+            width, height = struct.unpack_from("<ii", data, 18)
+        elif data.startswith(b"\xff\xd8"):
+            width, height = _jpeg_size(data)
+        elif data[:4] in (b"II*\0", b"MM\0*"):
+            width, height = _tiff_size(data)
+        elif data[8:15] == b"WEBPVP8":
+            width, height = _webp_size(data)
+    return abs(width * height)
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    """Return (w, h) from the first start of frame, which follows other segments."""
+    at = 2
+    while data[at] == 0xFF and not (
+        0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in JPEG_OTHER
+    ):
+        at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+    height, width = struct.unpack_from(">HH", data, at + 5)
+    return width, height
+
+
+JPEG_OTHER = (0xC4, 0xC8, 0xCC)  # tables among the markers of frames
+
+
+def _tiff_size(data: bytes) -> tuple[int, int]:
+    """Return (w, h) from the tags 256 and 257 of the first directory."""
+    order = "<" if data[:1] == b"I" else ">"
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, start)
+    tags = (struct.unpack_from(order + "HHII", data, start + 2 + 12 * i) for i in range(count))
+    sides = {tag: value >> 16 * (kind == 3 and order == ">") for tag, kind, _, value in tags}
+    return sides.get(256, 0), sides.get(257, 0)
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """Return (w, h): of the canvas, of a lossless or of a lossy picture."""
+    if data[15:16] == b"X":
+        width, height = (int.from_bytes(data[i : i + 3], "little") + 1 for i in (24, 27))
+    elif data[15:16] == b"L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        width, height = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
+    return width, height
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:
@@ -337,17 +409,28 @@ def shrunk(image: Image, size_px: int) -> Image:
     return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
 
 
+HASH_ROUNDS = 100_000  # chosen: .05 s, once a run, and for every guess at a password
+
+
 def source_fingerprint(source: Any) -> str:
     """Hash names, sizes and times of a file, a folder's files or a glob's matches.
 
     Returns:
-        16 hex digits; of a camera or stream its name as it is.
+        16 hex digits; of a camera its number; of a URL what may be shown of it, and a slow hash of
+        the rest: two queries of a server are two sources.
     """
-    path = Path(str(source))
-    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(source)))
-    files = sorted(p for p in found if p.is_file()) or [path] * path.is_file()
+    text, path = str(source), Path(str(source))
+    if STREAM_URL.match(text):
+        shown = without_secrets(text)
+        rest = hashlib.pbkdf2_hmac("sha256", text.encode(), shown.encode(), HASH_ROUNDS)
+        return shown if shown == text else f"{shown} {rest.hex()[:16]}"
+    if path.is_file():  # also one whose name looks like a glob: det[1].txt
+        files = [path]
+    else:
+        found = path.iterdir() if path.is_dir() else map(Path, glob.glob(text))
+        files = sorted(p for p in found if p.is_file())
     if not files:
-        return str(source)
+        return text
     facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 

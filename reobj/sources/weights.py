@@ -250,21 +250,49 @@ def _download(weights: Weights, part: Path) -> None:
                 raise ConnectionError(f"connection cut after {done} of {size} bytes")
 
 
-def onnx_session(path: Path, threads: int = 0) -> Any:
-    """Make an onnxruntime session on the CPU (threads 0: all cores)."""
+# onnxruntime's providers by what users call them, and the packages that bring them
+DEVICES = {
+    "cpu": ("CPUExecutionProvider", "onnxruntime"),
+    "cuda": ("CUDAExecutionProvider", "onnxruntime-gpu"),
+    "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu"),
+    "coreml": ("CoreMLExecutionProvider", "onnxruntime, on a Mac"),
+    "directml": ("DmlExecutionProvider", "onnxruntime-directml"),
+    "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
+    "migraphx": ("MIGraphXExecutionProvider", "onnxruntime-migraphx"),
+}
+
+
+def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
+    """Make an onnxruntime session on a device of DEVICES (threads 0: all cores).
+
+    Raises:
+        ReobjError: the device is unknown, or this onnxruntime cannot use it; or no model.
+    """
+    if device not in DEVICES:
+        raise ReobjError(f"--device {device}: unknown; known are {', '.join(DEVICES)}")
     try:
         import onnxruntime
     except ImportError as error:
         raise ReobjError("ONNX models need onnxruntime: pip install onnxruntime") from error
+    provider, package = DEVICES[device]
+    if provider not in (here := onnxruntime.get_available_providers()):
+        have = ", ".join(name for name, (own, _) in DEVICES.items() if own in here)
+        raise ReobjError(f"--device {device}: this onnxruntime has {have} only; {provider} comes "
+                         f"with {package} (in place of onnxruntime)")  # fmt: skip
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3  # errors only: its warnings are about how the model was exported
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # spare the cores
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        providers = list(dict.fromkeys([provider, DEVICES["cpu"][0]]))  # what it lacks: on the CPU
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
-        reason = str(error).splitlines()[0]
+        reason = str(error).partition("\n")[0]
         raise ReobjError(f"{path}: onnxruntime cannot load it: {reason}") from error
+    if session.get_providers()[0] != provider:  # it falls back by itself, with a line on stderr
+        raise ReobjError(f"--device {device}: {provider} did not start: its driver or libraries "
+                         "are missing, or of another version")  # fmt: skip
+    return session
 
 
 def onnx_metadata(session: Any) -> dict[str, Any]:
