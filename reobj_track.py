@@ -58,7 +58,8 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.files import atomic, load_cached, load_npz, save_npz
+from reobj.commands import make_parser, short_help
+from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
@@ -77,8 +78,8 @@ from reobj.identity.reid import (
     part_cosines,
 )  # fmt: skip
 from reobj.identity.sampling import SamplingLayout
-from reobj.objects import ObjectsConfig
-from reobj.options import add_flags, config_from_args, list_options
+from reobj.objects import ObjectsConfig, check_known_size, unused_sizes
+from reobj.options import config_from_args, read_config, write_config
 from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
@@ -92,7 +93,8 @@ from reobj.poses.stage import (
 )
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
-from reobj.results.export import EXPORTS, export
+from reobj.results.export import EXPORTS, Viewer, export
+from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import (
     Object,
@@ -105,7 +107,7 @@ from reobj.results.result import (
 )
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
-from reobj.results.workspace import Workspace
+from reobj.results.workspace import CONFIG_FILE, Workspace
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.recorded import write_detections_npz
@@ -184,16 +186,21 @@ class TrackerConfig:
 class OutputConfig:
     """Files written."""
 
-    overlay: bool = option(True, "write overlay.mp4")
+    overlay: str = option(
+        "solids", "what overlay.mp4 (or .webm) shows over boxes: solids, ellipses, trails; or none"
+    )
     scene: bool = option(True, "write scene.html")
     doubtful: bool = option(
-        False, "show doubtful objects too: in tracks.txt, in overlay.mp4, on the page at first"
+        False, "show doubtful objects too: in tracks.txt, in the film, on the page at first"
     )
     fill_gaps: int = option(
         5,
         "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never); "
         "an object's solid fills all frames from about where it was seen in others",
     )
+
+    def __post_init__(self) -> None:
+        film_layers(self.overlay)  # a wrong word is said before anything is computed
 
 
 @dataclass(frozen=True, slots=True)
@@ -981,6 +988,7 @@ def run(
     tracks: str | Path | None = None,
     in_3d: bool = True,
     overwrite: bool = False,
+    show: bool = False,
 ) -> Result:
     """Run the chain on a video: detect, track, poses, objects; write the output folder's files.
 
@@ -988,10 +996,9 @@ def run(
         source: video file, folder of images, glob, camera index or URL of a stream (Ctrl-C ends a
             live one: its files are written); None: no images, only detections and poses.
         out: output folder; results of earlier stages found there are used again.
-        detections: file with recorded detections, or a callable image -> detections; default:
-            config.detect.model.
+        detections: recorded ones, or a callable image -> detections; default: config.detect.model.
         tracks: file of identities that take the place of detector, tracker and linker.
-        in_3d: False for identities only, without cameras and ellipsoids.
+        in_3d: False for identities only, in 2D. show: live in rerun's viewer.
     Returns:
         Result; if the reconstruction fails, without cameras and ellipsoids, and with a warning.
     Raises:
@@ -1003,6 +1010,7 @@ def run(
     video = open_video(source, config.input, config.poses, tracks or detections)
     workspace = Workspace(out, overwrite)
     workspace.bind(video, overwrite)
+    viewer = Viewer(VideoInfo.of(video)) if show else None
     seconds: dict[str, float] = {}
     in_3d = in_3d and config.poses.mode != "none"
     poses = supplied_poses(video, config.poses, workspace) if in_3d else None
@@ -1018,6 +1026,7 @@ def run(
             found, boxes = detect_all(found, video, workspace)
             seconds["detect"] = time.monotonic() - started
         names = found.class_names
+    check_known_size(config.objects, names)
     model = None
     if poses is not None:
         check_directions(poses, boxes if tracks else _tracklets(boxes))
@@ -1027,11 +1036,15 @@ def run(
         poses, model = reconstruct_cached(video, config.poses, workspace, rows)
         seconds["poses"] = time.monotonic() - started
     if not tracks:
-        result = _track_video(video, workspace, config, found, poses, seconds)
+        result = _track_video(video, workspace, config, found, poses, seconds, viewer)
     workspace.save_last(result, poses)
     workspace.publish_model(model)
     result.poses, result.seconds = poses, seconds
-    return _finish(result, video, workspace, config)
+    result = _finish(result, video, workspace, config)
+    if viewer is not None:
+        viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
+        viewer.close()
+    return result
 
 
 def refit(
@@ -1040,19 +1053,29 @@ def refit(
     tracks: str | Path | None = None,
     edits: str | Path | None = None,
 ) -> Result:
-    """Link and fit again what a folder holds; tracks: other identities; edits: corrections."""
+    """Link and fit again what OUT holds, by default with its last options.
+
+    tracks: file of identities instead; edits: of corrections, instead of those that OUT keeps.
+    """
     if tracks and edits:
         raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")
     workspace = Workspace.open(out)
     result, video = workspace.load_last(), workspace.video()
     result.edits = read_edits(edits) if edits else None
-    config = dataclasses.replace(config or Config(), input=video.config)
+    config = dataclasses.replace(config or _last_config(out), input=video.config)
+    check_known_size(config.objects, result.class_names)
     if tracks:
         poses = result.poses
         result = _given_tracks(tracks, video, config.detect, result)
         workspace.save_last(result, poses)
         result.poses = poses
     return _finish(result, video, workspace, config)
+
+
+def _last_config(out: str | Path) -> Config:
+    """Read the options of the last run in an output folder; the defaults if it has none."""
+    path = Path(out) / CONFIG_FILE
+    return read_config(Config(), path) if path.is_file() else Config()
 
 
 def _track_video(
@@ -1062,6 +1085,7 @@ def _track_video(
     source: DetectionSource,
     poses: Poses | None,
     seconds: dict[str, float],
+    viewer: Viewer | None = None,
 ) -> Result:
     """Track all frames, or take the tracks from the cache; a live source is never cached."""
     poses = poses if poses is not None and poses.known.any() else None
@@ -1072,6 +1096,8 @@ def _track_video(
     started, on = time.monotonic(), (config.threads, config.offline, config.device)
     tracker = Tracker(config.tracker, make_embedder(config.embed.model, config.embed.head, *on))
     steps = track(video, source, tracker, poses=poses)
+    if viewer is not None:
+        steps = viewer.follow(steps, source.class_names, video, poses)
     result = collect_tracks(steps, tracker, video, source)
     seconds["track"] = time.monotonic() - started
     result.save_tracked(path)
@@ -1103,7 +1129,8 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     """Link tracklets, fit one solid an object, and write all files of the output folder."""
     started, poses = time.monotonic(), result.poses
     result.edits = result.edits or kept_edits(workspace.out)
-    link_and_fit(result, config.objects)
+    with Progress("objects"):
+        link_and_fit(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
     result.tracks, result.out = fill(result, video.size, gap), workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
@@ -1111,8 +1138,10 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.seconds["objects"] = time.monotonic() - started
     result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
     result.warnings += implausible(result, config.tracker.high_score, config.objects.moving_classes)
+    result.warnings += unused_sizes(config.objects, result.objects)
     started = time.monotonic()
     result.save(workspace.out, config.output.doubtful)
+    write_config(config, workspace.out / CONFIG_FILE)
     if poses is not None:
         write_supplied_model(poses, video, workspace.out)
     shown = config.output
@@ -1125,94 +1154,17 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
 
 # ---- Command line ------------------------------------------------------------------------------
 
-TRACKS_HELP = "identities from a file instead of the tracker: CVAT XML, COCO-VID JSON, MOT, CSV"
-
-
-class _ListOptions(argparse.Action):
-    """--options: print every option with its default and meaning, then stop."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *args: Any) -> None:
-        print(list_options(Config()))
-        parser.exit()
-
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="reobj_track",
-        description="Objects of a hand-held video of a static scene: which detections are the same "
-        "physical object, and where each one is in 3D.",
-        epilog="Example: reobj_track.py run room.mp4 -o out; then open out/scene.html.",
-    )
-    parser.add_argument("--version", action="version", version=f"reobj_track {__version__}")
-    text = "list what --set section.field=value can set"
-    parser.add_argument("--options", action=_ListOptions, nargs=0, help=text)
-    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_run(sub, "run", "video -> identities -> cameras -> ellipsoids -> files to look at")
-    _add_run(sub, "track", "identities only (2D)")
-    _add_run(sub, "poses", "cameras only (pycolmap)")
-    text = "(re)fit the ellipsoids from what an output folder already holds"
-    add = _command(sub, "objects", text, _cmd_objects, "objects", "output").add_argument
-    add("out", help="output folder of an earlier `run`")
-    text = "only check objects.json against its schema (needs jsonschema)"
-    add("--validate", action="store_true", help=text)
-    add("--tracks", help=TRACKS_HELP)
-    add("--edits", help="corrections by hand, saved by scene.html; later fits keep them")
-    text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
-    add = _command(sub, "eval", text, _cmd_eval).add_argument
-    add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
-    add("--gt", type=Path, required=True, help="true tracks, MOTChallenge gt.txt")
-    add("--gt-objects", type=Path, help="true solids, e.g. a gt_objects.json")
-    add("--gt-poses", type=Path, help="true cameras, TUM or 4x4 world_from_cam a line (default: "
-        "poses.txt or poses_c2w.txt beside --gt-objects)")  # fmt: skip
-    add("--classes", default="", help="score these classes only, comma-separated")
-    add("--min-visibility", type=float, default=0.0, help="ignore truth that is less visible")
-    text = "write what an output folder holds in another tool's format"
-    add = _command(sub, "export", text, _cmd_export).add_argument
-    add("out", help="output folder of an earlier `run`")
-    add("--to", required=True, choices=EXPORTS, help="the format")
-    add("-o", "--output", help="file to write (default: in the output folder)")
-    text = "list, download and verify weights"
-    add = _command(sub, "models", text, _cmd_models, "").add_argument
-    add("names", nargs="*", metavar="NAME", help="weights to download or verify; none: list all")
-    return parser
-
-
-def _command(
-    sub: Any, name: str, text: str, func: Callable[[argparse.Namespace], int], *sections: str
-) -> argparse.ArgumentParser:
-    """Add a command with the flags of some config sections, --set and the log options."""
-    parser: argparse.ArgumentParser = sub.add_parser(
-        name, help=text, description=text[0].upper() + text[1:] + "."
-    )
-    add_flags(parser, Config(), sections)
-    more = "any other option, e.g. tracker.coast_frames=60; --options lists them"
-    parser.add_argument("--set", action="append", metavar="SECTION.FIELD=VALUE", help=more)
-    parser.add_argument("-v", "--verbose", action="store_true", help="say what is being done")
-    parser.add_argument("--debug", action="store_true", help="say more, and show tracebacks")
-    parser.set_defaults(func=func)
-    return parser
-
-
-def _add_run(sub: Any, name: str, text: str) -> None:
-    sections = {
-        "run": ("input", "detect", "embed", "tracker", "poses", "objects", ""),
-        "track": ("input", "detect", "embed", "tracker", ""),
-        "poses": ("input", "poses", ""),
-    }[name]
-    add = _command(
-        sub, name, text, _cmd_poses if name == "poses" else _cmd_run, *sections
-    ).add_argument
-    text = "video file, folder of images, glob in quotes, camera index, stream URL (`run`: or none)"
-    add("video", nargs="?" if name == "run" else None, help=text)
-    add("-o", "--out", required=True, help="output folder")
-    add("--overwrite", action="store_true", help="write into a folder that holds something else")
-    if name != "poses":
-        add("--detections", help="recorded detections instead: MOT txt, CSV, COCO JSON, npz")
-        add("--tracks", help=TRACKS_HELP)
+    commands = {
+        "run": _cmd_run, "track": _cmd_run, "poses": _cmd_poses, "objects": _cmd_objects,
+        "eval": _cmd_eval, "export": _cmd_export, "models": _cmd_models,
+    }  # fmt: skip
+    return make_parser(Config(), commands, tuple(EXPORTS))
 
 
 def _cmd_run(args: argparse.Namespace) -> int:
-    given = {"detections": args.detections, "tracks": args.tracks, "overwrite": args.overwrite}
+    given = {name: getattr(args, name) for name in ("detections", "tracks", "overwrite", "show")}
     config = config_from_args(Config(), args)
     print(run(args.video, args.out, config, in_3d=args.command == "run", **given).summary())
     return 0
@@ -1244,7 +1196,7 @@ def _cmd_objects(args: argparse.Namespace) -> int:
         faults = validate_objects(out / "objects.json" if out.is_dir() else out)
         print("\n".join(faults) or "valid")
         return 2 if faults else 0
-    config = config_from_args(Config(), args)
+    config = config_from_args(_last_config(args.out), args)
     print(refit(args.out, config, args.tracks, args.edits).summary())
     return 0
 
@@ -1276,7 +1228,7 @@ def _cmd_models(args: argparse.Namespace) -> int:
             w = row.weights
             size = f"{w.size / 1e6:.1f}" if w.size else "?"
             facts = f"{w.name:<15} {w.role:<9} {size:>5} MB  {w.licence:<11}"
-            print(f"{facts} {row.state:<9} {w.note}")
+            print("\n".join(wrapped(f"{facts} {row.state:<9} {w.note}")))
     return 0
 
 
@@ -1285,7 +1237,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Ctrl-C is the way to end a live source: its files are written, and 0 is returned.
     """
-    args = _parser().parse_args(argv)
+    parser, words = _parser(), list(sys.argv[1:] if argv is None else argv)
+    if (text := short_help(parser, words)) is not None:
+        print(text, file=sys.stderr)
+        return 2
+    args = parser.parse_args(words)
     level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
     logging.addLevelName(logging.WARNING, "warning")
     form = "%(levelname)s: %(message)s"

@@ -68,7 +68,7 @@ def supervision(video: rt.Video) -> Identities:
 
 def chain(video: rt.Video) -> Identities:
     """4. The whole chain: identities, cameras and one solid for each object, typed."""
-    config = rt.Config(input=video.config, output=rt.OutputConfig(overlay=False, scene=False))
+    config = rt.Config(input=video.config, output=rt.OutputConfig(overlay="none", scene=False))
     with tempfile.TemporaryDirectory() as out:
         result = rt.run(video.source, out, config, detections=DETECTIONS)
     for found in result.objects:

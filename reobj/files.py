@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import difflib
 import hashlib
 import json
 import math
 import os
 import re
 import sys
+import textwrap
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -160,10 +162,14 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
 
 
 REDRAW_S = 0.1  # chosen: as often as an eye follows, too seldom to cost time
+WINDOW_S = 5.0  # of the past that the rate is measured in (chosen: what is slow now is seen now)
 
 
 class Progress:
     """Show one line a stage on stderr with rate and time left, if stderr is a terminal.
+
+    Used in a `with` block: left without an exception, the stage is complete, whatever the total
+    was thought to be.
 
     Attributes:
         done, total: steps so far and in all (0: unknown).
@@ -171,8 +177,17 @@ class Progress:
 
     def __init__(self, stage: str, total: int = 0) -> None:
         self.stage, self.total, self.done = stage, total, 0
-        self.started, self.shown = time.monotonic(), 0.0
+        self.started = self.shown = time.monotonic()
+        self.marks = [(self.started, 0)]  # time and steps, of the last WINDOW_S
         self.enabled = sys.stderr.isatty()
+
+    def __enter__(self) -> Progress:
+        if self.enabled:
+            self._write("...")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.close(kind is None)
 
     def step(self, n: int = 1) -> None:
         """Count n more steps."""
@@ -181,21 +196,48 @@ class Progress:
             self._draw()
 
     def _draw(self) -> None:
-        self.shown = time.monotonic()
-        rate = self.done / max(self.shown - self.started, 1e-6)
-        text = f"{self.stage:<10}{self.done}"
+        self.shown = now = time.monotonic()
+        self.marks = [mark for mark in self.marks if mark[0] >= now - WINDOW_S] or self.marks[-1:]
+        then, before = self.marks[0]
+        self.marks.append((now, self.done))
+        rate = (self.done - before) / (now - then) if now > then else 0.0
+        text = str(self.done)
         if self.total:
-            left = max(self.total - self.done, 0) / rate if rate else math.inf
-            text += f"/{self.total} {100 * self.done / self.total:3.0f} %"
-            text += f", {left:.0f} s left" if math.isfinite(left) else ""
-        sys.stderr.write(f"\r{text}, {rate:.1f}/s\x1b[K")  # erase what a longer line left behind
+            text += f"/{self.total} {min(100 * self.done / self.total, 99):3.0f} %"
+            text += f", {max(self.total - self.done, 0) / rate:.0f} s left" if rate else ""
+        self._write(text + (f", {rate:.1f}/s" if rate else ""))
 
-    def close(self) -> float:
-        """Finish the line and return the seconds since the start."""
-        if self.enabled and self.done:
-            self._draw()
+    def _write(self, text: str) -> None:
+        sys.stderr.write(f"\r{self.stage:<10}{text}\x1b[K")  # erase what a longer line left behind
+        sys.stderr.flush()
+
+    def close(self, complete: bool = True) -> float:
+        """Finish the line, at 100 % if the stage is complete; returns the seconds since the start.
+
+        The rate shown then is that of the whole stage.
+        """
+        seconds = time.monotonic() - self.started
+        if self.enabled:
+            text = ""
+            if self.done:
+                share = f"/{self.done} 100 %" if complete else f"/{self.total}" * (self.total > 0)
+                text = f"{self.done}{share}, "
+            text += f"{seconds:.1f} s" + ("" if complete else ", not finished")
+            if self.done and seconds > REDRAW_S:  # what came from the cache has no rate
+                text += f", {self.done / seconds:.1f}/s"
+            self._write(text)
             sys.stderr.write("\n")
-        return time.monotonic() - self.started
+        return seconds
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Name the known word that a wrong one is most like, for messages; "" if none is.
+
+    >>> did_you_mean("chiar", ["cup", "chair"])
+    '; did you mean chair?'
+    """
+    close = difflib.get_close_matches(word, list(known), 1)
+    return f"; did you mean {close[0]}?" if close else ""
 
 
 def without_secrets(text: str) -> str:
@@ -231,6 +273,14 @@ def shortened(items: Sequence[Any]) -> str:
     '1, 2, 3, 4, 5, ...'
     """
     return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
+
+
+PRINT_WIDTH = 100  # columns of what is printed
+
+
+def wrapped(text: str) -> list[str]:
+    """Wrap a line for the terminal; what follows is indented."""
+    return textwrap.wrap(text, PRINT_WIDTH, subsequent_indent="  ", break_long_words=False)
 
 
 def spans(numbers: Iterable[int], step: int = 1) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
-from reobj.files import rounded
+from reobj.files import did_you_mean, rounded, shortened
 from reobj.identity.evidence import CLASS_KEPT
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
@@ -104,6 +104,31 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
             raise ReobjError(f"--known-size {item!r}: expected {expected}")
         sizes[found[1]] = ("h", float(found[2]) / per_metre[found[3]])
     return sizes
+
+
+def _plain(name: str) -> str:
+    """Normalise a category as `quadrics` does: "Potted_Plant" and "potted plant" are the same."""
+    return re.sub(r"[\s_\-]+", " ", name.strip().lower())
+
+
+def check_known_size(config: ObjectsConfig, class_names: Sequence[str]) -> None:
+    """Refuse sizes of categories that no object can have; a misspelt one would set nothing."""
+    known = {_plain(name) for name in class_names}
+    for name in map(str, parse_known_size(config.known_size)):
+        if known and _plain(name) not in known:
+            close = did_you_mean(name, class_names) or f"; there are {shortened(class_names)}"
+            raise ReobjError(f"--known-size {name}: no such class{close}")
+
+
+def unused_sizes(config: ObjectsConfig, objects: Sequence[Object]) -> list[str]:
+    """Warn of sizes of categories that no object with a solid has: they set nothing."""
+    seen = {_plain(o.class_name) for o in objects if o.located}
+    names = map(str, parse_known_size(config.known_size))
+    return [
+        f"--known-size {name}: no {name} with a solid was found, so this sets no scale"
+        for name in names
+        if _plain(name) not in seen
+    ]
 
 
 def describe_objects(

@@ -1,14 +1,18 @@
-"""Options: fields of config dataclasses, set by flags or `--set section.field=value`."""
+"""Options: fields of config dataclasses, set by flags, --set section.field=value, TOML files."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import difflib
+import json
 import textwrap
+import tomllib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, TypeVar
 
+from reobj.files import atomic, read_text
 from reobj.types import ReobjError
 
 C = TypeVar("C")
@@ -26,6 +30,107 @@ def every_option(config: Any) -> dict[str, dataclasses.Field[Any]]:
     return options
 
 
+def value_of(config: Any, name: str) -> Any:
+    """Return the value of an option by its name for --set."""
+    section, _, field_name = name.rpartition(".")
+    return getattr(getattr(config, section) if section else config, field_name)
+
+
+def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
+    """Return the config with one option changed; a text is converted to the option's type.
+
+    Args:
+        where: begins the message of an error.
+    Raises:
+        ReobjError: no such option, or the value is none of its type.
+    """
+    options: Any = every_option(config)
+    if name not in options:
+        raise ReobjError(f"{where}{name}: no such option; did you mean {_likest(name, options)}?")
+    kind = type(options[name].default)
+    try:
+        if isinstance(value, str) and kind is bool:
+            value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
+                     "no": False, "off": False}[value.lower()]  # fmt: skip
+        elif isinstance(value, (bool, float)) and kind is int:
+            raise TypeError
+        value = kind(value)
+    except (KeyError, TypeError, ValueError):
+        expected = kind.__name__.upper()
+        raise ReobjError(f"{where}{name}: expected ={expected}, found {value!r}") from None
+    section, _, field_name = name.rpartition(".")
+    if section:
+        field_name, value = (
+            section,
+            dataclasses.replace(getattr(config, section), **{field_name: value}),
+        )
+    changed: Any = dataclasses.replace(config, **{field_name: value})  # type: ignore[type-var]
+    return changed  # type: ignore[no-any-return]
+
+
+def _likest(name: str, options: Iterable[str]) -> str:
+    """Name the option most like a wrong one: as a whole, or its field, or a word of its field."""
+
+    def likeness(option: str) -> float:
+        field_name = option.rpartition(".")[2]
+        words = (option, field_name, *field_name.split("_"))
+        return max(difflib.SequenceMatcher(None, name, word).ratio() for word in words)
+
+    return max(options, key=likeness)
+
+
+# ---- Files of options ----
+
+
+def read_config(config: C, path: str | Path) -> C:
+    """Apply a TOML file of options, by section; paths in it are those of the working folder.
+
+    Raises:
+        ReobjError: no TOML, no such option, or a value that is none of its type.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise ReobjError(f"{path}: not valid TOML ({error})") from error
+    for key, value in table.items():
+        inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else None
+        for name, own in (inner if inner is not None else {key: value}).items():
+            config = with_option(config, name, own, f"{path}: ")
+    return config
+
+
+def write_config(config: Any, path: str | Path) -> None:
+    """Write the options that differ from the defaults as TOML, for `read_config`.
+
+    By hand: a table of plain values in flat sections needs no package, and Python has no writer.
+    """
+    default, lines, sections = type(config)(), [], ""
+    changed = {
+        name: value
+        for name in every_option(config)
+        if (value := value_of(config, name)) != value_of(default, name)
+    }
+    for name in sorted(changed, key=lambda name: "." in name):  # those of no section come first
+        section, _, field_name = name.rpartition(".")
+        lines += [f"\n[{section}]"] if section != sections else []
+        lines.append(f"{field_name} = {_toml(changed[name])}")
+        sections = section
+    head = "# Options of reobj_track that differ from the defaults; --options lists all.\n"
+    with atomic(Path(path)) as part:
+        part.write_text(head + "\n".join(lines) + "\n" * bool(lines), encoding="utf-8")
+
+
+def _toml(value: str | float) -> str:
+    """Write a value: a text as JSON has it, but DEL escaped too; numbers as Python has them."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return str(value).lower()
+
+
+# ---- Flags ----
+
+
 def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[str]) -> None:
     """Add the flags that the options of some sections declare ("" for those of the top level)."""
     chosen = set(sections)
@@ -41,44 +146,22 @@ def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[s
             parser.add_argument(flag, dest=name, default=None, help=text, **how)
 
 
-def with_option(config: C, name: str, value: Any) -> C:
-    """Return the config with one option changed; a text is converted to the option's type.
+def config_from_args(config: C, args: argparse.Namespace) -> C:
+    """Apply --config FILE, then the flags that were given, then every --set section.field=value.
 
-    Raises:
-        ReobjError: no such option, or the text is none of its type.
+    The result is written to --save-config FILE.
     """
     options: Any = every_option(config)
-    if name not in options:
-        close = difflib.get_close_matches(name, options, 1) or ["tracker.coast_frames"]
-        raise ReobjError(f"--set {name}: no such option; did you mean {close[0]}?")
-    kind = type(options[name].default)
-    try:
-        if isinstance(value, str) and kind is bool:
-            value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
-                     "no": False, "off": False}[value.lower()]  # fmt: skip
-        value = kind(value)
-    except (KeyError, TypeError, ValueError):
-        expected = kind.__name__.upper()
-        raise ReobjError(f"--set {name}: expected ={expected}, found {value!r}") from None
-    section, _, field_name = name.rpartition(".")
-    if section:
-        field_name, value = (
-            section,
-            dataclasses.replace(getattr(config, section), **{field_name: value}),
-        )
-    changed: Any = dataclasses.replace(config, **{field_name: value})  # type: ignore[type-var]
-    return changed  # type: ignore[no-any-return]
-
-
-def config_from_args(config: C, args: argparse.Namespace) -> C:
-    """Apply the flags that were given, then every --set section.field=value."""
-    options: Any = every_option(config)
+    if args.config:
+        config = read_config(config, args.config)
     for name, value in vars(args).items():
         if name in options and value is not None:
             config = with_option(config, name, value)
     for item in args.set or []:
         name, equals, text = item.partition("=")
         config = with_option(config, name, text if equals else None)
+    if args.save_config:
+        write_config(config, args.save_config)
     return config
 
 

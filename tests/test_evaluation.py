@@ -256,6 +256,20 @@ def truth_of(path: Path, result: rt.Result) -> Path:
     return write(path, rows)
 
 
+def test_the_report_has_no_class_of_zeros() -> None:
+    """What was not found at all is named in one line; a class with any score keeps its own."""
+    zero = dict.fromkeys("HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split(), 0.0)
+    some = zero | {"HOTA": 0.4, "IDF1": 0.5, "IDP": 0.5, "IDR": 0.5}
+    names = {f"thing {i}": zero for i in range(20)}
+    tracks = {"all": some, "chair": some, "clock": zero, **names}
+    lines = score_report({"tracks": tracks, "ranks": {}}).splitlines()
+    assert [line.split()[0] for line in lines[1:3]] == ["all", "chair"]
+    assert lines[3].startswith("nothing found of: clock, thing 0,")
+    assert not any(line.startswith("clock") for line in lines) and max(map(len, lines)) <= 100
+    nothing = score_report({"tracks": {"all": zero}, "ranks": {}}).splitlines()
+    assert nothing[1].startswith("all ")
+
+
 def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None:
     """Two cups, one comes back twice: once like itself, once like the other (Rank-1 .5)."""
     result = cups([0, 0, 40, 80], [1, 2, 1, 1])

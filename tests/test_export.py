@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 import shutil
@@ -9,16 +10,21 @@ import subprocess
 import sys
 import zipfile
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import cv2
 import numpy as np
 import pytest
 from conftest import CAMERA, FEW, ROOM
 from scipy.spatial.transform import Rotation
+from simulated import fitted, tracks_of, walk
 
 import reobj_track as rt
-from reobj.results.export import EXPORTS
+from reobj.results.export import EXPORTS, Viewer
+from reobj.results.result import VideoInfo
+from reobj.results.workspace import Workspace
 from reobj.types import object_color
 
 NO_PICTURES = ("--set", "output.overlay=0", "--set", "output.scene=0")
@@ -233,6 +239,153 @@ def test_bad_tracks(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert not (tmp_path / "out" / "tracks.txt").exists()
 
 
+# ---- CSV ----
+
+
+def test_csv_holds_the_objects(room: Path, tmp_path: Path) -> None:
+    path = rt.export(room, "csv", tmp_path / "a.csv")
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    entries = objects(room)
+    assert [int(r["id"]) for r in rows] == [o["id"] for o in entries] and len(rows) > 5
+    for row, entry in zip(rows, entries, strict=True):
+        assert (row["class"], row["status"]) == (entry["class"], entry["status"])
+        assert int(row["visits"]) == len(entry["frames"]) and int(row["views"]) == entry["views"]
+        for name, axes in (("center", "xyz"), ("size_m", "xyz"), ("size_rel_sigma", "xyz")):
+            found = [row[f"{name}_{axis}"] for axis in axes]
+            assert [float(v) for v in found if v] == (entry[name] or [])
+        assert [float(row[k]) for k in ("qw", "qx", "qy", "qz") if row[k]] == (
+            entry["quat_wxyz"] or []
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "cell"),
+    [
+        ('=HYPERLINK("http://x")', '\'=HYPERLINK("http://x")'),
+        ("+1", "'+1"),
+        ("-chair", "'-chair"),
+        ("@SUM(A1)", "'@SUM(A1)"),
+        ("\tcup", "'\tcup"),
+        ("coat-rack, wide", "coat-rack, wide"),  # harmless
+    ],
+)
+def test_csv_runs_no_formula(tmp_path: Path, chairs: rt.Result, name: str, cell: str) -> None:
+    result = dataclasses.replace(chairs)
+    found = [dataclasses.replace(chairs.objects[0], class_name=name, reason=name)]
+    result.objects = [dataclasses.replace(o, center=-np.abs(o.center)) for o in found]
+    EXPORTS["csv"][1](result, tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["class"] == row["reason"] == cell
+    assert float(row["center_x"]) <= 0  # a negative number is a number
+
+
+# ---- nerfstudio ----
+
+
+def test_nerfstudio_of_a_video(room: Path, tmp_path: Path) -> None:
+    """Our own reader, which is tested with nerfstudio's files, finds cameras and images again."""
+    path = rt.export(room, "nerfstudio", tmp_path / "nerf/transforms.json")
+    data = json.loads(path.read_text())
+    assert len(data["frames"]) == 40
+    video = rt.Video(tmp_path / "nerf/images")
+    assert len(video.names) == 40 and video.size == (640, 480)
+    assert {f["file_path"] for f in data["frames"]} == {f"images/{n}" for n in video.names}
+    poses = rt.read_poses(str(path), video)
+    known = rt.Result.load(room).poses
+    np.testing.assert_allclose(poses.cam_from_world, known.cam_from_world, atol=1e-9)
+    np.testing.assert_allclose(poses.camera.K, known.camera.K, atol=1e-9)
+    original = [frame.image for frame in rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=4))]
+    second = next(frame.image for frame in video if frame.index == 1).astype(int)
+    assert np.abs(second - original[3]).mean() < 3 < np.abs(second - original[0]).mean()
+
+
+def test_nerfstudio_of_a_folder_copies_nothing(tmp_path: Path) -> None:
+    """Images stay where they are; sparse points come along; frames without a pose do not."""
+    (tmp_path / "frames").mkdir()
+    for i in range(40):
+        cv2.imwrite(str(tmp_path / f"frames/{i:03d}.png"), np.zeros((480, 640, 3), np.uint8))
+    poses = walk(40)
+    poses.cam_from_world[7] = np.nan
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    poses = dataclasses.replace(poses, points=points, colors=np.full((50, 3), 9, np.uint8))
+    out = tmp_path / "out"
+    Workspace(out).bind(rt.Video(tmp_path / "frames"))
+    result = fitted(tracks_of(walk(40)), poses)
+    result.save(out)
+    data = json.loads(rt.export(out, "nerfstudio").read_text())
+    files = [f["file_path"] for f in data["frames"]]
+    assert files[:2] == ["../../frames/000.png", "../../frames/001.png"]
+    assert len(files) == 39 and "../../frames/007.png" not in files
+    assert sorted(p.name for p in (out / "nerfstudio").iterdir()) == [
+        "sparse_pc.ply", "transforms.json",
+    ]  # fmt: skip
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
+    cloud = trimesh.load(out / "nerfstudio" / data["ply_file_path"])
+    np.testing.assert_allclose(cloud.vertices, points, atol=1e-6)
+    assert (np.asarray(cloud.colors)[:, :3] == 9).all()
+
+
+@pytest.mark.parametrize(
+    ("camera", "terms", "said"),
+    [
+        (("PINHOLE", 500.0, 510.0, 320.0, 240.0), {"k1": 0.0}, False),
+        (("SIMPLE_RADIAL", 500.0, 320.0, 240.0, 0.1), {"k1": 0.1, "k2": 0.0}, False),
+        (("RADIAL", 500.0, 320.0, 240.0, 0.1, 0.2), {"k1": 0.1, "k2": 0.2}, False),
+        (("OPENCV", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4),
+         {"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, False),
+        (("OPENCV_FISHEYE", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4),
+         {"k3": 0.3, "k4": 0.4}, False),
+        (("FULL_OPENCV", 500.0, 510.0, 320.0, 240.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0),
+         {"k1": 0.1, "p2": 0.4}, True),
+    ],
+)  # fmt: skip
+def test_nerfstudio_knows_the_lens(
+    tmp_path: Path, camera: tuple, terms: dict, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "f").mkdir()
+    for i in range(40):
+        cv2.imwrite(str(tmp_path / f"f/{i:03d}.png"), np.zeros((480, 640, 3), np.uint8))
+    lens = rt.Camera(camera[0], 640, 480, camera[1:])
+    poses = dataclasses.replace(walk(40), camera=lens)
+    Workspace(tmp_path / "out").bind(rt.Video(tmp_path / "f"))
+    empty = rt.Result(rt.Tracks.empty(), (), VideoInfo("f", 640, 480, 30.0), poses=poses)
+    empty.save(tmp_path / "out")
+    path = rt.export(tmp_path / "out", "nerfstudio")
+    data = json.loads(path.read_text())
+    assert {k: data[k] for k in terms} == terms and (data["w"], data["h"]) == (640, 480)
+    assert (data["fl_x"], data["cx"]) == (lens.K[0, 0], lens.K[0, 2])
+    assert ("distortion is left out" in caplog.text) == said
+    if not said:
+        again = rt.read_poses(str(path), rt.Video(tmp_path / "f")).camera
+        pixels = np.array([[10.0, 20], [600, 400]])
+        np.testing.assert_allclose(again.undistort(pixels), lens.undistort(pixels), atol=1e-6)
+
+
+# ---- PLY ----
+
+
+def test_ply_holds_the_solids(room: Path, tmp_path: Path) -> None:
+    """Closed, outwards, in place: each one's volume and corners are those of its shape."""
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
+    mesh = trimesh.load(rt.export(room, "ply", tmp_path / "a.ply"))
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    result = rt.Result.load(room)
+    parts = {tuple(p.visual.vertex_colors[0][:3]): p for p in mesh.split(only_watertight=True)}
+    share = {"box": 8.0, "cylinder": 2 * np.pi, "ellipsoid": 4 / 3 * np.pi}
+    assert {o.support for o in result.located} >= {"box", "cylinder"}
+    assert len(parts) == len(result.located) > 5
+    for o in result.located:
+        part = parts[object_color(o.id)[::-1]]
+        volume = share[o.support] * o.half_axes.prod()
+        assert part.volume == pytest.approx(volume, rel=0.02)
+        np.testing.assert_allclose(part.bounds.mean(0), o.center, atol=1e-4)
+        w, x, y, z = o.quat_wxyz
+        own = (part.vertices - o.center) @ Rotation.from_quat([x, y, z, w]).as_matrix()
+        np.testing.assert_allclose(np.abs(own).max(0), o.half_axes, rtol=0.01)
+
+
 # ---- What every export must do ----
 
 
@@ -420,11 +573,7 @@ def test_a_missing_package_is_named(
 def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
     """Read back by rerun itself: every ellipsoid, camera and box."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")
-    from rerun.chunk import RrdReader
-
-    found = defaultdict(list)
-    for chunk in RrdReader(rt.export(room, "rrd", tmp_path / "a.rrd")).stream().to_chunks():
-        found[chunk.entity_path] += chunk.to_record_batch().to_pylist()
+    found = in_rrd(rt.export(room, "rrd", tmp_path / "a.rrd"))
     world, kept = located(room)
     scale = world["scale"]["metres_per_unit"]
     for o in kept:
@@ -438,8 +587,90 @@ def test_rrd_in_rerun(room: Path, tmp_path: Path) -> None:
     assert frames == list(range(0, 120, 3))
     boxes = [len(row["Boxes2D:centers"]) for row in found["/world/camera/boxes"]]
     assert sum(boxes) == len(mot(room / "tracks.txt"))
+    shown = {row["frame"]: row["EncodedImage:blob"][0] for row in found["/world/camera/image"]}
+    assert sorted(shown) == frames
+    image = cv2.imdecode(np.array(shown[3], np.uint8), cv2.IMREAD_COLOR)
+    fourth = [f.image for f in rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=4))][3]
+    assert image.shape == (480, 640, 3) and np.abs(image.astype(int) - fourth).mean() < 4
     (points,) = found["/world/points"] or [{"Points3D:positions": []}]
     assert isinstance(points["Points3D:positions"], list)
+
+
+def test_images_in_rerun_are_small_and_boxes_fit_them(chairs: rt.Result, tmp_path: Path) -> None:
+    """A video of 1920 px: image, lens and boxes all shrink to a third."""
+    pytest.importorskip("rerun", reason="pip install .[viewer]")
+    large = rt.Camera("PINHOLE", 1920, 1440, tuple(3 * p for p in chairs.poses.camera.params))
+    tracks = dataclasses.replace(chairs.tracks, xyxy=3 * chairs.tracks.xyxy)
+    (tmp_path / "f").mkdir()
+    for i in range(2):
+        cv2.imwrite(str(tmp_path / f"f/{i}.jpg"), np.zeros((1440, 1920, 3), np.uint8))
+    Workspace(tmp_path / "out").bind(rt.Video(tmp_path / "f"))
+    poses = dataclasses.replace(chairs.poses, camera=large)
+    video = VideoInfo("f", 1920, 1440, 30.0)
+    result = dataclasses.replace(chairs, tracks=tracks, poses=poses, video=video)
+    result.save(tmp_path / "out")
+    found = in_rrd(rt.export(tmp_path / "out", "rrd"))
+    assert len(found["/world/camera/image"]) == 2
+    picture = np.array(found["/world/camera/image"][0]["EncodedImage:blob"][0], np.uint8)
+    assert cv2.imdecode(picture, cv2.IMREAD_COLOR).shape == (480, 640, 3)
+    lens = found["/world/camera"][0]
+    assert lens["Pinhole:resolution"] == [[640, 480]]
+    assert lens["Pinhole:image_from_camera"][0][0] == pytest.approx(520)
+    first = found["/world/camera/boxes"][0]
+    centers = chairs.tracks.xyxy[:3].reshape(3, 2, 2).mean(1)
+    np.testing.assert_allclose(first["Boxes2D:centers"], centers, atol=0.01)
+
+
+def test_the_viewer_follows_the_tracking(tmp_path: Path) -> None:
+    """Frame by frame, as they are tracked: image, boxes with names, and a known camera."""
+    pytest.importorskip("rerun", reason="pip install .[viewer]")
+    config = rt.InputConfig(stop=4, max_size=320)
+    video, path = rt.Video(ROOM / "room.mp4", config), tmp_path / "live.rrd"
+    viewer = Viewer(VideoInfo.of(video), lambda rec: rec.save(path))
+    steps = rt.track(video, lambda image: [[10, 20, 50, 80, 0.9, 56]], rt.Tracker())
+    poses, seen = walk(40), []
+    for frame, tracks in viewer.follow(steps, rt.COCO_NAMES, video, poses):
+        seen.append((frame.index, len(tracks)))
+        assert tracks.xyxy.max(initial=0) < 200  # handed on as they were
+    viewer.close()
+    found = in_rrd(path)
+    assert (
+        [f for f, _ in seen] == [0, 1, 2, 3] == [r["frame"] for r in found["/world/camera/image"]]
+    )
+    boxes = found["/world/camera/boxes"]
+    assert [len(row["Boxes2D:centers"] or []) for row in boxes] == [n for _, n in seen]
+    assert boxes[-1]["Boxes2D:labels"] == ["1 chair"]
+    np.testing.assert_allclose(boxes[-1]["Boxes2D:centers"], [[60, 100]], atol=2)  # native px
+    assert len(found["/world/camera"]) == 4
+
+
+def test_show_reaches_the_viewer(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flag: followed while tracking, then the result; what comes from the cache is read."""
+    pytest.importorskip("rerun", reason="pip install .[viewer]")
+    path = tmp_path / "live.rrd"
+    viewer = partial(Viewer, start=lambda rec: rec.save(path))
+    monkeypatch.setattr(rt, "Viewer", viewer)
+    args = ("--detections", ROOM / "detections.npz", "--poses", ROOM / "poses.txt", "--camera",
+            CAMERA, "--every", 3, "--stop", 30, "--show", *NO_PICTURES)  # fmt: skip
+    for _ in range(2):
+        assert cli("run", ROOM / "room.mp4", "-o", tmp_path / "out", *args) == 0
+        found = in_rrd(path)
+        assert len({row["frame"] for row in found["/world/camera/image"]}) == 10
+        assert any(name.startswith("/world/objects/chair/") for name in found)
+
+
+def in_rrd(path: Path) -> dict[str, list[dict]]:
+    """Rows of a recording by entity, read by rerun."""
+    from rerun.chunk import RrdReader
+
+    found = defaultdict(list)
+    for chunk in RrdReader(path).stream().to_chunks():
+        table = chunk.to_record_batch()
+        kept = [name for name in table.schema.names if name != "time"]  # whole frames are enough
+        found[chunk.entity_path] += table.select(kept).to_pylist()
+    return found
 
 
 def test_colmap_opens_sparse(room: Path) -> None:

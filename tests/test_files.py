@@ -200,6 +200,10 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
+def last_line(screen: Terminal) -> str:
+    return screen.getvalue().split("\r")[-1]
+
+
 def test_progress_tells_share_rate_and_time_left(
     clock: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -212,8 +216,54 @@ def test_progress_tells_share_rate_and_time_left(
     progress.step()  # too soon for an eye
     assert screen.getvalue() == "\rtrack     20/200  10 %, 36 s left, 5.0/s\x1b[K"
     clock[0] += 5.99
+    progress.step(9)  # the rate is that of the last seconds: what is slow now is seen now
+    assert last_line(screen) == "track     30/200  15 %, 102 s left, 1.7/s\x1b[K"
     assert progress.close() == pytest.approx(10)
-    assert screen.getvalue().endswith("\rtrack     21/200  10 %, 85 s left, 2.1/s\x1b[K\n")
+    assert last_line(screen) == "track     30/30 100 %, 10.0 s, 3.0/s\x1b[K\n"
+
+
+def test_the_first_step_has_no_rate_of_millions(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What comes from a cache in no time: the line says how many, and no rate."""
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    with files.Progress("track", 240) as progress:
+        for _ in range(240):
+            clock[0] += 1e-7
+            progress.step()
+    assert screen.getvalue() == "\rtrack     ...\x1b[K\rtrack     240/240 100 %, 0.0 s\x1b[K\n"
+
+
+@pytest.mark.parametrize("total", [90, 100, 110])
+def test_a_stage_ends_at_100_percent_only_when_it_is_complete(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch, total: int
+) -> None:
+    """Videos say their length wrong; 100 % is never shown before the end."""
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    with files.Progress("track", total) as progress:
+        for _ in range(100):
+            clock[0] += 1
+            progress.step()
+            assert "100 %" not in screen.getvalue()
+    assert last_line(screen) == "track     100/100 100 %, 100.0 s, 1.0/s\x1b[K\n"
+    with pytest.raises(KeyboardInterrupt), files.Progress("track", total) as progress:
+        clock[0] += 4
+        progress.step(8)
+        raise KeyboardInterrupt
+    assert last_line(screen) == f"track     8/{total}, 4.0 s, not finished, 2.0/s\x1b[K\n"
+
+
+def test_a_stage_without_steps_is_shown_while_it_lasts(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = Terminal()
+    monkeypatch.setattr("sys.stderr", screen)
+    with files.Progress("objects"):
+        assert screen.getvalue() == "\robjects   ...\x1b[K"
+        clock[0] += 4
+    assert last_line(screen) == "objects   4.0 s\x1b[K\n"
 
 
 def test_progress_without_a_total(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,9 +278,9 @@ def test_progress_without_a_total(clock: list[float], monkeypatch: pytest.Monkey
 def test_progress_is_silent_without_a_terminal(
     clock: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    progress = files.Progress("track", 200)
-    clock[0] += 4
-    progress.step(20)
+    with files.Progress("track", 200) as progress:
+        clock[0] += 4
+        progress.step(20)
     assert progress.close() == 4 and capsys.readouterr().err == ""
 
 
@@ -266,6 +316,21 @@ def test_passwords_are_not_shown(text: str, expected: str) -> None:
 def test_lists_are_shortened() -> None:
     assert files.shortened([]) == "" and files.shortened([1, 2, 3, 4, 5]) == "1, 2, 3, 4, 5"
     assert files.shortened("abcdef") == "a, b, c, d, e, ..."
+
+
+def test_long_lines_are_wrapped() -> None:
+    lines = files.wrapped("distinct objects: " + ", ".join(f"{i} chairs" for i in range(40)))
+    assert len(lines) > 1 and max(map(len, lines)) <= 100
+    assert all(line.startswith("  ") for line in lines[1:])
+    assert files.wrapped("/a/path/" + "x" * 200) == ["/a/path/" + "x" * 200]  # can be copied
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [("chiar", "; did you mean chair?"), ("zebra", ""), ("chair", "; did you mean chair?")],
+)
+def test_a_wrong_word_gets_the_likest_one(word: str, expected: str) -> None:
+    assert files.did_you_mean(word, ("cup", "chair", "bowl")) == expected
 
 
 @pytest.mark.parametrize(

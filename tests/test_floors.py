@@ -20,18 +20,18 @@ PATHS = [
 FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
-    2: "reobj.files reobj.options reobj.identity.evidence reobj.identity.sampling "
+    2: "reobj.files reobj.identity.evidence reobj.identity.sampling "
     "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
-    3: "reobj.cameras reobj.sources.video reobj.sources.weights reobj.sources.recorded "
-    "reobj.poses.child reobj.poses.uncertainty reobj.results.edits",
-    4: "reobj.views reobj.sources.imageless reobj.sources.detection_files "
+    3: "reobj.cameras reobj.options reobj.sources.video reobj.sources.weights "
+    "reobj.sources.recorded reobj.poses.child reobj.poses.uncertainty reobj.results.edits",
+    4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
     "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "
     "reobj.poses.soundness "
     "reobj.poses.adjustment "
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
-    "reobj.poses.checks reobj.poses.floor reobj.results.ply",
+    "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
@@ -45,9 +45,10 @@ FLOORS = {
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {  # optional, or slow to load
-    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "supervision",
+    "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "supervision", "av",
+    "shtab",
 }  # fmt: skip
-LINES = {"reobj_track": 1310, "quadrics": 2270}  # at most; of any other room:
+LINES = {"reobj_track": 1300, "quadrics": 2270}  # at most; of any other room:
 ROOM_LINES = 600
 METHODS = 20  # of a class; but `Tracker` names every step of its `update`
 

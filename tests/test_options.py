@@ -9,7 +9,9 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
+import re
 import shutil
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,7 +33,14 @@ import reobj.results.scene as scene
 import reobj.sources.detectors as detectors
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
-from reobj.options import every_option, list_options, with_option
+from reobj.options import (
+    every_option,
+    list_options,
+    read_config,
+    value_of,
+    with_option,
+    write_config,
+)
 from reobj.results.workspace import Workspace
 from reobj.sources.weights import own_models
 
@@ -86,13 +95,10 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[rt.Config]:
     return configs
 
 
-def value_of(config: rt.Config, name: str) -> Any:
-    section, _, field = name.rpartition(".")
-    return getattr(getattr(config, section) if section else config, field)
-
-
 def other_value(default: Any) -> Any:
     """A value that is not the default, of its type."""
+    if default == "solids":  # the one text that is checked where it is set
+        return "trails"
     if isinstance(default, bool):
         return not default
     return f"{default}x" if isinstance(default, str) else type(default)(default + 3)
@@ -127,8 +133,8 @@ def test_flags_set_their_options(seen: list[rt.Config]) -> None:
     [("true", True), ("On", True), ("1", True), ("no", False), ("off", False), ("FALSE", False)],
 )
 def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> None:
-    assert rt.main(["run", "a.mp4", "-o", "out", "--set", f"output.overlay={text}"]) == 0
-    assert seen[0].output.overlay is value
+    assert rt.main(["run", "a.mp4", "-o", "out", "--set", f"output.scene={text}"]) == 0
+    assert seen[0].output.scene is value
 
 
 @pytest.mark.parametrize(
@@ -136,12 +142,16 @@ def test_switches_take_words(text: str, value: bool, seen: list[rt.Config]) -> N
     [
         ("tracker.coast_frame=3", "no such option; did you mean tracker.coast_frames?"),
         ("traker.n_init=3", "no such option; did you mean tracker.n_init?"),
+        ("hgh=.3", "did you mean tracker.high_score?"),  # a word of the field is enough
+        ("coast=3", "did you mean tracker.coast_frames?"),
+        ("fps_max=3", "no such option; did you mean"),
         ("quite.else=3", "no such option; did you mean"),
         ("input=3", "no such option; did you mean"),
         ("tracker.n_init=three", "expected =INT, found 'three'"),
         ("tracker.n_init=2.5", "expected =INT, found '2.5'"),
         ("tracker.high_score=much", "expected =FLOAT, found 'much'"),
-        ("output.overlay=maybe", "expected =BOOL, found 'maybe'"),
+        ("output.scene=maybe", "expected =BOOL, found 'maybe'"),
+        ("output.overlay=solid", "expected boxes, solids, ellipses, trails"),
         ("tracker.n_init", "expected =INT, found None"),
     ],
 )
@@ -151,6 +161,76 @@ def test_a_wrong_set_is_one_line(
     assert rt.main(["run", "a.mp4", "-o", "out", "--set", item]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and expected in said and f"--set {item.partition('=')[0]}" in said
+
+
+# ---- Files of options ----
+
+
+def test_a_file_keeps_every_option(tmp_path: Path) -> None:
+    """All changed at once; then each value is what it was, and of its type."""
+    config = rt.Config()
+    for name in every_option(config):
+        config = with_option(config, name, other_value(value_of(config, name)))
+    write_config(config, tmp_path / "a.toml")
+    assert read_config(rt.Config(), tmp_path / "a.toml") == config
+    assert tomllib.loads((tmp_path / "a.toml").read_text())["tracker"]["n_init"] == 6
+
+
+def test_a_file_holds_what_differs_only(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    write_config(rt.Config(), path)
+    assert tomllib.loads(path.read_text()) == {}
+    config = rt.Config(threads=3, tracker=rt.TrackerConfig(n_init=4))
+    write_config(config, path)
+    assert path.read_text().splitlines()[1:] == ["threads = 3", "", "[tracker]", "n_init = 4"]
+
+
+@pytest.mark.parametrize(
+    "text", ['a "b" c', "back\\slash", "größe \U0001f600", "tab\tline\nend\x7f\x01", "", "#no"]
+)
+def test_any_text_survives_a_file(tmp_path: Path, text: str) -> None:
+    config = with_option(rt.Config(), "objects.priors", text)
+    write_config(config, tmp_path / "a.toml")
+    assert read_config(rt.Config(), tmp_path / "a.toml") == config
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[tracker]\nn_int = 3", r"tracker\.n_int: no such option; did you mean tracker\.n_init\?"),
+        ("[traker]\nn_init = 3", r"did you mean tracker\.n_init\?"),
+        ("[tracker]\nn_init = 2.5", r"tracker\.n_init: expected =INT, found 2\.5"),
+        ("[tracker]\nn_init = true", r"tracker\.n_init: expected =INT, found True"),
+        ("[tracker]\nremember = 'maybe'", "tracker.remember: expected =BOOL"),
+        ("tracker = 3", "tracker: no such option"),
+        ("[tracker", r"not valid TOML \(Expected"),
+        ("[output]\noverlay = 'solid'", r"output\.overlay=solid: expected"),
+    ],
+)
+def test_a_wrong_file_is_one_line(
+    tmp_path: Path, text: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    out = tmp_path / "out"
+    assert rt.main(["run", "a.mp4", "-o", str(out), "--config", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert re.search(expected, said) and said.count("\n") == 1 and not out.exists()
+    assert "a.toml" in said or "output.overlay" in said
+    assert rt.main(["run", "a.mp4", "-o", str(out), "--config", str(tmp_path / "no.toml")]) == 2
+    assert "no.toml: cannot be read" in capsys.readouterr().err
+
+
+def test_flags_override_the_file(tmp_path: Path, seen: list[rt.Config]) -> None:
+    """And --set overrides flags; --save-config keeps what came out."""
+    path, kept = tmp_path / "a.toml", tmp_path / "b.toml"
+    path.write_text("threads = 2\n[input]\nevery = 5\nstart = 7\n[tracker]\nhigh_score = 1\n")
+    words = ["--every", "3", "--set", "input.start=8", "--save-config", str(kept)]
+    assert rt.main(["run", "a.mp4", "-o", "out", "--config", str(path), *words]) == 0
+    (config,) = seen
+    assert (config.threads, config.input.every, config.input.start) == (2, 3, 8)
+    assert config.tracker.high_score == 1.0 and type(config.tracker.high_score) is float
+    assert read_config(rt.Config(), kept) == config
 
 
 # ---- Every one is obeyed ----
@@ -179,7 +259,7 @@ class Lab:
 
     def refit(self, value: Any, **others: Any) -> rt.Result:
         """Link, fit and write again what the room's folder holds."""
-        config = self.config(value, output__overlay=False, output__scene=False)
+        config = self.config(value, output__overlay="none", output__scene=False)
         for name, other in others.items():
             config = with_option(config, name.replace("__", "."), other)
         out = self.path / f"out-{value}".replace("/", "_")
@@ -373,7 +453,7 @@ def _(lab: Lab) -> None:
 def run_on_nothing(lab: Lab, value: Any) -> None:
     """Track six images in which nothing is found."""
     folder, out = lab.path / "images", lab.path / "out"
-    config = lab.config(value, output__overlay=False, output__scene=False)
+    config = lab.config(value, output__overlay="none", output__scene=False)
     rt.run(images(folder, 6), out, config, detections=lambda image: [], in_3d=False)
 
 
@@ -604,7 +684,7 @@ def _(lab: Lab) -> None:
         assert stage.supplied_poses(video, lab.config(mode).poses) is None
     asked = lab.caught(rt, "reconstruct_cached", "video")
     for mode, count in (("none", 0), ("auto", 1)):
-        config = lab.config(mode, embed__model="none", output__overlay=False, output__scene=False)
+        config = lab.config(mode, embed__model="none", output__overlay="none", output__scene=False)
         rt.run(video.source, lab.path / mode, config, detections=lambda image: [])
         assert len(asked) == count
 
@@ -752,7 +832,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
         embed=rt.EmbedConfig(model="none"),
         tracker=rt.TrackerConfig(coast_frames=4, remember=False),
         poses=rt.PosesConfig(mode=path, camera=CAMERA_TEXT),
-        output=rt.OutputConfig(overlay=False, scene=False),
+        output=rt.OutputConfig(overlay="none", scene=False),
     )
     source = images(base / "images", 24)
     rt.run(source, base / "out", config, detections=base / "det.csv")
@@ -824,17 +904,20 @@ def _(lab: Lab) -> None:
 
 @shows("output.overlay")
 def _(lab: Lab) -> None:
-    for value in (True, False):
+    """No film; one with edges of solids, and one with ellipses and trails besides boxes."""
+    sizes = {}
+    for value in ("none", "solids", "ellipses,trails"):
         config = lab.config(value, output__scene=False)
-        out = shutil.copytree(lab.room, lab.path / f"out{value}")
+        out = shutil.copytree(lab.room, lab.path / f"out-{value}")
         rt.refit(out, config)
-        assert (out / "overlay.mp4").exists() == value
+        sizes[value] = sum(path.stat().st_size for path in out.glob("overlay.*"))
+    assert sizes["none"] == 0 and 0 < sizes["solids"] != sizes["ellipses,trails"] > 0
 
 
 @shows("output.scene")
 def _(lab: Lab) -> None:
     for value in (True, False):
-        config = lab.config(value, output__overlay=False)
+        config = lab.config(value, output__overlay="none")
         out = shutil.copytree(lab.room, lab.path / f"out{value}")
         rt.refit(out, config)
         assert (out / "scene.html").exists() == value

@@ -506,11 +506,12 @@ def test_the_overlay_draws_each_part_in_its_own_frames(parted: rt.Result, tmp_pa
         config, fps, size = rt.InputConfig(), 30.0, SIZE
 
     video: Any = Facts()
-    film = Overlay(parted, tmp_path / "a.mp4", video)
+    film = Overlay(parted, tmp_path / "a.mp4", video, "ellipses")
     film.close(False)
     assert sorted(film.outlines) == [f for f in range(64) if f not in (38, 39, 40)]
     for frame in (0, 20, 37, 41, 63):
         ids, dual_c, visible = film.outlines[frame]
+        assert Overlay(parted, tmp_path / "b.mp4", video).cameras[frame][1] == ids
         assert ids == ([1, 2, 3] if frame < BREAK else [4, 5, 6]) and visible.all()
         boxes = np.array([ellipse_box(c) for c in dual_c])
         seen = parted.tracks.xyxy[parted.tracks.frame == frame]

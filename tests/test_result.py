@@ -139,7 +139,8 @@ def test_an_empty_result(tmp_path: Path) -> None:
 
 
 def test_files_of_an_earlier_run_go(chairs: rt.Result, saved: Path) -> None:
-    stale = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html")
+    stale = ("poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm",
+             "scene.html")  # fmt: skip
     for name in stale:
         (saved / name).write_text("old")
     (saved / "notes.txt").write_text("mine")
@@ -234,7 +235,8 @@ def test_summary_is_the_table_that_run_prints(chairs: rt.Result, saved: Path) ->
     (w, d, h), size = (side for side, _ in sides(chairs.objects[0])), chairs.objects[0].size_m
     assert re.search(rf"1  chair +40 +1 +{w} x {d} x {h} +\d+ %  ok$", text, re.M)
     assert size is not None and np.allclose([float(w), float(d), float(h)], size, atol=0.0051)
-    assert re.search(r"3  chair +40 +1 +- +-  rejected \(too far\)$", text, re.M)
+    assert re.search(r"3  chair +40 +1 +- +-  rejected$", text, re.M)
+    assert "\nrejected: too far: 3\n" in text
     assert "width x depth x height, m" in text and "distinct objects: 3 chair" in text
     assert "cameras: 40 of 40 frames (user)" in text and "seconds: track 1.2" in text
     assert f"look at: {saved / 'objects.json'}" in text
@@ -249,6 +251,23 @@ def test_sizes_have_the_decimals_that_the_best_known_side_is_worth(chairs: rt.Re
     units = dataclasses.replace(found, size_m=None)  # of arbitrary length
     assert sides(units) == [("4.1", "0.4"), ("2.0", "0.6"), ("1.0", "0.6")]
     assert sides(dataclasses.replace(units, size=None, size_rel_sigma=None)) == []
+
+
+def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
+    """However many objects there are, with reasons, in parts; each reason is said once."""
+    reason = "size along x, y rests on the prior"
+    result = copy_of(chairs, out=None)
+    result.objects = [
+        dataclasses.replace(chairs.objects[0], id=i, class_name=f"dining table {i % 40}",
+                            status="prior_dominated", reason=reason)
+        for i in range(1, 121)
+    ]  # fmt: skip
+    lines = result.summary().splitlines()
+    assert max(map(len, lines)) <= 100 and len(lines) < 150
+    assert sum(reason in line for line in lines) == 1
+    first = next(k for k, line in enumerate(lines) if reason in line)
+    assert lines[first].startswith(f"prior_dominated: {reason}: 1, 2, 3,")
+    assert any(line.endswith(" 120") for line in lines[first:])
 
 
 # ---- The schema ----

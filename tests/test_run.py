@@ -30,7 +30,8 @@ from reobj.results.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 12
-QUICK = ("--embed", "none", "--set", "output.overlay=0", "--set", "output.scene=0")
+NO_PAGE = ("--set", "output.scene=0")
+QUICK = ("--embed", "none", "--set", "output.overlay=none", *NO_PAGE)
 
 
 def texture(seed: int = 0) -> np.ndarray:
@@ -70,6 +71,12 @@ def cli(*args: object) -> int:
     return rt.main([str(a) for a in args])
 
 
+def film_in(out: Path) -> str:
+    """The one film in an output folder, whichever encoder is here."""
+    (name,) = (path.name for path in out.glob("overlay.*"))
+    return name
+
+
 # ---- What must work ----
 
 
@@ -84,7 +91,9 @@ def test_track_writes_identities(
     )  # tentative frames are back-filled
     assert validate_objects(tmp_path / "out/objects.json") == []
     out = capsys.readouterr().out
-    assert "distinct objects: 2" in out and "overlay.mp4" in out
+    assert "distinct objects: 2" in out and re.search(
+        r"^look at: .*overlay\.(mp4|webm),", out, re.M
+    )
     assert "reject" not in out and "sigma" not in out
     objects = json.loads((tmp_path / "out/objects.json").read_text())["objects"]
     assert [(o["status"], o["reason"], o["size"]) for o in objects] == [("tracked", "", None)] * 2
@@ -122,7 +131,7 @@ def test_poses_none_stays_in_2d(
 def test_same_input_same_bytes(clip: Path, detections: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert cli("track", clip, "-o", tmp_path / name, "--detections", detections) == 0
-    for file in ("tracks.txt", "scene.html", "overlay.mp4", "cache/last-tracks.npz"):
+    for file in ("tracks.txt", "scene.html", film_in(tmp_path / "a"), "cache/last-tracks.npz"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
     objects = [
         json.loads((tmp_path / n / "objects.json").read_text())["objects"] for n in ("a", "b")
@@ -206,8 +215,8 @@ def test_pictures_can_be_switched_off(
 ) -> None:
     """And those of the run before go: they would show other results."""
     args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, "--embed", "none")
-    files = {"overlay": "overlay.mp4", "scene": "scene.html"}
     assert cli(*args) == 0
+    files = {"overlay": film_in(tmp_path / "out"), "scene": "scene.html"}
     assert cli(*args, "--set", f"output.{option}=0") == 0
     left = {name for name, file in files.items() if (tmp_path / "out" / file).exists()}
     assert left == set(files) - {option}
@@ -232,7 +241,7 @@ def test_embeddings_keep_their_rows_where_gaps_are_filled(
 ) -> None:
     lines = detections.read_text().splitlines(keepends=True)
     detections.write_text("".join(x for x in lines if x.split(",")[0] not in ("4", "5")))
-    output = rt.OutputConfig(overlay=False, scene=False)
+    output = rt.OutputConfig(overlay="none", scene=False)
     config = rt.Config(output=output, tracker=rt.TrackerConfig(embed_every=2))
     result = rt.run(clip, tmp_path / "out", config, detections=detections, in_3d=False)
     before = Workspace.open(tmp_path / "out").load_last()
@@ -379,7 +388,7 @@ def test_a_function_detects_once_too_and_sure_people_are_masked(
         calls.append(1)
         return [[100, 60, 140, 110, 0.9, 0], [10, 60, 50, 110, 0.2, 0], [200, 9, 240, 90, 0.9, 56]]
 
-    output = rt.OutputConfig(overlay=False, scene=False)
+    output = rt.OutputConfig(overlay="none", scene=False)
     config = rt.Config(output=output, embed=rt.EmbedConfig(model="none"))
     rt.run(clip, tmp_path / "out", config, detections=people)
     assert len(calls) == FRAMES and len(stages.told) == FRAMES
@@ -409,9 +418,9 @@ def test_a_killed_run_leaves_nothing_broken(clip: Path, detections: Path, tmp_pa
         command = [sys.executable, "-c", code, *args, "-o", str(out)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True)
         assert done.returncode == -signal.SIGKILL
-        assert not (out / "scene.html").exists() and not (out / "overlay.mp4").exists()
+        assert not (out / "scene.html").exists() and not list(out.glob("overlay.*"))
         assert cli(*args, "-o", out) == 0
-        for file in ("tracks.txt", "scene.html", "overlay.mp4", "cache/last-tracks.npz"):
+        for file in ("tracks.txt", "scene.html", film_in(out), "cache/last-tracks.npz"):
             assert (out / file).read_bytes() == (tmp_path / "good" / file).read_bytes(), file
         assert not [p for p in out.rglob(".part-*")]
 
@@ -583,6 +592,24 @@ def test_poses_in_the_wrong_direction_are_refused(
     assert not (tmp_path / "out/objects.json").exists()
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_every_stage_is_shown_and_ends_at_100_percent(
+    clip: Path, detections: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, "--embed", "none")
+    for stages in (["track", "objects", "write"], ["objects", "write"]):  # tracks are cached then
+        screen = Terminal()
+        monkeypatch.setattr("sys.stderr", screen)
+        assert cli(*args) == 0
+        lines = [line.split("\r")[-1] for line in screen.getvalue().strip().split("\n")]
+        assert [line.split()[0] for line in lines] == stages
+        assert all("100 %" in line for line in lines if not line.startswith("objects"))
+
+
 def test_disk_full_leaves_nothing_half_written(
     clip: Path,
     detections: Path,
@@ -604,15 +631,13 @@ def test_disk_full_leaves_nothing_half_written(
 def test_overlay_cut_by_a_full_disk_is_not_kept(
     clip: Path, detections: Path, tmp_path: Path
 ) -> None:
-    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk: OpenCV itself does not
-    report it.
-    """
+    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk."""
     code = (
         "import resource, sys, reobj_track as rt; "
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (16000, 16000)); "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (10000, 10000)); "
         "sys.exit(rt.main(sys.argv[1:]))"
     )
-    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections)
+    args = ("track", clip, "-o", tmp_path / "out", "--detections", detections, *NO_PAGE)
     done = subprocess.run(
         [sys.executable, "-c", code, *map(str, args)],
         capture_output=True,
@@ -620,8 +645,8 @@ def test_overlay_cut_by_a_full_disk_is_not_kept(
         cwd=Path(rt.__file__).parent,
     )
     assert done.returncode == 2, done.stderr
-    assert "overlay.mp4" in done.stderr
-    assert not list((tmp_path / "out").glob("*overlay.mp4"))
+    assert "/overlay." in done.stderr and done.stderr.count("\n") == 1
+    assert not list((tmp_path / "out").glob("*overlay*"))
 
 
 # ---- Promises of the module ----
@@ -657,6 +682,154 @@ def test_help_is_there(command: str, capsys: pytest.CaptureFixture[str]) -> None
         cli(*([command] if command else []), "--help")
     assert stop.value.code == 0
     assert "usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS[:-1])  # bare `models` lists the weights
+def test_a_bare_command_prints_short_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """What it does, one example that is right, and where all flags are."""
+    assert cli(*([command] if command else [])) == 2
+    said = capsys.readouterr().err
+    lines = said.splitlines()
+    assert len(lines) <= 16 and max(map(len, lines)) <= 100 and said.count("Example: ") == 1
+    words = re.search(r"Example: reobj_track\.py ([^;\n]*[^;.\n])", said)[1].split()
+    args = rt._parser().parse_args(words)
+    assert args.command == (command or "run")
+    assert "--help" in said or all(name in said for name in COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        ("rnu a.mp4", "did you mean run?"),
+        ("run a.mp4 -o out --evry 3", "--evry 3; did you mean --every?"),
+        ("run a.mp4 -o out --detectons d.txt", "did you mean --detections?"),
+        ("export out --to gbl", "did you mean glb?"),
+        ("run a.mp4 -o out --every three", "--every: invalid int value: 'three'"),
+        ("run a.mp4", "required: -o/--out"),
+        ("run a.mp4 -o out --config", "--config: expected one argument"),
+        ("track a.mp4 -o out --known-size chair=.8m", "unrecognized arguments: --known-size"),
+    ],
+)
+def test_a_wrong_word_is_one_line_with_the_right_one(
+    args: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli(*args.split())
+    said = capsys.readouterr().err
+    assert stop.value.code == 2 and said.startswith("error: ") and said.count("\n") == 1
+    assert expected in said and "--help)" in said
+
+
+def test_a_wrong_class_is_one_line_with_the_right_one(
+    clip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = "".join(f"{i},100,60,140,110,.9,chair\n" for i in range(FRAMES))
+    (tmp_path / "det.csv").write_text("frame,x1,y1,x2,y2,score,class\n" + rows)
+    args = ("run", clip, "-o", tmp_path / "out", "--detections", tmp_path / "det.csv", *QUICK)
+    for flag, value in (("--classes", "chiar"), ("--known-size", "chiar=.82m")):
+        assert cli(*args, flag, value) == 2
+        assert_one_clear_line(capsys, f"{flag}.* no .*class.*; did you mean chair?")
+    assert not (tmp_path / "out/tracks.txt").exists()
+
+
+def test_known_sizes_and_other_options_stay_with_the_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`objects OUT` takes the options of the last run there; a flag replaces one."""
+    frames, det, path = rendered_tracks(tmp_path, "right")
+    rows = det.read_text().splitlines()
+    table = [row.split(",") for row in rows]
+    det = tmp_path / "det.csv"
+    det.write_text("frame,x1,y1,x2,y2,score,class\n" + "".join(
+        f"{int(f) - 1},{x},{y},{float(x) + float(w)},{float(y) + float(h)},{s},sports ball\n"
+        for f, _, x, y, w, h, s in table
+    ))  # fmt: skip
+    out = tmp_path / "out"
+    args = ("--detections", det, "--poses", path, "--camera", "300,300,160,120", *QUICK)
+    known = ("--known-size", "sports ball=22cm", "--support", "ellipsoid")
+    assert cli("run", frames, "-o", out, *args, *known) == 0
+
+    def scale() -> tuple[float, str]:
+        data = json.loads((out / "objects.json").read_text())
+        assert {o["support"] for o in data["objects"]} == {"ellipsoid"}
+        return data["world"]["scale"]["metres_per_unit"], data["world"]["scale"]["source"]
+
+    known_scale = (pytest.approx(0.44, rel=0.1), "known_size")  # the balls are half a unit high
+    assert scale() == known_scale
+    assert cli("objects", out) == 0 and scale() == known_scale
+    assert cli("export", out, "--to", "cvat", "-o", tmp_path / "a.xml") == 0
+    assert cli("objects", out, "--tracks", tmp_path / "a.xml") == 0 and scale() == known_scale
+    assert rt.refit(out).world.scale.source == "known_size"
+    assert not list(out.glob("overlay.*"))  # nor does it forget what it need not write
+    assert cli("objects", out, "--known-size", "Sports_Ball=11cm") == 0
+    assert scale() == (pytest.approx(0.22, rel=0.1), "known_size")
+    assert cli("objects", out, "--known-size", "") == 0 and scale()[1] == "poses"
+    capsys.readouterr()
+    assert cli("objects", out, "--known-size", "sports bal=1m") == 2
+    assert_one_clear_line(capsys, "sports bal: no such class; did you mean sports ball")
+
+
+def test_a_size_that_sets_nothing_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A class that the detector has, but no object with a solid."""
+    frames, _, path = rendered_tracks(tmp_path, "right")
+    (tmp_path / "names.txt").write_text("ball\ndoor\n")
+    mot = (tmp_path / "det.txt").read_text().splitlines()
+    (tmp_path / "det.txt").write_text("\n".join(f"{line},1,1,-1" for line in mot))
+    args = ("--detections", tmp_path / "det.txt", "--poses", path, "--camera", "300,300,160,120")
+    names = ("--set", f"detect.class_names={tmp_path / 'names.txt'}")
+    size = ("--known-size", "door=2m")
+    assert cli("run", frames, "-o", tmp_path / "out", *args, *QUICK, *names, *size) == 0
+    assert "warning: --known-size door: no door with a solid" in capsys.readouterr().err
+    assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
+
+
+def test_a_camera_line_of_colmap_is_taken_as_it_is(tmp_path: Path) -> None:
+    """`--camera "$(cat examples/room/camera.txt)"`."""
+    line = (ROOT / "examples/room/camera.txt").read_text().strip()
+    args = list(posed_run(tmp_path, "right"))
+    args[args.index("--camera") + 1] = "1 PINHOLE 320 240 300 300 160 120"
+    assert cli(*args) == 0
+    assert rt.Result.load(tmp_path / "out").poses.camera.K[0, 0] == 300
+    room = ("poses", ROOT / "examples/room/room.mp4", "-o", tmp_path / "room", "--stop", 20)
+    assert cli(*room, "--poses", ROOT / "examples/room/poses.txt", "--camera", line) == 0
+    camera = (tmp_path / "room/sparse/cameras.txt").read_text()
+    assert "PINHOLE 640 480 492.7567" in camera
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_completion(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The script names the program that pip installs; bash itself completes a flag with it."""
+    pytest.importorskip("shtab", reason="pip install '.[completion]'")
+    with pytest.raises(SystemExit) as stop:
+        cli("--completion", shell)
+    script = capsys.readouterr().out
+    assert stop.value.code == 0 and "reobj-track" in script and "--known-size" in script
+    if shell == "bash":
+        ask = (
+            'COMP_WORDS=(reobj-track run --kno); COMP_CWORD=2; COMP_LINE="reobj-track run --kno"; '
+            "COMP_POINT=21; $(complete -p reobj-track | sed 's/.*-F \\([^ ]*\\).*/\\1/') "
+            'reobj-track --kno run; echo "${COMPREPLY[@]}"'
+        )
+        done = subprocess.run(["bash", "-c", script + "\n" + ask], capture_output=True, text=True)
+        assert done.stdout.split() == ["--known-size"], done.stderr
+
+
+def test_completion_without_shtab(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    with pytest.raises(SystemExit) as stop:
+        cli("--completion", "bash")
+    said = capsys.readouterr().err
+    assert stop.value.code == 2 and "pip install 'reobj-track[completion]'" in said
+    assert said.count("\n") == 1
+
+
+def test_tables_fit_100_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli("models") == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
 
 
 def test_eval_of_no_output_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -242,7 +242,7 @@ def write_page(folder: Path, in_3d: bool = True, scene: bool = True) -> Path:
     link = rt.LinkEvent("join", (2, 6), 0.123456, 1.98765, True)
     result.world = dataclasses.replace(result.world, links=(link,))
     result.save(folder / "out")
-    write_pictures(result, folder / "out", video, overlay=False, scene=scene)
+    write_pictures(result, folder / "out", video, overlay="none", scene=scene)
     return folder / "out/scene.html"
 
 
@@ -1089,7 +1089,7 @@ def test_one_pass_writes_both_and_leaves_nothing_half(tmp_path: Path) -> None:
     assert source.read == FRAMES
     assert {"overlay.mp4", "scene.html"} <= {p.name for p in out.iterdir()}
     source.read = 0
-    write_pictures(result, out, source, overlay=False, scene=False)  # type: ignore[arg-type]
+    write_pictures(result, out, source, overlay="none", scene=False)  # type: ignore[arg-type]
     assert source.read == 0
 
 

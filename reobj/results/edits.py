@@ -137,9 +137,11 @@ def _box_ref(item: Any) -> BoxRef:
     return BoxRef(item["frame"], box, item.get("id", 0))
 
 
-def write_edits(folder: Path, edits: Edits) -> None:
-    """Keep edits in an output folder, for later fits; none: remove those that it has."""
+def write_edits(folder: Path, edits: Edits | None) -> None:
+    """Keep edits in an output folder, for later fits; an empty list removes those that it has."""
     path = folder / EDITS
+    if edits is None:
+        return
     if not edits.edits:
         path.unlink(missing_ok=True)
         return

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from reobj import __version__
-from reobj.files import load_json
+from reobj.files import load_json, wrapped
 from reobj.results.result import Result
 from reobj.results.solids import score_objects
 from reobj.results.workspace import LAST_TRACKS, Workspace
@@ -366,8 +366,11 @@ def score_table(scores: dict[str, dict[str, float]]) -> str:
 
 def score_report(scores: dict[str, Any]) -> str:
     """Format what `evaluate` returns for the terminal."""
-    lines = [score_table(scores["tracks"])]
-    ranks = scores["ranks"]
+    tracks: dict[str, dict[str, float]] = scores["tracks"]
+    found = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
+    lines, ranks = [score_table(found)], scores["ranks"]
+    if missed := [name for name in tracks if name not in found]:
+        lines += wrapped(f"nothing found of: {', '.join(missed)}")
     shares = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
     if ranks:
         lines.append(f"returns by appearance alone, {ranks['queries']:.0f} queries: "

@@ -1,4 +1,4 @@
-"""Files for other tools, from an output folder: COCO-VID, CVAT, GLB, rerun.
+"""Files for other tools, from an output folder: COCO-VID, CSV, CVAT, GLB, nerfstudio, PLY, rerun.
 
 Start at `export`. A writer takes a `Result` and a path; `EXPORTS` lists them.
 """
@@ -6,31 +6,51 @@ Start at `export`. A writer takes a `Result` and a path; `EXPORTS` lists them.
 from __future__ import annotations
 
 import contextlib
+import csv
+import dataclasses
 import itertools
 import json
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reobj import __version__
-from reobj.cameras import Poses, invert_rigid, quat_wxyz_from_matrix
-from reobj.files import atomic, spans
-from reobj.results.result import Result
+from reobj.cameras import (
+    Camera,
+    Poses,
+    camera_parameters,
+    invert_rigid,
+    quat_wxyz_from_matrix,
+)
+from reobj.files import Progress, atomic, spans
+from reobj.results.ply import write_ply, write_point_ply
+from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detection_files import CVAT_BOX
-from reobj.sources.video import IMAGE_FPS
-from reobj.types import Array, ReobjError, Tracks, log, object_classes, object_color
+from reobj.sources.video import IMAGE_FPS, Video
+from reobj.types import (
+    Array,
+    Frame,
+    Image,
+    ReobjError,
+    Tracks,
+    log,
+    object_classes,
+    object_color,
+)
 
 
 def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
     """Write what an output folder holds in another tool's format.
 
     Args:
-        out: output folder of `run`. to: coco-vid, cvat, glb or rrd.
+        out: output folder of `run`. to: a name in EXPORTS.
         path: default: OUT/ and the format's own name.
     Returns:
         The file written.
@@ -62,16 +82,21 @@ def _say_parts(result: Result, path: Path) -> None:
         log.warning("%s: no object is joined over the parts; objects of %s", path, "; ".join(of))
 
 
+def _video_of(result: Result) -> Video | None:
+    """Open the video of a result; None if it was moved or deleted since: most exports need none."""
+    if result.out is not None and (result.out / "cache" / "source.json").is_file():
+        with contextlib.suppress(ReobjError):
+            return Workspace.open(result.out).video()
+    return None
+
+
 def _frames_read(result: Result) -> tuple[list[int], list[str]]:
     """List the frames that were read or have a track (filled gaps), ascending.
 
     Returns:
         source frame numbers, and the image names by frame number ([]: a video, or it is gone).
     """
-    video = None
-    if result.out is not None and (result.out / "cache" / "source.json").is_file():
-        with contextlib.suppress(ReobjError):  # moved or deleted since: most exports need none
-            video = Workspace.open(result.out).video()
+    video = _video_of(result)
     names = video.names if video is not None else []
     read = np.empty(0, np.int64)
     if result.poses is not None:
@@ -219,26 +244,192 @@ def export_glb(result: Result, path: Path) -> None:
         part.write_bytes(scene.export(file_type="glb"))
 
 
-def export_rrd(result: Result, path: Path) -> None:
-    """Write a recording for the rerun viewer with rerun-sdk.
+def export_ply(result: Result, path: Path) -> None:
+    """Write the solids as one coloured, closed triangle mesh (trimesh, Open3D, MeshLab).
 
-    Ellipsoids, points and, on the timeline `frame`, the camera and the boxes it sees; z is up,
-    units are metres if the scale is known.
+    In the world of poses.txt and its units: boxes, cylinders and ellipsoids as they were fitted.
     """
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
-    largest = _largest_part(result, path)
-    scale, turn = _upright(largest, path, [0.0, 0, 1])
-    names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
-    rec = rr.RecordingStream("reobj_track", recording_id=Path(result.video.path).name)
-    rec.set_log_time_enabled(False)  # when the export was made is of no interest
+    result = _largest_part(result, path)
+    if not result.located:
+        raise ReobjError(f"{path}: nothing to show in 3D: no solids here, see `run`")
+    located = result.located
+    write_ply(path, result.ellipsoids(), [o.id for o in located], [o.support for o in located])
+
+
+CSV_AXES = ("x", "y", "z")
+
+
+def export_csv(result: Result, path: Path) -> None:
+    """Write a table of the objects, one a line, for spreadsheets and pandas.
+
+    Lengths are in world units, `_m` in metres; empty where unknown. A text that a spreadsheet would
+    take for a formula gets an apostrophe before it.
+    """
+    part = {"newline": "", "encoding": "utf-8"}
+    head = ["id", "class", "status", "reason", "score", "confidence", "support"]
+    vectors = ("center", "size", "size_m", "size_rel_sigma")
+    head += [f"{name}_{axis}" for name in vectors for axis in CSV_AXES]
+    head += ["qw", "qx", "qy", "qz", "views", "frames_seen", "visits", "part"]
+    with atomic(path) as made, made.open("w", **part) as file:  # type: ignore[call-overload]
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(head)
+        for o in result.objects:
+            row = [o.id, o.class_name, o.status, o.reason, o.score, o.confidence, o.support]
+            for name in vectors:
+                row += _numbers(getattr(o, name), 3)
+            row += [*_numbers(o.quat_wxyz, 4), o.views, o.frames_seen, len(o.visits), o.part]
+            table.writerow([_cell(value) for value in row])
+
+
+def _numbers(values: Array | None, count: int) -> list[float | None]:
+    return [None] * count if values is None else values.tolist()
+
+
+def _cell(value: Any) -> Any:
+    """Keep a text from being run as a formula (CWE-1236: = + - @, tab and carriage return)."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
+
+
+NERF_MODELS = {  # nerfstudio's names, and the distortion that they know in nerfstudio's order
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+}
+GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: x right, y up, z backwards
+
+
+def export_nerfstudio(result: Result, path: Path) -> None:
+    """Write transforms.json for nerfstudio, with points to start from and the images of a video.
+
+    The world is that of poses.txt. Images of a folder stay where they are; frames of a video are
+    written beside the file, into images/.
+
+    Ref: docs.nerf.studio, "Data conventions": camera axes of OpenGL, world_from_cam.
+    """
+    result = _largest_part(result, path)
+    poses, video = result.poses, _video_of(result)
+    if poses is None or not poses.known.any():
+        raise ReobjError(f"{path}: no cameras here, see `run`")
+    if video is None:
+        raise ReobjError(f"{path}: the video is gone, and nerfstudio needs its images")
+    folder = path.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    world_from_cam = np.tile(np.eye(4), (len(poses.frame), 1, 1))
+    world_from_cam[:, :3] = invert_rigid(poses.cam_from_world)
+    files = _image_files(video, poses, folder)
+    frames = [
+        {"file_path": files[frame], "transform_matrix": (pose @ GL_FROM_CV).tolist()}
+        for frame, pose in zip(poses.frame.tolist(), world_from_cam, strict=True)
+        if frame in files and np.isfinite(pose).all()
+    ]
+    data = _nerf_camera(poses.camera, path) | {"frames": frames}
+    if len(poses.points):
+        write_point_ply(folder / "sparse_pc.ply", poses.points, poses.colors)
+        data["ply_file_path"] = "sparse_pc.ply"
     with atomic(path) as part:
-        rec.save(part)
+        part.write_text(json.dumps(data, indent=1) + "\n")
+
+
+def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
+    """Describe the intrinsics as nerfstudio reads them; warns of a lens that it does not know."""
+    values = dict(zip(camera_parameters(camera.model), camera.params, strict=True))
+    model = "OPENCV_FISHEYE" if camera.model == "OPENCV_FISHEYE" else "OPENCV"
+    terms = {"k1": values.pop("k", 0.0)} | {k: v for k, v in values.items() if k[0] in "kp"}
+    known = {k: terms.get(k, 0.0) for k in NERF_MODELS[model]}
+    pinhole = {"f", "fx", "fy", "cx", "cy", "k"}
+    if any(v for k, v in values.items() if k not in known and k not in pinhole):
+        log.warning("%s: nerfstudio has no %s cameras: the rest of its distortion is left out",
+                    path, camera.model)  # fmt: skip
+    K = camera.K
+    facts = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    size = {"w": camera.width, "h": camera.height}
+    return {"camera_model": model, **{k: float(v) for k, v in facts.items()}, **size, **known}
+
+
+def _image_files(video: Video, poses: Poses, folder: Path) -> dict[int, str]:
+    """Name the image file of each frame, as seen from a folder; frames of a video are written."""
+    source, names = Path(str(video.source)), video.names
+    if names:
+        where = source if source.is_dir() else source.parent
+        return {
+            frame: Path(os.path.relpath(where / names[frame], folder)).as_posix()
+            for frame in poses.frame.tolist()
+        }
+    files, wanted = {}, set(poses.frame[poses.known].tolist())
+    with Progress("images", len(wanted)) as progress:
+        for frame in video:
+            if frame.index in wanted:
+                name = f"images/frame_{frame.index:06d}.jpg"
+                image = cv2.resize(frame.image, video.size) if video.scale != 1 else frame.image
+                data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
+                with atomic(folder / name) as part:
+                    part.write_bytes(data.tobytes())
+                files[frame.index] = name
+                progress.step()
+    return files
+
+
+# ---- rerun -------------------------------------------------------------------------------------
+
+RRD_SIZE_PX = 640  # longer side of the images in a recording (chosen: 40 kB a frame)
+
+
+class Viewer:
+    """A recording in rerun: to a file, or live to its viewer while a video is tracked.
+
+    Ellipsoids, points and, on the timelines `frame` and `time`, the camera, its image and the boxes
+    in it; z is up, units are metres if the scale is known.
+
+    Attributes:
+        followed: the images of the video were shown already, while it was tracked.
+    """
+
+    def __init__(self, video: VideoInfo, start: Callable[[Any], Any] | None = None) -> None:
+        """Open a recording of a video; `start` says where it goes (default: rerun's viewer)."""
+        try:
+            import rerun as rr
+        except ImportError as error:
+            raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
+        self.rr, self.video, self.followed = rr, video, False
+        self.shrink = min(1.0, RRD_SIZE_PX / max(video.width, video.height, 1))
+        self.rec = rr.RecordingStream("reobj_track", recording_id=Path(video.path).name)
+        self.rec.set_log_time_enabled(False)  # when the export was made is of no interest
+        if start is None:
+            self.rec.spawn()
+        else:
+            start(self.rec)
         views = rr.blueprint.Spatial3DView(), rr.blueprint.Spatial2DView(origin="world/camera")
-        rec.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Horizontal(*views)))
-        rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self.rec.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Horizontal(*views)))
+        self.rec.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def follow(
+        self, steps: Iterable[tuple[Frame, Tracks]], names: Sequence[str], video: Video,
+        poses: Poses | None,
+    ) -> Iterator[tuple[Frame, Tracks]]:  # fmt: skip
+        """Show each frame of a running `track` as it comes, and hand it on."""
+        self.followed = True
+        pose_of = _pose_by_frame(poses)
+        if poses is not None:
+            cloud = self.rr.Points3D(poses.points, colors=poses.colors)
+            self.rec.log("world/points", cloud, static=True)
+        for frame, tracks in steps:
+            labels = [
+                f"{i} {names[c] if 0 <= c < len(names) else 'object'}"
+                for i, c in zip(tracks.track_id.tolist(), tracks.class_id.tolist(), strict=True)
+            ]
+            native = dataclasses.replace(tracks, xyxy=tracks.xyxy / video.scale)
+            self._frame(frame.index, poses, pose_of.get(frame.index), 1.0, native, labels)
+            self._image(frame.image)
+            yield frame, tracks
+
+    def show(self, result: Result, path: Path, images: bool) -> None:
+        """Log a result: its solids, points and all frames; of several parts the largest in 3D.
+
+        Args:
+            path: for warnings. images: read the video again and log its images.
+        """
+        rr, rec, largest = self.rr, self.rec, _largest_part(result, path)
+        scale, turn = _upright(largest, path, [0.0, 0, 1])
+        names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
         ellipsoids = largest.ellipsoids()
         xyzw = np.roll(quat_wxyz_from_matrix(ellipsoids.world_from_obj), -1, 1)  # (O, 4)
@@ -253,41 +444,75 @@ def export_rrd(result: Result, path: Path) -> None:
         if (poses := largest.poses) is not None:
             cloud = rr.Points3D(scale * poses.points, colors=poses.colors)
             rec.log("world/points", cloud, static=True)
-        _rrd_frames(rr, rec, result, poses, names, scale)
-        rec.disconnect()  # writes what is left
+        pose_of, tracks, (frames, _) = _pose_by_frame(poses), result.tracks, _frames_read(result)
+        video = _video_of(result) if images else None
+        shown = iter(video if video is not None and video.has_images else ())
+        ahead = next(shown, None)
+        for frame in frames:
+            rows = tracks[tracks.frame == frame]
+            labels = [names[i] for i in rows.track_id.tolist()]
+            self._frame(frame, poses, pose_of.get(frame), scale, rows, labels)
+            while ahead is not None and ahead.index <= frame:
+                if ahead.index == frame:
+                    self._image(ahead.image)
+                ahead = next(shown, None)
 
-
-def _rrd_frames(
-    rr: Any, rec: Any, result: Result, poses: Poses | None, names: dict[int, str], scale: float
-) -> None:
-    """Log each frame's camera, if `poses` have one, and boxes."""
-    tracks, (frames, _) = result.tracks, _frames_read(result)
-    pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True)) if poses else {}
-    fps = result.video.fps or IMAGE_FPS
-    for frame in frames:
+    def _frame(
+        self, frame: int, poses: Poses | None, pose: Array | None, scale: float, rows: Tracks,
+        labels: list[str],
+    ) -> None:  # fmt: skip
+        """Set the time; log the camera, if the frame has a pose, and boxes in native pixels."""
+        rr, rec, shrink = self.rr, self.rec, self.shrink
         rec.set_time("frame", sequence=frame)
-        rec.set_time("time", duration=frame / fps)
-        pose = pose_of.get(frame)
+        rec.set_time("time", duration=frame / (self.video.fps or IMAGE_FPS))
         if poses is None or pose is None or not np.isfinite(pose).all():
             rec.log("world/camera", rr.Clear(recursive=False))
         else:
-            lens = {"image_from_camera": poses.camera.K, "camera_xyz": rr.ViewCoordinates.RDF}
-            size = [poses.camera.width, poses.camera.height]
+            K = np.diag([shrink, shrink, 1.0]) @ poses.camera.K
+            size = [round(shrink * poses.camera.width), round(shrink * poses.camera.height)]
+            lens = {"image_from_camera": K, "camera_xyz": rr.ViewCoordinates.RDF}
             to_child = {"relation": rr.TransformRelation.ChildFromParent}
             move = rr.Transform3D(translation=scale * pose[:, 3], mat3x3=pose[:, :3], **to_child)
             rec.log("world/camera", rr.Pinhole(**lens, resolution=size), move)
-        rows = tracks[tracks.frame == frame]
         boxes = rr.Boxes2D(
-            array=rows.xyxy, array_format=rr.Box2DFormat.XYXY,
-            labels=[names[i] for i in rows.track_id.tolist()],
+            array=shrink * rows.xyxy, array_format=rr.Box2DFormat.XYXY, labels=labels,
             colors=[object_color(i)[::-1] for i in rows.track_id.tolist()],
         )  # fmt: skip
         rec.log("world/camera/boxes", boxes)
 
+    def _image(self, image: Image) -> None:
+        """Log the frame's image at the time that is set."""
+        size = (round(self.shrink * self.video.width), round(self.shrink * self.video.height))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+        made = self.rr.EncodedImage(contents=data, media_type="image/jpeg")
+        self.rec.log("world/camera/image", made)
+
+    def close(self) -> None:
+        """Send or write what is left."""
+        self.rec.disconnect()
+
+
+def _pose_by_frame(poses: Poses | None) -> dict[int, Array]:
+    if poses is None:
+        return {}
+    return dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
+
+
+def export_rrd(result: Result, path: Path) -> None:
+    """Write a recording for the rerun viewer with rerun-sdk: what `Viewer` shows, with images."""
+    with atomic(path) as part:
+        viewer = Viewer(result.video, lambda rec: rec.save(part))
+        viewer.show(result, path, images=True)
+        viewer.close()
+
 
 EXPORTS: dict[str, tuple[str, Callable[[Result, Path], None]]] = {  # name: file in OUT, writer
     "coco-vid": ("coco_vid.json", export_coco_vid),
+    "csv": ("objects.csv", export_csv),
     "cvat": ("cvat.xml", export_cvat),
     "glb": ("objects.glb", export_glb),
+    "nerfstudio": ("nerfstudio/transforms.json", export_nerfstudio),
+    "ply": ("solids.ply", export_ply),
     "rrd": ("scene.rrd", export_rrd),
 }

@@ -1,48 +1,161 @@
-"""overlay.mp4: boxes, identities and back-projected ellipsoids drawn over every frame.
+"""The film: boxes, identities and back-projected solids drawn over every frame.
 
-`Overlay` is a sink under the one loop over the video (`write_pictures` in scene.py).
+`Overlay` is a sink under the one loop over the video (`write_pictures` in scene.py); `film` writes
+what it draws.
 """
 
 from __future__ import annotations
 
+import difflib
+import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 import quadrics
+from reobj.cameras import Camera
+from reobj.results.film import FilmWriter
 from reobj.results.result import Result
 from reobj.sources.video import IMAGE_FPS, Video
-from reobj.types import Array, BoolArray, Frame, Image, Tracks, object_color
+from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
+
+LAYERS = ("boxes", "solids", "ellipses", "trails")
+OFF, ON = ("none", "false", "no", "off", "0"), ("true", "yes", "on", "1")
+
+Color = tuple[int, int, int]
 
 
-def draw_tracks(image: Image, tracks: Tracks, labels: dict[int, str], scale: float) -> None:
-    """Draw the boxes and identities of one frame's rows, in place.
+def film_layers(text: str) -> frozenset[str]:
+    """Parse what the film shows besides boxes; empty: no film.
+
+    >>> sorted(film_layers("solids, trails"))
+    ['boxes', 'solids', 'trails']
+    """
+    words = {word.strip().lower() for word in str(text).split(",")}
+    if len(words) == 1 and words <= {*OFF, ""}:
+        return frozenset()
+    words = {"solids" if word in ON else word for word in words}
+    if unknown := sorted(words - set(LAYERS)):
+        close = difflib.get_close_matches(unknown[0], (*LAYERS, "none"), 1, 0)[0]
+        expected = f"{', '.join(LAYERS)} (several with commas) or none; did you mean {close}?"
+        raise ReobjError(f"--set output.overlay={text}: expected {expected}")
+    return frozenset(words | {"boxes"})
+
+
+# ---- Boxes and labels --------------------------------------------------------------------------
+
+FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45  # readable at 640 px width (chosen)
+DASH_PX = 6  # of boxes that fill a gap
+
+
+def draw_tracks(
+    image: Image,
+    tracks: Tracks,
+    labels: dict[int, str],
+    scale: float,
+    places: dict[int, int] | None = None,
+    thin: frozenset[int] = frozenset(),
+) -> None:
+    """Draw the boxes and identities of one frame's rows, in place; dashed where they fill a gap.
+
+    Labels never cover each other: one that finds no free place at its box is left out.
 
     Args:
         labels: text of each identity; scale: image pixels per pixel of the tracks.
+        places: where the labels of the frame before were, changed here: they jump less.
+        thin: identities whose solid is drawn too.
     """
-    for obj, box in zip(tracks.track_id.tolist(), tracks.xyxy * scale, strict=True):
-        x1, y1, x2, y2 = box.round().astype(int).tolist()
-        color = object_color(obj)
-        cv2.rectangle(image, (x1, y1), (x2, y2), color, 2, cv2.LINE_AA)
-        _draw_label(image, labels.get(obj, str(obj)), x1, y1, color)
+    boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
+    ids, score = tracks.track_id.tolist(), tracks.score.tolist()
+    for obj, box, sure in zip(ids, boxes, score, strict=True):
+        _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=sure == 0)
+    places = {} if places is None else places
+    texts = [labels.get(obj, str(obj)) for obj in ids]
+    sizes = np.array([_text_size(text) for text in texts], int).reshape(-1, 2)
+    spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), places)
+    for obj, text, spot in zip(ids, texts, spots, strict=True):
+        if spot is not None:
+            _draw_label(image, text, spot, object_color(obj))
 
 
-def _draw_label(image: Image, text: str, x: int, y: int, color: tuple[int, int, int]) -> None:
-    """Draw text on a filled tag above (x, y), kept inside the image."""
-    (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
-    x = max(0, min(x, image.shape[1] - width - 4))
-    y = max(height + base + 2, y)
-    cv2.rectangle(image, (x, y - height - base - 2), (x + width + 4, y), color, -1)
-    dark = sum(color) > 380
-    ink, at = (0,) * 3 if dark else (255,) * 3, (x + 2, y - base)
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, 1, cv2.LINE_AA)
+def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed: bool) -> None:
+    x1, y1, x2, y2 = box.tolist()
+    if not dashed:
+        cv2.rectangle(image, (x1, y1), (x2, y2), color, thickness, cv2.LINE_AA)
+        return
+    corners = np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
+    for a, b in itertools.pairwise(corners):
+        steps = max(1, int(np.abs(b - a).max() / DASH_PX))
+        points = np.linspace(a, b, steps + 1).round().astype(np.int32)  # (steps + 1, 2)
+        dashes = [points[i : i + 2] for i in range(0, steps, 2)]
+        cv2.polylines(image, dashes, False, color, thickness, cv2.LINE_AA)
 
 
-MAX_AXIS = 4  # image sides; longer ellipses are of objects beside the camera and only confuse
+def _text_size(text: str) -> tuple[int, int]:
+    """Width and height of a label's tag."""
+    (width, height), base = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
+    return width + 4, height + base + 2
+
+
+def _draw_label(image: Image, text: str, spot: tuple[int, int], color: Color) -> None:
+    """Draw text on a filled tag with its corner at `spot`."""
+    (x, y), (width, height) = spot, _text_size(text)
+    cv2.rectangle(image, (x, y), (x + width - 1, y + height - 1), color, -1)
+    ink = (0,) * 3 if sum(color) > 380 else (255,) * 3  # dark on light
+    _, base = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
+    cv2.putText(image, text, (x + 2, y + height - base), FONT, FONT_SCALE, ink, 1, cv2.LINE_AA)
+
+
+def place_labels(
+    ids: Sequence[int],
+    sizes: IntArray,
+    boxes: IntArray,
+    image_size: tuple[int, int],
+    places: dict[int, int],
+) -> list[tuple[int, int] | None]:
+    """Choose a place for each label, at its box, inside the image, free of other labels.
+
+    Args:
+        sizes: (N, 2) of the labels, boxes: (N, 4), both pixels.
+        places: number of the place that each identity's label had last; changed here.
+    Returns:
+        top-left corner of each label, None where no place is free.
+    """
+    taken = np.empty((0, 4), int)
+    spots: list[tuple[int, int] | None] = []
+    limit = np.array(image_size)
+    for obj, size, box in zip(ids, sizes, boxes, strict=True):
+        corners = _label_places(box, size).clip(0, np.maximum(limit - size, 0))  # (P, 2)
+        free = (  # left of, above, right of or below every other
+            (corners[:, None] >= taken[:, 2:]) | (corners[:, None] + size <= taken[:, :2])
+        ).any(2).all(1)  # fmt: skip
+        order = [places.get(obj, 0), *range(len(corners))]
+        place = next((k for k in order if free[k]), None)
+        spots.append(None)
+        if place is not None:
+            places[obj] = place
+            x, y = corners[place].tolist()
+            taken = np.concatenate([taken, [[x, y, *(corners[place] + size)]]])
+            spots[-1] = (x, y)
+    return spots
+
+
+def _label_places(box: IntArray, size: IntArray) -> IntArray:
+    """Top-left corners (14, 2) of a label at a box, the best first."""
+    (x1, y1, x2, y2), (w, h) = box.tolist(), size.tolist()
+    xs, beside = (x1, x2 - w, (x1 + x2 - w) // 2), ((x1 - w, y1), (x2, y1))
+    rows = [(x, y) for y in (y1 - h, y1 + 2, y2 - h - 1, y2) for x in xs]
+    return np.array([*rows[:6], *beside, *rows[6:]])
+
+
+# ---- Ellipses ----------------------------------------------------------------------------------
+
+MAX_AXIS = 4  # image sides; longer outlines are of objects beside the camera and only confuse
 
 
 def draw_ellipses(
@@ -82,101 +195,333 @@ def ellipse_of_dual_conic(
     return (x, y), (float(major), float(minor)), angle
 
 
-class VideoWriter:
-    """Write an MP4 file that appears under its name only when it is complete.
+# ---- Boxes and cylinders in 3D -----------------------------------------------------------------
+
+SIDES = 48  # of the prism that a cylinder is drawn as (chosen: round to the eye)
+NEAR = 0.05  # half extents of a solid: nearer to the camera's plane its edges are cut (chosen)
+BEND = 8  # pieces that an edge is drawn in where the lens distorts (chosen: smooth to the eye)
+SHIFT = 4  # bits of a pixel that OpenCV draws lines with
+
+
+@dataclass(frozen=True, slots=True)
+class Wireframes:
+    """Edges of boxes and cylinders in world: S solids, P points, E edges, N faces.
 
     Attributes:
-        path: of the file. part: of what is written of it. count: frames so far.
+        points: (P, 3). edges: (E, 2) points. faces: (E, 2) the two faces that meet in each edge.
+        crease: (E,) False between facets of a round side: seen only where it is the outline.
+        solid: (E,) number of the solid. planes: (N, 4) of the faces: n . x - d > 0 outside.
+        min_depth: (E,) least depth that is drawn.
     """
 
-    def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
-        self.path, self.part = path, path.with_name(f".part-{path.name}")
-        fourcc = cv2.VideoWriter.fourcc(*"mp4v")  # the one H.264-free codec in the wheel
-        self.writer = cv2.VideoWriter(str(self.part), fourcc, fps, size)
-        if not self.writer.isOpened():
-            raise OSError(f"{path}: OpenCV cannot write this video")
-        self.count = 0
+    points: Array
+    edges: IntArray
+    faces: IntArray
+    crease: BoolArray
+    solid: IntArray
+    planes: Array
+    min_depth: Array
 
-    def write(self, image: Image) -> None:
-        """Append one frame."""
-        self.writer.write(image)
-        self.count += 1
+    def segments(self, cam_from_world: Array) -> tuple[Array, IntArray, BoolArray]:
+        """Cut out what one camera (3, 4) may see.
 
-    def close(self, complete: bool) -> None:
-        """Finish the file; keep it only if complete (OpenCV is silent when the disk is full)."""
-        self.writer.release()
-        try:
-            if complete and self._frames_on_disk() != self.count:
-                raise OSError(f"{self.path}: not all frames could be written; is the disk full?")
-            if complete:
-                self.part.replace(self.path)
-        finally:
-            self.part.unlink(missing_ok=True)
+        Returns:
+            ends (n, 2, 3) in the camera, in front of it; their edges (n,); front (n,): False where
+            the solid hides its own edge.
+        """
+        turn, shift = cam_from_world[:, :3], cam_from_world[:, 3]
+        eye = -turn.T @ shift
+        outside = self.planes[:, :3] @ eye - self.planes[:, 3] > 0  # (N,) faces the camera
+        facing = outside[self.faces]  # (E, 2)
+        wanted = self.crease | (facing[:, 0] != facing[:, 1])  # (E,)
+        ends = (self.points @ turn.T + shift)[self.edges]  # (E, 2, 3)
+        wanted &= (ends[:, :, 2] > self.min_depth[:, None]).any(1)
+        edge = np.flatnonzero(wanted)
+        ends, least = ends[edge], self.min_depth[edge]
+        for a, b in ((0, 1), (1, 0)):  # move an end that is too near along its edge
+            missing = (least - ends[:, a, 2]).clip(0)  # (n,)
+            share = missing / np.maximum(np.maximum(missing, ends[:, b, 2] - ends[:, a, 2]), 1e-12)
+            ends[:, a] += share[:, None] * (ends[:, b] - ends[:, a])
+        return ends, edge, np.asarray(facing[edge].any(1), bool)
 
-    def _frames_on_disk(self) -> int:
-        capture = cv2.VideoCapture(str(self.part))
-        return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+
+def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -> Wireframes:
+    """Make the edges of solids that ellipsoids are inscribed in; none of those without edges.
+
+    Args:
+        support: (S,) "box" or "cylinder"; others have no edges.
+    """
+    columns: list[list[Any]] = [[] for _ in range(7)]
+    points = faces = 0
+    for k, shape in enumerate(support):
+        if shape not in ("box", "cylinder"):
+            continue
+        mesh = _unit_box() if shape == "box" else _unit_cylinder()
+        half, turn = ellipsoids.half_axes[k], ellipsoids.world_from_obj[k]
+        center, count = ellipsoids.center_in_world[k], len(mesh[1])
+        normal = (mesh[4][:, :3] / half) @ turn.T  # (N, 3) x = c + R (h u)
+        made = (
+            mesh[0] * half @ turn.T + center, mesh[1] + points, mesh[2] + faces, mesh[3],
+            np.full(count, k), np.c_[normal, mesh[4][:, 3] + normal @ center],
+            np.full(count, NEAR * half.max()),
+        )  # fmt: skip
+        for column, part in zip(columns, made, strict=True):
+            column.append(part)
+        points, faces = points + len(mesh[0]), faces + len(mesh[4])
+    empty = (
+        np.empty((0, 3)), np.empty((0, 2), int), np.empty((0, 2), int), np.empty(0, bool),
+        np.empty(0, int), np.empty((0, 4)), np.empty(0),
+    )  # fmt: skip
+    joined = [np.concatenate([e, *c]) for e, c in zip(empty, columns, strict=True)]
+    return Wireframes(*joined)
 
 
-OVERLAY_SIZE_PX = 1280  # longer side; larger videos are shrunk (chosen: HD, so that it plays)
+Mesh = tuple[Array, IntArray, IntArray, BoolArray, Array]  # points, edges, faces, crease, planes
+
+
+def _unit_box() -> Mesh:
+    """The cube of half side 1; face 2 k + (1 if positive) is across axis k."""
+    points = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
+    edges, faces = [], []
+    for a in range(8):
+        for axis in range(3):
+            if points[a, axis] < 0:
+                step = points[a] * 1
+                step[axis] = 1
+                edges.append((a, int(np.flatnonzero((points == step).all(1))[0])))
+                faces.append([2 * k + int(points[a, k] > 0) for k in range(3) if k != axis])
+    normals = np.repeat(np.eye(3), 2, 0) * np.tile([-1, 1], 3)[:, None]
+    planes = np.c_[normals, np.ones(6)]
+    return points.astype(float), np.array(edges), np.array(faces), np.ones(12, bool), planes
+
+
+def _unit_cylinder() -> Mesh:
+    """The upright cylinder of radius and half height 1, as a prism; its last two faces are caps."""
+    number = np.arange(SIDES)
+    angle, following = 2 * np.pi * number / SIDES, (number + 1) % SIDES
+    ring = np.c_[np.cos(angle), np.sin(angle)]
+    points = np.r_[np.c_[ring, -np.ones(SIDES)], np.c_[ring, np.ones(SIDES)]]
+    low, high = np.c_[number, following], np.c_[number, following] + SIDES
+    edges = np.r_[low, high, np.c_[number, number + SIDES]]
+    caps = (np.full(SIDES, SIDES), np.full(SIDES, SIDES + 1))
+    faces = np.r_[np.c_[number, caps[0]], np.c_[number, caps[1]], np.c_[number, number - 1]]
+    faces[faces < 0] = SIDES - 1  # the side before the first
+    middle = angle + np.pi / SIDES
+    side = np.c_[np.cos(middle), np.sin(middle), 0 * middle, 0 * middle + np.cos(np.pi / SIDES)]
+    planes = np.r_[side, [[0, 0, -1, 1], [0, 0, 1, 1]]]
+    return points, edges, faces, np.repeat([True, True, False], SIDES), planes
+
+
+def image_points(camera: Camera, points: Array) -> Array:
+    """Project points (..., 3) in the camera, in front of it, to pixels (..., 2); lens included."""
+    flat = points.reshape(-1, 3)
+    if camera.model == "PINHOLE" or not len(flat):
+        pixels = flat[:, :2] / flat[:, 2:] @ camera.K[:2, :2].T + camera.K[:2, 2]
+    else:
+        pixels = np.asarray(camera.to_pycolmap().img_from_cam(flat), np.float64)
+    return pixels.reshape(*points.shape[:-1], 2)
+
+
+def draw_wireframes(
+    image: Image,
+    frames: Wireframes,
+    camera: Camera,
+    cam_from_world: Array,
+    scale: float,
+    object_id: Sequence[int],
+    drawn: BoolArray,
+    seen: set[int],
+) -> None:
+    """Draw solids in place, the farthest first; edges that a solid hides itself are thin and dim.
+
+    Args:
+        scale: image pixels per pixel of the camera. object_id, drawn: (S,) identities of the
+            solids, and which ones to draw.
+        seen: identities with a box in this frame; solids of others are thin, without hidden edges.
+    """
+    ends, edge, front = frames.segments(cam_from_world)
+    pieces = 1 if camera.model == "PINHOLE" else BEND
+    share = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
+    line = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
+    pixels = scale * image_points(camera, line) - 0.5  # OpenCV draws with the pixel's centre at 0
+    solid = frames.solid[edge]
+    near_last = sorted(set(solid.tolist()), key=lambda k: -ends[solid == k, :, 2].mean())
+    for k in near_last:
+        mine, obj = solid == k, object_id[k]
+        if not drawn[k] or not _fits(pixels[mine], image):
+            continue
+        lines, shown = np.round(pixels[mine] * (1 << SHIFT)).astype(np.int32), front[mine]
+        color = object_color(obj)
+        dim = tuple(int(0.6 * c) for c in color)
+        if obj in seen:
+            cv2.polylines(image, list(lines[~shown]), False, dim, 1, cv2.LINE_AA, SHIFT)
+        width = 2 if obj in seen else 1
+        cv2.polylines(image, list(lines[shown]), False, color, width, cv2.LINE_AA, SHIFT)
+
+
+def _fits(pixels: Array, image: Image) -> bool:
+    """True where an outline (n, B, 2) can be drawn, and is not of something beside the camera."""
+    flat = pixels.reshape(-1, 2)
+    return bool(np.isfinite(flat).all() and np.ptp(flat, 0).max() < MAX_AXIS * max(image.shape))
+
+
+# ---- The film ----------------------------------------------------------------------------------
+
+LEGEND_S = 2.0  # the legend is shown (chosen: long enough to be read)
+TRAIL_S = 1.0  # of the past that a trail shows (chosen)
 
 
 class Overlay:
-    """Write overlay.mp4 frame by frame.
+    """Draw the film frame by frame.
 
-    Ellipsoids that rest on a prior are drawn only while their object is detected.
+    Solids that rest on a prior are drawn only while their object is detected.
 
     Attributes:
-        size: (w, h) of the pictures, even. scale: of their pixels per native pixel.
+        path: of the film. size: (w, h) of the pictures. scale: of their pixels per native pixel.
     """
 
-    def __init__(self, result: Result, path: Path, video: Video) -> None:
-        width, height = video.size
-        shrink = min(1.0, OVERLAY_SIZE_PX / max(width, height))
-        # codecs want even sides
-        self.size = (int(width * shrink) // 2 * 2, int(height * shrink) // 2 * 2)
-        self.scale, self.tracks = self.size[0] / width, result.tracks
+    def __init__(self, result: Result, path: Path, video: Video, layers: str = "solids") -> None:
+        """Open the film; its suffix is that of the format that can be written here."""
+        self.fps = max(1.0, (video.fps or IMAGE_FPS) / video.config.every)
+        self.writer = FilmWriter(path, self.fps, video.size)
+        self.path, self.size, self.layers = self.writer.path, self.writer.size, film_layers(layers)
+        self.scale, self.tracks = self.size[0] / video.size[0], result.tracks
         self.sure = {o.id for o in result.located if o.status == "ok"}
         self.labels = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
-        self.outlines = _project_all(result, self.scale)
-        fps = max(1.0, (video.fps or IMAGE_FPS) / video.config.every)
-        self.writer = VideoWriter(path, fps, self.size)
+        self.outlines = _project_all(result, self.scale, self.layers)
+        self.places: dict[int, int] = {}
+        self.cameras = _cameras(result) if "solids" in self.layers else {}
+        self.legend = _legend(result, self.layers)
+        self.trails: dict[int, list[tuple[int, Array]]] = {}  # by identity: count, place
 
     def take(self, frame: Frame) -> None:
         """Draw and append one frame."""
         low, high = np.searchsorted(self.tracks.frame, [frame.index, frame.index + 1])
         rows = self.tracks[slice(low, high)]
         small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
-        image = np.asarray(small, np.uint8)
-        if frame.index in self.outlines:
-            ids, dual_c, visible = self.outlines[frame.index]
-            seen = set(rows.track_id.tolist())
-            drawn = visible & np.array([i in seen or i in self.sure for i in ids], bool)
-            draw_ellipses(image, dual_c, drawn, ids, seen)
-        draw_tracks(image, rows, self.labels, self.scale)
+        image, seen = np.asarray(small, np.uint8), set(rows.track_id.tolist())
+        if "trails" in self.layers:
+            self._draw_trails(image, rows)
+        thin = self._draw_solids(image, frame.index, seen)
+        draw_tracks(image, rows, self.labels, self.scale, self.places, thin)
+        if self.legend and self.writer.count < LEGEND_S * self.fps:
+            draw_legend(image, self.legend)
         self.writer.write(image)
 
+    def _draw_solids(self, image: Image, frame: int, seen: set[int]) -> frozenset[int]:
+        """Draw what is known in 3D; returns the identities that were drawn."""
+        shown: set[int] = set()
+        if frame in self.cameras:
+            solids, ids, camera, cam_from_world = self.cameras[frame]
+            drawn = np.array([i in seen or i in self.sure for i in ids], bool)
+            draw_wireframes(image, solids, camera, cam_from_world, self.scale, ids, drawn, seen)
+            shown |= set(np.array(ids)[np.unique(solids.solid)].tolist())
+        if frame in self.outlines:
+            ids, dual_c, visible = self.outlines[frame]
+            drawn = visible & np.array([i in seen or i in self.sure for i in ids], bool)
+            draw_ellipses(image, dual_c, drawn, ids, seen)
+            shown |= set(ids)
+        return frozenset(shown & seen)
+
+    def _draw_trails(self, image: Image, rows: Tracks) -> None:
+        """Draw where the middle of each box was in the last second of the film."""
+        now = self.writer.count
+        for obj, box in zip(rows.track_id.tolist(), rows.xyxy * self.scale, strict=True):
+            trail = self.trails.setdefault(obj, [])
+            trail.append((now, box.reshape(2, 2).mean(0)))
+            trail[:] = [step for step in trail if step[0] >= now - TRAIL_S * self.fps]
+            line = np.array([place for _, place in trail]).round().astype(np.int32)  # (n, 2)
+            cv2.polylines(image, [line], False, object_color(obj), 2, cv2.LINE_AA)
+
     def close(self, complete: bool) -> None:
-        """Finish the file; it appears only if it is complete."""
+        """Finish the film; it appears only if it is complete."""
         self.writer.close(complete)
 
 
-def _project_all(result: Result, scale: float) -> dict[int, tuple[list[int], Array, BoolArray]]:
-    """Project the ellipsoids of the located objects into the frames with a pose of their part.
+def _located_by_part(result: Result) -> list[tuple[Result, list[int]]]:
+    """List the parts with cameras and solids, and the identities of these."""
+    parts = [(part, [o.id for o in part.located]) for part in result.parts()]
+    return [(p, ids) for p, ids in parts if p.poses is not None and ids and p.poses.known.any()]
+
+
+def _cameras(result: Result) -> dict[int, tuple[Wireframes, list[int], Camera, Array]]:
+    """Collect by frame number: solids and identities of its part, its camera and its pose."""
+    found = {}
+    for part, ids in _located_by_part(result):
+        poses = part.poses
+        assert poses is not None
+        solids = wireframes(part.ellipsoids(), [o.support for o in part.located])
+        for frame, pose in zip(poses.frame[poses.known].tolist(), poses.cam_from_world[poses.known],
+                               strict=True):  # fmt: skip
+            found[frame] = (solids, ids, poses.camera, pose)
+    return found
+
+
+def _project_all(
+    result: Result, scale: float, layers: frozenset[str]
+) -> dict[int, tuple[list[int], Array, BoolArray]]:
+    """Project the ellipsoids into the frames with a pose of their part.
+
+    Of all located objects where `layers` has ellipses; else, with solids, of those without edges.
 
     Returns:
         by frame number: identities (O), dual conics (O, 3, 3) in scaled pixels, and visible (O,).
     """
     outlines: dict[int, tuple[list[int], Array, BoolArray]] = {}
     scaled = np.diag([scale, scale, 1.0])
-    for part in result.parts():
-        ids, poses = [o.id for o in part.located], part.poses
-        if poses is None or not ids or not poses.known.any():
+    for part, ids in _located_by_part(result):
+        poses = part.poses
+        assert poses is not None
+        round_ones = np.array([o.support not in ("box", "cylinder") for o in part.located])
+        chosen = np.full(len(ids), "ellipses" in layers) | (round_ones & ("solids" in layers))
+        if not chosen.any():
             continue
         img_from_world = scaled @ poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
-        projected = quadrics.project(part.ellipsoids().dual_quadrics(), img_from_world)
+        projected = quadrics.project(part.ellipsoids()[chosen].dual_quadrics(), img_from_world)
+        kept = np.array(ids)[chosen].tolist()
         for frame, dual_c, visible in zip(
             poses.frame[poses.known].tolist(), *projected, strict=True
         ):
-            outlines[frame] = (ids, dual_c, visible)
+            outlines[frame] = (kept, dual_c, visible)
     return outlines
+
+
+# ---- Legend ------------------------------------------------------------------------------------
+
+LEGEND_COLOR = object_color(1)
+LINE_PX, SWATCH_PX = 20, 30  # height of a line, width of its picture
+
+
+def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
+    """List the kinds of lines in this film and what they mean."""
+    lines = [("box", "detected; number = identity")]
+    if (result.tracks.score == 0).any():
+        lines.append(("dashed", "not detected: filled in"))
+    if _located_by_part(result) and layers & {"solids", "ellipses"}:
+        name = "solid" if "solids" in layers else "ellipsoid"
+        lines.append(("solid", f"its {name} in 3D, back-projected"))
+        lines.append(("thin", f"{name} not detected in this frame"))
+    if "trails" in layers:
+        lines.append(("trail", f"its way in the last {TRAIL_S:.0f} s"))
+    return lines
+
+
+def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
+    """Draw a legend on a dark panel at the bottom left, in place."""
+    width = SWATCH_PX + 16 + max(_text_size(text)[0] for _, text in lines)
+    height = LINE_PX * len(lines) + 8
+    top = max(0, image.shape[0] - height - 6)
+    panel = image[top : top + height, 6 : 6 + width]
+    panel[:] = panel // 4
+    for k, (kind, text) in enumerate(lines):
+        x, y = 12, top + 4 + LINE_PX * k
+        box = np.array([x, y + 4, x + SWATCH_PX - 8, y + LINE_PX - 5])
+        if kind in ("box", "dashed"):
+            _draw_box(image, box, LEGEND_COLOR, 1 + (len(lines) == 1), kind == "dashed")
+        else:
+            middle = y + LINE_PX // 2
+            thickness = 1 if kind == "thin" else 2
+            cv2.line(image, (x, middle), (x + SWATCH_PX - 8, middle), LEGEND_COLOR, thickness,
+                     cv2.LINE_AA)  # fmt: skip
+        at = (x + SWATCH_PX, y + LINE_PX - 6)
+        cv2.putText(image, text, at, FONT, FONT_SCALE, (255, 255, 255), 1, cv2.LINE_AA)

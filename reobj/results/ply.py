@@ -1,4 +1,4 @@
-"""Ellipsoids as a coloured triangle mesh: the PLY files of a result."""
+"""Ellipsoids and solids as coloured triangle meshes, and points: PLY files."""
 
 from __future__ import annotations
 
@@ -13,28 +13,80 @@ from reobj.files import atomic
 from reobj.types import Array, object_color
 
 PLY_DETAIL = 2  # subdivisions of an octahedron: 512 triangles an ellipsoid
+PLY_SIDES = 48  # of the prism that stands for a cylinder (chosen: round to the eye)
+FACE_BYTES = 13  # of a triangle: how many corners, and their numbers
 
 
-def write_ply(path: Path, ellipsoids: quadrics.Ellipsoids, object_id: Sequence[int]) -> None:
-    """Write ellipsoids as one coloured triangle mesh (PLY, binary little endian), in world."""
-    sphere, faces = _sphere_mesh(PLY_DETAIL)  # (P, 3), (T, 3)
-    half = ellipsoids.half_axes[:, None] * sphere  # (O, P, 3)
-    points = half @ np.swapaxes(ellipsoids.world_from_obj, 1, 2)
-    points += ellipsoids.center_in_world[:, None]
-    colors = np.array([object_color(i)[::-1] for i in object_id], np.uint8).reshape(-1, 3)  # RGB
-    vertex = np.zeros(points.shape[:2], [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertex["xyz"], vertex["rgb"] = points, colors[:, None]
-    face = np.zeros((len(points), len(faces)), [("n", "u1"), ("i", "<i4", 3)])
-    face["n"], face["i"] = 3, faces + (np.arange(len(points)) * len(sphere))[:, None, None]
+def write_ply(
+    path: Path,
+    ellipsoids: quadrics.Ellipsoids,
+    object_id: Sequence[int],
+    support: Sequence[str | None] | None = None,
+) -> None:
+    """Write solids as one coloured triangle mesh (PLY, binary little endian), in world.
+
+    Each is closed, its triangles face outwards, and shares no vertex with another.
+
+    Args:
+        support: shapes, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
+    """
+    vertices, faces, start = [], [], 0
+    shapes = [None] * len(ellipsoids) if support is None else support
+    meshes = {None: _sphere_mesh(PLY_DETAIL), "box": _box_mesh(), "cylinder": _cylinder_mesh()}
+    for k, (identity, shape) in enumerate(zip(object_id, shapes, strict=True)):
+        unit, triangles = meshes.get(shape, meshes[None])  # (P, 3), (T, 3)
+        points = (ellipsoids.half_axes[k] * unit) @ ellipsoids.world_from_obj[k].T
+        vertex = np.zeros(len(unit), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+        vertex["xyz"] = points + ellipsoids.center_in_world[k]
+        vertex["rgb"] = object_color(identity)[::-1]
+        face = np.zeros(len(triangles), [("n", "u1"), ("i", "<i4", 3)])
+        face["n"], face["i"] = 3, triangles + start
+        vertices.append(vertex.tobytes())
+        faces.append(face.tobytes())
+        start += len(unit)
     names = [f"property float {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
+    what, count = "ellipsoids" if support is None else "solids", sum(map(len, faces)) // FACE_BYTES
     header = (
-        "ply\nformat binary_little_endian 1.0\ncomment reobj_track ellipsoids\n"
-        f"element vertex {vertex.size}\n{''.join(names)}"
-        f"element face {face.size}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {what}\n"
+        f"element vertex {start}\n{''.join(names)}"
+        f"element face {count}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     with atomic(path) as part:
-        part.write_bytes(header.encode() + vertex.tobytes() + face.tobytes())
+        part.write_bytes(header.encode() + b"".join(vertices) + b"".join(faces))
+
+
+def write_point_ply(path: Path, points: Array, colors: npt.NDArray[np.uint8]) -> None:
+    """Write points (N, 3) with RGB colours (N, 3) as PLY, binary little endian."""
+    vertex = np.zeros(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertex["xyz"], vertex["rgb"] = points, colors
+    names = [f"property float {n}\n" for n in "xyz"]
+    names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
+    header = f"element vertex {len(points)}\n{''.join(names)}end_header\n"
+    with atomic(path) as part:
+        head = "ply\nformat binary_little_endian 1.0\n" + header
+        part.write_bytes(head.encode() + vertex.tobytes())
+
+
+def _box_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
+    """Triangulate the cube of half side 1: points (8, 3), triangles (12, 3) facing outwards."""
+    points = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    faces = [half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))]
+    return points.astype(np.float64), np.array(faces)
+
+
+def _cylinder_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
+    """Triangulate the upright cylinder of radius and half height 1, facing outwards."""
+    number = np.arange(PLY_SIDES)
+    angle, following = 2 * np.pi * number / PLY_SIDES, (number + 1) % PLY_SIDES
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    low, high = (np.column_stack([ring, np.full(PLY_SIDES, z)]) for z in (-1.0, 1.0))
+    points = np.concatenate([low, high, [[0, 0, -1.0], [0, 0, 1.0]]])
+    a, b, c, d = number, following, following + PLY_SIDES, number + PLY_SIDES
+    bottom, top = np.full(PLY_SIDES, 2 * PLY_SIDES), np.full(PLY_SIDES, 2 * PLY_SIDES + 1)
+    faces = [(a, b, c), (a, c, d), (bottom, b, a), (top, d, c)]
+    return points, np.concatenate([np.column_stack(f) for f in faces])
 
 
 def _sphere_mesh(detail: int) -> tuple[Array, npt.NDArray[np.int64]]:

@@ -1,6 +1,6 @@
 """Result of a run, typed: objects, their world, tracks and cameras; writes and reads its files.
 
-Start at `Result`. Nothing is computed here; the pictures (overlay.mp4, scene.html) need the video
+Start at `Result`. Nothing is computed here; the pictures (the film, scene.html) need the video
 and have rooms of their own.
 """
 
@@ -35,6 +35,7 @@ from reobj.files import (
     shortened,
     texts_with_sigma,
     without_secrets,
+    wrapped,
 )
 from reobj.poses.floor import Floor
 from reobj.results.edits import Edits, write_edits
@@ -47,7 +48,8 @@ FORMAT = "reobj-objects"
 FORMAT_VERSION = 1  # of objects.json
 LAST_POSES = "cache/last-poses.npz"  # in an output folder
 STALE = (  # files of an earlier run, which another run may not write; cameras.csv: before 0.2
-    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "scene.html",
+    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm",
+    "scene.html",
 )  # fmt: skip
 CONVENTIONS = {
     "pose": "cam_from_world",
@@ -131,9 +133,8 @@ class Object:
 def sides(found: Object) -> list[tuple[str, str]]:
     """Write width, depth, height (own axes x, y, z; m or units) and sigmas; [] if unknown."""
     size = found.size if found.size_m is None else found.size_m
-    if size is None or found.size_rel_sigma is None:
-        return []
-    return texts_with_sigma(size, size * found.size_rel_sigma)
+    rel = found.size_rel_sigma
+    return [] if size is None or rel is None else texts_with_sigma(size, size * rel)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -351,8 +352,7 @@ class Result:
             (out / LAST_POSES).unlink(missing_ok=True)
         write_mot(out / "tracks.txt", (self if doubtful else self.without_doubtful()).tracks)
         self._write_objects(out / "objects.json")
-        if self.edits is not None:
-            write_edits(out, self.edits)
+        write_edits(out, self.edits)
         if self.poses is not None:
             save_poses(out / LAST_POSES, self.poses)
             write_trajectories(out, self.poses)
@@ -461,22 +461,27 @@ class Result:
             text += " units" if scaled and o.size is not None and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "
-            reason = f" ({o.reason})" if o.reason else ""
             part = f", part {o.part}" if len(self.world.parts) > 1 else ""
             lines.append(
                 f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
-                f"{sizes * sized}{o.status}{part}{reason}"
+                f"{sizes * sized}{o.status}{part}"
             )
+        reasons: dict[str, list[int]] = {}  # each once, with the objects that it holds for
+        for o in counted:
+            reasons.setdefault(f"{o.status}: {o.reason}" * bool(o.reason), []).append(o.id)
+        for reason, ids in reasons.items():
+            lines += wrapped(f"{reason}: {', '.join(map(str, ids))}") if reason else []
         counts = sorted(Counter(o.class_name for o in counted).items())
         each = " (each part counted by itself)" if len(self.world.parts) > 1 else ""
         names = ", ".join(f"{n} {c}" for c, n in counts) or "none"
-        lines.append(f"distinct objects: {names}{each}")
+        lines += wrapped(f"distinct objects: {names}{each}")
         if (doubtful := len(self.objects) - len(counted)) > 0:
             lines.append(f"doubtful: {doubtful} more, less likely there than not (objects.json)")
         lines += self._camera_lines()
         lines.append("seconds: " + ", ".join(f"{k} {v:.1f}" for k, v in self.seconds.items()))
         if self.out is not None:
-            files = [self.out / n for n in ("scene.html", "overlay.mp4", "objects.json")]
+            shown = ("scene.html", "overlay.mp4", "overlay.webm", "objects.json")
+            files = [self.out / name for name in shown]
             lines.append("look at: " + ", ".join(str(file) for file in files if file.exists()))
         return "\n".join(lines)
 
@@ -499,7 +504,7 @@ class Result:
             scale = [f"scale {_scale_text(part.scale)}"] if part.scale else []
             cameras = f"{part.registered_frames} of {part.frames} frames"
             facts = [part.span_text, cameras, f"{count} object{'s' * (count != 1)}", *scale]
-            lines.append(f"part {k}: " + "; ".join(facts))
+            lines += wrapped(f"part {k}: " + "; ".join(facts))
         return lines
 
     def _write_objects(self, path: Path) -> None:
@@ -525,8 +530,7 @@ class Result:
 
 
 def _scale_text(scale: quadrics.Scale) -> str:
-    sigma = f"{100 * (scale.rel_sigma or 0):.0f} %"
-    return f"{scale.value} m per unit, sigma {sigma} (from {scale.source})"
+    return f"{scale.value} m per unit, sigma {100 * (scale.rel_sigma or 0):.0f} % (from {scale.source})"
 
 
 def significant(values: Array) -> Array:

@@ -22,7 +22,7 @@ import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.poses.floor import NOISE
-from reobj.results.overlay import Overlay
+from reobj.results.overlay import Overlay, film_layers
 from reobj.results.result import Object, Result, World, sides, significant
 from reobj.sources.video import IMAGE_FPS, Video, shrunk
 from reobj.types import Frame, Image, IntArray, Tracks, object_color, rows_by
@@ -307,23 +307,26 @@ def write_pictures(
     result: Result,
     out: Path,
     video: Video,
-    overlay: bool = True,
+    overlay: str = "solids",
     scene: bool = True,
     doubtful: bool = False,
 ) -> None:
-    """Write overlay.mp4 and scene.html in one pass over the video.
+    """Write the film and scene.html in one pass over the video.
 
-    Doubtful objects are in the page, where a switch shows them, and in the overlay if `doubtful`.
+    Args:
+        overlay: what the film shows (`film_layers`); "none": no film.
+        doubtful: show doubtful objects in the film, and at first on the page, which holds them.
 
     Each file appears only when it is complete. A live source cannot be read again, and frames may
     have no images: no overlay then, and a page without pictures.
     """
     visible = video.has_images and not video.is_live
+    drawn = film_layers(overlay) and visible
     shown = result if doubtful else result.without_doubtful()
-    film = Overlay(shown, out / "overlay.mp4", video) if overlay and visible else None
+    film = Overlay(shown, out / "overlay.mp4", video, overlay) if drawn else None
     pictures = Pictures(result, video) if scene else None
     sinks = [sink for sink in (film, pictures) if sink is not None and visible]
-    progress, complete = Progress("pictures", video.expected), False
+    progress, complete = Progress("write", video.expected), False
     try:
         for frame in video if sinks else ():
             for sink in sinks:
@@ -331,7 +334,7 @@ def write_pictures(
             progress.step()
         complete = True
     finally:
-        progress.close()
+        progress.close(complete)
         if film is not None:
             film.close(complete)
     if pictures is not None:

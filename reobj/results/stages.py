@@ -53,15 +53,14 @@ def detect_all(
         source = dataclasses.replace(source, cache=DetectionCache(folder, video.working_size))
     frames: list[int] = []
     steps = []
-    progress = Progress("detect", video.expected)
     try:
-        for frame in video:
-            found_now = source(frame)
-            frames += [frame.index] * len(found_now)
-            steps.append((found_now.xyxy / video.scale, found_now.score, found_now.class_id))
-            progress.step()
+        with Progress("detect", video.expected) as progress:
+            for frame in video:
+                found_now = source(frame)
+                frames += [frame.index] * len(found_now)
+                steps.append((found_now.xyxy / video.scale, found_now.score, found_now.class_id))
+                progress.step()
     finally:
-        progress.close()
         source.flush()
     columns = [np.concatenate(column) for column in zip(*steps, strict=True)] if steps else []
     rows = _rows(np.array(frames, np.int64), *columns) if steps else Tracks.empty()
@@ -104,19 +103,18 @@ def collect_tracks(
     found: list[Tracks] = []
     embedded: list[tuple[IntArray, Floats]] = []
     detected: list[Detections] = []
-    progress = Progress("track", video.expected)
     try:
-        for frame, _ in steps:
-            frames.append(frame.index)
-            found.append(tracker.latest)
-            embedded.append(tracker.latest_embeddings())
-            detected.append(tracker.detections)
-            progress.step()
+        with Progress("track", video.expected) as progress:
+            for frame, _ in steps:
+                frames.append(frame.index)
+                found.append(tracker.latest)
+                embedded.append(tracker.latest_embeddings())
+                detected.append(tracker.detections)
+                progress.step()
     except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:
             raise
     finally:
-        progress.close()
         source.flush()
         if source.cache is not None and not source.key:
             shutil.rmtree(Path(source.cache.folder), ignore_errors=True)

@@ -24,6 +24,7 @@ from reobj.types import ReobjError
 
 LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
 SOURCE = "cache/source.json"
+CONFIG_FILE = "config.toml"  # options of the last run, in an output folder
 
 
 class Workspace:

@@ -23,7 +23,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from reobj.files import check_unpacked, load_json, load_npz, read_text, shortened
+from reobj.files import check_unpacked, did_you_mean, load_json, load_npz, read_text, shortened
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, read_npz
 from reobj.sources.video import Video
@@ -84,7 +84,8 @@ def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
     chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
     unknown = [name for name in chosen if name not in known]
     if unknown:
-        raise ReobjError(f"--classes: no class {', '.join(unknown)} among {', '.join(names)}")
+        close = did_you_mean(unknown[0], known) or f" among {', '.join(names)}"
+        raise ReobjError(f"--classes: no class {', '.join(unknown)}{close}")
     return np.array([known[name] for name in chosen], np.int64)
 
 

@@ -241,14 +241,13 @@ def _download(weights: Weights, part: Path) -> None:
         part.open("wb") as file,
     ):
         size, done = weights.size or min(response.length or 0, DOWNLOAD_MAX), 0
-        progress = Progress("fetch kB", size // 1000)
-        while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
-            file.write(chunk)
-            done += len(chunk)
-            progress.step(len(chunk) // 1000)
-    progress.close()
-    if done < size:
-        raise ConnectionError(f"connection cut after {done} of {size} bytes")
+        with Progress("fetch kB", size // 1000) as progress:
+            while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
+                file.write(chunk)
+                done += len(chunk)
+                progress.step(done // 1000 - progress.done)
+            if done < size:
+                raise ConnectionError(f"connection cut after {done} of {size} bytes")
 
 
 # onnxruntime's providers by what users call them, and the packages that bring them

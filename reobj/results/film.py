@@ -1,0 +1,167 @@
+"""A film that browsers play: H.264 in MP4 where PyAV is installed, else VP8 in WebM by OpenCV.
+
+OpenCV's wheel has no H.264 encoder, and no browser plays the MPEG-4 that it writes into .mp4. What
+it has: VP8 (6 times as slow as PyAV's H.264, measured on the example) and VP9 (20 times).
+PyAV and not imageio-ffmpeg: frames are handed over in memory, errors come as exceptions instead of
+a child process' log, and `supervision` brings it along. Its wheels hold x264, which is GPL: an
+extra that the user installs, never a dependency.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sys
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from reobj.types import Image
+
+H264_SIZE_PX = 1280  # longer side; larger videos are shrunk (chosen: HD, so that it plays)
+VP8_SIZE_PX = 640  # the same for the slow encoder (chosen: a film takes less time than tracking)
+# x264's own quality, files half as large as MPEG-4's. Without lookahead: with it, the same pictures
+# give other bytes every few runs (seen with PyAV 18.1, one thread and no B-frames too).
+H264 = {
+    "preset": "veryfast", "crf": "23", "x264-params": "bframes=0:threads=1:rc-lookahead=0:mbtree=0",
+}  # fmt: skip
+KEYFRAME_S = 2  # between frames that a player can jump to (chosen)
+WEBM_HEAD = 1 << 16  # bytes that hold all before the first frame (FFmpeg: under 1000)
+MAX_DENOMINATOR = 1001  # of frame rates: 30000/1001
+
+
+def import_av() -> Any:
+    """Import PyAV; None where it is missing or has no H.264 encoder."""
+    try:
+        import av
+
+        av.codec.Codec("h264", "w")
+    except (ImportError, ValueError):  # PyAV's UnknownCodecError is a ValueError
+        return None
+    return av
+
+
+class FilmWriter:
+    """Write a film that appears under its name only when it is complete.
+
+    Attributes:
+        path: of the file, with the suffix of its format. part: of what is written of it.
+        size: (w, h) of the frames, even: codecs want that. count: frames so far.
+    """
+
+    def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
+        """Open a film of frames that are shrunk from (w, h) `size`; the suffix is replaced."""
+        av = import_av()
+        self.path = path.with_suffix(".webm" if av is None else ".mp4")
+        self.part = self.path.with_name(f".part-{self.path.name}")
+        shrink = min(1.0, (VP8_SIZE_PX if av is None else H264_SIZE_PX) / max(size))
+        self.size = (int(size[0] * shrink) // 2 * 2, int(size[1] * shrink) // 2 * 2)
+        self.count = 0
+        with self._named():
+            self.part.touch()  # PyAV finds out at the first frame only
+            made = (self.part, fps, self.size)
+            self.sink = _VP8(*made) if av is None else _H264(av, *made)
+
+    def write(self, image: Image) -> None:
+        """Append one frame of (w, h) `size`, BGR."""
+        with self._named():
+            self.sink.write(image)
+        self.count += 1
+
+    def close(self, complete: bool) -> None:
+        """Finish the file; keep it only if complete (OpenCV is silent when the disk is full)."""
+        try:
+            with self._named() if complete else contextlib.suppress(OSError):
+                self.sink.close()
+            if complete and self._frames_on_disk() != self.count:
+                raise OSError(f"{self.path}: not all frames could be written; is the disk full?")
+            if complete:
+                self.part.replace(self.path)
+        finally:
+            self.part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        """Name the film in errors of the encoder, which name the part or nothing."""
+        try:
+            yield
+        except OSError as error:
+            reason = error.strerror or error
+            raise OSError(f"{self.path}: the film cannot be written ({reason})") from error
+
+    def _frames_on_disk(self) -> int:
+        capture = cv2.VideoCapture(str(self.part))
+        return int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+
+
+class _H264:
+    """H.264 in MP4 by PyAV."""
+
+    def __init__(self, av: Any, path: Path, fps: float, size: tuple[int, int]) -> None:
+        self.av, rate = av, Fraction(fps).limit_denominator(MAX_DENOMINATOR)
+        # faststart: the index comes first, so that a page plays what it has loaded
+        self.file = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
+        self.stream = self.file.add_stream("h264", rate=rate, options=H264)
+        self.stream.width, self.stream.height = size
+        self.stream.pix_fmt = "yuv420p"  # the one that all browsers decode
+        self.stream.gop_size = max(1, round(KEYFRAME_S * fps))
+
+    def write(self, image: Image) -> None:
+        # OpenCV converts: FFmpeg's result depends on where in memory the picture happens to lie
+        planes = cv2.cvtColor(image, cv2.COLOR_BGR2YUV_I420)
+        frame = self.av.VideoFrame.from_ndarray(planes, format="yuv420p")
+        self.file.mux(self.stream.encode(frame))
+
+    def close(self) -> None:
+        try:
+            self.file.mux(self.stream.encode())
+        finally:
+            self.file.close()
+
+
+class _VP8:
+    """VP8 in WebM by OpenCV; same input, same bytes."""
+
+    def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
+        self.path = path
+        with _quiet():
+            self.writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), fps, size)
+        if not self.writer.isOpened():
+            raise OSError("OpenCV does not open it")
+
+    def write(self, image: Image) -> None:
+        self.writer.write(image)
+
+    def close(self) -> None:
+        self.writer.release()
+        with contextlib.suppress(FileNotFoundError), self.path.open("r+b") as file:
+            head = file.read(WEBM_HEAD)
+            file.seek(0)
+            file.write(_with_fixed_uid(head))
+
+
+def _with_fixed_uid(webm: bytes) -> bytes:
+    """Replace the random number that FFmpeg gives the track (TrackUID, and its tags' TagTrackUID).
+
+    Ref: RFC 9559, 5.1.4.1.2: element 0x73C5, here of 8 bytes (size 0x88).
+    """
+    found = re.search(rb"\x73\xc5\x88(.{8})", webm, re.DOTALL)
+    return webm if found is None else webm.replace(found[1], b"\0\0\0\0\0\0\0\1")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep FFmpeg's remark on the four letters of the codec, printed by C code, off stderr."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

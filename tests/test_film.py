@@ -1,0 +1,219 @@
+"""The film: it plays in a browser, whichever encoder is here; it is whole or not there at all."""
+
+from __future__ import annotations
+
+import http.server
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import threading
+import urllib.parse
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from reobj.results.film import FilmWriter, import_av
+
+ROOT = Path(__file__).resolve().parent.parent
+SIZE, FRAMES, FPS = (320, 240), 30, 15.0
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync "
+    "--disable-background-networking --disable-component-update "
+    "--autoplay-policy=no-user-gesture-required"
+).split()
+PAGE = """<video src="%s" muted></video><script>
+const v = document.querySelector("video")
+const say = text => { new Image().src = "http://127.0.0.1:%d/" + text }
+v.onerror = () => say(`error ${v.error.code}`)
+v.ontimeupdate = () => {
+  if (v.currentTime < 0.5) return
+  const c = new OffscreenCanvas(v.videoWidth, v.videoHeight).getContext("2d")
+  c.drawImage(v, 0, 0)
+  say(`${v.readyState} ${v.duration} ${c.getImageData(9, 9, 1, 1).data.join(" ")}`)
+}
+v.play().catch(error => say(error))
+</script>"""
+
+
+@pytest.fixture(params=["h264", "vp8"])
+def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Both encoders: with PyAV, and without."""
+    if request.param == "vp8":
+        monkeypatch.setitem(sys.modules, "av", None)
+    elif import_av() is None:
+        pytest.skip("no PyAV here: pip install '.[video]'")
+    return str(request.param)
+
+
+def pictures(count: int = FRAMES) -> list[np.ndarray]:
+    """A red ground on which a square moves."""
+    made = [np.full((SIZE[1], SIZE[0], 3), (20, 20, 200), np.uint8) for _ in range(count)]
+    for i, image in enumerate(made):
+        image[100:140, 8 * i : 8 * i + 40] = (200, 200, 20)
+    return made
+
+
+def written(path: Path, images: list[np.ndarray]) -> Path:
+    film = FilmWriter(path, FPS, SIZE)
+    for image in images:
+        film.write(image)
+    film.close(True)
+    return film.path
+
+
+def test_the_suffix_is_that_of_the_format(tmp_path: Path, encoder: str) -> None:
+    path = written(tmp_path / "overlay.mp4", pictures(3))
+    assert path.name == {"h264": "overlay.mp4", "vp8": "overlay.webm"}[encoder]
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    magic = {"h264": (4, b"ftyp"), "vp8": (0, b"\x1aE\xdf\xa3")}[encoder]
+    data = path.read_bytes()
+    assert data[magic[0] : magic[0] + 4] == magic[1]
+    if encoder == "h264":  # what all browsers decode, and can play while it loads
+        with import_av().open(str(path)) as file:
+            (stream,) = file.streams
+            assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert data.index(b"moov") < data.index(b"mdat")
+
+
+class Listener(http.server.BaseHTTPRequestHandler):
+    """Keeps what a page says by asking for a path."""
+
+    said: queue.Queue[str]
+
+    def do_GET(self) -> None:
+        self.said.put(urllib.parse.unquote(self.path[1:]))
+        self.send_response(204)
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None: ...
+
+
+def test_a_browser_plays_it(tmp_path: Path, encoder: str) -> None:
+    """From the disk, as a user opens it: decoded, of the right length, and time goes on."""
+    if CHROMIUM is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+    path = written(tmp_path / "overlay.mp4", pictures())
+    listener = type("One", (Listener,), {"said": queue.Queue()})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), listener)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    page = tmp_path / "page.html"
+    page.write_text(PAGE % (path.name, server.server_port))
+    command = [CHROMIUM, *FLAGS, "--allow-file-access-from-files",
+               f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]  # fmt: skip
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = subprocess.Popen(command, **quiet)
+    try:
+        said = listener.said.get(timeout=60)
+    finally:
+        process.terminate()
+        process.wait(20)
+        server.shutdown()
+        server.server_close()
+    ready, seconds, *rgba = [float(word) for word in said.split()]
+    assert ready >= 2 and seconds == pytest.approx(FRAMES / FPS, abs=0.1)
+    np.testing.assert_allclose(rgba[:3], [200, 20, 20], atol=12)
+
+
+def test_pictures_come_back_in_order(tmp_path: Path, encoder: str) -> None:
+    images = pictures()
+    capture = cv2.VideoCapture(str(written(tmp_path / "a.mp4", images)))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(FPS)
+    for image in images:
+        assert np.abs(capture.read()[1].astype(int) - image).mean() < 8
+    assert not capture.read()[0]
+
+
+def test_same_pictures_same_bytes(tmp_path: Path, encoder: str) -> None:
+    """Wherever they lie in memory, and however often: noise that moves, as x264 had it wrong."""
+    rng = np.random.default_rng(0)
+    wide = cv2.GaussianBlur(rng.integers(0, 256, (SIZE[1], 400, 3), np.uint8), (0, 0), 2)
+    made = set()
+    for _ in range(8):
+        junk = [bytearray(int(n)) for n in rng.integers(1, 90_000, 20)]
+        images = [wide[:, 4 * i : 4 * i + SIZE[0]].copy() for i in range(12)]
+        made.add(written(tmp_path / "a.mp4", images).read_bytes())
+        del junk
+    assert len(made) == 1
+
+
+@pytest.mark.parametrize("fps", [30000 / 1001, 12.0, 1.0])
+def test_frame_rates_are_kept(tmp_path: Path, encoder: str, fps: float) -> None:
+    film = FilmWriter(tmp_path / "a.mp4", fps, SIZE)
+    for image in pictures(4):
+        film.write(image)
+    film.close(True)
+    found = cv2.VideoCapture(str(film.path)).get(cv2.CAP_PROP_FPS)
+    assert found == pytest.approx(fps, rel=1e-2 if encoder == "vp8" else 1e-6)  # whole ms
+
+
+@pytest.mark.parametrize("size", [(321, 241), (1601, 901), (3840, 2160), (64, 48)])
+def test_sides_are_even_and_no_longer_than_plays(
+    tmp_path: Path, encoder: str, size: tuple[int, int]
+) -> None:
+    film = FilmWriter(tmp_path / "a.mp4", FPS, size)
+    film.close(False)
+    limit = {"h264": 1280, "vp8": 640}[encoder]
+    assert film.size[0] % 2 == film.size[1] % 2 == 0
+    assert min(limit, size[0]) - 2 < film.size[0] <= min(limit, size[0])
+    assert film.size[0] / film.size[1] == pytest.approx(size[0] / size[1], rel=0.01)
+
+
+def test_a_film_that_is_not_complete_is_not_kept(tmp_path: Path, encoder: str) -> None:
+    film = FilmWriter(tmp_path / "o.mp4", FPS, SIZE)
+    film.path.write_text("of an earlier run")
+    film.write(pictures(1)[0])
+    assert film.path.read_text() == "of an earlier run"  # until the new one is complete
+    film.close(False)
+    assert film.path.read_text() == "of an earlier run"
+    assert list(tmp_path.iterdir()) == [film.path]
+
+
+def test_a_film_that_lost_frames_is_an_error(tmp_path: Path, encoder: str) -> None:
+    film = FilmWriter(tmp_path / "o.mp4", FPS, SIZE)
+    film.write(pictures(1)[0])
+    film.count += 1  # as a full disk does: OpenCV says nothing
+    with pytest.raises(OSError, match="disk full"):
+        film.close(True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_said(tmp_path: Path, encoder: str) -> None:
+    """A real limit on the size of files: PyAV raises, OpenCV says nothing."""
+    code = (
+        "import resource, sys; import numpy as np; from pathlib import Path\n"
+        "if sys.argv[1] == 'vp8': sys.modules['av'] = None\n"
+        "from reobj.results.film import FilmWriter\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
+        "film, rng = FilmWriter(Path('o.mp4'), 15, (320, 240)), np.random.default_rng(0)\n"
+        "try:\n"
+        "    for _ in range(40): film.write(rng.integers(0, 255, (240, 320, 3), np.uint8))\n"
+        "    film.close(True)\n"
+        "except OSError as error:\n"
+        "    film.close(False)\n"
+        "    print(error)\n"
+    )
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", code, encoder]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith({"h264": "o.mp4", "vp8": "o.webm"}[encoder])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_that_cannot_be_written_is_an_error(tmp_path: Path, encoder: str) -> None:
+    with pytest.raises(OSError, match=r"overlay.*: the film cannot be written"):
+        FilmWriter(tmp_path / "nowhere" / "overlay.mp4", FPS, SIZE)
+
+
+def test_nothing_is_said_on_the_terminal(
+    tmp_path: Path, encoder: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """FFmpeg's C code prints a remark on the four letters of VP8."""
+    written(tmp_path / "a.mp4", pictures(3))
+    print("still there", file=sys.stderr)
+    assert capfd.readouterr() == ("", "still there\n")
