@@ -132,8 +132,7 @@ class Object:
 
 def sides(found: Object) -> list[tuple[str, str]]:
     """Write width, depth, height (own axes x, y, z; m or units) and sigmas; [] if unknown."""
-    size = found.size if found.size_m is None else found.size_m
-    rel = found.size_rel_sigma
+    size, rel = found.size if found.size_m is None else found.size_m, found.size_rel_sigma
     return [] if size is None or rel is None else texts_with_sigma(size, size * rel)
 
 
@@ -530,7 +529,8 @@ class Result:
 
 
 def _scale_text(scale: quadrics.Scale) -> str:
-    return f"{scale.value} m per unit, sigma {100 * (scale.rel_sigma or 0):.0f} % (from {scale.source})"
+    sigma = f"{100 * (scale.rel_sigma or 0):.0f} %"
+    return f"{scale.value} m per unit, sigma {sigma} (from {scale.source})"
 
 
 def significant(values: Array) -> Array:
