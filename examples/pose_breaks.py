@@ -21,7 +21,7 @@ Kinds of breaks, in short stretches (24-40 pictures):
     zoomed           a stretch is zoomed: another focal length
     thin             a stretch is blurred or dark: the sides of it share few points
 and beside them
-    issue            the two breaks that issue 15 names, whole and at the defaults
+    issue            the two breaks that were reported first, whole and at the defaults
     good             recordings as they are, at the defaults: what registers today must go on to
 
 Verdict. Every frame has a true pose and a world that it shows. A part of the result is right if all
@@ -777,7 +777,7 @@ ISSUES = ("room_mirrored", "bonsai_every_3rd", "hololens")
 
 
 def issue_case(shelf: Shelf, name: str, folder: Path) -> Case:
-    """Make a case that issue 15 names, at the defaults."""
+    """Make a case that was reported first, at the defaults."""
     config = rt.PosesConfig()
     if name == "room_mirrored":
         video = rt.Video(shelf.path("room"))

@@ -2398,7 +2398,7 @@ def hand_shake(rng: Rng, seconds: Array) -> Array:
     return wave
 
 
-STEP_M = 0.28  # between two photos of the path "table" (issue 15: a held-back orbit's steps)
+STEP_M = 0.28  # between two photos of the path "table" (those of a recorded orbit)
 EYE_RANGE_M = (0.95, 1.85)  # their heights: kneeling to standing
 WALL_MARGIN_M = 0.35  # of the path "table"
 

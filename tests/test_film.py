@@ -147,8 +147,11 @@ def test_frame_rates_are_kept(tmp_path: Path, encoder: str, fps: float) -> None:
     for image in pictures(4):
         film.write(image)
     film.close(True)
-    found = cv2.VideoCapture(str(film.path)).get(cv2.CAP_PROP_FPS)
-    assert found == pytest.approx(fps, rel=1e-2 if encoder == "vp8" else 1e-6)  # whole ms
+    found = cv2.VideoCapture(str(film.path))
+    every = 2 if encoder == "vp8" and fps > 15 else 1  # the slow encoder takes every second one
+    assert found.get(cv2.CAP_PROP_FRAME_COUNT) == 4 / every
+    rel = 2e-2 if encoder == "vp8" else 1e-6  # whole ms
+    assert found.get(cv2.CAP_PROP_FPS) == pytest.approx(fps / every, rel=rel)
 
 
 @pytest.mark.parametrize("size", [(321, 241), (1601, 901), (3840, 2160), (64, 48)])
@@ -157,7 +160,7 @@ def test_sides_are_even_and_no_longer_than_plays(
 ) -> None:
     film = FilmWriter(tmp_path / "a.mp4", FPS, size)
     film.close(False)
-    limit = {"h264": 1280, "vp8": 640}[encoder]
+    limit = {"h264": 1280, "vp8": 480}[encoder]
     assert film.size[0] % 2 == film.size[1] % 2 == 0
     assert min(limit, size[0]) - 2 < film.size[0] <= min(limit, size[0])
     assert film.size[0] / film.size[1] == pytest.approx(size[0] / size[1], rel=0.01)

@@ -1,7 +1,8 @@
 """A film that browsers play: H.264 in MP4 where PyAV is installed, else VP8 in WebM by OpenCV.
 
 OpenCV's wheel has no H.264 encoder, and no browser plays the MPEG-4 that it writes into .mp4. What
-it has: VP8 (6 times as slow as PyAV's H.264, measured on the example) and VP9 (20 times).
+it has is VP8, some ten times as slow as PyAV's H.264 (so the film is smaller, with fewer frames a
+second), and VP9, slower still.
 PyAV and not imageio-ffmpeg: frames are handed over in memory, errors come as exceptions instead of
 a child process' log, and `supervision` brings it along. Its wheels hold x264, which is GPL: an
 extra that the user installs, never a dependency.
@@ -10,6 +11,7 @@ extra that the user installs, never a dependency.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import sys
@@ -23,7 +25,9 @@ import cv2
 from reobj.types import Image
 
 H264_SIZE_PX = 1280  # longer side; larger videos are shrunk (chosen: HD, so that it plays)
-VP8_SIZE_PX = 640  # the same for the slow encoder (chosen: a film takes less time than tracking)
+# The same, and most frames a second, for the slow encoder: 60 ms for a frame of 640 x 480 (chosen:
+# a film takes no longer than tracking)
+VP8_SIZE_PX, VP8_FPS = 480, 15.0
 # x264's own quality, files half as large as MPEG-4's. Without lookahead: with it, the same pictures
 # give other bytes every few runs (seen with PyAV 18.1, one thread and no B-frames too).
 H264 = {
@@ -51,6 +55,7 @@ class FilmWriter:
     Attributes:
         path: of the file, with the suffix of its format. part: of what is written of it.
         size: (w, h) of the frames, even: codecs want that. count: frames so far.
+        every: one frame of so many is in the film.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
@@ -59,17 +64,19 @@ class FilmWriter:
         self.path = path.with_suffix(".webm" if av is None else ".mp4")
         self.part = self.path.with_name(f".part-{self.path.name}")
         shrink = min(1.0, (VP8_SIZE_PX if av is None else H264_SIZE_PX) / max(size))
+        self.every = 1 if av else math.ceil(fps / VP8_FPS - 1e-3)  # 30.0001 fps is 30
         self.size = (int(size[0] * shrink) // 2 * 2, int(size[1] * shrink) // 2 * 2)
         self.count = 0
         with self._named():
             self.part.touch()  # PyAV finds out at the first frame only
-            made = (self.part, fps, self.size)
+            made = (self.part, fps / self.every, self.size)
             self.sink = _VP8(*made) if av is None else _H264(av, *made)
 
     def write(self, image: Image) -> None:
         """Append one frame of (w, h) `size`, BGR."""
-        with self._named():
-            self.sink.write(image)
+        if self.count % self.every == 0:
+            with self._named():
+                self.sink.write(image)
         self.count += 1
 
     def close(self, complete: bool) -> None:
@@ -77,7 +84,7 @@ class FilmWriter:
         try:
             with self._named() if complete else contextlib.suppress(OSError):
                 self.sink.close()
-            if complete and self._frames_on_disk() != self.count:
+            if complete and self._frames_on_disk() != -(-self.count // self.every):
                 raise OSError(f"{self.path}: not all frames could be written; is the disk full?")
             if complete:
                 self.part.replace(self.path)
