@@ -6,7 +6,8 @@ Usage:
 
 Meshes (obj, ply, glb, stl, off) must be in metres (--scale multiplies) and stand upright: --up
 names the vertical axis (up y: w = x, d = z; up z: w = x, d = y). Sizes are modelled as log-normal,
-as in quadrics.py; axis ratios (log w/h, log d/h) follow from the same samples.
+as in quadrics.py; axis ratios (log w/h, log d/h) follow from the same samples. What sizes are
+scored on must not be among them: the prior would know the answer.
 """
 
 from __future__ import annotations

@@ -1139,6 +1139,33 @@ def test_priors_cover_the_vocabularies() -> None:
     assert all(e["source"] and e["support"] in q.SUPPORTS for e in entries)
 
 
+# What sizes and places are scored on: recordings, who measured their objects, and rendered rooms.
+SCORED = re.compile(
+    r"7-?scenes|kitchen|hololens|\bTUM\b|MRHan|SO-?SLAM|fr[123]|\bTUW\b|aldoma|cubeslam|\bADT\b|"
+    r"\baria\b|render|examples/",
+    re.IGNORECASE,
+)
+
+
+@pytest.mark.parametrize(
+    ("source", "scored"),
+    [("TUM hand GT (MRHan)+own knowledge", True), ("Objectron/CenterPose+ProcTHOR", False)],
+)
+def test_scored_sets_are_known_by_name(source: str, scored: bool) -> None:
+    assert bool(SCORED.search(source)) == scored
+
+
+def test_no_prior_comes_from_a_scored_set() -> None:
+    table = json.loads(Path(q.__file__).with_name("priors.json").read_text())
+    sources = {"about": table.pop("about")["sources"]}
+    table.pop("aliases")
+    for name, entry in table.items():
+        sources[name] = entry["source"]
+        sources[f"{name}, axis_ratio"] = entry["axis_ratio"]["source"]
+    assert len(sources) > 200
+    assert [name for name, source in sources.items() if SCORED.search(source)] == []
+
+
 def test_garbled_priors_are_named(tmp_path: Path) -> None:
     path = tmp_path / "p.json"
     path.write_text('{"chair": {"size_m": {"mean": [1, 2, 3]}}}')
