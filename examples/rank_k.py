@@ -4,7 +4,7 @@
     python examples/rank_k.py --rooms 900 901 902 903 904 --recording redkitchen_7scenes \\
         --models mobilenetv2_feat --person osnet_x0_25_msmt17 -o OUT
 
-writes OUT/rank_k.csv, OUT/by_bin.csv, OUT/cost.csv and plots, and prints Markdown tables.
+writes OUT/rank_k.csv, by_bin.csv, counts.csv, cost.csv and plots, and prints Markdown tables.
 
 Every labelled detection is a query; its gallery are the labelled detections of *other* frames.
 Protocols:
@@ -33,9 +33,14 @@ Scenes:
                      annotated; poses_c2w.txt and intrinsics.json give view angles where they exist.
   --depth DIR...     the same folder, identities from depth/ and poses: detections_*.csv back-
                      projected and clustered (the protocol of the frozen-backbone table).
-  --scannet DIR...   ScanNet or Matterport3D layout: color/, instance-filt/ (or instance/) label
-                     images, *.aggregation.json or *.semseg.json, pose/. Options of the CLOVER
-                     protocol: --views 8 --min-mask 10000 --min-side 100.
+  --scannet DIR...   ScanNet as SensReader exports it, or a house of Matterport3D, with label images
+                     (reid_scenes.py says which files). Options of the CLOVER protocol:
+                     --views 8 --min-mask 10000 --min-side 100.
+With --detect MODEL the boxes and masks are those of a detector, each associated with the labelled
+instance of its frame and category that it overlaps with (IoU .5). Views and instances of each class
+(the thesis's tables 3.1 and 3.2) are printed and stand in OUT/counts.csv.
+With --pictures N, OUT/matches_SET_METHOD.jpg shows queries, their best five matches by foreground,
+background and both, and which of them are right.
 """
 
 from __future__ import annotations
@@ -43,9 +48,7 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
-import hashlib
 import itertools
-import json
 import os
 import sys
 import time
@@ -59,13 +62,22 @@ import numpy as np
 import numpy.typing as npt
 
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
+from reid_scenes import (
+    Scene,
+    depth_scene,
+    detected_scene,
+    read_image,
+    recording_scene,
+    room_scene,
+    scannet_scene,
+    view_counts,
+)
+
 import reobj_track as rt
-from reobj.cameras import viewing_rays
 from reobj.files import atomic
 from reobj.identity.crops import flat_maps
 from reobj.identity.reid import RETURN_ODDS, SimilarityCalibration, match_probability
-from reobj.results.evaluation import ABSENT, SCORED, read_truth
-from reobj.sources.masks import NO_RUNS, rle_decode, rle_encode
+from reobj.sources.masks import NO_RUNS
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session
 from reobj.types import Array, BoolArray, Image, IntArray
 
@@ -73,340 +85,12 @@ Look = Callable[[Image, rt.Detections, IntArray], rt.Embeddings]
 
 ANGLES_DEG = (0, 15, 30, 45, 60, 90, 180)
 GAPS = (0, 30, 60, 120, 240, 10**9)  # frames
-RANKS = (1, 5, 20, 50)
+RANKS = (1, 5, 10, 20, 50)
 PARTS = ("fg", "bg")
 COLUMNS = (("twins", "any"), ("twins", "away"), ("single", "away"), ("open", "away"))  # printed
 DRAWS = 1000  # of the bootstrap
 DRAWN_GALLERIES = 10  # of the single-shot protocol
-
-
-# ---- Scenes --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """Images of one place with labelled detections, as a struct of arrays (F frames, N rows).
-
-    Attributes:
-        images: F files. number: (F,) frame numbers in the recording.
-        row: (N,) frame of each detection, an index of images. xyxy: (N, 4).
-        name: (N,) class names. model: (N,) what looks identical, -1 unknown.
-        identity: (N,) from 1; 0: not scored, only known not to be background.
-        sight: (N, 3) unit vector from the camera to the object in world axes, NaN if unknown.
-        runs: N run lengths of masks for images of `size` (w, h), empty where there is none.
-    """
-
-    title: str
-    images: list[Path]
-    number: IntArray
-    row: IntArray
-    xyxy: Array
-    name: npt.NDArray[np.str_]
-    model: IntArray
-    identity: IntArray
-    sight: Array
-    runs: list[Any]
-    size: tuple[int, int]
-
-    def at(self, f: int) -> tuple[Image, rt.Detections, IntArray]:
-        """Image of frame f, all its detections, and which of them are scored."""
-        rows = np.flatnonzero(self.row == f)
-        runs = [self.runs[i] for i in rows]
-        masks = None
-        if any(map(len, runs)):
-            masks = np.stack([rle_decode(r, self.size) for r in runs])  # (D, H, W)
-        classes = np.unique(self.name, return_inverse=True)[1][rows].astype(np.int64)
-        found = rt.Detections(self.xyxy[rows], np.ones(len(rows)), classes, masks)
-        return read_image(self.images[f]), found, np.flatnonzero(self.identity[rows] > 0)
-
-    @property
-    def scored(self) -> IntArray:
-        """(n,) rows that are scored, in the order of frames."""
-        order = np.argsort(self.row, kind="stable")
-        return order[self.identity[order] > 0]
-
-    def sampled(self, every: int) -> Scene:
-        """Keep every n-th frame."""
-        keep = np.arange(0, len(self.images), every)
-        rows = np.isin(self.row, keep)
-        arrays = {k: getattr(self, k)[rows] for k in ("xyxy", "name", "model", "identity", "sight")}
-        return dataclasses.replace(
-            self, **arrays, images=[self.images[f] for f in keep], number=self.number[keep],
-            row=np.searchsorted(keep, self.row[rows]),
-            runs=[r for r, kept in zip(self.runs, rows, strict=True) if kept],
-        )  # fmt: skip
-
-
-def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any]:
-    """Read an image (BGR unless flags say otherwise), or say which one cannot be read."""
-    image = cv2.imread(str(path), flags)
-    if image is None:
-        raise rt.ReobjError(f"{path}: cannot be read as an image")
-    return np.asarray(image)
-
-
-# ---- Rendered rooms ------------------------------------------------------------------------------
-
-
-def room_scene(
-    seed: int, cache: Path, every: int = 6, plan: str = "home", min_side: float = 24.0
-) -> Scene:
-    """A room of render_room.py, sampled widely; rendered once for each version of the renderer."""
-    import render_room
-
-    version = hashlib.sha256(Path(render_room.__file__).read_bytes()).hexdigest()[:8]
-    folder = cache / f"{plan}_{seed}_{every}_{version}"
-    if not (folder / "scene.npz").exists():
-        config = render_room.RoomConfig(seed=seed)
-        if plan != "home":
-            changes: dict[str, Any] = {"plan": plan, "path": "tour"}
-            config = dataclasses.replace(config, **changes)
-        render_scene(config, folder, every)
-    with np.load(folder / "scene.npz") as data:
-        part = {k: data[k] for k in data.files}
-    runs = np.split(part["mask_counts"], part["mask_offsets"][1:-1])
-    side = (part["xyxy"][:, 2:] - part["xyxy"][:, :2]).min(1)
-    clear = (part["visibility"] >= 0.3) & (side >= min_side)
-    files = [folder / f"{n:05d}.jpg" for n in part["number"]]
-    return Scene(
-        f"{plan} {seed}", files, part["number"], part["row"], part["xyxy"], part["name"],
-        part["model"], np.where(clear, part["identity"], 0), part["sight"], runs,
-        (int(part["size"][0]), int(part["size"][1])),
-    )  # fmt: skip
-
-
-def render_scene(config: Any, folder: Path, every: int) -> None:
-    """Render every n-th frame of a clip with detector-like boxes and masks into a folder."""
-    import render_room as rr
-
-    folder.mkdir(parents=True, exist_ok=True)
-    seed, room, K = config.seed, rr.make_room(config), rr.camera_matrix(config)
-    poses = rr.camera_path(room, config)
-    rows: list[dict[str, Any]] = []
-    numbers = np.arange(0, len(poses) - 1, every)
-    for f, number in enumerate(numbers):
-        own = dataclasses.replace(config, seed=1000 * seed + int(number))  # noise and exposure
-        frame = next(rr.render_clip(room, own, poses[number : number + 2]))
-        cv2.imwrite(str(folder / f"{number:05d}.jpg"), frame.image, [cv2.IMWRITE_JPEG_QUALITY, 95])
-        rng = np.random.default_rng([seed, 5, int(number)])
-        found = rr.simulate_detections(
-            room, frame.truth, frame.instance, rr.DetectorConfig(false_positives=0), rng
-        )
-        sight = viewing_rays(found.xyxy, K @ poses[number])
-        for i, k in enumerate(found.truth_index):
-            item = room.objects[k]
-            rows.append({
-                "row": f, "xyxy": found.xyxy[i], "name": item.class_name, "sight": sight[i],
-                "model": item.twin_group, "identity": item.index + 1,
-                "visibility": frame.truth.visibility[k], "run": rr.run_lengths(found.masks[i]),
-            })  # fmt: skip
-    lengths = [len(r["run"]) for r in rows]
-    arrays: dict[str, Any] = {k: np.array([r[k] for r in rows]) for k in rows[0] if k != "run"}
-    with atomic(folder / "scene.npz") as part, part.open("wb") as file:
-        np.savez_compressed(
-            file, **arrays, number=numbers, size=np.array([config.width, config.height]),
-            mask_counts=np.concatenate([r["run"] for r in rows]),
-            mask_offsets=np.concatenate([[0], np.cumsum(lengths)]),
-        )  # fmt: skip
-
-
-# ---- Recordings ----------------------------------------------------------------------------------
-
-
-def recording_scene(folder: Path, every: int = 1, min_visibility: float = 0.0) -> Scene:
-    """A folder with images/ and gt_mot.txt, gt.txt or gt/gt.txt (MOTChallenge, 1-based frames)."""
-    known = [folder / n for n in ("gt_mot.txt", "gt.txt", "gt/gt.txt", "tracks.txt")]
-    truth_file = next((p for p in known if p.is_file()), None)
-    if truth_file is None:
-        raise rt.ReobjError(f"{folder}: expected identities in gt_mot.txt, gt.txt or gt/gt.txt")
-    files = image_files(folder)
-    truth = read_truth(truth_file, rt.COCO_NAMES, min_visibility)
-    truth = truth[truth.role != ABSENT]
-    if len(truth) and truth.frame.max() > len(files):
-        raise rt.ReobjError(
-            f"{truth_file}: frame {truth.frame.max()} of {len(files)} images in {folder}: give the "
-            "folder that holds every frame"
-        )
-    size = read_image(files[0]).shape[1::-1]
-    n = len(truth)
-    scene = Scene(
-        folder.name, files, np.arange(len(files)), truth.frame - 1, truth.xyxy, truth.name,
-        np.full(n, -1), np.where(truth.role == SCORED, truth.identity, 0),
-        sights(folder, truth.frame - 1, truth.xyxy), [NO_RUNS] * n, (size[0], size[1]),
-    )  # fmt: skip
-    return scene.sampled(every)
-
-
-def image_files(folder: Path) -> list[Path]:
-    """Images of a recording in natural order."""
-    for name in ("images", "img1", "color", "rgb", "undistorted_color_images"):
-        files = [p for p in (folder / name).glob("*") if p.suffix.lower() in (".jpg", ".png")]
-        if files:
-            return sorted(files, key=lambda p: (len(p.stem), p.stem))
-    raise rt.ReobjError(f"{folder}: expected images in images/, img1/, color/ or rgb/")
-
-
-def sights(folder: Path, row: IntArray, xyxy: Array) -> Array:
-    """View directions (N, 3) where poses_c2w.txt and intrinsics.json exist, else NaN."""
-    sight = np.full((len(row), 3), np.nan)
-    files = (folder / "poses_c2w.txt", folder / "intrinsics.json")
-    if not all(p.is_file() for p in files):
-        return sight
-    cams = np.linalg.inv(np.loadtxt(files[0]).reshape(-1, 4, 4))[:, :3]  # (F, 3, 4)
-    K = pinhole(json.loads(files[1].read_text()))
-    for f in np.unique(row):
-        sight[row == f] = viewing_rays(xyxy[row == f], K @ cams[f])
-    return sight
-
-
-def pinhole(numbers: dict[str, Any]) -> Array:
-    """(3, 3) from fx, fy, cx, cy."""
-    fx, fy, cx, cy = (float(numbers[k]) for k in ("fx", "fy", "cx", "cy"))
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def depth_scene(folder: Path, min_score: float = 0.3, reach: float = 0.3) -> Scene:
-    """Identities without annotation: detections of the frames that have depth, clustered in 3D.
-
-    A detection's place is the median back-projected point of the middle of its box; detections of
-    a class belong together when their places chain within `reach` times 1 m (single linkage).
-    """
-    from scipy.cluster.hierarchy import fcluster, linkage
-
-    files = image_files(folder)
-    found = np.loadtxt(next(folder.glob("detections_*.csv")), delimiter=",")
-    found = found[found[:, 5] >= min_score]
-    poses = np.loadtxt(folder / "poses_c2w.txt").reshape(-1, 4, 4)
-    numbers = json.loads((folder / "intrinsics.json").read_text())
-    stems = {p.stem: f for f, p in enumerate(files)}
-    depths = {stems[p.stem]: p for p in sorted((folder / "depth").glob("*.png"))}
-    found = found[np.isin(found[:, 0], list(depths))]
-    place = np.array([
-        center_in_world(rt_depth, box, poses[int(f)], numbers)
-        for f, box in zip(found[:, 0], found[:, 1:5], strict=True)
-        for rt_depth in [depths[int(f)]]
-    ])  # (N, 3)  # fmt: skip
-    good = np.isfinite(place).all(1)
-    found, place = found[good], place[good]
-    identity, count = np.zeros(len(found), np.int64), 0
-    for c in np.unique(found[:, 6]):
-        own = np.flatnonzero(found[:, 6] == c)
-        labels = np.ones(1, int)
-        if len(own) > 1:
-            labels = fcluster(linkage(place[own], "average"), reach, "distance")
-        identity[own] = labels + count
-        count += int(labels.max())
-    row = found[:, 0].astype(np.int64)
-    size = read_image(files[0]).shape[1::-1]
-    return Scene(
-        f"{folder.name} (depth)", files, np.arange(len(files)), row, found[:, 1:5],
-        np.array(rt.COCO_NAMES)[found[:, 6].astype(int)], np.full(len(row), -1), identity,
-        sights(folder, row, found[:, 1:5]), [NO_RUNS] * len(row), (size[0], size[1]),
-    )  # fmt: skip
-
-
-def center_in_world(path: Path, xyxy: Array, world_from_cam: Array, numbers: Any) -> Array:
-    """Median point (3,) of the middle of a box in a depth image (mm), NaN if there is no depth."""
-    depth = read_image(path, cv2.IMREAD_UNCHANGED).astype(np.float64) / 1000  # (H, W) m
-    K = pinhole(numbers.get("depth", numbers))
-    shift = np.asarray(numbers.get("T_color_from_depth", [0, 0, 0]), float)
-    rows, cols = np.nonzero((depth > 0.2) & (depth < 8))
-    z = depth[rows, cols]
-    points = np.stack([(cols + 0.5 - K[0, 2]) * z / K[0, 0], (rows + 0.5 - K[1, 2]) * z / K[1, 1],
-                       z], 1) + shift  # (P, 3) in the colour camera  # fmt: skip
-    pixels = points @ pinhole(numbers).T
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    middle, half = (xyxy[:2] + xyxy[2:]) / 2, (xyxy[2:] - xyxy[:2]) / 4
-    inside = (np.abs(pixels - middle) <= half).all(1)
-    if inside.sum() < 5:
-        return np.full(3, np.nan)
-    point = np.median(points[inside], 0)
-    return np.asarray(world_from_cam[:3, :3] @ point + world_from_cam[:3, 3])
-
-
-# ---- ScanNet and Matterport3D --------------------------------------------------------------------
-
-
-def scannet_scene(
-    folder: Path, every: int = 1, min_mask: int = 0, min_side: float = 0.0, views: int = 0
-) -> Scene:
-    """A scene exported in ScanNet's layout; Matterport3D with rendered label images likewise.
-
-    Label images hold objectId + 1 (ScanNet's instance-filt), 0 is nothing. Every visible object
-    takes part; scored are those with `min_mask` pixels, a box side of `min_side` and fewer than two
-    image borders touched (CLOVER), at most `views` evenly chosen ones of each instance.
-    """
-    names = instance_names(folder)
-    files = image_files(folder)[::every]
-    numbers, boxes, labels, runs, rows, scored = [], [], [], [], [], []
-    size = (0, 0)
-    for f, path in enumerate(files):
-        label = label_image(folder, path.stem)
-        size = label.shape[1], label.shape[0]
-        numbers.append(int("".join(c for c in path.stem if c.isdigit()) or f))
-        for k in np.setdiff1d(np.unique(label), [0]):
-            mask = label == k
-            y, x = np.nonzero(mask)
-            box = np.array([x.min(), y.min(), x.max() + 1, y.max() + 1], float)
-            touched = (box[0] <= 0) + (box[1] <= 0) + (box[2] >= size[0]) + (box[3] >= size[1])
-            good = len(x) >= min_mask and (box[2:] - box[:2]).min() >= min_side and touched < 2
-            boxes.append(box)
-            labels.append(int(k))
-            runs.append(rle_encode(np.ascontiguousarray(mask)))
-            rows.append(f)
-            scored.append(good and int(k) in names)
-    identity = np.where(scored, labels, 0)
-    if views:
-        identity = evenly(identity, views)
-    xyxy, row = np.array(boxes).reshape(-1, 4), np.array(rows, np.int64)
-    sight = scannet_sights(folder, [p.stem for p in files], row, xyxy)
-    class_name = np.array([names.get(k, "") for k in labels], str)
-    return Scene(
-        folder.name, files, np.array(numbers), row, xyxy, class_name, np.full(len(row), -1),
-        identity, sight, runs, size,
-    )  # fmt: skip
-
-
-def evenly(identity: IntArray, views: int) -> IntArray:
-    """Keep at most so many evenly spaced rows of each identity, 0 for the others."""
-    kept = np.zeros_like(identity)
-    for k in np.setdiff1d(np.unique(identity), [0]):
-        rows = np.flatnonzero(identity == k)
-        kept[rows[np.unique(np.linspace(0, len(rows) - 1, views).round().astype(int))]] = k
-    return kept
-
-
-def instance_names(folder: Path) -> dict[int, str]:
-    """Class name of each label value, from ScanNet's aggregation or Matterport3D's semseg file."""
-    files = sorted([*folder.glob("*aggregation.json"), *folder.glob("*.semseg.json")])
-    if not files:
-        raise rt.ReobjError(f"{folder}: expected SCENE.aggregation.json or SCENE.semseg.json")
-    try:
-        groups = json.loads(files[0].read_text())["segGroups"]
-        return {int(g.get("objectId", g.get("id"))) + 1: str(g["label"]) for g in groups}
-    except (KeyError, TypeError, ValueError) as error:
-        raise rt.ReobjError(f"{files[0]}: expected segGroups with objectId and label") from error
-
-
-def label_image(folder: Path, stem: str) -> IntArray:
-    """The label image of a frame, (H, W)."""
-    for name in ("instance-filt", "instance", "instance-raw"):
-        path = folder / name / f"{stem}.png"
-        if path.is_file():
-            return np.asarray(read_image(path, cv2.IMREAD_UNCHANGED), np.int64)
-    raise rt.ReobjError(f"{folder}: expected instance-filt/{stem}.png for color/{stem}")
-
-
-def scannet_sights(folder: Path, stems: Sequence[str], row: IntArray, xyxy: Array) -> Array:
-    """View directions from pose/STEM.txt (world_from_cam) and intrinsic/intrinsic_color.txt."""
-    sight = np.full((len(row), 3), np.nan)
-    intrinsic = folder / "intrinsic" / "intrinsic_color.txt"
-    for f, stem in enumerate(stems):
-        pose = folder / "pose" / f"{stem}.txt"
-        if intrinsic.is_file() and pose.is_file():
-            K = np.loadtxt(intrinsic)[:3, :3]
-            sight[row == f] = viewing_rays(xyxy[row == f], K @ np.linalg.inv(np.loadtxt(pose))[:3])
-    return sight
+BEST = 5  # matches in a picture, as in the thesis
 
 
 # ---- Looks ---------------------------------------------------------------------------------------
@@ -953,6 +637,9 @@ def evaluate(
             found = reliabilities(scene_cases(scenes, parts, args.weight))
             trust += [{"set": title, "method": method, **r} for r in found]
         cosines = setups(parts, names, args.weight)
+        if args.pictures:
+            path = args.out / f"matches_{file_name(title)}_{file_name(method)}.jpg"
+            draw_matches(path, scenes, pairs, cosines, args.away, args.pictures)
         for setup, cosine in cosines.items():
             head = {"set": title, "method": method, "setup": setup}
             for kind in kinds:
@@ -1015,6 +702,110 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def markdown_ranks(rows: Sequence[dict[str, Any]]) -> str:
+    """Rank-1, -5, -10 and -20 with all scenes and classes in the gallery, as in the thesis."""
+    lines = ["Rank-1 / 5 / 10 / 20, percent (open, away)", ""]
+    lines += ["| set | method | setup | Rank-1 | Rank-5 | Rank-10 | Rank-20 |", "|---" * 7 + "|"]
+    for r in rows:
+        if (r["protocol"], r["gap"]) == ("open", "away"):
+            cells = " | ".join(f"{r[f'rank{k}']:.1f}" for k in (1, 5, 10, 20))
+            lines.append(f"| {r['set']} | {r['method']} | {r['setup']} | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+def markdown_counts(counts: Sequence[dict[str, Any]]) -> str:
+    """Views and instances of each class, and their sums, one table for all sets."""
+    lines = ["| set | class | views | instances |", "|---|---|---|---|"]
+    for title in dict.fromkeys(r["set"] for r in counts):
+        own = [r for r in counts if r["set"] == title]
+        total = {k: sum(r[k] for r in own) for k in ("views", "instances")}
+        for r in [*own, {"set": title, "class": "*all*", **total}]:
+            lines.append(f"| {r['set']} | {r['class']} | {r['views']} | {r['instances']} |")
+    return "\n".join(lines) + "\n"
+
+
+def file_name(text: str) -> str:
+    """A text without what file names should not have."""
+    return text.replace(", ", "_").replace(" ", "_").replace("/", "_")
+
+
+# ---- Pictures of matches -------------------------------------------------------------------------
+
+CELL = 120  # px of a picture of one match
+CAPTION = 16  # px of the line below it
+RIGHT, WRONG, QUERY = (60, 170, 40), (40, 40, 220), (90, 90, 90)  # BGR
+
+
+def draw_matches(
+    path: Path,
+    scenes: Sequence[Scene],
+    pairs: Pairs,
+    cosines: dict[str, npt.NDArray[Any]],
+    away: int,
+    count: int,
+) -> None:
+    """Draw some queries and their BEST matches, right or wrong, a row for each setup.
+
+    The gallery is that of the protocol `open`, more than `away` frames from the query, or any other
+    frame where that holds no right one.
+    """
+    allowed, same = pairs.gallery("open", away), pairs.same()
+    near = ~(same & allowed).any(1)
+    allowed[near] = pairs.gallery("open", 0)[near]
+    queries = chosen_queries(same & allowed, ~same & allowed, pairs.identity, count)
+    place = [(s, int(r)) for s in scenes for r in s.scored]  # of the rows of the pairs
+    lines = []
+    for q in queries:
+        for setup, cosine in cosines.items():
+            best = best_matches(cosine[q], allowed[q])
+            cells = [match_cell(*place[int(q)], QUERY, f"query: {setup}")]
+            for rank, j in enumerate(best, 1):
+                text = "right" if same[q, j] else "wrong"
+                color = RIGHT if same[q, j] else WRONG
+                cells.append(match_cell(*place[int(j)], color, f"{rank} {text} {cosine[q, j]:.2f}"))
+            blank = np.full_like(cells[0], 255)
+            lines.append(np.hstack(cells + [blank] * (BEST + 1 - len(cells))))
+    if not lines:
+        raise rt.ReobjError(f"{path.name}: no object is seen twice beside another: no pictures")
+    with atomic(path) as part:
+        part.write_bytes(cv2.imencode(".jpg", np.vstack(lines))[1].tobytes())
+
+
+def chosen_queries(
+    right: BoolArray, wrong: BoolArray, identity: IntArray, count: int, seed: int = 0
+) -> IntArray:
+    """Random queries whose gallery holds a right and a wrong one, first one of each identity."""
+    valid = np.random.default_rng(seed).permutation(np.flatnonzero(right.any(1) & wrong.any(1)))
+    first = np.sort(np.unique(identity[valid], return_index=True)[1])
+    order = np.concatenate([valid[first], np.delete(valid, first)])
+    return np.asarray(order[:count])
+
+
+def best_matches(cosine: npt.NDArray[Any], allowed: BoolArray, count: int = BEST) -> IntArray:
+    """The most similar rows of the gallery of one query, best first: at most `count`."""
+    order = np.argsort(-np.where(allowed, cosine, -np.inf), kind="stable")
+    return np.asarray(order[: min(count, int(allowed.sum()))])
+
+
+def match_cell(scene: Scene, row: int, color: tuple[int, int, int], text: str) -> Image:
+    """One object with its surroundings (twice its box) in a frame of a colour, and a caption."""
+    image, box = read_image(scene.images[scene.row[row]]), scene.xyxy[row]
+    middle, half = (box[:2] + box[2:]) / 2, float((box[2:] - box[:2]).max())
+    scale = (CELL - 8) / (2 * half)
+    affine = np.column_stack([np.eye(2) * scale, (CELL - 8) / 2 - scale * middle])  # (2, 3)
+    inner = cv2.warpAffine(image, affine, (CELL - 8, CELL - 8), borderValue=(200, 200, 200))
+    x1, y1, x2, y2 = (box * scale + np.tile(affine[:, 2], 2)).astype(int)
+    cv2.rectangle(inner, (x1, y1), (x2, y2), (255, 255, 255), 1)
+    cell = np.full((CELL + CAPTION, CELL, 3), 255, np.uint8)
+    cell[:CELL] = color
+    cell[4 : CELL - 4, 4 : CELL - 4] = inner
+    cv2.putText(cell, text, (3, CELL + 12), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (0, 0, 0), 1)
+    return cell
+
+
+# ---- Plots ---------------------------------------------------------------------------------------
+
+
 def plot_bins(bins: Sequence[dict[str, Any]], out: Path) -> None:
     """Twin Rank-1 against view angle and time gap, one picture a set."""
     plt = pyplot()
@@ -1035,7 +826,7 @@ def plot_bins(bins: Sequence[dict[str, Any]], out: Path) -> None:
             axes[1].legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5))
         figure.suptitle(title, fontsize=10)
         figure.tight_layout()
-        figure.savefig(out / f"rank_k_{title.replace(', ', '_').replace(' ', '_')}.png", dpi=80)
+        figure.savefig(out / f"rank_k_{file_name(title)}.png", dpi=80)
         plt.close(figure)
 
 
@@ -1067,6 +858,13 @@ def scene_sets(args: Any) -> dict[str, list[Scene]]:
             scannet_scene(f, args.every, args.min_mask, args.min_side, args.views)
             for f in args.scannet
         ]
+    if args.detect:
+        detect = rt.OnnxDetector(args.detect, threads=1)
+        for title, scenes in sets.items():
+            sets[title] = [detected_scene(s, detect, detect.class_names) for s in scenes]
+    for title, scenes in sets.items():
+        if not any(len(s.scored) for s in scenes):
+            raise rt.ReobjError(f"{title}: no view is scored: too small, or labels without names")
     return sets
 
 
@@ -1082,6 +880,10 @@ def build_parser() -> argparse.ArgumentParser:
     add("--recording", type=Path, nargs="*", default=[], metavar="DIR")
     add("--depth", type=Path, nargs="*", default=[], metavar="DIR")
     add("--scannet", type=Path, nargs="*", default=[], metavar="DIR")
+    add("--detect", default="", metavar="MODEL",
+        help="a detector's boxes, associated with the labelled ones, instead of these")  # fmt: skip
+    add("--pictures", type=int, default=0, metavar="N",
+        help="draw N queries of each set with their best five matches")  # fmt: skip
     add("--cache", type=Path, default=Path("build/rank_k"), help="for rendered rooms")
     add("--every", type=int, default=6, help="use every n-th frame (default %(default)s)")
     add("--away", type=int, default=30, help="frames that count as away (default %(default)s)")
@@ -1108,6 +910,9 @@ def measure(args: Any) -> None:
     if not sets:
         raise rt.ReobjError("nothing to measure: give --rooms, --recording, --depth or --scannet")
     args.out.mkdir(parents=True, exist_ok=True)
+    counts = [r for title, scenes in sets.items() for r in view_counts(title, scenes)]
+    write_csv(args.out / "counts.csv", counts)
+    print(markdown_counts(counts))
     found = [evaluate(title, scenes, args) for title, scenes in sets.items()]
     rows, bins, trust = ([r for part in found for r in part[i]] for i in range(3))
     write_csv(args.out / "rank_k.csv", rows)
@@ -1117,6 +922,7 @@ def measure(args: Any) -> None:
         write_csv(args.out / "calibration.csv", trust)
         plot_reliability(trust, args.out)
     print(markdown(rows))
+    print(markdown_ranks(rows))
     methods = looks(args)
     for title in sets:
         own = [r for r in rows if r["set"] == title]

@@ -15,7 +15,7 @@ What it learns from; every source may be given several times:
                         the views that observe the point show the same place from another side.
   --tracks IMAGES=FILE  `tracks.txt` of `run` (MOTChallenge): identity by 3D object. Masks
                         are those of the detector (OUT/cache, or a detections .npz beside FILE).
-  --scannet DIR         a scene in ScanNet's or Matterport3D's layout, as rank_k.py reads it.
+  --scannet DIR         a scene in ScanNet's or Matterport3D's layout, as reid_scenes.py reads it.
 Validation: --val-rooms A:B, --val-sparse.
 
 Method: each step takes several scenes and several views of each, and changes every picture as
@@ -278,10 +278,10 @@ def paint(label: Image, found: rt.Detections, xyxy: Array, identity: IntArray) -
 
 
 def scannet_clip(folder: Path) -> Clip:
-    """Instances of a scene in ScanNet's layout (`rank_k.scannet_scene`), 120 views at most."""
-    import rank_k
+    """Instances of a scene in ScanNet's layout (`reid_scenes.scannet_scene`), 120 views at most."""
+    import reid_scenes
 
-    scene = rank_k.scannet_scene(folder)
+    scene = reid_scenes.scannet_scene(folder)
     scene = scene.sampled(-(-len(scene.images) // 120))
     names, identity = np.unique(scene.identity, return_inverse=True)
     looks = np.unique(scene.name, return_inverse=True)[1]

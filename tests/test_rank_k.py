@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import rank_k as rk
+import reid_scenes as rs
 
 import reobj_track as rt
 from reobj.identity.reid import SimilarityCalibration
@@ -144,7 +146,7 @@ def test_interval_holds_the_mean_and_shrinks_with_identities() -> None:
 
 @pytest.fixture
 def scannet(tmp_path: Path) -> Path:
-    """A tiny scene in ScanNet's layout: two chairs and a lamp that is not in the aggregation."""
+    """A tiny scene with ScanNet's names: two chairs and a lamp that is not in the aggregation."""
     folder = tmp_path / "scene0000_00"
     for name in ("color", "instance-filt", "pose", "intrinsic"):
         (folder / name).mkdir(parents=True)
@@ -160,7 +162,10 @@ def scannet(tmp_path: Path) -> Path:
         pose[:3, :3] = turn
         np.savetxt(folder / "pose" / f"{f}.txt", pose)
     groups = [{"id": k, "objectId": k, "segments": [], "label": "chair"} for k in (0, 1)]
-    (folder / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": groups}))
+    groups.append({"id": 2, "objectId": 2, "segments": [], "label": "wall"})
+    text = json.dumps({"sceneId": "scannet.scene0000_00", "segGroups": groups})
+    (folder / "scene0000_00.aggregation.json").write_text(text)
+    (folder / "scene0000_00_vh_clean.aggregation.json").write_text(text)
     return folder
 
 
@@ -189,11 +194,163 @@ def test_scannet_options(scannet: Path, options: dict, scored: int) -> None:
     assert int((rk.scannet_scene(scannet, **options).identity > 0).sum()) == scored
 
 
+def relabel(scannet: Path, boxes: dict[int, tuple[int, int, int, int]]) -> rk.Scene:
+    """The scene with other label images: value -> x1, y1, x2, y2."""
+    label = np.zeros((60, 80), np.uint8)
+    for value, (x1, y1, x2, y2) in boxes.items():
+        label[y1:y2, x1:x2] = value
+    for path in (scannet / "instance-filt").glob("*.png"):
+        cv2.imwrite(str(path), label)
+    return rk.scannet_scene(scannet)
+
+
+@pytest.mark.parametrize(
+    ("box", "scored"),
+    [
+        ((20, 20, 40, 40), True),
+        ((0, 20, 40, 40), True),  # one border
+        ((20, 20, 80, 40), True),
+        ((0, 0, 40, 40), False),  # two: a corner
+        ((40, 30, 80, 60), False),
+        ((0, 20, 80, 40), False),  # two that face each other
+        ((0, 0, 80, 40), False),  # three
+    ],
+)
+def test_two_borders_are_too_many(scannet: Path, box: tuple, scored: bool) -> None:
+    assert (relabel(scannet, {1: box}).identity > 0).all() == scored
+
+
+def test_walls_are_no_objects(scannet: Path) -> None:
+    scene = relabel(scannet, {3: (20, 20, 40, 40), 1: (50, 20, 60, 40)})
+    assert set(scene.name[scene.identity > 0]) == {"chair"} and "wall" in scene.name
+
+
+def test_a_lost_pose_has_no_view_direction(scannet: Path) -> None:
+    np.savetxt(scannet / "pose" / "5.txt", np.full((4, 4), -np.inf))  # as ScanNet has it
+    scene = rk.scannet_scene(scannet)
+    assert np.isnan(scene.sight[scene.row == 1]).all()
+    assert np.isfinite(scene.sight[scene.row != 1]).all()
+
+
+def test_labels_of_another_size_are_stretched(scannet: Path) -> None:
+    for path in (scannet / "color").glob("*.jpg"):
+        cv2.imwrite(str(path), np.full((120, 160, 3), 90, np.uint8))
+    scene = rk.scannet_scene(scannet)
+    assert scene.size == (160, 120) and scene.xyxy[0].tolist() == [0, 20, 60, 80]
+
+
+PANORAMAS = ("5b9b2794954e4694a45fc424a8643081", "8c7e2b3d0f1a4c5e9d6b7a8f90123456")
+HOUSE = "17DRP5sb8fy"
+
+
+@pytest.fixture
+def matterport(tmp_path: Path) -> Path:
+    """A tiny house with Matterport3D's names: two panoramas, two yaws each, a chair and a wall."""
+    folder = tmp_path / HOUSE
+    names = ("undistorted_color_images", "undistorted_camera_parameters", "instance",
+             "house_segmentations", "region_segmentations")  # fmt: skip
+    for name in names:
+        (folder / name).mkdir(parents=True)
+    text = ["dataset matterport", "n_images 4", "depth_directory undistorted_depth_images",
+            "color_directory undistorted_color_images", ""]  # fmt: skip
+    text.append("intrinsics_matrix 100 0 40  0 100 20  0 0 1")  # cy from below: 60 - 20 from above
+    for p, panorama in enumerate(PANORAMAS):
+        for yaw in (0, 1):
+            color = f"{panorama}_i1_{yaw}.jpg"
+            label = np.zeros((60, 80), np.uint16)
+            label[35:45, 35:45], label[:5] = 301, 1
+            cv2.imwrite(str(folder / names[0] / color), np.full((60, 80, 3), 90, np.uint8))
+            cv2.imwrite(str(folder / "instance" / f"{panorama}_i1_{yaw}.png"), label)
+            turn, _ = cv2.Rodrigues(np.array([0, np.radians(60.0 * yaw), 0]))
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = turn, (p, 0, 0)
+            numbers = " ".join(map(str, pose.ravel()))
+            text.append(f"scan {panorama}_d1_{yaw}.png {color} {numbers}")
+    (folder / names[1] / f"{HOUSE}.conf").write_text("\n".join(text) + "\n")
+    groups = [{"id": k, "objectId": k, "segments": [], "label": label}
+              for k, label in ((0, "wall"), (300, "dining chair"))]  # fmt: skip
+    path = folder / "house_segmentations" / f"{HOUSE}.semseg.json"
+    path.write_text(json.dumps({"sceneId": f"mp3d.{HOUSE}", "segGroups": groups}))
+    region = [{"id": 300, "objectId": 300, "segments": [], "label": "of a region only"}]
+    path = folder / "region_segmentations" / "region0.semseg.json"
+    path.write_text(json.dumps({"segGroups": region}))
+    return folder
+
+
+def test_matterport_layout(matterport: Path) -> None:
+    """Its hexadecimal names, its house file, its camera axes; panoramas are "away"."""
+    scene = rk.scannet_scene(matterport)
+    assert scene.number.tolist() == [6, 7, 1006, 1007]
+    assert scene.identity[scene.name == "dining chair"].tolist() == [301] * 4
+    assert scene.name[scene.identity > 0].tolist() == ["dining chair"] * 4
+    chairs = np.flatnonzero(scene.identity > 0)
+    # at the optical centre: the camera looks along its -z
+    np.testing.assert_allclose(scene.sight[chairs[0]], [0, 0, -1], atol=1e-9)
+    pairs = rk.pairs_of([scene])
+    assert pairs.angle_deg()[0, 1] == pytest.approx(60)
+    assert pairs.gallery("open", 30)[0].tolist() == [False, False, True, True]
+
+
+def test_matterport_without_label_images(matterport: Path) -> None:
+    (matterport / "instance" / f"{PANORAMAS[0]}_i1_0.png").unlink()
+    with pytest.raises(rt.ReobjError, match="Matterport3D has no label images; render them"):
+        rk.scannet_scene(matterport)
+    path = matterport / "undistorted_camera_parameters" / f"{HOUSE}.conf"
+    path.write_text(path.read_text() + "scan a.png b.jpg 1 2 3\n")
+    with pytest.raises(rt.ReobjError, match=r"\.conf, line 11: expected"):
+        rs.posed_images(matterport, [Path("b.jpg")], 60)
+
+
+def test_scans_that_are_not_exported_say_how(tmp_path: Path) -> None:
+    (tmp_path / "scene0000_00.sens").touch()
+    (tmp_path / "scene0000_00.aggregation.json").write_text('{"segGroups": []}')
+    with pytest.raises(rt.ReobjError, match=r"reader\.py --filename .*--export_color_images"):
+        rk.scannet_scene(tmp_path)
+
+
+def test_detections_get_the_identity_of_what_they_show(scannet: Path) -> None:
+    """By category and overlap, one to one; others are known, and not scored."""
+    for path in scannet.glob("*.aggregation.json"):
+        path.write_text(path.read_text().replace('"chair"', '"office chair"'))
+    boxes = np.array([
+        [2, 10, 30, 40],  # chair 1: "office chair" is a chair
+        [4, 10, 30, 40],  # again: the better one has it
+        [40, 10, 70, 40],  # chair 2, but a table is said
+        [42, 10, 74, 42],  # chair 2
+        [40, 10, 55, 20],  # a chair that overlaps too little
+    ], float)  # fmt: skip
+    classes = np.array([0, 0, 1, 0, 0])
+    seen: list[tuple[int, ...]] = []
+
+    def detect(image: np.ndarray) -> rt.Detections:
+        seen.append(image.shape)
+        return rt.Detections(boxes, np.ones(5), classes)
+
+    truth = rk.scannet_scene(scannet)
+    scene = rs.detected_scene(truth, detect, ("chair", "dining table"))
+    assert len(seen) == 3 and scene.identity.tolist() == [1, 0, 0, 2, 0] * 3
+    assert scene.name.tolist() == ["chair", "chair", "dining table", "chair", "chair"] * 3
+    np.testing.assert_array_equal(scene.sight[3], truth.sight[1])
+    _, found, rows = scene.at(1)
+    assert rows.tolist() == [0, 3] and found.masks is None and len(found) == 5
+
+
+def test_views_and_instances_are_counted_by_class(scannet: Path) -> None:
+    scene = rk.scannet_scene(scannet)
+    lamp = dataclasses.replace(scene, name=np.where(scene.identity == 2, "lamp", scene.name))
+    counts = rs.view_counts("both", [scene, lamp])
+    assert counts == [
+        {"set": "both", "class": "chair", "views": 9, "instances": 3},
+        {"set": "both", "class": "lamp", "views": 3, "instances": 1},
+    ]
+    assert "| both | *all* | 12 | 4 |" in rk.markdown_counts(counts)
+
+
 def test_scannet_faults(scannet: Path) -> None:
     (scannet / "instance-filt" / "5.png").unlink()
     with pytest.raises(rt.ReobjError, match=r"instance-filt/5\.png"):
         rk.scannet_scene(scannet)
-    next(scannet.glob("*.aggregation.json")).write_text("[]")
+    (scannet / "scene0000_00.aggregation.json").write_text("[]")
     with pytest.raises(rt.ReobjError, match="segGroups"):
         rk.scannet_scene(scannet)
 
@@ -225,6 +382,41 @@ def test_twins_are_told_apart_by_the_background(textured: bool, tmp_path: Path) 
     assert (rank1["bg"] == 100) == textured
     assert (rank1["concat"] == 100) == textured
     assert (out / "rank_k_clip.png").stat().st_size > 0
+
+
+def test_tables_and_pictures_of_matches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Counts, Rank-1/5/10/20, and a row of six cells for each setup of each query."""
+    out, clip = tmp_path / "out", recording(tmp_path / "clip", True)
+    words = ["--every", "1", "--no-crops", "--pictures", "2", "--away", "3", "-o", str(out)]
+    assert rk.main(["--recording", str(clip), *words]) == 0
+    printed = capsys.readouterr().out
+    assert "| clip | chair | 16 | 2 |" in printed
+    table = next(line for line in printed.splitlines() if line.startswith("| clip | reobj, frame"))
+    with (out / "rank_k.csv").open() as file:
+        row = next(r for r in csv.DictReader(file) if (r["protocol"], r["gap"]) == ("open", "away"))
+    assert table.split("|")[4:-1] == [f" {float(row[f'rank{k}']):.1f} " for k in (1, 5, 10, 20)]
+    picture = cv2.imread(str(out / "matches_clip_reobj_frame.jpg"))
+    assert picture.shape == (2 * 3 * (rk.CELL + rk.CAPTION), 6 * rk.CELL, 3)
+
+
+def test_the_frame_of_a_match_says_whether_it_is_right(tmp_path: Path) -> None:
+    """Best first; right ones of one colour, wrong ones of another, the query of a third."""
+    scene = rk.recording_scene(recording(tmp_path / "clip", True))
+    pairs = rk.pairs_of([scene])
+    same = pairs.same()
+    cosine = np.where(same, 0.5, 0.0) + np.linspace(0, 0.01, 16)[None]
+    cosine[0, np.flatnonzero(~same[0])[-1]] = 1.0  # the best match of row 0 is wrong
+    allowed = pairs.gallery("open", 0)
+    assert rk.best_matches(cosine[0], allowed[0]).tolist() == [15, 14, 12, 10, 8]
+    assert len(rk.best_matches(cosine[0], allowed[0] & (np.arange(16) > 13))) == 2
+    rk.draw_matches(tmp_path / "a.jpg", [scene], pairs, {"fg": cosine}, 0, 16)
+    picture = cv2.imread(str(tmp_path / "a.jpg")).astype(int)
+    queries = rk.chosen_queries(same & allowed, ~same & allowed, pairs.identity, 16)
+    assert sorted(queries) == list(range(16)) and len(set(pairs.identity[queries[:2]])) == 2
+    line = queries.tolist().index(0) * (rk.CELL + rk.CAPTION) + rk.CELL // 2
+    colors = [rk.QUERY, rk.WRONG, *[rk.RIGHT] * 4]
+    for k, color in enumerate(colors):
+        np.testing.assert_allclose(picture[line, k * rk.CELL + 1], color, atol=25)
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
