@@ -418,9 +418,8 @@ def posed_images(folder: Path, files: Sequence[Path], height: int) -> Array:
     for f, path in enumerate(files):
         pose = folder / "pose" / f"{path.stem}.txt"
         if intrinsic.is_file() and pose.is_file():
-            K, world_from_cam = np.loadtxt(intrinsic)[:3, :3], np.loadtxt(pose)
-            if np.isfinite(world_from_cam).all():  # ScanNet writes -inf where it lost track
-                found[f] = K @ np.linalg.inv(world_from_cam)[:3]
+            K = np.loadtxt(intrinsic)[:3, :3]
+            found[f] = K @ np.linalg.inv(np.loadtxt(pose))[:3]  # of -inf (lost track): NaN
     return found
 
 

@@ -291,6 +291,12 @@ def test_matterport_layout(matterport: Path) -> None:
     assert pairs.gallery("open", 30)[0].tolist() == [False, False, True, True]
 
 
+def test_objects_of_a_region_are_not_those_of_the_house(matterport: Path) -> None:
+    (matterport / "house_segmentations" / f"{HOUSE}.semseg.json").unlink()
+    with pytest.raises(rt.ReobjError, match=r"house_segmentations/HOUSE\.semseg\.json"):
+        rk.scannet_scene(matterport)
+
+
 def test_matterport_without_label_images(matterport: Path) -> None:
     (matterport / "instance" / f"{PANORAMAS[0]}_i1_0.png").unlink()
     with pytest.raises(rt.ReobjError, match="Matterport3D has no label images; render them"):
