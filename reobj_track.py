@@ -108,6 +108,7 @@ from reobj.results.result import (
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import CONFIG_FILE, Workspace
+from reobj.solvers import solve_again
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.recorded import write_detections_npz
@@ -1131,6 +1132,7 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.edits = result.edits or kept_edits(workspace.out)
     with Progress("objects"):
         link_and_fit(result, config.objects)
+        solve_again(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
     result.tracks, result.out = fill(result, video.size, gap), workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in

@@ -23,6 +23,8 @@ from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
 from reobj.views import NOTHING_KNOWN, Fit, Scene, Views
 
+OURS, PUBLISHED = "solids", ("lfd", "sfmo", "psfmo")  # solvers
+
 
 @dataclass(frozen=True, slots=True)
 class ObjectsConfig:
@@ -38,6 +40,11 @@ class ObjectsConfig:
         "auto",
         "shape of the solids: box, cylinder, ellipsoid, or auto (by category, else by evidence)",
         "--support",
+    )
+    solver: str = option(
+        OURS,
+        "solids (ours), or ellipsoids by a published closed form: lfd, sfmo, psfmo",
+        "--solver",
     )
     up: str = option("", "direction against gravity in the world, x,y,z (default: estimated)")
     link: bool = option(True, "join and split the tracker's tracklets after the video")
@@ -61,6 +68,8 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
     """
     priors = quadrics.load_priors(config.priors or None)
     known = parse_known_size(config.known_size)
+    if config.solver not in (OURS, *PUBLISHED):
+        raise ReobjError(f"--solver {config.solver}: expected {OURS} or {', '.join(PUBLISHED)}")
     up = parse_up(config.up) if config.up else poses.up_in_world
     support = None if config.support == "auto" else config.support
 
@@ -248,7 +257,8 @@ def _with_solid(
             "size_rel_sigma": np.sqrt(sigma2),
             "cov": fits.cov[i],
         }
-        solid = {k: None if v is None else significant(v) for k, v in values.items()}
+        unknown = {k for k, v in values.items() if v is None or not np.isfinite(v).all()}
+        solid = {k: None if k in unknown else significant(v) for k, v in values.items()}
     return dataclasses.replace(
         found,
         status=status,

@@ -39,7 +39,7 @@ FLOORS = {
     6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
     "reobj.results.workspace "
     "reobj.results.overlay reobj.results.solids reobj.results.plausibility",
-    7: "reobj.parts reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
+    7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
     "reobj.results.stages reobj.results.export reobj.results.scene",
     8: "reobj_track",
 }

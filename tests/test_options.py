@@ -55,7 +55,7 @@ CAMERA = rt.Camera("PINHOLE", 320, 240, (300.0, 300.0, 160.0, 120.0))
 def test_options_are_few_enough_to_read() -> None:
     sections = [f for f in dataclasses.fields(rt.Config) if f.default is dataclasses.MISSING]
     solver = dataclasses.fields(quadrics.FitConfig)
-    assert len(every_option(rt.Config())) + len(sections) + len(solver) <= 61
+    assert len(every_option(rt.Config())) + len(sections) + len(solver) <= 62
     assert len(solver) == 8
 
 
@@ -871,6 +871,13 @@ def _(lab: Lab) -> None:
 def _(lab: Lab) -> None:
     for value in ("cylinder", "ellipsoid"):
         assert {found.support for found in lab.refit(value).objects} == {value}
+
+
+@shows("objects.solver")
+def _(lab: Lab) -> None:
+    for value in ("lfd", "psfmo"):
+        found = [o for o in lab.refit(value).objects if o.status == "ok"]
+        assert found and all(o.support == "ellipsoid" and o.cov is None for o in found)
 
 
 @shows("objects.up")
