@@ -985,6 +985,14 @@ def test_sfmo_says_when_there_is_too_little(shape: tuple[int, int]) -> None:
     assert not result.ok and "needs" in result.note and len(result.ellipsoids) == shape[1]
 
 
+def test_psfmo_estimates_how_far_the_ellipses_are_off() -> None:
+    """Its noise variance, alone and with cameras, rises with rotation error and with size error."""
+    for sweep in ([(0, 0.02), (10, 0.02), (30, 0.02)], [(2, 0.0), (2, 0.1), (2, 0.3)]):
+        variance = np.array([[syn.thesis_trial(*s, seed)[4:] for seed in (0, 1)] for s in sweep])
+        mean = variance.mean(1)  # (3, 2)
+        assert (mean > 0).all() and (mean[1:] > 2 * mean[:-1]).all()
+
+
 def test_psfmo_prior_helps_where_least_squares_is_weak() -> None:
     """Narrow views: least squares (LfD) knows little about the depth, the prior does."""
     gains = []
