@@ -315,12 +315,16 @@ def decimals(sigma: float) -> int:
     return max(0, math.ceil(-math.log10(sigma))) if 0 < sigma < math.inf else 2
 
 
-def texts_with_sigma(values: Array, sigma: Array) -> list[tuple[str, str]]:
+def texts_with_sigma(values: Array, sigma: Array | None) -> list[tuple[str, ...]]:
     """Write values (N,) and their sigmas with the decimals that the best known of them is worth.
+
+    Without sigmas the values alone, in three digits.
 
     >>> texts_with_sigma(np.array([0.444, 0.5]), np.array([0.05, 0.2]))
     [('0.44', '0.05'), ('0.50', '0.20')]
     """
+    if sigma is None:
+        return [(f"{value:.3g}",) for value in values]
     digits = decimals(float(np.min(sigma)))
     return [(f"{a:.{digits}f}", f"{b:.{digits}f}") for a, b in zip(values, sigma, strict=True)]
 

@@ -130,10 +130,10 @@ class Object:
         return Object(**values)
 
 
-def sides(found: Object) -> list[tuple[str, str]]:
-    """Write width, depth, height (own axes x, y, z; m or units) and sigmas; [] if unknown."""
+def sides(found: Object) -> list[tuple[str, ...]]:
+    """Write width, depth, height (own axes x, y, z; m or units) and any sigmas; [] if unknown."""
     size, rel = found.size if found.size_m is None else found.size_m, found.size_rel_sigma
-    return [] if size is None or rel is None else texts_with_sigma(size, size * rel)
+    return [] if size is None else texts_with_sigma(size, None if rel is None else size * rel)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -456,7 +456,7 @@ class Result:
         sizes = f"{'width x depth x height, ' + ('m' if scaled else 'units'):<26} {'sigma':>6}  "
         lines = [f"{'object':>6}  {'class':<14} {'frames':>6} {'visits':>6}  {sizes * sized}status"]
         for o in counted:
-            text = " x ".join(side for side, _ in sides(o)) or "-"
+            text = " x ".join(side for side, *_ in sides(o)) or "-"
             text += " units" if scaled and o.size is not None and o.size_m is None else ""
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "

@@ -85,7 +85,8 @@ function facts(o) {
   const { scale } = S.parts[o.part], unitName = o.size_m ? "m" : "units";
   const rows = [["status", o.status.replace("_", " ") + (o.reason ? `: ${o.reason}` : "")]];
   ["width", "depth", "height"].forEach((name, i) => { if (o.sides.length) rows.push(
-    [name, `${o.sides[i].join(" ± ")} ${unitName} (${percent(o.size_rel_sigma[i])})`]); });
+    [name, `${o.sides[i].join(" ± ")} ${unitName}`
+      + (o.size_rel_sigma ? ` (${percent(o.size_rel_sigma[i])})` : "")]); });
   if (o.sides.length) rows.push(
     ["scale", scale && scale.source !== "none" ? `from ${scale.source.replace("_", " ")}, ± `
       + percent(scale.rel_sigma || 0) : "unknown"], ["shape", o.support]);
