@@ -1132,9 +1132,10 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.edits = result.edits or kept_edits(workspace.out)
     with Progress("objects"):
         link_and_fit(result, config.objects)
-        solve_again(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
-    result.tracks, result.out = fill(result, video.size, gap), workspace.out
+    filled = fill(result, video.size, gap)  # by our own solids, whatever solver is asked for
+    solve_again(result, config.objects)
+    result.tracks, result.out = filled, workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
     result.embedding_row = detected[result.embedding_row]
     result.seconds["objects"] = time.monotonic() - started

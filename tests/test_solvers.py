@@ -118,6 +118,7 @@ def test_objects_writes_the_same_files(room: Path, tmp_path: Path, solver: str) 
         assert rt.main(["objects", str(out), "--solver", solver, *off]) == 0
         assert {p.name for p in out.iterdir()} == names | {"scene.html"}
         assert validate_objects(out / "objects.json") == []
+        assert (out / "tracks.txt").read_bytes() == (room / "tracks.txt").read_bytes()
         texts.append((out / "objects.json").read_bytes())
     assert texts[0] == texts[1] != before
     table = json.loads(texts[0])
