@@ -1009,43 +1009,44 @@ def run(
     if config.threads:
         cv2.setNumThreads(config.threads)
     video = open_video(source, config.input, config.poses, tracks or detections)
-    workspace = Workspace(out, overwrite)
-    workspace.bind(video, overwrite)
-    viewer = Viewer(VideoInfo.of(video)) if show else None
-    seconds: dict[str, float] = {}
-    in_3d = in_3d and config.poses.mode != "none"
-    poses = supplied_poses(video, config.poses, workspace) if in_3d else None
-    if tracks:
-        result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
-        boxes, names = result.tracks, result.class_names
-    else:
-        on = (config.threads, config.offline, config.device)
-        found = open_detections(video, config.detect, detections, *on)
-        found, boxes = keep_detections(found, video, workspace), Tracks.empty()
-        if in_3d and not video.is_live:
+    with Workspace(out, overwrite) as workspace:
+        workspace.bind(video, overwrite)
+        viewer = Viewer(VideoInfo.of(video)) if show else None
+        seconds: dict[str, float] = {}
+        in_3d = in_3d and config.poses.mode != "none"
+        poses = supplied_poses(video, config.poses, workspace) if in_3d else None
+        if tracks:
+            result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
+            boxes, names = result.tracks, result.class_names
+        else:
+            on = (config.threads, config.offline, config.device)
+            found = open_detections(video, config.detect, detections, *on)
+            found, boxes = keep_detections(found, video, workspace), Tracks.empty()
+            if in_3d and not video.is_live:
+                started = time.monotonic()
+                found, boxes = detect_all(found, video, workspace)
+                seconds["detect"] = time.monotonic() - started
+            names = found.class_names
+        check_known_size(config.objects, names)
+        model = None
+        if poses is not None:
+            check_directions(poses, boxes if tracks else _tracklets(boxes))
+        elif in_3d and not video.is_live:
+            moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
+            rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
             started = time.monotonic()
-            found, boxes = detect_all(found, video, workspace)
-            seconds["detect"] = time.monotonic() - started
-        names = found.class_names
-    check_known_size(config.objects, names)
-    model = None
-    if poses is not None:
-        check_directions(poses, boxes if tracks else _tracklets(boxes))
-    elif in_3d and not video.is_live:
-        moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
-        rows, started = boxes[moving & (boxes.score >= config.tracker.high_score)], time.monotonic()
-        poses, model = reconstruct_cached(video, config.poses, workspace, rows)
-        seconds["poses"] = time.monotonic() - started
-    if not tracks:
-        result = _track_video(video, workspace, config, found, poses, seconds, viewer)
-    workspace.save_last(result, poses)
-    workspace.publish_model(model)
-    result.poses, result.seconds = poses, seconds
-    result = _finish(result, video, workspace, config)
-    if viewer is not None:
-        viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
-        viewer.close()
-    return result
+            poses, model = reconstruct_cached(video, config.poses, workspace, rows)
+            seconds["poses"] = time.monotonic() - started
+        if not tracks:
+            result = _track_video(video, workspace, config, found, poses, seconds, viewer)
+        workspace.save_last(result, poses)
+        workspace.publish_model(model)
+        result.poses, result.seconds = poses, seconds
+        result = _finish(result, video, workspace, config)
+        if viewer is not None:
+            viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
+            viewer.close()
+        return result
 
 
 def refit(
@@ -1060,17 +1061,17 @@ def refit(
     """
     if tracks and edits:
         raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")
-    workspace = Workspace.open(out)
-    result, video = workspace.load_last(), workspace.video()
-    result.edits = read_edits(edits) if edits else None
-    config = dataclasses.replace(config or _last_config(out), input=video.config)
-    check_known_size(config.objects, result.class_names)
-    if tracks:
-        poses = result.poses
-        result = _given_tracks(tracks, video, config.detect, result)
-        workspace.save_last(result, poses)
-        result.poses = poses
-    return _finish(result, video, workspace, config)
+    with Workspace.open(out) as workspace:
+        result, video = workspace.load_last(), workspace.video()
+        result.edits = read_edits(edits) if edits else None
+        config = dataclasses.replace(config or _last_config(out), input=video.config)
+        check_known_size(config.objects, result.class_names)
+        if tracks:
+            poses = result.poses
+            result = _given_tracks(tracks, video, config.detect, result)
+            workspace.save_last(result, poses)
+            result.poses = poses
+        return _finish(result, video, workspace, config)
 
 
 def _last_config(out: str | Path) -> Config:
@@ -1143,12 +1144,14 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.warnings += implausible(result, config.tracker.high_score, config.objects.moving_classes)
     result.warnings += unused_sizes(config.objects, result.objects)
     started = time.monotonic()
-    result.save(workspace.out, config.output.doubtful)
-    write_config(config, workspace.out / CONFIG_FILE)
-    if poses is not None:
-        write_supplied_model(poses, video, workspace.out)
     shown = config.output
-    write_pictures(result, workspace.out, video, shown.overlay, shown.scene, shown.doubtful)
+
+    def pictures(folder: Path) -> None:
+        write_pictures(result, folder, video, shown.overlay, shown.scene, shown.doubtful)
+
+    result.save(workspace.out, shown.doubtful, pictures)
+    write_config(config, workspace.out / CONFIG_FILE)
+    write_supplied_model(poses, video, workspace.out)
     result.seconds["write"] = time.monotonic() - started
     for warning in result.warnings:
         log.warning(warning)
@@ -1176,13 +1179,12 @@ def _cmd_run(args: argparse.Namespace) -> int:
 def _cmd_poses(args: argparse.Namespace) -> int:
     config = config_from_args(Config(), args)
     video = Video(args.video, config.input)
-    workspace = Workspace(args.out, args.overwrite)
-    workspace.bind(video, args.overwrite)
-    poses, model = supplied_poses(video, config.poses, workspace), None
-    if poses is None:
-        poses, model = reconstruct_cached(video, config.poses, workspace)
-    workspace.publish_model(model)
-    if poses.known.any():
+    with Workspace(args.out, args.overwrite) as workspace:
+        workspace.bind(video, args.overwrite)
+        poses, model = supplied_poses(video, config.poses, workspace), None
+        if poses is None:
+            poses, model = reconstruct_cached(video, config.poses, workspace)
+        workspace.publish_model(model)
         write_trajectories(workspace.out, poses)
         write_supplied_model(poses, video, workspace.out)
     known, count = poses.known.sum(), len(poses.frame)
@@ -1195,8 +1197,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
 
 def _cmd_objects(args: argparse.Namespace) -> int:
     if args.validate:
-        out = Path(args.out)
-        faults = validate_objects(out / "objects.json" if out.is_dir() else out)
+        faults = validate_objects(Path(args.out))
         print("\n".join(faults) or "valid")
         return 2 if faults else 0
     config = config_from_args(_last_config(args.out), args)

@@ -8,11 +8,13 @@ from __future__ import annotations
 import base64
 import contextlib
 import difflib
+import errno
 import hashlib
 import json
 import math
 import os
 import re
+import shutil
 import sys
 import textwrap
 import time
@@ -26,6 +28,11 @@ import numpy.typing as npt
 
 from reobj.types import Array, ReobjError, log
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
 T = TypeVar("T")
 
 
@@ -34,15 +41,119 @@ def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces it at the end of the `with` block.
 
     An exception in the block leaves `path` as it was, and nothing beside it.
+
+    Raises:
+        ReobjError: the disk is full, may not be written, or fails: where, why and what to do.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".part-{path.name}")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield part
+            _sync(part)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+DISK_ERRORS = {
+    errno.ENOSPC: "make room on this disk",
+    errno.EDQUOT: "make room: your quota is used up",
+    errno.EFBIG: "choose a folder on a file system that takes larger files",
+    errno.EROFS: "choose a folder on a disk that is not read-only",
+    errno.EACCES: "choose a folder that you may write into",
+    errno.EPERM: "choose a folder that you may write into",
+    errno.EIO: "look at the disk: it fails",
+}  # what to do about them
+NUMPY_FULL = re.compile(r"\d+ requested and \d+ written")  # its error without a number
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Say where and what to do if the disk is why the block cannot write `path`.
+
+    Raises:
+        ReobjError: for errors of DISK_ERRORS; others, and those of files elsewhere, pass.
+    """
     try:
-        yield part
-        _sync(part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        number = errno.ENOSPC if NUMPY_FULL.search(str(error)) else error.errno
+        named = Path(os.fsdecode(error.filename or path))
+        beside = named.is_relative_to(path.parent) or path.is_relative_to(named)
+        if number not in DISK_ERRORS or not beside:
+            raise
+        why, advice = os.strerror(number), DISK_ERRORS[number]
+        shown = Path(*(name for name in path.parts if name != PART_RESULTS))
+        raise ReobjError(f"{shown}: cannot be written ({why}); {advice}, then run again") from error
+
+
+@contextlib.contextmanager
+def locked(path: Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Hold the lock of a file, which the system frees when the process ends, however it ends.
+
+    Args:
+        wait_s: for another process that holds it.
+    Raises:
+        LockedError: another process, or this one, still holds it.
+    """
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(path, "ab")
+    with file:
+        until = time.monotonic() + wait_s
+        while not _lock(file.fileno()):
+            if time.monotonic() >= until:
+                raise LockedError(f"{path}: locked by another process")
+            time.sleep(LOCK_POLL_S)
+        yield
+
+
+class LockedError(ReobjError):
+    """A lock is held by another process."""
+
+
+LOCK_POLL_S = 0.05  # chosen: soon enough for a person
+
+
+def _lock(handle: int) -> bool:
+    """Take the lock of an open file; False if it is held, True too where there are no locks."""
+    try:
+        if sys.platform == "win32":
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in HELD
+    return True
+
+
+HELD = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
+
+
+PART_RESULTS = ".part-results"
+
+
+@contextlib.contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder whose files replace those of `folder` at the end of the block.
+
+    All of them are there before the first one is replaced: an exception in the block leaves
+    `folder` as it was. Files that were not made anew stay.
+    """
+    part = folder / PART_RESULTS
+    with writing(folder):
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        try:
+            yield part
+            for file in sorted(part.rglob("*")):
+                if file.is_file():
+                    target = folder / file.relative_to(part)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    file.replace(target)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:
@@ -107,11 +218,8 @@ def save_npz(path: Path, arrays: Mapping[str, Any], **metadata: Any) -> None:
     """Write arrays, and metadata as JSON, to a compressed npz file; same input, same bytes."""
     own: dict[str, Any] = {name: np.asarray(values) for name, values in arrays.items()}
     metadata = metadata | {"digest": _digest(own, metadata)}
-    try:
-        with atomic(path) as part, part.open("wb") as file:
-            np.savez_compressed(file, **own, metadata=np.array(json.dumps(metadata)))
-    except OSError as error:  # zipfile's own does not name the file
-        raise ReobjError(f"{path}: cannot be written ({error.strerror})") from error
+    with atomic(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **own, metadata=np.array(json.dumps(metadata)))
 
 
 def _digest(arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> str:

@@ -31,7 +31,8 @@ FLOORS = {
     "reobj.poses.soundness "
     "reobj.poses.adjustment "
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
-    "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film",
+    "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film "
+    "reobj.results.folder",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -14,6 +16,8 @@ from simulated import fitted, tracks_of, walk
 
 import reobj_track as rt
 from reobj.results.workspace import Workspace
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture
@@ -96,9 +100,47 @@ def test_results_of_two_videos_never_mix(video: rt.Video, tmp_path: Path) -> Non
 def test_a_changed_video_is_another_one(video: rt.Video, tmp_path: Path) -> None:
     space = Workspace(tmp_path / "out")
     space.bind(video)
+    space.save_last(fitted(tracks_of(walk(2)), None), None)
     cv2.imwrite(str(tmp_path / "frames/2.png"), np.zeros((48, 64, 3), np.uint8))
-    with pytest.raises(rt.ReobjError, match="holds the results of"):
+    with pytest.raises(rt.ReobjError, match=r"results of .*frames as it was before it changed;"):
         space.bind(rt.Video(tmp_path / "frames"))
+
+
+def test_a_run_that_failed_does_not_claim_the_folder(video: rt.Video, tmp_path: Path) -> None:
+    """It has no results that could mix with those of another video."""
+    Workspace(tmp_path / "out").bind(video)
+    other = rt.Video(frames(tmp_path / "other", 10))
+    Workspace(tmp_path / "out").bind(other)
+    assert Workspace(tmp_path / "out").source[0] == str(tmp_path / "other")
+    (tmp_path / "out/tracks.txt").write_text("")
+    with pytest.raises(rt.ReobjError, match=r"results of .*other, not of .*frames"):
+        Workspace(tmp_path / "out").bind(video)
+
+
+HOLD = """
+import os, sys, time
+from reobj.results.workspace import Workspace
+with Workspace(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_one_run_at_a_time_writes_into_a_folder(tmp_path: Path) -> None:
+    """The lock ends with its process, also by kill -9, and leaves nothing to be cleaned up."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", HOLD, str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"held\n"
+        with pytest.raises(rt.ReobjError, match="out: another run is writing into this folder"):
+            with Workspace(out):
+                pass
+        Workspace(out)  # who only reads needs no lock
+        other.kill()
+        other.wait()
+    for _ in range(2):
+        with Workspace(out):
+            pass
 
 
 def test_the_same_video_with_other_options_is_the_same_video(

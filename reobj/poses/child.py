@@ -6,26 +6,37 @@ import contextlib
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
-from reobj.files import Progress
+from reobj.files import LockedError, Progress, locked
+from reobj.types import ReobjError
 
 
 class Child:
     """A fresh interpreter that imports a module and does the job of a folder whenever it is told.
 
     It starts at once, so that its imports take no time later. A context: it ends with it, and is
-    killed by an exception.
+    killed by an exception. Where this process is killed it ends too, and no other child works in
+    the folder before it has.
 
     Args:
         module: its main part calls `serve`. log_path: receives the child's stderr; its folder is
             made.
+    Raises:
+        ReobjError: the child of another process works in the folder.
     """
 
     def __init__(self, module: str, folder: Path, log_path: Path) -> None:
         self.log_path = log_path
+        try:
+            with locked(_lock_of(folder), LEFT_OVER_S):
+                pass
+        except LockedError:
+            why = "a reconstruction still runs in this folder"
+            raise ReobjError(f"{folder.parent}: {why}; wait for it, or end it") from None
         log_path.parent.mkdir(parents=True, exist_ok=True)
         # -P: not the modules of the working directory; the package's own folder comes first
         command = [sys.executable, "-P", "-m", module, str(folder)]
@@ -89,13 +100,33 @@ class Child:
 
 
 DONE = "reobj: done"
+LEFT_OVER_S = 60.0  # for the child of a killed run to end; chosen: it does at once (watched)
+
+
+def _lock_of(folder: Path) -> Path:
+    """Name the file that a child holds the lock of: beside its folder, which may be removed."""
+    return folder.with_name(f"{folder.name}.lock")
 
 
 def serve(job: Callable[[Path], None]) -> None:
-    """Do the job of the folder of the command line for each line of stdin (in the child)."""
-    for _ in sys.stdin:
-        job(Path(sys.argv[1]))
-        print(DONE, flush=True)
+    """Do the job of the folder of the command line for each line of stdin (in the child).
+
+    The process ends as soon as stdin does, also in the middle of a job: its parent is gone.
+    """
+    folder, told = Path(sys.argv[1]), threading.Semaphore(0)
+    with locked(_lock_of(folder), LEFT_OVER_S):
+        threading.Thread(target=_watch_parent, args=(told,), daemon=True).start()
+        while told.acquire():
+            job(folder)
+            print(DONE, flush=True)
+
+
+def _watch_parent(told: threading.Semaphore) -> None:
+    """Count the lines of stdin; end this process at their end, whatever it does."""
+    while data := os.read(0, 1):  # not sys.stdin, whose lock would hang the end of the process
+        if data == b"\n":
+            told.release()
+    os._exit(0)
 
 
 def send_progress(stage: str, done: int, total: int) -> None:

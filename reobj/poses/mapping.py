@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, import_pycolmap
-from reobj.files import Progress, atomic
+from reobj.files import Progress, atomic, load_cached, load_json, writing
 from reobj.poses.adjustment import Adjusted, adjusted, refine
 from reobj.poses.child import Child, send_progress, serve
 from reobj.poses.consistency import (
@@ -112,12 +112,14 @@ def reconstruct(
     if not _may_go_on(path, job):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-    np.save(folder / "keyframes.npy", np.stack(images))
+    with writing(folder):
+        np.save(folder / "keyframes.npy", np.stack(images))
     with atomic(path) as part:
         part.write_text(json.dumps(job))
     (folder / "messages.json").unlink(missing_ok=True)
     problem = child.run(progress)
     if not (folder / "messages.json").exists():
+        path.unlink()  # from the beginning the next time: what it left may be why
         why = f"no camera poses: the reconstruction {problem}; give --poses"
         return Mapped([], [why])
     models = []
@@ -128,11 +130,11 @@ def reconstruct(
 
 def _may_go_on(path: Path, job: dict[str, Any]) -> bool:
     """Tell whether the database beside a job serves another: same camera, images and boxes."""
-    if not path.exists():
+    old, new = load_cached(path, load_json), json.loads(json.dumps(job))
+    if not isinstance(old, dict) or not isinstance(old.get("images"), dict):
         return False
-    old, new = json.loads(path.read_text()), json.loads(json.dumps(job))
     same = all(old.get(key) == new[key] for key in ("camera", "size", "seed"))
-    images = old.get("images", {}).items()
+    images = old["images"].items()
     return same and all(new["images"].get(number) == text for number, text in images)
 
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from reobj.cameras import Camera, Poses, import_pycolmap, invert_rigid, write_colmap
-from reobj.files import Progress, load_npz, save_npz
+from reobj.files import Progress, load_npz, save_npz, writing
 from reobj.poses.child import Child, serve
 from reobj.poses.features import extract_features, match_pairs
 from reobj.sources.video import shrunk
@@ -63,9 +63,6 @@ def triangulate(
         why = f"{len(rows)} images have a pose; two or more are needed"
         return _without_points(poses, why)
     folder = work_dir / "points"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    np.save(folder / "keyframes.npy", np.stack([images[row] for row in rows]))
     job = {
         "camera": [poses.camera.model, list(poses.camera.params)],
         "size": size,
@@ -73,8 +70,11 @@ def triangulate(
         "pairs": choose_pairs(steps[rows]).tolist(),
         "seed": seed,
     }
-    (folder / "job.json").write_text(json.dumps(job))
-    with Child("reobj.poses.points", folder, work_dir / "points.log") as child:
+    with Child("reobj.poses.points", folder, work_dir / "points.log") as child, writing(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        np.save(folder / "keyframes.npy", np.stack([images[row] for row in rows]))
+        (folder / "job.json").write_text(json.dumps(job))
         problem = child.run(progress)
     if problem:
         return _without_points(poses, f"the triangulation {problem}")

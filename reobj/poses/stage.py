@@ -149,9 +149,9 @@ def _with_depth(
     return found, [part_path(scaled.with_suffix(".sparse"), k) for k in range(len(models))]
 
 
-def write_supplied_model(poses: Poses, video: Video, out: Path) -> None:
+def write_supplied_model(poses: Poses | None, video: Video, out: Path) -> None:
     """Write sparse/ of supplied poses; a reconstruction has its own, with more in it."""
-    if poses.source == "user" and poses.known.any():
+    if poses is not None and poses.source == "user" and poses.known.any():
         for k in range(poses.part_count):
             part = poses.of_part(k)
             names = [video.name(int(f)) or f"{f:06d}" for f in part.frame]

@@ -11,7 +11,7 @@ import dataclasses
 import json
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -39,6 +39,7 @@ from reobj.files import (
 )
 from reobj.poses.floor import Floor
 from reobj.results.edits import Edits, write_edits
+from reobj.results.folder import LAST_POSES, replaced
 from reobj.results.ply import write_ply
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
@@ -46,11 +47,6 @@ from reobj.types import Array, Embeddings, Floats, IntArray, LinkEvent, ReobjErr
 
 FORMAT = "reobj-objects"
 FORMAT_VERSION = 1  # of objects.json
-LAST_POSES = "cache/last-poses.npz"  # in an output folder
-STALE = (  # files of an earlier run, which another run may not write; cameras.csv: before 0.2
-    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm",
-    "scene.html",
-)  # fmt: skip
 CONVENTIONS = {
     "pose": "cam_from_world",
     "camera_axes": "x right, y down, z forward",
@@ -337,28 +333,30 @@ class Result:
         )
         return quadrics.Ellipsoids(center, half_axes, axes)
 
-    def save(self, out: str | Path, doubtful: bool = False) -> None:
+    def save(
+        self, out: str | Path, doubtful: bool = False, more: Callable[[Path], None] | None = None
+    ) -> None:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
 
         Doubtful objects are in objects.json, in tracks.txt only if `doubtful`. Of several parts
-        each has its own poses and objects: poses_part1.txt, objects_part1.ply, ... Each file
-        appears only when it is complete. Those of an earlier run are removed, pictures too:
-        `write_pictures` makes new ones from the video.
+        each has its own poses and objects: poses_part1.txt, objects_part1.ply, ... All of them
+        appear together, when all are complete, instead of those of an earlier run, pictures too;
+        so does what `more` writes into the folder that it is given.
         """
-        self.out = out = Path(out)
-        remove_stale(out)
-        if self.poses is None:
-            (out / LAST_POSES).unlink(missing_ok=True)
-        write_mot(out / "tracks.txt", (self if doubtful else self.without_doubtful()).tracks)
-        self._write_objects(out / "objects.json")
-        write_edits(out, self.edits)
-        if self.poses is not None:
-            save_poses(out / LAST_POSES, self.poses)
-            write_trajectories(out, self.poses)
-        if self.fits is not None or self.located:
-            for k, part in enumerate(self.parts()):
-                ids = [o.id for o in part.located]
-                write_ply(part_path(out / "objects.ply", k), part.ellipsoids(), ids)
+        with replaced(Path(out)) as new:
+            write_mot(new / "tracks.txt", (self if doubtful else self.without_doubtful()).tracks)
+            self._write_objects(new / "objects.json")
+            if self.poses is not None:
+                save_poses(new / LAST_POSES, self.poses)
+                write_trajectories(new, self.poses)
+            if self.fits is not None or self.located:
+                for k, part in enumerate(self.parts()):
+                    ids = [o.id for o in part.located]
+                    write_ply(part_path(new / "objects.ply", k), part.ellipsoids(), ids)
+            if more is not None:
+                more(new)
+        self.out = Path(out)
+        write_edits(self.out, self.edits)
 
     @staticmethod
     def load(out: str | Path) -> Result:
@@ -555,18 +553,13 @@ def written_by(out: Path) -> str:
     return f"{by}: run the video again"
 
 
-def remove_stale(out: Path) -> None:
-    """Remove what an earlier run wrote and another one may not: of further parts too."""
-    for path in (out / name for name in STALE):
-        for file in (path, *part_paths(path)):
-            file.unlink(missing_ok=True)
-
-
 def write_trajectories(out: Path, poses: Poses) -> None:
     """Write poses.txt, and poses_part1.txt, ... of further parts: a TUM file is one world."""
+    if not poses.known.any():
+        return
     for old in part_paths(out / "poses.txt"):
         old.unlink()
-    for k in range(poses.part_count if poses.known.any() else 0):
+    for k in range(poses.part_count):
         write_tum(part_path(out / "poses.txt", k), poses.of_part(k))
 
 
@@ -582,11 +575,16 @@ def load_last_poses(out: Path) -> Poses | None:
 
 
 def validate_objects(path: Path) -> list[str]:
-    """Check an objects.json against objects.schema.json; returns one line for each fault."""
+    """Check an objects.json, or that of a folder, against objects.schema.json.
+
+    Returns:
+        one line for each fault.
+    """
     try:
         import jsonschema
     except ImportError as error:
         raise ReobjError("jsonschema is not installed: pip install jsonschema") from error
+    path = path / "objects.json" if path.is_dir() else path
     schema = json.loads(Path(__file__).with_name("objects.schema.json").read_text())
     faults = jsonschema.Draft202012Validator(schema).iter_errors(load_json(path))
     return sorted(f"{path}: {fault.json_path}: {fault.message[:200]}" for fault in faults)

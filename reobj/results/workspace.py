@@ -5,6 +5,7 @@ What the files of a result hold is the business of result.py; what a stage compu
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -15,9 +16,20 @@ from typing import Any
 
 from reobj import __version__
 from reobj.cameras import Poses, save_poses
-from reobj.files import atomic, load_cached, load_json, part_path, part_paths
+from reobj.files import (
+    PART_RESULTS,
+    LockedError,
+    atomic,
+    load_cached,
+    load_json,
+    locked,
+    part_path,
+    part_paths,
+    writing,
+)
 from reobj.results.edits import EDITS
-from reobj.results.result import LAST_POSES, Result, load_last_poses, remove_stale, written_by
+from reobj.results.folder import LAST_POSES, remove_stale
+from reobj.results.result import Result, load_last_poses, written_by
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
 from reobj.types import ReobjError
@@ -25,13 +37,15 @@ from reobj.types import ReobjError
 LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
 SOURCE = "cache/source.json"
 CONFIG_FILE = "config.toml"  # options of the last run, in an output folder
+LOCK = "cache/lock"
 
 
 class Workspace:
     """Keep the results of a video's stages in an output folder.
 
     Every stage keeps its result in OUT/cache under a hash of its inputs and options: a killed run
-    resumes, a changed option recomputes what depends on it.
+    resumes, a changed option recomputes what depends on it. A context: whoever writes into the
+    folder enters it, and is the only one to do so until it leaves or its process ends.
 
     Attributes:
         out: the folder. cache: OUT/cache, made here; it may be deleted, then all is computed again.
@@ -52,7 +66,20 @@ class Workspace:
             raise ReobjError(f"{out}: {what}; choose another -o, or say --overwrite")
         if foreign and (out / "sparse").exists():
             raise ReobjError(f"{out}: a sparse/ of its own would be lost; choose another -o")
-        self.cache.mkdir(parents=True, exist_ok=True)
+        self._held = contextlib.ExitStack()
+        with writing(self.cache):
+            self.cache.mkdir(parents=True, exist_ok=True)
+
+    def __enter__(self) -> Workspace:
+        try:
+            self._held.enter_context(locked(self.out / LOCK))
+        except LockedError:
+            what = "another run is writing into this folder"
+            raise ReobjError(f"{self.out}: {what}; wait for it, or choose another -o") from None
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._held.close()
 
     @staticmethod
     def open(out: str | Path) -> Workspace:
@@ -81,16 +108,22 @@ class Workspace:
             old = load_cached(path, load_json)
             old = old if isinstance(old, dict) else {}
             if old.get("content") != fingerprint["content"]:
-                if not overwrite:
-                    raise ReobjError(
-                        f"{self.out}: holds the results of {old.get('source', 'another video')}, "
-                        f"not of {video.source}; choose another -o, or say --overwrite"
-                    )
+                if not overwrite and self._has_results():
+                    what = f"holds the results of {old.get('source', 'another video')}"
+                    what += f", not of {video.source}"
+                    if old.get("source") == fingerprint["source"]:
+                        what = f"holds the results of {video.source} as it was before it changed"
+                    raise ReobjError(f"{self.out}: {what}; choose another -o, or say --overwrite")
                 remove_stale(self.out)
                 for name in ("tracks.txt", "objects.json", EDITS, LAST_TRACKS, LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
             part.write_text(json.dumps(fingerprint))
+
+    def _has_results(self) -> bool:
+        """True unless no run came so far as to write one: what is in the cache does not mix."""
+        shown = [p for p in self.out.iterdir() if p != self.cache and p.name != PART_RESULTS]
+        return bool(shown) or any((self.out / name).exists() for name in (LAST_TRACKS, LAST_POSES))
 
     @property
     def source(self) -> tuple[str, InputConfig]:
