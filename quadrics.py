@@ -384,18 +384,15 @@ def load_priors(path: str | Path | None = None) -> Priors:
     Keys "about" and "aliases" are reserved; every other key is a category.
     """
     path = Path(__file__).with_name("priors.json") if path is None else Path(path)
+    what = "not valid JSON"
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise QuadricsError(f"{path}: not valid JSON ({error}); see docs/quadrics.md") from error
-    aliases = table.pop("aliases", {})
-    table.pop("about", None)
-    try:
+        table = dict(json.loads(path.read_text(encoding="utf-8")))
+        aliases = {a: str(name) for a, name in dict(table.pop("aliases", {})).items()}
+        table.pop("about", None)
+        what = "a category lacks or garbles"
         rows = [_prior_row(entry) for entry in table.values()]
-    except (KeyError, TypeError, ValueError) as error:
-        raise QuadricsError(
-            f"{path}: a category lacks or garbles {error}; see docs/quadrics.md"
-        ) from error
+    except (AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
+        raise QuadricsError(f"{path}: {what} ({error}); see docs/quadrics.md") from error
     columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
     if not rows:
         columns = [np.zeros(s) for s in ((0, 3), (0, 3, 3), (0, 2), (0, 2, 2))]
@@ -406,15 +403,22 @@ def load_priors(path: str | Path | None = None) -> Priors:
 def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
     """Parse one category into the columns of `Priors`; without "axis_ratio" the sizes imply it."""
     size = entry["size_m"]
-    std = np.array(size["log_std"], np.float64)  # (3,)
+    mean, std = (np.array(size[key], np.float64).reshape(3) for key in ("mean", "log_std"))
     corr_wd, corr_wh, corr_dh = size.get("corr", (0.0, 0.0, 0.0))
     corr = np.array([[1, corr_wd, corr_wh], [corr_wd, 1, corr_dh], [corr_wh, corr_dh, 1.0]])
-    log_mean = np.log(np.array(size["mean"], np.float64))
+    log_mean = np.log(np.where(mean > 0, mean, np.nan))
     log_cov = corr * std[:, None] * std
     difference = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, -1.0]])
     implied = {"mean_log": difference @ log_mean, "cov_log": difference @ log_cov @ difference.T}
     ratio = entry.get("axis_ratio", implied)
-    ratios = (np.array(ratio[key], np.float64) for key in ("mean_log", "cov_log"))
+    shapes = {"mean_log": (2,), "cov_log": (2, 2)}
+    ratios = [np.array(ratio[key], np.float64).reshape(s) for key, s in shapes.items()]
+    variances = [
+        np.linalg.eigvalsh(cov)[0] if np.isfinite(cov).all() else 0.0
+        for cov in (log_cov, ratios[1])
+    ]
+    if not np.isfinite([*log_mean, *ratios[0]]).all() or min(variances) <= 0:
+        raise ValueError("sizes and variances are finite and above 0")
     code = SUPPORTS.index(entry.get("support", "ellipsoid"))
     round_, upright = bool(entry.get("yaw_symmetric", False)), bool(entry.get("upright", True))
     on_floor = entry.get("stands_on") == "floor"
@@ -766,6 +770,7 @@ def _fit_shapes(design: Array, rows: Array, seen: BoolArray) -> Array:
     weight = seen.T[:, :, None, None].astype(np.float64)  # (O, F, 1, 1)
     target = np.where(seen.T[..., None], rows.transpose(1, 0, 2), 0.0)  # (O, F, 3)
     flat = (design * weight).reshape(len(target), -1, 6)
+    flat = np.where(np.isfinite(flat).all((1, 2), keepdims=True), flat, 0.0)  # no quadric then
     entries = np.linalg.pinv(flat) @ target.reshape(len(target), -1, 1)  # (O, 6, 1)
     return _symmetric(np.asarray(entries[..., 0], np.float64), 3)
 

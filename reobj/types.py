@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,8 +22,38 @@ log = logging.getLogger("reobj_track")
 
 
 class ReobjError(ValueError):
-    """A mistake in the input: says what, where, what was expected and what to do (exit code 2)."""
+    """A mistake in the input: says what, where, what was expected and what to do (exit code 2).
 
+    In one line: control characters, such as those of the input, are escaped.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(printable(text))
+
+
+def printable(text: str) -> str:
+    """Escape what is no printable character, so that names in a text cannot steer a terminal.
+
+    >>> printable("a chair\\n")
+    'a chair\\\\n'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def visible_name(name: str) -> str:
+    """Replace what no name should have: control characters, which XML cannot hold either.
+
+    >>> visible_name("a chair").isprintable()
+    True
+    """
+    return CONTROLS.sub("\ufffd", name)
+
+
+CONTROLS = re.compile(  # C0, C1, surrogates, those that turn the direction of text, no characters
+    "[\x00-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069\ufffe\uffff]"
+)
 
 COCO_CLASSES = (
     "person bicycle car motorcycle airplane bus train truck boat traffic_light fire_hydrant "

@@ -52,6 +52,7 @@ from reobj.types import (
     as_detections,
     as_frame,
     log,
+    visible_name,
 )
 
 DYNAMIC_SIDE = 640  # px, longer side that models for any size are fed (YOLO11 was trained so)
@@ -295,6 +296,9 @@ class DetectionSource:
     slow: bool = False
     cache: DetectionCache | None = None
     recorded: RecordedDetections | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "class_names", tuple(map(visible_name, self.class_names)))
 
     def __call__(self, frame: Frame) -> Detections:
         """Return the detections of a frame, from the cache if they are there."""

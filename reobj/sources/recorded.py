@@ -15,7 +15,7 @@ import numpy as np
 
 from reobj.files import load_npz, save_npz
 from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
-from reobj.types import Array, BoolArray, Detections, IntArray, ReobjError
+from reobj.types import Array, BoolArray, Detections, IntArray, ReobjError, visible_name
 
 
 @dataclass(slots=True)
@@ -44,6 +44,9 @@ class RecordedDetections:
     unit: str
     messages: list[str] = field(default_factory=list)
     identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+
+    def __post_init__(self) -> None:
+        self.class_names = tuple(map(visible_name, self.class_names))
 
     def __len__(self) -> int:
         return len(self.frame)
