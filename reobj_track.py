@@ -78,7 +78,7 @@ from reobj.identity.reid import (
     part_cosines,
 )  # fmt: skip
 from reobj.identity.sampling import SamplingLayout
-from reobj.objects import ObjectsConfig, check_known_size, unused_sizes
+from reobj.objects import ObjectsConfig, check_known_size, parse_known_size, parse_up, unused_sizes
 from reobj.options import config_from_args, read_config, write_config
 from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
@@ -746,7 +746,7 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
         soon = (state.identity[t] < 0) & (state.hits[t] >= self.config.n_init - 1)
-        due = soon | (self.frame_number % self.config.embed_every == 0)  # all in one pass
+        due = soon | (self.frame_number % max(1, self.config.embed_every) == 0)  # all in one pass
         self._calibrate_matches(detections, track_of, rows[lazy.done[rows] | due], lazy)
         rows = rows[due]
         t = track_of[rows]
@@ -1008,6 +1008,7 @@ def run(
     config = config or Config()
     if config.threads:
         cv2.setNumThreads(config.threads)
+    _check_objects(config.objects)
     video = open_video(source, config.input, config.poses, tracks or detections)
     with Workspace(out, overwrite) as workspace:
         workspace.bind(video, overwrite)
@@ -1065,6 +1066,7 @@ def refit(
         result, video = workspace.load_last(), workspace.video()
         result.edits = read_edits(edits) if edits else None
         config = dataclasses.replace(config or _last_config(out), input=video.config)
+        _check_objects(config.objects)
         check_known_size(config.objects, result.class_names)
         if tracks:
             poses = result.poses
@@ -1072,6 +1074,21 @@ def refit(
             workspace.save_last(result, poses)
             result.poses = poses
         return _finish(result, video, workspace, config)
+
+
+def _check_objects(config: ObjectsConfig) -> None:
+    """Refuse what the fit could not use, before minutes are spent on what comes first."""
+    quadrics.load_priors(config.priors or None)
+    if config.up:
+        parse_up(config.up)
+    if config.support not in (kinds := ("auto", *quadrics.SUPPORTS)):
+        raise ReobjError(f"--support {config.support}: expected one of {', '.join(kinds)}")
+    for name, (_, height_m) in parse_known_size(config.known_size).items():
+        if height_m > KNOWN_SIZE_MAX_M:
+            raise ReobjError(f"--known-size {name}: {height_m:g} m; at most {KNOWN_SIZE_MAX_M:g} m")
+
+
+KNOWN_SIZE_MAX_M = 1000.0  # chosen: no object of a room or a street is as large
 
 
 def _last_config(out: str | Path) -> Config:

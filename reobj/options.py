@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import difflib
 import json
+import math
 import textwrap
 import tomllib
 from collections.abc import Iterable
@@ -55,8 +56,10 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
         elif isinstance(value, (bool, float)) and kind is int:
             raise TypeError
         value = kind(value)
-    except (KeyError, TypeError, ValueError):
-        expected = kind.__name__.upper()
+        if kind in (int, float) and not 0 <= value < math.inf:
+            raise ValueError
+    except (KeyError, OverflowError, TypeError, ValueError):
+        expected = kind.__name__.upper() + ", finite, 0 or more" * (kind in (int, float))
         raise ReobjError(f"{where}{name}: expected ={expected}, found {value!r}") from None
     section, _, field_name = name.rpartition(".")
     if section:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -100,6 +102,7 @@ class Child:
 
 
 DONE = "reobj: done"
+PR_SET_PDEATHSIG = 1  # of Linux' sys/prctl.h
 LEFT_OVER_S = 60.0  # for the child of a killed run to end; chosen: it does at once (watched)
 
 
@@ -113,6 +116,8 @@ def serve(job: Callable[[Path], None]) -> None:
 
     The process ends as soon as stdin does, also in the middle of a job: its parent is gone.
     """
+    if sys.platform == "linux":  # at once, also in long calls of COLMAP that hold the interpreter
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     folder, told = Path(sys.argv[1]), threading.Semaphore(0)
     with locked(_lock_of(folder), LEFT_OVER_S):
         threading.Thread(target=_watch_parent, args=(told,), daemon=True).start()

@@ -39,7 +39,7 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     'PINHOLE'
     """
     camera = stated_camera(text, size)
-    return None if camera is None else fitted_camera(camera, size, f"--camera {text}")
+    return None if camera is None else fitted_camera(camera, size, f"--camera {text:.200}")
 
 
 def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
@@ -60,10 +60,10 @@ def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
         if camera is None:
             raise ReobjError(f"no focal length; expected {CAMERA_FORMS}")
     except ReobjError as error:
-        raise ReobjError(f"--camera {text}: {error}") from None
+        raise ReobjError(f"--camera {text:.200}: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError):
         what = "not understood" if is_file else "no such file, and no camera"
-        raise ReobjError(f"--camera {text}: {what}; expected {CAMERA_FORMS}") from None
+        raise ReobjError(f"--camera {text:.200}: {what}; expected {CAMERA_FORMS}") from None
     return camera
 
 
@@ -214,7 +214,10 @@ def _pinhole_of_json(
     cx, cy = next(((data[x], data[y]) for x, y in CENTRES if x in data), middle)
     fx, fy = next(((data[x], data.get(y, data[x])) for x, y in FOCALS if x in data), (None, None))
     if fx is None and size and "camera_angle_x" in data:
-        fx = fy = 0.5 * size[0] / math.tan(0.5 * float(data["camera_angle_x"]))
+        angle = float(data["camera_angle_x"])
+        if not 0 < angle < math.pi:
+            raise ReobjError(f"camera_angle_x {angle:g}, expected radians between 0 and pi")
+        fx = fy = 0.5 * size[0] / math.tan(0.5 * angle)
     return None if fx is None or fy is None else (float(fx), float(fy), float(cx), float(cy))
 
 

@@ -373,6 +373,8 @@ def _read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
         cameras = [camera_from_json({**data, **f}, size) for f in frames]
         applied = np.eye(4)
         applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
+    except ReobjError as error:
+        raise ReobjError(f"{path}: {error}") from None
     except (KeyError, TypeError, ValueError, IndexError) as error:
         what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
         raise ReobjError(f"{path}: {what}") from None

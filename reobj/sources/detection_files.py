@@ -38,6 +38,7 @@ from reobj.types import (
     Tracks,
     box_iou,
     option,
+    printable,
     rows_by,
 )
 
@@ -176,7 +177,9 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
         class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
     except (OverflowError, ReobjError) as error:
         raise ReobjError(f"{path}: {error}") from error
-    messages = [f"{len(new)} class names not in the list: {shortened(new)}"] if new else []
+    messages = (
+        [f"{len(new)} class names not in the list: {printable(shortened(new))}"] if new else []
+    )
     if "frame" not in column:
         column["frame"] = _frames_at(column["time"], video, path)
     frame = column["frame"].astype(np.int64) - is_mot
@@ -197,7 +200,7 @@ def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray
         What each column holds (a name of MOT_COLUMNS, "x2", "y2", or any other of a header), the N
         rows of cells, the lines they stand on (N,), and whether it is MOT (no header).
     """
-    reader = csv.reader(read_text(path).splitlines())
+    reader = csv.reader(read_text(path).splitlines(keepends=True), strict=True)
     try:
         rows = [(reader.line_num, cells) for cells in reader if cells]
     except csv.Error as error:

@@ -50,6 +50,7 @@ STREAM_URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, .
 MAX_UNREADABLE = 64  # frames in a row; chosen: 2 s without a picture, then the video has ended
 MISSING_SHARE = 0.02  # of the announced frames; chosen: containers often announce a few too many
 LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: one to work on next and the newest one
+LIVE_POLL_S = 0.5  # chosen: longer than the reading thread takes to say that it ends
 LIVE_TIMEOUT_S = 2.0  # chosen: no frame for so long, and a live source has ended
 
 
@@ -127,7 +128,7 @@ class Video:
         self.files = [] if self._is_url else _image_files(self.source)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
-        self.is_live = self._is_url or (self.source.isdigit() and not Path(self.source).exists())
+        self.is_live = self._is_url or (self.source.isdecimal() and not Path(self.source).exists())
         self.size, self.fps, self.frame_count = self._probe()
         if 0 < self.frame_count <= self.config.start:
             raise ReobjError(f"{self.source}: --start {self.config.start}, but it has only "
@@ -209,19 +210,29 @@ class Video:
         """
         capture, self._opened = self._opened or self._open(), None
         frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_QUEUE)
-        stopped = threading.Event()
+        stopped, self._came = threading.Event(), time.monotonic()
         thread = threading.Thread(
             target=self._read_live, args=(capture, frames, stopped), daemon=True
         )
         thread.start()
         try:
-            while (item := frames.get()) is not None:
+            while (item := self._next_live(frames)) is not None:
                 yield item
         finally:
             stopped.set()
-            thread.join(LIVE_TIMEOUT_S)
+            thread.join(LIVE_TIMEOUT_S / 2)
             if not thread.is_alive():  # else it hangs in the driver; the process may still end
                 capture.release()
+
+    def _next_live(
+        self, frames: queue.Queue[tuple[int, float, Image] | None]
+    ) -> tuple[int, float, Image] | None:
+        """Wait for a frame of a live source; None at its end, or where the driver hangs."""
+        while time.monotonic() - self._came < LIVE_TIMEOUT_S + LIVE_POLL_S or not frames.empty():
+            with contextlib.suppress(queue.Empty):
+                return frames.get(timeout=LIVE_POLL_S)
+        self._warn(f"no frame came for {LIVE_TIMEOUT_S:g} s: taken as its end")
+        return None
 
     def _read_live(
         self,
@@ -240,7 +251,8 @@ class Video:
                 if not ok:
                     time.sleep(0.01)
                     continue
-                last, at, index = time.monotonic(), index, index + 1
+                self._came = last = time.monotonic()
+                at, index = index, index + 1
                 if at < self.config.start or (at - self.config.start) % self.config.every:
                     continue
                 self.read += 1
@@ -263,7 +275,7 @@ class Video:
             raise ReobjError(f"{self.source}: no such file or folder")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        is_camera = self.is_live and self._address.isdigit()
+        is_camera = self.is_live and self._address.isdecimal()
         capture = cv2.VideoCapture(int(self._address) if is_camera else self._address)
         cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
@@ -291,7 +303,7 @@ class Video:
             if pixels > PIXELS_MAX:
                 raise ReobjError(f"{self.source}: frames of {pixels:.0f} pixels, at most "
                                  f"{PIXELS_MAX} are taken")  # fmt: skip
-            if not self._address.isdigit():
+            if not self._address.isdecimal():
                 count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
             self.is_live = self.is_live and not count  # a URL may be that of a file
             self._opened = capture if self.is_live else None
