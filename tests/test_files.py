@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import errno
 import io
 import json
 import math
@@ -182,6 +183,70 @@ def test_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(rt.ReobjError, match=r"a\.npz: cannot be written .No space left on device"):
         files.save_npz(tmp_path / "a.npz", {})
     assert not list(tmp_path.iterdir())
+
+
+def test_other_errors_pass(tmp_path: Path) -> None:
+    """Such as that of a file elsewhere, which the block reads."""
+    elsewhere = OSError(errno.EACCES, "Permission denied", "/elsewhere/input.txt")
+    for error in (elsewhere, OSError(errno.ENOENT, "No such file"), OSError("unknown")):
+        with pytest.raises(OSError) as raised, files.atomic(tmp_path / "a.txt"):
+            raise error
+        assert raised.value is error
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (OSError(errno.ENOSPC, "full"), r"a\.txt: .*No space left.*make room on this disk"),
+        (OSError(errno.EROFS, "read-only"), "not read-only"),
+        (OSError("1024 requested and 16 written"), "make room on this disk"),  # NumPy
+    ],
+)
+def test_errors_of_the_disk_say_where_and_what_to_do(
+    tmp_path: Path, error: OSError, text: str
+) -> None:
+    with pytest.raises(rt.ReobjError, match=text), files.atomic(tmp_path / "a.txt") as part:
+        part.write_text("half")
+        raise error
+    assert not list(tmp_path.iterdir())
+
+
+# ---- Several files together, locks ---------------------------------------------------------------
+
+
+def test_staged_files_appear_together(tmp_path: Path) -> None:
+    """Files of folders too; what was not made anew stays, and what a kill left behind goes."""
+    (tmp_path / "a.txt").write_text("old")
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / files.PART_RESULTS).mkdir()
+    (tmp_path / files.PART_RESULTS / "left.txt").write_text("of a killed run")
+    with files.staged(tmp_path) as new:
+        (new / "a.txt").write_text("new")
+        (new / "cache").mkdir()
+        (new / "cache/b.txt").write_text("new")
+        assert (tmp_path / "a.txt").read_text() == "old"
+    found = {str(p.relative_to(tmp_path)): p.read_text() for p in tmp_path.rglob("*.txt")}
+    assert found == {"a.txt": "new", "cache/b.txt": "new", "notes.txt": "mine"}
+
+
+def test_a_full_disk_keeps_all_old_files(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("old")
+    where = rf"{tmp_path.name}/b\.txt: cannot be written"  # not the folder that is gone again
+    with pytest.raises(rt.ReobjError, match=where), files.staged(tmp_path) as new:
+        (new / "a.txt").write_text("new")
+        with files.atomic(new / "b.txt"):
+            raise OSError(errno.ENOSPC, "full")
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["old"]
+
+
+def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
+    with files.locked(tmp_path / "lock"):
+        began = time.monotonic()
+        with pytest.raises(files.LockedError), files.locked(tmp_path / "lock", 0.2):
+            pass
+        assert time.monotonic() - began >= 0.2
+    with files.locked(tmp_path / "lock"):
+        pass
 
 
 # ---- Progress ------------------------------------------------------------------------------------

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +19,8 @@ from test_consistency import fundamental
 
 import reobj_track as rt
 from reobj.cameras import read_sparse_model
-from reobj.files import Progress
+from reobj.files import Progress, locked
+from reobj.poses import child as child_room
 from reobj.poses import mapping
 from reobj.poses.consistency import MatchedPairs
 from reobj.poses.mapping import FOCAL_GUESS, mapping_child, reconstruct
@@ -384,3 +387,52 @@ def test_objects_as_landmarks_never_worsen_the_points(walk, noise_px, used):
     if used:
         assert together <= 1.001 * alone and adjusted.num_points3D() == model.num_points3D()
     assert pose_accuracy.refine_together(model, [])[0] is model
+
+
+SLEEPER = """
+import sys, time
+from pathlib import Path
+from reobj.poses.child import Child, serve
+def job(folder):
+    Path(sys.argv[1]).with_name("pid").write_text(str(__import__("os").getpid()))
+    time.sleep(60)
+if __name__ == "__main__":
+    serve(job)
+"""
+PARENT = """
+from pathlib import Path
+from reobj.files import Progress
+from reobj.poses.child import Child
+with Child("sleeper", Path("work/mapping"), Path("work/log")) as child:
+    child.run(Progress)
+"""
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("platform", ["linux", "other"])
+def test_the_child_ends_with_its_parent(tmp_path, monkeypatch, ending, platform):
+    """Also in the middle of a job; the next one waits until nobody works in the folder."""
+    code = SLEEPER.replace("import sys, time", f"import sys, time; sys.platform = {platform!r}")
+    (tmp_path / "sleeper.py").write_text(code)
+    root = str(Path(rt.__file__).parent)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), root])}
+    parent = subprocess.Popen([sys.executable, "-c", PARENT], cwd=tmp_path, env=environment)
+    noted, deadline = tmp_path / "work/pid", time.monotonic() + 60
+    while not noted.exists() or not noted.read_text():
+        assert time.monotonic() < deadline and parent.poll() is None
+        time.sleep(0.01)
+    monkeypatch.setattr(child_room, "LEFT_OVER_S", 0.1)
+    with pytest.raises(rt.ReobjError, match=r"work: a reconstruction still runs in this folder"):
+        child_room.Child("sleeper", tmp_path / "work/mapping", tmp_path / "work/log2")
+    parent.send_signal(ending)
+    parent.wait()
+    with locked(tmp_path / "work/mapping.lock", 10.0):  # held as long as the child lives
+        pass
+
+
+def test_a_damaged_job_file_begins_anew(walk, tmp_path, caplog):
+    first = run(tmp_path, walk[0])
+    (tmp_path / "mapping/job.json").write_text('{"camera"')
+    again = run(tmp_path, walk[0])
+    assert first[0] == again[0] == [] and again[1] is not None
+    assert "job.json" in caplog.text and "computed again" in caplog.text

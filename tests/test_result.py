@@ -149,6 +149,20 @@ def test_files_of_an_earlier_run_go(chairs: rt.Result, saved: Path) -> None:
     assert (saved / "notes.txt").exists() and rt.Result.load(saved).poses is None
 
 
+def test_a_full_disk_keeps_the_files_of_an_earlier_run(chairs: rt.Result, saved: Path) -> None:
+    """Whatever fails last: here what the caller adds."""
+    (saved / "scene.html").write_text("old page")
+    before = {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()}
+
+    def full(folder: Path) -> None:
+        (folder / "scene.html").write_text("ne")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(rt.ReobjError, match="No space left"):
+        fitted(chairs.tracks, None).save(saved, more=full)
+    assert {p: p.read_bytes() for p in saved.rglob("*") if p.is_file()} == before
+
+
 def test_evidence_is_rounded_to_four_digits() -> None:
     links = (rt.LinkEvent("join", (1, 2), 0.123456, -9.87654321, True),
              rt.LinkEvent("join", (1, 3), None, 0.00004, False))  # fmt: skip

@@ -513,6 +513,17 @@ def test_a_slow_consumer_sees_the_newest_frames(
     assert all(a.time_s <= b.time_s for a, b in itertools.pairwise(seen))
 
 
+def test_a_driver_that_hangs_is_the_end(monkeypatch: pytest.MonkeyPatch, quick: None) -> None:
+    """A stream that stalls blocks OpenCV for half a minute; the frames before are used."""
+    gate = threading.Event()
+    opened(monkeypatch, FakeCamera(5, {3: gate}))
+    video = rt.Video(0)
+    began = time.monotonic()
+    assert [f.index for f in video] == [0, 1]
+    assert time.monotonic() - began < 10 and "no frame came for 1 s" in video.messages[-1]
+    gate.set()
+
+
 def test_leaving_early_stops_the_thread_and_frees_the_camera(
     monkeypatch: pytest.MonkeyPatch, quick: None
 ) -> None:

@@ -240,6 +240,8 @@ def _download(weights: Weights, part: Path) -> None:
         urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response,
         part.open("wb") as file,
     ):
+        if weights.url.startswith("https:") and not response.url.startswith("https:"):
+            raise ConnectionError(f"redirected to {response.url}, which is not encrypted")
         size, done = weights.size or min(response.length or 0, DOWNLOAD_MAX), 0
         with Progress("fetch kB", size // 1000) as progress:
             while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
