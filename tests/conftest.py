@@ -12,6 +12,15 @@ from simulated import SIZE, finished, fitted, tracks_of, unlinked, walk
 import reobj_track as rt
 from reobj.results.workspace import Workspace
 
+try:
+    from hypothesis import settings
+except ImportError:  # test_properties.py is skipped then
+    pass
+else:  # the same cases each time, within a minute; `--hypothesis-profile long` tries new ones
+    settings.register_profile("ci", max_examples=40, deadline=None, derandomize=True, database=None)
+    settings.register_profile("long", max_examples=2000, deadline=None, database=None)
+    settings.load_profile("ci")
+
 ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
 CAMERA = "492.756788421,492.756788421,320,240"  # of examples/room/camera.txt
 FEW = ("--every", 3, "--stop", 120)  # frames of the example room that are enough for files

@@ -1,0 +1,324 @@
+"""Hostile input: whatever comes in, it is understood or refused in one line that says why.
+
+`hypothesis` draws it; every defect that was found this way stays as an example. All of it takes
+less than a minute; `pytest -n 0 tests/test_properties.py --hypothesis-profile long` tries more.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated import chair_solids, fitted, tracks_of, walk
+
+import quadrics
+import reobj_track as rt
+from reobj.files import load_cached
+from reobj.objects import parse_known_size, parse_up
+from reobj.options import with_option
+from reobj.poses.intrinsics import parse_camera
+from reobj.sources.imageless import ImagelessVideo
+
+hypothesis = pytest.importorskip("hypothesis", reason="pip install hypothesis (dev extra)")
+from hypothesis import example, given  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+from hypothesis.extra import numpy as npst  # noqa: E402
+
+REFUSED = (rt.ReobjError, quadrics.QuadricsError)
+SIZE = (640, 480)
+LONGEST = 1000  # characters of a message
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("hostile")
+
+
+@pytest.fixture(scope="module")
+def video(folder: Path) -> Any:
+    names = [f"{i}.png" for i in range(20)]
+    return ImagelessVideo("room", SIZE, times_s=np.arange(20) / 10, names=names)
+
+
+def understood(read: Callable[[], Any]) -> Any:
+    """Call a reader; None if it refuses in one printable line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            return read()
+    except REFUSED as error:
+        text = str(error)
+        assert text.strip() and text.isprintable() and len(text) < LONGEST, repr(text)
+        return None
+
+
+# ---- Files ----
+
+MOT = "".join(f"{f},-1,{10 + f},20,30.5,40,.9,57,-1,-1\n" for f in range(1, 6))
+CSV = "frame,x1,y1,x2,y2,score,class\n" + "".join(f"{f},1,2,30,40,.9,chair\n" for f in range(5))
+COCO = json.dumps([
+    {"image_id": f, "category_id": 62, "bbox": [1.5, 2, 30, 40], "score": 0.9} for f in range(4)
+])  # fmt: skip
+TUM = "".join(f"{f / 10} {f / 5} 0 0 0 0 0 1\n" for f in range(20))
+TRANSFORMS = json.dumps({
+    "w": 640, "h": 480, "fl_x": 500, "fl_y": 500, "cx": 320, "cy": 240,
+    "applied_transform": np.eye(4)[:3].tolist(),
+    "frames": [
+        {"file_path": f"{f}.png", "transform_matrix": np.eye(4).tolist()} for f in range(20)
+    ],
+})  # fmt: skip
+PRIORS = json.dumps({
+    "aliases": {"sofa": "couch"},
+    "couch": {"size_m": {"mean": [2, 0.9, 0.8], "log_std": [0.2, 0.2, 0.2], "corr": [0, 0, 0]}},
+})  # fmt: skip
+CVAT = (
+    '<annotations><track id="0" label="chair">'
+    + "".join(f'<box frame="{f}" xtl="1" ytl="2" xbr="30" ybr="40"/>' for f in range(4))
+    + "</track></annotations>"
+)
+
+
+def boxes_make_sense(found: Any, video: Any) -> None:
+    assert np.isfinite(found.xyxy).all() and (np.abs(found.xyxy) <= 1e7).all()
+    assert ((found.score >= 0) & (found.score <= 1)).all()
+    assert ((found.frame >= 0) & (found.frame < video.frame_count)).all()
+    assert (found.class_id < len(found.class_names)).all() and len(found.class_names) < 40000
+    assert not re.search("[\x00-\x1f\x7f-\x9f]", "".join(found.class_names))
+
+
+def poses_make_sense(poses: rt.Poses, video: Any) -> None:
+    rotation = poses.cam_from_world[poses.known][:, :, :3]
+    assert len(rotation) and (np.linalg.det(rotation) > 0).all()
+    assert np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max() < 1e-6
+    assert np.isfinite(poses.camera.params).all() and (np.diag(poses.camera.K) > 0).all()
+    assert (np.abs(poses.cam_from_world[poses.known]) < 1e9).all()
+
+
+def tracks_make_sense(found: Any, video: Any) -> None:
+    tracks = found[0]
+    assert np.isfinite(tracks.xyxy).all() and (tracks.track_id >= 0).all()
+    rows = np.column_stack([tracks.frame, tracks.track_id])
+    assert len(np.unique(rows, axis=0)) == len(rows)
+
+
+def priors_make_sense(priors: quadrics.Priors, video: Any) -> None:
+    for values in (priors.log_mean, priors.log_cov, priors.ratio_mean, priors.ratio_cov):
+        assert np.isfinite(values).all()
+    assert not len(priors.names) or np.linalg.eigvalsh(priors.log_cov).min() > 0
+    priors.index(["chair", "sofa", None])
+
+
+EVERY_SCORE = rt.DetectConfig(min_score=0.0)
+FILES: dict[str, tuple[str, Callable[..., Any], Callable[..., None]]] = {
+    "det.txt": (MOT, lambda p, v: rt.read_detections(p, v, EVERY_SCORE), boxes_make_sense),
+    "det.csv": (CSV, lambda p, v: rt.read_detections(p, v, EVERY_SCORE), boxes_make_sense),
+    "coco.json": (COCO, lambda p, v: rt.read_detections(p, v, EVERY_SCORE), boxes_make_sense),
+    "cvat.xml": (CVAT, rt.read_tracks, tracks_make_sense),
+    "poses.txt": (TUM, lambda p, v: rt.read_poses(p, v, camera="500,500,320,240"),
+                  poses_make_sense),
+    "transforms.json": (TRANSFORMS, rt.read_poses, poses_make_sense),
+    "priors.json": (PRIORS, lambda p, v: quadrics.load_priors(p), priors_make_sense),
+}  # fmt: skip
+NASTY = [
+    "nan", "inf", "-inf", "1e308", "1e400", "-1", "0", "1e-320", "1.5", "2147483648", "3.7", "1e30",
+    "9" * 23, "", " ", "abc", "²", "٣", "--5", "null", "[]", "{}", "true", '"', "\\", "\x00",
+    "\x1b[31m", "\n", "a" * 300, "[" * 2000, "x" * 140000, "=1+1", "\u202e", "\ud800",
+]  # fmt: skip
+edits = st.lists(st.tuples(st.floats(0, 1), st.sampled_from(NASTY), st.integers(0, 4)),
+                 min_size=1, max_size=3)  # fmt: skip
+
+
+def edited(text: str, changes: list[tuple[float, str, int]]) -> str:
+    """Put hostile text in place of numbers and words; cut, double and turn around."""
+    for at, nasty, kind in changes:
+        spots = list(re.finditer(r"[-+]?[0-9][0-9.eE+-]*|[A-Za-z_]+", text))
+        place = round(at * len(text))
+        if kind < 3 and spots:
+            spot = spots[min(int(at * len(spots)), len(spots) - 1)]
+            text = text[: spot.start()] + nasty + text[spot.end() :]
+        elif kind == 3:
+            text = text[:place]
+        else:
+            text = text[:place] + nasty + text[place:] + text[:place]
+    return text
+
+
+@pytest.mark.parametrize("name", FILES)
+@given(changes=edits)
+@example(changes=[(0.0, "3.7", 0)])  # a frame between two
+@example(changes=[(0.0, "1e30", 0)])
+@example(changes=[(0.99, '"', 4)])  # a quote that nothing ends
+@example(changes=[(0.99, "x" * 140000, 0)])  # a longer field than csv takes
+@example(changes=[(0.3, "[" * 2000, 4)])
+@example(changes=[(0.45, "-1", 0)])
+@example(changes=[(0.0, "\x1b[31m", 4)])
+def test_files_are_understood_or_refused(
+    name: str, folder: Path, video: Any, changes: list[tuple[float, str, int]]
+) -> None:
+    text, read, check = FILES[name]
+    path = folder / name
+    path.write_bytes(edited(text, changes).encode("utf-8", "surrogatepass"))
+    found = understood(lambda: read(path, video))
+    if found is not None:
+        check(found, video)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_files_that_are_changed_are_right(name: str, folder: Path, video: Any) -> None:
+    """Else only refusals would be tested."""
+    text, read, check = FILES[name]
+    (folder / name).write_text(text)
+    check(read(folder / name, video), video)
+
+
+def with_applied(matrix: Any) -> str:
+    return json.dumps(json.loads(TRANSFORMS) | {"applied_transform": matrix})
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (with_applied(np.diag([-1.0, 1, 1, 1])[:3].tolist()), "mirrored"),
+        (with_applied([[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "not finite"),
+        (TRANSFORMS.replace('"fl_x": 500', '"fl_x": 0'), r"json: a number is not finite, or"),
+        (TRANSFORMS.replace('"fl_x": 500, "fl_y": 500', '"camera_angle_x": 0'), "angle_x 0"),
+    ],
+)
+def test_cameras_that_cannot_be_meant(folder: Path, video: Any, text: str, what: str) -> None:
+    path = folder / "transforms.json"
+    path.write_text(text)
+    with pytest.raises(rt.ReobjError, match=what):
+        rt.read_poses(path, video)
+
+
+# ---- Options ----
+
+
+def options_make_sense(text: str) -> None:
+    name, _, value = text.partition("=")
+    config = with_option(rt.Config(), name, value)
+    for section in ("tracker", "objects", "input", "detect", "poses"):
+        own = getattr(config, section)
+        values = [getattr(own, name) for name in own.__dataclass_fields__]
+        assert all(v >= 0 and np.isfinite(v) for v in values if isinstance(v, int | float))
+
+
+def sizes_make_sense(text: str) -> None:
+    assert all(np.isfinite(v) and v > 0 for _, v in parse_known_size(text).values())
+
+
+def camera_makes_sense(text: str) -> None:
+    camera = parse_camera(text, SIZE)
+    assert camera is None or np.isfinite(camera.params).all()
+
+
+ARGUMENTS: dict[str, tuple[str, Callable[[str], None]]] = {
+    "camera": ("492.7,492.7,320,240,0.1,0,0,0", camera_makes_sense),
+    "known-size": ("chair=0.82m,door=2.0m", sizes_make_sense),
+    "up": ("0,0,1", lambda text: None if np.isfinite(parse_up(text)).all() else pytest.fail(text)),
+    "set": ("tracker.coast_frames=30", options_make_sense),
+    "set float": ("tracker.return_probability=.5", options_make_sense),
+}
+
+
+@pytest.mark.parametrize("name", ARGUMENTS)
+@given(changes=edits)
+@example(changes=[(0.99, "nan", 0)])
+@example(changes=[(0.99, "-1", 0)])
+@example(changes=[(0.99, "\n", 4)])
+@example(changes=[(0.3, "1.2.3", 0)])
+def test_arguments_are_understood_or_refused(
+    name: str, changes: list[tuple[float, str, int]]
+) -> None:
+    text, check = ARGUMENTS[name]
+    changed = edited(text, changes)
+    if "\x00" not in changed and name != "up":  # no argument of a command can hold it
+        understood(lambda: check(changed))
+
+
+# ---- Arrays ----
+
+
+@given(
+    rows=npst.arrays(
+        st.sampled_from([np.float64, np.float32, np.int64]),
+        npst.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=7),
+        elements=st.sampled_from([0, 1, 2, 10, 63, -5, 1000]),
+    ),
+    value=st.sampled_from([0.5, np.nan, np.inf, -np.inf, 1e300, -1.0, 9.0]),
+    at=st.integers(0, 50),
+)
+@example(rows=np.ones((6, 5)), value=0.5, at=0)  # once reshaped to garbage
+@example(rows=np.ones((6, 7)), value=0.5, at=0)
+@example(rows=np.array([[30.0, 30, 10, 10, 0.9, 1]]), value=0.9, at=4)  # upside down
+@example(rows=np.array([[1.0, 1, 10, 10, 0.9, 1]]), value=1e300, at=2)
+@example(rows=np.array([[1.0, 1, 10, 10, 0.9, 1]]), value=9.0, at=4)
+def test_frames_of_a_tracker_are_understood_or_refused(rows: Any, value: float, at: int) -> None:
+    tracker = rt.Tracker()
+    if rows.dtype.kind == "f" and rows.size:
+        rows = rows.copy()
+        rows.flat[at % rows.size] = value
+    for _ in range(4):
+        tracks = understood(lambda: tracker.update(rows))
+        if tracks is not None:
+            assert (
+                np.isfinite(tracks.xyxy).all() and ((tracks.score >= 0) & (tracks.score <= 1)).all()
+            )
+            assert (tracks.xyxy[:, 2:] >= tracks.xyxy[:, :2]).all()
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    value=st.sampled_from([np.nan, np.inf, 0.0, 1e300, -1e12, 1e-300]),
+    share=st.sampled_from([0.0, 0.05, 0.5, 1.0]),
+    cameras=st.booleans(),
+)
+@example(seed=5, value=1e300, share=0.05, cameras=False)
+@example(seed=5, value=np.inf, share=1.0, cameras=True)
+def test_fits_are_finite_or_not_there(seed: int, value: float, share: float, cameras: bool) -> None:
+    """Objects are located with finite numbers, or have none; factorisations as well."""
+    rng, poses = np.random.default_rng(seed), walk(5)
+    img_from_world = poses.camera.K @ poses.cam_from_world
+    boxes = quadrics.solid_boxes(chair_solids(), "box", img_from_world)
+    boxes = np.concatenate([boxes, boxes + rng.normal(0, 2, boxes.shape)], 1)  # (5, 6, 4)
+    target = img_from_world if cameras else boxes
+    target[rng.random(target.shape) < share] = value
+    categories = ["chair"] * boxes.shape[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # squares of 1e300
+        try:
+            fits = quadrics.fit_objects(boxes, img_from_world, SIZE, categories)
+            for name in ("center_in_world", "half_axes"):
+                values = getattr(fits.ellipsoids, name)
+                assert (np.isfinite(values).all(1) | np.isnan(values).any(1)).all()
+            quadrics.fit_psfmo(boxes, categories)
+        except REFUSED as error:
+            assert str(error).isprintable() and str(error)
+
+
+# ---- Caches ----
+
+
+@given(at=st.lists(st.floats(0, 1), min_size=1, max_size=4), value=st.integers(0, 255),
+       cut=st.booleans())  # fmt: skip
+def test_a_damaged_cache_is_computed_again(
+    folder: Path, at: list[float], value: int, cut: bool
+) -> None:
+    """Never a traceback, and never other tracks than were written."""
+    path, result = folder / "tracks.npz", fitted(tracks_of(walk(2)), None)
+    result.save_tracked(path)
+    data = bytearray(path.read_bytes())
+    for share in at:
+        data[round(share * (len(data) - 1))] = value
+    path.write_bytes(data[: round(at[0] * len(data))] if cut else data)
+    found = load_cached(path, rt.Result.load_tracked)
+    if found is None:
+        assert not path.exists()
+    else:
+        np.testing.assert_array_equal(found.tracks.xyxy, result.tracks.xyxy)
