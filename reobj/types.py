@@ -24,11 +24,17 @@ log = logging.getLogger("reobj_track")
 class ReobjError(ValueError):
     """A mistake in the input: says what, where, what was expected and what to do (exit code 2).
 
-    In one line: control characters, such as those of the input, are escaped.
+    In one line: control characters, such as those of the input, are escaped, and of long texts the
+    middle is left out.
     """
 
     def __init__(self, text: str = "") -> None:
+        if len(text) > MESSAGE_MAX:
+            text = f"{text[: MESSAGE_MAX // 2]} ... {text[-MESSAGE_MAX // 3 :]}"
         super().__init__(printable(text))
+
+
+MESSAGE_MAX = 1500  # characters; chosen: ours are shorter, what is longer is the input's
 
 
 def printable(text: str) -> str:

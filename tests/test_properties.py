@@ -32,7 +32,7 @@ from hypothesis.extra import numpy as npst  # noqa: E402
 
 REFUSED = (rt.ReobjError, quadrics.QuadricsError)
 SIZE = (640, 480)
-LONGEST = 1000  # characters of a message
+LONGEST = 5000  # characters of a message, which may be escaped: six for one
 
 
 @pytest.fixture(scope="module")
