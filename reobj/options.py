@@ -56,7 +56,7 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
         elif isinstance(value, (bool, float)) and kind is int:
             raise TypeError
         value = kind(value)
-        if kind in (int, float) and not 0 <= value < math.inf:
+        if kind in (int, float) and not 0 <= value < (2**31 if kind is int else math.inf):
             raise ValueError
     except (KeyError, OverflowError, TypeError, ValueError):
         expected = kind.__name__.upper() + ", finite, 0 or more" * (kind in (int, float))

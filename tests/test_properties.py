@@ -297,7 +297,7 @@ def test_fits_are_finite_or_not_there(seed: int, value: float, share: float, cam
             for name in ("center_in_world", "half_axes"):
                 values = getattr(fits.ellipsoids, name)
                 assert (np.isfinite(values).all(1) | np.isnan(values).any(1)).all()
-            quadrics.fit_psfmo(boxes, categories)
+            quadrics.fit_psfmo(boxes, quadrics.load_priors(), categories)
         except REFUSED as error:
             assert str(error).isprintable() and str(error)
 
