@@ -769,6 +769,26 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
     assert_one_clear_line(capsys, "sports bal: no such class; did you mean sports ball")
 
 
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        (("--known-size", "chair=nan"), "--known-size 'chair=nan': expected"),
+        (("--known-size", "chair=9999m"), "--known-size chair: 9999 m; at most 1000 m"),
+        (("--priors", ROOT / "README.md"), "README.md: not valid JSON"),
+        (("--support", "cube"), "--support cube: expected one of auto, ellipsoid"),
+        (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
+        (("--set", "tracker.return_probability=nan"), "expected =FLOAT, finite, 0 or more"),
+    ],
+)
+def test_what_the_fit_cannot_use_is_said_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[Any, ...], said: str
+) -> None:
+    """Before the video is read, and before anything is written."""
+    out = tmp_path / "out"
+    assert cli("run", ROOT / "examples/room/room.mp4", "-o", out, *option) == 2
+    assert said in capsys.readouterr().err and not out.exists()
+
+
 def test_a_size_that_sets_nothing_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
