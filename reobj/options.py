@@ -48,7 +48,7 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     options: Any = every_option(config)
     if name not in options:
         raise ReobjError(f"{where}{name}: no such option; did you mean {_likest(name, options)}?")
-    kind = type(options[name].default)
+    kind, in_range = type(options[name].default), ""
     try:
         if isinstance(value, str) and kind is bool:
             value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
@@ -57,9 +57,10 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
             raise TypeError
         value = kind(value)
         if kind in (int, float) and not 0 <= value < (2**31 if kind is int else math.inf):
+            in_range = ", finite, 0 or more"
             raise ValueError
     except (KeyError, OverflowError, TypeError, ValueError):
-        expected = kind.__name__.upper() + ", finite, 0 or more" * (kind in (int, float))
+        expected = kind.__name__.upper() + in_range
         raise ReobjError(f"{where}{name}: expected ={expected}, found {value!r}") from None
     section, _, field_name = name.rpartition(".")
     if section:

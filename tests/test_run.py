@@ -781,7 +781,7 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
     ],
 )
 def test_what_the_fit_cannot_use_is_said_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[Any, ...], said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: tuple[object, ...], said: str
 ) -> None:
     """Before the video is read, and before anything is written."""
     out = tmp_path / "out"
