@@ -368,5 +368,11 @@ def test_frames_are_filled_only_from_where_it_was_seen() -> None:
     assert 5 < near.sum() < 40  # the walk sees it from farther aside too
     filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3)
     assert filled.frame[filled.score == 0].tolist() == [f for f in np.flatnonzero(near) if f != 30]
+    own = table.detection_index[seen] == 0
+    for shift, explained in (([0, 0, 0, -0.4], True), ([0.3, 0, 0.3, 0], False)):  # hidden; beside
+        moved = shifted(table[seen], np.where(own[:, None], shift, 0.0))
+        again = fill_by_place(moved, poses, np.array([1, 2, 3]), solids, ["box"] * 3)
+        assert ((again.score == 0).sum() == (filled.score == 0).sum()) == explained
+        assert explained or len(again) == len(moved)
     never = table[seen & (table.detection_index != 0)]  # no detection, nothing to fill from
     assert len(fill_by_place(never, poses, np.array([1]), solids[:1], ["box"])) == len(never)
