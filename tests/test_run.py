@@ -403,7 +403,7 @@ def test_a_killed_run_leaves_nothing_broken(clip: Path, detections: Path, tmp_pa
     """
     args = ["track", str(clip), "--detections", str(detections), "--embed", "none"]
     assert cli(*args, "-o", tmp_path / "good") == 0
-    for place in ("rt.Tracker.update", "scene._webp"):
+    for place in ("rt.Tracker.update", "scene._jpeg"):
         code = (
             "import os, signal, sys, reobj_track as rt; from reobj.results import scene\n"
             f"calls, own = [], {place}\n"

@@ -4,7 +4,7 @@ const $ = (id) => document.getElementById(id);
 const S = JSON.parse($("data").textContent);
 const bytes = (b64) => Uint8Array.from(atob(b64), (c) => c.charCodeAt(0));
 const floats = (b64) => new Float32Array(bytes(b64).buffer);
-const picture = (b64) => `data:image/webp;base64,${b64}`;
+const picture = (b64) => `data:image/jpeg;base64,${b64}`;
 const percent = (x) => `${Math.round(100 * x)} %`;
 const rgb = (o) => `rgb(${o.color})`;
 
