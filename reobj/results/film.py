@@ -32,8 +32,10 @@ VP8_SIZE_PX, VP8_FPS = 480, 15.0
 # lookahead: with it, the same pictures give other bytes every few runs (seen with PyAV 18.1, one
 # thread and no B-frames too).
 H264 = {
-    "preset": "superfast", "crf": "23", "x264-params": "bframes=0:threads=1:rc-lookahead=0:mbtree=0",
-}  # fmt: skip
+    "preset": "superfast",
+    "crf": "23",
+    "x264-params": "bframes=0:threads=1:rc-lookahead=0:mbtree=0",
+}
 KEYFRAME_S = 2  # between frames that a player can jump to (chosen)
 WEBM_HEAD = 1 << 16  # bytes that hold all before the first frame (FFmpeg: under 1000)
 MAX_DENOMINATOR = 1001  # of frame rates: 30000/1001
