@@ -63,6 +63,8 @@ DISK_ERRORS = {
     errno.EROFS: "choose a folder on a disk that is not read-only",
     errno.EACCES: "choose a folder that you may write into",
     errno.EPERM: "choose a folder that you may write into",
+    errno.EEXIST: "a file stands where a folder should be: move it away",
+    errno.ENOTDIR: "a file stands where a folder should be: move it away",
     errno.EIO: "look at the disk: it fails",
 }  # what to do about them
 NUMPY_FULL = re.compile(r"\d+ requested and \d+ written")  # its error without a number

@@ -45,7 +45,7 @@ def test_a_walk_gets_a_pose_for_every_frame(walk):
     assert ate_percent(poses.cam_from_world, truth) < 1.0
     assert len(poses.points) > 300 and poses.colors.any() and len(poses.colors) == len(poses.points)
     assert (poses.camera.width, poses.camera.height) == video.size
-    assert sorted(p.name for p in folder.iterdir()) == ["pycolmap.log", "sparse"]
+    assert sorted(p.name for p in folder.iterdir()) == ["mapping.lock", "pycolmap.log", "sparse"]
 
 
 def test_the_sparse_model_holds_the_keyframes(walk):
