@@ -585,6 +585,21 @@ def test_what_was_put_last_counts(tmp_path: Path) -> None:
     assert_same(DetectionCache(tmp_path, (32, 24)).get(1), some(3))
 
 
+def test_detections_that_were_changed_in_the_cache_are_not_believed(
+    tmp_path: Path, caplog: Any
+) -> None:
+    """A whole npz file of the right shapes, with other scores than were written."""
+    cache = DetectionCache(tmp_path, (32, 24))
+    cache.put(1, some(1))
+    cache.flush()
+    (chunk,) = tmp_path.glob("chunk_*.npz")
+    arrays = dict(np.load(chunk))
+    assert len(arrays["score"])
+    np.savez(chunk, **arrays | {"score": arrays["score"] * 0.5})
+    assert DetectionCache(tmp_path, (32, 24)).get(1) is None
+    assert "its frames are detected again" in caplog.text
+
+
 def test_a_cache_of_another_working_size_is_none(tmp_path: Path) -> None:
     cache = DetectionCache(tmp_path, (32, 24))
     cache.put(2, some(2))
