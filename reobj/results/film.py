@@ -25,8 +25,8 @@ import cv2
 from reobj.types import Image
 
 H264_SIZE_PX = 1280  # longer side; larger videos are shrunk (chosen: HD, so that it plays)
-# The same, and most frames a second, for the slow encoder: 60 ms for a frame of 640 x 480, 40 ms for
-# one of 480 x 360, three times as long as tracking takes (chosen: labels can still be read)
+# The same, and most frames a second, for the slow encoder: 60 ms for a frame of 640 x 480, 40 ms
+# for one of 480 x 360, three times as long as tracking takes (chosen: labels can still be read)
 VP8_SIZE_PX, VP8_FPS = 480, 15.0
 # x264's own quality; "superfast" takes half the time of "veryfast" for 1.3 times the bytes. Without
 # lookahead: with it, the same pictures give other bytes every few runs (seen with PyAV 18.1, one
