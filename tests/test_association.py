@@ -15,7 +15,7 @@ from reobj.identity import locate as locating
 from reobj.identity.association import Association, Associator
 from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
 from reobj.identity.gaps import fill_by_place
-from reobj.identity.locate import Categories, confidence, locate
+from reobj.identity.locate import Categories, best_scores, confidence, locate
 from reobj.identity.proposals import propose
 from reobj.objects import fitter
 from reobj.types import class_shares
@@ -274,6 +274,43 @@ def test_a_double_is_dropped_and_its_detections_return() -> None:
     assert len(found.solids) == 3 and (found.owner >= 0).all()
 
 
+@pytest.mark.parametrize("first", [0, 3])
+def test_of_two_that_stand_for_one_thing_the_better_placed_one_stays(first: int) -> None:
+    """A solid 12 cm off has half of the chair's detections, and is of a likelier size."""
+    three = chairs()
+    off = dataclasses.replace(
+        three.ellipsoids, center_in_world=three.ellipsoids.center_in_world + np.array([0.12, 0, 0])
+    )
+    four = Solids.concatenate([three, dataclasses.replace(three, ellipsoids=off)[[0]]])
+    order = np.array([0, 1, 2, 3] if first == 0 else [3, 1, 2, 0])
+    made, found = association_of(four[order], walk(30))
+    shift = order.tolist().index(3)
+    own = np.flatnonzero(table_of(walk(30)).detection_index == 0)
+    owner = found.owner.copy()
+    owner[own[::2]], owner[own[1::2]] = shift, order.tolist().index(0)
+    likelier = np.where(np.arange(4) == shift, 0.0, -1.0)
+    thinned = made._thinned(dataclasses.replace(found, owner=owner, size_log_odds=likelier))
+    centre = thinned.solids.ellipsoids.center_in_world
+    assert len(centre) == 3
+    assert np.abs(centre - three.ellipsoids.center_in_world[0]).max(1).min() < 1e-9
+
+
+def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two states that follow each other for ever are looked at once each."""
+    made, found = association_of(chairs(), walk(10))
+    states = [np.where(found.owner == k, -1, found.owner) for k in (0, 1)]
+    rounds: list[int] = []
+
+    def turned(now: Association) -> Association:
+        rounds.append(1)
+        return dataclasses.replace(now, owner=states[len(rounds) % 2])
+
+    for step in ("_refitted", "_thinned", "_merged"):
+        monkeypatch.setattr(made, step, turned if step == "_merged" else lambda now: now)
+    made.run(chairs())
+    assert len(rounds) == 3
+
+
 def test_pursuit_chooses_what_is_there() -> None:
     three = chairs()
     away = dataclasses.replace(
@@ -316,9 +353,21 @@ def test_confidence_rises_with_score_and_share() -> None:
     score, share = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
     table = confidence(score[:, None], share, 0.0)
     assert (np.diff(table, axis=0) > 0).all() and (np.diff(table, axis=1) > 0).all()
-    assert table[0, 0] < 0.1 and table[2, 2] > 0.95
-    assert (confidence(score, share, 2.0) < confidence(score, share, 0.0)).all()
+    assert table[0, 0] < 0.1 and table[2, 2] > 0.9
+    np.testing.assert_array_equal(confidence(score, share, 2.0), table.diagonal())
+    assert (confidence(score, share, -2.0) > table.diagonal()).all()  # all its scores are low
     assert confidence(np.zeros(1), np.array([np.nan]), 0.0)[0] < 0.1  # no solid explains it
+
+
+def test_the_best_views_tell_what_a_thing_scores() -> None:
+    """Ten views, nine of them half hidden; the order does not matter."""
+    score = np.r_[np.full(8, 0.2), 0.9, 0.9, 0.5]
+    group = np.r_[np.zeros(10, int), 2]
+    found = best_scores(score, group, 3)
+    np.testing.assert_array_equal(found, best_scores(score[::-1], group[::-1], 3))
+    odds = np.log(score / (1 - score))
+    np.testing.assert_allclose(found[0], np.quantile(odds[:10], 0.9))
+    assert found[0] == odds[9] and np.isnan(found[1]) and found[2] == odds[10]
 
 
 # ---- What follows ----

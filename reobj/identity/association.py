@@ -91,12 +91,13 @@ class Associator:
         """Choose among proposed solids, then improve them and their detections in turn."""
         chosen = self._pursue(self._empty(proposed))
         now = self._assign(proposed[chosen], np.full(len(self.detected.view), -1))
+        known = {now.owner.tobytes()}
         for _ in range(MAX_ROUNDS):
-            before = now.owner
             for step in (self._refitted, self._thinned, self._merged):
                 now = step(now)
-            if np.array_equal(now.owner, before):
+            if (state := now.owner.tobytes()) in known:
                 break
+            known.add(state)
         return now
 
     def _empty(self, solids: Solids) -> Association:
@@ -184,21 +185,31 @@ class Associator:
         return self._assign(both[pick], now.owner)
 
     def _thinned(self, now: Association) -> Association:
-        """Drop solids that bring less than they cost, as others would explain their detections."""
+        """Drop solids that bring less than they cost, as others would explain their detections.
+
+        Of those the worse half goes at once: that whose boxes others fit as well. Two that stand
+        for one thing are both superfluous, and only the boxes tell which of them is the thing.
+        """
         evidence, owner, view = now.evidence, now.owner, self.detected.view
-        owned = owner >= 0
+        owned, mine = owner >= 0, owner[evidence.row] == evidence.solid
         busy = np.zeros_like(evidence.expected)
         busy[view[owned], owner[owned]] = True
-        other = owned[evidence.row] & (owner[evidence.row] != evidence.solid)
+        other = owned[evidence.row] & ~mine
         row, solid = evidence.row[other], evidence.solid[other]
         missed = MISSED * evidence.expected[view[row], solid]
         worth = np.where(busy[view[row], solid], SECOND_DETECTION, missed)
-        instead = np.zeros(len(owner))
-        np.maximum.at(instead, row, evidence.log_odds[other] + worth)
-        lost = np.bincount(owner[owned], instead[owned], len(now.solids))
-        marginal = now.gains(self.detected) - lost  # (S,)
+
+        def instead(value: Array) -> Array:
+            """Return what the best others would bring for the detections of each solid, (S,)."""
+            best = np.zeros(len(owner))
+            np.maximum.at(best, row, value[other] + worth)
+            return np.bincount(owner[owned], best[owned], len(now.solids))
+
+        marginal = now.gains(self.detected) - instead(evidence.log_odds)  # (S,)
+        fit = np.bincount(evidence.solid[mine], evidence.choice[mine], len(now.solids))
+        better = fit - instead(evidence.choice)  # (S,) than others
         weak = np.flatnonzero((marginal < 0) | (now.count < MIN_DETECTIONS))
-        worst = weak[np.argsort(marginal[weak])][: (len(weak) + 1) // 2]  # others may hold then
+        worst = weak[np.argsort(better[weak])][: (len(weak) + 1) // 2]
         return self._without(now, worst) if len(worst) else now
 
     def _without(self, now: Association, gone: IntArray) -> Association:

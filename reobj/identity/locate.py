@@ -24,11 +24,13 @@ from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
 from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
 
-# Log odds that an object is there: constant, by the mean log odds of its scores, by the share of
-# the frames that should show it and do. Fitted to 154 solids of 7 recordings (docs/tracking.md)
-CONFIDENCE = (0.1, 1.4, 1.7)
-NO_SOLID = -2.4  # instead of the constant where no solid explains it (12 of 150 were real)
-# Share of a recording's mean score that is taken off: detectors differ in how high they score
+# Log odds that an object is there: constant, by the log odds of its best scores, by the share of
+# the frames that should show it and do. Fitted to 385 solids of 17 runs (docs/tracking.md)
+CONFIDENCE = (-1.7, 1.45, 1.5)
+BEST = 0.9  # quantile of the scores: most views of a half-hidden thing are poor, its best are not
+NO_SOLID = -4.2  # instead of the constant where no solid explains it (12 of 150 were real)
+# Share of a recording's mean log odds, where it is below 0, that is forgiven: some detectors score
+# low throughout, in dark rooms most
 RELATIVE = 0.5
 DOUBLE_IOU = 0.6  # boxes of a class that overlap more are of one thing (NMS: .5 to .7)
 UNKNOWN_LOG = 3.0  # sigma of log sizes of which nothing is known (chosen: a factor of 20)
@@ -124,25 +126,33 @@ def floor_under(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | Non
     return None if plane is None else quadrics.Floor(plane.normal, plane.offset, plane.sigma)
 
 
-def confidence(mean_score: Array, share: Array, usual_score: float) -> Array:
+def confidence(best_score: Array, share: Array, usual_score: float) -> Array:
     """Return the probability that objects are there, each a thing of its own.
 
     Args:
-        mean_score: mean log odds of the scores of its detections. usual_score: of all solids'.
+        best_score: log odds of the scores of its best detections (`BEST`).
         share: of the frames that should show it and do; NaN where no solid tells which should.
+        usual_score: mean log odds of the scores of all solids' detections.
     """
     constant, of_score, of_share = CONFIDENCE
     place = np.where(np.isnan(share), NO_SOLID, constant + of_share * share)
-    return np.asarray(1 / (1 + np.exp(-place - of_score * (mean_score - RELATIVE * usual_score))))
+    score = best_score - RELATIVE * min(usual_score, 0.0)
+    return np.asarray(1 / (1 + np.exp(-place - of_score * score)))
+
+
+def best_scores(score: Array, group: IntArray, count: int) -> Array:
+    """Return the log odds (count,) of the best scores (N,) of each group, NaN without any."""
+    odds = logit(score)
+    own = [odds[group == k] for k in range(count)]
+    return np.array([np.quantile(x, BEST) if len(x) else np.nan for x in own])
 
 
 def _confidence(found: Association, detected: Detected) -> tuple[Array, float]:
     """Return the `confidence` (S,) of solids, and the mean log odds of all their scores."""
     owned = np.flatnonzero(found.owner >= 0)
     solid, view = found.owner[owned], detected.view[owned]
-    count, expected = found.count.clip(1), found.evidence.expected
-    odds = logit(detected.score[owned])
-    score = np.bincount(solid, odds, len(found.solids)) / count
+    expected, odds = found.evidence.expected, logit(detected.score[owned])
+    score = best_scores(detected.score[owned], solid, len(found.solids))
     shown = np.bincount(solid, expected[view, solid], len(found.solids))
     usual = float(odds.mean()) if len(odds) else 0.0
     return confidence(score, shown / expected.sum(0).clip(1), usual), usual
