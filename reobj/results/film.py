@@ -16,6 +16,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -74,19 +75,32 @@ class FilmWriter:
             self.part.touch()  # PyAV finds out at the first frame only
             made = (self.part, fps / self.every, self.size)
             self.sink = _VP8(*made) if av is None else _H264(av, *made)
+        self.encoder = ThreadPoolExecutor(1)  # encodes a frame while the next one is drawn
+        self.pending: Future[None] | None = None
 
     def write(self, image: Image) -> None:
-        """Append one frame of (w, h) `size`, BGR."""
+        """Append one frame of (w, h) `size`, BGR, which must not change afterwards."""
         if self.count % self.every == 0:
-            with self._named():
-                self.sink.write(image)
+            self._wait()
+            self.pending = self.encoder.submit(self.sink.write, image)
         self.count += 1
+
+    def _wait(self) -> None:
+        """Wait for the frame that is being encoded."""
+        pending, self.pending = self.pending, None
+        if pending is not None:
+            with self._named():
+                pending.result()
 
     def close(self, complete: bool) -> None:
         """Finish the file; keep it only if complete (OpenCV is silent when the disk is full)."""
         try:
             with self._named() if complete else contextlib.suppress(OSError):
-                self.sink.close()
+                try:
+                    self._wait()
+                finally:
+                    self.encoder.shutdown()
+                    self.sink.close()
             if complete and self._frames_on_disk() != -(-self.count // self.every):
                 raise OSError(f"{self.path}: not all frames could be written; is the disk full?")
             if complete:
