@@ -18,7 +18,7 @@ import numpy.typing as npt
 import quadrics
 from reobj.types import Array, BoolArray, IntArray, box_area
 
-# Chosen on hololens_kitchen and redkitchen, but for those with a source (docs/association.md).
+# Chosen on hololens_kitchen and redkitchen, but for those with a source (docs/tracking.md).
 EDGE_SIGMA = 0.08  # of an edge of a box, over the size of the box
 HIDDEN, WRONG = 0.2, 0.02  # shares of edges that are hidden, and that are anywhere (as quadrics.py)
 CLUTTER_LOG_SIZES = 3.0  # range of the log of the width and of the height of other boxes
@@ -153,7 +153,7 @@ def _gather(solids: Solids, detected: Detected, share: Array) -> Evidence:
 
 
 def logit(score: Array) -> Array:
-    """Turn scores into log odds: detectors are calibrated about so (docs/association.md)."""
+    """Turn scores into log odds: detectors are calibrated about so (docs/tracking.md)."""
     score = score.clip(1e-3, 1 - 1e-3)
     return np.asarray(np.log(score / (1 - score)))
 
