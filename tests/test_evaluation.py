@@ -663,7 +663,7 @@ def straight(tmp_path: Path, form: str, turned: np.ndarray) -> float:
 
 @pytest.mark.parametrize("form", ["tum", "matrix"])
 def test_a_short_path_is_aligned_by_its_directions_of_view(tmp_path: Path, form: str) -> None:
-    """Of centres alone the world turns about a path that is nearly straight; axes of another kind do not count."""
+    """Of centres alone the world turns about a straight path; axes of another kind are left out."""
     assert straight(tmp_path, form, np.eye(3)) < 0.01
     assert straight(tmp_path, form, np.diag([1.0, -1, -1])) > 0.05  # OpenGL's axes
 
