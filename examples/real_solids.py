@@ -458,7 +458,8 @@ def draw_solvers(rows: Sequence[Row], path: Path) -> None:
         axes.set_title(name, fontsize=9)
         axes.set_ylabel("O3D")
         axes.spines[["top", "right"]].set_visible(False)
-    panels[0, 0].legend(fontsize=8, frameon=False, ncols=4)
+    handles = panels[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, fontsize=8, frameon=False, ncols=4, loc="outside upper center")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=90)
     plt.close(figure)
@@ -560,7 +561,7 @@ def draw_frame(rec: Recording, found: dict[str, Scored], path: Path) -> None:
     image = next(f.image for f in rt.Video(rec.video) if f.index == chosen)
     both = np.hstack([over(image, scored, chosen, name) for name, scored in found.items()])
     with atomic(path) as part:
-        part.write_bytes(cv2.imencode(".jpg", both)[1].tobytes())
+        part.write_bytes(cv2.imencode(".jpg", both, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].tobytes())
 
 
 def over(image: Image, scored: Scored, frame: int, title: str) -> Image:
