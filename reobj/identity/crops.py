@@ -63,8 +63,9 @@ class CropEmbedder(Embedder):
     The grown box is cut out twice, once with all but the object hidden and once with the object
     hidden. A backbone turns each crop into a map, and a trained ConvBlock turns the two maps,
     stacked in the channels, into one embedding (the one that comes along first treats each alone).
-    Without a ConvBlock the maps are flattened (the thesis's "no-train"). A model of `examples/train_embedding.py` has its own head: its cells are
-    pooled from the crops' maps as `Embedder` does from the frame's.
+    Without a ConvBlock the maps are flattened (the thesis's "no-train"). A model of
+    `examples/train_embedding.py` has its own head: its cells are pooled from the crops' maps as
+    `Embedder` does from the frame's.
 
     Args:
         model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image
