@@ -22,8 +22,9 @@ Method: each step takes several scenes and several views of each, and changes ev
 phones do (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of
 masks half of the time). Triplet loss on cosines of (foreground, background) together and of each
 alone; for every anchor and positive the negative is the soft maximum of all (mostly an identical
-twin elsewhere in the room), or with --loss triplet semi-hard (the nearest of those further than the
-positive) and with --hard-after, the nearest of all of the same scene from then on.
+twin elsewhere in the room), with --loss triplet semi-hard (the nearest of those further than the
+positive), or with --loss hardest the nearest of all of the batch. From --hard-after on negatives
+are of the same scene only, and semi-hard ones become the nearest.
 Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
 al., MobileNetV2, CVPR 2018 (inverted residual); Izmailov et al., UAI 2018 (--average).
 
@@ -770,23 +771,24 @@ def triplet_loss(
 
 
 def batch_loss(
-    foreground: Any, background: Any, scenes: list[list[View]], hard: bool, soft: bool = False
+    foreground: Any, background: Any, scenes: list[list[View]], late: bool, kind: str = "triplet"
 ) -> Any:
     """Triplet loss of both parts together, and a quarter as much of each alone."""
     views = [(s, f, v) for s, scene in enumerate(scenes) for f, v in enumerate(scene)]
     scene = np.concatenate([np.full(len(v.identity), s) for s, _, v in views])
     identity = np.concatenate([v.identity for _, _, v in views])
     frame = np.concatenate([np.full(len(v.identity), f) for _, f, v in views])
-    return parts_loss([foreground, background], (scene, identity, frame), hard, soft)
+    return parts_loss([foreground, background], (scene, identity, frame), late, kind)
 
 
 def parts_loss(
-    parts: Sequence[Any], of: tuple[IntArray, IntArray, IntArray], hard: bool, soft: bool
+    parts: Sequence[Any], of: tuple[IntArray, IntArray, IntArray], late: bool, kind: str
 ) -> Any:
     """Triplet loss of all parts (N, E) together, and a quarter as much of each, if there are two.
 
     Args:
         of: (N,) scene, identity within it and frame of each row.
+        late: negatives are of the same scene only. kind: one of LOSSES.
     """
     scene, frame, device = of[0], of[2], parts[0].device
     identity = of[1] + 10000 * scene
@@ -794,11 +796,15 @@ def parts_loss(
     apart = torch.from_numpy(frame[:, None] != frame).to(device)
     near = torch.from_numpy(scene[:, None] == scene).to(device)
     fused = torch.cat(list(parts), 1) * len(parts) ** -0.5
-    same, different = one & apart, ~one & (near if hard else torch.ones_like(near))
-    loss = triplet_loss(fused, same, different, hard, soft)
+    same, different = one & apart, ~one & (near if late else torch.ones_like(near))
+    how = {"hard": late or kind == "hardest", "soft": kind == "soft"}
+    loss = triplet_loss(fused, same, different, **how)
     for alone in parts if len(parts) > 1 else ():
-        loss = loss + 0.25 * triplet_loss(alone, same, different, hard, soft)
+        loss = loss + 0.25 * triplet_loss(alone, same, different, **how)
     return loss
+
+
+LOSSES = ("soft", "triplet", "hardest")  # the negative: soft maximum, semi-hard, hardest
 
 
 # ---- Validation ----------------------------------------------------------------------------------
@@ -1045,10 +1051,10 @@ class Trainer:
         self.step += 1
         return float(np.asarray(loss.detach().cpu()))
 
-    def loss(self, scenes: Any, hard: bool) -> Any:
-        """Loss of one batch."""
+    def loss(self, scenes: Any, late: bool) -> Any:
+        """Loss of one batch; late: as in `parts_loss`."""
         parts = self.net([view for scene in scenes for view in scene], self.device)
-        return batch_loss(parts[0], parts[1], scenes, hard, self.args.loss == "soft")
+        return batch_loss(parts[0], parts[1], scenes, late, self.args.loss)
 
     def score(self, clips: Any) -> dict[str, float]:
         """Rank-1 on validation clips."""
@@ -1220,14 +1226,12 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
         "--average", type=float, default=0.0, metavar="DECAY",
         help="take the moving average of the weights (.9995; 0: the last weights)",
     )  # fmt: skip
-    add("--hard-after", type=float, default=1.0, help="hardest negatives from this share on")
+    add("--hard-after", type=float, default=1.0, help="negatives of one scene from this share on")
     add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)
     add("--ahead", type=int, default=0, help="batches that a second process makes ahead (0: none)")
-    add(
-        "--loss", choices=("triplet", "soft"), default="soft", help="semi-hard negative or soft max"
-    )
+    add("--loss", choices=LOSSES, default="soft", help="the negative (default %(default)s)")
     add("--resume", action="store_true", help="go on from OUT/last.pt")
     return parser
 

@@ -8,6 +8,9 @@ frame, or with --crops OUT/SETUP/crops_mobilenetv2_feat_head.onnx, re-OBJ's Conv
 crops an object (use: `--embed mobilenetv2_feat` or `--embed crops`, with `--set embed.head=FILE`),
 beside checkpoints, log and curves as of `train_embedding.py`, whose sources, augmentation, loss and
 validation these are. What the backbone shows of every scene is computed once and kept in the cache.
+As published, the maps of foreground and background are concatenated and merged by one ConvBlock;
+--merge rows gives each crop a block of its own and joins their rows, as in the weights that come
+along. `reobj_folds.py` trains and tests re-OBJ's setups on one recording.
 Ref: Bansal et al., re-OBJ, ICIAP 2019 (ConvBlock).
 """
 
@@ -179,20 +182,47 @@ class CellHead(nn.Module):
 
 
 class ConvBlock(nn.Module):
-    """re-OBJ: maps (N, C, 7, 7) of one crop to unit rows.
+    """re-OBJ: the maps (N, C, n, n) of one crop, or of two concatenated in C, to unit rows.
 
-    Two crops have one each, and their rows make one: stacked maps in a common block were worse by
-    3 points of Rank-1 on the validation rooms (docs/appearance.md).
+    Convolution 3x3, batch norm, ReLU and max-pooling by two, until one place is left: 7, 4, 2, 1.
+    Ref: Bansal et al., ICIAP 2019; widths as in ut-amrl/CLOVER: of 2 x 512 channels 1024, 2048,
+    4096, here `width` and its doubles (0: C, as published).
     """
 
-    def __init__(self, channels: int, width: int, inner: int = 64) -> None:
+    def __init__(self, channels: int, side: int, width: int = 0) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(channels, affine=False)
+        stages, inner, width = list[Any](), channels, width or channels
+        while side > 1 or not stages:
+            pool = nn.MaxPool2d(2, 2, padding=side % 2) if side > 1 else nn.Identity()
+            stages.append(nn.Sequential(te.block(inner, width), pool))
+            inner, width, side = width, 2 * width, (side + 1) // 2
+        self.stages = nn.Sequential(*stages)
+
+    def forward(self, maps: Any) -> Any:
+        return F.normalize(self.stages(self.norm(maps)).flatten(1), dim=1)
+
+    def start(self, maps: Any) -> None:
+        """Take over mean and deviation of every channel."""
+        self.norm.running_mean[:] = maps.mean((0, 2, 3))
+        self.norm.running_var[:] = maps.var((0, 2, 3))
+
+
+class CropBlock(nn.Module):
+    """Maps (N, C, n, n) of one crop to unit rows; two crops have one each, their rows make one.
+
+    re-OBJ style, not as published: better by 3 points of Rank-1 on the validation rooms than a
+    block in common, and what comes along (docs/appearance.md).
+    """
+
+    def __init__(self, channels: int, side: int, width: int, inner: int = 64) -> None:
         super().__init__()
         self.norm = nn.BatchNorm2d(channels, affine=False)
         self.squeeze = te.block(channels, inner, 1)
         self.mix = nn.Sequential(te.block(inner, inner), te.block(inner, 64, 3, 2), nn.Dropout(0.2))
-        self.out = nn.Linear(64 * 16, width)
+        self.out = nn.Linear(64 * ((side + 1) // 2) ** 2, width)
         self.short = nn.Conv2d(channels, 20, 1, bias=False)
-        self.project = nn.Linear(20 * 49, width, bias=False)
+        self.project = nn.Linear(20 * side**2, width, bias=False)
 
     def forward(self, maps: Any) -> Any:
         maps = self.norm(maps)
@@ -265,8 +295,11 @@ class HeadTrainer(te.Trainer):
 
     def make_net(self) -> Any:
         shapes = [self.pool.rooms[0].parts[n].shape[1:] for n in self.names]
+        if self.frozen.crops and self.args.merge == "maps":
+            channels = sum(shape[0] for shape in shapes)
+            return nn.ModuleList([ConvBlock(channels, shapes[0][-1], self.args.width)])
         if self.frozen.crops:
-            return nn.ModuleList(ConvBlock(shape[0], 192 // len(shapes)) for shape in shapes)
+            return nn.ModuleList(CropBlock(c, n, 192 // len(shapes)) for c, n, _ in shapes)
         fore, *back = (FROZEN[f"{k}_cells"] for k in ("foreground", "background", "surround"))
         channels = shapes[0][0] // int(fore) ** 2 - 2
         return nn.ModuleList([CellHead([int(fore)], channels),
@@ -293,20 +326,22 @@ class HeadTrainer(te.Trainer):
 
     def inputs(self, scenes: Sequence[Seen]) -> list[Any]:
         """What each head takes of all objects of the scenes."""
-        return [torch.from_numpy(np.concatenate([s.parts[n] for s in scenes])).float()
-                for n in self.names]  # fmt: skip
+        parts = [torch.from_numpy(np.concatenate([s.parts[n] for s in scenes])).float()
+                 for n in self.names]  # fmt: skip
+        one = self.frozen.crops and self.args.merge == "maps"
+        return [torch.cat(parts, 1)] if one else parts
 
     def embed(self, net: Any, scenes: Sequence[Seen]) -> list[Any]:
         """Unit rows of each part by these heads."""
         parts = self.inputs(scenes)
         return [head(part.to(self.device)) for head, part in zip(net, parts, strict=True)]
 
-    def loss(self, scenes: Any, hard: bool) -> Any:
+    def loss(self, scenes: Any, late: bool) -> Any:
         parts = self.embed(self.net, scenes)
         scene = np.repeat(np.arange(len(scenes)), [len(s.identity) for s in scenes])
         identity = np.concatenate([s.identity for s in scenes])
         frame = np.concatenate([s.frame for s in scenes])
-        return te.parts_loss(parts, (scene, identity, frame), hard, self.args.loss == "soft")
+        return te.parts_loss(parts, (scene, identity, frame), late, self.args.loss)
 
     def score(self, clips: Sequence[Seen]) -> dict[str, float]:
         net = self.taken().eval()
@@ -390,6 +425,10 @@ def build_parser() -> argparse.ArgumentParser:
     add("--backbone", required=True, help="name or ONNX file of the frozen backbone")
     add("--crops", action="store_true", help="for two crops an object (re-OBJ's ConvBlock)")
     add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="of --crops")
+    add("--merge", choices=("maps", "rows"), default="maps",
+        help="of two crops: their maps, by one ConvBlock, or the rows of a block each")  # fmt: skip
+    add("--width", type=int, default=64,
+        help="channels of the ConvBlock's first stage (0: of its maps, as published)")  # fmt: skip
     add("--copies", type=int, default=1, help="augmented copies of each scene")
     add("--seen", type=int, default=20, help="frames of each scene")
     return parser

@@ -130,6 +130,31 @@ def test_triplet_loss_picks_the_negative(te, hard: bool, soft: bool, expected: f
     assert loss == pytest.approx(0.1 * np.log1p(np.exp((expected - 0.6) / 0.1)), abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("kind", "late", "expected"),
+    [
+        ("hardest", False, 0.8),  # of another scene
+        ("hardest", True, 0.7),  # of the same scene
+        ("triplet", False, 0.5),  # semi-hard: the nearest of those further than the positive
+        ("triplet", True, 0.7),
+    ],
+)
+def test_the_hardest_negative_is_the_nearest_of_the_batch(
+    te, kind: str, late: bool, expected: float
+) -> None:
+    """Two rows of one object at cosine .6; to both, others are at .8 (another scene), .7 and .5."""
+    import torch
+
+    rows = np.zeros((5, 5))
+    rows[:2, 0], rows[0, 1], rows[1, 1] = 0.8**0.5, 0.2**0.5, -(0.2**0.5)
+    for k, cosine in ((2, 0.8), (3, 0.7), (4, 0.5)):  # (5, 5) each with an axis of its own
+        rows[k, 0] = cosine / 0.8**0.5
+        rows[k, k] = (1 - rows[k, 0] ** 2) ** 0.5
+    of = (np.array([0, 0, 1, 0, 0]), np.array([1, 1, 1, 2, 3]), np.arange(5))
+    loss = float(te.parts_loss([torch.tensor(rows)], of, late, kind))
+    assert loss == pytest.approx(0.1 * np.log1p(np.exp((expected - 0.6) / 0.1)), abs=1e-6)
+
+
 def test_windows_of_large_pictures_are_narrower(te) -> None:
     """Sizes differ by up to 1 : 3 where the picture holds the detail."""
     rng = np.random.default_rng(0)
@@ -197,13 +222,15 @@ def test_scannet_folders_become_a_clip(te, tmp_path) -> None:
         assert (inner == identity + 1).all()
 
 
-@pytest.mark.parametrize("crops", [False, True])
-def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, crops: bool) -> None:
+@pytest.mark.parametrize("merge", ["", "maps", "rows"])  # "": not of crops
+def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, merge: str) -> None:
     """A step of training; the exported head gives through the tool what it gives in PyTorch."""
+    crops = bool(merge)
+    options = ["--crops", "--merge", merge, "--width", "8"] if crops else []
     mean_backbone(tmp_path / "net.onnx", channels=8)
     command = ["-o", str(tmp_path), "--backbone", str(tmp_path / "net.onnx"), "--rooms", "3"]
     command += ["--cache", str(trained / "rooms"), "--val-rooms", "3", "--frames", "6"]
-    assert th.main([*command, *["--crops"] * crops, "--steps", "2", "--every", "1"]) == 0
+    assert th.main([*command, *options, "--steps", "2", "--every", "1"]) == 0
     out = tmp_path / "concat" if crops else tmp_path
     name = "crops_net_head.onnx" if crops else "net_head.onnx"
     assert cv2.imread(str(out / "curves.png")) is not None
@@ -217,7 +244,7 @@ def test_head_of_a_frozen_backbone_is_found_beside_it(th, trained, tmp_path, cro
     assert look.foreground.shape != frozen.foreground.shape  # "none": no training
     assert look.background.shape == ((2, 0) if crops else (2, 128))
     np.testing.assert_allclose(np.linalg.norm(look.foreground, axis=1), 1, atol=1e-3)
-    args = th.build_parser().parse_args([*command, *["--crops"] * crops])
+    args = th.build_parser().parse_args([*command, *options])
     see = th.Frozen(args).see(image, detections, np.arange(2))
     assert_same_as_in_torch(th, args, see, out / "best.pt", look)
 
@@ -243,7 +270,7 @@ def assert_same_as_in_torch(th, args, see, checkpoint: Path, look: rt.Embeddings
     with torch.no_grad():
         expected = [part.numpy() for part in trainer.embed(trainer.net, [seen])]
     if args.crops:  # one row of both
-        expected = [np.concatenate(expected, 1) / 2**0.5]
+        expected = [np.concatenate(expected, 1) / len(expected) ** 0.5]
     for mine, theirs in zip((look.foreground, look.background), expected, strict=False):
         np.testing.assert_allclose(mine, theirs, atol=5e-3)  # weights kept as float16
 

@@ -1,4 +1,4 @@
-"""Appearance as published in re-OBJ: embeddings from two masked crops of every object.
+"""Appearance in the style of re-OBJ: embeddings from two masked crops of every object.
 
 `CropEmbedder` has the interface of `Embedder` (`reobj.identity.embedding`), which needs one pass a
 frame instead of two crops an object; `make_embedder` makes whichever a configuration names.
@@ -58,13 +58,14 @@ CROP_STRIDE = 32  # of the map taken from crops: 7 x 7 for 224 px, as the last o
 
 
 class CropEmbedder(Embedder):
-    """Foreground and background embeddings as in re-OBJ: two masked crops of every object.
+    """Foreground and background embeddings in re-OBJ style: two masked crops of every object.
 
     The grown box is cut out twice, once with all but the object hidden and once with the object
     hidden. A backbone turns each crop into a map, and a trained ConvBlock turns the two maps,
-    stacked in the channels, into one embedding. Without a ConvBlock the maps are flattened (the
-    thesis's "no-train"). A model of `examples/train_embedding.py` has its own head: its cells are
-    pooled from the crops' maps as `Embedder` does from the frame's.
+    stacked in the channels, into one embedding (the one that comes along first treats each alone).
+    Without a ConvBlock the maps are flattened (the thesis's "no-train"). A model of
+    `examples/train_embedding.py` has its own head: its cells are pooled from the crops' maps as
+    `Embedder` does from the frame's.
 
     Args:
         model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image

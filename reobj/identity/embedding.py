@@ -49,7 +49,7 @@ class EmbedConfig:
     model: str = option(
         "reobj",
         "appearance model: reobj (comes along), none (motion only), a backbone (name or .onnx "
-        "file), or crops[:BACKBONE] (two crops an object, as published in re-OBJ)",
+        "file), or crops[:BACKBONE] (two crops an object, re-OBJ style)",
         "--embed",
     )
     head: str = option(

@@ -5,10 +5,12 @@ Start at `score_objects`. Writes nothing.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
@@ -39,9 +41,11 @@ def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
 
 
 def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, Array, Array]:
-    """Align the world of the largest part with the truth's by a similarity of the camera centres.
+    """Align the world of the largest part with the truth's by a similarity of the cameras.
 
-    Poses that the user supplied are in the truth's world already.
+    Poses that the user supplied are in the truth's world already. Of centres alone the turn is as
+    uncertain as the path is short, and at the distance of the objects it is their error: where the
+    true directions of view are those of our axes, they count too.
 
     Args:
         truth_poses: TUM, or a 4x4 world_from_cam a line; None is enough for supplied poses.
@@ -55,23 +59,46 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
         return 1.0, np.eye(3), np.zeros(3)
     if truth_poses is None:
         raise ReobjError("reconstructed cameras have a world of their own: give --gt-poses")
-    centers = _true_centers(truth_poses, poses)  # (F, 3)
-    use = poses.known & np.isfinite(centers).all(1)
-    ours = invert_rigid(poses.cam_from_world[use])[:, :, 3]  # (f, 3)
-    true_from_ours = None
+    truth = _true_cameras(truth_poses, poses)  # (F, 3, 4)
+    use = poses.known & np.isfinite(truth[:, :, 3]).all(1)
+    ours, truth = invert_rigid(poses.cam_from_world[use]), truth[use]  # (f, 3, 4)
+    found = None
     if use.sum() >= 3:  # Umeyama, PAMI 1991
-        true_from_ours = import_pycolmap().estimate_sim3d(ours, centers[use])
-    if true_from_ours is None:
+        found = _similarity(ours[:, :, 3], truth[:, :, 3])
+    if found is None:
         raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
-    turn = np.asarray(true_from_ours.rotation.matrix(), np.float64)
-    return float(true_from_ours.scale), turn, np.asarray(true_from_ours.translation)
+    scale, turn, _ = found
+    residual = turn @ ours[:, :, :3] @ truth[:, :, :3].swapaxes(1, 2)  # (f, 3, 3)
+    cosine = (np.trace(residual, axis1=1, axis2=2) - 1) / 2  # of its angle
+    solids = result.of_part(0).ellipsoids().center_in_world  # (S, 3)
+    if not len(solids) or not np.median(cosine) > math.cos(math.radians(SAME_AXES_DEG)):
+        return found
+    away = float(np.median(np.linalg.norm(solids[:, None] - ours[:, :, 3], axis=2)))
+    ahead = [
+        np.concatenate([cams[:, :, 3], *(cams[:, :, 3] + far * cams[:, :, k] for k in range(3))])
+        for cams, far in ((ours, away), (truth, scale * away))
+    ]  # (4 f, 3) each: the centres, and points along the camera's axes as far as the objects
+    return _similarity(*ahead) or found
+
+
+SAME_AXES_DEG = 10.0  # between true and own directions of view, at most (chosen; another convention
+# of axes is 90 or 180 degrees off)
+
+
+def _similarity(ours: Array, truth: Array) -> tuple[float, Array, Array] | None:
+    """Estimate scale, rotation and shift from points (N, 3) to points, or None."""
+    found = import_pycolmap().estimate_sim3d(ours, truth)
+    if found is None:
+        return None
+    turn = np.asarray(found.rotation.matrix(), np.float64)
+    return float(found.scale), turn, np.asarray(found.translation)
 
 
 SAME_TIME_S = 0.02  # of a frame and its true pose; chosen: half a frame at 25 Hz
 
 
-def _true_centers(path: Path, poses: Poses) -> Array:
-    """Read camera centres (F, 3) of the poses' frames, NaN where unknown.
+def _true_cameras(path: Path, poses: Poses) -> Array:
+    """Read world_from_cam (F, 3, 4) of the poses' frames, NaN where unknown.
 
     TUM rows belong to the frame of their time; of 4x4 world_from_cam, row n belongs to frame n.
     """
@@ -81,13 +108,20 @@ def _true_centers(path: Path, poses: Poses) -> Array:
         raise ReobjError(f"{path}: {error}; expected TUM rows or 16 numbers a line") from error
     if table.shape[1] == 16:
         frame = poses.frame.clip(0, len(table) - 1)
-        return np.where((frame == poses.frame)[:, None], table[frame][:, 3:12:4], np.nan)
+        rows = table[frame].reshape(-1, 4, 4)[:, :3]
+        return np.where((frame == poses.frame)[:, None, None], rows, np.nan)
     if table.shape[1] != 8:
         found = f"{table.shape[1]} columns"
         raise ReobjError(f"{path}: {found}; expected TUM rows of 8 numbers, or 16 numbers a line")
     nearest = np.abs(table[:, :1] - poses.time_s[None]).argmin(0)  # (F,)
     far = np.abs(table[nearest, 0] - poses.time_s) > SAME_TIME_S
-    return np.where(far[:, None], np.nan, table[nearest, 1:4])
+    turn = np.full((len(nearest), 3, 3), np.nan)
+    xyzw = table[nearest, 4:]
+    whole = np.isfinite(xyzw).all(1) & (np.linalg.norm(xyzw, axis=1) > 0)
+    if whole.any():
+        turn[whole] = Rotation.from_quat(xyzw[whole]).as_matrix()
+    rows = np.concatenate([turn, table[nearest, 1:4, None]], 2)  # (F, 3, 4)
+    return np.where(far[:, None, None], np.nan, rows)
 
 
 def score_objects(
