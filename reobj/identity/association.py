@@ -203,7 +203,7 @@ class Associator:
             """Return what the best others would bring for the detections of each solid, (S,)."""
             best = np.zeros(len(owner))
             np.maximum.at(best, row, value[other] + worth)
-            return np.bincount(owner[owned], best[owned], len(now.solids))
+            return np.asarray(np.bincount(owner[owned], best[owned], len(now.solids)), np.float64)
 
         marginal = now.gains(self.detected) - instead(evidence.log_odds)  # (S,)
         fit = np.bincount(evidence.solid[mine], evidence.choice[mine], len(now.solids))
