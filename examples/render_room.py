@@ -2787,7 +2787,7 @@ def mot_lines(frame: int, truth: FrameTruth, room: Room, size: tuple[int, int]) 
     for item in room.objects:
         x0, y0, x1, y1 = truth.visible_xyxy[item.index]
         if truth.visibility[item.index] >= 0.1 and min(x1 - x0, y1 - y0) >= 8:
-            box_text = f"{x0 + 1:.2f},{y0 + 1:.2f},{x1 - x0:.2f},{y1 - y0:.2f}"
+            box_text = f"{x0:.2f},{y0:.2f},{x1 - x0:.2f},{y1 - y0:.2f}"  # pixels as in tracks.txt
             tail = f"1,{item.class_id},{truth.visibility[item.index]:.3f}"
             lines.append(f"{frame + 1},{item.index + 1},{box_text},{tail}")
     return lines
