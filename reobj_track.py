@@ -242,10 +242,12 @@ def kalman_predict(mean: Array, cov: Array, config: TrackerConfig) -> tuple[Arra
         mean, cov after x = F x, P = F P F' + Q.
     """
     scale = _noise_scale(mean)  # (T, 4)
-    p00, p01, p11 = np.moveaxis(cov, -1, 0)  # (T, 4) each
-    q0, q1 = (config.std_position * scale) ** 2, (config.std_velocity * scale) ** 2
-    new_cov = np.stack([p00 + 2 * p01 + p11 + q0, p01 + p11, p11 + q1], -1)  # (T, 4, 3)
-    new_mean = np.stack([mean[..., 0] + mean[..., 1], mean[..., 1]], -1)  # (T, 4, 2)
+    p01, p11 = cov[..., 1], cov[..., 2]  # (T, 4) each
+    new_mean, new_cov = mean.copy(), cov.copy()
+    new_mean[..., 0] += mean[..., 1]
+    new_cov[..., 0] = cov[..., 0] + 2 * p01 + p11 + (config.std_position * scale) ** 2
+    new_cov[..., 1] += p11
+    new_cov[..., 2] += (config.std_velocity * scale) ** 2
     return new_mean, new_cov
 
 
@@ -259,13 +261,13 @@ def kalman_update(mean: Array, cov: Array, box: Array, noise: Array) -> tuple[Ar
     Returns:
         mean, cov after K = P H' / S, x = x + K y, P = (I - K H) P.
     """
-    p00, p01, p11 = np.moveaxis(cov, -1, 0)
-    innovation_var = p00 + noise**2  # S (T, 4)
-    k0, k1 = p00 / innovation_var, p01 / innovation_var  # K (T, 4)
+    innovation_var = cov[..., :1] + noise[..., None] ** 2  # S (T, 4, 1)
+    gain = cov[..., :2] / innovation_var  # K (T, 4, 2)
     residual = box - mean[..., 0]  # y (T, 4)
-    new_mean = np.stack([mean[..., 0] + k0 * residual, mean[..., 1] + k1 * residual], -1)
-    new_cov = np.stack([(1 - k0) * p00, (1 - k0) * p01, p11 - k1 * p01], -1)
-    return new_mean, new_cov
+    new_cov = np.empty_like(cov)
+    new_cov[..., :2] = (1 - gain[..., :1]) * cov[..., :2]
+    new_cov[..., 2] = cov[..., 2] - gain[..., 1] * cov[..., 1]
+    return mean + gain * residual[..., None], new_cov
 
 
 def squared_mahalanobis(mean: Array, cov: Array, center: Array) -> Array:
@@ -275,15 +277,15 @@ def squared_mahalanobis(mean: Array, cov: Array, center: Array) -> Array:
     """
     noise = STD_MEASURE * _noise_scale(mean)[:, :2]
     innovation_var = cov[:, :2, 0] + noise**2  # S (T, 2)
-    residual = mean[:, None, :2, 0] - center  # y (T, D, 2)
-    return np.asarray((residual**2 / innovation_var[:, None]).sum(-1))
+    x, y = (mean[:, i, :1] - center[:, i] for i in range(2))  # y (T, D) each
+    return np.asarray(x**2 / innovation_var[:, :1] + y**2 / innovation_var[:, 1:])
 
 
 def _noise_scale(mean: Array) -> Array:
     """Return the length (T, 4) that noise is relative to: mean side for x, y, own side for w, h."""
-    size = mean[:, 2:, 0].clip(1.0)  # (T, 2)
-    side = np.sqrt(size.prod(1, keepdims=True))  # (T, 1)
-    return np.concatenate([side, side, size], 1)
+    scale = np.maximum(mean[:, [2, 3, 2, 3], 0], 1.0)  # (T, 4)
+    scale[:, :2] = np.sqrt(scale[:, :1] * scale[:, 1:2])
+    return scale
 
 
 def warp_states(mean: Array, cov: Array, new_from_old: Array) -> tuple[Array, Array]:
