@@ -595,7 +595,12 @@ class Tracker:
         config = self.config
         same_class = _same_class(self.state.votes, detections.class_id)  # (T, D), as all below
         cost, feasible, iou, share = self._motion_cost(detections.xyxy, same_class, lazy.available)
-        evidence = share * (IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS)
+
+        def evidence(rows: IntArray) -> Array:
+            """Compute the log odds of one object that the boxes give, (T, n)."""
+            odds = IOU_ODDS * (iou[:, rows] - CLASS_COST * ~same_class[:, rows])
+            return np.asarray(share * (odds - NO_OVERLAP_ODDS))
+
         priority = self._priority_cost()[:, None]
         first = feasible & (detections.score >= config.high_score)
         weak = (cost + priority > WEAK_MATCH_COST) & (self.state.embedded >= 0)[:, None]
@@ -632,9 +637,10 @@ class Tracker:
             growth = np.log(state.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
             feasible &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(-1)
             feasible &= iou >= MOTION_ONLY_IOU
-        cost = (1 - DISTANCE_WEIGHT) * (1 - iou * share) + DISTANCE_WEIGHT * distance.clip(0, 1)
-        cost = cost + CLASS_COST * ~same_class
-        return cost, feasible & (same_class | (iou * share > LOW_IOU)), iou, share
+        overlap = iou * share
+        cost = (1 - DISTANCE_WEIGHT) * (1 - overlap) + DISTANCE_WEIGHT * np.minimum(distance, 1)
+        cost += CLASS_COST * ~same_class
+        return cost, feasible & (same_class | (overlap > LOW_IOU)), iou, share
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
@@ -660,13 +666,13 @@ class Tracker:
 
     def _match(
         self, cost: Array, priority: Array, feasible: BoolArray, must_agree: BoolArray,
-        rivals: BoolArray, evidence: Array, lazy: LazyEmbeddings,
+        rivals: BoolArray, evidence: Callable[[IntArray], Array], lazy: LazyEmbeddings,
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
         """Assign at least cost; compare the appearance where it must agree; assign again.
 
         Args:
             must_agree: pairs whose appearance must agree; rivals: pairs that compete, (T, D) each.
-            evidence: log odds of one object that the boxes give, (T, D).
+            evidence: log odds of one object (T, n) that the boxes of rows (n,) give.
         Returns:
             row of the track of each detection (D,), or -1; pairs refused by appearance (T, D).
         """
@@ -679,13 +685,13 @@ class Tracker:
             assign(cost + priority, good, track_of)
             matched = np.flatnonzero(track_of >= 0)
             matched = matched[must_agree[track_of[matched], matched] & ~compared[matched]]
+            if not len(matched):
+                return track_of, refused
             ask = (rivals & must_agree)[track_of[matched]].any(0)  # (D,) and their rivals
             ask[matched] = True
             rows = np.flatnonzero(ask & ~compared)
-            if not len(rows):
-                return track_of, refused
             compared[rows] = True
-            cost, against = self._blend_appearance(cost, evidence, rows, lazy)
+            cost, against = self._blend_appearance(cost, evidence(rows), rows, lazy)
             refused[:, rows] |= against & must_agree[:, rows]
 
     def _blend_appearance(
@@ -702,7 +708,7 @@ class Tracker:
         weight, cost = self.config.appearance_weight, cost.copy()
         unlike = 1 / (1 + np.exp(np.where(known, logit, 0)))
         cost[:, rows] = (1 - weight) * cost[:, rows] + weight * unlike
-        return cost, known & (logit + evidence[:, rows] < 0)
+        return cost, known & (logit + evidence < 0)
 
     def _update_states(self, detections: Detections, track_of: IntArray) -> None:
         """Correct the matched tracks; boxes of low score are less certain."""
@@ -804,6 +810,8 @@ class Tracker:
         ready = np.flatnonzero(young & (state.hits >= min(needed, self.config.n_init - 1)))
         seen_now = (state.identity >= 0) & (state.missed == 0)
         self.last_seen[state.identity[seen_now]] = self.frame_number
+        if not len(ready):
+            return track_of
         returning = self._recognise(ready)  # (n,) identity or -1
         sure = (returning >= 0) | (state.hits[ready] >= needed)
         ready, returning = ready[sure], returning[sure]

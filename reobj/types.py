@@ -531,7 +531,7 @@ def widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def unit_rows(rows: npt.NDArray[Any]) -> Array:
     """Scale rows (N, E) to unit length; zero rows stay zero."""
     rows = np.asarray(rows, np.float64)
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
+    return np.asarray(rows / np.maximum(np.sqrt((rows * rows).sum(-1, keepdims=True)), 1e-12))
 
 
 def object_color(object_id: int) -> tuple[int, int, int]:
