@@ -283,8 +283,9 @@ def squared_mahalanobis(mean: Array, cov: Array, center: Array) -> Array:
 
 def _noise_scale(mean: Array) -> Array:
     """Return the length (T, 4) that noise is relative to: mean side for x, y, own side for w, h."""
-    scale = np.maximum(mean[:, [2, 3, 2, 3], 0], 1.0)  # (T, 4)
-    scale[:, :2] = np.sqrt(scale[:, :1] * scale[:, 1:2])
+    scale = np.empty((len(mean), 4))
+    size = np.maximum(mean[:, 2:, 0], 1.0, out=scale[:, 2:])  # (T, 2)
+    np.sqrt(size[:, :1] * size[:, 1:], out=scale[:, :2])
     return scale
 
 
@@ -460,9 +461,10 @@ class Tracker:
         lazy = LazyEmbeddings(given, self.embedder, frame, detections, weight)
         self._enter(part)
         self._predict(frame, pose, camera)
-        track_of = self._associate(detections, lazy)  # (D,) row of the track's state, or -1
-        self._update_states(detections, track_of)
-        track_of = self._spawn(detections, track_of)
+        box = cxcywh_from_xyxy(detections.xyxy)
+        track_of = self._associate(detections, box, lazy)  # (D,) row of the track's state, or -1
+        self._update_states(detections, box, track_of)
+        track_of = self._spawn(detections, box, track_of)
         if points is not None and self._pose is not None and camera is not None:
             self._note_spans(detections, track_of, points, self._pose, camera.K)
         self._embed(detections, track_of, lazy)
@@ -506,7 +508,8 @@ class Tracker:
         """
         state = self.state
         state.mean, state.cov = kalman_predict(state.mean, state.cov, self.config)
-        state.mean[:, 2:, 0] = state.mean[:, 2:, 0].clip(1.0)  # a size stays positive
+        size = state.mean[:, 2:, 0]
+        np.maximum(size, 1.0, out=size)  # stays positive
         state.reach[:] = 0
         self._view, self._pose, before = None, pose, state.mean[..., 0].copy()
         if frame is not None and self.config.camera_motion:
@@ -583,7 +586,7 @@ class Tracker:
         if self.frame_number % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
             self.places.refit(self._image_size)
 
-    def _associate(self, detections: Detections, lazy: LazyEmbeddings) -> IntArray:
+    def _associate(self, detections: Detections, box: Array, lazy: LazyEmbeddings) -> IntArray:
         """Match detections to tracks: high scores by motion, then the rest by overlap.
 
         Both times an ambiguous match (a rival costs little more) and a weak one (the detection may
@@ -594,7 +597,9 @@ class Tracker:
         """
         config = self.config
         same_class = _same_class(self.state.votes, detections.class_id)  # (T, D), as all below
-        cost, feasible, iou, share = self._motion_cost(detections.xyxy, same_class, lazy.available)
+        cost, feasible, iou, share = self._motion_cost(
+            detections.xyxy, box, same_class, lazy.available
+        )
 
         def evidence(rows: IntArray) -> Array:
             """Compute the log odds of one object that the boxes give, (T, n)."""
@@ -618,7 +623,7 @@ class Tracker:
         return track_of
 
     def _motion_cost(
-        self, xyxy: Array, same_class: BoolArray, has_appearance: bool
+        self, xyxy: Array, box: Array, same_class: BoolArray, has_appearance: bool
     ) -> tuple[Array, BoolArray, Array, Array]:
         """Compare tracks and detections by motion.
 
@@ -626,7 +631,7 @@ class Tracker:
             cost in [0, 1] from overlap and gated distance, which pairs pass the gate, and IoU,
             (T, D) each; share (T, 1) of what an overlap says where the place is uncertain.
         """
-        state, box = self.state, cxcywh_from_xyxy(xyxy)
+        state = self.state
         iou = box_iou(xyxy_from_cxcywh(state.mean[..., 0]), xyxy)
         share = np.ones((len(iou), 1))
         if state.reach.any():
@@ -644,7 +649,7 @@ class Tracker:
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
-        age = ((self.state.missed - 1) / AGE_FRAMES).clip(0, 1)
+        age = np.minimum(np.maximum((self.state.missed - 1) / AGE_FRAMES, 0), 1)
         return np.asarray(AGE_COST * age + UNCONFIRMED_COST * (self.state.identity < 0))
 
     @staticmethod
@@ -656,13 +661,18 @@ class Tracker:
         A pair is a rival where it costs little more than the best of its track and detection. (Two
         boxes of two classes around one thing are no rivals: they show the same.)
         """
-        gated = np.where(gate, cost, np.inf)
-        best_of_detection = gated.min(0, initial=np.inf)[None]
-        best_of_track = gated.min(1, initial=np.inf)[:, None]
-        best = np.minimum(best_of_detection, best_of_track)
-        rivals = gate & same_class & (cost <= best + AMBIGUITY_MARGIN)
-        several = (rivals.sum(0) > 1)[None] | (rivals.sum(1) > 1)[:, None]
-        return rivals & several, rivals
+        t, d = pair = np.divmod(np.flatnonzero(gate), max(gate.shape[1], 1))
+        gated = cost[pair]
+        best_of_track, best_of_detection = (np.full(n, np.inf) for n in gate.shape)
+        np.minimum.at(best_of_track, t, gated)
+        np.minimum.at(best_of_detection, d, gated)
+        best = np.minimum(best_of_track[t], best_of_detection[d])
+        rival = same_class[pair] & (gated <= best + AMBIGUITY_MARGIN)
+        t, d = t[rival], d[rival]
+        several = (np.bincount(t)[t] > 1) | (np.bincount(d)[d] > 1)
+        ambiguous, rivals = np.zeros((2, *gate.shape), bool)
+        rivals[t, d], ambiguous[t, d] = True, several
+        return ambiguous, rivals
 
     def _match(
         self, cost: Array, priority: Array, feasible: BoolArray, must_agree: BoolArray,
@@ -710,14 +720,14 @@ class Tracker:
         cost[:, rows] = (1 - weight) * cost[:, rows] + weight * unlike
         return cost, known & (logit + evidence < 0)
 
-    def _update_states(self, detections: Detections, track_of: IntArray) -> None:
+    def _update_states(self, detections: Detections, box: Array, track_of: IntArray) -> None:
         """Correct the matched tracks; boxes of low score are less certain."""
         rows = np.flatnonzero(track_of >= 0)
         t, state = track_of[rows], self.state
-        box = cxcywh_from_xyxy(detections.xyxy[rows])
-        growth = ((1 - detections.score[rows]).clip(0.05) / 0.2) ** SCORE_NOISE  # (n,) 1 at .8
-        noise = STD_MEASURE * _noise_scale(state.mean[t]) * growth[:, None]
-        state.mean[t], state.cov[t] = kalman_update(state.mean[t], state.cov[t], box, noise)
+        mean, score = state.mean[t], detections.score[rows]
+        growth = (np.maximum(1 - score, 0.05) / 0.2) ** SCORE_NOISE  # (n,) 1 at .8
+        noise = STD_MEASURE * _noise_scale(mean) * growth[:, None]
+        state.mean[t], state.cov[t] = kalman_update(mean, state.cov[t], box[rows], noise)
         self._count_hits(detections, rows, t)
 
     def _count_hits(self, detections: Detections, rows: IntArray, t: IntArray) -> None:
@@ -729,16 +739,16 @@ class Tracker:
         state.votes = widen(state.votes, np.empty((0, int(classes.max(initial=0)) + 1)))
         state.votes[t, classes] += detections.score[rows]
 
-    def _spawn(self, detections: Detections, track_of: IntArray) -> IntArray:
+    def _spawn(self, detections: Detections, box: Array, track_of: IntArray) -> IntArray:
         """Start a tentative track at every unmatched detection of sufficient score."""
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
         if not len(rows):
             return track_of
         ids = self._next_tracklet + np.arange(len(rows))
         self._next_tracklet += len(rows)
-        box = cxcywh_from_xyxy(detections.xyxy[rows])
         track_of[rows] = len(self.state.mean) + np.arange(len(rows))
-        self.state = self.state.append(TrackState.spawn(box, ids, self.frame_number, self.config))
+        born = TrackState.spawn(box[rows], ids, self.frame_number, self.config)
+        self.state = self.state.append(born)
         self._count_hits(detections, rows, track_of[rows])
         return track_of
 
@@ -897,9 +907,9 @@ class Tracker:
         """Drop tracks that coasted too long; their identities stay in the gallery."""
         state, config = self.state, self.config
         tentative = np.minimum(state.hits, config.n_init)
-        patience = np.where(state.identity < 0, tentative, config.coast_frames)
-        if (state.missed > patience).any():
-            self.state = state.select(state.missed <= patience)
+        stays = state.missed <= np.where(state.identity < 0, tentative, config.coast_frames)
+        if not stays.all():
+            self.state = state.select(stays)
 
     def save(self, path: str | Path) -> None:
         """Write the whole state, without the embedder, as an .npz file.

@@ -219,7 +219,9 @@ class SimilarityCalibration:
             view_angle_deg: between the viewing rays. From another side, an object looks less like
                 itself, and from 90 degrees on its background says nothing. NaN: as 45 degrees.
         """
-        scores = self.part_scores(np.asarray(foreground), np.asarray(background), view_angle_deg)
+        kind = np.result_type(foreground, background)
+        cosines = (np.asarray(foreground, kind), np.asarray(background, kind))
+        scores = self.part_scores(*cosines, view_angle_deg)
         parts = (w * np.where(np.isnan(s), 0, s) for w, s in zip(self.WEIGHTS, scores, strict=True))
         logit = np.where(np.isnan(foreground), -np.inf, sum(parts))
         # of a mixture of both kinds, in which OUTLIER_SHARE of either is like the other
@@ -276,7 +278,7 @@ def assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
 
     Pairs that have no rival need no solver.
     """
-    row, column = np.nonzero(possible)
+    row, column = np.divmod(np.flatnonzero(possible), max(possible.shape[1], 1))
     alone = (np.bincount(row)[row] == 1) & (np.bincount(column)[column] == 1)
     row_of_column[column[alone]] = row[alone]
     if not alone.all():
