@@ -60,6 +60,7 @@ from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.commands import make_parser, short_help
 from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
+from reobj.identity.assignment import Pairs, ambiguous_pairs, assign
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
@@ -73,7 +74,6 @@ from reobj.identity.places import (
 from reobj.identity.reid import (
     Gallery,
     SimilarityCalibration,
-    assign,
     match_probability,
     part_cosines,
 )  # fmt: skip
@@ -363,7 +363,6 @@ AGE_COST = 0.2  # at most, of tracks not seen for AGE_FRAMES; linear before
 AGE_FRAMES = 10
 UNCONFIRMED_COST = 0.2  # of tentative tracks
 CLASS_COST = 0.2  # where track and detection differ in class; taken off the overlap as evidence
-AMBIGUITY_MARGIN = 0.3  # a match is ambiguous where a rival costs less than this more
 WEAK_MATCH_COST = 0.5  # from this cost on a match is weak: perhaps an object without a track
 IOU_ODDS = 20.0  # log odds of one object that full overlap is worth ...
 NO_OVERLAP_ODDS = 6.0  # ... and that the appearance must make up for where there is no overlap
@@ -373,6 +372,7 @@ JUMP_ODDS = 2.0  # log odds against a return far from where the object's own tra
 JUMP_GATE = 9.0  # far: three times the gate's radius
 # With poses
 PLACE_REFIT = 10  # frames between two fits of the places that have new views
+OUT_OF_VIEW = -1e6  # px, where tracks wait whose place is not in view
 PLACE_IN_VIEW = 0.5  # share of a projected box in the image from which a detection is expected
 
 
@@ -482,6 +482,23 @@ class Tracker:
         """Tracks of the latest frame with the tentative ones too, of track_id 0."""
         return Tracks.empty() if self._latest is None else self._latest
 
+    def predicted(self, frames: int = 5) -> Tracks:
+        """Return the boxes predicted in the latest frame for identities that were missed in it.
+
+        They lie where the track's motion and the camera's lead, perhaps beyond the image's border.
+
+        Args:
+            frames: since the last detection, at most. After more, a prediction is mostly wrong.
+        Returns:
+            Tracks of score 0 and detection_index -1, as filled gaps are.
+        """
+        state = self.state
+        t = np.flatnonzero((state.identity >= 0) & (state.missed > 0) & (state.missed <= frames))
+        t = t[state.mean[t, 0, 0] > OUT_OF_VIEW / 2]
+        box, none = xyxy_from_cxcywh(state.mean[t, :, 0]), np.full(len(t), -1)
+        ids = (np.full(len(t), self.frame_number), state.identity[t] + 1, state.tracklet[t])
+        return Tracks(*ids, box, np.zeros(len(t)), state.votes[t].argmax(1), none)
+
     def latest_embeddings(self) -> tuple[IntArray, Floats]:
         """Return which detections of the latest frame were embedded (n,), and their rows (n, E)."""
         lazy = self._lazy
@@ -555,7 +572,7 @@ class Tracker:
             state.reach[followed] = np.abs(reach - reach_before)[followed]
         lost = located & (state.missed > 0)
         shown = (in_view & np.isfinite(now[:, 0]))[:, None]
-        where = np.where(shown, now, [-1e6, -1e6, 1, 1])  # out of view: matches nothing
+        where = np.where(shown, now, [OUT_OF_VIEW, OUT_OF_VIEW, 1, 1])  # matches nothing
         again = TrackState.spawn(where[lost], state.tracklet[lost], 0, self.config)
         state.mean[lost], state.cov[lost] = again.mean, again.cov
         state.reach[lost] = np.abs(reach[lost])
@@ -595,130 +612,103 @@ class Tracker:
         Returns:
             (D,) row of the track's state, or -1.
         """
-        config = self.config
-        same_class = _same_class(self.state.votes, detections.class_id)  # (T, D), as all below
-        cost, feasible, iou, share = self._motion_cost(
-            detections.xyxy, box, same_class, lazy.available
-        )
-
-        def evidence(rows: IntArray) -> Array:
-            """Compute the log odds of one object that the boxes give, (T, n)."""
-            odds = IOU_ODDS * (iou[:, rows] - CLASS_COST * ~same_class[:, rows])
-            return np.asarray(share * (odds - NO_OVERLAP_ODDS))
-
-        priority = self._priority_cost()[:, None]
-        first = feasible & (detections.score >= config.high_score)
-        weak = (cost + priority > WEAK_MATCH_COST) & (self.state.embedded >= 0)[:, None]
-        ambiguous, rivals = self._ambiguous(cost, first, same_class)
-        must_agree = ambiguous | weak
-        track_of, refused = self._match(cost, priority, first, must_agree, rivals, evidence, lazy)
-        free = np.ones(len(iou) + 1, bool)
-        free[track_of] = False  # -1: the last one, cut off below
-        low = (track_of < 0) & (detections.score >= config.low_score)
-        second = feasible & ~refused & (iou >= LOW_IOU) & low & free[:-1, None]
+        config, state = self.config, self.state
+        pairs = self._gate(detections, box, lazy.available)
+        score, priority = detections.score[pairs.detection], self._priority_cost()[pairs.track]
+        first = score >= config.high_score  # (M,), as all below
+        weak = (pairs.cost + priority > WEAK_MATCH_COST) & (state.embedded >= 0)[pairs.track]
+        ambiguous, rivals = ambiguous_pairs(pairs, first)
+        track_of, must_agree = np.full(len(detections), -1), ambiguous | weak
+        track_of, refused = self._match(pairs, priority, first, must_agree, rivals, lazy, track_of)
+        free = np.ones(len(state.mean) + 1, bool)
+        free[track_of] = False  # -1: the last one, of no track
+        low = (track_of[pairs.detection] < 0) & (score >= config.low_score) & free[pairs.track]
+        second = low & ~refused & (pairs.iou >= LOW_IOU)
         if second.any():
-            none = np.zeros_like(weak)
-            late, _ = self._match(1 - iou, 0 * priority, second, weak, none, evidence, lazy)
-            track_of = np.maximum(track_of, late)
+            late, none = dataclasses.replace(pairs, cost=1 - pairs.iou), np.zeros(len(weak), bool)
+            track_of, _ = self._match(late, 0 * priority, second, weak, none, lazy, track_of)
         return track_of
 
-    def _motion_cost(
-        self, xyxy: Array, box: Array, same_class: BoolArray, has_appearance: bool
-    ) -> tuple[Array, BoolArray, Array, Array]:
-        """Compare tracks and detections by motion.
-
-        Returns:
-            cost in [0, 1] from overlap and gated distance, which pairs pass the gate, and IoU,
-            (T, D) each; share (T, 1) of what an overlap says where the place is uncertain.
-        """
+    def _gate(self, detections: Detections, box: Array, has_appearance: bool) -> Pairs:
+        """Compare tracks and detections by motion: which may belong together, and at what cost."""
         state = self.state
-        iou = box_iou(xyxy_from_cxcywh(state.mean[..., 0]), xyxy)
-        share = np.ones((len(iou), 1))
+        iou, share = box_iou(xyxy_from_cxcywh(state.mean[..., 0]), detections.xyxy), np.ones((1, 1))
         if state.reach.any():
             iou, share = overlap_within_reach(state.mean[..., 0], state.reach, box)
         distance = squared_mahalanobis(state.mean, state.cov, box[:, :2]) / GATE_CHI2
-        feasible = (distance < 1) | (iou > GATE_IOU)
-        if not has_appearance:
-            growth = np.log(state.mean[:, None, 2:, 0] / box[None, :, 2:].clip(1e-3))  # (T, D, 2)
-            feasible &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(-1)
-            feasible &= iou >= MOTION_ONLY_IOU
+        t, d = pair = np.divmod(np.flatnonzero((distance < 1) | (iou > GATE_IOU)), max(len(box), 1))
+        iou, share = iou[pair], np.broadcast_to(share, iou.shape)[pair]  # (M,)
         overlap = iou * share
-        cost = (1 - DISTANCE_WEIGHT) * (1 - overlap) + DISTANCE_WEIGHT * np.minimum(distance, 1)
-        cost += CLASS_COST * ~same_class
-        return cost, feasible & (same_class | (overlap > LOW_IOU)), iou, share
+        same_class = state.votes.argmax(1)[t] == detections.class_id[d]
+        cost = (1 - DISTANCE_WEIGHT) * (1 - overlap)
+        cost += DISTANCE_WEIGHT * np.minimum(distance[pair], 1) + CLASS_COST * ~same_class
+        evidence = share * (IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS)
+        good = same_class | (overlap > LOW_IOU)
+        if not has_appearance:
+            growth = np.log(state.mean[t, 2:, 0] / np.maximum(box[d, 2:], 1e-3))  # (M, 2)
+            good &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(1) & (iou >= MOTION_ONLY_IOU)
+        return Pairs(*(x[good] for x in (t, d, cost, iou, evidence, same_class)))
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
         age = np.minimum(np.maximum((self.state.missed - 1) / AGE_FRAMES, 0), 1)
         return np.asarray(AGE_COST * age + UNCONFIRMED_COST * (self.state.identity < 0))
 
-    @staticmethod
-    def _ambiguous(
-        cost: Array, gate: BoolArray, same_class: BoolArray
-    ) -> tuple[BoolArray, BoolArray]:
-        """Mark pairs (T, D) that have a rival of the class, and those that are rivals.
-
-        A pair is a rival where it costs little more than the best of its track and detection. (Two
-        boxes of two classes around one thing are no rivals: they show the same.)
-        """
-        t, d = pair = np.divmod(np.flatnonzero(gate), max(gate.shape[1], 1))
-        gated = cost[pair]
-        best_of_track, best_of_detection = (np.full(n, np.inf) for n in gate.shape)
-        np.minimum.at(best_of_track, t, gated)
-        np.minimum.at(best_of_detection, d, gated)
-        best = np.minimum(best_of_track[t], best_of_detection[d])
-        rival = same_class[pair] & (gated <= best + AMBIGUITY_MARGIN)
-        t, d = t[rival], d[rival]
-        several = (np.bincount(t)[t] > 1) | (np.bincount(d)[d] > 1)
-        ambiguous, rivals = np.zeros((2, *gate.shape), bool)
-        rivals[t, d], ambiguous[t, d] = True, several
-        return ambiguous, rivals
-
     def _match(
-        self, cost: Array, priority: Array, feasible: BoolArray, must_agree: BoolArray,
-        rivals: BoolArray, evidence: Callable[[IntArray], Array], lazy: LazyEmbeddings,
+        self, pairs: Pairs, priority: Array, possible: BoolArray, must_agree: BoolArray,
+        rivals: BoolArray, lazy: LazyEmbeddings, known: IntArray,
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
         """Assign at least cost; compare the appearance where it must agree; assign again.
 
         Args:
-            must_agree: pairs whose appearance must agree; rivals: pairs that compete, (T, D) each.
-            evidence: log odds of one object (T, n) that the boxes of rows (n,) give.
+            priority: added to the cost (M,). must_agree: pairs whose appearance must agree.
+            rivals: pairs that compete. known: (D,) matches made before, or -1.
         Returns:
-            row of the track of each detection (D,), or -1; pairs refused by appearance (T, D).
+            row of the track of each detection (D,), or -1; pairs refused by appearance (M,).
         """
-        track_of = np.full(cost.shape[1], -1, np.int64)
-        refused = np.zeros(cost.shape, bool)
-        compared = np.full(cost.shape[1], not (lazy.available and self.state.embedding.shape[1]))
+        t, d, cost = pairs.track, pairs.detection, pairs.cost
+        refused = np.zeros(len(cost), bool)
+        compared = np.full(len(known), not (lazy.available and self.state.embedding.shape[1]))
         while True:
-            track_of[:] = -1
-            good = feasible & ~refused & (cost < MAX_COST)
-            assign(cost + priority, good, track_of)
-            matched = np.flatnonzero(track_of >= 0)
-            matched = matched[must_agree[track_of[matched], matched] & ~compared[matched]]
-            if not len(matched):
+            good = np.flatnonzero(possible & ~refused & (cost < MAX_COST))
+            matched = good[assign(t[good], d[good], (cost + priority)[good])]
+            ask = matched[must_agree[matched] & ~compared[d[matched]]]
+            if not len(ask):
+                track_of = known.copy()
+                track_of[d[matched]] = t[matched]
                 return track_of, refused
-            ask = (rivals & must_agree)[track_of[matched]].any(0)  # (D,) and their rivals
-            ask[matched] = True
-            rows = np.flatnonzero(ask & ~compared)
-            compared[rows] = True
-            cost, against = self._blend_appearance(cost, evidence(rows), rows, lazy)
-            refused[:, rows] |= against & must_agree[:, rows]
+            asked_by, asked = np.zeros(len(self.state.mean), bool), np.zeros(len(known), bool)
+            asked_by[t[ask]] = True
+            asked[d[ask]] = asked[d[rivals & must_agree & asked_by[t]]] = True
+            asked &= ~compared
+            compared |= asked
+            cost, against = self._blend_appearance(pairs, cost, asked, lazy)
+            refused |= against & must_agree
 
     def _blend_appearance(
-        self, cost: Array, evidence: Array, rows: IntArray, lazy: LazyEmbeddings
+        self, pairs: Pairs, cost: Array, asked: BoolArray, lazy: LazyEmbeddings
     ) -> tuple[Array, BoolArray]:
-        """Blend the appearance of detections (n,) into the cost, half similar where unknown.
+        """Blend the appearance of the detections asked for (D,) into the cost.
+
+        It is half similar where unknown.
 
         Returns:
-            cost (T, D), and pairs (T, n) that boxes and appearance together speak against.
+            cost (M,), and pairs (M,) that boxes and appearance together speak against.
         """
-        known = (self.state.embedded >= 0)[:, None]
+        rows, some = np.flatnonzero(asked), np.flatnonzero(asked[pairs.detection])
         cosines = part_cosines(self.state.embedding, lazy.get(rows), lazy.foreground_width)
-        logit = self.match_calibration.logit(*cosines)  # (T, n)
-        weight, cost = self.config.appearance_weight, cost.copy()
+        t, column = pairs.track[some], np.searchsorted(rows, pairs.detection[some])
+        known = self.state.embedded[t] >= 0
+        logit = self.match_calibration.logit(*(part[t, column] for part in cosines))
+        weight, cost, against = (
+            self.config.appearance_weight,
+            cost.copy(),
+            np.zeros(len(cost), bool),
+        )
         unlike = 1 / (1 + np.exp(np.where(known, logit, 0)))
-        cost[:, rows] = (1 - weight) * cost[:, rows] + weight * unlike
-        return cost, known & (logit + evidence < 0)
+        cost[some] = (1 - weight) * cost[some] + weight * unlike
+        against[some] = known & (logit + pairs.evidence[some] < 0)
+        return cost, against
 
     def _update_states(self, detections: Detections, box: Array, track_of: IntArray) -> None:
         """Correct the matched tracks; boxes of low score are less certain."""
@@ -747,8 +737,8 @@ class Tracker:
         ids = self._next_tracklet + np.arange(len(rows))
         self._next_tracklet += len(rows)
         track_of[rows] = len(self.state.mean) + np.arange(len(rows))
-        born = TrackState.spawn(box[rows], ids, self.frame_number, self.config)
-        self.state = self.state.append(born)
+        spawned = TrackState.spawn(box[rows], ids, self.frame_number, self.config)
+        self.state = self.state.append(spawned)
         self._count_hits(detections, rows, track_of[rows])
         return track_of
 
@@ -873,11 +863,10 @@ class Tracker:
         possible &= self.identity_class[identity] == state.votes[ready].argmax(1)[:, None]
         logit[~possible | (iou == 0)] = -np.inf
         probability = match_probability(logit)
-        claimed = np.full(len(identity), -1, np.int64)
         good = probability >= self.config.return_probability
-        assign(1 - probability, good | (at_known_place & (logit > 0)), claimed)
-        column = np.flatnonzero(claimed >= 0)
-        result[claimed[column]] = identity[column]
+        row, column = np.nonzero(good | (at_known_place & (logit > 0)))
+        taken = assign(row, column, 1 - probability[row, column])
+        result[row[taken]] = identity[column[taken]]
         return result
 
     def _far_from_own_track(self, ready: IntArray, identity: IntArray) -> BoolArray:
@@ -955,12 +944,6 @@ class Tracker:
             "camera_motion": (self._camera_motion, CameraMotion.ARRAYS),
         }
         return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
-
-
-def _same_class(votes: Array, class_id: IntArray) -> BoolArray:
-    """Mark pairs (T, D) whose detection has the class that the track was mostly seen as."""
-    own = votes.argmax(1) if votes.size else np.zeros(len(votes), np.int64)
-    return np.asarray(own[:, None] == class_id[None], bool)
 
 
 # ---- The loop ----------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ SIZE = np.array([1920.0, 1080.0])
 # cosine within a visit, between objects, across visits, as trackers measure them
 COSINES = {"hard": (0.82, 0.44, 0.72)}
 STEADY = {10: 500, 50: 500, 100: 300, 200: 300, 500: 100, 1000: 60}  # frames by number of objects
-LIMIT_S = 25.0  # CPU seconds after which a tracker is stopped (marked * in the tables)
+LIMIT_S = 10.0  # CPU seconds after which a tracker is stopped (marked * in the tables)
 PACKAGES = {
     "peers": ["deep-sort-realtime==1.3.2", "trackers==2.6.1"],
     "norfair": ["norfair==2.3.0"],  # pins numpy<2
@@ -280,7 +280,7 @@ def camera_motions(stream: Stream) -> Iterator[Any]:
 
     folder, motion = Path(stream.images), trackers.CMC()
     files = sorted(folder.iterdir()) if folder.is_dir() else None
-    video = None if files else cv2.VideoCapture(stream.images)
+    video = cv2.VideoCapture(stream.images)
     for i in range(stream.frames * stream.every):
         image = cv2.imread(str(files[i])) if files else video.read()[1]
         if i % stream.every == 0:
@@ -336,10 +336,10 @@ def worker(name: str, options: Options, job: Path, result: Path) -> None:
         seen, seconds[f] = None if motions is None else next(motions), 0.0
         for k, (c, step) in enumerate(steps.items()):
             own = a + np.flatnonzero(stream.class_id[a:b] == c)
-            columns = (stream.xyxy, stream.score, stream.class_id, stream.embedding)
-            part = [column[own] for column in columns]
+            xyxy, score, class_id = stream.xyxy[own], stream.score[own], stream.class_id[own]
+            embedding = stream.embedding[own]
             started = time.process_time()
-            rows, ids = step(*part, seen)
+            rows, ids = step(xyxy, score, class_id, embedding, seen)
             seconds[f] += time.process_time() - started
             identity[own[np.asarray(rows, np.int64)]] = (
                 1 + k + len(steps) * np.asarray(ids, np.int64)

@@ -364,7 +364,7 @@ def cached(path: Path, make: Callable[[], IntArray]) -> IntArray:
     """The result in the file, or made and written there."""
     if path.exists():
         with np.load(path) as data:
-            return data["identity"]
+            return np.asarray(data["identity"])
     identity = make()
     with atomic(path) as part, part.open("wb") as file:
         np.savez_compressed(file, identity=identity)
@@ -406,7 +406,7 @@ def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], IntArray
     result: dict[str, tuple[str, Callable[[], IntArray]]] = {
         "ours": (source, part(ours, seq, None))
     }
-    settings = {peer: (peer, {}) for peer in SWEEP}
+    settings: dict[str, tuple[str, Options]] = {peer: (peer, {}) for peer in SWEEP}
     settings |= {f"{peer} tuned": (peer, TUNED[peer]) for peer in SWEEP if TUNED.get(peer)}
     settings = settings if args.peers else {}
     nets = networks(seq)
@@ -436,8 +436,8 @@ def kept_run(
     """Identities (N,) of a tracker on one sequence, from OUT/runs where known."""
     stream = stream_of(seq, None)
     boxes = digest(stream.frame, stream.xyxy, stream.score, stream.class_id)
-    name = f"{seq.name}-{tracker}-{digest(boxes, key)}.npz".replace(", ", "-").replace(" ", "_")
-    path = out / "runs" / name
+    name = f"{seq.name}-{tracker}-{digest(boxes, key)}.npz".replace(", ", "-")
+    path = out / "runs" / re.sub(r"[^\w.()-]+", "_", name)
     if not path.exists():
         print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
     return cached(path, make)
@@ -456,18 +456,15 @@ def tune(peer: str, seqs: list[Sequence], args: Any) -> tuple[Options, list[list
 
     DeepSORT has our embeddings.
     """
-    embedded = {}
-    if peer == "deepsort":
-        make = functools.partial(own_embedding, embedder=rt.Embedder())
-        embedded = {s.name: functools.cache(functools.partial(embed_all, s, make)) for s in seqs}
+    net = functools.partial(own_embedding, embedder=rt.Embedder())
+    embedded = {s.name: embed_all(s, net) if peer == "deepsort" else None for s in seqs}
     truth = joined([s.truth for s in seqs])
 
     def hota(options: Options) -> float:
         boxes = []
         for s in seqs:
-            run = functools.partial(peer_run, peer, options, s, args.peers)
-            make = functools.partial(with_embeddings, run, embedded.get(s.name, lambda: None))
-            key = f"{options}{EMBEDDER if embedded else ''}"
+            make = functools.partial(peer_run, peer, options, s, args.peers, embedded[s.name])
+            key = f"{options}{EMBEDDER if peer == 'deepsort' else ''}"
             boxes.append(result_boxes(s, kept_run(s, f"{peer} {options}", key, make, args.out)))
         score = score_tracks(truth, joined(boxes))
         lines.append([peer, str(options), *(f"{100 * score[c]:.1f}" for c in ("HOTA", "IDF1"))])
@@ -660,8 +657,8 @@ def wanted(args: argparse.Namespace) -> list[Sequence]:
     return [chosen_on(s) for s in seqs]
 
 
-def main() -> int:
-    """Run the comparison."""
+def make_parser() -> argparse.ArgumentParser:
+    """The command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -676,6 +673,12 @@ def main() -> int:
     parser.add_argument("--tune", action="store_true", help="find the best settings of the peers")
     parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")
     parser.add_argument("-o", "--out", type=Path, required=True)
+    return parser
+
+
+def main() -> int:
+    """Run the comparison."""
+    parser = make_parser()
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     seqs = wanted(args)

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from reobj.cameras import angle_deg
-from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
+from reobj.types import Array, Floats, IntArray, unit_rows
 
 # ---- Gallery -----------------------------------------------------------------------------------
 
@@ -219,8 +218,9 @@ class SimilarityCalibration:
             view_angle_deg: between the viewing rays. From another side, an object looks less like
                 itself, and from 90 degrees on its background says nothing. NaN: as 45 degrees.
         """
+        foreground, background = np.asarray(foreground), np.asarray(background)
         kind = np.result_type(foreground, background)
-        cosines = (np.asarray(foreground, kind), np.asarray(background, kind))
+        cosines = (foreground.astype(kind), background.astype(kind))
         scores = self.part_scores(*cosines, view_angle_deg)
         parts = (w * np.where(np.isnan(s), 0, s) for w, s in zip(self.WEIGHTS, scores, strict=True))
         logit = np.where(np.isnan(foreground), -np.inf, sum(parts))
@@ -239,8 +239,10 @@ class SimilarityCalibration:
         separation = ((mean[1] - mean[0]) / std).clip(0)
         angle = np.radians(np.where(np.isnan(view_angle_deg), USUAL_ANGLE_DEG, view_angle_deg))
         facing = ((1 + np.cos(angle)) / 2, np.cos(angle).clip(0))
-        parts = zip((foreground, background), facing, mean.mean(0), std, separation, strict=True)
-        return [f * ((self.log_similarity(x) - m) / s) * (1 + apart) for x, f, m, s, apart in parts]
+        scale = zip(
+            (foreground, background), facing, mean.mean(0), std, 1 + separation, strict=True
+        )
+        return [f * ((self.log_similarity(x) - m) / s) * d for x, f, m, s, d in scale]
 
     def probability(self, *known: npt.ArrayLike, prior: float = 0.5) -> Array:
         """Compute the probability of one object from the arguments of `logit` and its prior."""
@@ -271,20 +273,3 @@ def _best_other(odds: Array) -> Array:
     """Return (N, M) the largest of the other entries of the row, 0 if there are none."""
     top = np.sort(np.pad(odds, ((0, 0), (2, 0))), 1)[:, -2:]  # (N, 2) second, best
     return np.where(odds == top[:, 1:], top[:, :1], top[:, 1:])
-
-
-def assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
-    """Match as many rows to columns as possible, then at least cost; fills row_of_column (C,).
-
-    Pairs that have no rival need no solver.
-    """
-    row, column = np.divmod(np.flatnonzero(possible), max(possible.shape[1], 1))
-    alone = (np.bincount(row)[row] == 1) & (np.bincount(column)[column] == 1)
-    row_of_column[column[alone]] = row[alone]
-    if not alone.all():
-        row, column = (np.flatnonzero(np.bincount(x[~alone])) for x in (row, column))
-        part = (row[:, None], column)
-        cost = np.where(possible[part], cost[part], 1e3)
-        r, c = linear_sum_assignment(cost)
-        good = cost[r, c] < 1e3
-        row_of_column[column[c[good]]] = row[r[good]]
