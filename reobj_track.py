@@ -488,7 +488,8 @@ class Tracker:
         They lie where the track's motion and the camera's lead, perhaps beyond the image's border.
 
         Args:
-            frames: since the last detection, at most. After more, a prediction is mostly wrong.
+            frames: since the last detection, at most; 5 has the best HOTA on benchmark.py's steady
+                stream of 50 objects (none .857, 1 .901, 5 .907, 10 .907).
         Returns:
             Tracks of score 0 and detection_index -1, as filled gaps are.
         """
