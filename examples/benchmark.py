@@ -44,7 +44,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SIZE = np.array([1920.0, 1080.0])
 # cosine within a visit, between objects, across visits, as trackers measure them
 COSINES = {"hard": (0.82, 0.44, 0.72)}
-STEADY = {10: 500, 50: 500, 100: 300, 200: 300, 500: 100, 1000: 60}  # frames by number of objects
+STEADY = {10: 300, 50: 300, 200: 100, 1000: 30}  # frames by number of objects
 LIMIT_S = 10.0  # CPU seconds after which a tracker is stopped (marked * in the tables)
 PACKAGES = {
     "peers": ["deep-sort-realtime==1.3.2", "trackers==2.6.1"],
