@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "examples"))
 import compare_deepsort  # noqa: E402
+import real_rooms  # noqa: E402
 from benchmark import TUNED  # noqa: E402
 from splits import SPLITS, held_out, room_name  # noqa: E402
 
@@ -72,3 +73,9 @@ def test_every_peer_has_a_setting_within_its_sweep() -> None:
     for peer, options in TUNED.items():
         for option, value in options.items():
             assert value in compare_deepsort.SWEEP[peer][option][1:]
+
+
+def test_the_table_of_real_rooms_says_what_was_chosen_on() -> None:
+    rooms = [real_rooms.Case("", "", seed=seed) for seed in (901, 2006)]
+    assert [case.held_out for case in rooms] == [False, True]
+    assert not any(case.held_out for case in real_rooms.CASES)
