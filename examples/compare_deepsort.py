@@ -304,10 +304,12 @@ def peer_run(
     return run_tracker(peer, stream_of(seq, embedded), venvs, options)[0]
 
 
-def ours(seq: Sequence, embedded: Embedded | None) -> IntArray:
+def ours(
+    seq: Sequence, embedded: Embedded | None, config: rt.TrackerConfig | None = None
+) -> IntArray:
     """Our tracker alone, frame by frame, its own embedder unless embeddings are given."""
     embedder = rt.Embedder() if seq.images is not None and embedded is None else None
-    tracker, identity = rt.Tracker(embedder=embedder), []
+    tracker, identity = rt.Tracker(config, embedder), []
     frames = iter(seq.video()) if seq.images is not None else None
     for f, found in enumerate(seq.detections):
         image = None if frames is None else next(frames).image
