@@ -17,14 +17,16 @@ Times are CPU ms of one process with one thread; the better of two runs.
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
 import venv
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,20 +36,33 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-Step = Callable[[Array, Array, IntArray, Array], tuple[Any, Any]]  # -> detection rows, identities
+Options = dict[str, Any]
+# boxes, scores, classes, embeddings, what the frame shows -> detection rows, identities
+Step = Callable[[Array, Array, IntArray, Array, Any], tuple[Any, Any]]
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = np.array([1920.0, 1080.0])
 # cosine within a visit, between objects, across visits, as trackers measure them
 COSINES = {"hard": (0.82, 0.44, 0.72)}
-LIMIT_S = 25.0  # CPU seconds after which a tracker is stopped (marked * in the tables)
+STEADY = {10: 300, 50: 300, 200: 100, 1000: 30}  # frames by number of objects
+LIMIT_S = 10.0  # CPU seconds after which a tracker is stopped (marked * in the tables)
 PACKAGES = {
     "peers": ["deep-sort-realtime==1.3.2", "trackers==2.6.1"],
     "norfair": ["norfair==2.3.0"],  # pins numpy<2
 }
 PEERS = {
-    "deepsort": "peers", "deepsort-tuned": "peers", "rf-sort": "peers", "rf-bytetrack": "peers",
-    "rf-ocsort": "peers", "norfair-reid": "norfair", "norfair-reid-1000": "norfair",
+    "deepsort": "peers", "rf-sort": "peers", "rf-bytetrack": "peers", "rf-ocsort": "peers",
+    "rf-botsort": "peers", "norfair-reid": "norfair",
+}  # fmt: skip
+# best settings of the sweep of `compare_deepsort.py --tune`, by peer
+TUNED: dict[str, Options] = json.loads((Path(__file__).resolve().parent / "tuned.json").read_text())
+ROWS: dict[str, tuple[str, Options]] = {  # of the tables: tracker and options
+    "ours": ("ours", {}),
+    **{peer: (peer, {}) for peer in PEERS},
+    "deepsort (100 samples)": ("deepsort", {"nn_budget": 100}),
+    "deepsort (1000 frames)": ("deepsort", {
+        "max_age": 1000, "gating_only_position": True, "max_cosine_distance": 0.35}),
+    "norfair-reid (1000 frames)": ("norfair-reid", {"reid_hit_counter_max": 1000}),
 }  # fmt: skip
 
 
@@ -67,6 +82,8 @@ class Stream:
     owner: IntArray  # (N,)
     visit: IntArray  # (N,)
     truth: Array  # (M, 9) MOTChallenge rows: objects in view, detected or not
+    images: str = ""  # video or folder, for a tracker that looks at them; "": none
+    every: int = 1  # n-th image that counts
 
     def save(self, path: Path) -> None:
         np.savez(path, **{k: getattr(self, k) for k in self.__slots__})
@@ -74,7 +91,7 @@ class Stream:
     @staticmethod
     def load(path: Path) -> Stream:
         with np.load(path) as data:
-            return Stream(int(data["frames"]), **{k: data[k] for k in data if k != "frames"})
+            return Stream(**{k: data[k] if data[k].ndim else data[k].item() for k in data})
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +221,9 @@ def _ours(**options: Any) -> Step:
 
     tracker = rt.Tracker(rt.TrackerConfig(**options))
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
+    def step(
+        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
+    ) -> tuple[Any, Any]:
         found = rt.Detections(xyxy, score, class_id)
         tracks = tracker.update(found, embeddings=embedding if embedding.shape[1] else None)
         return tracks.detection_index, tracks.track_id
@@ -218,7 +237,9 @@ def _deepsort(min_score: float = 0.3, **options: Any) -> Step:
 
     tracker = DeepSort(embedder=None, **options)
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
+    def step(
+        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
+    ) -> tuple[Any, Any]:
         rows = np.flatnonzero(score >= min_score)
         ltwh = np.c_[xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]]
         raw = [(ltwh[i].tolist(), float(score[i]), int(class_id[i])) for i in rows]
@@ -231,22 +252,42 @@ def _deepsort(min_score: float = 0.3, **options: Any) -> Step:
     return step
 
 
-def _roboflow(name: str) -> Step:
+def _roboflow(name: str, **options: Any) -> Step:
     import supervision as sv
     import trackers
 
-    tracker = getattr(trackers, name)()
+    tracker = getattr(trackers, name)(**options)
+    botsort = name == "BoTSORTTracker"
+    if botsort:
+        tracker.cmc.estimate = lambda motion, boxes: motion  # of `camera_motions`
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
+    def step(
+        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
+    ) -> tuple[Any, Any]:
         rows = {"row": np.arange(len(xyxy))}
-        found = tracker.update(sv.Detections(xyxy, None, score, class_id, data=rows))
+        motion = (seen,) if botsort else ()
+        found = tracker.update(sv.Detections(xyxy, None, score, class_id, data=rows), *motion)
         good = found.tracker_id >= 0 if len(found) else np.zeros(0, bool)
         return (found.data["row"][good], found.tracker_id[good]) if len(found) else ([], [])
 
     return step
 
 
-def _norfair(memory: int | None = None) -> Step:
+def camera_motions(stream: Stream) -> Iterator[Any]:
+    """BoT-SORT's camera motion (2, 3) in every frame, once for the trackers of all classes."""
+    import cv2
+    import trackers
+
+    folder, motion = Path(stream.images), trackers.CMC()
+    files = sorted(folder.iterdir()) if folder.is_dir() else None
+    video = cv2.VideoCapture(stream.images)
+    for i in range(stream.frames * stream.every):
+        image = cv2.imread(str(files[i])) if files else video.read()[1]
+        if i % stream.every == 0:
+            yield motion.estimate(image, None)
+
+
+def _norfair(**options: Any) -> Step:
     import norfair
 
     def unlike(new: Any, old: Any) -> float:
@@ -255,10 +296,12 @@ def _norfair(memory: int | None = None) -> Step:
 
     tracker = norfair.Tracker(
         "iou", 0.7, reid_distance_function=unlike, reid_distance_threshold=0.35,
-        reid_hit_counter_max=memory or 30, initialization_delay=3,
+        initialization_delay=3, **{"reid_hit_counter_max": 30, **options},
     )  # fmt: skip
 
-    def step(xyxy: Array, score: Array, class_id: IntArray, embedding: Array) -> tuple[Any, Any]:
+    def step(
+        xyxy: Array, score: Array, class_id: IntArray, embedding: Array, seen: Any
+    ) -> tuple[Any, Any]:
         corners = xyxy.reshape(-1, 2, 2)
         found = [
             norfair.Detection(b, data=i, embedding=embedding[i]) for i, b in enumerate(corners)
@@ -270,38 +313,45 @@ def _norfair(memory: int | None = None) -> Step:
     return step
 
 
-TUNED = {"max_age": 1000, "gating_only_position": True, "max_cosine_distance": 0.35}
-MAKERS: dict[str, Callable[[], Step]] = {
+MAKERS: dict[str, Callable[..., Step]] = {
     "ours": _ours,
     "deepsort": _deepsort,
-    "deepsort-tuned": lambda: _deepsort(**TUNED),
-    "rf-sort": lambda: _roboflow("SORTTracker"),
-    "rf-bytetrack": lambda: _roboflow("ByteTrackTracker"),
-    "rf-ocsort": lambda: _roboflow("OCSORTTracker"),
+    "rf-sort": functools.partial(_roboflow, "SORTTracker"),
+    "rf-bytetrack": functools.partial(_roboflow, "ByteTrackTracker"),
+    "rf-ocsort": functools.partial(_roboflow, "OCSORTTracker"),
+    "rf-botsort": functools.partial(_roboflow, "BoTSORTTracker"),
     "norfair-reid": _norfair,
-    "norfair-reid-1000": lambda: _norfair(1000),
 }
 
 
-def worker(name: str, job: Path, result: Path) -> None:
-    """Run one tracker over a stream in this process; write identities (N,) and CPU seconds (F,)."""
+def worker(name: str, options: Options, job: Path, result: Path) -> None:
+    """Run a tracker for each class, as its users do; write identities (N,) and CPU seconds (F,)."""
     stream = Stream.load(job)
-    step = MAKERS[name]()
+    steps = {c: MAKERS[name](**options) for c in np.unique(stream.class_id)}
     identity = np.zeros(len(stream.frame), np.int64)
     seconds = np.full(stream.frames, np.nan)
     cuts = np.searchsorted(stream.frame, np.arange(stream.frames + 1))
+    motions = camera_motions(stream) if stream.images and name == "rf-botsort" else None
     for f, (a, b) in enumerate(itertools.pairwise(cuts)):
-        part = (stream.xyxy[a:b], stream.score[a:b], stream.class_id[a:b], stream.embedding[a:b])
-        started = time.process_time()
-        rows, ids = step(*part)
-        seconds[f] = time.process_time() - started
-        identity[a + np.asarray(rows, np.int64)] = np.asarray(ids, np.int64) + (name != "ours")
-        if np.nansum(seconds) > LIMIT_S:
+        seen, seconds[f] = None if motions is None else next(motions), 0.0
+        for k, (c, step) in enumerate(steps.items()):
+            own = a + np.flatnonzero(stream.class_id[a:b] == c)
+            xyxy, score, class_id = stream.xyxy[own], stream.score[own], stream.class_id[own]
+            embedding = stream.embedding[own]
+            started = time.process_time()
+            rows, ids = step(xyxy, score, class_id, embedding, seen)
+            seconds[f] += time.process_time() - started
+            identity[own[np.asarray(rows, np.int64)]] = (
+                1 + k + len(steps) * np.asarray(ids, np.int64)
+            )
+        if np.nansum(seconds) > LIMIT_S * len(steps):
             break  # the rest stays without identity and time
     np.savez(result, identity=identity, seconds=seconds)
 
 
-def run_tracker(name: str, stream: Stream, venvs: Path | None) -> tuple[IntArray, Array]:
+def run_tracker(
+    name: str, stream: Stream, venvs: Path | None, options: Options | None = None
+) -> tuple[IntArray, Array]:
     """Run a tracker in a process of its own: identities (N,), 0 for none; CPU seconds (F,)."""
     python = sys.executable
     if name != "ours" and venvs is not None:
@@ -310,7 +360,8 @@ def run_tracker(name: str, stream: Stream, venvs: Path | None) -> tuple[IntArray
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder) / "job.npz", Path(folder) / "result.npz"
         stream.save(job)
-        command = [python, __file__, "--worker", name, str(job), str(result)]
+        facts = (name, json.dumps(options or {}), str(job), str(result))
+        command = [python, __file__, "--worker", *facts]
         subprocess.run(command, check=True, env=os.environ | threads, stderr=subprocess.PIPE)
         with np.load(result) as data:
             return data["identity"], data["seconds"]
@@ -435,34 +486,36 @@ def recovery(stream: Stream, identity: IntArray) -> tuple[float, float]:
     return own / max(len(came), 1), other / max(len(came), 1)
 
 
-def best_of(name: str, stream: Stream, venvs: Path | None, runs: int) -> tuple[IntArray, Array]:
+def best_of(row: str, stream: Stream, venvs: Path | None, runs: int) -> tuple[IntArray, Array]:
     """Identities and the CPU seconds of the fastest run."""
-    results = [run_tracker(name, stream, venvs) for _ in range(runs)]
+    name, options = ROWS[row]
+    results = [run_tracker(name, stream, venvs, options) for _ in range(runs)]
     return min(results, key=lambda r: float(np.nanmean(r[1])))
 
 
-def steady_row(name: str, venvs: Path | None, runs: int) -> list[str]:
-    cells, extra = [name], []
-    for objects in (10, 50, 200):
-        stream = make_stream("steady", objects)
-        identity, seconds = best_of(name, stream, venvs, runs)
-        done, ms = int(np.isfinite(seconds).sum()), 1e3 * seconds[np.isfinite(seconds)]
-        score, star = scores(stream, identity, done), "*" if done < stream.frames else ""
-        cells.append(f"{np.median(ms):.2f} / {np.percentile(ms, 95):.2f}{star}")
-        extra.append(f"{score['IDF1']:.3f}")
-        if objects == 50:
-            facts = [str(score["IDSW"]), f"{score['identities']} / {score['gt_objects']}"]
-    return [*cells, " / ".join(extra), *facts]
+def steady_rows(names: list[str], venvs: Path | None, runs: int) -> list[list[str]]:
+    """Time and identities of each tracker: one after the other at every number of objects."""
+    cells: dict[str, list[str]] = {name: [name] for name in names}
+    idf1: dict[str, list[str]] = {name: [] for name in names}
+    for objects, frames in STEADY.items():
+        stream = make_stream("steady", objects, frames=frames)
+        for name in names:
+            identity, seconds = best_of(name, stream, venvs, runs)
+            done, ms = int(np.isfinite(seconds).sum()), 1e3 * seconds[np.isfinite(seconds)]
+            score, star = scores(stream, identity, done), "*" if done < stream.frames else ""
+            cells[name].append(f"{np.median(ms):.2f} / {np.percentile(ms, 95):.2f}{star}")
+            idf1[name].append(f"{score['IDF1']:.3f}")
+    return [[*cells[name], " / ".join(idf1[name])] for name in names]
 
 
-def revisit_row(name: str, venvs: Path | None, objects: int, seeds: int) -> list[str]:
+def revisit_row(row: str, venvs: Path | None, objects: int, seeds: int) -> list[str]:
     """The worst of all seeds."""
-    cells = [name]
+    cells, (name, options) = [row], ROWS[row]
     for kind in ("revisit", "hard", "shape"):
         found = []
         for seed in range(seeds):
             stream = make_stream(kind, objects, seed=seed)
-            identity, _ = run_tracker(name, stream, venvs)
+            identity, _ = run_tracker(name, stream, venvs, options)
             own, other = recovery(stream, identity)
             found.append((own, -other, scores(stream, identity, stream.frames)["IDF1"]))
         own, other, idf1 = (min(column) for column in zip(*found, strict=True))
@@ -488,25 +541,27 @@ def main() -> int:
     parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
     parser.add_argument("--only", default="", help="names of trackers, comma-separated")
     parser.add_argument("--runs", type=int, default=2, help="timed runs, the better one counts")
-    parser.add_argument("--revisit", default="50", help="numbers of objects, e.g. 10,50,200")
+    parser.add_argument("--revisit", default="50", help="numbers of objects, e.g. 10,50,200, or ''")
     parser.add_argument("--seeds", type=int, default=1, help="random scenes of each number")
     parser.add_argument("--embedding", nargs="+", metavar="VIDEO", help="time the embedding only")
     parser.add_argument("--frames", type=int, default=0, help="of these videos (0: all)")
-    parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.embedding:
         print(embedding_table(args.embedding, args.frames))
         return 0
     if args.worker:
-        worker(args.worker[0], Path(args.worker[1]), Path(args.worker[2]))
+        name, options, job, result = args.worker
+        worker(name, json.loads(options), Path(job), Path(result))
         return 0
-    names = ["ours", *(PEERS if args.peers else ())]
+    names = [n for n, (tracker, _) in ROWS.items() if args.peers or tracker == "ours"]
     names = [n for n in names if n in (args.only or n).split(",")]
-    steady = [steady_row(n, args.peers, args.runs) for n in names]
-    header = "tracker | 10 objects, ms median / p95 | 50 | 200 | IDF1 10 / 50 / 200"
-    print(table("Steady", f"{header} | IDSW 50 | ids made / real 50", steady), flush=True)
+    header = " | ".join(f"{n} objects" for n in STEADY)
+    steady = steady_rows(names, args.peers, args.runs)
+    title = f"Steady, ms a frame, median / p95; load of the machine {os.getloadavg()[0]:.1f}"
+    print(table(title, f"tracker | {header} | IDF1 of each", steady), flush=True)
     header = "tracker | revisit: recovered, stolen, IDF1 | hard | shape"
-    for objects in map(int, args.revisit.split(",")):
+    for objects in (int(n) for n in args.revisit.split(",") if n):
         revisit = [revisit_row(n, args.peers, objects, args.seeds) for n in names]
         title = f"Revisit, {objects} objects, the worst of {args.seeds} scenes"
         print(table(title, header, revisit), flush=True)

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Compare identities on the same detections: ours, DeepSORT and today's trackers.
 
-    python examples/compare_deepsort.py --peers build/peers --rooms examples/room \\
-        --render 1,2,v900,v901 --kitchen redkitchen_7scenes --mot mot -o OUT
+    python examples/compare_deepsort.py --peers build/peers --rooms reporting --mot mot -o OUT
+    python examples/compare_deepsort.py --peers build/peers --rooms choosing --tune -o OUT
 
 Writes OUT/compare.html (all of it on one page), compare.csv, compare_*.png; prints Markdown tables.
 The same settings for all sequences; every tracker's rows are the detections it gave an identity to,
@@ -10,15 +10,20 @@ never predicted boxes; identities of `whole chain` are decided over the whole vi
 frame by frame. Every result is kept in OUT/runs: an interrupted comparison goes on where it
 stopped, and a changed reobj_track.py runs only our own rows again.
 
+splits.json says which rooms, recordings and pedestrians are for reporting. What is not is refused;
+with --choosing it is shown, marked, and in no table of the documents. --tune wants the others only:
+it tries one option of every peer after the other (SWEEP) for the best HOTA over all of them and
+writes the best settings to tuned.json beside this file, which the rows `tuned` use.
+
 Rank-1: share of the returns (a true object in view again after >= 30 frames) whose first detection
 is, by the tracker's appearance alone, most like an earlier view of the same object (of its class).
 Returns: share of these returns that the tracker itself gave the identity of the visits before.
 
 Appearance networks (folder REOBJ_MODELS): persons osnet_x0_25_msmt17.onnx, rooms
 mobilenetv2_feat.onnx (ImageNet, as DeepSORT's own embedder), one crop a box; "own embedding" is our
-embedder's. Without images no tracker has appearance.
+embedder's. Without images no tracker has appearance, and BoT-SORT no motion of the camera.
 DeepSORT is deep-sort-realtime 1.3.2 (PyPI), whose gallery of a lost track fills up with copies of
-the last view; `tuned` is max_age 1000, position-only gate, cosine distance .35.
+the last view. Pedestrians without recorded detections get the truth, disturbed (`simulated`).
 """
 
 from __future__ import annotations
@@ -29,12 +34,14 @@ import csv
 import functools
 import hashlib
 import html
+import json
 import os
 import re
 import shutil
 import sys
 import time
 from collections.abc import Callable
+from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +49,8 @@ from typing import Any
 import cv2
 import numpy as np
 import render_room
-from benchmark import PEERS, TUNED, Array, IntArray, Stream, run_tracker, table
+from benchmark import TUNED, Array, IntArray, Options, Stream, run_tracker, table
+from splits import SPLITS, held_out, room_name
 
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
 import reobj_track as rt
@@ -58,8 +66,35 @@ from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own_models
 from reobj.types import Image
 
-Run = tuple[IntArray, float]  # identity of every detection (N,), 0 for none; CPU seconds
-Embedded = tuple[list[Array], float]  # embeddings of every frame's detections; CPU seconds
+Embedded = list[Array]  # embeddings of every frame's detections
+# What --tune tries, one option after the other, each with the best of those before it. The first
+# value is the default; frames are frames, since `frame_rate` stays 30.
+SWEEP: dict[str, dict[str, Rows[Any]]] = {
+    "deepsort": {
+        "max_age": (30, 100, 1000), "gating_only_position": (False, True), "n_init": (3, 1),
+        "max_cosine_distance": (0.2, 0.1, 0.35), "min_score": (0.3, 0.1, 0.5),
+    },
+    "rf-sort": {
+        "lost_track_buffer": (30, 90), "track_activation_threshold": (0.25, 0.4),
+        "minimum_consecutive_frames": (3, 1), "minimum_iou_threshold": (0.3, 0.1, 0.2),
+    },
+    "rf-bytetrack": {
+        "lost_track_buffer": (30, 90), "track_activation_threshold": (0.7, 0.5, 0.3),
+        "minimum_consecutive_frames": (2, 1), "minimum_iou_threshold": (0.1, 0.05, 0.2),
+        "high_conf_det_threshold": (0.6, 0.4),
+    },
+    "rf-ocsort": {
+        "lost_track_buffer": (30, 90), "minimum_consecutive_frames": (3, 1),
+        "minimum_iou_threshold": (0.3, 0.1, 0.2), "direction_consistency_weight": (0.2, 0.0),
+        "high_conf_det_threshold": (0.6, 0.4), "delta_t": (3, 1),
+    },
+    "rf-botsort": {
+        "lost_track_buffer": (30, 90), "track_activation_threshold": (0.7, 0.5, 0.3),
+        "minimum_consecutive_frames": (2, 1), "high_conf_det_threshold": (0.6, 0.4),
+        "minimum_iou_threshold_first_assoc": (0.2, 0.05, 0.1),
+        "minimum_iou_threshold_second_assoc": (0.5, 0.3),
+    },
+}  # fmt: skip
 KITCHEN = ("chair", "dining table", "cup")  # what redkitchen's truth knows
 
 
@@ -96,6 +131,7 @@ class Sequence:
     truth: LabelledBoxes
     images: Path | None
     every: int = 1
+    held_out: bool = False  # for reporting
 
     def video(self) -> rt.Video:
         """The images that count."""
@@ -114,25 +150,51 @@ def split_frames(frame: IntArray, rows: Array, count: int) -> list[rt.Detections
 def mot_sequence(name: str, det: Path, gt: Path, images: Path | None = None) -> Sequence:
     """A MOTChallenge sequence: pedestrians, class 0."""
     truth = read_truth(gt, rt.COCO_NAMES, 0.0)
+    out = held_out("pedestrians", name)
+    if not det.exists():
+        return Sequence(name, "pedestrians", simulated(gt), truth, None, held_out=out)
     rows = read_mot_rows(det)
     frames = int(max(truth.frame.max(), rows[:, 0].max()))
     boxes = np.c_[rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6], rows[:, 6].clip(0, 1), 0 * rows[:, 0]]
     found = split_frames(rows[:, 0].astype(np.int64) - 1, boxes, frames)
-    return Sequence(name, "pedestrians", found, truth, images)
+    return Sequence(name, "pedestrians", found, truth, images, held_out=out)
+
+
+def simulated(gt: Path) -> list[rt.Detections]:
+    """Boxes of pedestrians as a detector might find them, from MOT17's truth.
+
+    Found with the probability of what is visible of them, at most .95; corners off by 4 % of the
+    size; score .3 to .9 by visibility; one box in twenty is nothing.
+    """
+    rows = np.loadtxt(gt, delimiter=",")
+    rows, rng = rows[(rows[:, 7] == 1) & (rows[:, 6] == 1)], np.random.default_rng(len(rows))
+    frames, visible = int(rows[:, 0].max()), rows[:, 8]
+    rows = rows[rng.random(len(rows)) < visible.clip(max=0.95)]
+    size = np.tile(rows[:, 4:6], 2)
+    boxes = np.c_[rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]]
+    boxes = boxes + 0.04 * size * rng.normal(size=boxes.shape)
+    score = (0.3 + 0.6 * rows[:, 8] + 0.05 * rng.normal(size=len(rows))).clip(0.05, 0.99)
+    frame = rows[:, 0].astype(np.int64) - 1
+    wrong = rng.choice(len(rows), len(rows) // 20)  # a box of another frame and a low score
+    frame = np.r_[frame, rng.permutation(frame[wrong])]
+    boxes, score = np.r_[boxes, boxes[wrong]], np.r_[score, rng.uniform(0.2, 0.5, len(wrong))]
+    return split_frames(frame, np.c_[boxes, score, 0 * score], frames)
 
 
 def mot_sequences(folder: Path) -> list[Sequence]:
-    """All sequences of the folder that have detections of full length."""
+    """All sequences of the folder; of MOT17 those that are no videos of MOT15 as well."""
     result = []
     for seq in sorted((folder / "MOT15-train").iterdir()):
         images = folder / seq.name / "img1"
         files = (seq / "det" / "det_sort_frcnn.txt", seq / "gt" / "gt.txt")
         result.append(mot_sequence(seq.name, *files, images if images.is_dir() else None))
-    pets, mot17 = folder / "PETS-S3-MF1", folder / "MOT17-train" / "MOT17-02"
-    det17 = folder / "MOT17-mini" / "train" / "MOT17-02-FRCNN" / "det" / "det.txt"
+    pets = folder / "PETS-S3-MF1"
     pets_files = (pets / "det" / "det.txt", pets / "gt" / "gt.txt")
     result.append(mot_sequence("PETS-S3-MF1", *pets_files, pets / "img1"))
-    return [*result, mot_sequence("MOT17-02", det17, mot17 / "gt" / "gt.txt")]
+    for name in ("MOT17-11", "MOT17-13"):  # 02, 05, 09, 10: Venice-2, ETH-Pedcross2, ADL-Rundle
+        seq = folder / "MOT17-train" / name
+        result.append(mot_sequence(name, seq / "det" / "det.txt", seq / "gt" / "gt.txt"))
+    return result
 
 
 def kitchen_sequence(folder: Path) -> Sequence:
@@ -143,7 +205,8 @@ def kitchen_sequence(folder: Path) -> Sequence:
     rows = rows[np.isin(rows[:, 6], [rt.COCO_NAMES.index(n) for n in KITCHEN])]
     count = len(list((folder / "images").iterdir()))
     found = split_frames(rows[:, 0].astype(np.int64), rows[:, 1:], count)
-    return Sequence(folder.name, "rooms", found, truth, folder / "images")
+    out = held_out("recordings", folder.name)
+    return Sequence(folder.name, "rooms", found, truth, folder / "images", held_out=out)
 
 
 def room_sequence(folder: Path) -> Sequence:
@@ -152,7 +215,8 @@ def room_sequence(folder: Path) -> Sequence:
     recorded = rt.read_detections(folder / "detections.npz", video)
     found = [recorded.at(f) for f in range(len(list(video)))]
     truth = read_truth(folder / "gt_mot.txt", recorded.class_names, 0.0)
-    return Sequence(folder.name, "rooms", found, truth, folder / "room.mp4")
+    name, images = room_name(folder), folder / "room.mp4"
+    return Sequence(f"room {name}", "rooms", found, truth, images, held_out=held_out("rooms", name))
 
 
 def thinned(seq: Sequence, every: int) -> Sequence:
@@ -162,19 +226,15 @@ def thinned(seq: Sequence, every: int) -> Sequence:
     truth = seq.truth[(seq.truth.frame - 1) % every == 0]
     truth = replace(truth, frame=(truth.frame - 1) // every + 1)
     name, group = (f"{x}, every {every}th frame" for x in (seq.name, seq.group))
-    return Sequence(name, group, seq.detections[::every], truth, seq.images, every)
+    found = seq.detections[::every]
+    return replace(seq, name=name, group=group, detections=found, truth=truth, every=every)
 
 
-def disturbed(seq: Sequence, seed: int) -> Sequence:
-    """The same video with other detections: 3 % left out, corners off by 1 % of the size. Where
-    two trackers differ by one event, many such copies tell luck from merit.
-    """
-    rng, found = np.random.default_rng([seed, len(seq.detections)]), []
-    for d in seq.detections:
-        size = np.tile(d.xyxy[:, 2:] - d.xyxy[:, :2], 2)
-        moved = replace(d, xyxy=d.xyxy + 0.01 * size * rng.normal(size=size.shape))
-        found.append(moved[rng.random(len(d)) > 0.03])
-    return Sequence(f"{seq.name}-{seed}", f"{seq.group}, disturbed", found, seq.truth, seq.images)
+def chosen_on(seq: Sequence) -> Sequence:
+    """Mark a sequence that is not held out, and its group."""
+    if seq.held_out:
+        return seq
+    return replace(seq, name=f"{seq.name} (choosing)", group=f"{seq.group} (choosing)")
 
 
 # ---- Appearance --------------------------------------------------------------------------------
@@ -214,15 +274,12 @@ def own_embedding(image: Image, found: rt.Detections, embedder: rt.Embedder) -> 
     return np.asarray(np.concatenate(parts, 1) / np.sqrt(2))
 
 
-def embed_all(seq: Sequence, net: Any) -> tuple[list[Array], float]:
-    """Embeddings of every frame's detections, and CPU seconds."""
-    embedded, seconds = [], 0.0
-    for frame, found in zip(seq.video(), seq.detections, strict=True):
-        started = time.process_time()
-        embedded.append(net(frame.image, found))
-        seconds += time.process_time() - started
+def embed_all(seq: Sequence, net: Any) -> Embedded:
+    """Embeddings of every frame's detections."""
+    frames = zip(seq.video(), seq.detections, strict=True)
+    embedded = [net(frame.image, found) for frame, found in frames]
     width = max((x.shape[1] for x in embedded if x.ndim == 2), default=0)
-    return [x if len(x) else np.empty((0, width)) for x in embedded], seconds
+    return [x if len(x) else np.empty((0, width)) for x in embedded]
 
 
 # ---- Running and scoring -----------------------------------------------------------------------
@@ -235,45 +292,36 @@ def stream_of(seq: Sequence, embedded: list[Array] | None) -> Stream:
     fields = ("xyxy", "score", "class_id")
     box, score, cls = (np.concatenate([getattr(d, k) for d in seq.detections]) for k in fields)
     rows = np.empty((len(frame), 0)) if embedded is None else np.concatenate(embedded)
-    none = np.zeros(len(frame), np.int64)
-    return Stream(len(count), frame, box, score, cls, rows, none, none, np.empty((0, 9)))
+    none, images = np.zeros(len(frame), np.int64), str(seq.images.resolve()) if seq.images else ""
+    facts = (rows, none, none, np.empty((0, 9)), images, seq.every)
+    return Stream(len(count), frame, box, score, cls, *facts)
 
 
-def peer_run(name: str, seq: Sequence, venvs: Path, embedded: list[Array] | None) -> Run:
-    """Run a peer once for every class, as its users do: identities (N,) and CPU seconds."""
-    stream = stream_of(seq, embedded)
-    identity, seconds = np.zeros(len(stream.frame), np.int64), 0.0
-    for cls in np.unique(stream.class_id):
-        rows = np.flatnonzero(stream.class_id == cls)
-        fields = ("frame", "xyxy", "score", "class_id", "embedding", "owner", "visit")
-        part = replace(stream, **{k: getattr(stream, k)[rows] for k in fields})
-        found, spent = run_tracker(name, part, venvs)
-        identity[rows] = np.where(found > 0, found + identity.max(), 0)
-        seconds += float(np.nansum(spent))
-    return identity, seconds
+def peer_run(
+    peer: str, options: Options, seq: Sequence, venvs: Path, embedded: Embedded | None
+) -> IntArray:
+    """Run a peer: identity of every detection (N,), 0 for none."""
+    return run_tracker(peer, stream_of(seq, embedded), venvs, options)[0]
 
 
 def ours(
-    seq: Sequence, embedded: list[Array] | None, config: rt.TrackerConfig | None = None
-) -> tuple[IntArray, float]:
+    seq: Sequence, embedded: Embedded | None, config: rt.TrackerConfig | None = None
+) -> IntArray:
     """Our tracker alone, frame by frame, its own embedder unless embeddings are given."""
     embedder = rt.Embedder() if seq.images is not None and embedded is None else None
-    tracker = rt.Tracker(config, embedder)
-    identity, seconds = [], 0.0
+    tracker, identity = rt.Tracker(config, embedder), []
     frames = iter(seq.video()) if seq.images is not None else None
     for f, found in enumerate(seq.detections):
         image = None if frames is None else next(frames).image
-        started = time.process_time()
         tracks = tracker.update(found, image, embeddings=None if embedded is None else embedded[f])
-        seconds += time.process_time() - started
         ids = np.zeros(len(found), np.int64)
         ids[tracks.detection_index] = tracks.track_id
         identity.append(ids)
-    return np.concatenate(identity), seconds
+    return np.concatenate(identity)
 
 
-def whole_chain(seq: Sequence, out: Path, poses: str) -> Run:
-    """`run`, identities decided over the whole video; seconds of tracking and linking, no poses."""
+def whole_chain(seq: Sequence, out: Path, poses: str) -> IntArray:
+    """`run`, identities decided over the whole video."""
     assert seq.images is not None
     at = iter(seq.detections)
     config = rt.Config(
@@ -288,7 +336,7 @@ def whole_chain(seq: Sequence, out: Path, poses: str) -> Run:
     identity = np.zeros(first[-1], np.int64)
     row = first[result.tracks.frame // seq.every] + result.tracks.detection_index
     identity[row] = result.tracks.track_id
-    return identity, result.seconds["track"] + result.seconds["objects"]
+    return identity
 
 
 def result_boxes(seq: Sequence, identity: IntArray, stream: Stream | None = None) -> LabelledBoxes:
@@ -314,15 +362,15 @@ def joined(parts: list[LabelledBoxes]) -> LabelledBoxes:
     return LabelledBoxes(*(np.concatenate([getattr(p, k) for p in shifted]) for k in names))
 
 
-def cached(path: Path, make: Callable[[], Run]) -> Run:
+def cached(path: Path, make: Callable[[], IntArray]) -> IntArray:
     """The result in the file, or made and written there."""
     if path.exists():
         with np.load(path) as data:
-            return data["identity"], float(data["seconds"])
-    identity, seconds = make()
+            return np.asarray(data["identity"])
+    identity = make()
     with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, identity=identity, seconds=seconds)
-    return identity, seconds
+        np.savez_compressed(file, identity=identity)
+    return identity
 
 
 def networks(seq: Sequence) -> dict[str, Any]:
@@ -337,44 +385,46 @@ def networks(seq: Sequence) -> dict[str, Any]:
     return nets | {"own embedding": own}
 
 
-def appearance_ranks(seq: Sequence, embedded: Callable[[], Embedded]) -> Run:
-    """Ranks of the right object by appearance alone (`return_ranks`); seconds of embedding."""
-    stream = stream_of(seq, embedded()[0])
+def appearance_ranks(seq: Sequence, embedded: Callable[[], Embedded]) -> IntArray:
+    """Ranks of the right object by appearance alone (`return_ranks`)."""
+    stream = stream_of(seq, embedded())
     found = result_boxes(seq, 1 + np.arange(len(stream.frame)), stream)
-    return return_ranks(seq.truth, found, stream.embedding), embedded()[1]
+    return return_ranks(seq.truth, found, stream.embedding)
 
 
-def with_embeddings(make: Callable[[list[Array]], Run], embedded: Callable[[], Embedded]) -> Run:
+def with_embeddings(
+    make: Callable[[Embedded], IntArray], embedded: Callable[[], Embedded]
+) -> IntArray:
     """A tracker's run on embeddings that are only computed now."""
-    return make(embedded()[0])
+    return make(embedded())
 
 
-def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], Run]]]:
+def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], IntArray]]]:
     """For every tracker: what its result depends on, and how to make it.
 
-    `appearance NAME` gives the ranks of the returns in place of identities, and the time of
-    embedding.
+    `appearance NAME` gives the ranks of the returns in place of identities.
     """
     part, source = functools.partial, SOURCE + EMBEDDER
-    result: dict[str, tuple[str, Callable[[], Run]]] = {"ours": (source, part(ours, seq, None))}
-    deepsorts = ["deepsort", "deepsort-tuned"] if args.peers else []
+    result: dict[str, tuple[str, Callable[[], IntArray]]] = {
+        "ours": (source, part(ours, seq, None))
+    }
+    settings: dict[str, tuple[str, Options]] = {peer: (peer, {}) for peer in SWEEP}
+    settings |= {f"{peer} tuned": (peer, TUNED[peer]) for peer in SWEEP if TUNED.get(peer)}
+    settings = settings if args.peers else {}
     nets = networks(seq)
     for name, net in nets.items():
         embedded = functools.cache(part(embed_all, seq, net))
-        key = str(net.path) if name != "own embedding" else EMBEDDER
+        key = digest(net.path) if name != "own embedding" else EMBEDDER
         result[f"appearance {name}"] = (key, part(appearance_ranks, seq, embedded))
-        if name != "own embedding":
-            result[f"ours, {name}"] = (
-                source + key,
-                part(with_embeddings, part(ours, seq), embedded),
-            )
-        for peer in deepsorts:
-            run = part(peer_run, peer, seq, args.peers)
-            result[f"{peer}, {name}"] = (key + str(TUNED), part(with_embeddings, run, embedded))
-    for peer in PEERS if args.peers else ():
-        if peer.startswith("rf-") or (peer in deepsorts and not nets):
-            label = f"{peer}, no appearance" if peer in deepsorts else peer
-            result[label] = (str(TUNED), part(peer_run, peer, seq, args.peers, None))
+        for label, (peer, options) in settings.items():
+            if peer == "deepsort":
+                run = part(peer_run, peer, options, seq, args.peers)
+                job = (key + str(options), part(with_embeddings, run, embedded))
+                result[f"{label}, {name}"] = job
+    for label, (peer, options) in settings.items():
+        if peer != "deepsort" or not nets:
+            run = part(peer_run, peer, options, seq, args.peers, None)
+            result[label + ", no appearance" * (peer == "deepsort")] = (str(options), run)
     if seq.images is not None and seq.group.startswith("rooms"):
         chain = args.out / "chain"
         result["ours, whole video, no poses"] = (source, part(whole_chain, seq, chain, "none"))
@@ -382,18 +432,55 @@ def jobs(seq: Sequence, args: Any) -> dict[str, tuple[str, Callable[[], Run]]]:
     return result
 
 
-def variants(seq: Sequence, args: Any) -> dict[str, Run]:
-    """Identities and CPU seconds of every tracker on one sequence, from OUT/runs where known."""
+def kept_run(
+    seq: Sequence, tracker: str, key: str, make: Callable[[], IntArray], out: Path
+) -> IntArray:
+    """Identities (N,) of a tracker on one sequence, from OUT/runs where known."""
     stream = stream_of(seq, None)
     boxes = digest(stream.frame, stream.xyxy, stream.score, stream.class_id)
-    result = {}
-    for tracker, (key, make) in jobs(seq, args).items():
-        name = f"{seq.name}-{tracker}-{digest(boxes, key)}.npz".replace(", ", "-").replace(" ", "_")
-        path = args.out / "runs" / name
-        if not path.exists():
-            print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
-        result[tracker] = cached(path, make)
-    return result
+    name = f"{seq.name}-{tracker}-{digest(boxes, key)}.npz".replace(", ", "-")
+    path = out / "runs" / re.sub(r"[^\w.()-]+", "_", name)
+    if not path.exists():
+        print(f"{time.strftime('%H:%M:%S')} {seq.name}: {tracker}", file=sys.stderr, flush=True)
+    return cached(path, make)
+
+
+def variants(seq: Sequence, args: Any) -> dict[str, IntArray]:
+    """Identities (N,) of every tracker on one sequence."""
+    return {t: kept_run(seq, t, *job, args.out) for t, job in jobs(seq, args).items()}
+
+
+# ---- Tuning the peers --------------------------------------------------------------------------
+
+
+def tune(peer: str, seqs: list[Sequence], args: Any) -> tuple[Options, list[list[str]]]:
+    """The best options of a peer on these sequences, and a line for every setting that was tried.
+
+    DeepSORT has our embeddings.
+    """
+    net = functools.partial(own_embedding, embedder=rt.Embedder())
+    embedded = {s.name: embed_all(s, net) if peer == "deepsort" else None for s in seqs}
+    truth = joined([s.truth for s in seqs])
+
+    def hota(options: Options) -> float:
+        boxes = []
+        for s in seqs:
+            make = functools.partial(peer_run, peer, options, s, args.peers, embedded[s.name])
+            key = f"{options}{EMBEDDER if peer == 'deepsort' else ''}"
+            boxes.append(result_boxes(s, kept_run(s, f"{peer} {options}", key, make, args.out)))
+        score = score_tracks(truth, joined(boxes))
+        lines.append([peer, str(options), *(f"{100 * score[c]:.1f}" for c in ("HOTA", "IDF1"))])
+        return float(score["HOTA"])
+
+    lines: list[list[str]] = []
+    best: Options = {}
+    reached = hota(best)
+    for option, (_, *values) in SWEEP[peer].items():
+        found = {v: hota(best | {option: v}) for v in values}
+        value = max(found, key=found.__getitem__)
+        if found[value] > reached:
+            reached, best = found[value], best | {option: value}
+    return best, lines
 
 
 # ---- Output ------------------------------------------------------------------------------------
@@ -401,7 +488,7 @@ def variants(seq: Sequence, args: Any) -> dict[str, Run]:
 
 def sets_of(seqs: list[Sequence]) -> dict[str, list[Sequence]]:
     """Every sequence alone, and the sequences of a kind together."""
-    sets = {s.name: [s] for s in seqs if "disturbed" not in s.group}
+    sets = {s.name: [s] for s in seqs}
     for group in sorted({s.group for s in seqs}):
         for images in (True, False):
             members = [s for s in seqs if s.group == group and (s.images is not None) == images]
@@ -410,26 +497,28 @@ def sets_of(seqs: list[Sequence]) -> dict[str, list[Sequence]]:
     return sets
 
 
-def report(found: dict[str, dict[str, Run]], seqs: list[Sequence]) -> list[dict[str, Any]]:
-    """One row for each tracker and sequence, and for each group of sequences together."""
-    rows = []
+def report(found: dict[str, dict[str, IntArray]], seqs: list[Sequence]) -> list[dict[str, Any]]:
+    """One row for each tracker and sequence, and for each group of sequences together.
+
+    A group has the scores of its sequences as one long sequence, and their least and largest.
+    """
+    rows: list[dict[str, Any]] = []
     for label, members in sets_of(seqs).items():
         for tracker in [t for t in found[members[0].name] if not t.startswith("appearance ")]:
             runs = [found[s.name] for s in members]
-            boxes = [result_boxes(s, r[tracker][0]) for s, r in zip(members, runs, strict=True)]
+            boxes = [result_boxes(s, r[tracker]) for s, r in zip(members, runs, strict=True)]
             score = score_tracks(joined([s.truth for s in members]), joined(boxes))
             name = tracker.partition(", ")[2]
-            by = (
-                "appearance own embedding"
-                if tracker == "ours" or "whole" in name
-                else f"appearance {name}"
-            )
+            by = f"appearance {'own embedding' if tracker.startswith('ours') else name}"
             ranks = [r[by] for r in runs if by in r]
-            seconds = sum(r[tracker][1] for r in runs)
-            seconds += 0 if tracker == "ours" or "whole" in name else sum(s for _, s in ranks)
-            first = np.concatenate([k for k, _ in ranks]) == 1 if ranks else np.empty(0)
-            ms = 1e3 * seconds / sum(len(s.detections) for s in members)
-            rows.append({"sequence": label, "tracker": tracker, **score, "ms_per_frame": ms,
+            first = np.concatenate(ranks) == 1 if ranks else np.empty(0)
+            names = {s.name for s in members}
+            single = [r for r in rows if r["sequence"] in names and r["tracker"] == tracker]
+            spread = {
+                f"{c}_{end.__name__}": end([r[c] for r in single] or [score[c]])
+                for c in SPREAD for end in (min, max)
+            }  # fmt: skip
+            rows.append({"sequence": label, "tracker": tracker, **score, **spread,
                          "rank1": float(first.mean()) if len(first) else float("nan")})  # fmt: skip
     return rows
 
@@ -437,16 +526,19 @@ def report(found: dict[str, dict[str, Run]], seqs: list[Sequence]) -> list[dict[
 def cells(row: dict[str, Any]) -> list[str]:
     """One line of a table."""
     share = [f"{100 * row[c]:.1f}" for c in "HOTA DetA AssA IDF1 MOTA".split()]
+    for c, at in SPREAD.items():
+        if row[f"{c}_min"] < row[f"{c}_max"]:
+            share[at] += f" ({100 * row[f'{c}_min']:.0f}-{100 * row[f'{c}_max']:.0f})"
     kept = f"{round(row['returns'] * row['returns_kept'])} of {row['returns']}"
     rank1 = "-" if np.isnan(row["rank1"]) else f"{100 * row['rank1']:.0f}"
     ids = [f"{row['ids_per_object']:.2f}", f"{row['identities']} / {row['gt_objects']}"]
-    speed = f"{row['ms_per_frame']:.1f} ({1e3 / row['ms_per_frame']:.0f})"
-    return [row["tracker"], *share, str(row["IDSW"]), *ids, kept, rank1, speed]
+    return [row["tracker"], *share, str(row["IDSW"]), *ids, kept, rank1]
 
 
+SPREAD = {"HOTA": 0, "IDF1": 3}  # columns with the least and largest of the sequences
 HEADER = (
     "tracker | HOTA | DetA | AssA | IDF1 | MOTA | IDSW | ids per object | ids / objects | "
-    "returns kept | Rank-1 | CPU ms a frame (fps)"
+    "returns kept | Rank-1"
 )
 
 
@@ -525,9 +617,9 @@ def plots(rows: list[dict[str, Any]], out: Path) -> None:
         plt.close(figure)
 
 
-def rendered(seeds: str, folder: Path) -> list[Path]:
-    """Rooms of render_room.py with these seeds, made where missing; v7: of its own plan."""
-    rooms = [folder / f"room_{seed}" for seed in seeds.split(",") if seed]
+def rendered(names: list[str], folder: Path) -> list[Path]:
+    """Rooms of render_room.py by seed, made where missing; v7: of its own plan."""
+    rooms = [folder / f"room_{name}" for name in names]
     for room in rooms:
         seed, own = room.name[5:].lstrip("v"), ["--plan", "varied", "--path", "tour"]
         if not (room / "gt_mot.txt").exists() or not (room / "detections.npz").exists():
@@ -547,27 +639,64 @@ def fill_in(document: Path, rows: list[dict[str, Any]], pictures: Path) -> None:
         document.write_text(re.sub(mark, f"<!-- compare: {name} -->\n\n{body}\n\n", text))
 
 
-def main() -> int:
-    """Run the comparison."""
+def wanted(args: argparse.Namespace) -> list[Sequence]:
+    """The sequences asked for that may be used, and a line for each of the others."""
+
+    def allowed(kind: str, name: str) -> bool:
+        if held_out(kind, name) != args.tune or (args.choosing and not args.tune):
+            return True
+        kept_for = "reporting" if args.tune else "choosing"
+        print(f"left out: {name} is for {kept_for} (examples/splits.json)", file=sys.stderr)
+        return False
+
+    split = args.rooms in ("reporting", "choosing")
+    names = SPLITS[args.rooms]["rooms"] if split else args.rooms.split(",")
+    rooms = [name for name in names if name and allowed("rooms", name)]
+    seqs = [room_sequence(p) for p in rendered(rooms, args.out / "rooms")]
+    seqs += [kitchen_sequence(p) for p in args.recordings if allowed("recordings", p.name)]
+    if args.mot:
+        seqs += [s for s in mot_sequences(args.mot) if allowed("pedestrians", s.name)]
+    return [chosen_on(s) for s in seqs]
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
-    parser.add_argument("--rooms", type=Path, nargs="*", default=[], help="of render_room.py")
-    parser.add_argument("--render", default="", metavar="SEEDS", help="more rooms: 1,2,v900")
-    parser.add_argument("--kitchen", type=Path, nargs="*", default=[], help="recordings")
+    parser.add_argument(
+        "--rooms", default="", metavar="SEEDS", help="e.g. 1,v900; or `reporting`, `choosing`"
+    )
+    parser.add_argument("--recordings", type=Path, nargs="*", default=[], help="folders")
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
     parser.add_argument("--every", type=int, default=1, help="use every n-th frame: wide steps")
-    parser.add_argument("--copies", type=int, default=0, help="disturbed ones of --mot with images")
+    parser.add_argument("--choosing", action="store_true", help="also what is not held out, marked")
+    parser.add_argument("--tune", action="store_true", help="find the best settings of the peers")
     parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")
     parser.add_argument("-o", "--out", type=Path, required=True)
+    return parser
+
+
+def main() -> int:
+    """Run the comparison."""
+    parser = make_parser()
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    rooms = [*args.rooms, *rendered(args.render, args.out / "rooms")]
-    seqs = [room_sequence(p) for p in rooms] + [kitchen_sequence(p) for p in args.kitchen]
-    seqs += mot_sequences(args.mot) if args.mot else []
-    pictured = [s for s in seqs if s.group == "pedestrians" and s.images is not None]
-    seqs += [disturbed(s, seed) for seed in range(args.copies) for s in pictured]
+    seqs = wanted(args)
+    if not seqs:
+        parser.error("no sequences: give --rooms, --recordings or --mot with some that may be used")
+    if args.tune and not args.peers:
+        parser.error("--tune needs --peers")
+    if args.tune:
+        best = {peer: tune(peer, seqs, args) for peer in SWEEP}
+        with atomic(Path(__file__).resolve().parent / "tuned.json") as part:
+            settings = {peer: options for peer, (options, _) in best.items()}
+            part.write_text(json.dumps(settings, indent=1) + "\n")
+        title = f"Tuned on {', '.join(s.name for s in seqs)}"
+        lines = [line for _, tried in best.values() for line in tried]
+        print(table(title, "peer | options | HOTA | IDF1", lines))
+        return 0
     seqs = [thinned(seq, args.every) for seq in seqs]
     found = {s.name: variants(s, args) for s in seqs}
     rows = report(found, seqs)

@@ -475,8 +475,9 @@ def calibrate(cases: Sequence[Cases]) -> tuple[Array, float]:
     fitted: list[tuple[Array, BoolArray, Array]] = []
     for c in cases:
         for angle in (c.angle, np.full(len(c.same), np.nan)):
+            fore, back = c.cosine.T
             weight = c.balance(bool(np.isfinite(angle).any())) / max(len(c.same), 1)
-            terms = np.nan_to_num(c.decider().part_scores(c.cosine, angle))
+            terms = np.nan_to_num(np.stack(c.decider().part_scores(fore, back, angle), -1))
             fitted.append((terms, c.same, weight))
     terms, same, weight = (np.concatenate(x) for x in zip(*fitted, strict=True))
     weights = fit_logistic(terms, same, weight)

@@ -54,6 +54,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import render_room
+from splits import held_out
 from synthetic_quadrics import table, write_table
 
 import quadrics
@@ -98,6 +99,12 @@ class Case:
         )
         where = self.data or ("examples/room" if self.seed is None else f"rendered {self.seed}")
         return [where, boxes, "supplied" if self.supplied else "own"]
+
+    @property
+    def held_out(self) -> bool:
+        """Whether nothing was chosen on it (splits.json)."""
+        kind, name = ("recordings", self.data) if self.data else ("rooms", f"v{self.seed}")
+        return held_out(kind, name)
 
 
 CASES = [
@@ -806,8 +813,10 @@ def tables(cases: Sequence[Case], made: dict[str, list[Figures]]) -> dict[str, s
         ]
         return {"left out": figures_table(["recording", "without"], rows)}
     rows = [(case.title, figures) for case, figures in zip(cases, made[""], strict=True)]
+    reported = [", ".join(case.title) for case in cases if case.held_out]
+    note = f"\n\nHeld out (`examples/splits.json`): {'; '.join(reported) or 'none of these'}."
     return {
-        "real rooms": figures_table(["recording", "boxes", "cameras"], rows),
+        "real rooms": figures_table(["recording", "boxes", "cameras"], rows) + note,
         "confidence": reliability_table(sure_by_group(cases, made[""])),
     }
 

@@ -52,6 +52,7 @@ from scipy.optimize import linear_sum_assignment
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import compare_deepsort as cd
+from benchmark import ROWS
 from rank_k import pyplot
 from real_rooms import MIN_VISIBLE, identity_f1, judge, kinds_of, median, short, write_poses
 from reid_scenes import scannet_scene
@@ -69,8 +70,8 @@ SOLVERS = ("sfmo", "psfmo", "lfd", "solids")
 TRACKERS = {
     "SORT": "rf-sort",
     "DeepSORT": "deepsort",
-    "DeepSORT, tuned": "deepsort-tuned",
-}  # of compare_deepsort.py
+    "DeepSORT, tuned": "deepsort (1000 frames)",
+}  # rows of benchmark.py
 PLAIN, ONLINE = "ours, no re-identification", "ours, frame by frame"
 CHAIN, TRUTH = "ours, whole chain", "true identities"
 SHOWN = ("SORT", "DeepSORT, tuned", PLAIN, CHAIN)  # in pictures
@@ -287,7 +288,7 @@ def tracked(name: str, rec: Recording, boxes: Boxes, peers: Path | None, work: P
     own = name not in TRACKERS
     key = cd.digest(columns, boxes.frame, cd.SOURCE if own else "")
 
-    def make() -> cd.Run:
+    def make() -> IntArray:
         if own:
             return cd.ours(seq, None, rt.TrackerConfig(remember=name == ONLINE))
         embedded = None
@@ -296,10 +297,11 @@ def tracked(name: str, rec: Recording, boxes: Boxes, peers: Path | None, work: P
             if not nets:
                 text = "DeepSORT needs mobilenetv2_feat.onnx in the folder REOBJ_MODELS"
                 raise rt.ReobjError(text)
-            embedded = cd.embed_all(seq, nets[0])[0]
-        return cd.peer_run(TRACKERS[name], seq, peers or Path("build/peers"), embedded)
+            embedded = cd.embed_all(seq, nets[0])
+        peer = ROWS[TRACKERS[name]]
+        return cd.peer_run(*peer, seq, peers or Path("build/peers"), embedded)
 
-    return cd.cached(work / f"{rec.name}-{tag(name)}-{key}.npz", make)[0]
+    return cd.cached(work / f"{rec.name}-{tag(name)}-{key}.npz", make)
 
 
 def tag(name: str) -> str:

@@ -426,18 +426,18 @@ def _checked(xyxy: Any, score: Any, class_id: Any, masks: Any) -> Detections:
 
 def _check_values(xyxy: Array, score: Array, class_id: npt.NDArray[Any]) -> None:
     """Refuse boxes (N, 4), scores (N,) and classes (N,) that cannot be meant."""
-    wide = ~(np.abs(xyxy) <= COORDINATE_MAX).all(1)  # NaN too
-    inverted = (xyxy[:, 2:] < xyxy[:, :2]).any(1)
-    unlikely = ~((score >= 0) & (score <= 1))
-    unnamed = ~((class_id >= 0) & (class_id <= CLASS_MAX) & (class_id == np.floor(class_id)))
-    for bad, values, expected in (
-        (wide, xyxy, f"finite coordinates in pixels, at most {COORDINATE_MAX:g}"),
-        (inverted, xyxy, "x1 <= x2 and y1 <= y2: corners, not x, y, width, height"),
-        (unlikely, score, "a confidence in [0, 1]"),
-        (unnamed, class_id, f"a class number from 0 to {CLASS_MAX}"),
+    finite = np.abs(xyxy) <= COORDINATE_MAX  # not NaN either
+    ordered = xyxy[:, 2:] >= xyxy[:, :2]
+    likely = (score >= 0) & (score <= 1)
+    named = (class_id >= 0) & (class_id <= CLASS_MAX) & (class_id == np.floor(class_id))
+    for good, values, expected in (
+        (finite, xyxy, f"finite coordinates in pixels, at most {COORDINATE_MAX:g}"),
+        (ordered, xyxy, "x1 <= x2 and y1 <= y2: corners, not x, y, width, height"),
+        (likely, score, "a confidence in [0, 1]"),
+        (named, class_id, f"a class number from 0 to {CLASS_MAX}"),
     ):
-        if bad.any():
-            row = int(bad.argmax())
+        if not good.all():
+            row = int(np.argwhere(~good)[0, 0])
             raise ReobjError(f"detection {row}: {values[row]}, expected {expected}")
 
 
@@ -492,10 +492,11 @@ def box_area(xyxy: Array) -> Array:
 
 def box_iou(a_xyxy: Array, b_xyxy: Array) -> Array:
     """Return the intersection over union (A, B) of boxes a (A, 4) with boxes b (B, 4)."""
-    a, b = a_xyxy[:, None], b_xyxy[None]  # (A, 1, 4), (1, B, 4)
-    overlap = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])  # (A, B, 2)
-    inter = overlap.clip(0).prod(-1)  # (A, B)
-    union = box_area(a) + box_area(b) - inter
+    (ax, ay, ax2, ay2), (bx, by, bx2, by2) = a_xyxy.T[..., None], b_xyxy.T  # (A, 1), (B,) each
+    width = np.minimum(ax2, bx2) - np.maximum(ax, bx)  # (A, B)
+    height = np.minimum(ay2, by2) - np.maximum(ay, by)
+    inter = np.maximum(width, 0) * np.maximum(height, 0)
+    union = (ax2 - ax) * (ay2 - ay) + (bx2 - bx) * (by2 - by) - inter
     return np.asarray(inter / np.maximum(union, 1e-9), np.float64)
 
 
@@ -530,7 +531,7 @@ def widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def unit_rows(rows: npt.NDArray[Any]) -> Array:
     """Scale rows (N, E) to unit length; zero rows stay zero."""
     rows = np.asarray(rows, np.float64)
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-12))
+    return np.asarray(rows / np.maximum(np.sqrt((rows * rows).sum(-1, keepdims=True)), 1e-12))
 
 
 def object_color(object_id: int) -> tuple[int, int, int]:

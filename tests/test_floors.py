@@ -20,7 +20,7 @@ PATHS = [
 FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
-    2: "reobj.files reobj.identity.evidence reobj.identity.sampling "
+    2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
     "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.options reobj.sources.video reobj.sources.weights "

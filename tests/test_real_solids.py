@@ -131,12 +131,12 @@ def compared(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`identities` with a tracker that loses everything once in place of SORT."""
     work, name = tmp_path_factory.mktemp("out"), "SORT"
 
-    def cut(peer, seq, venvs, embedded):
-        assert (peer, embedded) == ("rf-sort", None) and venvs == Path("peers")
+    def cut(peer, options, seq, venvs, embedded):
+        assert (peer, options, embedded) == ("rf-sort", {}, None) and venvs == Path("peers")
         rec = rs.recording(room, work)
         boxes = rec.boxes()
         assert sum(map(len, seq.detections)) == len(boxes.frame)
-        return halves(boxes, rs.true_identities(boxes, rec.truth, 0.5)), 0.0
+        return halves(boxes, rs.true_identities(boxes, rec.truth, 0.5))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rs.cd, "peer_run", cut)

@@ -896,6 +896,24 @@ def test_tracks_wait_for_coast_frames(gap: int, same: bool) -> None:
     assert (update(tracker, rows((100, 100, 150, 150))).tracklet_id == 1).tolist() == [same]
 
 
+def test_missed_identities_have_predicted_boxes() -> None:
+    """One goes on at 4 px a frame unseen, the other is seen; a tentative one is none."""
+    tracker = rt.Tracker()
+    assert not len(tracker.predicted())
+    for f in range(20):
+        tracker.update(rows((100 + 4 * f, 100, 150 + 4 * f, 180), (400, 100, 450, 180, 0.9, CUP)))
+        assert not len(tracker.predicted())
+    tracker.update(rows((400, 100, 450, 180, 0.9, CUP), (600, 300, 650, 380)))  # a newcomer
+    for f in range(21, 27):
+        tracker.update(rows((400, 100, 450, 180, 0.9, CUP)))
+        found = tracker.predicted()
+        assert len(found) == (f < 25) and len(tracker.predicted(2)) == (f < 22)
+        if len(found):
+            assert found.xyxy[0] == pytest.approx([100 + 4 * f, 100, 150 + 4 * f, 180], abs=4)
+            assert (found.frame, found.track_id, found.tracklet_id) == (f, 1, 1)
+            assert (found.score, found.class_id, found.detection_index) == (0, CHAIR, -1)
+
+
 def test_tracks_are_given_up_one_by_one() -> None:
     """One is lost a frame later than the other, and is given up a frame later."""
     tracker, counts = rt.Tracker(rt.TrackerConfig(coast_frames=5)), []
@@ -1052,7 +1070,9 @@ def test_out_of_view_no_time_passes_for_a_track_of_known_place() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
     walk(tracker, PAST)
     before = tracker.latest.tracklet_id.tolist()
-    walk(tracker, AWAY + [pose_at(0.5, 180 - 3.0 * i) for i in range(61)])
+    walk(tracker, AWAY)
+    assert not len(tracker.predicted())  # nothing is missed
+    walk(tracker, [pose_at(0.5, 180 - 3.0 * i) for i in range(61)])
     assert tracker.latest.tracklet_id.tolist() == before
 
 

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from reobj.cameras import angle_deg
-from reobj.types import Array, BoolArray, Floats, IntArray, unit_rows
+from reobj.types import Array, Floats, IntArray, unit_rows
 
 # ---- Gallery -----------------------------------------------------------------------------------
 
@@ -144,7 +143,7 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
     """Compute the cosines (N, M) of all pairs of rows (N, E) and (M, E), NaN for rows of zeros."""
     if not a.shape[1]:
         return np.full((len(a), len(b)), np.nan)
-    lengths = (np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    lengths = (np.sqrt((x * x).sum(1, keepdims=True)) for x in (a, b))
     a, b = (x / np.where(n > 1e-9, n, np.nan) for x, n in zip((a, b), lengths, strict=True))
     return np.asarray(a @ b.T)
 
@@ -219,24 +218,31 @@ class SimilarityCalibration:
             view_angle_deg: between the viewing rays. From another side, an object looks less like
                 itself, and from 90 degrees on its background says nothing. NaN: as 45 degrees.
         """
-        parts = np.stack(np.broadcast_arrays(foreground, background), -1)  # (..., 2)
-        scores = self.WEIGHTS * self.part_scores(parts, view_angle_deg)
-        logit = np.where(np.isnan(scores), 0, scores).sum(-1)
+        foreground, background = np.asarray(foreground), np.asarray(background)
+        kind = np.result_type(foreground, background)
+        cosines = (foreground.astype(kind), background.astype(kind))
+        scores = self.part_scores(*cosines, view_angle_deg)
+        parts = (w * np.where(np.isnan(s), 0, s) for w, s in zip(self.WEIGHTS, scores, strict=True))
+        logit = np.where(np.isnan(foreground), -np.inf, sum(parts))
         # of a mixture of both kinds, in which OUTLIER_SHARE of either is like the other
-        odds = np.exp(np.where(np.isnan(parts[..., 0]), -np.inf, logit).clip(None, 50))
+        odds = np.exp(np.minimum(logit, 50))
         bounded = (odds + OUTLIER_SHARE) / (1 + OUTLIER_SHARE * odds)
         return np.asarray(np.where(odds > 0, np.log(bounded), -np.inf))
 
-    def part_scores(self, cosine: Array, view_angle_deg: npt.ArrayLike = np.nan) -> Array:
-        """Standardise the cosines (..., 2) of both parts: evidence for one object, unweighted."""
-        count, total, squares = np.moveaxis(self.moments, 1, 0)  # (2, 2) each: kinds, parts
+    def part_scores(
+        self, foreground: Array, background: Array, view_angle_deg: npt.ArrayLike = np.nan
+    ) -> list[Array]:
+        """Standardise the cosines (...) of both parts: evidence for one object, unweighted."""
+        count, total, squares = self.moments.swapaxes(0, 1)  # (2, 2) each: kinds, parts
         mean = total / count
         std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
         separation = ((mean[1] - mean[0]) / std).clip(0)
         angle = np.radians(np.where(np.isnan(view_angle_deg), USUAL_ANGLE_DEG, view_angle_deg))
-        facing = np.stack([(1 + np.cos(angle)) / 2, np.cos(angle).clip(0)], -1)  # (..., 2)
-        deviation = (self.log_similarity(cosine) - mean.mean(0)) / std  # (..., 2)
-        return np.asarray(facing * deviation * (1 + separation))
+        facing = ((1 + np.cos(angle)) / 2, np.cos(angle).clip(0))
+        scale = zip(
+            (foreground, background), facing, mean.mean(0), std, 1 + separation, strict=True
+        )
+        return [f * ((self.log_similarity(x) - m) / s) * d for x, f, m, s, d in scale]
 
     def probability(self, *known: npt.ArrayLike, prior: float = 0.5) -> Array:
         """Compute the probability of one object from the arguments of `logit` and its prior."""
@@ -267,11 +273,3 @@ def _best_other(odds: Array) -> Array:
     """Return (N, M) the largest of the other entries of the row, 0 if there are none."""
     top = np.sort(np.pad(odds, ((0, 0), (2, 0))), 1)[:, -2:]  # (N, 2) second, best
     return np.where(odds == top[:, 1:], top[:, :1], top[:, 1:])
-
-
-def assign(cost: Array, possible: BoolArray, row_of_column: IntArray) -> None:
-    """Match as many rows to columns as possible, then at least cost; fills row_of_column (C,)."""
-    if possible.any():
-        rows, columns = linear_sum_assignment(np.where(possible, cost, 1e3))
-        good = possible[rows, columns]
-        row_of_column[columns[good]] = rows[good]

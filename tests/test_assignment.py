@@ -1,0 +1,52 @@
+"""Pairs of tracks and detections: who gets whom, and which compete."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+from reobj.identity.assignment import AMBIGUITY_MARGIN, Pairs, ambiguous_pairs, assign
+
+
+def random_pairs(seed: int, rows: int, columns: int, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 2) row and column of pairs that are possible, and their costs (M,)."""
+    rng = np.random.default_rng(seed)
+    pairs = np.argwhere(rng.random((rows, columns)) < share)
+    return pairs, rng.random(len(pairs))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 1.0])
+@pytest.mark.parametrize(("rows", "columns"), [(0, 3), (1, 1), (6, 9), (30, 20)])
+def test_as_many_as_possible_then_at_least_cost(rows: int, columns: int, share: float) -> None:
+    """As scipy does on the whole matrix, where what is impossible costs more than all the rest."""
+    for seed in range(10):
+        pairs, cost = random_pairs(seed, rows, columns, share)
+        whole = np.full((rows, columns), 1e3)
+        whole[tuple(pairs.T)] = cost
+        row, column = linear_sum_assignment(whole)
+        expected = {(r, c) for r, c in zip(row, column, strict=True) if whole[r, c] < 1e3}
+        assert {tuple(p) for p in pairs[assign(*pairs.T, cost)]} == expected
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.7])
+def test_rivals_cost_little_more_than_the_best_of_track_and_detection(share: float) -> None:
+    """As the same rule over the whole matrix."""
+    for seed in range(10):
+        pairs, cost = random_pairs(seed, 8, 7, share)
+        rng = np.random.default_rng(seed)
+        same, possible = rng.random((2, len(pairs))) < 0.8
+        given = Pairs(*pairs.T, cost, cost, cost, same)
+        whole = np.full((8, 7), np.inf)
+        whole[tuple(pairs[possible].T)] = cost[possible]
+        near = whole <= np.minimum(whole.min(0)[None], whole.min(1)[:, None]) + AMBIGUITY_MARGIN
+        of_class = np.zeros((8, 7), bool)
+        of_class[tuple(pairs[same & possible].T)] = True
+        rivals = near & of_class
+        several = (rivals.sum(0) > 1)[None] | (rivals.sum(1) > 1)[:, None]
+        for found, expected in zip(
+            ambiguous_pairs(given, possible), (rivals & several, rivals), strict=True
+        ):
+            whole_found = np.zeros((8, 7), bool)
+            whole_found[tuple(pairs[found].T)] = True
+            np.testing.assert_array_equal(whole_found, expected)
