@@ -350,32 +350,6 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
-def without_secrets(text: str) -> str:
-    """Leave of the URLs in a text what may be shown and written: scheme, host and path.
-
-    User and password go, also a password with "@" or "/" in it, and all after the path: queries
-    and parameters, where cameras take passwords too. Where nothing tells which is which, only the
-    scheme is left.
-
-    >>> without_secrets("rtsp://me:secret@10.0.0.7/stream?pwd=x")
-    'rtsp://10.0.0.7/stream'
-    """
-    return URL.sub(_public_part, text)
-
-
-URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]*:/+)(\S*)", re.IGNORECASE)
-PARAMETERS = re.compile(r"[?#;&=]")  # begin what is no path: also rtsp://host/user=me&password=x
-
-
-def _public_part(url: re.Match[str]) -> str:
-    """Cut a URL to scheme, host and path."""
-    scheme, rest = url.groups()
-    user, _, rest = rest.rpartition("@")
-    if PARAMETERS.search(user):  # of a password, or the "@" is one of a query
-        return f"{scheme}..."
-    return scheme + PARAMETERS.split(rest)[0]
-
-
 def shortened(items: Sequence[Any]) -> str:
     """Write the first five items, for messages.
 

@@ -95,6 +95,7 @@ def parse_up(text: str) -> Array:
         up = np.empty(0)
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise ReobjError(f"--set objects.up={text}: expected a direction x,y,z, such as 0,0,1")
+    up /= np.abs(up).max()  # the squares of 1e300 are too large
     return np.asarray(up / np.linalg.norm(up))
 
 
@@ -108,11 +109,15 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     sizes: dict[str | int, tuple[str | int, float]] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
         found = re.fullmatch(r"(.+?)\s*=\s*([0-9]*\.?[0-9]+|[0-9]+\.)\s*(m|cm|mm)", item)
-        if found is None or float(found[2]) == 0:
-            expected = "CATEGORY=HEIGHT in m, cm or mm, such as door=2.0m"
-            raise ReobjError(f"--known-size {item!r}: expected {expected}")
-        sizes[found[1]] = ("h", float(found[2]) / per_metre[found[3]])
+        height_m = float(found[2]) / per_metre[found[3]] if found else 0.0
+        if found is None or not KNOWN_SIZE_M[0] <= height_m <= KNOWN_SIZE_M[1]:
+            expected = "CATEGORY=HEIGHT in m, cm or mm, from {:g} to {:g} m, such as door=2.0m"
+            raise ReobjError(f"--known-size {item!r}: expected {expected.format(*KNOWN_SIZE_M)}")
+        sizes[found[1]] = ("h", height_m)
     return sizes
+
+
+KNOWN_SIZE_M = (0.001, 1000.0)  # chosen: objects of a room or a street are neither
 
 
 def _plain(name: str) -> str:

@@ -15,8 +15,10 @@ from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_co
 
 import quadrics
 import reobj_track as rt
+from reobj.results.folder import write_mot
 from reobj.results.ply import write_ply
-from reobj.results.result import VideoInfo, sides, validate_objects, write_mot
+from reobj.results.result import VideoInfo, sides
+from reobj.schema import validate_objects
 
 
 def copy_of(result: rt.Result, **changes: object) -> rt.Result:
@@ -300,7 +302,6 @@ def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
     ],
 )
 def test_validate_finds_faults(saved: Path, change: dict[str, object], fault: str) -> None:
-    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
     data = json.loads((saved / "objects.json").read_text())
     data["objects"][0] |= change
     (saved / "objects.json").write_text(json.dumps(data))
@@ -310,7 +311,6 @@ def test_validate_finds_faults(saved: Path, change: dict[str, object], fault: st
 
 @pytest.mark.parametrize("key", ["format", "world", "objects"])
 def test_validate_misses_nothing_that_must_be_there(saved: Path, key: str) -> None:
-    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
     data = json.loads((saved / "objects.json").read_text())
     del data[key]
     (saved / "objects.json").write_text(json.dumps(data))

@@ -24,9 +24,9 @@ import quadrics
 import reobj
 import reobj_track as rt
 from reobj.poses import stage
-from reobj.results.result import validate_objects
 from reobj.results.stages import detect_all
 from reobj.results.workspace import Workspace
+from reobj.schema import validate_objects
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 12

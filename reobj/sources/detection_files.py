@@ -131,8 +131,14 @@ def read_mot_rows(path: Path) -> Array:
     columns, cells, lines, is_mot = _table_cells(path)
     if not is_mot:
         raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
-    numbers = [_column([row[i] for row in cells], lines, path) for i in range(len(columns))]
-    return np.stack(numbers, 1)
+    texts = [[row[i] for row in cells] for i in range(len(columns))]
+    rows = np.stack([_column(column, lines, path) for column in texts], 1)  # (N, 6 to 10)
+    for at in (0, 1):
+        _check_whole(rows[:, at], texts[at], lines, path, columns[at])
+    if (far := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
+        box, line = rows[far][0, 2:6], lines[far][0]
+        raise ReobjError(f"{path}, line {line}: box {box}, expected at most {COORDINATE_MAX:g} px")
+    return rows
 
 
 MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
@@ -158,17 +164,12 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
     columns, cells, lines, is_mot = _table_cells(path)
     texts = {role: [row[i] for row in cells] for i, role in enumerate(columns)}
     column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
-    for role in ("frame", "id"):
-        whole = np.abs(column.get(role, np.zeros(0))) <= WHOLE_MAX
-        if role == "frame" and role in column:
-            whole &= column[role] % 1 == 0
-        if not whole.all():
-            line = int(lines[whole.argmin()])
-            raise ReobjError(f"{path}, line {line}: {role} {texts[role][whole.argmin()]}, expected "
-                             "a whole number")  # fmt: skip
     if is_mot and (column["id"] % 1 != 0).any():
         raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
                          "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
+    for role in ("frame", "id"):
+        if role in column:
+            _check_whole(column[role], texts[role], lines, path, role)
     if "x2" not in column:
         column["x2"], column["y2"] = column["x1"] + column["w"], column["y1"] + column["h"]
     xyxy = np.stack([column[role] for role in ("x1", "y1", "x2", "y2")], 1)  # (N, 4)
@@ -293,6 +294,17 @@ def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
         if not math.isfinite(values[i]):
             raise ReobjError(f"{path}, line {lines[i]}: {cell!r} is no finite number")
     return values
+
+
+def _check_whole(
+    values: Array, cells: Sequence[str], lines: IntArray, path: Path, role: str
+) -> None:
+    """Refuse a column of numbers (N,) that are not whole, or beyond WHOLE_MAX."""
+    bad = (np.abs(values) > WHOLE_MAX) | (values % 1 != 0)
+    if bad.any():
+        row = int(bad.argmax())
+        where = f"{path}, line {lines[row]}: {role}"
+        raise ReobjError(f"{where} {cells[row]}, expected a whole number")
 
 
 def _table_classes(

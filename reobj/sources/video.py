@@ -28,8 +28,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.files import shortened, without_secrets
-from reobj.types import Array, Frame, Image, ReobjError, option
+from reobj.files import shortened
+from reobj.types import Array, Frame, Image, ReobjError, option, without_secrets
 
 IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
 
