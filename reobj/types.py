@@ -72,7 +72,8 @@ def without_secrets(text: str) -> str:
     return URL.sub(_public_part, text)
 
 
-URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]*:/+)(\S*)", re.IGNORECASE)
+# A scheme: two letters at least (C:/ is a drive), few enough for linear time.
+URL = re.compile(r"([a-z][a-z0-9+.-]{1,30}:/+)(\S*)", re.IGNORECASE)
 PARAMETERS = re.compile(r"[?#;&=]")  # begin what is no path: also rtsp://host/user=me&password=x
 
 

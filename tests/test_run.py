@@ -773,7 +773,8 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
     ("option", "said"),
     [
         (("--known-size", "chair=nan"), "--known-size 'chair=nan': expected"),
-        (("--known-size", "chair=9999m"), "--known-size chair: 9999 m; at most 1000 m"),
+        (("--known-size", "chair=9999m"), "cm or mm, from 0.001 to 1000 m, such as door=2.0m"),
+        (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm or mm"),
         (("--priors", ROOT / "README.md"), "README.md: not valid JSON"),
         (("--support", "cube"), "--support cube: expected one of auto, ellipsoid"),
         (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
@@ -1024,3 +1025,55 @@ def test_poses_command_takes_supplied_poses(tmp_path: Path) -> None:
         np.loadtxt(tmp_path / "out/poses.txt"), np.loadtxt(str(given)), atol=1e-6
     )
     assert (tmp_path / "out/sparse/images.txt").exists()
+
+
+URL = "rtsp://me:w0rd@127.0.0.1:9/cam?pwd=w0rd"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", URL, "-o", "out", "--offline"],
+        ["run", "a.mp4", "-o", "out", URL],  # argparse repeats what it does not know
+        ["run", "a.mp4", "-o", "out", f"--{URL}"],
+        [URL],
+        ["run", "a.mp4", "-o", "out", "--every", URL],
+        ["run", "a.mp4", "-o", "out", "--set", URL],
+        ["run", "a.mp4", "-o", "out", "--known-size", URL],
+        ["track", "a.mp4", "-o", "out", "--detections", URL],
+        ["export", URL, "--to", "csv"],
+        ["export", "out", "--to", URL],
+        ["objects", URL],
+        ["objects", URL, "--debug"],
+        ["eval", URL, "--gt", URL],
+        ["models", URL],
+    ],
+)
+def test_passwords_reach_no_message(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    try:
+        assert rt.main(words) == 2
+    except SystemExit as end:
+        assert end.code == 2
+    said = capfd.readouterr()
+    assert "error" in said.err.lower() and "w0rd" not in said.out + said.err
+    assert not [p for p in tmp_path.rglob("*") if p.is_file() and b"w0rd" in p.read_bytes()]
+
+
+def test_passwords_reach_no_log_line_and_no_traceback(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the fault is ours, which ends with exit code 1."""
+
+    def fails(*_: object, **__: object) -> None:
+        rt.log.warning("opening %s", URL)
+        raise RuntimeError(f"cannot open {URL}")
+
+    monkeypatch.setattr(rt, "run", fails)
+    assert rt.main(["run", "a.mp4", "-o", "out"]) == 1
+    said = capfd.readouterr().err
+    assert "warning: opening rtsp://127.0.0.1:9/cam" in said and "Traceback" in said
+    assert "RuntimeError: cannot open rtsp://127.0.0.1:9/cam" in said and "w0rd" not in said
