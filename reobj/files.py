@@ -28,11 +28,6 @@ import numpy.typing as npt
 
 from reobj.types import Array, ReobjError, log
 
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
-
 T = TypeVar("T")
 
 
@@ -121,13 +116,22 @@ LOCK_POLL_S = 0.05  # chosen: soon enough for a person
 def _lock(handle: int) -> bool:
     """Take the lock of an open file; False if it is held, True too where there are no locks."""
     try:
-        if sys.platform == "win32":
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        else:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _take_lock(handle)
     except OSError as error:
         return error.errno not in HELD
     return True
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _take_lock(handle: int) -> None:
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # the first byte, whether it is there or not
+else:
+    import fcntl
+
+    def _take_lock(handle: int) -> None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 HELD = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)

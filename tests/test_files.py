@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import errno
+import importlib.util
 import io
 import json
 import math
 import os
 import struct
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -246,6 +248,53 @@ def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
             pass
         assert time.monotonic() - began >= 0.2
     with files.locked(tmp_path / "lock"):
+        pass
+
+
+class Windows:
+    """What its module msvcrt does: a byte that one open file has locked is refused to others."""
+
+    LK_NBLCK = 2
+
+    def __init__(self) -> None:
+        self.held: dict[int, int] = {}  # by the file: the handle
+
+    def locking(self, handle: int, mode: int, count: int) -> None:
+        assert (mode, count) == (self.LK_NBLCK, 1) and os.lseek(handle, 0, os.SEEK_CUR) == 0
+        file = os.fstat(handle).st_ino
+        if file in self.held:
+            raise OSError(errno.EACCES, "Permission denied")
+        self.held[file] = handle
+
+
+def test_a_lock_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same file, as it is there: without fcntl, with msvcrt."""
+    windows = Windows()
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setitem(sys.modules, "msvcrt", windows)
+    monkeypatch.setitem(sys.modules, "fcntl", None)  # an import fails
+    spec = importlib.util.spec_from_file_location("files_on_windows", files.__file__)
+    assert spec is not None and spec.loader is not None
+    there = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(there)
+    with there.locked(tmp_path / "lock"):
+        with pytest.raises(there.LockedError), there.locked(tmp_path / "lock", 0.1):
+            pass
+        with there.locked(tmp_path / "other"):
+            pass
+    windows.held.clear()  # the system does so when the file is closed
+    with there.locked(tmp_path / "lock"):
+        pass
+
+
+def test_without_locks_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some network drives: better two runs than none."""
+
+    def no_locks(_: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(files, "_take_lock", no_locks)
+    with files.locked(tmp_path / "lock"), files.locked(tmp_path / "lock"):
         pass
 
 

@@ -243,7 +243,8 @@ def _checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
     last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
     what = "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)"
     _raise_where(last_row.max(1) > POSE_TOLERANCE, where, what)
-    rotation = matrix[:, :3, :3]
+    _check_places(matrix[:, :3, 3], where)
+    rotation = matrix[:, :3, :3].clip(-2, 2)  # the squares of 1e300 are too large
     error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))  # (N, 3, 3)
     what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular)"
     what += "; expected a row-major rigid pose without scale"
@@ -253,6 +254,12 @@ def _checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
     u, _, vt = np.linalg.svd(rotation)
     exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
     return np.where(lost[:, None, None], np.nan, exact)
+
+
+def _check_places(translation: Array, where: Sequence[str]) -> None:
+    """Refuse translations (N, 3) beyond WORLD_MAX."""
+    far = (np.abs(translation) >= WORLD_MAX).any(1)
+    _raise_where(far, where, f"more than {WORLD_MAX:g} units away from the origin")
 
 
 def _raise_where(bad: Any, where: Sequence[str], problem: str) -> None:
@@ -265,7 +272,8 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
     """Make rigid transforms (N, 3, 4) of unit quaternions (N, 4) and translations (N, 3)."""
     finite = np.isfinite(np.column_stack([xyzw, translation])).all(1)
     _raise_where(~finite, where, "a number is not finite")
-    norm = np.linalg.norm(xyzw, axis=1)
+    _check_places(translation, where)
+    norm = np.linalg.norm(xyzw.clip(-2, 2), axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
     _raise_where(np.abs(norm - 1) > POSE_TOLERANCE, where, what)
     return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
@@ -394,7 +402,8 @@ def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
     if not found:
         return None
     kinds = {(c.model, c.width, c.height) for c in found}
-    spread = found[-1].params[0] / found[0].params[0] - 1
+    least, most = found[0].params[0], found[-1].params[0]
+    spread = (most - least) / max(abs(least), 1e-9)
     if len(kinds) > 1 or spread > MAX_FOCAL_SPREAD:
         raise ReobjError(f"{path}: several different cameras; expected one (single_camera)")
     return found[len(found) // 2]
@@ -421,8 +430,11 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
         raise ReobjError(f"{found[0]}: the COLMAP model has no registered image")
     camera = _one_camera(model.cameras, found[0])
     seen = np.column_stack([model.obs_image, model.obs_point])
+    last_row = np.tile([0, 0, 0, 1.0], (len(model.names), 1, 1))
+    where = [f"{found[0] / 'images.bin'}, {name}" for name in model.names]
+    poses = _checked_rigid(np.concatenate([model.cam_from_world, last_row], 1), where)
     return PoseFile(
-        model.cam_from_world, camera, model.names, points=model.points, colors=model.colors,
+        poses, camera, model.names, points=model.points, colors=model.colors,
         visibility=seen,
     )  # fmt: skip
 
