@@ -79,7 +79,14 @@ from reobj.identity.reid import (
     part_cosines,
 )  # fmt: skip
 from reobj.identity.sampling import SamplingLayout
-from reobj.objects import ObjectsConfig, check_known_size, parse_known_size, parse_up, unused_sizes
+from reobj.objects import (
+    ObjectsConfig,
+    check_known_size,
+    parse_known_size,
+    parse_up,
+    size_priors,
+    unused_sizes,
+)
 from reobj.options import config_from_args, read_config, write_config
 from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
@@ -1081,7 +1088,7 @@ def refit(
 
 def _check_objects(config: ObjectsConfig) -> None:
     """Refuse what the fit could not use, before minutes are spent on what comes first."""
-    quadrics.load_priors(config.priors or None)
+    size_priors(config)
     if config.up:
         parse_up(config.up)
     if config.support not in (kinds := ("auto", *quadrics.SUPPORTS)):

@@ -187,29 +187,54 @@ def part_paths(path: Path) -> list[Path]:
 
 
 TEXT_MAX = 1 << 28  # characters of a file; chosen: a million detections with masks have 2e8
+LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame; 2 GB once read
+LINE_MAX = 1 << 22  # characters; chosen: the observations of 100,000 points in COLMAP's text
+OTHER_BREAKS = "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"  # where str.splitlines breaks lines too
+JSON_MAX = 1 << 31  # bytes once read; chosen: two million detections with masks
+JSON_BYTES = {"{": 200, "[": 64, ",": 64}  # that what follows takes, about (sys.getsizeof)
 NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
 
 
-def read_text(path: Path) -> str:
-    """Read a UTF-8 file of at most TEXT_MAX characters, with or without a byte order mark."""
+def read_text(path: Path, most: int | None = None) -> str:
+    """Read a UTF-8 file, with or without a byte order mark.
+
+    most: characters that it may have; default: TEXT_MAX.
+    """
+    most = most or TEXT_MAX
     try:
         with path.open(encoding="utf-8-sig") as file:
-            text = file.read(TEXT_MAX + 1)
+            text = file.read(most + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ReobjError(f"{path}: cannot be read as text ({error})") from error
-    if len(text) > TEXT_MAX:
-        raise ReobjError(f"{path}: more than {TEXT_MAX >> 20} MB of text; cut it into pieces")
+    if len(text) > most:
+        raise ReobjError(f"{path}: more than {most >> 20} MB of text; cut it into pieces")
     return text
 
 
+def read_lines(path: Path) -> list[str]:
+    """Read a UTF-8 file of at most LINES_MAX lines, with their ends."""
+    text = read_text(path)
+    count = text.count("\n") + sum(map(text.count, OTHER_BREAKS))
+    if count > LINES_MAX:
+        raise ReobjError(
+            f"{path}: {count} lines, at most {LINES_MAX} are taken; cut it into pieces"
+        )
+    lines = text.splitlines(keepends=True)
+    if lines and (longest := max(map(len, lines))) > LINE_MAX:
+        raise ReobjError(f"{path}: a line of {longest} characters, at most {LINE_MAX} are taken")
+    return lines
+
+
 def load_json(path: Path) -> Any:
-    """Read a JSON file; an error names the line."""
+    """Read a JSON file that takes at most JSON_MAX bytes then; an error names the line."""
+    text = read_text(path)
+    if (size := sum(text.count(sign) * each for sign, each in JSON_BYTES.items())) > JSON_MAX:
+        taken = f"would take {size >> 20} MB of memory, at most {JSON_MAX >> 20} MB are taken"
+        raise ReobjError(f"{path}: {taken}; cut it into pieces")
     try:
-        return json.loads(read_text(path))
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
-    except ReobjError:
-        raise
     except (RecursionError, ValueError) as error:  # nested too deep; a number of 4,300 digits
         raise ReobjError(f"{path}: no JSON that can be meant ({error})") from error
 
@@ -271,6 +296,8 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
         return read(path)
     except (ReobjError, OSError) as error:
         log.warning("%s; computed again", error)
+        if path.is_dir():
+            shutil.rmtree(path)
         path.unlink(missing_ok=True)
         return None
 

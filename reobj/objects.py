@@ -10,13 +10,14 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
-from reobj.files import did_you_mean, rounded, shortened
+from reobj.files import did_you_mean, load_json, rounded, shortened
 from reobj.identity.evidence import CLASS_KEPT
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
@@ -66,7 +67,7 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
     Raises:
         ReobjError, QuadricsError: an option cannot be read, or there are no such priors.
     """
-    priors = quadrics.load_priors(config.priors or None)
+    priors = size_priors(config)
     known = parse_known_size(config.known_size)
     if config.solver not in (OURS, *PUBLISHED):
         raise ReobjError(f"--solver {config.solver}: expected {OURS} or {', '.join(PUBLISHED)}")
@@ -85,6 +86,17 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
         return fits if known_up else dataclasses.replace(fits, up_source="floor")
 
     return fit
+
+
+def size_priors(config: ObjectsConfig) -> quadrics.Priors:
+    """Load the size priors that a config names.
+
+    Raises:
+        ReobjError, QuadricsError: no JSON, too large, or no priors.
+    """
+    if config.priors:
+        load_json(Path(config.priors))  # as large as our files may be
+    return quadrics.load_priors(config.priors or None)
 
 
 def parse_up(text: str) -> Array:

@@ -86,6 +86,9 @@ def _likest(name: str, options: Iterable[str]) -> str:
 # ---- Files of options ----
 
 
+CONFIG_MAX = 1 << 20  # characters; chosen: a thousand times what all options take
+
+
 def read_config(config: C, path: str | Path) -> C:
     """Apply a TOML file of options, by section; paths in it are those of the working folder.
 
@@ -94,7 +97,7 @@ def read_config(config: C, path: str | Path) -> C:
     """
     path = Path(path)
     try:
-        table = tomllib.loads(read_text(path))
+        table = tomllib.loads(read_text(path, CONFIG_MAX))
     except tomllib.TOMLDecodeError as error:
         raise ReobjError(f"{path}: not valid TOML ({error})") from error
     for key, value in table.items():

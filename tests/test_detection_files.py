@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.sources import detection_files
+from reobj.sources import detection_files, recorded
 from reobj.sources.recorded import RecordedDetections
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -338,6 +338,24 @@ def test_npz_of_other_kinds(
 def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -> None:
     with pytest.raises(rt.ReobjError, match=r"line 2: frame .*, expected a whole number"):
         read(tmp_path, "a.txt", LINE + f"{frame},-1,10,20,30,40,.9\n", video)
+
+
+@pytest.mark.parametrize("key", ["frame", "class_names", "mask_counts"])
+def test_npz_of_more_than_is_taken(
+    tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch, key: str
+) -> None:
+    """Small numbers of bytes become ints and objects: a GB of them would be tens."""
+    path = tmp_path / "a.npz"
+    mask = np.zeros((1, 480, 640), bool)
+    mask[0, 10:20, 10:20] = True
+    found = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.ones(1), np.zeros(1, np.int64), mask)
+    rt.write_detections_npz(path, [(0, found), (1, found)], ["a", "b"], video.size)
+    count = dict(np.load(path))[key].size
+    monkeypatch.setitem(recorded.SIZES, key, count)
+    assert len(rt.read_detections(path, video)) == 2
+    monkeypatch.setitem(recorded.SIZES, key, count - 1)
+    with pytest.raises(rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are taken"):
+        rt.read_detections(path, video)
 
 
 def test_zip_that_unpacks_to_too_much(

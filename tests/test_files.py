@@ -12,6 +12,7 @@ import os
 import struct
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,64 @@ def test_text_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
         files.read_text(Path("/dev/zero"))
     (tmp_path / "a.txt").write_text("x" * (3 << 20))
     assert len(files.read_text(tmp_path / "a.txt")) == 3 << 20
+
+
+@pytest.mark.parametrize(
+    ("limit", "most", "text", "what"),
+    [
+        ("LINES_MAX", 3, "a\nb\nc\nd\n", "a.txt: 4 lines, at most 3 are taken; cut it into pieces"),
+        ("LINES_MAX", 3, "a\x0bb\x1cc\u2028d\x85e", "a.txt: 4 lines, at most 3 are taken"),
+        ("LINE_MAX", 3, "ab\nabcd\n", "a.txt: a line of 5 characters, at most 3 are taken"),
+        ("TEXT_MAX", 9, "a\n" * 5, "a.txt: more than 0 MB of text"),
+    ],
+)
+def test_tables_have_an_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int, text: str, what: str
+) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    assert "".join(files.read_lines(path)) == text
+    monkeypatch.setattr(files, limit, most)
+    with pytest.raises(rt.ReobjError, match=what):
+        files.read_lines(path)
+
+
+def test_the_lines_of_a_file_are_those_of_its_text(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n\nd")
+    assert files.read_lines(path) == ["a\n", "b\n", "c\n", "\n", "d"]
+    path.write_bytes(b"")
+    assert files.read_lines(path) == []
+
+
+@pytest.mark.parametrize("text", ["[" + "[]," * 9 + "0]", "[" + "{}," * 9 + "0]", "[1,2,3,4]"])
+def test_json_is_refused_before_it_takes_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    """What is taken is less than what was reckoned, which is what is refused."""
+    path, taken = tmp_path / "a.json", 64 * (text.count(",") + text.count("["))
+    taken += 200 * text.count("{")
+    path.write_text(text)
+    monkeypatch.setattr(files, "JSON_MAX", taken)
+    files.load_json(path)
+    monkeypatch.setattr(files, "JSON_MAX", taken - 1)
+    with pytest.raises(rt.ReobjError, match=r"a.json: would take 0 MB of memory, at most 0 MB"):
+        files.load_json(path)
+
+
+@pytest.mark.parametrize("item", ["[],", "{},", '{"a":1},', "1.5,", '"ab",', "[1.5,2.5,3.5],"])
+def test_json_takes_no_more_than_was_reckoned(tmp_path: Path, item: str) -> None:
+    """By what Python has allocated; 2 MB of text of the worst kinds."""
+    path, text = tmp_path / "a.json", "[" + item * (2_000_000 // len(item)) + "0]"
+    path.write_text(text)
+    reckoned = sum(text.count(sign) * each for sign, each in files.JSON_BYTES.items())
+    tracemalloc.start()
+    try:
+        data = files.load_json(path)
+        taken = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert len(data) > 1000 and taken < 1.3 * reckoned
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000, "9" * 5000])

@@ -10,9 +10,11 @@ import io
 import json
 import pkgutil
 import re
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -775,7 +777,7 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
         (("--known-size", "chair=nan"), "--known-size 'chair=nan': expected"),
         (("--known-size", "chair=9999m"), "cm or mm, from 0.001 to 1000 m, such as door=2.0m"),
         (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm or mm"),
-        (("--priors", ROOT / "README.md"), "README.md: not valid JSON"),
+        (("--priors", ROOT / "README.md"), "README.md, line 1: not valid JSON"),
         (("--support", "cube"), "--support cube: expected one of auto, ellipsoid"),
         (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
         (("--set", "tracker.return_probability=nan"), "expected =FLOAT, finite, 0 or more"),
@@ -936,6 +938,7 @@ def test_damaged_poses_are_computed_again(
     def estimate(*args: object, **more: object) -> rt.Poses:
         calls.append("estimate")
         (workspace.cache / "sfm/sparse").mkdir(parents=True)
+        (workspace.cache / "sfm/sparse/images.bin").write_bytes(b"a model")
         return made
 
     def points(poses: rt.Poses, *args: object, **more: object) -> rt.Poses:
@@ -956,6 +959,23 @@ def test_damaged_poses_are_computed_again(
         np.savez(path, **(dict(np.load(path)) | {"frame": np.arange(9)}))
         assert compute().known.all() and len(calls) == 2
         assert [r.message.endswith("computed again") for r in caplog.records] == [True]
+
+    (model,) = workspace.cache.glob("poses-*.sparse")
+    (cached,) = workspace.cache.glob("poses-*.npz")
+    damages: list[Callable[[], object]] = [
+        lambda: (model / "images.bin").write_bytes(b"a modem"),
+        lambda: (model / "images.bin").unlink(),
+        lambda: (model / "points3D.bin").touch(),
+        lambda: shutil.rmtree(model),
+        lambda: (cached.unlink(), cached.mkdir()),
+    ]
+    for damage in damages:
+        stages["poses"]()
+        calls.clear(), caplog.clear()
+        damage()
+        assert stages["poses"]().known.all() and calls == ["estimate"]
+        assert [r.message.endswith("computed again") for r in caplog.records] == [True]
+        assert (model / "images.bin").read_bytes() == b"a model" and len(list(model.iterdir())) == 1
 
 
 def test_a_closed_pipe_is_no_error(clip: Path, detections: Path, tmp_path: Path) -> None:

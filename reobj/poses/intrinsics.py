@@ -42,6 +42,9 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     return None if camera is None else fitted_camera(camera, size, f"--camera {text:.200}")
 
 
+CAMERA_MAX = 1 << 20  # characters of a file; chosen: a thousand times what a camera takes
+
+
 def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
     """Parse as `parse_camera` does, without a look at the frames: the camera at its own size.
 
@@ -52,7 +55,7 @@ def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
         return None
     is_file = os.path.isfile(text)  # of any text, however long
     try:
-        content = read_text(Path(text)) if is_file else text
+        content = read_text(Path(text), CAMERA_MAX) if is_file else text
         if is_file and content.lstrip()[:1] in ("{", "["):
             camera = camera_from_json(load_json(Path(text)), size)
         else:

@@ -28,7 +28,7 @@ from reobj.cameras import (
     read_sparse_model,
     usable,
 )
-from reobj.files import load_json, read_text, spans
+from reobj.files import load_json, read_lines, spans
 from reobj.poses.intrinsics import (
     CAMERA_FORMS,
     camera_from_json,
@@ -177,7 +177,7 @@ def _pose_format(path: Path) -> str:
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield where each line of a text file is (for messages) and its words, without comments."""
-    for number, text in enumerate(read_text(path).splitlines(), 1):
+    for number, text in enumerate(read_lines(path), 1):
         if not text.lstrip().startswith("#"):
             yield f"{path}, line {number}", text.split()
 
@@ -283,7 +283,7 @@ def _read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read TUM rows: seconds, world_from_cam; metres unless the header is our own and says no."""
     rows, where = _read_table(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
-    metric = re.search(f"^#.*{NO_SCALE}", read_text(path), re.MULTILINE) is None
+    metric = not any(re.match(f"#.*{NO_SCALE}", line) for line in read_lines(path))
     order = np.unique(rows[:, 0], return_index=True)[1]
     return PoseFile(invert_rigid(world_from_cam)[order], stamps_s=rows[order, 0], metric=metric)
 
