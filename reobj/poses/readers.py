@@ -34,6 +34,7 @@ from reobj.poses.intrinsics import (
     camera_from_json,
     colmap_camera,
     fitted_camera,
+    image_side,
     parse_camera,
 )
 from reobj.poses.matching import interpolated, rows_by_name, rows_by_order, rows_by_time
@@ -294,7 +295,7 @@ def _read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
     try:
         rows = np.array(data["poses"], np.float64).reshape(-1, 7)
         fx, fy, cx, cy = (float(data["K"][i]) for i in (0, 4, 6, 7))
-        camera = Camera("PINHOLE", int(data["w"]), int(data["h"]), (fx, fy, cx, cy))
+        camera = Camera("PINHOLE", image_side(data["w"]), image_side(data["h"]), (fx, fy, cx, cy))
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise ReobjError(
             f"{path}: no Record3D metadata ({error!r}); expected poses (N x 7), K (9), w and h"

@@ -96,7 +96,9 @@ def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) ->
     known = path.with_name("gt_mot_format.json")
     names = {str(i): n for i, n in enumerate(class_names)}
     if known.exists():
-        names = load_json(known).get("classes", names)
+        stated = load_json(known)
+        stated = stated.get("classes") if isinstance(stated, dict) else None
+        names = {str(k): str(v) for k, v in (stated if isinstance(stated, dict) else names).items()}
     return labelled(rows, [names.get(str(n), str(n)) for n in number], hidden * IGNORED)
 
 
