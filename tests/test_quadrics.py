@@ -20,6 +20,7 @@ import build_priors
 import numpy as np
 import pytest
 import synthetic_quadrics as syn
+from simulated import chair_solids, walk
 
 import quadrics as q
 
@@ -1234,3 +1235,15 @@ def test_functions_are_short_and_nothing_optional_is_imported() -> None:
         a.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names
     }
     assert names <= {"json", "re", "numpy"}
+
+
+def test_cameras_beyond_numbers_give_no_quadric() -> None:
+    """Squares of 1e300 are infinite, of which the SVD does not converge: NaN, and no exception."""
+    poses = walk(6)
+    img_from_world = poses.camera.K @ poses.cam_from_world  # (6, 3, 4)
+    boxes = q.solid_boxes(chair_solids(), "box", img_from_world)
+    priors, categories = q.load_priors(), ["chair"] * boxes.shape[1]
+    good = q.fit_psfmo(boxes, priors, categories, img_from_world)
+    assert np.isfinite(good.ellipsoids.half_axes).all()
+    bad = q.fit_psfmo(boxes, priors, categories, 1e300 * img_from_world)
+    assert bad.ellipsoids.half_axes.shape == good.ellipsoids.half_axes.shape
