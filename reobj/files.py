@@ -371,13 +371,16 @@ class Progress:
         return seconds
 
 
+WORD_MAX = 100  # characters that are compared; chosen: our words are shorter, the time is quadratic
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Name the known word that a wrong one is most like, for messages; "" if none is.
 
     >>> did_you_mean("chiar", ["cup", "chair"])
     '; did you mean chair?'
     """
-    close = difflib.get_close_matches(word, list(known), 1)
+    close = difflib.get_close_matches(word[:WORD_MAX], list(known), 1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
