@@ -644,6 +644,16 @@ def test_an_image_that_is_missing_is_missing_in_rerun(chairs: rt.Result, tmp_pat
     assert shown == {0: 0, 2: 80, 4: 160} and len(found["/world/camera/image"]) == 3
 
 
+def test_tracks_of_no_object_are_not_exported(chairs: rt.Result, tmp_path: Path) -> None:
+    """Rows added to tracks.txt by hand: of which class they are is not known."""
+    chairs.save(tmp_path)
+    with (tmp_path / "tracks.txt").open("a") as file:
+        file.write("1,9,10,10,20,20,0.9,-1,-1,-1\n")
+    with pytest.raises(rt.ReobjError, match=r"tracks\.txt: object 9 is not in objects\.json"):
+        rt.export(tmp_path, "cvat")
+    assert not (tmp_path / "cvat.xml").exists()
+
+
 def test_the_viewer_follows_the_tracking(tmp_path: Path) -> None:
     """Frame by frame, as they are tracked: image, boxes with names, and a known camera."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")

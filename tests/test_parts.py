@@ -389,6 +389,15 @@ def test_objects_json_is_as_its_schema_says(parted_folder: Path, tmp_path: Path)
     assert "objects[0].part" in faults and "world.parts[1]" in faults
 
 
+def test_parts_are_those_of_the_cameras(parted_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(parted_folder, tmp_path / "out")
+    data = json.loads((parted_folder / "objects.json").read_text())
+    data["world"]["parts"].append(data["world"]["parts"][0])
+    (tmp_path / "out/objects.json").write_text(json.dumps(data))
+    with pytest.raises(rt.ReobjError, match="3 parts of a path that has 2; is damaged"):
+        rt.Result.load(tmp_path / "out")
+
+
 def test_an_objects_json_without_parts_loads(chairs: rt.Result, tmp_path: Path) -> None:
     dataclasses.replace(chairs).save(tmp_path)
     data = json.loads((tmp_path / "objects.json").read_text())

@@ -409,6 +409,7 @@ def test_passwords_are_not_shown(text: str, expected: str) -> None:
         "a\nb\x00\x85\u2028\ud800\u202e",
         "rtsp://me:pa@ss/w0rd@host/cam?pwd=w0rd " * 50,
         "y" * 340 + "rtsp://me:w0rd@host/" + "z" * 500,  # where a message is cut
+        "y" * 500 + "rtsp://me:w0rd@host/" + "z" * 222,
     ],
 )
 def test_messages_are_one_printable_short_line_without_secrets(text: str) -> None:

@@ -155,7 +155,7 @@ class Workspace:
     @property
     def source(self) -> tuple[str, InputConfig]:
         """The video that the folder is bound to, and the options that it was read with."""
-        facts = self._facts()
+        facts = self._binding()
         try:
             return str(facts["source"]), InputConfig(**facts["input"])
         except TypeError as error:  # an option of another version
@@ -164,12 +164,12 @@ class Workspace:
     def video(self) -> Video:
         """Open the video that the folder is bound to, read as it was."""
         source, config = self.source
-        if not (frames := self._facts().get("frames")):
+        if not (frames := self._binding().get("frames")):
             return Video(source, config)
         more = {k: frames[k] for k in ("times_s", "names", "count") if k in frames}
         return ImagelessVideo(source, frames["size"], config, **more)
 
-    def _facts(self) -> dict[str, Any]:
+    def _binding(self) -> dict[str, Any]:
         """Read what `bind` wrote."""
         path = self.out / SOURCE
         facts: dict[str, Any] = load_json(path)
