@@ -878,7 +878,7 @@ def _psfmo_em(
         rest = target - scale[:, None] * (system @ mean[..., None])[..., 0]
         precision = loading.transpose(0, 2, 1) @ loading / sigma2[:, None, None]
         precision[:, [0, 1], [0, 1]] += 1.0 / spread
-        cov_h = np.linalg.inv(precision)  # (B, 2, 2)
+        cov_h = np.stack([_solve(precision, np.tile(e, (len(h), 1))) for e in np.eye(2)], 2)
         h = (cov_h @ (loading.transpose(0, 2, 1) @ rest[..., None]))[..., 0] / sigma2[:, None]
         left = rest - (loading @ h[..., None])[..., 0]
         extra = np.einsum("bmi,bij,bmj->b", loading, cov_h, loading, optimize=True)

@@ -104,6 +104,9 @@ def test_mot_rows_as_they_are(tmp_path: Path, text: str, expected: list[list[flo
         ("1,2,3,4,5,6,1,1,1,x\n", "line 1: 'x' is no finite number"),  # the last column too
         ("frame,x1,y1,x2,y2\n0,1,2,3,4\n", "line 1: no MOTChallenge file"),
         ("1," + "2" * 200_000, "line 1: no table"),
+        ("1,2,3,4,5,6\n1.5,2,3,4,5,6\n", "line 2: frame 1.5, expected a whole number"),
+        ("1,1e30,3,4,5,6\n", "line 1: id 1e30, expected a whole number"),
+        ("1,2,3,4,5,6\n1,2,3,-1e9,5,6\n", "line 2: box .*, expected at most 1e.07 px"),
     ],
 )  # fmt: skip
 def test_damaged_mot_rows(tmp_path: Path, text: str, expected: str) -> None:

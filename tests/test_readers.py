@@ -690,6 +690,6 @@ def test_numbers_without_end_are_refused_without_overflow(tmp_path, number):
 
 def test_focal_lengths_of_zero_are_refused(tmp_path):
     path = as_colmap_text(tmp_path, some_cameras())
-    (path / "cameras.txt").write_text("1 PINHOLE 640 480 0 0 320 240\n")
+    (path / "sparse/0/cameras.txt").write_text("1 PINHOLE 640 480 0 0 320 240\n")
     with pytest.raises(rt.ReobjError, match="focal length"):
         read(path)
