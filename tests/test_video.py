@@ -568,6 +568,16 @@ def test_a_lost_source_is_connected_again(
     assert all(camera.released for camera in flaky.cameras if camera.n)
 
 
+def test_a_source_that_stays_away_is_asked_for_days(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1,100 attempts: twice as long each time is more than a number holds."""
+    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(video_room, "RECONNECT_S", (1e-9, 1e-9))
+    flaky = Flaky("x")
+    monkeypatch.setattr(cv2, "VideoCapture", flaky)
+    list(rt.Video(0, rt.InputConfig(reconnect=1100)))
+    assert len(flaky.cameras) == 1101
+
+
 def test_what_has_reached_its_stop_is_not_connected_again(
     monkeypatch: pytest.MonkeyPatch, quick: None
 ) -> None:

@@ -224,7 +224,7 @@ class Video:
             while capture is None and attempts < self.config.reconnect:
                 if 0 < self.config.stop <= self._seen:
                     break
-                wait_s = min(RECONNECT_S[0] * 2**attempts, RECONNECT_S[1])
+                wait_s = min(RECONNECT_S[0] * 2.0 ** min(attempts, 9), RECONNECT_S[1])
                 attempts += 1
                 log.warning("%s: ended; connecting again in %g s", self.source, wait_s)
                 time.sleep(wait_s)
