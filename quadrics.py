@@ -400,6 +400,7 @@ def load_priors(path: str | Path | None = None) -> Priors:
     return Priors(tuple(table), aliases, *columns)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused below
 def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
     """Parse one category into the columns of `Priors`; without "axis_ratio" the sizes imply it."""
     size = entry["size_m"]
@@ -421,8 +422,7 @@ def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
         raise ValueError("sizes and variances are finite and above 0")
     code = SUPPORTS.index(entry.get("support", "ellipsoid"))
     round_, upright = bool(entry.get("yaw_symmetric", False)), bool(entry.get("upright", True))
-    on_floor = entry.get("stands_on") == "floor"
-    return log_mean, log_cov, *ratios, code, round_, upright, on_floor
+    return log_mean, log_cov, *ratios, code, round_, upright, entry.get("stands_on") == "floor"
 
 
 # ---- Views: cameras, selection, tangent planes ----------------------------------------------
@@ -878,7 +878,7 @@ def _psfmo_em(
         rest = target - scale[:, None] * (system @ mean[..., None])[..., 0]
         precision = loading.transpose(0, 2, 1) @ loading / sigma2[:, None, None]
         precision[:, [0, 1], [0, 1]] += 1.0 / spread
-        cov_h = np.linalg.inv(precision)  # (B, 2, 2)
+        cov_h = np.stack([_solve(precision, np.tile(e, (len(h), 1))) for e in np.eye(2)], 2)
         h = (cov_h @ (loading.transpose(0, 2, 1) @ rest[..., None]))[..., 0] / sigma2[:, None]
         left = rest - (loading @ h[..., None])[..., 0]
         extra = np.einsum("bmi,bij,bmj->b", loading, cov_h, loading, optimize=True)

@@ -46,6 +46,7 @@ import math
 import os
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,7 +59,7 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.commands import make_parser, short_help
+from reobj.commands import SecretFormatter, make_parser, short_help
 from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
 from reobj.identity.assignment import Pairs, ambiguous_pairs, assign
 from reobj.identity.camera_motion import CameraMotion
@@ -78,7 +79,14 @@ from reobj.identity.reid import (
     part_cosines,
 )  # fmt: skip
 from reobj.identity.sampling import SamplingLayout
-from reobj.objects import ObjectsConfig, check_known_size, parse_known_size, parse_up, unused_sizes
+from reobj.objects import (
+    ObjectsConfig,
+    check_known_size,
+    parse_known_size,
+    parse_up,
+    size_priors,
+    unused_sizes,
+)
 from reobj.options import config_from_args, read_config, write_config
 from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
@@ -94,6 +102,7 @@ from reobj.poses.stage import (
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
+from reobj.results.folder import write_trajectories
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import (
@@ -102,12 +111,11 @@ from reobj.results.result import (
     Result,
     VideoInfo,
     World,
-    validate_objects,
-    write_trajectories,
 )
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import CONFIG_FILE, Workspace
+from reobj.schema import validate_objects
 from reobj.solvers import solve_again
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
@@ -132,10 +140,12 @@ from reobj.types import (
     box_iou,
     cxcywh_from_xyxy,
     log,
+    one_line,
     option,
     rows_by,
     unit_rows,
     widen,
+    without_secrets,
     xyxy_from_cxcywh,
 )
 
@@ -1082,17 +1092,12 @@ def refit(
 
 def _check_objects(config: ObjectsConfig) -> None:
     """Refuse what the fit could not use, before minutes are spent on what comes first."""
-    quadrics.load_priors(config.priors or None)
+    size_priors(config)
     if config.up:
         parse_up(config.up)
     if config.support not in (kinds := ("auto", *quadrics.SUPPORTS)):
         raise ReobjError(f"--support {config.support}: expected one of {', '.join(kinds)}")
-    for name, (_, height_m) in parse_known_size(config.known_size).items():
-        if height_m > KNOWN_SIZE_MAX_M:
-            raise ReobjError(f"--known-size {name}: {height_m:g} m; at most {KNOWN_SIZE_MAX_M:g} m")
-
-
-KNOWN_SIZE_MAX_M = 1000.0  # chosen: no object of a room or a street is as large
+    parse_known_size(config.known_size)
 
 
 def _last_config(out: str | Path) -> Config:
@@ -1269,8 +1274,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(words)
     level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
     logging.addLevelName(logging.WARNING, "warning")
-    form = "%(levelname)s: %(message)s"
-    logging.basicConfig(level=level, format=form, stream=sys.stderr, force=True)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(SecretFormatter("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler], force=True)
     try:
         return int(args.func(args))
     except KeyboardInterrupt:
@@ -1280,11 +1286,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output (head, less) has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (ReobjError, quadrics.QuadricsError, OSError) as error:
-        if args.debug:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    except Exception as error:
+        expected = isinstance(error, ReobjError | quadrics.QuadricsError | OSError)
+        trace = args.debug or not expected
+        text = (
+            without_secrets(traceback.format_exc()) if trace else f"error: {one_line(str(error))}"
+        )
+        print(text, file=sys.stderr)
+        return 2 if expected else 1
 
 
 if __name__ == "__main__":

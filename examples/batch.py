@@ -124,7 +124,8 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
     """Run one video in a worker, unless a worker that was killed since has finished it."""
     sys.path.insert(0, root)
     import reobj_track as rt
-    from reobj.files import atomic, without_secrets
+    from reobj.files import atomic
+    from reobj.types import without_secrets
 
     if done := finished(item):
         return done

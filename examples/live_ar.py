@@ -26,8 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
 import reobj_track as rt
 from reobj.files import atomic
+from reobj.results.folder import write_mot
 from reobj.results.ply import write_ply
-from reobj.results.result import write_mot
 
 ROOM = Path(__file__).resolve().parent / "room"
 

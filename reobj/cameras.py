@@ -273,9 +273,9 @@ _POSE_ARRAYS = (
 )  # fmt: skip
 
 
-def save_poses(path: Path, poses: Poses) -> None:
-    """Write poses as npz, whole or not at all."""
-    facts = {
+def save_poses(path: Path, poses: Poses, **more: Any) -> None:
+    """Write poses as npz, whole or not at all; `more` goes into its metadata."""
+    facts = more | {
         "camera": dataclasses.asdict(poses.camera),
         "source": poses.source,
         "metric": poses.metric,

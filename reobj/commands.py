@@ -6,6 +6,7 @@ What a command does is the business of `reobj_track`.
 from __future__ import annotations
 
 import argparse
+import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, NoReturn
 from reobj import __version__
 from reobj.files import did_you_mean, wrapped
 from reobj.options import add_flags, list_options
-from reobj.types import ReobjError
+from reobj.types import ReobjError, one_line, without_secrets
 
 Command = Callable[[argparse.Namespace], int]
 SHELLS = ("bash", "zsh")  # shtab's script for tcsh knows no flags of commands
@@ -31,7 +32,7 @@ class Parser(argparse.ArgumentParser):
         elif found := re.search(r"invalid choice: '([^']*)'", message):
             message = re.sub(r"^argument (\S+): ", r"\1: ", message)
             message += did_you_mean(found[1], re.findall(r"'?([\w-]+)'?[,)]", message))
-        self.exit(2, f"error: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"error: {one_line(message)} (see {self.prog} --help)\n")
 
     def _words(self, start: str) -> list[str]:
         """List the flags of this parser and of its commands."""
@@ -41,6 +42,14 @@ class Parser(argparse.ArgumentParser):
                 for command in action.choices.values():
                     words |= dict.fromkeys(command._option_string_actions)
         return [word for word in words if word.startswith(start)]
+
+
+class SecretFormatter(logging.Formatter):
+    """Write log lines without the secrets of URLs."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        return without_secrets(super().format(record))
 
 
 class _ListOptions(argparse.Action):
@@ -93,7 +102,7 @@ def make_parser(
     text = "(re)fit the ellipsoids from what an output folder already holds, with its last options"
     add = command("objects", text, "out --known-size chair=0.82m", "objects", "output")
     add("out", help="output folder of an earlier `run`")
-    text = "only check objects.json against its schema (needs jsonschema)"
+    text = "only check objects.json against its schema"
     add("--validate", action="store_true", help=text)
     add("--tracks", help=TRACKS_HELP)
     add("--edits", help="corrections by hand, saved by scene.html; later fits keep them")

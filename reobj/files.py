@@ -28,11 +28,6 @@ import numpy.typing as npt
 
 from reobj.types import Array, ReobjError, log
 
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
-
 T = TypeVar("T")
 
 
@@ -121,13 +116,22 @@ LOCK_POLL_S = 0.05  # chosen: soon enough for a person
 def _lock(handle: int) -> bool:
     """Take the lock of an open file; False if it is held, True too where there are no locks."""
     try:
-        if sys.platform == "win32":
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        else:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _take_lock(handle)
     except OSError as error:
         return error.errno not in HELD
     return True
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _take_lock(handle: int) -> None:
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # the first byte, whether it is there or not
+else:
+    import fcntl
+
+    def _take_lock(handle: int) -> None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 HELD = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
@@ -183,29 +187,54 @@ def part_paths(path: Path) -> list[Path]:
 
 
 TEXT_MAX = 1 << 28  # characters of a file; chosen: a million detections with masks have 2e8
+LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame; 2 GB once read
+LINE_MAX = 1 << 22  # characters; chosen: the observations of 100,000 points in COLMAP's text
+OTHER_BREAKS = "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"  # where str.splitlines breaks lines too
+JSON_MAX = 1 << 31  # bytes once read; chosen: two million detections with masks
+JSON_BYTES = {"{": 200, "[": 64, ",": 64}  # that what follows takes, about (sys.getsizeof)
 NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
 
 
-def read_text(path: Path) -> str:
-    """Read a UTF-8 file of at most TEXT_MAX characters, with or without a byte order mark."""
+def read_text(path: Path, most: int | None = None) -> str:
+    """Read a UTF-8 file, with or without a byte order mark.
+
+    most: characters that it may have; default: TEXT_MAX.
+    """
+    most = most or TEXT_MAX
     try:
         with path.open(encoding="utf-8-sig") as file:
-            text = file.read(TEXT_MAX + 1)
+            text = file.read(most + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ReobjError(f"{path}: cannot be read as text ({error})") from error
-    if len(text) > TEXT_MAX:
-        raise ReobjError(f"{path}: more than {TEXT_MAX >> 20} MB of text; cut it into pieces")
+    if len(text) > most:
+        raise ReobjError(f"{path}: more than {most >> 20} MB of text; cut it into pieces")
     return text
 
 
+def read_lines(path: Path) -> list[str]:
+    """Read a UTF-8 file of at most LINES_MAX lines, with their ends."""
+    text = read_text(path)
+    count = text.count("\n") + sum(map(text.count, OTHER_BREAKS))
+    if count > LINES_MAX:
+        raise ReobjError(
+            f"{path}: {count} lines, at most {LINES_MAX} are taken; cut it into pieces"
+        )
+    lines = text.splitlines(keepends=True)
+    if lines and (longest := max(map(len, lines))) > LINE_MAX:
+        raise ReobjError(f"{path}: a line of {longest} characters, at most {LINE_MAX} are taken")
+    return lines
+
+
 def load_json(path: Path) -> Any:
-    """Read a JSON file; an error names the line."""
+    """Read a JSON file that takes at most JSON_MAX bytes then; an error names the line."""
+    text = read_text(path)
+    if (size := sum(text.count(sign) * each for sign, each in JSON_BYTES.items())) > JSON_MAX:
+        taken = f"would take {size >> 20} MB of memory, at most {JSON_MAX >> 20} MB are taken"
+        raise ReobjError(f"{path}: {taken}; cut it into pieces")
     try:
-        return json.loads(read_text(path))
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
-    except ReobjError:
-        raise
     except (RecursionError, ValueError) as error:  # nested too deep; a number of 4,300 digits
         raise ReobjError(f"{path}: no JSON that can be meant ({error})") from error
 
@@ -267,6 +296,8 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
         return read(path)
     except (ReobjError, OSError) as error:
         log.warning("%s; computed again", error)
+        if path.is_dir():
+            shutil.rmtree(path)
         path.unlink(missing_ok=True)
         return None
 
@@ -340,40 +371,17 @@ class Progress:
         return seconds
 
 
+WORD_MAX = 100  # characters that are compared; chosen: our words are shorter, the time is quadratic
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Name the known word that a wrong one is most like, for messages; "" if none is.
 
     >>> did_you_mean("chiar", ["cup", "chair"])
     '; did you mean chair?'
     """
-    close = difflib.get_close_matches(word, list(known), 1)
+    close = difflib.get_close_matches(word[:WORD_MAX], list(known), 1)
     return f"; did you mean {close[0]}?" if close else ""
-
-
-def without_secrets(text: str) -> str:
-    """Leave of the URLs in a text what may be shown and written: scheme, host and path.
-
-    User and password go, also a password with "@" or "/" in it, and all after the path: queries
-    and parameters, where cameras take passwords too. Where nothing tells which is which, only the
-    scheme is left.
-
-    >>> without_secrets("rtsp://me:secret@10.0.0.7/stream?pwd=x")
-    'rtsp://10.0.0.7/stream'
-    """
-    return URL.sub(_public_part, text)
-
-
-URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]*:/+)(\S*)", re.IGNORECASE)
-PARAMETERS = re.compile(r"[?#;&=]")  # begin what is no path: also rtsp://host/user=me&password=x
-
-
-def _public_part(url: re.Match[str]) -> str:
-    """Cut a URL to scheme, host and path."""
-    scheme, rest = url.groups()
-    user, _, rest = rest.rpartition("@")
-    if PARAMETERS.search(user):  # of a password, or the "@" is one of a query
-        return f"{scheme}..."
-    return scheme + PARAMETERS.split(rest)[0]
 
 
 def shortened(items: Sequence[Any]) -> str:

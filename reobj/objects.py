@@ -10,13 +10,14 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
-from reobj.files import did_you_mean, rounded, shortened
+from reobj.files import did_you_mean, load_json, rounded, shortened
 from reobj.identity.evidence import CLASS_KEPT
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
@@ -66,7 +67,7 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
     Raises:
         ReobjError, QuadricsError: an option cannot be read, or there are no such priors.
     """
-    priors = quadrics.load_priors(config.priors or None)
+    priors = size_priors(config)
     known = parse_known_size(config.known_size)
     if config.solver not in (OURS, *PUBLISHED):
         raise ReobjError(f"--solver {config.solver}: expected {OURS} or {', '.join(PUBLISHED)}")
@@ -87,6 +88,17 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
     return fit
 
 
+def size_priors(config: ObjectsConfig) -> quadrics.Priors:
+    """Load the size priors that a config names.
+
+    Raises:
+        ReobjError, QuadricsError: no JSON, too large, or no priors.
+    """
+    if config.priors:
+        load_json(Path(config.priors))  # as large as our files may be
+    return quadrics.load_priors(config.priors or None)
+
+
 def parse_up(text: str) -> Array:
     """Parse a direction x,y,z into a unit vector (3,)."""
     try:
@@ -95,6 +107,7 @@ def parse_up(text: str) -> Array:
         up = np.empty(0)
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise ReobjError(f"--set objects.up={text}: expected a direction x,y,z, such as 0,0,1")
+    up /= np.abs(up).max()  # the squares of 1e300 are too large
     return np.asarray(up / np.linalg.norm(up))
 
 
@@ -108,11 +121,15 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     sizes: dict[str | int, tuple[str | int, float]] = {}
     for item in filter(None, (part.strip() for part in text.split(","))):
         found = re.fullmatch(r"(.+?)\s*=\s*([0-9]*\.?[0-9]+|[0-9]+\.)\s*(m|cm|mm)", item)
-        if found is None or float(found[2]) == 0:
-            expected = "CATEGORY=HEIGHT in m, cm or mm, such as door=2.0m"
-            raise ReobjError(f"--known-size {item!r}: expected {expected}")
-        sizes[found[1]] = ("h", float(found[2]) / per_metre[found[3]])
+        height_m = float(found[2]) / per_metre[found[3]] if found else 0.0
+        if found is None or not KNOWN_SIZE_M[0] <= height_m <= KNOWN_SIZE_M[1]:
+            expected = "CATEGORY=HEIGHT in m, cm or mm, from {:g} to {:g} m, such as door=2.0m"
+            raise ReobjError(f"--known-size {item!r}: expected {expected.format(*KNOWN_SIZE_M)}")
+        sizes[found[1]] = ("h", height_m)
     return sizes
+
+
+KNOWN_SIZE_M = (0.001, 1000.0)  # chosen: objects of a room or a street are neither
 
 
 def _plain(name: str) -> str:

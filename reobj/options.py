@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from reobj.files import atomic, read_text
+from reobj.files import WORD_MAX, atomic, read_text
 from reobj.types import ReobjError
 
 C = TypeVar("C")
@@ -74,6 +74,7 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
 
 def _likest(name: str, options: Iterable[str]) -> str:
     """Name the option most like a wrong one: as a whole, or its field, or a word of its field."""
+    name = name[:WORD_MAX]
 
     def likeness(option: str) -> float:
         field_name = option.rpartition(".")[2]
@@ -86,6 +87,9 @@ def _likest(name: str, options: Iterable[str]) -> str:
 # ---- Files of options ----
 
 
+CONFIG_MAX = 1 << 20  # characters; chosen: a thousand times what all options take
+
+
 def read_config(config: C, path: str | Path) -> C:
     """Apply a TOML file of options, by section; paths in it are those of the working folder.
 
@@ -94,9 +98,9 @@ def read_config(config: C, path: str | Path) -> C:
     """
     path = Path(path)
     try:
-        table = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise ReobjError(f"{path}: not valid TOML ({error})") from error
+        table = tomllib.loads(read_text(path, CONFIG_MAX))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ReobjError(f"{path}: not valid TOML ({error})") from None
     for key, value in table.items():
         inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else None
         for name, own in (inner if inner is not None else {key: value}).items():

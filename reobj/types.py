@@ -24,17 +24,28 @@ log = logging.getLogger("reobj_track")
 class ReobjError(ValueError):
     """A mistake in the input: says what, where, what was expected and what to do (exit code 2).
 
-    In one line: control characters, such as those of the input, are escaped, and of long texts the
-    middle is left out.
+    As `one_line` has it.
     """
 
     def __init__(self, text: str = "") -> None:
-        if len(text) > MESSAGE_MAX:
-            text = f"{text[: MESSAGE_MAX // 2]} ... {text[-MESSAGE_MAX // 3 :]}"
-        super().__init__(printable(text))
+        super().__init__(one_line(text))
 
 
-MESSAGE_MAX = 1500  # characters; chosen: ours are shorter, what is longer is the input's
+MESSAGE_MAX = 700  # characters; chosen: ours are shorter, what is longer is the input's
+
+
+def one_line(text: str) -> str:
+    """Make a message of a text that may hold anything of the input.
+
+    Without secrets of URLs; control characters are escaped; of long texts the middle is left out.
+    """
+    return _cut(printable(_cut(without_secrets(text))))
+
+
+def _cut(text: str) -> str:
+    if len(text) <= MESSAGE_MAX:
+        return text
+    return f"{text[: MESSAGE_MAX // 2]} ... {text[-MESSAGE_MAX // 3 :]}"
 
 
 def printable(text: str) -> str:
@@ -46,6 +57,33 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def without_secrets(text: str) -> str:
+    """Leave of the URLs in a text what may be shown and written: scheme, host and path.
+
+    User and password go, also a password with "@" or "/" in it, and all after the path: queries
+    and parameters, where cameras take passwords too. Where nothing tells which is which, only the
+    scheme is left.
+
+    >>> without_secrets("rtsp://me:secret@10.0.0.7/stream?pwd=x")
+    'rtsp://10.0.0.7/stream'
+    """
+    return URL.sub(_public_part, text)
+
+
+# A scheme: two letters at least (C:/ is a drive), few enough for linear time.
+URL = re.compile(r"([a-z][a-z0-9+.-]{1,30}:/+)(\S*)", re.IGNORECASE)
+PARAMETERS = re.compile(r"[?#;&=]")  # begin what is no path: also rtsp://host/user=me&password=x
+
+
+def _public_part(url: re.Match[str]) -> str:
+    """Cut a URL to scheme, host and path."""
+    scheme, rest = url.groups()
+    user, _, rest = rest.rpartition("@")
+    if PARAMETERS.search(user):  # of a password, or the "@" is one of a query
+        return f"{scheme}..."
+    return scheme + PARAMETERS.split(rest)[0]
 
 
 def visible_name(name: str) -> str:

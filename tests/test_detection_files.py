@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.sources import detection_files
+from reobj.sources import detection_files, recorded
 from reobj.sources.recorded import RecordedDetections
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -104,6 +104,9 @@ def test_mot_rows_as_they_are(tmp_path: Path, text: str, expected: list[list[flo
         ("1,2,3,4,5,6,1,1,1,x\n", "line 1: 'x' is no finite number"),  # the last column too
         ("frame,x1,y1,x2,y2\n0,1,2,3,4\n", "line 1: no MOTChallenge file"),
         ("1," + "2" * 200_000, "line 1: no table"),
+        ("1,2,3,4,5,6\n1.5,2,3,4,5,6\n", "line 2: frame 1.5, expected a whole number"),
+        ("1,1e30,3,4,5,6\n", "line 1: id 1e30, expected a whole number"),
+        ("1,2,3,4,5,6\n1,2,3,-1e9,5,6\n", "line 2: box .*, expected at most 1e.07 px"),
     ],
 )  # fmt: skip
 def test_damaged_mot_rows(tmp_path: Path, text: str, expected: str) -> None:
@@ -338,6 +341,24 @@ def test_npz_of_other_kinds(
 def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -> None:
     with pytest.raises(rt.ReobjError, match=r"line 2: frame .*, expected a whole number"):
         read(tmp_path, "a.txt", LINE + f"{frame},-1,10,20,30,40,.9\n", video)
+
+
+@pytest.mark.parametrize("key", ["frame", "class_names", "mask_counts"])
+def test_npz_of_more_than_is_taken(
+    tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch, key: str
+) -> None:
+    """Small numbers of bytes become ints and objects: a GB of them would be tens."""
+    path = tmp_path / "a.npz"
+    mask = np.zeros((1, 480, 640), bool)
+    mask[0, 10:20, 10:20] = True
+    found = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.ones(1), np.zeros(1, np.int64), mask)
+    rt.write_detections_npz(path, [(0, found), (1, found)], ["a", "b"], video.size)
+    count = dict(np.load(path))[key].size
+    monkeypatch.setitem(recorded.SIZES, key, count)
+    assert len(rt.read_detections(path, video)) == 2
+    monkeypatch.setitem(recorded.SIZES, key, count - 1)
+    with pytest.raises(rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are taken"):
+        rt.read_detections(path, video)
 
 
 def test_zip_that_unpacks_to_too_much(

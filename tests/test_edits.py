@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 from simulated import SIZE, tracks_of, unlinked, walk, with_columns
 
+import quadrics
 import reobj_track as rt
+from reobj import parts
+from reobj.identity.occlusion import hidden_edges
 from reobj.parts import link_and_fit
 from reobj.results.edits import EDITS, apply_edits, kept_edits, read_edits
 from reobj.results.workspace import Workspace
@@ -144,6 +147,7 @@ def test_what_is_not_found_is_said(tmp_path: Path, edit: dict[str, Any], said: s
         ([{**RENAME, "class": 3}], "class 3 is no name"),
         ([{**SPLIT, "visits": []}], "visits is empty"),
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3]}}], "is no box"),
+        ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3e300, 4]}}], "is no box"),
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3, "x"]}}], "edit 1"),
         ([{**DELETE, "object": {"frame": 1.5, "box": [1, 2, 3, 4]}}], "whole numbers"),
         ([{**DELETE, "object": {"box": [1, 2, 3, 4]}}], "edit 1: 'frame'"),
@@ -289,3 +293,34 @@ def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
     assert len(result.tracks) == 80 and SIZE == (640, 480)
     np.testing.assert_array_equal(result.embeddings.foreground, vectors[kept])
     np.testing.assert_array_equal(result.tracks.xyxy[result.embedding_row], tracks.xyxy[rows[kept]])
+
+
+def test_solids_of_merged_objects_hide_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What stood where one of two merged objects was is not the solid of both; others keep theirs.
+
+    (Splits likewise: neither piece is the solid that was fitted to both.)
+    """
+    poses = walk()
+    tracks = tracks_of(poses)
+    asked: list[quadrics.Ellipsoids] = []
+
+    def noted(views: Any, ellipsoids: quadrics.Ellipsoids) -> Any:
+        asked.append(ellipsoids)
+        return hidden_edges(views, ellipsoids)
+
+    monkeypatch.setattr(parts, "hidden_edges", noted)
+    plain = unlinked(poses, tracks)
+    link_and_fit(plain, rt.ObjectsConfig())
+    assert np.isfinite(asked[-1].half_axes).all() and len(asked[-1]) == 3  # all known to begin with
+    refs = [
+        {"id": i, "frame": 0, "box": plain.tracks.xyxy[(plain.tracks.track_id == i)][0].tolist()}
+        for i in (1, 2)
+    ]
+    result = unlinked(poses, tracks)
+    path = write(tmp_path / "e.json", {"do": "merge", "object": refs[0], "with": refs[1]})
+    result.edits = read_edits(path)
+    link_and_fit(result, rt.ObjectsConfig())
+    assert [o.id for o in result.objects] == [1, 3]
+    assert np.isfinite(asked[-1].half_axes).all(1).tolist() == [False, True]

@@ -26,6 +26,7 @@ from reobj.results.evaluation import (
     drop_ignored,
     identity_map,
     labelled,
+    read_truth,
     return_ranks,
     score_report,
     score_tracks,
@@ -683,6 +684,21 @@ def test_bad_true_cameras(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(rt.ReobjError, match=message):
         score_objects(result, solids, path, {4: 9})
+
+
+@pytest.mark.parametrize("number", ["NaN", "1e999", '"x"', "[]"])
+def test_true_solids_are_finite_numbers(tmp_path: Path, number: str) -> None:
+    result, solids, path = half_sized(tmp_path)
+    solids.write_text(solids.read_text().replace("0.5", number, 1))
+    with pytest.raises(rt.ReobjError, match=r"gt_objects.json: .*; expected objects with id"):
+        score_objects(result, solids, path, {4: 9})
+
+
+def test_true_classes_of_any_number_are_read(tmp_path: Path) -> None:
+    """Also those that no table has; without a warning of numpy's."""
+    path = write(tmp_path / "gt.txt", np.array([[1, 1, 5, 5, 20, 20, 1, 1e30, 1]]))
+    found = read_truth(path, ["chair"], 0.0)
+    assert len(found) == 1 and found.name[0] not in ("", "chair")
 
 
 def test_3d_needs_cameras(tmp_path: Path) -> None:

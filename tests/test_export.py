@@ -621,6 +621,39 @@ def test_images_in_rerun_are_small_and_boxes_fit_them(chairs: rt.Result, tmp_pat
     np.testing.assert_allclose(first["Boxes2D:centers"], centers, atol=0.01)
 
 
+def test_an_image_that_is_missing_is_missing_in_rerun(chairs: rt.Result, tmp_path: Path) -> None:
+    """Frame 1 cannot be read, frame 3 was never read: each image stands at its own frame."""
+    pytest.importorskip("rerun", reason="pip install .[viewer]")
+    (tmp_path / "f").mkdir()
+    for i in range(5):
+        cv2.imwrite(str(tmp_path / f"f/{i}.png"), np.full((480, 640, 3), 40 * i, np.uint8))
+    (tmp_path / "f/1.png").write_bytes(b"no image")
+    Workspace(tmp_path / "out").bind(rt.Video(tmp_path / "f"))
+    read = np.isin(chairs.tracks.frame, [0, 1, 2, 4])
+    rows = np.flatnonzero(np.isin(chairs.poses.frame, [0, 1, 2, 4]))
+    own = {k: getattr(chairs.poses, k)[rows] for k in ("frame", "time_s", "cam_from_world",
+                                                       "status", "part")}  # fmt: skip
+    poses = dataclasses.replace(chairs.poses, **own)
+    dataclasses.replace(chairs, tracks=chairs.tracks[read], poses=poses).save(tmp_path / "out")
+    found = in_rrd(rt.export(tmp_path / "out", "rrd"))
+    assert sorted(row["frame"] for row in found["/world/camera"]) == [0, 1, 2, 4]
+    shown = {}
+    for row in found["/world/camera/image"]:
+        picture = np.array(row["EncodedImage:blob"][0], np.uint8)
+        shown[row["frame"]] = round(float(cv2.imdecode(picture, cv2.IMREAD_COLOR).mean()))
+    assert shown == {0: 0, 2: 80, 4: 160} and len(found["/world/camera/image"]) == 3
+
+
+def test_tracks_of_no_object_are_not_exported(chairs: rt.Result, tmp_path: Path) -> None:
+    """Rows added to tracks.txt by hand: of which class they are is not known."""
+    chairs.save(tmp_path)
+    with (tmp_path / "tracks.txt").open("a") as file:
+        file.write("1,9,10,10,20,20,0.9,-1,-1,-1\n")
+    with pytest.raises(rt.ReobjError, match=r"tracks\.txt: object 9 is not in objects\.json"):
+        rt.export(tmp_path, "cvat")
+    assert not (tmp_path / "cvat.xml").exists()
+
+
 def test_the_viewer_follows_the_tracking(tmp_path: Path) -> None:
     """Frame by frame, as they are tracked: image, boxes with names, and a known camera."""
     pytest.importorskip("rerun", reason="pip install .[viewer]")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import base64
 import errno
+import importlib.util
 import io
 import json
 import math
 import os
 import struct
+import sys
 import time
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +99,64 @@ def test_text_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
         files.read_text(Path("/dev/zero"))
     (tmp_path / "a.txt").write_text("x" * (3 << 20))
     assert len(files.read_text(tmp_path / "a.txt")) == 3 << 20
+
+
+@pytest.mark.parametrize(
+    ("limit", "most", "text", "what"),
+    [
+        ("LINES_MAX", 3, "a\nb\nc\nd\n", "a.txt: 4 lines, at most 3 are taken; cut it into pieces"),
+        ("LINES_MAX", 3, "a\x0bb\x1cc\u2028d\x85e", "a.txt: 4 lines, at most 3 are taken"),
+        ("LINE_MAX", 3, "ab\nabcd\n", "a.txt: a line of 5 characters, at most 3 are taken"),
+        ("TEXT_MAX", 9, "a\n" * 5, "a.txt: more than 0 MB of text"),
+    ],
+)
+def test_tables_have_an_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int, text: str, what: str
+) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    assert "".join(files.read_lines(path)) == text
+    monkeypatch.setattr(files, limit, most)
+    with pytest.raises(rt.ReobjError, match=what):
+        files.read_lines(path)
+
+
+def test_the_lines_of_a_file_are_those_of_its_text(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n\nd")
+    assert files.read_lines(path) == ["a\n", "b\n", "c\n", "\n", "d"]
+    path.write_bytes(b"")
+    assert files.read_lines(path) == []
+
+
+@pytest.mark.parametrize("text", ["[" + "[]," * 9 + "0]", "[" + "{}," * 9 + "0]", "[1,2,3,4]"])
+def test_json_is_refused_before_it_takes_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    """What is taken is less than what was reckoned, which is what is refused."""
+    path, taken = tmp_path / "a.json", 64 * (text.count(",") + text.count("["))
+    taken += 200 * text.count("{")
+    path.write_text(text)
+    monkeypatch.setattr(files, "JSON_MAX", taken)
+    files.load_json(path)
+    monkeypatch.setattr(files, "JSON_MAX", taken - 1)
+    with pytest.raises(rt.ReobjError, match=r"a.json: would take 0 MB of memory, at most 0 MB"):
+        files.load_json(path)
+
+
+@pytest.mark.parametrize("item", ["[],", "{},", '{"a":1},', "1.5,", '"ab",', "[1.5,2.5,3.5],"])
+def test_json_takes_no_more_than_was_reckoned(tmp_path: Path, item: str) -> None:
+    """By what Python has allocated; 2 MB of text of the worst kinds."""
+    path, text = tmp_path / "a.json", "[" + item * (2_000_000 // len(item)) + "0]"
+    path.write_text(text)
+    reckoned = sum(text.count(sign) * each for sign, each in files.JSON_BYTES.items())
+    tracemalloc.start()
+    try:
+        data = files.load_json(path)
+        taken = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert len(data) > 1000 and taken < 1.3 * reckoned
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000, "9" * 5000])
@@ -249,6 +310,53 @@ def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
         pass
 
 
+class Windows:
+    """What its module msvcrt does: a byte that one open file has locked is refused to others."""
+
+    LK_NBLCK = 2
+
+    def __init__(self) -> None:
+        self.held: dict[int, int] = {}  # by the file: the handle
+
+    def locking(self, handle: int, mode: int, count: int) -> None:
+        assert (mode, count) == (self.LK_NBLCK, 1) and os.lseek(handle, 0, os.SEEK_CUR) == 0
+        file = os.fstat(handle).st_ino
+        if file in self.held:
+            raise OSError(errno.EACCES, "Permission denied")
+        self.held[file] = handle
+
+
+def test_a_lock_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same file, as it is there: without fcntl, with msvcrt."""
+    windows = Windows()
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setitem(sys.modules, "msvcrt", windows)
+    monkeypatch.setitem(sys.modules, "fcntl", None)  # an import fails
+    spec = importlib.util.spec_from_file_location("files_on_windows", files.__file__)
+    assert spec is not None and spec.loader is not None
+    there = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(there)
+    with there.locked(tmp_path / "lock"):
+        with pytest.raises(there.LockedError), there.locked(tmp_path / "lock", 0.1):
+            pass
+        with there.locked(tmp_path / "other"):
+            pass
+    windows.held.clear()  # the system does so when the file is closed
+    with there.locked(tmp_path / "lock"):
+        pass
+
+
+def test_without_locks_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some network drives: better two runs than none."""
+
+    def no_locks(_: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(files, "_take_lock", no_locks)
+    with files.locked(tmp_path / "lock"), files.locked(tmp_path / "lock"):
+        pass
+
+
 # ---- Progress ------------------------------------------------------------------------------------
 
 
@@ -350,32 +458,6 @@ def test_progress_is_silent_without_a_terminal(
 
 
 # ---- Text for messages ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("rtsp://me:secret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
-        ("run http://token@a/b rtsp://u:p@c -o out", "run http://a/b rtsp://c -o out"),
-        ("rtsp://me:se@cret@10.0.0.7:554/a/b", "rtsp://10.0.0.7:554/a/b"),
-        ("rtsp://me:se/cret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
-        ("rtsp://me:1/2@3/4@cam/stream", "rtsp://cam/stream"),
-        ("rtsp://me:s?c@cam/stream", "rtsp://..."),  # or a query with "@": nothing tells
-        ("http://cam/v.mp4?user=me@x.org&pwd=secret", "http://..."),
-        ("http://cam/v.mp4?user=me&pwd=secret", "http://cam/v.mp4"),
-        ("http://cam/v.mp4#t=secret", "http://cam/v.mp4"),
-        ("rtsp://cam:554/user=me_password=secret_channel=1", "rtsp://cam:554/user"),
-        ("rtsp://me:s=c@cam/stream", "rtsp://..."),
-        ("http://cam?pwd=a@secret", "http://..."),
-        ("rtsp://cam/stream;key=secret", "rtsp://cam/stream"),
-        ("RTSP://me:secret@cam/1 is gone", "RTSP://cam/1 is gone"),
-        ("http:/me:secret@cam/1", "http:/cam/1"),  # as pathlib writes it
-        ("me@home.org and/or C:\\a", "me@home.org and/or C:\\a"),
-        ("/data/room=1?/a@b.mp4", "/data/room=1?/a@b.mp4"),  # a file
-    ],
-)
-def test_passwords_are_not_shown(text: str, expected: str) -> None:
-    assert files.without_secrets(text) == expected
 
 
 def test_lists_are_shortened() -> None:

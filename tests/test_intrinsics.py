@@ -154,6 +154,8 @@ def test_a_camera_of_another_size_is_resized_and_of_another_shape_refused(tmp_pa
         ("a.json", '{"w": 640, "h": 480}', "no focal length"),
         ("a.json", '{"fx": 500, "cx": 320}', "not understood"),
         ("a.json", '{"fx": "x"}', "not understood"),
+        ("a.json", '{"fx": 500, "w": Infinity, "h": 480}', "images of inf pixels"),
+        ("a.json", '{"fx": 500, "w": 640, "h": 0}', "images of 0 pixels"),
         ("a.json", '{"K": [1, 2]}', "not understood"),
         ("a.json", '{"fx": 500, "model": "FOV"}', "no omega of a FOV camera"),
         ("a.json", '{"fx": 500, "model": "MAGIC"}', "no camera model MAGIC"),

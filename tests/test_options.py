@@ -31,6 +31,7 @@ import reobj.poses.mapping as mapping
 import reobj.poses.stage as stage
 import reobj.results.scene as scene
 import reobj.sources.detectors as detectors
+import reobj.sources.video as video_room
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses, write_colmap
 from reobj.options import (
@@ -55,7 +56,7 @@ CAMERA = rt.Camera("PINHOLE", 320, 240, (300.0, 300.0, 160.0, 120.0))
 def test_options_are_few_enough_to_read() -> None:
     sections = [f for f in dataclasses.fields(rt.Config) if f.default is dataclasses.MISSING]
     solver = dataclasses.fields(quadrics.FitConfig)
-    assert len(every_option(rt.Config())) + len(sections) + len(solver) <= 62
+    assert len(every_option(rt.Config())) + len(sections) + len(solver) <= 63
     assert len(solver) == 8
 
 
@@ -341,6 +342,36 @@ def _(lab: Lab) -> None:
 def _(lab: Lab) -> None:
     video = rt.Video(images(lab.path / "images", 1), lab.config("80").input)
     assert [frame.image.shape for frame in video] == [(60, 80, 3)]
+
+
+@shows("input.reconnect")
+def _(lab: Lab) -> None:
+    """A camera of one frame is opened once, then as often as the option says."""
+    opened = []
+
+    class Camera:
+        def __init__(self, *_: Any) -> None:
+            opened.append(self)
+            self.left = 1
+
+        def read(self) -> tuple[bool, Any]:
+            self.left -= 1
+            return self.left >= 0, np.zeros((48, 64, 3), np.uint8)
+
+        def isOpened(self) -> bool:
+            return len(opened) == 1
+
+        def get(self, _: int) -> float:
+            return 0.0
+
+        def release(self) -> None:
+            pass
+
+    lab.patch.setattr(cv2, "VideoCapture", Camera)
+    lab.patch.setattr(video_room, "LIVE_TIMEOUT_S", 0.05)
+    lab.patch.setattr(video_room, "RECONNECT_S", (0.0, 0.0))
+    list(rt.Video(0, lab.config("4").input))
+    assert len(opened) == 1 + 4
 
 
 # ---- detect ----

@@ -35,8 +35,8 @@ from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.files import part_path
 from reobj.parts import parts_message
 from reobj.results.overlay import Overlay
-from reobj.results.result import validate_objects
 from reobj.results.solids import score_objects
+from reobj.schema import validate_objects
 from reobj.types import Embeddings
 
 CENTERS = chair_solids().center_in_world
@@ -379,7 +379,6 @@ def test_parts_come_back_when_loaded(
 
 
 def test_objects_json_is_as_its_schema_says(parted_folder: Path, tmp_path: Path) -> None:
-    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
     assert validate_objects(parted_folder / "objects.json") == []
     data = json.loads((parted_folder / "objects.json").read_text())
     assert [o["part"] for o in data["objects"]] == [0, 0, 0, 1, 1, 1]
@@ -388,6 +387,15 @@ def test_objects_json_is_as_its_schema_says(parted_folder: Path, tmp_path: Path)
     (tmp_path / "a.json").write_text(json.dumps(data))
     faults = " ".join(validate_objects(tmp_path / "a.json"))
     assert "objects[0].part" in faults and "world.parts[1]" in faults
+
+
+def test_parts_are_those_of_the_cameras(parted_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(parted_folder, tmp_path / "out")
+    data = json.loads((parted_folder / "objects.json").read_text())
+    data["world"]["parts"].append(data["world"]["parts"][0])
+    (tmp_path / "out/objects.json").write_text(json.dumps(data))
+    with pytest.raises(rt.ReobjError, match="3 parts of a path that has 2; is damaged"):
+        rt.Result.load(tmp_path / "out")
 
 
 def test_an_objects_json_without_parts_loads(chairs: rt.Result, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ import build_priors
 import numpy as np
 import pytest
 import synthetic_quadrics as syn
+from simulated import chair_solids, walk
 
 import quadrics as q
 
@@ -1234,3 +1235,37 @@ def test_functions_are_short_and_nothing_optional_is_imported() -> None:
         a.name.split(".")[0] for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names
     }
     assert names <= {"json", "re", "numpy"}
+
+
+def test_cameras_beyond_numbers_give_no_quadric() -> None:
+    """Squares of 1e300 are infinite, of which the SVD does not converge: NaN, and no exception."""
+    poses = walk(6)
+    img_from_world = poses.camera.K @ poses.cam_from_world  # (6, 3, 4)
+    boxes = q.solid_boxes(chair_solids(), "box", img_from_world)
+    priors, categories = q.load_priors(), ["chair"] * boxes.shape[1]
+    good = q.fit_psfmo(boxes, priors, categories, img_from_world)
+    assert np.isfinite(good.ellipsoids.half_axes).all()
+    bad = q.fit_psfmo(boxes, priors, categories, 1e300 * img_from_world)
+    assert bad.ellipsoids.half_axes.shape == good.ellipsoids.half_axes.shape
+
+
+@pytest.mark.parametrize("factor", [1e6, 1e9])
+def test_one_camera_of_an_absurd_focal_length_gives_no_exception(factor: float) -> None:
+    """Its two latent dimensions cannot be told apart: the precision is singular."""
+    poses = walk(6)
+    img_from_world = (poses.camera.K @ poses.cam_from_world)[:1]
+    boxes = q.solid_boxes(chair_solids(), "box", img_from_world)
+    img_from_world[:, 0, 0] *= factor
+    found = q.fit_psfmo(boxes, q.load_priors(), ["chair"] * boxes.shape[1], img_from_world)
+    assert not np.isfinite(found.ellipsoids.half_axes).any()  # seen in fewer than two frames
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("key", ["mean", "log_std", "corr"])
+def test_priors_beyond_numbers_are_refused(tmp_path: Path, key: str) -> None:
+    """Without a warning of numpy's."""
+    size = {"mean": [2, 0.9, 0.8], "log_std": [0.2, 0.2, 0.2], "corr": [0, 0, 0]}
+    path = tmp_path / "p.json"
+    path.write_text(json.dumps({"couch": {"size_m": size | {key: [1e308, -1e308, 1e308]}}}))
+    with pytest.raises(q.QuadricsError, match="a category lacks or garbles"):
+        q.load_priors(path)

@@ -645,3 +645,51 @@ def test_slightly_different_focal_lengths_are_one_camera(tmp_path):
     edit_json(path, lambda d: d["frames"][1].update(fl_x=511))
     with pytest.raises(rt.ReobjError, match="several different cameras"):
         read(path)
+
+
+def test_rotations_of_binary_models_are_checked(tmp_path, monkeypatch):
+    """pycolmap takes a quaternion of any length; nearly right ones are made right."""
+    path = as_colmap_binary(tmp_path, some_cameras())
+    model = readers.read_sparse_model(path)
+
+    def scaled(factor):
+        wrong = model.cam_from_world.copy()
+        wrong[3, :, :3] *= factor
+        monkeypatch.setattr(
+            readers,
+            "read_sparse_model",
+            lambda _: dataclasses.replace(model, cam_from_world=wrong),
+        )
+
+    scaled(1.1)
+    with pytest.raises(rt.ReobjError, match=f"images.bin, {NAMES[3]}: the 3x3 part is no rotation"):
+        read(path)
+    scaled(1.001)
+    turned = read(path).cam_from_world[:, :, :3]
+    np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1) - np.eye(3), 0, atol=1e-12)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("number", [1e300, -1.7e308, 1e12])
+def test_numbers_without_end_are_refused_without_overflow(tmp_path, number):
+    """In one line, and no warning of numpy's beside it."""
+    cams, names = some_cameras(), NAMES[:FRAMES]
+    path = as_tum(tmp_path, cams)
+    rows = [line.split() for line in path.read_text().splitlines()[1:]]
+    rows[2][1:4] = [repr(number)] * 3
+    path.write_text("\n".join(" ".join(row) for row in rows))
+    with pytest.raises(rt.ReobjError, match=r"line 3: more than 1e\+09 units away"):
+        read(path, camera=CAMERA)
+    for row, what in ((0, "the 3x3 part is no rotation"), (3, "more than 1e")):
+        matrix = full(invert_rigid(cams))
+        matrix[2, 0, row] = number
+        text(tmp_path / "transforms.json", transforms(matrix, names))
+        with pytest.raises(rt.ReobjError, match=rf"frames\[2\]: {what}"):
+            read(tmp_path / "transforms.json", blank(FRAMES, names))
+
+
+def test_focal_lengths_of_zero_are_refused(tmp_path):
+    path = as_colmap_text(tmp_path, some_cameras())
+    (path / "sparse/0/cameras.txt").write_text("1 PINHOLE 640 480 0 0 320 240\n")
+    with pytest.raises(rt.ReobjError, match="focal length"):
+        read(path)

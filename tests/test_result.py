@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,10 @@ from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_co
 
 import quadrics
 import reobj_track as rt
+from reobj.results.folder import write_mot
 from reobj.results.ply import write_ply
-from reobj.results.result import VideoInfo, sides, validate_objects, write_mot
+from reobj.results.result import VideoInfo, sides
+from reobj.schema import validate_objects
 
 
 def copy_of(result: rt.Result, **changes: object) -> rt.Result:
@@ -300,7 +303,6 @@ def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
     ],
 )
 def test_validate_finds_faults(saved: Path, change: dict[str, object], fault: str) -> None:
-    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
     data = json.loads((saved / "objects.json").read_text())
     data["objects"][0] |= change
     (saved / "objects.json").write_text(json.dumps(data))
@@ -310,7 +312,6 @@ def test_validate_finds_faults(saved: Path, change: dict[str, object], fault: st
 
 @pytest.mark.parametrize("key", ["format", "world", "objects"])
 def test_validate_misses_nothing_that_must_be_there(saved: Path, key: str) -> None:
-    pytest.importorskip("jsonschema", reason="pip install jsonschema (dev extra)")
     data = json.loads((saved / "objects.json").read_text())
     del data[key]
     (saved / "objects.json").write_text(json.dumps(data))
@@ -321,6 +322,25 @@ def test_validate_refuses_what_is_no_json(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(rt.ReobjError, match="not valid JSON"):
         validate_objects(tmp_path / "x.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda d: d["objects"][0].update(id=2), "two objects of one id"),
+        (lambda d: d["objects"][1].update(quat_wxyz=[0, 0, 0, 0]), "quat_wxyz of object 2 is not"),
+        (lambda d: d["objects"][1].update(quat_wxyz=[1, 1, 0, 0]), "quat_wxyz of object 2 is not"),
+        (lambda d: d["objects"][2].update(part=1), "object 3 is of part 1, which is not there"),
+        (lambda d: d["objects"][2].update(center=["x"] * 3), r"objects\[2\].center\[0\]: 'x', exp"),
+        (lambda d: d.update(video=None), r"\$.video: None, expected object"),
+    ],
+)
+def test_what_does_not_fit_together_is_not_loaded(saved: Path, change: Any, fault: str) -> None:
+    data = json.loads((saved / "objects.json").read_text())
+    change(data)
+    (saved / "objects.json").write_text(json.dumps(data))
+    with pytest.raises(rt.ReobjError, match=rf"objects.json: .*{fault}.*; is damaged: run the"):
+        rt.Result.load(saved)
 
 
 # ---- Tracks and embeddings, as the tracker had them ----

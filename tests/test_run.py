@@ -10,9 +10,11 @@ import io
 import json
 import pkgutil
 import re
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -24,9 +26,9 @@ import quadrics
 import reobj
 import reobj_track as rt
 from reobj.poses import stage
-from reobj.results.result import validate_objects
 from reobj.results.stages import detect_all
 from reobj.results.workspace import Workspace
+from reobj.schema import validate_objects
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 12
@@ -773,8 +775,9 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
     ("option", "said"),
     [
         (("--known-size", "chair=nan"), "--known-size 'chair=nan': expected"),
-        (("--known-size", "chair=9999m"), "--known-size chair: 9999 m; at most 1000 m"),
-        (("--priors", ROOT / "README.md"), "README.md: not valid JSON"),
+        (("--known-size", "chair=9999m"), "cm or mm, from 0.001 to 1000 m, such as door=2.0m"),
+        (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm or mm"),
+        (("--priors", ROOT / "README.md"), "README.md, line 1: not valid JSON"),
         (("--support", "cube"), "--support cube: expected one of auto, ellipsoid"),
         (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
         (("--set", "tracker.return_probability=nan"), "expected =FLOAT, finite, 0 or more"),
@@ -935,6 +938,7 @@ def test_damaged_poses_are_computed_again(
     def estimate(*args: object, **more: object) -> rt.Poses:
         calls.append("estimate")
         (workspace.cache / "sfm/sparse").mkdir(parents=True)
+        (workspace.cache / "sfm/sparse/images.bin").write_bytes(b"a model")
         return made
 
     def points(poses: rt.Poses, *args: object, **more: object) -> rt.Poses:
@@ -955,6 +959,23 @@ def test_damaged_poses_are_computed_again(
         np.savez(path, **(dict(np.load(path)) | {"frame": np.arange(9)}))
         assert compute().known.all() and len(calls) == 2
         assert [r.message.endswith("computed again") for r in caplog.records] == [True]
+
+    (model,) = workspace.cache.glob("poses-*.sparse")
+    (cached,) = workspace.cache.glob("poses-*.npz")
+    damages: list[Callable[[], object]] = [
+        lambda: (model / "images.bin").write_bytes(b"a modem"),
+        lambda: (model / "images.bin").unlink(),
+        lambda: (model / "points3D.bin").touch(),
+        lambda: shutil.rmtree(model),
+        lambda: (cached.unlink(), cached.mkdir()),
+    ]
+    for damage in damages:
+        stages["poses"]()
+        calls.clear(), caplog.clear()
+        damage()
+        assert stages["poses"]().known.all() and calls == ["estimate"]
+        assert [r.message.endswith("computed again") for r in caplog.records] == [True]
+        assert (model / "images.bin").read_bytes() == b"a model" and len(list(model.iterdir())) == 1
 
 
 def test_a_closed_pipe_is_no_error(clip: Path, detections: Path, tmp_path: Path) -> None:
@@ -1024,3 +1045,55 @@ def test_poses_command_takes_supplied_poses(tmp_path: Path) -> None:
         np.loadtxt(tmp_path / "out/poses.txt"), np.loadtxt(str(given)), atol=1e-6
     )
     assert (tmp_path / "out/sparse/images.txt").exists()
+
+
+URL = "rtsp://me:w0rd@127.0.0.1:9/cam?pwd=w0rd"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", URL, "-o", "out", "--offline"],
+        ["run", "a.mp4", "-o", "out", URL],  # argparse repeats what it does not know
+        ["run", "a.mp4", "-o", "out", f"--{URL}"],
+        [URL],
+        ["run", "a.mp4", "-o", "out", "--every", URL],
+        ["run", "a.mp4", "-o", "out", "--set", URL],
+        ["run", "a.mp4", "-o", "out", "--known-size", URL],
+        ["track", "a.mp4", "-o", "out", "--detections", URL],
+        ["export", URL, "--to", "csv"],
+        ["export", "out", "--to", URL],
+        ["objects", URL],
+        ["objects", URL, "--debug"],
+        ["eval", URL, "--gt", URL],
+        ["models", URL],
+    ],
+)
+def test_passwords_reach_no_message(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    try:
+        assert rt.main(words) == 2
+    except SystemExit as end:
+        assert end.code == 2
+    said = capfd.readouterr()
+    assert "error" in said.err.lower() and "w0rd" not in said.out + said.err
+    assert not [p for p in tmp_path.rglob("*") if p.is_file() and b"w0rd" in p.read_bytes()]
+
+
+def test_passwords_reach_no_log_line_and_no_traceback(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the fault is ours, which ends with exit code 1."""
+
+    def fails(*_: object, **__: object) -> None:
+        rt.log.warning("opening %s", URL)
+        raise RuntimeError(f"cannot open {URL}")
+
+    monkeypatch.setattr(rt, "run", fails)
+    assert rt.main(["run", "a.mp4", "-o", "out"]) == 1
+    said = capfd.readouterr().err
+    assert "warning: opening rtsp://127.0.0.1:9/cam" in said and "Traceback" in said
+    assert "RuntimeError: cannot open rtsp://127.0.0.1:9/cam" in said and "w0rd" not in said

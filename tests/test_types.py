@@ -18,9 +18,11 @@ from reobj.types import (
     cxcywh_from_xyxy,
     object_classes,
     object_color,
+    one_line,
     rows_by,
     unit_rows,
     widen,
+    without_secrets,
     xyxy_from_cxcywh,
 )
 
@@ -363,3 +365,59 @@ def test_neighbouring_identities_have_clearly_different_colours() -> None:
     assert colors.min() >= 0 and colors.max() <= 255
     assert np.linalg.norm(np.diff(colors, axis=0), axis=1).min() > 90
     assert object_color(3) == object_color(3)
+
+
+# ---- Messages ----
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("rtsp://me:secret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
+        ("run http://token@a/b rtsp://u:p@c -o out", "run http://a/b rtsp://c -o out"),
+        ("rtsp://me:se@cret@10.0.0.7:554/a/b", "rtsp://10.0.0.7:554/a/b"),
+        ("rtsp://me:se/cret@10.0.0.7/stream", "rtsp://10.0.0.7/stream"),
+        ("rtsp://me:1/2@3/4@cam/stream", "rtsp://cam/stream"),
+        ("rtsp://me:s?c@cam/stream", "rtsp://..."),  # or a query with "@": nothing tells
+        ("http://cam/v.mp4?user=me@x.org&pwd=secret", "http://..."),
+        ("http://cam/v.mp4?user=me&pwd=secret", "http://cam/v.mp4"),
+        ("http://cam/v.mp4#t=secret", "http://cam/v.mp4"),
+        ("rtsp://cam:554/user=me_password=secret_channel=1", "rtsp://cam:554/user"),
+        ("rtsp://me:s=c@cam/stream", "rtsp://..."),
+        ("http://cam?pwd=a@secret", "http://..."),
+        ("rtsp://cam/stream;key=secret", "rtsp://cam/stream"),
+        ("RTSP://me:secret@cam/1 is gone", "RTSP://cam/1 is gone"),
+        ("http:/me:secret@cam/1", "http:/cam/1"),  # as pathlib writes it
+        ("--rtsp://me:secret@cam/1", "--rtsp://cam/1"),  # as argparse repeats it
+        ("a" * 40 + "://me:secret@cam/1", "a" * 40 + "://cam/1"),
+        ("C:/Users/me@work/a?b", "C:/Users/me@work/a?b"),  # no URL
+        ("me@home.org and/or C:\\a", "me@home.org and/or C:\\a"),
+        ("/data/room=1?/a@b.mp4", "/data/room=1?/a@b.mp4"),  # a file
+    ],
+)
+def test_passwords_are_not_shown(text: str, expected: str) -> None:
+    assert without_secrets(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x" * 10**6,
+        "\x1b" * 10**5,  # escaped, each is four characters
+        "\U000e0001" * 10**5,
+        "a-" * 10**6,  # not in quadratic time
+        "a\nb\x00\x85\u2028\ud800\u202e",
+        "rtsp://me:pa@ss/w0rd@host/cam?pwd=w0rd " * 50,
+        "y" * 340 + "rtsp://me:w0rd@host/" + "z" * 500,  # where a message is cut
+        "y" * 500 + "rtsp://me:w0rd@host/" + "z" * 222,
+    ],
+)
+def test_messages_are_one_printable_short_line_without_secrets(text: str) -> None:
+    for found in (one_line(text), str(rt.ReobjError(text))):
+        assert found.isprintable() and 0 < len(found) <= 700 and "w0rd" not in found
+
+
+def test_messages_keep_their_begin_and_their_end() -> None:
+    assert one_line("begin " + "x" * 2000 + " end")[:7] == "begin x"
+    assert one_line("begin " + "x" * 2000 + " end").endswith("x end")
+    assert one_line("x" * 700) == "x" * 700

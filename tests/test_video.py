@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import http.server
 import itertools
 import json
 import os
+import re
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -524,6 +527,66 @@ def test_a_driver_that_hangs_is_the_end(monkeypatch: pytest.MonkeyPatch, quick: 
     gate.set()
 
 
+class Flaky:
+    """cv2.VideoCapture of a source that is there on some attempts only, with three frames each."""
+
+    def __init__(self, there: str) -> None:
+        self.there, self.cameras = there, list[FakeCamera]()
+
+    def __call__(self, *_: Any) -> FakeCamera:
+        attempt = len(self.cameras)
+        camera = FakeCamera(3)
+        if self.there[attempt : attempt + 1] != "x":
+            camera.isOpened = lambda: False  # type: ignore[method-assign]
+        self.cameras.append(camera)
+        return camera
+
+
+@pytest.mark.parametrize(
+    ("reconnect", "there", "frames", "attempts", "waits"),
+    [
+        (0, "xxx", 2, 1, []),  # as it was before: the first end is the end
+        (1, "xxx-", 8, 4, ["0.01", "0.01", "0.01"]),  # every frame is a new hope
+        (3, "x--x---", 5, 7, ["0.01", "0.02", "0.03"] * 2),  # twice as long each time, at most .03
+        (2, "x-----", 2, 3, ["0.01", "0.02"]),
+    ],
+)
+def test_a_lost_source_is_connected_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+    reconnect: int, there: str, frames: int, attempts: int, waits: list[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(video_room, "RECONNECT_S", (0.01, 0.03))
+    flaky = Flaky(there)
+    monkeypatch.setattr(cv2, "VideoCapture", flaky)
+    video = rt.Video(0, rt.InputConfig(reconnect=reconnect))
+    seen = [(frame.index, frame.time_s) for frame in video]
+    assert video.read == frames and seen[-1][0] == frames - 1  # counted on, whatever was dropped
+    assert seen == sorted(seen) and len({index for index, _ in seen}) == len(seen)
+    assert len(flaky.cameras) == attempts
+    assert re.findall(r"0: ended; connecting again in ([\d.]+) s", caplog.text) == waits
+    assert all(camera.released for camera in flaky.cameras if camera.n)
+
+
+def test_a_source_that_stays_away_is_asked_for_days(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1,100 attempts: twice as long each time is more than a number holds."""
+    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(video_room, "RECONNECT_S", (1e-9, 1e-9))
+    flaky = Flaky("x")
+    monkeypatch.setattr(cv2, "VideoCapture", flaky)
+    list(rt.Video(0, rt.InputConfig(reconnect=1100)))
+    assert len(flaky.cameras) == 1101
+
+
+def test_what_has_reached_its_stop_is_not_connected_again(
+    monkeypatch: pytest.MonkeyPatch, quick: None
+) -> None:
+    flaky = Flaky("xxx")
+    monkeypatch.setattr(cv2, "VideoCapture", flaky)
+    video = rt.Video(0, rt.InputConfig(stop=2, reconnect=5))
+    assert [frame.index for frame in video] == [0, 1] and len(flaky.cameras) == 1
+
+
 def test_leaving_early_stops_the_thread_and_frees_the_camera(
     monkeypatch: pytest.MonkeyPatch, quick: None
 ) -> None:
@@ -570,9 +633,10 @@ def test_a_camera_that_is_not_there(capsys: pytest.CaptureFixture[str], tmp_path
 class Stream(http.server.ThreadingHTTPServer):
     """MJPEG as IP cameras send it; one client after the other sees all the frames."""
 
-    def __init__(self, count: int, pause_s: float) -> None:
+    def __init__(self, count: int, pause_s: float, stalls_s: float = 0.0) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.count, self.pause_s, self.sent = count, pause_s, 0
+        self.stalls_s, self.over = stalls_s, threading.Event()
 
 
 class Handler(http.server.BaseHTTPRequestHandler):
@@ -597,6 +661,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
                 return
             self.server.sent += 1
             time.sleep(self.server.pause_s)
+        self.server.over.wait(self.server.stalls_s)
 
 
 @pytest.fixture
@@ -604,6 +669,7 @@ def stream(request: pytest.FixtureRequest) -> Iterator[tuple[Stream, str]]:
     server = Stream(*request.param)
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
     yield server, f"http://me:secret@127.0.0.1:{server.server_port}/camera.mjpg?pwd=secret"
+    server.over.set()
     server.shutdown()
     server.server_close()
 
@@ -621,6 +687,72 @@ def test_a_stream_is_read_to_its_end(stream: tuple[Stream, str], quick: None) ->
     assert seen[-1][0] == 38 and [i for i, _ in seen] == sorted({i for i, _ in seen})
     for index, grey in seen:
         assert abs(grey - index - 1) <= 2  # the number in the picture; JPEG
+
+
+@pytest.fixture
+def silent(request: pytest.FixtureRequest) -> Iterator[str]:
+    """URL of a camera that sends no more than `request.param`, and holds the connection."""
+    done, held = threading.Event(), list[socket.socket]()
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        listening.settimeout(0.05)
+
+        def serve() -> None:
+            while not done.is_set():
+                with contextlib.suppress(OSError):
+                    client = listening.accept()[0]
+                    held.append(client)
+                    client.sendall(request.param)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}/camera.mjpg"
+        done.set()
+        thread.join()
+        for client in held:
+            client.close()
+
+
+HEAD = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=frame\r\n\r\n"
+
+
+@pytest.mark.parametrize("silent", [b"", HEAD, HEAD + b"--frame\r\n"], indirect=True)
+def test_a_camera_that_does_not_answer_is_not_waited_for(
+    silent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV alone waits for half a minute."""
+    monkeypatch.setattr(video_room, "OPEN_TIMEOUT_S", 0.5)
+    began = time.monotonic()
+    with pytest.raises(rt.ReobjError, match=r"cannot be opened as a stream \(is it there"):
+        rt.Video(silent)
+    assert 0.4 < time.monotonic() - began < 5
+
+
+@pytest.mark.parametrize("stream", [(10, 0.01, 20.0)], indirect=True)
+def test_a_stream_that_stalls_ends_soon(
+    stream: tuple[Stream, str], quick: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the time that is promised, and half a second to notice."""
+    url = stream[1]
+    video = rt.Video(url)
+    last = began = time.monotonic()
+    for _ in video:
+        last = time.monotonic()
+    assert video.read == 9 and last - began < 5
+    assert 0.9 < time.monotonic() - last < 1.0 + video_room.LIVE_POLL_S + 0.5
+    assert "no frame came for 1 s: taken as its end" in video.messages[-1]
+
+
+@pytest.mark.parametrize("stream", [(6, 0.02)], indirect=True)
+def test_a_stream_is_connected_again(
+    stream: tuple[Stream, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over a real connection: each serves six frames, then ends."""
+    server, url = stream
+    monkeypatch.setattr(video_room, "LIVE_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(video_room, "RECONNECT_S", (0.05, 0.1))
+    video = rt.Video(url, rt.InputConfig(reconnect=2, stop=14))
+    seen = [frame.index for frame in video]
+    assert video.read == 14 and seen == sorted(set(seen)) and server.sent >= 15
 
 
 def test_a_file_behind_a_url_is_read_like_a_file(tmp_path: Path) -> None:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import email.message
 import hashlib
 import http.server
+import io
 import os
 import re
 import subprocess
 import sys
 import threading
+import time
 import urllib.parse
+import urllib.request
+import urllib.response
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +26,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
+from reobj.files import locked
 from reobj.sources import weights
 from reobj.sources.onnx_layouts import LAYOUTS
 
@@ -41,6 +47,19 @@ class Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         mode = self.server.mode
         self.server.asked.append((self.path, self.headers.get("Range")))
+        if mode == "portal":
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.end_headers()
+            self.wfile.write(b"<html>Welcome to our hotel</html>")
+            return
+        if mode == "moved" and self.path != "/there":
+            self.send_response(302)
+            self.send_header("Location", "/there")
+            self.end_headers()
+            return
+        if mode == "slow":
+            time.sleep(1.0)
         if mode == "404":
             self.send_error(404)
             return
@@ -77,6 +96,11 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     made.server_close()
 
 
+def here(server: Any) -> list[Path]:
+    """Files in the folder of weights, but for its lock."""
+    return sorted(p for p in server.folder.iterdir() if p.name != weights.DOWNLOAD_LOCK)
+
+
 # ---- Download ------------------------------------------------------------------------------------
 
 
@@ -89,7 +113,7 @@ def test_a_download_is_announced_verified_and_done_once(
     by_name, by_file = rt.model_path("toy"), rt.model_path("toy_416.onnx", offline=True)
     assert by_name == by_file == server.target
     assert server.asked == [("/toy.onnx", None)]
-    assert list(server.folder.iterdir()) == [server.target]
+    assert here(server) == [server.target]
 
 
 def test_another_file_than_expected_is_not_kept(server: Any) -> None:
@@ -97,7 +121,7 @@ def test_another_file_than_expected_is_not_kept(server: Any) -> None:
         found = hashlib.sha256(body).hexdigest()
         with pytest.raises(rt.ReobjError, match=f"sha256 is {found}, expected {SHA256}: not kept"):
             rt.model_path("toy")
-        assert list(server.folder.iterdir()) == []
+        assert here(server) == []
 
 
 def test_a_git_blob_id_verifies_a_file_of_unknown_size(
@@ -112,7 +136,7 @@ def test_a_git_blob_id_verifies_a_file_of_unknown_size(
         ) as caught:
             rt.model_path("toy")
         assert "\n" not in str(caught.value) and "not kept" in str(caught.value)
-        assert "--detector fast" in str(caught.value) and list(server.folder.iterdir()) == []
+        assert "--detector fast" in str(caught.value) and here(server) == []
     server.mode = "cut"  # its length was announced
     with pytest.raises(rt.ReobjError, match="cut after 100000 of 300000 bytes"):
         rt.model_path("toy")
@@ -181,7 +205,7 @@ def test_a_cut_download_leaves_nothing_and_starts_again(server: Any, mode: str) 
     expected = r"cut after 100000 of 300000 bytes.: run again"
     with pytest.raises(rt.ReobjError, match=expected) as caught:
         rt.model_path("toy")
-    assert "\n" not in str(caught.value) and list(server.folder.iterdir()) == []
+    assert "\n" not in str(caught.value) and here(server) == []
     server.mode = "good"
     assert rt.model_path("toy").read_bytes() == BLOB
     assert server.asked == [("/toy.onnx", None)] * 2  # the whole file, not a range of it
@@ -194,7 +218,7 @@ def test_ctrl_c_leaves_nothing(server: Any, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(weights.Progress, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         rt.model_path("toy")
-    assert list(server.folder.iterdir()) == []
+    assert here(server) == []
 
 
 def test_404_names_url_and_hash(server: Any) -> None:
@@ -202,7 +226,7 @@ def test_404_names_url_and_hash(server: Any) -> None:
     expected = r"toy.onnx: download failed .HTTP Error 404.*sha256.*put it at"
     with pytest.raises(rt.ReobjError, match=expected):
         rt.model_path("toy")
-    assert list(server.folder.iterdir()) == []
+    assert here(server) == []
 
 
 def test_no_network_says_what_to_do(server: Any) -> None:
@@ -234,7 +258,75 @@ def test_a_full_disk(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     why = r"toy.*\.onnx: cannot be written \(No space left on device\); make room on this disk"
     with pytest.raises(rt.ReobjError, match=why):
         rt.model_path("toy")
-    assert list(server.folder.iterdir()) == []
+    assert here(server) == []
+
+
+def test_the_page_of_a_captive_portal_is_no_file(server: Any) -> None:
+    """Also where neither size nor digest would tell it before it is read to its end."""
+    server.mode = "portal"
+    with pytest.raises(rt.ReobjError, match=r"a web page came instead: must you log in") as caught:
+        rt.model_path("toy")
+    assert "put it at" in str(caught.value) and here(server) == []
+
+
+def test_redirects_are_followed_but_never_off_https(
+    server: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.mode = "moved"
+    assert rt.model_path("toy").read_bytes() == BLOB
+    assert [path for path, _ in server.asked] == ["/toy.onnx", "/there"]
+    server.target.unlink()
+    headers = email.message.Message()
+    plain = weights.WEIGHTS[0].url
+    headers["Location"] = plain  # where the file can be had without encryption
+
+    def answers(_: Any, request: Any) -> Any:
+        made = urllib.response.addinfourl(io.BytesIO(), headers, request.full_url, 302)
+        made.msg = "Found"  # type: ignore[attr-defined]
+        return made
+
+    monkeypatch.setattr(urllib.request.HTTPSHandler, "https_open", answers)
+    row = dataclasses.replace(weights.WEIGHTS[0], url="https://example.org/toy.onnx")
+    monkeypatch.setattr(weights, "WEIGHTS", (row,))
+    server.asked.clear()
+    with pytest.raises(rt.ReobjError, match=f"redirected to {plain}, which is not encrypted"):
+        rt.model_path("toy")
+    assert server.asked == [] and here(server) == []  # not even asked
+
+
+FETCHES = """
+import dataclasses, sys, reobj_track as rt
+from reobj.sources import weights
+weights.WEIGHTS = (weights.Weights(*eval(sys.argv[1])),)
+print(rt.model_path("toy"))
+"""
+
+
+def test_two_downloads_at_once_are_one(server: Any, caplog: pytest.LogCaptureFixture) -> None:
+    """Of two processes one fetches, the other waits and takes the same file."""
+    server.mode = "slow"
+    row = repr(dataclasses.astuple(weights.WEIGHTS[0]))
+    command = [sys.executable, "-c", FETCHES, row]
+    pipe, root = subprocess.PIPE, str(Path(rt.__file__).parent)
+    env = os.environ | {"PYTHONPATH": root}
+    pair = [
+        subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=env) for _ in range(2)
+    ]
+    said = [process.communicate(timeout=60) for process in pair]
+    assert [out.strip() for out, _ in said] == [str(server.target)] * 2, said
+    assert server.asked == [("/toy.onnx", None)] and server.target.read_bytes() == BLOB
+    waits = ["waiting for it" in err for _, err in said]
+    assert sorted(waits) == [False, True] and here(server) == [server.target]
+
+
+def test_a_download_waits_for_another_but_not_for_ever(
+    server: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(weights, "DOWNLOAD_WAIT_S", 0.2)
+    with locked(server.folder / weights.DOWNLOAD_LOCK):
+        with pytest.raises(rt.ReobjError, match=r"\.lock: locked by another process"):
+            rt.model_path("toy")
+    assert server.asked == [] and rt.model_path("toy") == server.target
 
 
 # ---- Folders and states --------------------------------------------------------------------------

@@ -164,12 +164,33 @@ def test_the_source_is_found_from_anywhere(
     assert space.source[0] == str(tmp_path / "frames")
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"source": "a", "input": {"evry": 1}}'])
+FRAMES = '{"source": "a", "input": {}, "frames": {"size": [640, %s], "count": 3%s}}'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{", "[]", "{}", '{"source": "a", "input": {"evry": 1}}',
+        '{"source": 5, "input": {}}', '{"source": "a", "input": {"every": "x"}}',
+        '{"source": "a", "input": {"every": 1.5}}', '{"source": "a", "input": {}, "frames": []}',
+        FRAMES % (0, ""), FRAMES % ("NaN", ""), FRAMES % (480, ', "times_s": [1, "x"]'),
+        FRAMES % (480, ', "names": [5]'),
+    ],
+)  # fmt: skip
 def test_a_damaged_binding_is_said(tmp_path: Path, text: str) -> None:
     space = Workspace(tmp_path)
     (space.cache / "source.json").write_text(text)
     with pytest.raises(rt.ReobjError, match=r"source\.json"):
-        _ = space.source
+        space.video()
+
+
+def test_frames_without_images_are_bound_as_they_were(tmp_path: Path) -> None:
+    space = Workspace(tmp_path)
+    (space.cache / "source.json").write_text(FRAMES % (480, ', "times_s": [0, 1, 5]'))
+    assert [(f.index, f.time_s) for f in space.video()] == [(0, 0), (1, 1), (2, 5)]
+    (space.cache / "source.json").write_text(FRAMES % (480, ', "times_s": [0, 1]'))
+    with pytest.raises(rt.ReobjError, match="2 times of 3 frames; expected one each"):
+        space.video()
 
 
 # ---- The cache ----

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import Camera, Poses, invert_rigid
-from reobj.files import load_json, read_text
+from reobj.files import load_json, read_lines
 from reobj.sources.video import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError
 from reobj.views import VisiblePoints
@@ -187,7 +187,7 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
 def _matrix(path: Path) -> Array:
     """Read a 3x3 or 4x4 matrix of intrinsics."""
     with contextlib.suppress(ValueError):
-        K = np.array([row.split() for row in read_text(path).splitlines() if row.strip()], float)
+        K = np.array([row.split() for row in read_lines(path) if row.strip()], float)
         if K.shape in ((3, 3), (4, 4), (3, 4)) and min(K[0, 0], K[1, 1]) > 0:
             return K
     raise ReobjError(f"{path}: expected a 3x3 or 4x4 matrix of intrinsics")

@@ -15,7 +15,7 @@ import numpy as np
 
 from reobj.cameras import Camera, camera_parameters, checked_camera
 from reobj.files import load_json, read_text
-from reobj.types import ReobjError
+from reobj.types import COORDINATE_MAX, ReobjError
 
 NUMBERS = "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]"  # OpenCV's order
 CAMERA_FORMS = f"{NUMBERS}; MODEL WIDTH HEIGHT PARAMS as COLMAP has it; or a file"
@@ -42,6 +42,9 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     return None if camera is None else fitted_camera(camera, size, f"--camera {text:.200}")
 
 
+CAMERA_MAX = 1 << 20  # characters of a file; chosen: a thousand times what a camera takes
+
+
 def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
     """Parse as `parse_camera` does, without a look at the frames: the camera at its own size.
 
@@ -52,7 +55,7 @@ def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
         return None
     is_file = os.path.isfile(text)  # of any text, however long
     try:
-        content = read_text(Path(text)) if is_file else text
+        content = read_text(Path(text), CAMERA_MAX) if is_file else text
         if is_file and content.lstrip()[:1] in ("{", "["):
             camera = camera_from_json(load_json(Path(text)), size)
         else:
@@ -183,7 +186,7 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
         the camera at the size of the data; None without a focal length.
     """
     data = data | next((data[k] for k in ("camera", "intrinsics") if _is_object(data.get(k))), {})
-    size = next(((int(data[w]), int(data[h])) for w, h in SIZES if w in data), size)
+    size = next(((image_side(data[w]), image_side(data[h])) for w, h in SIZES if w in data), size)
     model = str(data.get("model", data.get("camera_model", ""))).upper()
     if size and model and "params" in data:
         return colmap_camera([model, *map(str, (*size, *data["params"]))])
@@ -196,6 +199,14 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
     if model in BROWN_MODELS:
         return brown_camera(size, *pinhole, *_terms(data, BROWN))
     return _camera_of_names(model, data, pinhole, _sized(size))
+
+
+def image_side(value: Any) -> int:
+    """Convert the width or height of images, px."""
+    side = float(value)
+    if not 1 <= side <= COORDINATE_MAX:
+        raise ReobjError(f"images of {side:g} pixels; expected a width and height")
+    return int(side)
 
 
 def _is_object(value: Any) -> bool:

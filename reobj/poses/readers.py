@@ -28,12 +28,13 @@ from reobj.cameras import (
     read_sparse_model,
     usable,
 )
-from reobj.files import load_json, read_text, spans
+from reobj.files import load_json, read_lines, spans
 from reobj.poses.intrinsics import (
     CAMERA_FORMS,
     camera_from_json,
     colmap_camera,
     fitted_camera,
+    image_side,
     parse_camera,
 )
 from reobj.poses.matching import interpolated, rows_by_name, rows_by_order, rows_by_time
@@ -177,7 +178,7 @@ def _pose_format(path: Path) -> str:
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield where each line of a text file is (for messages) and its words, without comments."""
-    for number, text in enumerate(read_text(path).splitlines(), 1):
+    for number, text in enumerate(read_lines(path), 1):
         if not text.lstrip().startswith("#"):
             yield f"{path}, line {number}", text.split()
 
@@ -243,7 +244,8 @@ def _checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
     last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
     what = "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)"
     _raise_where(last_row.max(1) > POSE_TOLERANCE, where, what)
-    rotation = matrix[:, :3, :3]
+    _check_places(matrix[:, :3, 3], where)
+    rotation = matrix[:, :3, :3].clip(-2, 2)  # the squares of 1e300 are too large
     error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))  # (N, 3, 3)
     what = "the 3x3 part is no rotation (rows not of length 1 and perpendicular)"
     what += "; expected a row-major rigid pose without scale"
@@ -253,6 +255,12 @@ def _checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
     u, _, vt = np.linalg.svd(rotation)
     exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
     return np.where(lost[:, None, None], np.nan, exact)
+
+
+def _check_places(translation: Array, where: Sequence[str]) -> None:
+    """Refuse translations (N, 3) beyond WORLD_MAX."""
+    far = (np.abs(translation) >= WORLD_MAX).any(1)
+    _raise_where(far, where, f"more than {WORLD_MAX:g} units away from the origin")
 
 
 def _raise_where(bad: Any, where: Sequence[str], problem: str) -> None:
@@ -265,7 +273,8 @@ def _from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> 
     """Make rigid transforms (N, 3, 4) of unit quaternions (N, 4) and translations (N, 3)."""
     finite = np.isfinite(np.column_stack([xyzw, translation])).all(1)
     _raise_where(~finite, where, "a number is not finite")
-    norm = np.linalg.norm(xyzw, axis=1)
+    _check_places(translation, where)
+    norm = np.linalg.norm(xyzw.clip(-2, 2), axis=1)
     what = "the quaternion is not of length 1; expected the columns of the format in its order"
     _raise_where(np.abs(norm - 1) > POSE_TOLERANCE, where, what)
     return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
@@ -275,7 +284,7 @@ def _read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read TUM rows: seconds, world_from_cam; metres unless the header is our own and says no."""
     rows, where = _read_table(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     world_from_cam = _from_quaternions(rows[:, 4:], rows[:, 1:4], where)
-    metric = re.search(f"^#.*{NO_SCALE}", read_text(path), re.MULTILINE) is None
+    metric = not any(re.match(f"#.*{NO_SCALE}", line) for line in read_lines(path))
     order = np.unique(rows[:, 0], return_index=True)[1]
     return PoseFile(invert_rigid(world_from_cam)[order], stamps_s=rows[order, 0], metric=metric)
 
@@ -286,7 +295,7 @@ def _read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
     try:
         rows = np.array(data["poses"], np.float64).reshape(-1, 7)
         fx, fy, cx, cy = (float(data["K"][i]) for i in (0, 4, 6, 7))
-        camera = Camera("PINHOLE", int(data["w"]), int(data["h"]), (fx, fy, cx, cy))
+        camera = Camera("PINHOLE", image_side(data["w"]), image_side(data["h"]), (fx, fy, cx, cy))
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise ReobjError(
             f"{path}: no Record3D metadata ({error!r}); expected poses (N x 7), K (9), w and h"
@@ -394,7 +403,8 @@ def _one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
     if not found:
         return None
     kinds = {(c.model, c.width, c.height) for c in found}
-    spread = found[-1].params[0] / found[0].params[0] - 1
+    least, most = found[0].params[0], found[-1].params[0]
+    spread = (most - least) / max(abs(least), 1e-9)
     if len(kinds) > 1 or spread > MAX_FOCAL_SPREAD:
         raise ReobjError(f"{path}: several different cameras; expected one (single_camera)")
     return found[len(found) // 2]
@@ -421,8 +431,11 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
         raise ReobjError(f"{found[0]}: the COLMAP model has no registered image")
     camera = _one_camera(model.cameras, found[0])
     seen = np.column_stack([model.obs_image, model.obs_point])
+    last_row = np.tile([0, 0, 0, 1.0], (len(model.names), 1, 1))
+    where = [f"{found[0] / 'images.bin'}, {name}" for name in model.names]
+    poses = _checked_rigid(np.concatenate([model.cam_from_world, last_row], 1), where)
     return PoseFile(
-        model.cam_from_world, camera, model.names, points=model.points, colors=model.colors,
+        poses, camera, model.names, points=model.points, colors=model.colors,
         visibility=seen,
     )  # fmt: skip
 

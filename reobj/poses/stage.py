@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from reobj.cameras import Poses, import_pycolmap, load_poses, save_poses, write_colmap
-from reobj.files import load_cached, part_path
+from reobj.files import load_cached, load_npz, part_path
 from reobj.poses.checks import check_poses
 from reobj.poses.depth import add_depth
 from reobj.poses.estimate import PosesConfig, estimate_poses
@@ -104,7 +104,7 @@ def reconstruct_cached(
     own = dataclasses.replace(config, depth="")
     path = workspace.path("poses", content, video.config, own, digest)
     model = path.with_suffix(".sparse")
-    if (known := load_cached(path, load_poses)) is not None:
+    if (known := load_cached(path, _load_reconstruction)) is not None:
         models = [part_path(model, k) for k in range(known.part_count)]
         return _with_depth(known, models, video, config, workspace)
     work = workspace.cache / "sfm"
@@ -114,9 +114,27 @@ def reconstruct_cached(
         for k in range(poses.part_count):
             shutil.rmtree(part_path(model, k), ignore_errors=True)
             part_path(work / "sparse", k).replace(part_path(model, k))
-        save_poses(path, poses)
+        save_poses(path, poses, models=_digest_of(model, poses.part_count))
     models = [part_path(model, k) for k in range(poses.part_count)]
     return _with_depth(poses, models, video, config, workspace)
+
+
+def _load_reconstruction(path: Path) -> Poses:
+    """Read cached poses; the models beside them must be those that were written with them."""
+    poses, model = load_poses(path), path.with_suffix(".sparse")
+    if load_npz(path)[1].get("models") != _digest_of(model, poses.part_count):
+        raise ReobjError(f"{model}: damaged, or not there")
+    return poses
+
+
+def _digest_of(model: Path, parts: int) -> str:
+    """Hash the files of the COLMAP models of all parts."""
+    digest = hashlib.sha256()
+    for folder in (part_path(model, k) for k in range(parts)):
+        for file in sorted(folder.glob("*")):
+            digest.update(f"{folder.name}/{file.name} {file.stat().st_size} ".encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def poses_key(poses: Poses | None) -> str:

@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from reobj.files import atomic, load_json, shortened
-from reobj.types import Array, BoolArray, IntArray, ReobjError, Tracks, box_iou
+from reobj.types import (
+    COORDINATE_MAX,
+    Array,
+    BoolArray,
+    IntArray,
+    ReobjError,
+    Tracks,
+    box_iou,
+)
 
 FORMAT = "reobj-edits"
 FORMAT_VERSION = 1
@@ -130,7 +138,7 @@ def _parse(entry: Any) -> Edit:
 
 def _box_ref(item: Any) -> BoxRef:
     box = tuple(float(value) for value in item["box"])
-    if len(box) != 4 or not np.isfinite(box).all():
+    if len(box) != 4 or not (np.abs(box) <= COORDINATE_MAX).all():  # NaN too
         raise ValueError(f"box {item['box']} is no box")
     if type(item["frame"]) is not int or type(item.get("id", 0)) is not int:
         raise ValueError(f"frame {item['frame']}, id {item.get('id')}: whole numbers")

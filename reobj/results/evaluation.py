@@ -24,6 +24,7 @@ from reobj.results.workspace import LAST_TRACKS, Workspace
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import InputConfig
 from reobj.types import (
+    CLASS_MAX,
     COCO_NAMES,
     Array,
     BoolArray,
@@ -86,7 +87,7 @@ def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) ->
     flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
     if rows.shape[1] != 9:  # MOT15 has ten: world coordinates in place of class and visibility
         return labelled(rows, "", np.where(flagged, ABSENT, SCORED))
-    number = rows[:, 7].astype(np.int64)
+    number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
     if (path.parent.parent / "seqinfo.ini").exists():
         role = np.where(flagged | (number != 1), ABSENT, SCORED)
         role[np.isin(number, MOT_DISTRACTORS)] = IGNORED
@@ -95,7 +96,9 @@ def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) ->
     known = path.with_name("gt_mot_format.json")
     names = {str(i): n for i, n in enumerate(class_names)}
     if known.exists():
-        names = load_json(known).get("classes", names)
+        stated = load_json(known)
+        stated = stated.get("classes") if isinstance(stated, dict) else None
+        names = {str(k): str(v) for k, v in (stated if isinstance(stated, dict) else names).items()}
     return labelled(rows, [names.get(str(n), str(n)) for n in number], hidden * IGNORED)
 
 

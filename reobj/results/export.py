@@ -62,7 +62,11 @@ def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
         raise ReobjError(f"no export called {to!r}; there are {', '.join(EXPORTS)}")
     name, write = EXPORTS[to]
     path = Path(path) if path else Path(out) / name
-    write(Result.load(out), path)
+    result = Result.load(out)
+    for identity in result.tracks.track_id[result.tracks.class_id < 0][:1]:
+        where = f"{Path(out) / 'tracks.txt'}: object {identity} is not in objects.json"
+        raise ReobjError(f"{where}: run the video again, or correct it by edits.json")
+    write(result, path)
     return path
 
 

@@ -22,28 +22,37 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Poses, load_poses, save_poses, write_tum
+from reobj.cameras import Poses, load_poses, save_poses
 from reobj.files import (
     atomic,
     load_json,
     load_npz,
     numbers,
     part_path,
-    part_paths,
     rounded,
     save_npz,
     shortened,
     texts_with_sigma,
-    without_secrets,
     wrapped,
 )
 from reobj.poses.floor import Floor
 from reobj.results.edits import Edits, write_edits
-from reobj.results.folder import LAST_POSES, replaced
+from reobj.results.folder import LAST_POSES, replaced, write_mot, write_trajectories
 from reobj.results.ply import write_ply
+from reobj.schema import faults, objects_schema
 from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import Video
-from reobj.types import Array, Embeddings, Floats, IntArray, LinkEvent, ReobjError, Tracks
+from reobj.types import (
+    Array,
+    Embeddings,
+    Floats,
+    IntArray,
+    LinkEvent,
+    ReobjError,
+    Tracks,
+    visible_name,
+    without_secrets,
+)
 
 FORMAT = "reobj-objects"
 FORMAT_VERSION = 1  # of objects.json
@@ -123,7 +132,7 @@ class Object:
         values = {f.name: entry[_JSON_KEYS.get(f.name, f.name)] for f in dataclasses.fields(Object)}
         for name in ("center", "half_axes", "quat_wxyz", "size", "size_m", "size_rel_sigma", "cov"):
             values[name] = None if values[name] is None else np.array(values[name], np.float64)
-        return Object(**values)
+        return Object(**values | {"class_name": visible_name(values["class_name"])})
 
 
 def sides(found: Object) -> list[tuple[str, ...]]:
@@ -362,7 +371,8 @@ class Result:
     def load(out: str | Path) -> Result:
         """Read what `save` wrote; without the fits and the embeddings.
 
-        Boxes come as tracks.txt has them, to .01 px, with the class of their object.
+        Boxes come as tracks.txt has them, to .01 px, with the class of their object (-1: there is
+        no such object, as in a file that was edited by hand).
 
         Raises:
             ReobjError: no `run` or `track` finished there, or another version wrote the folder.
@@ -370,27 +380,25 @@ class Result:
         out = Path(out)
         if not (out / "objects.json").is_file() or not (out / "tracks.txt").is_file():
             raise ReobjError(f"{out}: no objects.json and tracks.txt; make them first with `run`")
-        data = load_json(out / "objects.json")
-        try:
-            objects = [Object.from_json(entry) for entry in data["objects"]]
-            world = World.from_json(data["world"])
-            facts = {f.name: data["video"][f.name] for f in dataclasses.fields(VideoInfo)}
-            warnings = [str(text) for text in data.get("warnings", ())]
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ReobjError(f"{out / 'objects.json'}: {written_by(out)} ({error!r})") from error
+        path, poses = out / "objects.json", load_last_poses(out)
+        data = load_json(path)
+        for fault in faults(data, objects_schema()):
+            raise ReobjError(f"{path}: {fault}; {written_by(out)}")
+        objects = [Object.from_json(entry) for entry in data["objects"]]
+        world = World.from_json(data["world"])
+        facts = {f.name: data["video"][f.name] for f in dataclasses.fields(VideoInfo)}
         names = tuple(dict.fromkeys(o.class_name for o in objects))
         class_of = {o.id: names.index(o.class_name) for o in objects}
         rows = read_mot_rows(out / "tracks.txt")
         ids = rows[:, 1].astype(np.int64)
+        _check_together(objects, world, poses, out)
         unknown = np.full(len(rows), -1, np.int64)
         classes = np.array([class_of.get(i, -1) for i in ids.tolist()], np.int64)
         corners = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], 1)  # (N, 4)
         frame = rows[:, 0].astype(np.int64) - 1
         tracks = Tracks(frame, ids, ids, corners, rows[:, 6], classes, unknown)
-        poses = load_last_poses(out)
-        return Result(
-            tracks, names, VideoInfo(**facts), objects, world, poses, warnings=warnings, out=out
-        )
+        info, warnings = VideoInfo(**facts), data.get("warnings", [])
+        return Result(tracks, names, info, objects, world, poses, warnings=warnings, out=out)
 
     def keep_embeddings(
         self,
@@ -553,16 +561,6 @@ def written_by(out: Path) -> str:
     return f"{by}: run the video again"
 
 
-def write_trajectories(out: Path, poses: Poses) -> None:
-    """Write poses.txt, and poses_part1.txt, ... of further parts: a TUM file is one world."""
-    if not poses.known.any():
-        return
-    for old in part_paths(out / "poses.txt"):
-        old.unlink()
-    for k in range(poses.part_count):
-        write_tum(part_path(out / "poses.txt", k), poses.of_part(k))
-
-
 def load_last_poses(out: Path) -> Poses | None:
     """Read the latest poses of an output folder, None if it has none."""
     path = out / LAST_POSES
@@ -574,25 +572,24 @@ def load_last_poses(out: Path) -> Poses | None:
         raise ReobjError(f"{path}: {written_by(out)}") from error
 
 
-def validate_objects(path: Path) -> list[str]:
-    """Check an objects.json, or that of a folder, against objects.schema.json.
+def _check_together(
+    objects: Sequence[Object], world: World, poses: Poses | None, out: Path
+) -> None:
+    """Refuse what no schema can tell: the parts of a result that do not fit each other."""
+    own = [o.id for o in objects]
+    parts = 1 if poses is None else poses.part_count
+    fault = ""
+    if len(set(own)) != len(own):
+        fault = "two objects of one id"
+    for o in objects:
+        if o.quat_wxyz is not None and abs(np.linalg.norm(o.quat_wxyz) - 1) > UNIT_TOLERANCE:
+            fault = f"quat_wxyz of object {o.id} is not of length 1"
+        if o.part >= max(parts, len(world.parts)):
+            fault = f"object {o.id} is of part {o.part}, which is not there"
+    if parts not in (1, len(world.parts)):
+        fault = f"{len(world.parts)} parts of a path that has {parts}"
+    if fault:
+        raise ReobjError(f"{out / 'objects.json'}: {fault}; {written_by(out)}")
 
-    Returns:
-        one line for each fault.
-    """
-    try:
-        import jsonschema
-    except ImportError as error:
-        raise ReobjError("jsonschema is not installed: pip install jsonschema") from error
-    path = path / "objects.json" if path.is_dir() else path
-    schema = json.loads(Path(__file__).with_name("objects.schema.json").read_text())
-    faults = jsonschema.Draft202012Validator(schema).iter_errors(load_json(path))
-    return sorted(f"{path}: {fault.json_path}: {fault.message[:200]}" for fault in faults)
 
-
-def write_mot(path: Path, tracks: Tracks) -> None:
-    """Write MOTChallenge results: frame (from 1), id, left, top, width, height, score, 3 x -1."""
-    ltwh = np.column_stack([tracks.xyxy[:, :2], tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]])
-    rows = np.column_stack([tracks.frame + 1, tracks.track_id, ltwh, tracks.score])  # (N, 7)
-    with atomic(path) as part:
-        np.savetxt(part, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
+UNIT_TOLERANCE = 1e-3  # of a quaternion's length; chosen: rounded to six digits it is off by 1e-6

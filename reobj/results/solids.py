@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
-from reobj.files import load_json
+from reobj.files import load_json, read_lines
 from reobj.results.result import Object, Result
 from reobj.types import Array, ReobjError, log
 
@@ -34,8 +34,12 @@ def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
         center = np.array([e["center"] for e in seen], np.float64).reshape(-1, 3)
         half_axes = np.maximum(np.array(half, np.float64).reshape(-1, 3), MIN_HALF_AXIS)
         rotation = np.array(axes, np.float64).reshape(-1, 3, 3)
+        if not all(np.isfinite(part).all() for part in (center, half_axes, rotation)):
+            raise ValueError("a number is not finite")
         return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, rotation)
-    except (IndexError, KeyError, TypeError, AttributeError) as error:
+    except ReobjError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         expected = "objects with id, center, size and R, or half_axes and world_from_obj"
         raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
 
@@ -103,7 +107,7 @@ def _true_cameras(path: Path, poses: Poses) -> Array:
     TUM rows belong to the frame of their time; of 4x4 world_from_cam, row n belongs to frame n.
     """
     try:
-        table = np.loadtxt(path, ndmin=2)
+        table = np.loadtxt(read_lines(path), ndmin=2)
     except ValueError as error:
         raise ReobjError(f"{path}: {error}; expected TUM rows or 16 numbers a line") from error
     if table.shape[1] == 16:
@@ -113,8 +117,12 @@ def _true_cameras(path: Path, poses: Poses) -> Array:
     if table.shape[1] != 8:
         found = f"{table.shape[1]} columns"
         raise ReobjError(f"{path}: {found}; expected TUM rows of 8 numbers, or 16 numbers a line")
-    nearest = np.abs(table[:, :1] - poses.time_s[None]).argmin(0)  # (F,)
-    far = np.abs(table[nearest, 0] - poses.time_s) > SAME_TIME_S
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    after = np.searchsorted(table[:, 0], poses.time_s).clip(max=len(table) - 1)  # (F,)
+    pair = np.stack([(after - 1).clip(0), after])  # (2, F) the rows before and after
+    late = np.abs(table[pair, 0] - poses.time_s)  # (2, F)
+    nearest = np.where(late[0] <= late[1], *pair)  # (F,)
+    far = late.min(0) > SAME_TIME_S
     turn = np.full((len(nearest), 3, 3), np.nan)
     xyzw = table[nearest, 4:]
     whole = np.isfinite(xyzw).all(1) & (np.linalg.norm(xyzw, axis=1) > 0)

@@ -30,14 +30,41 @@ from reobj.files import (
 from reobj.results.edits import EDITS
 from reobj.results.folder import LAST_POSES, remove_stale
 from reobj.results.result import Result, load_last_poses, written_by
+from reobj.schema import faults
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
-from reobj.types import ReobjError
+from reobj.types import COORDINATE_MAX, ReobjError
 
 LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
 SOURCE = "cache/source.json"
 CONFIG_FILE = "config.toml"  # options of the last run, in an output folder
 LOCK = "cache/lock"
+
+
+_COUNT = {"type": "integer", "minimum": 0, "maximum": 2**31 - 1}
+SOURCE_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "required": ["source", "input"],
+    "properties": {
+        "source": {"type": "string"},
+        "input": {"type": "object", "additionalProperties": _COUNT},
+        "frames": {
+            "type": ["object", "null"],
+            "required": ["size"],
+            "properties": {
+                "size": {
+                    "type": "array",
+                    "items": {"type": "integer", "minimum": 1, "maximum": COORDINATE_MAX},
+                    "minItems": 2,
+                    "maxItems": 2,
+                },
+                "times_s": {"type": ["array", "null"], "items": {"type": "number"}},
+                "names": {"type": "array", "items": {"type": "string"}},
+                "count": _COUNT,
+            },
+        },
+    },
+}  # of SOURCE
 
 
 class Workspace:
@@ -128,18 +155,27 @@ class Workspace:
     @property
     def source(self) -> tuple[str, InputConfig]:
         """The video that the folder is bound to, and the options that it was read with."""
-        path = self.out / SOURCE
-        facts = load_json(path)
+        facts = self._binding()
         try:
             return str(facts["source"]), InputConfig(**facts["input"])
-        except (KeyError, TypeError) as error:
-            raise ReobjError(f"{path}: {written_by(self.out)} ({error!r})") from error
+        except TypeError as error:  # an option of another version
+            raise ReobjError(f"{self.out / SOURCE}: {written_by(self.out)} ({error})") from error
 
     def video(self) -> Video:
         """Open the video that the folder is bound to, read as it was."""
         source, config = self.source
-        frames = load_json(self.out / SOURCE).get("frames")
-        return ImagelessVideo(source, config=config, **frames) if frames else Video(source, config)
+        if not (frames := self._binding().get("frames")):
+            return Video(source, config)
+        more = {k: frames[k] for k in ("times_s", "names", "count") if k in frames}
+        return ImagelessVideo(source, frames["size"], config, **more)
+
+    def _binding(self) -> dict[str, Any]:
+        """Read what `bind` wrote."""
+        path = self.out / SOURCE
+        facts: dict[str, Any] = load_json(path)
+        for fault in faults(facts, SOURCE_SCHEMA):
+            raise ReobjError(f"{path}: {fault}; {written_by(self.out)}")
+        return facts
 
     def path(self, stage: str, *key: Any) -> Path:
         """Return the file for a stage's result under a key: its inputs and options.

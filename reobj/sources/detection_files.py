@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-import json
 import math
 import re
 import sys
@@ -23,7 +22,14 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from reobj.files import check_unpacked, did_you_mean, load_json, load_npz, read_text, shortened
+from reobj.files import (
+    check_unpacked,
+    did_you_mean,
+    load_json,
+    load_npz,
+    read_lines,
+    shortened,
+)
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, read_npz
 from reobj.sources.video import Video
@@ -66,7 +72,10 @@ class DetectConfig:
 
 def load_class_names(path: str | Path) -> tuple[str, ...]:
     """Read class names, one a line in the order of their ids; empty lines do not count."""
-    return tuple(line.strip() for line in read_text(Path(path)).splitlines() if line.strip())
+    names = tuple(filter(None, (line.strip() for line in read_lines(Path(path)))))
+    if len(names) > CLASS_MAX:
+        raise ReobjError(f"{path}: {len(names)} class names, at most {CLASS_MAX} are taken")
+    return names
 
 
 def unnamed_class(class_id: int, count: int) -> str:
@@ -131,23 +140,19 @@ def read_mot_rows(path: Path) -> Array:
     columns, cells, lines, is_mot = _table_cells(path)
     if not is_mot:
         raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
-    numbers = [_column([row[i] for row in cells], lines, path) for i in range(len(columns))]
-    return np.stack(numbers, 1)
+    texts = [[row[i] for row in cells] for i in range(len(columns))]
+    rows = np.stack([_column(column, lines, path) for column in texts], 1)  # (N, 6 to 10)
+    for at in (0, 1):
+        _check_whole(rows[:, at], texts[at], lines, path, columns[at])
+    if (far := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
+        box, line = rows[far][0, 2:6], lines[far][0]
+        raise ReobjError(f"{path}, line {line}: box {box}, expected at most {COORDINATE_MAX:g} px")
+    return rows
 
 
 MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
-NUMBERS = (
-    "frame",
-    "time",
-    "id",
-    "x1",
-    "y1",
-    "x2",
-    "y2",
-    "w",
-    "h",
-    "score",
-)  # columns that hold numbers
+NUMBERS = ("frame", "time", "id", "x1", "y1", "x2", "y2", "w", "h", "score")
+ROLES = (*NUMBERS, "class")  # of columns; those before hold numbers
 
 
 WHOLE_MAX = 2.0**53  # of frame and identity; beyond, a float skips whole numbers
@@ -158,17 +163,12 @@ def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetec
     columns, cells, lines, is_mot = _table_cells(path)
     texts = {role: [row[i] for row in cells] for i, role in enumerate(columns)}
     column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
-    for role in ("frame", "id"):
-        whole = np.abs(column.get(role, np.zeros(0))) <= WHOLE_MAX
-        if role == "frame" and role in column:
-            whole &= column[role] % 1 == 0
-        if not whole.all():
-            line = int(lines[whole.argmin()])
-            raise ReobjError(f"{path}, line {line}: {role} {texts[role][whole.argmin()]}, expected "
-                             "a whole number")  # fmt: skip
     if is_mot and (column["id"] % 1 != 0).any():
         raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
                          "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
+    for role in ("frame", "id"):
+        if role in column:
+            _check_whole(column[role], texts[role], lines, path, role)
     if "x2" not in column:
         column["x2"], column["y2"] = column["x1"] + column["w"], column["y1"] + column["h"]
     xyxy = np.stack([column[role] for role in ("x1", "y1", "x2", "y2")], 1)  # (N, 4)
@@ -197,24 +197,34 @@ def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray
     """Split a table into cells.
 
     Returns:
-        What each column holds (a name of MOT_COLUMNS, "x2", "y2", or any other of a header), the N
-        rows of cells, the lines they stand on (N,), and whether it is MOT (no header).
+        What each column holds (a name of ROLES), the N rows of cells, the lines they stand on (N,),
+        and whether it is MOT (no header). Other columns of a header are left out.
     """
-    reader = csv.reader(read_text(path).splitlines(keepends=True), strict=True)
+    reader = csv.reader(read_lines(path), strict=True)
+    columns: tuple[str, ...] = ()
+    expected, is_mot = "6 to 10 (frame, id, left, top, w, h, score)", False
+    kept, lines = list[list[str]](), list[int]()
+    used: list[int] = []  # numbers of the columns that mean something here
     try:
-        rows = [(reader.line_num, cells) for cells in reader if cells]
+        for cells in filter(None, reader):
+            if not columns:
+                is_mot = cells[0].strip()[:1] in "+-.0123456789"
+                columns = MOT_COLUMNS[: len(cells)] if is_mot else _csv_columns(cells, path)
+                used = [i for i, role in enumerate(columns) if is_mot or role in ROLES]
+                if not is_mot or len(cells) in range(6, 11):
+                    expected = str(len(columns))
+                if not is_mot:
+                    continue
+            if str(len(cells)) != expected:
+                where = f"{path}, line {reader.line_num}"
+                raise ReobjError(f"{where}: {len(cells)} columns, expected {expected}")
+            kept.append([cells[i].strip() for i in used])
+            lines.append(reader.line_num)
     except csv.Error as error:
         raise ReobjError(f"{path}, line {reader.line_num}: no table ({error})") from error
-    is_mot = not rows or rows[0][1][0].strip()[:1] in "+-.0123456789"
-    columns = MOT_COLUMNS if is_mot else _csv_columns(rows.pop(0)[1], path)
-    width = len(rows[0][1]) if is_mot and rows else len(columns)
-    known = not is_mot or width in range(6, 11)
-    expected = str(width) if known else "6 to 10 (frame, id, left, top, w, h, score)"
-    for line, cells in rows:
-        if str(len(cells)) != expected:
-            raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {expected}")
-    stripped = [[cell.strip() for cell in row] for _, row in rows]
-    return tuple(columns[:width]), stripped, np.array([line for line, _ in rows], np.int64), is_mot
+    is_mot, columns = is_mot or not columns, columns or MOT_COLUMNS
+    roles = tuple(columns[i] for i in used) if used else columns
+    return roles, kept, np.array(lines, np.int64), is_mot
 
 
 def _frames_at(time_s: Array, video: Video, path: Path) -> Array:
@@ -293,6 +303,17 @@ def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
         if not math.isfinite(values[i]):
             raise ReobjError(f"{path}, line {lines[i]}: {cell!r} is no finite number")
     return values
+
+
+def _check_whole(
+    values: Array, cells: Sequence[str], lines: IntArray, path: Path, role: str
+) -> None:
+    """Refuse a column of numbers (N,) that are not whole, or beyond WHOLE_MAX."""
+    bad = (np.abs(values) > WHOLE_MAX) | (values % 1 != 0)
+    if bad.any():
+        row = int(bad.argmax())
+        where = f"{path}, line {lines[row]}: {role}"
+        raise ReobjError(f"{where} {cells[row]}, expected a whole number")
 
 
 def _table_classes(
@@ -390,7 +411,7 @@ def _dataset(path: Path, own: Any) -> dict[str, Any] | None:
     data = own if isinstance(own, dict) else None
     for other in sorted(path.parent.glob("*.json")) if data is None else ():
         with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
-            found = json.loads(other.read_text()) if other != path else None
+            found = load_json(other) if other != path else None
             data = found if isinstance(found, dict) and found.get("images") else data
     return data
 

@@ -53,6 +53,9 @@ class ImagelessVideo(Video):
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
         self.times_s = given
         self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
+        if given is not None and len(given) < self.frame_count:
+            what = f"{len(given)} times of {self.frame_count} frames"
+            raise ReobjError(f"{self.source}: {what}; expected one each")
         self.fps = IMAGE_FPS
         if given is not None and len(given) > 1:
             self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)

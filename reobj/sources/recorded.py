@@ -13,9 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reobj.files import load_npz, save_npz
+from reobj.files import LINES_MAX, NPZ_MAX, load_npz, save_npz
 from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
-from reobj.types import Array, BoolArray, Detections, IntArray, ReobjError, visible_name
+from reobj.types import CLASS_MAX, Array, BoolArray, Detections, IntArray, ReobjError, visible_name
 
 
 @dataclass(slots=True)
@@ -121,6 +121,9 @@ KINDS = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_
          "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
 
 
+SIZES = {"frame": LINES_MAX, "class_names": CLASS_MAX, "mask_counts": NPZ_MAX // 4}  # as uint32
+
+
 def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
 ) -> tuple[RecordedDetections, IntArray]:
@@ -133,7 +136,10 @@ def read_npz(
         without a detection (where the file does not say: the frame of every detection).
     """
     data, _ = load_npz(path, sealed)
-    count = len(data.get("frame", ()))
+    for key, most in SIZES.items():
+        if key in data and data[key].size > most:
+            raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are taken")
+    count = len(np.atleast_1d(data.get("frame", ())))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
     shapes = {"frame": (count,), "xyxy": (count, 4), "score": (count,), "class_id": (count,),

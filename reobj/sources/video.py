@@ -28,8 +28,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from reobj.files import shortened, without_secrets
-from reobj.types import Array, Frame, Image, ReobjError, option
+from reobj.files import shortened
+from reobj.types import Array, Frame, Image, ReobjError, log, option, without_secrets
 
 IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
 
@@ -44,6 +44,9 @@ class InputConfig:
     max_size: int = option(
         0, "shrink frames whose longer side has more pixels to this (0: never)", "--max-size"
     )
+    reconnect: int = option(
+        0, "times to connect again to a live source that ended, after 1, 2, 4, ... 30 s"
+    )
 
 
 STREAM_URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
@@ -52,6 +55,8 @@ MISSING_SHARE = 0.02  # of the announced frames; chosen: containers often announ
 LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: one to work on next and the newest one
 LIVE_POLL_S = 0.5  # chosen: longer than the reading thread takes to say that it ends
 LIVE_TIMEOUT_S = 2.0  # chosen: no frame for so long, and a live source has ended
+OPEN_TIMEOUT_S = 5.0  # chosen: cameras answer within 2 s; OpenCV's own is 30 s
+RECONNECT_S = (1.0, 30.0)  # chosen: before the first attempt, twice as long before each, at most
 
 
 # Image names that are time stamps (TUM: 1305031102.175304.png)
@@ -121,7 +126,7 @@ class Video:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.skipped: list[int] = []
         self.messages: list[str] = []
-        self.read = self.dropped = 0
+        self.read = self.dropped = self._seen = 0
         self._opened: Any = None  # capture of a live source, until it is iterated
         self._is_url = bool(STREAM_URL.match(self._address))
         self.fingerprint = source_fingerprint(source)
@@ -206,13 +211,37 @@ class Video:
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
         """Yield number, time in s since the start and image of the newest frames of a live source.
 
-        A thread reads all frames, so that the driver's own queue never fills with old ones.
+        Where it ends, connect again as often as the config says; the frames are counted on.
         """
         capture, self._opened = self._opened or self._open(), None
+        self.read = self.dropped = self._seen = attempts = 0
+        began = time.monotonic()
+        while capture is not None:
+            before = self._seen
+            yield from self._from_connection(capture, began)
+            attempts = attempts if self._seen == before else 0  # in a row without a frame
+            capture = None
+            while capture is None and attempts < self.config.reconnect:
+                if 0 < self.config.stop <= self._seen:
+                    break
+                wait_s = min(RECONNECT_S[0] * 2.0 ** min(attempts, 9), RECONNECT_S[1])
+                attempts += 1
+                log.warning("%s: ended; connecting again in %g s", self.source, wait_s)
+                time.sleep(wait_s)
+                with contextlib.suppress(ReobjError):
+                    capture = self._open()
+
+    def _from_connection(
+        self, capture: Any, began: float
+    ) -> Iterator[tuple[int, float, Image | None]]:
+        """Yield the newest frames until a connection ends.
+
+        A thread reads all frames, so that the driver's own queue never fills with old ones.
+        """
         frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_QUEUE)
         stopped, self._came = threading.Event(), time.monotonic()
         thread = threading.Thread(
-            target=self._read_live, args=(capture, frames, stopped), daemon=True
+            target=self._read_live, args=(capture, frames, stopped, began), daemon=True
         )
         thread.start()
         try:
@@ -220,7 +249,8 @@ class Video:
                 yield item
         finally:
             stopped.set()
-            thread.join(LIVE_TIMEOUT_S / 2)
+            hangs = time.monotonic() - self._came > LIVE_TIMEOUT_S
+            thread.join(0.0 if hangs else LIVE_TIMEOUT_S / 2)
             if not thread.is_alive():  # else it hangs in the driver; the process may still end
                 capture.release()
 
@@ -239,20 +269,22 @@ class Video:
         capture: Any,
         frames: queue.Queue[tuple[int, float, Image] | None],
         stopped: threading.Event,
+        began: float,
     ) -> None:
         """Read a live source until it ends or `stopped`; drop the oldest frame of a full queue."""
-        began = last = time.monotonic()
-        self.read = self.dropped = index = 0
+        last = time.monotonic()
         try:
             while not stopped.is_set() and time.monotonic() - last < LIVE_TIMEOUT_S:
-                if 0 < self.config.stop <= index:
+                if 0 < self.config.stop <= self._seen:
                     break
                 ok, image = capture.read()
                 if not ok:
                     time.sleep(0.01)
                     continue
+                if stopped.is_set():  # the driver hung; another connection counts now
+                    break
                 self._came = last = time.monotonic()
-                at, index = index, index + 1
+                at, self._seen = self._seen, self._seen + 1
                 if at < self.config.start or (at - self.config.start) % self.config.every:
                     continue
                 self.read += 1
@@ -276,7 +308,13 @@ class Video:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         is_camera = self.is_live and self._address.isdecimal()
-        capture = cv2.VideoCapture(int(self._address) if is_camera else self._address)
+        timeout_ms = round(1000 * OPEN_TIMEOUT_S)
+        timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
+        timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
+        if self._is_url:
+            capture = cv2.VideoCapture(self._address, cv2.CAP_ANY, timeouts)
+        else:
+            capture = cv2.VideoCapture(int(self._address) if is_camera else self._address)
         cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
             what = "video (damaged, or no video)"

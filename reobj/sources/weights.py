@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reobj.files import Progress, atomic
+from reobj.files import LockedError, Progress, atomic, locked
 from reobj.types import ReobjError, log
 
 # Mean and standard deviation of the pixels of ImageNet, RGB, 0..255 (torchvision: .485, .456, .406
@@ -186,19 +186,35 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
 
 def _fetch(weights: Weights, offline: bool) -> Path:
     """Download weights into the first writable folder; keep the file only if its digest fits."""
-    expected = f"{weights.digest_kind} {weights.digest}"
     missing = f"model {weights.name} is not in {' nor '.join(map(str, _model_folders()))},"
     by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
     if offline:
         raise ReobjError(f"{missing} and --offline forbids the download: "
                          f"fetch {weights.url} elsewhere and {by_hand}{weights.fallback}"
                          )  # fmt: skip
+    target = _writable_folder() / weights.file
+    lock = target.with_name(DOWNLOAD_LOCK)
+    with contextlib.suppress(LockedError), locked(lock):
+        return _fetch_alone(weights, target, missing, by_hand)
+    log.warning("another process is fetching weights into %s: waiting for it", target.parent)
+    with locked(lock, DOWNLOAD_WAIT_S):
+        return _fetch_alone(weights, target, missing, by_hand)
+
+
+DOWNLOAD_LOCK = ".lock"  # in the folder of weights
+DOWNLOAD_WAIT_S = 600.0  # chosen: 100 MB at 1.3 Mbit/s
+
+
+def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> Path:
+    """Download weights to `target` unless another process has done so meanwhile."""
+    if target.is_file() and weights.digest_of(target) == weights.digest:
+        return target
+    expected = f"{weights.digest_kind} {weights.digest}"
     size = f"{weights.size / 1e6:.1f} MB" if weights.size else "size unknown"
     log.warning(
         "fetching %s: %s, licence %s, from %s, %s",
         weights.name, size, weights.licence, weights.url, expected,
     )  # fmt: skip
-    target = _writable_folder() / weights.file
     try:
         with atomic(target) as part:
             _download(weights, part)
@@ -233,15 +249,31 @@ DOWNLOAD_MAX = 100_000_000  # bytes of a file of unknown size; chosen: several t
 DOWNLOAD_TIMEOUT_S = 30  # chosen: no byte for so long, and the connection counts as cut
 
 
+WEB_PAGES = ("text/html", "application/xhtml+xml")  # what captive portals answer with
+
+
+class StaysEncrypted(urllib.request.HTTPRedirectHandler):
+    """Follow redirects, but never from an encrypted connection to one that is not."""
+
+    def redirect_request(
+        self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, to: Any
+    ) -> Any:
+        """Return the request that follows a redirect."""
+        if req.full_url.startswith("https:") and not to.startswith("https:"):
+            raise ConnectionError(f"redirected to {to}, which is not encrypted")
+        return super().redirect_request(req, fp, code, msg, headers, to)
+
+
 def _download(weights: Weights, part: Path) -> None:
     """Write the file behind the URL to `part`; a connection cut early is an error."""
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
+    opener = urllib.request.build_opener(StaysEncrypted)
     with (
-        urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_S) as response,
+        opener.open(request, timeout=DOWNLOAD_TIMEOUT_S) as response,
         part.open("wb") as file,
     ):
-        if weights.url.startswith("https:") and not response.url.startswith("https:"):
-            raise ConnectionError(f"redirected to {response.url}, which is not encrypted")
+        if response.headers.get_content_type() in WEB_PAGES:
+            raise ConnectionError("a web page came instead: must you log in to this network first?")
         size, done = weights.size or min(response.length or 0, DOWNLOAD_MAX), 0
         with Progress("fetch kB", size // 1000) as progress:
             while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
