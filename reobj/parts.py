@@ -19,7 +19,7 @@ from reobj.cameras import Poses, place_of
 from reobj.files import shortened
 from reobj.identity.gaps import fill_by_place, fill_gaps
 from reobj.identity.linking import FRAGMENT_GAP, link
-from reobj.identity.locate import Located, best_scores, confidence, floor_under, locate
+from reobj.identity.locate import Located, confidence, floor_under, locate, log_mean_odds
 from reobj.identity.occlusion import hidden_edges
 from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
 from reobj.results.edits import Edits, apply_edits
@@ -217,7 +217,7 @@ def _confidences(
         own = solid[rows][solid[rows] >= 0]
         sure = located.confidence[own[:1]]
         if not len(own):
-            score = best_scores(tracks.score[rows], np.zeros(len(rows), np.int64), 1)
+            score = log_mean_odds(tracks.score[rows], np.zeros(len(rows), np.int64), 1)
             sure = confidence(score, np.array([np.nan]), located.usual_score)
         found[int(tracks.track_id[rows[0]])] = float(sure[0])
     return found

@@ -6,6 +6,7 @@ less than a minute; `pytest -n 0 tests/test_properties.py --hypothesis-profile l
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import warnings
@@ -270,7 +271,7 @@ def replaced(data: Any, path: tuple[Any, ...], value: Any) -> None:
     if value == "gone":
         del data[path[-1]]
     else:
-        data[path[-1]] = value
+        data[path[-1]] = copy.deepcopy(value)
 
 
 @pytest.fixture(scope="module")

@@ -24,11 +24,10 @@ from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
 from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
 
-# Log odds that an object is there: constant, by the log odds of its best scores, by the share of
-# the frames that should show it and do. Fitted to 385 solids of 17 runs (docs/tracking.md)
-CONFIDENCE = (-1.7, 1.45, 1.5)
-BEST = 0.9  # quantile of the scores: most views of a half-hidden thing are poor, its best are not
-NO_SOLID = -4.2  # instead of the constant where no solid explains it (12 of 150 were real)
+# Log odds that an object is there: constant, by the log of the mean odds of its scores, by the
+# share of the frames that should show it and do. Fitted to 399 solids of 17 runs (docs/tracking.md)
+CONFIDENCE = (-0.5, 1.5, 1.3)
+NO_SOLID = -3.3  # instead of the constant where no solid explains it (12 of 150 were real)
 # Share of a recording's mean log odds, where it is below 0, that is forgiven: some detectors score
 # low throughout, in dark rooms most
 RELATIVE = 0.5
@@ -126,25 +125,28 @@ def floor_under(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | Non
     return None if plane is None else quadrics.Floor(plane.normal, plane.offset, plane.sigma)
 
 
-def confidence(best_score: Array, share: Array, usual_score: float) -> Array:
+def confidence(score: Array, share: Array, usual_score: float) -> Array:
     """Return the probability that objects are there, each a thing of its own.
 
     Args:
-        best_score: log odds of the scores of its best detections (`BEST`).
+        score: `log_mean_odds` of its detections.
         share: of the frames that should show it and do; NaN where no solid tells which should.
         usual_score: mean log odds of the scores of all solids' detections.
     """
     constant, of_score, of_share = CONFIDENCE
     place = np.where(np.isnan(share), NO_SOLID, constant + of_share * share)
-    score = best_score - RELATIVE * min(usual_score, 0.0)
+    score = score - RELATIVE * min(usual_score, 0.0)
     return np.asarray(1 / (1 + np.exp(-place - of_score * score)))
 
 
-def best_scores(score: Array, group: IntArray, count: int) -> Array:
-    """Return the log odds (count,) of the best scores (N,) of each group, NaN without any."""
-    odds = logit(score)
-    own = [odds[group == k] for k in range(count)]
-    return np.array([np.quantile(x, BEST) if len(x) else np.nan for x in own])
+def log_mean_odds(score: Array, group: IntArray, count: int) -> Array:
+    """Return the log of the mean odds (count,) of the scores (N,) of each group, -inf without any.
+
+    The odds of the best views decide: most views of a half-hidden thing are poor.
+    """
+    odds = np.bincount(group, np.exp(logit(score)), count)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(odds / np.bincount(group, minlength=count).clip(1)))
 
 
 def _confidence(found: Association, detected: Detected) -> tuple[Array, float]:
@@ -152,7 +154,7 @@ def _confidence(found: Association, detected: Detected) -> tuple[Array, float]:
     owned = np.flatnonzero(found.owner >= 0)
     solid, view = found.owner[owned], detected.view[owned]
     expected, odds = found.evidence.expected, logit(detected.score[owned])
-    score = best_scores(detected.score[owned], solid, len(found.solids))
+    score = log_mean_odds(detected.score[owned], solid, len(found.solids))
     shown = np.bincount(solid, expected[view, solid], len(found.solids))
     usual = float(odds.mean()) if len(odds) else 0.0
     return confidence(score, shown / expected.sum(0).clip(1), usual), usual
