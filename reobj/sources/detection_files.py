@@ -437,8 +437,9 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
         finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
     finite &= (np.abs(found.xyxy) <= COORDINATE_MAX).all(1)
     named = np.isin(found.class_id, np.arange(len(found.class_names)))
-    pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,) 0: no mask
-    fits = (pixels == 0) | (pixels == math.prod(found.size))
+    pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,)
+    masked = np.array([len(runs) > 0 for runs in found.runs], bool)
+    fits = ~masked | (pixels == math.prod(found.size))
     for row in np.flatnonzero(~(finite & named & fits))[:1]:
         text = f"mask of {pixels[row]} pixels in a video of {found.size}"
         if not finite[row]:
