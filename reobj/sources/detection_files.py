@@ -425,7 +425,10 @@ def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
     counts = mask["counts"]
     if tuple(mask["size"]) != size[::-1]:
         raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
-    return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
+    runs = coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
+    if runs.ndim != 1:
+        raise ReobjError(f"{where}: a mask's counts are {counts!r}, expected run lengths")
+    return runs
 
 
 def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_count: int) -> None:
