@@ -291,7 +291,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": [0, 0]})),
          r"entry 0: mask of 0 pixels in a video of \(640, 480\)"),
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": 9})),
-         r"entry 0: a mask's counts are 9, expected run lengths"),
+         r"entry 0: mask of 9 pixels in a video of \(640, 480\)"),
         ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: .*NaN, infinite"),
         ("d.json", json.dumps(coco_entries(image_id="x")), "not as expected"),
         ("d.json", "[1, 2]", "not as expected"),

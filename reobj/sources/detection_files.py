@@ -425,10 +425,7 @@ def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
     counts = mask["counts"]
     if tuple(mask["size"]) != size[::-1]:
         raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
-    runs = coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32)
-    if runs.ndim != 1:
-        raise ReobjError(f"{where}: a mask's counts are {counts!r}, expected run lengths")
-    return runs
+    return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32).ravel()
 
 
 def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_count: int) -> None:
