@@ -19,9 +19,23 @@ from reobj.cameras import Poses, place_of
 from reobj.files import shortened
 from reobj.identity.gaps import fill_by_place, fill_gaps
 from reobj.identity.linking import FRAGMENT_GAP, link
-from reobj.identity.locate import Located, confidence, floor_under, locate, log_mean_odds
+from reobj.identity.locate import (
+    Located,
+    confidence,
+    floor_under,
+    locate,
+    log_mean_odds,
+    on_floor,
+)
 from reobj.identity.occlusion import hidden_edges
-from reobj.objects import MIN_SCORE, ObjectsConfig, describe_objects, describe_world, fitter
+from reobj.objects import (
+    MIN_SCORE,
+    ObjectsConfig,
+    describe_objects,
+    describe_world,
+    fitter,
+    name_of,
+)
 from reobj.results.edits import Edits, apply_edits
 from reobj.results.result import Result
 from reobj.types import (
@@ -82,7 +96,9 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
             else:
                 solid = np.array([linked.solid_of.get(identity, -1) for identity in classes])
                 floor, ellipsoids = located.floor, located.ellipsoids[solid]
-            views = dataclasses.replace(views, hidden=hidden_edges(views, ellipsoids))
+            stands = on_floor(priors, [name_of(result.class_names, c) for c in classes.values()])
+            hidden = hidden_edges(views, ellipsoids, stands & (floor is not None))
+            views = dataclasses.replace(views, hidden=hidden)
             up = None if floor is None else floor.normal
             fits[k] = fit(views, list(classes.values()), Scene(floor, up))
         found = describe_objects(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -198,6 +199,29 @@ def test_a_thing_that_is_detected_twice_is_one_thing(off_px: float, name: str) -
     assert np.unique(found).tolist() == [-1, 0, 1, 2]
 
 
+def test_chairs_at_a_table_are_as_wide_as_where_they_are_seen_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In three of four frames only the narrow upper half of every chair shows."""
+    floor = quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.01)
+    poses = walk()
+    table = table_of(poses)
+    back = table.frame % 4 != 0
+    x1, y1, x2, y2 = table.xyxy.T
+    half = np.stack([0.75 * x1 + 0.25 * x2, y1, 0.25 * x1 + 0.75 * x2, (y1 + y2) / 2], 1)
+    seen = dataclasses.replace(table, xyxy=np.where(back[:, None], half, table.xyxy))
+    fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    width = {}
+    for standing, rounds in ((True, association.WIDENED), (True, 0), (False, association.WIDENED)):
+        monkeypatch.setattr(association, "WIDENED", rounds)
+        monkeypatch.setattr(locating, "floor_under", Mock(return_value=floor if standing else None))
+        found = locate(seen, NAMES, poses, fit, priors)
+        assert (found.solid >= 0).mean() > 0.9 and len(found.confidence) == 3
+        width[standing, rounds > 0] = found.ellipsoids.half_axes[:3, :2].mean()
+    assert abs(width[True, True] / 0.29 - 1) < 0.1
+    assert max(width[True, False], width[False, True]) < 0.85 * width[True, True]
+
+
 @pytest.mark.parametrize("metric", [True, False])
 def test_no_detections_are_fitted_twice_and_the_first_scale_holds(metric: bool) -> None:
     """The first fit finds the scale; what follows asks for sets of detections not fitted yet."""
@@ -245,7 +269,9 @@ def association_of(solids: Solids, poses: rt.Poses) -> tuple[Associator, Associa
     table = table_of(poses)
     detected = detected_in(table, poses)
     made = Associator(
-        detected, lambda rows, solid, classes: solids[np.unique(solid)], lambda s: np.zeros(len(s))
+        detected,
+        lambda rows, solid, classes, before: solids[np.unique(solid)],
+        lambda s: np.zeros(len(s)),
     )
     return made, made._assign(solids, np.full(len(table), -1))
 
@@ -306,7 +332,9 @@ def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatc
         return dataclasses.replace(now, owner=states[len(rounds) % 2])
 
     for step in ("_refitted", "_thinned", "_merged"):
-        monkeypatch.setattr(made, step, turned if step == "_merged" else lambda now: now)
+        monkeypatch.setattr(
+            made, step, turned if step == "_merged" else lambda now, widened=False: now
+        )
     made.run(chairs())
     assert len(rounds) == 3
 

@@ -306,9 +306,9 @@ def test_solids_of_merged_objects_hide_nothing(
     tracks = tracks_of(poses)
     asked: list[quadrics.Ellipsoids] = []
 
-    def noted(views: Any, ellipsoids: quadrics.Ellipsoids) -> Any:
+    def noted(views: Any, ellipsoids: quadrics.Ellipsoids, on_floor: Any) -> Any:
         asked.append(ellipsoids)
-        return hidden_edges(views, ellipsoids)
+        return hidden_edges(views, ellipsoids, on_floor)
 
     monkeypatch.setattr(parts, "hidden_edges", noted)
     plain = unlinked(poses, tracks)

@@ -9,6 +9,7 @@ should show a solid and does not, and against every solid.
  3. refit    each solid to its detections
  4. thin     drop solids that bring less than they cost, as others explain their detections too
  5. merge    two solids where one explains the detections of both
+ 6. widen    refit, but boxes that end above the floor do not tell how wide a thing is
 """
 
 from __future__ import annotations
@@ -37,9 +38,11 @@ COINCIDE = 0.5  # half widths; centres nearer than that are one thing, whatever 
 ALIKE = float(np.log(1.4))  # of mean sizes; if so, also where the classes differ (laptop and tv)
 MIN_DETECTIONS = 3  # of a solid; fewer do not determine it
 MAX_ROUNDS = 10  # of steps 2 to 5 (chosen)
+WIDENED = 2  # rounds of step 6 (chosen)
 
-# detections (K,), the solid of each (K,), the classes (S,) of the solids -> S solids
-Refit = Callable[[IntArray, IntArray, IntArray], Solids]
+# detections (K,), the solid of each (K,), the classes (S,) of the solids, and the solids so far if
+# edges of boxes may be hidden by the floor's place (else None) -> S solids
+Refit = Callable[[IntArray, IntArray, IntArray, Solids | None], Solids]
 SizeLogOdds = Callable[[Solids], Array]  # (S,) of the sizes by the categories
 
 
@@ -98,6 +101,8 @@ class Associator:
             if (state := now.owner.tobytes()) in known:
                 break
             known.add(state)
+        for _ in range(WIDENED):  # not before: wide solids swallow their neighbours
+            now = self._refitted(now, widened=True)
         return now
 
     def _empty(self, solids: Solids) -> Association:
@@ -171,14 +176,14 @@ class Associator:
             owner[row_at[j[good]]] = solid_at[i[good]]
         return Association(solids, owner, evidence, self.size_log_odds(solids))
 
-    def _refitted(self, now: Association) -> Association:
+    def _refitted(self, now: Association, widened: bool = False) -> Association:
         """Fit the solids to their detections, in the class that most of them have."""
         owned = np.flatnonzero(now.owner >= 0)
         solid, label = now.owner[owned], self.detected.class_id[owned].clip(0)
         votes = np.zeros((len(now.solids), int(label.max(initial=0)) + 1))
         np.add.at(votes, (solid, label), self.detected.score[owned])
         classes = np.where(votes.any(1), votes.argmax(1), now.solids.class_id)
-        fitted = self.refit(owned, solid, classes)
+        fitted = self.refit(owned, solid, classes, now.solids if widened else None)
         well = np.isfinite(fitted.ellipsoids.center_in_world).all(1)
         both = Solids.concatenate([now.solids, fitted])
         pick = np.arange(len(fitted)) + np.where(well, len(fitted), 0)
@@ -226,7 +231,7 @@ class Associator:
         if not len(strong):
             return now
         row, pair = self._joint_rows(now.owner, strong, weak)
-        fitted = self.refit(row, pair, now.solids.class_id[strong])
+        fitted = self.refit(row, pair, now.solids.class_id[strong], None)
         more = self._joint_gains(now.owner, strong, weak, fitted) - gain[strong] - gain[weak]
         one_place = _coincide(now.solids)[strong, weak]
         more[one_place & np.isfinite(more)] = np.inf

@@ -7,7 +7,7 @@ solid. What moves, and what no solid explains, is left to appearance (`reobj.ide
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from reobj.cameras import Poses, undistort_boxes
 from reobj.identity.association import Association, Associator, Refit
 from reobj.identity.evidence import Detected, Solids, logit
 from reobj.identity.linking import cut_at_gaps
+from reobj.identity.occlusion import edges_above_floor
 from reobj.identity.proposals import propose
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
@@ -87,17 +88,15 @@ def locate(
     fits = fit(views, classes.tolist(), NOTHING_KNOWN)
     kinds = Categories(priors, names, fits.scale)
     floor = floor_under(poses, fits)
-    usual, on_floor = kinds.usual_size(classes), kinds.on_floor(classes)
-    proposed = propose(fits, views, classes, usual, floor, on_floor)
+    usual, stands = kinds.usual_size(classes), kinds.on_floor(classes)
+    proposed = propose(fits, views, classes, usual, floor, stands)
     detected = _detected(table, poses, views)
     scene = Scene(floor, scale=None if poses.metric else fits.scale)
-    refit = _refit(detected, views, lambda v, c: fit(v, c, scene))
+    refit = _refit(detected, views, kinds, scene, fit)
     found = Associator(detected, refit, kinds.size_log_odds).run(proposed)
     solid[own] = found.owner
     owned = np.flatnonzero(found.owner >= 0)
-    support = list(found.solids.support)
-    boxes = quadrics.solid_boxes(found.solids.ellipsoids, support, views.img_from_world)
-    boxes = quadrics.clip_boxes(boxes, views.image_size)[detected.view[owned], found.owner[owned]]
+    boxes = _projected(found.solids, views)[detected.view[owned], found.owner[owned]]
     overlap[own[owned]] = quadrics.box_iou(boxes, detected.box[owned])
     solids = Solids.concatenate([found.solids, _NO_SOLID])
     sure = _confidence(found, detected)
@@ -184,7 +183,7 @@ class Categories:
 
     def on_floor(self, classes: IntArray) -> BoolArray:
         """Mark the classes (G,) that stand on the floor."""
-        return np.asarray(_or_unknown(self.priors.on_floor, False)[self.rows(classes)], bool)
+        return on_floor(self.priors, self.names[classes.clip(-1, len(self.names) - 1)].tolist())
 
     def size_log_odds(self, solids: Solids) -> Array:
         """Return the log odds (S,) of the sizes, 0 at the usual size, turned by 90 deg or not."""
@@ -195,6 +194,11 @@ class Categories:
         off = size[:, [[0, 1, 2], [1, 0, 2]]] - np.log(self.usual_size(solids.class_id))[:, None]
         square = np.einsum("ski,sij,skj->sk", off, np.linalg.inv(cov), off).min(1)  # (S,)
         return np.asarray(-0.5 * np.nan_to_num(square, nan=np.inf).clip(max=SIZE_SIGMAS**2))
+
+
+def on_floor(priors: quadrics.Priors, names: list[str]) -> BoolArray:
+    """Mark the categories (G,) that stand on the floor."""
+    return np.asarray(_or_unknown(priors.on_floor, False)[priors.index(names)], bool)
 
 
 def _or_unknown(column: npt.NDArray[Any], unknown: Any) -> npt.NDArray[Any]:
@@ -222,27 +226,38 @@ def _detected(table: Tracks, poses: Poses, views: Views) -> Detected:
     )
 
 
-def _refit(
-    detected: Detected, views: Views, fit: Callable[[Views, list[int]], quadrics.ObjectFits]
-) -> Refit:
+def _projected(solids: Solids, views: Views) -> Array:
+    """Return the boxes (V, S, 4) of solids in the images, NaN where they are not in view."""
+    boxes = quadrics.solid_boxes(solids.ellipsoids, list(solids.support), views.img_from_world)
+    return quadrics.clip_boxes(boxes, views.image_size)
+
+
+def _refit(detected: Detected, views: Views, kinds: Categories, scene: Scene, fit: Fit) -> Refit:
     """Make the function that fits solids to some of the detections, each set of them once."""
     found: dict[tuple[bytes, int], Solids] = {}
 
-    def refit(rows: IntArray, solid: IntArray, classes: IntArray) -> Solids:
+    def refit(rows: IntArray, solid: IntArray, classes: IntArray, before: Solids | None) -> Solids:
         order = np.lexsort((rows, solid))
-        rows, start = rows[order], np.searchsorted(solid[order], np.arange(len(classes) + 1))
-        sets = [rows[a:b].tobytes() for a, b in itertools.pairwise(start)]
+        rows, solid = rows[order], solid[order]
+        hidden = np.zeros((len(rows), 4), bool)
+        if before is not None and scene.floor is not None:
+            projected = _projected(before, views)[detected.view[rows], solid]
+            hidden = edges_above_floor(detected.box[rows], projected)
+            hidden &= kinds.on_floor(classes)[solid, None]
+        start = np.searchsorted(solid, np.arange(len(classes) + 1))
+        sets = [rows[a:b].tobytes() + hidden[a:b].tobytes() for a, b in itertools.pairwise(start)]
         keys = list(zip(sets, classes.tolist(), strict=True))
         new = [k for k, key in enumerate(keys) if key not in found]
         if new:
             boxes = np.full((len(views.frame), len(new), 4), np.nan)
-            score = np.zeros(boxes.shape[:2])
+            score, behind = np.zeros(boxes.shape[:2]), np.zeros(boxes.shape, bool)
             for column, k in enumerate(new):
-                own = rows[start[k] : start[k + 1]]
-                at = detected.view[own], column
-                boxes[at], score[at] = detected.box[own], detected.score[own]
-            seen = Views(views.frame, boxes, score, views.img_from_world, views.image_size)
-            fits = fit(seen, classes[new].tolist())
+                part = slice(start[k], start[k + 1])
+                at = detected.view[rows[part]], column
+                boxes[at], score[at] = detected.box[rows[part]], detected.score[rows[part]]
+                behind[at] = hidden[part]
+            seen = Views(views.frame, boxes, score, views.img_from_world, views.image_size, behind)
+            fits = fit(seen, classes[new].tolist(), scene)
             made = Solids(fits.ellipsoids, fits.support, classes[new])
             found.update((keys[k], made[[column]]) for column, k in enumerate(new))
         return Solids.concatenate([_NO_SOLID[:0], *(found[key] for key in keys)])
