@@ -335,7 +335,7 @@ def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr(
             made, step, turned if step == "_merged" else lambda now, widened=False: now
         )
-    made.run(chairs())
+    made.run(chairs(), False)
     assert len(rounds) == 3
 
 

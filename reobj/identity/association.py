@@ -90,7 +90,7 @@ class Associator:
     def __init__(self, detected: Detected, refit: Refit, size_log_odds: SizeLogOdds) -> None:
         self.detected, self.refit, self.size_log_odds = detected, refit, size_log_odds
 
-    def run(self, proposed: Solids) -> Association:
+    def run(self, proposed: Solids, floor_known: bool) -> Association:
         """Choose among proposed solids, then improve them and their detections in turn."""
         chosen = self._pursue(self._empty(proposed))
         now = self._assign(proposed[chosen], np.full(len(self.detected.view), -1))
@@ -101,7 +101,7 @@ class Associator:
             if (state := now.owner.tobytes()) in known:
                 break
             known.add(state)
-        for _ in range(WIDENED):  # not before: wide solids swallow their neighbours
+        for _ in range(WIDENED * floor_known):  # not before: wide solids swallow their neighbours
             now = self._refitted(now, widened=True)
         return now
 

@@ -93,7 +93,7 @@ def locate(
     detected = _detected(table, poses, views)
     scene = Scene(floor, scale=None if poses.metric else fits.scale)
     refit = _refit(detected, views, kinds, scene, fit)
-    found = Associator(detected, refit, kinds.size_log_odds).run(proposed)
+    found = Associator(detected, refit, kinds.size_log_odds).run(proposed, floor is not None)
     solid[own] = found.owner
     owned = np.flatnonzero(found.owner >= 0)
     boxes = _projected(found.solids, views)[detected.view[owned], found.owner[owned]]
