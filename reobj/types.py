@@ -525,7 +525,8 @@ def class_shares(table: Tracks, group: IntArray, count: int) -> Array:
 
 def box_area(xyxy: Array) -> Array:
     """Return the area (...) of boxes (..., 4)."""
-    return np.asarray((xyxy[..., 2:] - xyxy[..., :2]).prod(-1), np.float64)
+    width, height = xyxy[..., 2] - xyxy[..., 0], xyxy[..., 3] - xyxy[..., 1]
+    return np.asarray(width * height, np.float64)
 
 
 def box_iou(a_xyxy: Array, b_xyxy: Array) -> Array:

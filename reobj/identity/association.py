@@ -14,6 +14,7 @@ should show a solid and does not, and against every solid.
 
 from __future__ import annotations
 
+import heapq
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -123,28 +124,40 @@ class Associator:
         value = np.minimum(evidence.choice, evidence.log_odds + PURSUED_CHOICE)
         positive = value > 0
         solid, row, log_odds = evidence.solid[positive], evidence.row[positive], value[positive]
-        if not len(solid):
-            return np.empty(0, np.int64)
-        key = solid * len(evidence.expected) + view[row]  # ascending: rows ascend with the views
-        first = np.flatnonzero(np.append(True, np.diff(key) != 0))
-        solid_of, view_of = solid[first], view[row[first]]
-        not_missed = MISSED * evidence.expected[view_of, solid_of]
+        start = np.searchsorted(solid, np.arange(len(cost) + 1))
+        not_missed = MISSED * evidence.expected  # (V, S)
         explained, chosen = np.zeros(len(view)), list[int]()  # explained: log odds of each row
-        while True:
-            more = np.maximum(log_odds - explained[row], 0)
-            best = np.maximum.reduceat(more, first)  # of each solid in each view
-            gain = np.bincount(solid_of, np.where(best > 0, best + not_missed, 0), len(cost)) - cost
-            gain[chosen] = -np.inf
-            winner = int(gain.argmax())
-            if gain[winner] <= 0:
-                return np.array(chosen, np.int64)
-            chosen.append(winner)
-            low, high = np.searchsorted(solid, (winner, winner + 1))
-            at, own = view[row[low:high]], more[low:high]
-            top = np.zeros(len(evidence.expected))
-            np.maximum.at(top, at, own)
-            value = log_odds[low:high] + np.where(own >= top[at], 0, SECOND_DETECTION)
-            np.maximum.at(explained, row[low:high], value)
+        best = np.zeros(len(evidence.expected))
+
+        def gain(k: int) -> float:
+            """Return what solid k would add to those chosen so far."""
+            own = slice(start[k], start[k + 1])
+            more, at = log_odds[own] - explained[row[own]], view[row[own]]
+            more, at = more[more > 0], at[more > 0]
+            best[:] = 0
+            np.maximum.at(best, at, more)
+            return float(best.sum() + not_missed[best > 0, k].sum() - cost[k])
+
+        # What a solid adds only falls as others are chosen: one that still leads after it was
+        # looked at again is the best (lazy greedy, Minoux 1978).
+        queue = [(-gain(k), k) for k in range(len(cost))]
+        heapq.heapify(queue)
+        while queue and queue[0][0] < 0:
+            k = heapq.heappop(queue)[1]
+            now = (-gain(k), k)
+            if queue and queue[0] < now:
+                heapq.heappush(queue, now)
+                continue
+            if now[0] >= 0:
+                break
+            chosen.append(k)
+            own = slice(start[k], start[k + 1])
+            at, more = view[row[own]], (log_odds[own] - explained[row[own]]).clip(0)
+            best[:] = 0
+            np.maximum.at(best, at, more)
+            value = log_odds[own] + np.where(more >= best[at], 0, SECOND_DETECTION)
+            np.maximum.at(explained, row[own], value)
+        return np.array(chosen, np.int64)
 
     def _assign(self, solids: Solids, owner: IntArray) -> Association:
         """Assign detections to solids frame by frame, given the neighbours in their tracklets.

@@ -160,9 +160,11 @@ def logit(score: Array) -> Array:
 
 def _overlapping(a: Array, b: Array) -> BoolArray:
     """Mark pairs (A, B) of boxes that share enough of the smaller one's area."""
-    inter = np.minimum(a[:, None, 2:], b[:, 2:]) - np.maximum(a[:, None, :2], b[:, :2])
+    (ax, ay, ax2, ay2), (bx, by, bx2, by2) = a.T[..., None], b.T  # (A, 1), (B,) each
+    width = np.minimum(ax2, bx2) - np.maximum(ax, bx)  # (A, B)
+    height = np.minimum(ay2, by2) - np.maximum(ay, by)
     least = np.minimum(box_area(a)[:, None], box_area(b))
-    return np.asarray(inter.clip(0).prod(-1) > MIN_OVERLAP * least)
+    return np.asarray(width.clip(0) * height.clip(0) > MIN_OVERLAP * least)
 
 
 def _box_log_odds(projected: Array, box: Array, image_size: tuple[int, int]) -> Array:
@@ -174,5 +176,6 @@ def _box_log_odds(projected: Array, box: Array, image_size: tuple[int, int]) -> 
     gaussian = np.exp(-0.5 * (inside / EDGE_SIGMA) ** 2) / (np.sqrt(2 * np.pi) * EDGE_SIGMA)
     hidden = (inside >= 0) & (inside <= 1)
     density = (1 - HIDDEN - WRONG) * gaussian + HIDDEN * hidden + WRONG / CLUTTER_LOG_SIZES
-    anywhere = np.log((size / image_size).prod(1)) - 2 * np.log(CLUTTER_LOG_SIZES)
-    return np.asarray(np.log(density).sum((1, 2)) - anywhere)
+    anywhere = size[:, 0] * size[:, 1] / (image_size[0] * image_size[1] * CLUTTER_LOG_SIZES**2)
+    edges = density[:, 0, 0] * density[:, 0, 1] * density[:, 1, 0] * density[:, 1, 1]
+    return np.asarray(np.log(edges / anywhere))
