@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from reobj.identity.evidence import Detected, Evidence, Solids, gather_evidence
+from reobj.identity.evidence import MIN_LOG_ODDS, Detected, Evidence, Solids, gather_evidence
 from reobj.types import Array, BoolArray, IntArray
 
 # Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).
@@ -93,7 +93,7 @@ class Associator:
 
     def run(self, proposed: Solids, floor_known: bool) -> Association:
         """Choose among proposed solids, then improve them and their detections in turn."""
-        chosen = self._pursue(self._empty(proposed))
+        chosen = self._pursue(self._empty(proposed, 0.0))
         now = self._assign(proposed[chosen], np.full(len(self.detected.view), -1))
         known = {now.owner.tobytes()}
         for _ in range(MAX_ROUNDS):
@@ -106,12 +106,10 @@ class Associator:
             now = self._refitted(now, widened=True)
         return now
 
-    def _empty(self, solids: Solids) -> Association:
-        """Look at solids of which nothing is a detection yet."""
-        evidence, nothing = (
-            gather_evidence(solids, self.detected),
-            np.full_like(self.detected.view, -1),
-        )
+    def _empty(self, solids: Solids, least: float = MIN_LOG_ODDS) -> Association:
+        """Look at solids of which nothing is a detection yet, by pairs of more than `least`."""
+        evidence = gather_evidence(solids, self.detected, least)
+        nothing = np.full_like(self.detected.view, -1)
         return Association(solids, nothing, evidence, self.size_log_odds(solids))
 
     def _pursue(self, of: Association) -> IntArray:

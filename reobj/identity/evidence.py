@@ -107,12 +107,16 @@ class Evidence:
 SOLIDS_AT_ONCE = 500  # that are projected together (chosen: memory)
 
 
-def gather_evidence(solids: Solids, detected: Detected) -> Evidence:
-    """Compare the projections of solids with the detections of all frames."""
+def gather_evidence(solids: Solids, detected: Detected, least: float = MIN_LOG_ODDS) -> Evidence:
+    """Compare the projections of solids with the detections of all frames.
+
+    Args:
+        least: `choice` above which pairs are kept.
+    """
     share = np.asarray(np.bincount(detected.class_id.clip(0), detected.score) + 0.5, np.float64)
     share /= share.sum()
     starts = range(0, max(len(solids), 1), SOLIDS_AT_ONCE)
-    parts = [_gather(solids[k : k + SOLIDS_AT_ONCE], detected, share) for k in starts]
+    parts = [_gather(solids[k : k + SOLIDS_AT_ONCE], detected, share, least) for k in starts]
     solid = np.concatenate([part.solid + k for k, part in zip(starts, parts, strict=True)])
     row = np.concatenate([part.row for part in parts])
     log_odds = np.concatenate([part.log_odds for part in parts])
@@ -121,11 +125,11 @@ def gather_evidence(solids: Solids, detected: Detected) -> Evidence:
     return Evidence(solid, row, log_odds, choice, expected)
 
 
-def _gather(solids: Solids, detected: Detected, share: Array) -> Evidence:
+def _gather(solids: Solids, detected: Detected, share: Array, least: float) -> Evidence:
     """Gather the evidence of some solids.
 
     Args:
-        share: of the classes in all detections.
+        share: of the classes in all detections. least: `choice` above which pairs are kept.
     """
     cams, size = detected.img_from_world, detected.image_size
     whole = quadrics.solid_boxes(solids.ellipsoids, list(solids.support), cams)  # (V, S, 4)
@@ -144,7 +148,7 @@ def _gather(solids: Solids, detected: Detected, share: Array) -> Evidence:
         named = np.log(CLASS_KEPT * (own == other) / share[other.clip(0)] + 1 - CLASS_KEPT)
         rest = of_detection[row] + named
         choice = box.clip(max=MAX_BOX_CHOICE) + rest
-        keep = choice > MIN_LOG_ODDS
+        keep = choice > least
         log_odds = box.clip(max=MAX_BOX_LOG_ODDS) + rest
         found.append((solid[keep], row[keep], log_odds[keep], choice[keep]))
     solid, row, log_odds, choice = (np.concatenate(column) for column in zip(*found, strict=True))
