@@ -179,6 +179,16 @@ def test_points_that_near_views_do_not_find_again_part_two_groups(ties, found):
     assert scene.groups() == numbers(*found)
 
 
+@pytest.mark.parametrize("back, found", [(1.5, [(1, 13)]), (12.0, [(1, 8), (8, 13)])])
+def test_points_that_only_far_views_share_tie_nothing(back, found):
+    """From 12 m farther off no feature looks as it does from near: such matches are chance."""
+    scene = Scene()
+    scene.poses[7:, 2, 3] += back
+    scene.xy[7:] = [scene.project(pose)[0] for pose in scene.poses[7:]]
+    scene.untie(7, 2 * MIN_BRIDGE)
+    assert scene.groups() == numbers(*found)
+
+
 def test_fewer_than_three_images_that_hang_loose_are_in_no_group():
     scene = Scene()
     scene.untie(10, MIN_BRIDGE - 1)
