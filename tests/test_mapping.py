@@ -37,6 +37,7 @@ def parts_of(folder, images, boxes=None, size=None, camera=None, guess=FOCAL_GUE
         mapped = reconstruct(
             images,
             ids,
+            [10 * i for i in ids],
             [f"{i - 1:03d}.jpg" for i in ids],
             [np.empty((0, 4))] * len(images) if boxes is None else boxes,
             size or images[0].shape[1::-1],
@@ -120,8 +121,8 @@ def search(monkeypatch):
     pairs = MatchedPairs(
         np.array([[1, 2]]), [np.zeros((1000, 2))], dict.fromkeys(range(1, 31)), np.ones((1, 3, 3))
     )
-    names = {i: f"{i}.jpg" for i in range(1, 31)}
-    search = mapping._Search(Path("database.db"), names, pairs, False, 0)
+    frames = {i: 10 * i for i in range(1, 31)}
+    search = mapping._Search(Path("database.db"), frames, pairs, False, 0)
     search.made, search.ran = [], []
 
     def parts(mapper, held):
@@ -156,7 +157,7 @@ def test_a_part_that_is_refused_is_said_and_why(search, monkeypatch):
     models, messages = search.run(0.8, 0.8)
     assert models == ["model"] * 2 and search.ran == [("incremental", True), ("global", True)]
     assert messages == [
-        "a part of the video (16.jpg to 27.jpg) has no poses: the camera hardly moved"
+        "a part of the video (frames 160-270) has no poses: the camera hardly moved"
     ]
 
 
@@ -185,7 +186,8 @@ def test_of_two_focal_lengths_the_given_camera_tells_which_is_right(
     search.made[0].arrays.camera = SimpleNamespace(width=640, height=480)
     models, messages = search.run(None, 0.8)
     assert (len(models) == 1) == kept
-    assert kept or "another focal length than that of the given camera" in messages[0]
+    what = "between frames 210 and 220" if kept else "another focal length than that of the given"
+    assert what in messages[0]
 
 
 def test_a_given_camera_is_kept(walk, tmp_path):
@@ -289,9 +291,9 @@ def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
         "import numpy as np; from pathlib import Path; from reobj.files import Progress;"
         "from reobj.poses import mapping; images = list(np.load('images.npy'));"
         "child = mapping.mapping_child(Path('out'));"
-        "print(mapping.__file__, mapping.reconstruct(images, list(range(1, 9)), list('abcdefgh'),"
-        "[np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guess=0.8, seed=0, child=child,"
-        "work_dir=Path('out'), progress=Progress))"
+        "print(mapping.__file__, mapping.reconstruct(images, list(range(1, 9)), list(range(8)), "
+        "list('abcdefgh'), [np.empty((0, 4))] * 8, (320, 240), camera=None, focal_guess=0.8, "
+        "seed=0, child=child, work_dir=Path('out'), progress=Progress))"
     )
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
     command = [sys.executable, "-P", "-c", code]

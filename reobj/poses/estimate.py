@@ -91,6 +91,7 @@ def estimate_poses(
             found = reconstruct(
                 [key.bgr for key in keys],
                 [key.row + 1 for key in keys],
+                [key.frame for key in keys],
                 [_frame_name(video, key.frame) for key in keys],
                 [
                     np.empty((0, 4)) if boxes_to_mask is None

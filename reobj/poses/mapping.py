@@ -64,6 +64,7 @@ def mapping_child(work_dir: Path) -> Child:
 def reconstruct(
     images: Sequence[Image],
     ids: Sequence[int],
+    frames: Sequence[int],
     names: Sequence[str],
     moving_boxes: Sequence[Array],
     size: tuple[int, int],
@@ -82,7 +83,7 @@ def reconstruct(
 
     Args:
         images: (h, w, 3) BGR, resized. ids: of each, above 0, in the order of time.
-        names: of the images in the models.
+        frames: their numbers in the video, for messages. names: of the images in the models.
         moving_boxes: (N, 4) xyxy of each image, native pixels: no features there.
         size: (w, h), native. camera: kept as it is; None: calibrated.
         focal_guess: over the longer side, used where the matches do not tell the focal length.
@@ -97,6 +98,7 @@ def reconstruct(
     boxes = [(xyxy * scale).tolist() for xyxy in moving_boxes]
     job = {
         "ids": list(ids),
+        "frames": list(frames),
         "names": list(names),
         "boxes": boxes,
         "camera": None if camera is None else [camera.model, list(camera.params)],
@@ -150,8 +152,8 @@ def _reconstruct_job(folder: Path) -> None:
     match_pairs(database, choose_pairs(database, job["ids"], job["seed"]), job["seed"])
     pairs = read_pairs(database)
     focal = None if job["camera"] is not None else focal_from_pairs(pairs, size)
-    names = dict(zip(job["ids"], job["names"], strict=True))
-    search = _Search(database, names, pairs, job["camera"] is not None, job["seed"])
+    frames = dict(zip(job["ids"], job["frames"], strict=True))
+    search = _Search(database, frames, pairs, job["camera"] is not None, job["seed"])
     parts, messages = search.run(focal, job["guess"])
     for old in folder.glob("sparse*"):
         shutil.rmtree(old)
@@ -188,14 +190,14 @@ class _Search:
 
     Attributes:
         ids: of the keyframes in the order of time. pairs: their verified matches.
-        names: of the keyframes, for messages. fixed: the intrinsics are known.
+        frames: numbers of the keyframes, for messages. fixed: the intrinsics are known.
     """
 
     def __init__(
-        self, database: Path, names: dict[int, str], pairs: MatchedPairs, fixed: bool, seed: int
+        self, database: Path, frames: dict[int, int], pairs: MatchedPairs, fixed: bool, seed: int
     ) -> None:
-        self.database, self.ids, self.pairs = database, list(names), pairs
-        self.names, self.fixed, self.seed = names, fixed, seed
+        self.database, self.ids, self.pairs = database, list(frames), pairs
+        self.frames, self.fixed, self.seed = frames, fixed, seed
 
     def run(self, focal: float | None, guess: float) -> tuple[list[Any], list[str]]:
         """Try mappers until sound parts hold nearly all keyframes.
@@ -228,14 +230,14 @@ class _Search:
             problem = best[0].problem if best else why
             return [], [f"no camera poses: {problem}; {HOW_TO_FILM}"]
         messages = [
-            f"the focal length changed between {self.names[a]} and {self.names[b]} "
+            f"the focal length changed between frames {self.frames[a]} and {self.frames[b]} "
             f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
             for a, b, ratio in zooms
         ] + messages
         for part in best:
             ids = part.arrays.ids.tolist()
             if part.problem and len(ids) >= MIN_PART_IMAGES:
-                ends = f"{self.names[ids[0]]} to {self.names[ids[-1]]}"
+                ends = f"frames {self.frames[ids[0]]}-{self.frames[ids[-1]]}"
                 messages.append(f"a part of the video ({ends}) has no poses: {part.problem}")
         return self._one_camera(sound), messages
 
