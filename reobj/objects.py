@@ -302,10 +302,7 @@ def describe_world(
     if poses is None:
         return World(links=tuple(events))
     parts = tuple(_describe_part(poses, k, fit) for k, fit in enumerate(fits))
-    first, scale = parts[0], parts[0].scale
-    known = None if scale is None or scale.source == "none" else scale.value
-    metres = 1.0 if poses.metric else known
-    floor, reason = floor_of(poses.of_part(0), first.up_in_world, metres)
+    first = parts[0]
     return World(
         "m" if poses.metric else "arbitrary",
         poses.source,
@@ -317,8 +314,8 @@ def describe_world(
         first.scale,
         tuple(events),
         parts,
-        floor,
-        reason,
+        first.floor,
+        first.floor_reason,
     )
 
 
@@ -333,12 +330,17 @@ def _describe_part(poses: Poses, part: int, fits: quadrics.ObjectFits | None) ->
         scale = quadrics.Scale(value, sigma, fits.scale.source)
         if fits.up.any():
             up, up_source = fits.up, fits.up_source
+    up = None if up is None else significant(up)
+    known = None if scale is None or scale.source == "none" else scale.value
+    floor, reason = floor_of(poses, up, 1.0 if poses.metric else known)
     return Part(
         [[int(run[0]), int(run[-1])] for run in runs if len(run)],
         len(poses.frame),
         int(poses.known.sum()),
         int((poses.status == "interpolated").sum()),
-        None if up is None else significant(up),
+        up,
         up_source,
         scale,
+        floor,
+        reason,
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from pose_worlds import motion, supplied
 from scipy.spatial.transform import Rotation
 from simulated import walk
 
+import quadrics
 import reobj_track as rt
 from reobj.objects import describe_world
 from reobj.poses.floor import find_floor, floor_of
@@ -160,19 +163,37 @@ def test_points_that_only_two_frames_observed_do_not_count():
     assert floor is not None and abs(floor.middle[2]) < 0.03
 
 
-def test_the_floor_is_that_of_the_largest_part():
-    part = np.repeat([0, 1], 15)
-    poses = poses_in_room(part=part)
+def poses_in_two_parts():
+    """The same room again in the world of frames 15-29, 5 m higher."""
+    poses = poses_in_room(part=np.repeat([0, 1], 15))
     count = len(poses.points)
-    other = poses.points + 5 * HIGHER
-    seen = poses.visibility + np.array([20, count])
-    both = dataclasses.replace(
-        poses, points=np.concatenate([poses.points, other]),
+    cams = poses.cam_from_world.copy()
+    cams[15:, :, 3] -= cams[15:, :, :3] @ (5 * HIGHER)
+    return dataclasses.replace(
+        poses, cam_from_world=cams,
+        points=np.concatenate([poses.points, poses.points + 5 * HIGHER]),
         colors=np.zeros((2 * count, 3), np.uint8),
-        visibility=np.concatenate([poses.visibility, seen]),
+        visibility=np.concatenate([poses.visibility, poses.visibility + np.array([20, count])]),
     )  # fmt: skip
-    floor, _ = floor_of(both, UP, 1.0)
+
+
+def test_the_floor_is_that_of_the_largest_part():
+    floor, _ = floor_of(poses_in_two_parts(), UP, 1.0)
     assert floor is not None and abs(floor.middle[2]) < 0.03
+
+
+def test_every_part_of_a_world_has_a_floor_of_its_own():
+    scale = quadrics.Scale(1.0, 0.05, "priors")
+    told = SimpleNamespace(scale=scale, up=UP, up_source="cameras")  # all that is asked of a fit
+    world = describe_world(poses_in_two_parts(), [told, told], [])
+    for part, height in zip(world.parts, (0, 5 * HIGHER @ UP), strict=True):
+        assert part.floor is not None and part.floor_reason == ""
+        assert abs(part.floor.middle @ UP - height) < 0.03
+    assert world.floor is world.parts[0].floor
+    back = rt.World.from_json(json.loads(json.dumps(world.to_json())))
+    assert back.to_json() == world.to_json()
+    np.testing.assert_array_equal(back.parts[1].floor.middle, world.parts[1].floor.middle)
+    assert describe_world(poses_in_two_parts(), [told, None], []).parts[1].floor is None
 
 
 def test_without_gravity_there_is_no_floor():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 from simulated import (
@@ -34,7 +35,9 @@ import reobj_track as rt
 from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.files import part_path
 from reobj.parts import parts_message
+from reobj.poses.floor import Floor
 from reobj.results.overlay import Overlay
+from reobj.results.scene import Pictures, write_scene
 from reobj.results.solids import score_objects
 from reobj.schema import validate_objects
 from reobj.types import Embeddings
@@ -540,6 +543,22 @@ def test_the_page_holds_every_part(parted_folder: Path) -> None:
         assert entry["scale"]["metres_per_unit"] == pytest.approx(1 / PARTS[part][0], rel=0.2)
     assert [o["part"] for o in data["objects"]] == [0, 0, 0, 1, 1, 1]
     assert all(len(o["crops"]) >= 3 for o in data["objects"])
+
+
+def test_the_page_has_the_floor_of_every_part(parted: rt.Result, tmp_path: Path) -> None:
+    floor = Floor(np.array([0, 0, 1.0]), -0.25, np.zeros(3), 0.01, 0.3, 200)
+    first, second = (dataclasses.replace(p, floor=None) for p in parted.world.parts)
+    parts = (first, dataclasses.replace(second, floor=floor))
+    world = dataclasses.replace(parted.world, parts=parts, floor=None)
+    result = dataclasses.replace(parted, world=world)
+    (tmp_path / "frames").mkdir()
+    cv2.imwrite(str(tmp_path / "frames/0.jpg"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    video = rt.Video(tmp_path / "frames")
+    write_scene(result, Pictures(result, video), tmp_path / "a.html", video)
+    text = (tmp_path / "a.html").read_text()
+    data = json.loads(text.split('id="data">')[1].split("</script>")[0])
+    assert "floor" not in data["parts"][0]
+    assert data["parts"][1]["floor"] == {"normal": [0, 0, 1], "offset": -0.25}
 
 
 # ---- Exports and scores ----

@@ -143,12 +143,12 @@ def sides(found: Object) -> list[tuple[str, ...]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Frames, gravity and scale of a rigid part of the cameras' path, which is a world of its own.
+    """A rigid part of the cameras' path, which is a world of its own.
 
     Attributes:
         spans: first and last frame of each unbroken run of its frames; frames: their number.
         registered_frames, interpolated_frames: of them with a pose, and between two.
-        up_in_world, up_source, scale: as in `World`.
+        up_in_world, up_source, scale, floor, floor_reason: as in `World`.
     """
 
     spans: list[list[int]]
@@ -158,6 +158,8 @@ class Part:
     up_in_world: Array | None = None
     up_source: str = "none"
     scale: quadrics.Scale | None = None
+    floor: Floor | None = None
+    floor_reason: str = ""
 
     @property
     def span_text(self) -> str:
@@ -197,8 +199,6 @@ class World:
     def to_json(self) -> dict[str, Any]:
         """Return the `world` of objects.json."""
         values = _world_json(self) | {"parts": [_world_json(part) for part in self.parts]}
-        if self.floor is not None:
-            values["floor"] = {k: _plain(v) for k, v in dataclasses.asdict(self.floor).items()}
         links = [dataclasses.asdict(event) for event in self.links]
         for link in links:
             link["place_iou"] = rounded(link["place_iou"], EVIDENCE_DIGITS)
@@ -209,9 +209,6 @@ class World:
     def from_json(entry: dict[str, Any]) -> World:
         """Read the `world` of objects.json."""
         values = _world_values(World, entry)
-        if (floor := values.get("floor")) is not None:
-            vectors = {name: np.array(floor[name], np.float64) for name in ("normal", "middle")}
-            values["floor"] = Floor(**floor | vectors)
         values["links"] = tuple(LinkEvent.from_json(link) for link in values.get("links", ()))
         values["parts"] = tuple(Part(**_world_values(Part, e)) for e in values.get("parts", ()))
         return World(**values)
@@ -226,6 +223,8 @@ def _world_json(world: World | Part) -> dict[str, Any]:
             "rel_sigma": world.scale.rel_sigma,
             "source": world.scale.source,
         }
+    if world.floor is not None:
+        values["floor"] = {k: _plain(v) for k, v in dataclasses.asdict(world.floor).items()}
     return values
 
 
@@ -237,6 +236,9 @@ def _world_values(kind: type[World | Part], entry: dict[str, Any]) -> dict[str, 
     if (scale := values.get("scale")) is not None:
         facts = (scale["metres_per_unit"], scale["rel_sigma"], scale["source"])
         values["scale"] = quadrics.Scale(*facts)
+    if (floor := values.get("floor")) is not None:
+        vectors = {name: np.array(floor[name], np.float64) for name in ("normal", "middle")}
+        values["floor"] = Floor(**floor | vectors)
     return values
 
 

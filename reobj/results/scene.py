@@ -237,8 +237,7 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
         return facts | {"points": "", "colors": "", "up": [0, 0, 1]}
     if up is None:
         up = quadrics.camera_up(poses.camera.K @ poses.cam_from_world[poses.known])[0]
-    floor = None if number else part.world.floor  # that of the largest part
-    if floor is not None:
+    if (floor := part.world.floor) is not None:
         facts["floor"] = {"normal": floor.normal.tolist(), "offset": floor.offset}
     eye = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
     some = (poses.points[:: len(poses.points) // 500 + 1], eye[:: len(eye) // 50 + 1])
