@@ -253,8 +253,9 @@ def _weak_cut(
     Candidates are the cuts of the spanning tree of most shared points. A point ties two groups,
     and their scales, if one of them sees it from directions that tell its depth, and the other sees
     it too. Too few are few points, or few of those that should be found again: near views of a
-    place that share nothing are two places, and features of far views look alike by chance. Points without two images that have as many matches are
-    few too: chance matches of a symmetric thing add up over images.
+    place that share nothing are two places, and what far views share is chance. Points without two
+    images that have as many matches are few too: chance matches of a symmetric thing add up over
+    images.
 
     Args:
         explained: (P,) matches of each pair.
