@@ -20,7 +20,7 @@ class FakeVideo:
     def __init__(self, images, names=(), fps=30.0, files=()):
         self.images, self.names, self.fps = images, list(names), fps
         self.size = (images[0].shape[1], images[0].shape[0]) if len(images) else SIZE
-        self.expected = len(images)
+        self.expected = self.frame_count = len(images)
         self.files = list(files)
 
     def __iter__(self):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -237,6 +238,25 @@ def test_what_is_not_possible_is_said_in_one_line(
     with pytest.raises(rt.ReobjError, match=message) as refused:
         rt.run(None, tmp_path / "out", config, detections=detections)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("video", "options", "message"),
+    [
+        (False, {"depth": "maps"}, "--depth maps: .*name the video"),
+        (True, {"mode": "none", "depth": "maps"}, "--poses none has none"),
+        (True, {"mode": "none", "metric": True}, "--poses none has none"),
+    ],
+)
+def test_options_of_cameras_or_images_that_are_not_there_are_refused(
+    tmp_path: Path, video: bool, options: dict[str, object], message: str
+) -> None:
+    given = {"mode": str(as_tum(tmp_path)), "camera": LINE} | options
+    config = rt.Config(poses=dataclasses.replace(rt.PosesConfig(), **given))
+    source = "a.mp4" if video else None
+    with pytest.raises(rt.ReobjError, match=message):
+        rt.run(source, tmp_path / "out", config, detections=as_csv(tmp_path))
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_line_needs_no_video_for_run_alone(

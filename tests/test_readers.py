@@ -429,12 +429,29 @@ DAMAGED = [
     (as_instant_ngp, NGP, lambda p: p.write_text("[1]"), "expected an object"),
     (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.pop("frames")), "no `frames`"),
     (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.pop("camera_angle_x")), "--camera"),
-    (as_instant_ngp, NGP, lambda p: edit_frame(p, transform_matrix=[1, 2]), "transform_matrix"),
+    (
+        as_instant_ngp,
+        NGP,
+        lambda p: edit_frame(p, transform_matrix=[1, 2]),
+        r"frames\[1\]: expected a 4x4 transform_matrix",
+    ),
+    (as_instant_ngp, NGP, lambda p: edit_frame(p, fl_x="wide"), r"frames\[1\]: expected a 4x4"),
+    (
+        as_instant_ngp,
+        NGP,
+        lambda p: edit_json(p, lambda d: d.update(applied_transform="no")),
+        "applied_transform: expected 3x4",
+    ),
     (as_instant_ngp, NGP, mirror_frame, r"frames\[1\]: .*mirrored"),
     (as_instant_ngp, NGP, lambda p: edit_frame(p, fl_x=900.0), "several different cameras"),
     (as_instant_ngp, NGP, lambda p: edit_json(p, lambda d: d.update(w=480, h=640)), "rotated"),
     (as_instant_ngp, NGP, rename_frames, "none of its"),
-    (as_record3d, "metadata", lambda p: edit_json(p, lambda d: d.pop("K")), "no Record3D metadata"),
+    (
+        as_record3d,
+        "metadata",
+        lambda p: edit_json(p, lambda d: d.pop("K")),
+        r"no Record3D metadata; expected numbers poses \(N x 7\), K",
+    ),
     (ONLY, IMAGES, lambda p: edit(p, 1, drop_last), "images.txt, line 2: expected IMAGE_ID"),
     (ONLY, IMAGES, lambda p: edit(p, 1, word(1, "2.0")), "images.txt, line 2: the quaternion"),
     (ONLY, IMAGES, lambda p: edit(p, 1, word(3, "nan")), "images.txt, line 2: .*finite"),
@@ -461,6 +478,11 @@ def test_damaged_files_are_refused_in_one_clear_line(tmp_path, write, file, dama
     with pytest.raises(rt.ReobjError, match=message) as refused:
         read(path, camera=CAMERA if write is as_tum else "")
     assert "\n" not in str(refused.value)
+
+
+def test_a_folder_in_no_known_format_is_refused_with_what_is_known(tmp_path):
+    with pytest.raises(rt.ReobjError, match=r"COLMAP model, or transforms.json, pose/N.txt"):
+        read(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "frames.bin"])
@@ -507,6 +529,35 @@ def test_missing_unknown_and_without_intrinsics(tmp_path):
 
 
 # ---- Which pose belongs to which frame -----------------------------------------------------------
+
+
+def test_scannets_pose_folder_may_be_named_itself(tmp_path):
+    path = as_scannet(tmp_path, some_cameras())
+    poses, whole = read(path / "pose", blank(FRAMES)), read(path, blank(FRAMES))
+    assert poses.camera == whole.camera and poses.known.all()
+    np.testing.assert_array_equal(poses.up_in_world, whole.up_in_world)
+    np.testing.assert_array_equal(poses.cam_from_world, whole.cam_from_world)
+
+
+@pytest.mark.parametrize("start, every, count, known", [(1, 2, 6, True), (0, 1, 7, False)])
+def test_stamps_of_another_clock_may_be_one_a_frame_of_the_source(
+    tmp_path, start, every, count, known
+):
+    """Of some frames of a video; with more stamps than frames nothing tells which are whose."""
+    for i in range(FRAMES):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((480, 640, 3), np.uint8))
+    video = rt.Video(tmp_path, rt.InputConfig(start=start, every=every))
+    cams = some_cameras(count)
+    path = as_tum(tmp_path, cams)
+    for i in range(count):
+        edit(path, i + 1, word(0, repr(100 + i / 30)))
+    if not known:
+        with pytest.raises(rt.ReobjError, match="another clock: one for each frame"):
+            read(path, video, camera=CAMERA)
+        return
+    poses = read(path, video, camera=CAMERA)
+    np.testing.assert_allclose(poses.cam_from_world, cams[[1, 3, 5]], atol=1e-9)
+    assert "matched in order" in poses.messages[0]
 
 
 def test_lost_scannet_frames_have_no_pose(tmp_path):

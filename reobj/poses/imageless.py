@@ -39,10 +39,15 @@ def open_video(
         source: as `Video` takes it; None: there is none.
         poses, boxes: file of poses, and of detections or identities; of use without a video.
     Raises:
-        ReobjError: no video, and no file of detections, poses or size of the images either.
+        ReobjError: no video, and no file of detections, poses or size of the images either;
+            options that ask for what is not there.
     """
+    if poses.mode == "none" and (poses.depth or poses.metric):
+        raise ReobjError("--depth and --metric are said of cameras, and --poses none has none")
     if source is not None:
         return Video(source, config)
+    if poses.depth:
+        raise ReobjError(f"--depth {poses.depth}: its maps are found by the images; name the video")
     if not isinstance(boxes, str | Path) or not boxes or poses.mode in ("auto", "none"):
         raise ReobjError(
             "no video: name one, or give `run` what needs no images: --detections FILE (or "

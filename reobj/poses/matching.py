@@ -108,20 +108,25 @@ SAME_TIME_S = 5e-4  # times in files and containers are rounded to a ms
 STAMP_STEP_S = 0.1  # between poses, up to which one between them is interpolated (chosen: 10 Hz)
 
 
-def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> tuple[IntArray, list[str]]:
+def rows_by_time(
+    stamps_s: Array, frame: IntArray, time_s: Array, count: int
+) -> tuple[IntArray, list[str]]:
     """Match the nearest stamp within half a frame interval and `STAMP_TOLERANCE_S`.
 
     Stamps of another clock (no overlap in time) are matched in order if there is one for each
-    frame.
+    frame that is read, or for each of the source.
 
     Args:
-        stamps_s: (N,) ascending. time_s: (F,) of the frames.
+        stamps_s: (N,) ascending. time_s: (F,) of the frames. count: frames of the source.
     Returns:
         row (F,) of each frame, -1: none; messages.
     """
-    if len(stamps_s) == len(frame) and (stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]):
-        message = "time stamps are of another clock than the frames: matched in order"
-        return np.arange(len(frame)), [message]
+    if stamps_s[0] > time_s[-1] or stamps_s[-1] < time_s[0]:
+        messages = ["time stamps are of another clock than the frames: matched in order"]
+        if len(stamps_s) == len(frame):
+            return np.arange(len(frame)), messages
+        if len(stamps_s) == count > frame.max():
+            return frame.copy(), messages
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
     half = 0.5 * float(np.median(steps)) if len(steps) else LONE_FRAME_S
     after = np.searchsorted(stamps_s, time_s).clip(1, max(len(stamps_s) - 1, 1))  # (F,)

@@ -69,8 +69,7 @@ def read_poses(
     if not numbers:
         raise ReobjError("the video has no frame that can be read: poses belong to nothing")
     frame, time_s = np.array([n for n, _ in numbers], np.int64), np.array([t for _, t in numbers])
-    names = [video.names[n] for n in frame if video.names]
-    row, what, messages = _rows_of_frames(given, path, frame, time_s, names, video.names)
+    row, what, messages = _rows_of_frames(given, path, frame, time_s, video)
     poses = np.full((len(frame), 3, 4), np.nan)
     poses[row >= 0] = given.cam_from_world[row[row >= 0]]
     if given.stamps_s is not None and len(given.stamps_s) > 1:
@@ -109,21 +108,21 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
 
 
 def _rows_of_frames(
-    given: PoseFile, path: Path, frame: IntArray, time_s: Array, names: Sequence[str],
-    images: Sequence[str],
-) -> tuple[IntArray, str, list[str]]:  # fmt: skip
+    given: PoseFile, path: Path, frame: IntArray, time_s: Array, video: Any
+) -> tuple[IntArray, str, list[str]]:
     """Find the row of each frame in a file of poses by name, time stamp or order.
 
     Returns:
         row (F,), -1 where it has none; what was compared; messages.
     """
+    images, names = video.names, [video.names[n] for n in frame if video.names]
     if given.names:
         what = f"images {given.names[0]!r} ..., frames {names[0] if len(names) else frame[0]!r} ..."
         return rows_by_name(given.names, frame, names, images), what, []
     if given.stamps_s is not None:
         what = f"{given.stamps_s[0]:.3f}-{given.stamps_s[-1]:.3f} s, "
-        what += f"frames {time_s[0]:.3f}-{time_s[-1]:.3f} s"
-        row, messages = rows_by_time(given.stamps_s, frame, time_s)
+        what += f"frames {time_s[0]:.3f}-{time_s[-1]:.3f} s; another clock: one for each frame"
+        row, messages = rows_by_time(given.stamps_s, frame, time_s, video.frame_count)
         return row, what, messages
     try:
         row = rows_by_order(len(given.cam_from_world), frame, names, images)
@@ -166,7 +165,7 @@ def _pose_format(path: Path) -> str:
     if path.is_dir():
         if (path / "transforms.json").exists():
             return "transforms"
-        if (path / "pose").is_dir() or any(path.glob("*.pose.txt")):
+        if path.name == "pose" or (path / "pose").is_dir() or any(path.glob("*.pose.txt")):
             return "scannet"
         return "arkit" if _arkit_files(path) else "colmap"
     if path.name.startswith("images."):
@@ -296,9 +295,9 @@ def _read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
         rows = np.array(data["poses"], np.float64).reshape(-1, 7)
         fx, fy, cx, cy = (float(data["K"][i]) for i in (0, 4, 6, 7))
         camera = Camera("PINHOLE", image_side(data["w"]), image_side(data["h"]), (fx, fy, cx, cy))
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, IndexError):
         raise ReobjError(
-            f"{path}: no Record3D metadata ({error!r}); expected poses (N x 7), K (9), w and h"
+            f"{path}: no Record3D metadata; expected numbers poses (N x 7), K (9), w and h"
         ) from None
     where = [f"{path}, poses[{i}]" for i in range(len(rows))]
     world_from_gl = _from_quaternions(rows[:, :4], rows[:, 4:], where)
@@ -311,6 +310,7 @@ def _read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
 
     Metres; inf: no pose. ScanNet's intrinsics have the centre of the first pixel at (0, 0).
     """
+    path = path.parent if path.name == "pose" else path
     folder = path / "pose" if (path / "pose").is_dir() else path
     files = sorted(f for f in folder.glob("*.txt") if re.search(r"(\d|\.pose)$", f.stem))
     if not files:
@@ -356,9 +356,9 @@ def _read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
             ]
             matrices.append(np.array([*rows, 0, 0, 0, 1][:16], np.float64).reshape(4, 4))
             cameras.append(camera_from_json(d, size))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError):
             what = "4x4 cameraPoseARFrame or t_00 to t_23, and intrinsics"
-            raise ReobjError(f"{at}: no camera ({error!r}); expected {what}") from None
+            raise ReobjError(f"{at}: no camera; expected numbers {what}") from None
     poses = CV_FROM_GL @ invert_rigid(_checked_rigid(np.array(matrices), where))
     names, up = tuple(file.stem for file in files), np.array([0, 1.0, 0])
     return PoseFile(poses, _one_camera(cameras, path), names, metric=True, up_in_world=up)
@@ -376,22 +376,28 @@ def _read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     if not isinstance(frames, list) or not frames:
         raise ReobjError(f"{path}: no `frames`; expected nerfstudio's or ngp's transforms.json")
     where = [f"{path}, frames[{i}]" for i in range(len(frames))]
+    matrices, names, cameras = list[Array](), list[str](), list[Camera | None]()
+    for at, f in zip(where, frames, strict=True):
+        try:
+            matrices.append(np.array(f["transform_matrix"], np.float64).reshape(4, 4))
+            names.append(str(f["file_path"]))
+            cameras.append(camera_from_json({**data, **f}, size))
+        except ReobjError as error:
+            raise ReobjError(f"{at}: {error}") from None
+        except (KeyError, TypeError, ValueError, IndexError):
+            what = "expected a 4x4 transform_matrix, file_path, and intrinsics that are numbers"
+            raise ReobjError(f"{at}: {what}") from None
+    applied = np.eye(4)
     try:
-        matrix = np.array([f["transform_matrix"] for f in frames], np.float64).reshape(-1, 4, 4)
-        names = tuple(str(f["file_path"]) for f in frames)
-        cameras = [camera_from_json({**data, **f}, size) for f in frames]
-        applied = np.eye(4)
         applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
-    except ReobjError as error:
-        raise ReobjError(f"{path}: {error}") from None
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        what = f"a frame without a 4x4 transform_matrix and file_path ({error!r})"
-        raise ReobjError(f"{path}: {what}") from None
+    except (TypeError, ValueError, IndexError):
+        applied[:] = np.nan
     if not np.isfinite(applied).all():
-        raise ReobjError(f"{path}: applied_transform is not finite")
+        raise ReobjError(f"{path}: applied_transform: expected 3x4 or 4x4 finite numbers")
     applied[:3] = _checked_rigid(applied[None], [f"{path}, applied_transform"])[0]
-    gl_from_world = invert_rigid(_checked_rigid(matrix, where)) @ applied  # (N, 3, 4)
-    return PoseFile(CV_FROM_GL @ gl_from_world, _one_camera(cameras, path), names)
+    world_from_gl = _checked_rigid(np.array(matrices), where)
+    poses = CV_FROM_GL @ invert_rigid(world_from_gl) @ applied  # (N, 3, 4)
+    return PoseFile(poses, _one_camera(cameras, path), tuple(names))
 
 
 MAX_FOCAL_SPREAD = 0.02  # of the images of one camera, a share: autofocus (chosen)
@@ -417,7 +423,8 @@ def _read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     found = [f for suffix in (".bin", ".txt") for f in folders if (f / f"images{suffix}").exists()]
     if not found:
         raise ReobjError(
-            f"{path}: no images.bin or .txt; expected a COLMAP model, or see --pose-format"
+            f"{path}: no images.bin or .txt; expected a COLMAP model, or transforms.json, "
+            "pose/N.txt, *.pose.txt or an ARKit export in the folder; or name a file"
         )
     if not (found[0] / "images.bin").exists():
         return _read_colmap_text(found[0])
