@@ -278,6 +278,14 @@ def test_maps_that_contradict_metric_poses_give_no_points(tmp_path, walk, mistak
     assert len(poses.points) == 0 and "no points from depth" in poses.messages[0]
 
 
+def test_maps_without_depth_are_said(tmp_path, walk):
+    folder = write_maps(tmp_path / "d", walk.cam_from_world, NUMBERS)
+    for path in folder.glob("*.png"):
+        cv2.imwrite(str(path), np.zeros((24, 32), np.uint16))
+    poses = add(metric(walk), folder)
+    assert len(poses.points) == 0 and "12 maps show no surface" in poses.messages[0]
+
+
 # ---- Which map belongs to which frame ------------------------------------------------------------
 
 
@@ -328,6 +336,11 @@ def other_json(folder):
     (folder / "intrinsics.json").write_text('{"fx": 3}')
 
 
+def lacking_json(folder):
+    write_maps(folder, motion("walk", 1), NUMBERS[:1])
+    (folder / "intrinsics.json").write_text('{"fx": 50}')
+
+
 def other_matrix(folder):
     write_maps(folder, motion("walk", 1), NUMBERS[:1])
     (folder / "intrinsic_depth.txt").write_text("1 2 3")
@@ -340,7 +353,8 @@ def other_matrix(folder):
         (empty, "d:0", "no such folder"), (empty, "d", "no .png in it"),
         (strange, "d", "no depth map"), (color_image, "d", "no depth map"),
         (other_names, "d", "none of its 1 depth maps"), (other_sizes, "d", "32x24 pixels"),
-        (other_json, "d", "expected fx, fy"), (other_matrix, "d", "3x3 or 4x4"),
+        (other_json, "d", "expected fx, fy"), (lacking_json, "d", "intrinsics.json: expected fx"),
+        (other_matrix, "d", "3x3 or 4x4"),
     ],
 )  # fmt: skip
 def test_bad_input_gives_one_line(tmp_path, walk, make, text, expected):
@@ -418,6 +432,9 @@ def test_supplied_poses_are_triangulated_once_where_they_bring_no_points(
     assert len(found.points) > 3000 and len(asked) == 1
     found = stage.with_points(walk, video, with_depth, workspace)  # the scale needs points
     assert found.metric and len(asked) == 2
+    contradicted = rt.PosesConfig(depth=f"{folder}:300", **options)
+    found = stage.with_points(metric(walk), video, contradicted, workspace)
+    assert len(found.points) == 360 and len(asked) == 3 and "no points from" in found.messages[0]
     unknown = dataclasses.replace(walk, cam_from_world=np.full_like(walk.cam_from_world, np.nan))
     assert stage.with_points(unknown, video, rt.PosesConfig(), workspace) is unknown
 

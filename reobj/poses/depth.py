@@ -206,9 +206,9 @@ def _camera_of(path: Path, content: Any, own: Any, size: tuple[int, int]) -> tup
         else:
             color_from_depth[:] = given.reshape(-1, 4)[:3]
         return camera.resized(size), color_from_depth
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError):
         expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
-        raise ReobjError(f"{path}: {error!r}; expected {expected}") from None
+        raise ReobjError(f"{path}: expected {expected}") from None
 
 
 # ---- Scale and points ----------------------------------------------------------------------------
@@ -378,6 +378,11 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
         )
         return dataclasses.replace(poses, messages=(*poses.messages, text))
     good = (views > through) & (views > 0)  # else it moved, or is a stray pixel
+    if not good.any():
+        text = (
+            f"--depth: no points from depth: {len(rows)} maps show no surface; are they of depth?"
+        )
+        return dataclasses.replace(poses, messages=(*poses.messages, text))
     visibility = visibility[good[visibility[:, 1]]]
     visibility[:, 1] = np.cumsum(good)[visibility[:, 1]] - 1 + len(poses.points)
     colors = _colors(points[good], origin[good], poses, video)

@@ -39,7 +39,7 @@ def supplied_poses(
 
 
 def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: Workspace) -> Poses:
-    """Add points from depth maps, else, if there are none, triangulate them; or from the cache."""
+    """Add points: from depth maps, where these have none triangulated; or from the cache."""
     if (
         not video.has_images
         or not poses.known.any()
@@ -49,12 +49,14 @@ def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: Work
     path = _points_path(poses, video, config, workspace)
     if (known := load_cached(path, load_poses)) is not None:
         return known
-    if not len(poses.visibility) and not (config.depth and poses.metric):
-        size_px, seed = config.size_px, config.seed
-        poses = triangulate(
-            poses, video, size_px=size_px, seed=seed, work_dir=workspace.cache / "sfm"
-        )
-    if config.depth:
+    size_px, seed = config.size_px, config.seed
+    depth_first = bool(config.depth) and poses.metric  # else the maps need points to tell the scale
+    if depth_first:
+        poses = add_depth(poses, config.depth, video)
+    if not len(poses.visibility):
+        work = workspace.cache / "sfm"
+        poses = triangulate(poses, video, size_px=size_px, seed=seed, work_dir=work)
+    if config.depth and not depth_first:
         poses = add_depth(poses, config.depth, video)
     if len(poses.points):
         save_poses(path, poses)
