@@ -178,7 +178,7 @@ def _link_parts(
     table, source = _with_untracked(result.tracks, result.untracked)
     part = np.zeros(len(table), np.int64)
     if result.poses is not None:
-        part = result.poses.part_of(table.frame)
+        part = _part_of_rows(table, result.poses)
     table = _cut_at_parts(table, part)
     for k, fit in enumerate(fit_in):
         rows = np.flatnonzero(part == k)
@@ -273,6 +273,21 @@ def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:
             else:
                 tracklet[row], fresh = fresh, fresh + 1
     return dataclasses.replace(table, tracklet_id=tracklet)
+
+
+def _part_of_rows(tracks: Tracks, poses: Poses) -> IntArray:
+    """Return the part (N,) of rows: of their frame, or without a pose that of their tracklet.
+
+    Where the path breaks, a thing that comes into view before the next part begins is of that part.
+    """
+    part = poses.part_of(tracks.frame)
+    posed = place_of(poses, tracks.frame)[1]
+    for rows in rows_by(tracks.tracklet_id) if poses.part_count > 1 else ():
+        lost, own = rows[~posed[rows]], rows[posed[rows]]
+        if tracks.tracklet_id[rows[0]] and len(lost) and len(own):
+            away = np.abs(tracks.frame[lost, None] - tracks.frame[own])
+            part[lost] = part[own[away.argmin(1)]]
+    return part
 
 
 def _cut_at_parts(tracks: Tracks, part: IntArray) -> Tracks:

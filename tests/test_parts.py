@@ -136,6 +136,16 @@ def test_without_linking_too_identities_end_with_their_part() -> None:
     assert [(o.id, o.part) for o in result.objects] == [(i + 1, i // 3) for i in range(6)]
 
 
+def test_what_comes_into_view_while_the_cameras_are_lost_is_of_the_next_part() -> None:
+    """Frames 38 to 40 have no pose; the third chair is seen from frame 39 on, of part 0."""
+    given = unlinked()
+    third = given.tracks.detection_index == 2
+    given.tracks = given.tracks[~third | (given.tracks.frame >= BREAK - 1)]
+    objects = finished(given).objects
+    assert [(o.part, o.status != "rejected") for o in objects] == [(0, True)] * 2 + [(1, True)] * 3
+    assert sorted(o.visits[0][0] for o in objects) == [0, 0, BREAK - 1, BREAK, BREAK]
+
+
 def test_embeddings_stay_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """The linker of each part gets those of its own frames, numbered by its own rows."""
     given = unlinked()
