@@ -86,6 +86,17 @@ def test_poses_that_do_not_explain_the_images_give_a_message(corner, tmp_path, m
     np.testing.assert_array_equal(poses.cam_from_world, turned.cam_from_world)
 
 
+def test_a_stretch_of_poses_that_is_off_is_named(corner, tmp_path):
+    """Frames 12 and 14 lie 40 m below their place; between the two all is as it should be."""
+    _, given, video, _, _ = corner
+    cams = given.cam_from_world.copy()
+    cams[6:8, 1, 3] += 40
+    poses = run(video, dataclasses.replace(given, cam_from_world=cams), tmp_path)
+    (message,) = poses.messages
+    assert message.startswith("the supplied poses tear between frames 10 and 12, 14 and 16: what")
+    assert len(poses.points) > 100
+
+
 @pytest.mark.parametrize("images", [0, 1, 3])
 def test_nothing_to_triangulate_is_a_message_and_no_exception(images, tmp_path):
     """No images at all, one alone, and three without texture."""

@@ -92,7 +92,35 @@ def triangulate(
         return _without_points(poses, f"{why} (good poses: half of them); {advice}")
     seen = np.array(rows)[found["visibility"][:, 0]]
     found["visibility"] = np.column_stack([seen, found["visibility"][:, 1]])
-    return dataclasses.replace(poses, **found)
+    messages = (*poses.messages, *_torn(found.pop("ties"), poses.frame[rows]))
+    return dataclasses.replace(poses, **found, messages=messages)
+
+
+MIN_MATCHES = 30  # of two keyframes that say something (COLMAP registers from 30 on)
+# Share of them that must be one point (measured, least of a recording: rendered .71, studio_room
+# .42, hololens_kitchen .14; redkitchen .09, and .003 where its Kinect lost track; ends of stretches
+# that were moved 0 and .04)
+MIN_TIED = 0.05
+MAX_TEARS = 5  # named in a message (chosen)
+
+
+def _torn(ties: IntArray, frame: IntArray) -> list[str]:
+    """Say where supplied poses tear: what keyframes (K,) that follow each other show is not one.
+
+    Args:
+        ties: (K - 1, 2) of `_neighbours_tied`. frame: (K,).
+    """
+    count, tied = ties.T
+    at = np.flatnonzero((count >= MIN_MATCHES) & (tied < MIN_TIED * count))
+    if not len(at):
+        return []
+    runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+    where = [f"{frame[run[0]]} and {frame[run[-1] + 1]}" for run in runs]
+    more = f" and {len(where) - MAX_TEARS} more" if len(where) > MAX_TEARS else ""
+    return [
+        f"the supplied poses tear between frames {', '.join(where[:MAX_TEARS])}{more}: what both "
+        "sides see does not meet in 3D; objects that are seen mostly there are likely misplaced"
+    ]
 
 
 def _without_points(poses: Poses, why: str) -> Poses:
@@ -229,6 +257,7 @@ def _triangulate_job(folder: Path) -> None:
         "colors": np.array(colors, np.uint8).reshape(-1, 3),
         "visibility": np.array(seen, np.int64).reshape(-1, 2),
     }
+    arrays["ties"] = _neighbours_tied(database, model, len(images))
     save_npz(folder / "points.npz", arrays, matched=_count_matched(database))
 
 
@@ -252,6 +281,22 @@ def _count_matched(database: Path) -> int:
             for image_id, features in zip(ids, geometry.inlier_matches.T.tolist(), strict=True):
                 matched |= {(image_id, feature) for feature in features}
     return len(matched)
+
+
+def _neighbours_tied(database: Path, model: Any, count: int) -> IntArray:
+    """Count (K - 1, 2) matches of keyframes that follow each other, and those that are a point."""
+    point_of = {
+        i: np.array([p.point3D_id if p.has_point3D() else -1 for p in model.image(i).points2D])
+        for i in range(1, count + 1)
+    }
+    ties = np.zeros((count - 1, 2), np.int64)
+    with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
+        for i in range(1, count):
+            if db.exists_two_view_geometry(i, i + 1):
+                one, other = db.read_two_view_geometry(i, i + 1).inlier_matches.T.astype(np.int64)
+                points = point_of[i][one]
+                ties[i - 1] = len(one), ((points == point_of[i + 1][other]) & (points >= 0)).sum()
+    return ties
 
 
 if __name__ == "__main__":
