@@ -270,23 +270,20 @@ def kalman_update(mean: Array, cov: Array, box: Array, noise: Array) -> tuple[Ar
     Returns:
         mean, cov after K = P H' / S, x = x + K y, P = (I - K H) P.
     """
-    p00, p01, p11 = (cov[..., i] for i in range(3))  # (T, 4) each, as all below
-    innovation_var = p00 + noise**2  # S
+    p00, p01 = cov[..., 0], cov[..., 1]  # (T, 4), as all below
+    innovation_var, residual = p00 + noise**2, box - mean[..., 0]  # S, y
     gain, velocity_gain = p00 / innovation_var, p01 / innovation_var  # K
-    residual = box - mean[..., 0]  # y
-    new_mean, new_cov, rest = mean.copy(), cov.copy(), 1 - gain
+    new_mean, new_cov = mean.copy(), cov.copy()
     new_mean[..., 0] += gain * residual
     new_mean[..., 1] += velocity_gain * residual
-    new_cov[..., 0] *= rest
-    new_cov[..., 1] *= rest
+    new_cov[..., :2] *= (1 - gain)[..., None]
     new_cov[..., 2] -= velocity_gain * p01
     return new_mean, new_cov
 
 
 def center_variance(mean: Array, cov: Array) -> Array:
     """Return the variances (T, 2) of a measured centre: S = H P H' + R, R at score .8."""
-    noise = STD_MEASURE * _noise_scale(mean)[:, :2]
-    return np.asarray(cov[:, :2, 0] + noise**2)
+    return np.asarray(cov[:, :2, 0] + (STD_MEASURE * _noise_scale(mean)[:, :2]) ** 2)
 
 
 def squared_mahalanobis(residual: Array, variance: Array) -> Array:
@@ -650,8 +647,8 @@ class Tracker:
         state = self.state
         track, reach = state.mean[..., 0].T, state.reach.T  # (4, T) cx, cy, w, h; (2, T)
         variance = center_variance(state.mean, state.cov).T  # (2, T)
-        near = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)
-        t, d = touching(track[:2], near, detections.xyxy)  # (M,) each
+        gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # or any overlap
+        t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
         track, seen, reach = track.take(t, 1), box.T.take(d, 1), reach.take(t, 1)  # (4, M) ...
         iou, share = overlap_within_reach(track, reach, seen)
         distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1)) / GATE_CHI2
@@ -714,12 +711,11 @@ class Tracker:
         t, column = pairs.track[some], np.searchsorted(rows, pairs.detection[some])
         known = self.state.embedded[t] >= 0
         logit = self.match_calibration.logit(*(part[t, column] for part in cosines))
-        weight, cost = self.config.appearance_weight, cost.copy()
-        unlike = 1 / (1 + np.exp(np.where(known, logit, 0)))
+        unlike, weight = 1 / (1 + np.exp(np.where(known, logit, 0))), self.config.appearance_weight
+        against, cost = np.zeros(len(cost), bool), cost.copy()
         cost[some] = (1 - weight) * cost[some] + weight * unlike
         overlap = pairs.iou[some] - CLASS_COST * ~pairs.same_class[some]
         evidence = pairs.share[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
-        against = np.zeros(len(cost), bool)
         against[some] = known & (logit + evidence < 0)
         return cost, against
 
@@ -894,8 +890,8 @@ class Tracker:
         row[state.identity[coasting]] = coasting
         row = row[identity]  # (I,)
         center, variance = state.mean[:, :2, 0].T, center_variance(state.mean, state.cov).T
-        residual = center[:, ready, None] - center[:, None, row]  # (2, n, I)
-        far = squared_mahalanobis(residual, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
+        away = center[:, ready, None] - center[:, None, row]  # (2, n, I)
+        far = squared_mahalanobis(away, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
         placed = rows_of(self.places.known, identity, False) & (self._view is not None)
         return np.asarray(far & (row >= 0) & ~placed, bool)
 
