@@ -112,11 +112,11 @@ def test_gate_is_the_distance_over_the_whole_innovation() -> None:
 def test_what_overlaps_passes_the_gate_though_its_centre_lies_outside() -> None:
     """A thing of 200 px at rest, of which only the right end is detected."""
     tracker, appearance = rt.Tracker(rt.TrackerConfig(n_init=1)), [[1.0, 0, 0]]
-    whole, end = [100, 100, 300, 300, 0.9, 0], [245, 100, 335, 300, 0.9, 0]
+    whole, end = [100, 100, 300, 300, 0.9, 0], [256, 100, 301, 300, 0.9, 0]
     for _ in range(20):
         tracker.update([whole], embeddings=appearance)
-    variance = rt.center_variance(tracker.state.mean, tracker.state.cov)[0, 0]
-    assert 9.21 * variance < (245 - 200) ** 2  # px: to its nearest edge
+    state = rt.kalman_predict(tracker.state.mean, tracker.state.cov, tracker.config)
+    assert 9.21 * rt.center_variance(*state)[0, 0] < (256 - 200) ** 2  # px, to its nearest edge
     assert tracker.update([end], embeddings=appearance).tracklet_id.tolist() == [1]
 
 
