@@ -776,7 +776,8 @@ def draw_matches(
             blank = np.full_like(cells[0], 255)
             lines.append(np.hstack(cells + [blank] * (BEST + 1 - len(cells))))
     if not lines:
-        raise rt.ReobjError(f"{path.name}: no object is seen twice beside another: no pictures")
+        print(f"no {path.name}: no object is seen twice beside another", file=sys.stderr)
+        return
     with atomic(path) as part:
         part.write_bytes(cv2.imencode(".jpg", np.vstack(lines))[1].tobytes())
 
@@ -917,8 +918,20 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def check_words(args: Any) -> None:
+    """Refuse numbers and folders that cannot be meant."""
+    for name in ("every", "pictures", "away", "views"):
+        least = int(name == "every")
+        if getattr(args, name) < least:
+            raise rt.ReobjError(f"--{name} {getattr(args, name)}: expected {least} or more")
+    for folder in (*args.recording, *args.depth, *args.scannet):
+        if not folder.is_dir():
+            raise rt.ReobjError(f"{folder}: no such folder")
+
+
 def measure(args: Any) -> None:
     """Measure all sets, write the files, print the tables."""
+    check_words(args)
     if args.calibrate:
         print_calibration(args)
     sets = scene_sets(args)
@@ -927,10 +940,13 @@ def measure(args: Any) -> None:
                             "with some that may be shown")  # fmt: skip
     args.out.mkdir(parents=True, exist_ok=True)
     counts = [r for title, scenes in sets.items() for r in view_counts(title, scenes)]
-    write_csv(args.out / "counts.csv", counts)
     print(markdown_counts(counts))
     found = [evaluate(title, scenes, args) for title, scenes in sets.items()]
     rows, bins, trust = ([r for part in found for r in part[i]] for i in range(3))
+    if not rows:
+        raise rt.ReobjError("nothing to compare: no object is seen in two frames; a smaller "
+                            "--every takes more of them")  # fmt: skip
+    write_csv(args.out / "counts.csv", counts)
     write_csv(args.out / "rank_k.csv", rows)
     write_csv(args.out / "by_bin.csv", bins)
     plot_bins(bins, args.out)

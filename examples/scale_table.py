@@ -38,7 +38,7 @@ from scipy.optimize import linear_sum_assignment
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import render_room as rr
-from splits import SPLITS, add_choosing, marked, room_of, usable
+from splits import MARK, SPLITS, add_choosing, marked, room_of, usable
 from synthetic_quadrics import table, write_table
 
 import quadrics
@@ -281,15 +281,12 @@ def measure(case: tuple[Recording, float]) -> Row:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Share within 2 sigma and typical errors by recording, and of all."""
+    """Share within 2 sigma and typical errors by recording, and of all of a kind."""
     kinds: dict[str, list[Row]] = {}
     for row in rows:
-        name = row.name.split(" | ")[0]
-        whole = "all real recordings"
-        if name.startswith("room "):
-            name = re.sub(r"^room \d+", "rooms", name)
-            whole = name.replace("rooms", "all rooms").split(":")[0]
-        for key in (name, whole, "all"):
+        name = re.sub(r"^room \d+", "rooms", row.name.split(" | ")[0])
+        whole = "all rooms" if name.startswith("rooms") else "all real recordings"
+        for key in (name, whole + MARK * (MARK in name)):
             kinds.setdefault(key, []).append(row)
     lines: list[list[object]] = []
     for name in sorted(kinds, key=lambda key: key.startswith("all")):

@@ -427,10 +427,41 @@ def test_the_frame_of_a_match_says_whether_it_is_right(tmp_path: Path) -> None:
         np.testing.assert_allclose(picture[line, k * rk.CELL + 1], color, atol=25)
 
 
-def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert rk.main(["--choosing", "--recording", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--choosing", "--recording", "."], "expected identities in gt_mot.txt"),
+        (["--choosing", "--recording", "nowhere"], "nowhere: no such folder"),
+        (["--scannet", "nowhere"], "nowhere: no such folder"),
+        (["--scannet", "."], "expected SCENE.aggregation.json"),
+        (["--scannet", "scene0000_00", "--every", "0"], "--every 0: expected 1 or more"),
+        (["--scannet", "scene0000_00", "--pictures", "-1"], "--pictures -1: expected 0 or more"),
+        (["--scannet", "scene0000_00", "--min-side", "999"], "no view is scored"),
+        (["--scannet", "scene0000_00", "--every", "6"], "no object is seen in two frames"),
+        (["--scannet", "scene0000_00", "--models", "nothing"], "model nothing: no such file"),
+    ],
+)
+def test_bad_input_is_one_line(
+    words: list[str], said: str, scannet: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert rk.main([*words, "--no-crops", "-o", "out"]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("error: ") and said in last
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_without_a_query_for_a_picture_there_is_none(scannet, tmp_path, capsys) -> None:
+    """One chair is masked away: nothing beside it could be taken for it."""
+    (scannet / "scene0000_00.aggregation.json").write_text(
+        json.dumps({"segGroups": [{"objectId": 0, "label": "chair"}]})
+    )
+    out = tmp_path / "out"
+    words = ["--every", "1", "--away", "0", "--pictures", "1", "--no-crops", "-o", str(out)]
+    assert rk.main(["--scannet", str(scannet), *words]) == 0
+    assert "no matches_scannet_reobj_frame.jpg: no object" in capsys.readouterr().err
+    assert (out / "rank_k.csv").exists() and not list(out.glob("*.jpg"))
 
 
 def normal_cases(n: int = 2400, objects: int = 3) -> rk.Cases:

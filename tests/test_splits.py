@@ -165,5 +165,4 @@ def test_the_table_of_scales_has_the_rooms_for_reporting(
     lines = [line.split("|")[1:3] for line in scale_table.summary(rows).splitlines()[2:]]
     assert {name.strip(): int(runs) for name, runs in lines} == {
         "rooms: true": 2, "rooms (choosing): true": 1, "all rooms": 2, "all rooms (choosing)": 1,
-        "all": 3,
     }  # fmt: skip
