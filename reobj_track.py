@@ -647,7 +647,7 @@ class Tracker:
         state = self.state
         track, reach = state.mean[..., 0].T, state.reach.T  # (4, T) cx, cy, w, h; (2, T)
         variance = center_variance(state.mean, state.cov).T  # (2, T)
-        gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # or any overlap
+        gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
         t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
         track, seen, reach = track.take(t, 1), box.T.take(d, 1), reach.take(t, 1)  # (4, M) ...
         iou, share = overlap_within_reach(track, reach, seen)

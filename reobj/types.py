@@ -465,8 +465,6 @@ def _check_values(xyxy: Array, score: Array, class_id: npt.NDArray[Any]) -> None
     ordered = xyxy[:, 2:] >= xyxy[:, :2]
     likely = (score >= 0) & (score <= 1)
     named = (class_id >= 0) & (class_id <= CLASS_MAX) & (class_id == np.floor(class_id))
-    if finite.all() and ordered.all() and (likely & named).all():
-        return
     for good, values, expected in (
         (finite, xyxy, f"finite coordinates in pixels, at most {COORDINATE_MAX:g}"),
         (ordered, xyxy, "x1 <= x2 and y1 <= y2: corners, not x, y, width, height"),

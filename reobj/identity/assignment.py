@@ -58,7 +58,7 @@ def ambiguous_pairs(pairs: Pairs, possible: BoolArray) -> tuple[BoolArray, BoolA
     """
     rivals = possible & pairs.same_class
     cost = np.where(possible, pairs.cost, np.inf)
-    best, several = [], []
+    best = []  # of the track and of the detection of each pair
     for side in (pairs.track, pairs.detection):
         least = np.full(side.max(initial=0) + 1, np.inf)
         np.minimum.at(least, side, cost)
