@@ -61,7 +61,7 @@ from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.commands import SecretFormatter, make_parser, short_help
 from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
-from reobj.identity.assignment import Pairs, ambiguous_pairs, assign
+from reobj.identity.assignment import Pairs, ambiguous_pairs, assign, touching
 from reobj.identity.camera_motion import CameraMotion
 from reobj.identity.crops import CropEmbedder, make_embedder
 from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
@@ -137,7 +137,6 @@ from reobj.types import (
     Tracks,
     as_detections,
     as_frame,
-    box_iou,
     cxcywh_from_xyxy,
     log,
     one_line,
@@ -271,31 +270,32 @@ def kalman_update(mean: Array, cov: Array, box: Array, noise: Array) -> tuple[Ar
     Returns:
         mean, cov after K = P H' / S, x = x + K y, P = (I - K H) P.
     """
-    innovation_var = cov[..., :1] + noise[..., None] ** 2  # S (T, 4, 1)
-    gain = cov[..., :2] / innovation_var  # K (T, 4, 2)
-    residual = box - mean[..., 0]  # y (T, 4)
-    new_cov = np.empty_like(cov)
-    new_cov[..., :2] = (1 - gain[..., :1]) * cov[..., :2]
-    new_cov[..., 2] = cov[..., 2] - gain[..., 1] * cov[..., 1]
-    return mean + gain * residual[..., None], new_cov
+    p00, p01 = cov[..., 0], cov[..., 1]  # (T, 4), as all below
+    innovation_var, residual = p00 + noise**2, box - mean[..., 0]  # S, y
+    gain, velocity_gain = p00 / innovation_var, p01 / innovation_var  # K
+    new_mean, new_cov = mean.copy(), cov.copy()
+    new_mean[..., 0] += gain * residual
+    new_mean[..., 1] += velocity_gain * residual
+    new_cov[..., :2] *= (1 - gain)[..., None]
+    new_cov[..., 2] -= velocity_gain * p01
+    return new_mean, new_cov
 
 
-def squared_mahalanobis(mean: Array, cov: Array, center: Array) -> Array:
-    """Return (T, D) squared Mahalanobis distances of box centres (D, 2) from tracks, 2 dof.
+def center_variance(mean: Array, cov: Array) -> Array:
+    """Return the variances (T, 2) of a measured centre: S = H P H' + R, R at score .8."""
+    return np.asarray(cov[:, :2, 0] + (STD_MEASURE * _noise_scale(mean)[:, :2]) ** 2)
 
-    y' S^-1 y with S = H P H' + R, R at score .8.
-    """
-    noise = STD_MEASURE * _noise_scale(mean)[:, :2]
-    innovation_var = cov[:, :2, 0] + noise**2  # S (T, 2)
-    x, y = (mean[:, i, :1] - center[:, i] for i in range(2))  # y (T, D) each
-    return np.asarray(x**2 / innovation_var[:, :1] + y**2 / innovation_var[:, 1:])
+
+def squared_mahalanobis(residual: Array, variance: Array) -> Array:
+    """Return squared Mahalanobis distances (...), 2 dof: y' S^-1 y of residuals y (2, ...)."""
+    x, y = residual**2 / variance
+    return np.asarray(x + y)
 
 
 def _noise_scale(mean: Array) -> Array:
     """Return the length (T, 4) that noise is relative to: mean side for x, y, own side for w, h."""
-    scale = np.empty((len(mean), 4))
-    size = np.maximum(mean[:, 2:, 0], 1.0, out=scale[:, 2:])  # (T, 2)
-    np.sqrt(size[:, :1] * size[:, 1:], out=scale[:, :2])
+    scale = np.maximum(mean[..., 0], 1.0)  # (T, 4)
+    scale[:, 0] = scale[:, 1] = np.sqrt(scale[:, 2] * scale[:, 3])
     return scale
 
 
@@ -334,11 +334,11 @@ class TrackState:
 
     def select(self, keep: npt.NDArray[Any]) -> TrackState:
         """Return the chosen tracks."""
-        return TrackState(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+        return TrackState(*(getattr(self, name)[keep] for name in self.__slots__))
 
     def append(self, other: TrackState) -> TrackState:
         """Return these tracks and others, with as many classes and embedding columns as either."""
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
+        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__slots__)
         return TrackState(*(np.concatenate([widen(a, b), widen(b, a)]) for a, b in pairs))
 
     @staticmethod
@@ -625,40 +625,42 @@ class Tracker:
         """
         config, state = self.config, self.state
         pairs = self._gate(detections, box, lazy.available)
-        score, priority = detections.score[pairs.detection], self._priority_cost()[pairs.track]
+        t, d = pairs.track, pairs.detection
+        score, priority = detections.score[d], self._priority_cost()[t]
         first = score >= config.high_score  # (M,), as all below
-        weak = (pairs.cost + priority > WEAK_MATCH_COST) & (state.embedded >= 0)[pairs.track]
+        weak = (pairs.cost + priority > WEAK_MATCH_COST) & (state.embedded[t] >= 0)
         ambiguous, rivals = ambiguous_pairs(pairs, first)
-        track_of, must_agree = np.full(len(detections), -1), ambiguous | weak
-        track_of, refused = self._match(pairs, priority, first, must_agree, rivals, lazy, track_of)
-        free = np.ones(len(state.mean) + 1, bool)
-        free[track_of] = False  # -1: the last one, of no track
-        low = (track_of[pairs.detection] < 0) & (score >= config.low_score) & free[pairs.track]
+        agree = ambiguous | weak
+        matched, refused = self._match(pairs, pairs.cost, priority, first, agree, rivals, lazy)
+        track_of, free = np.full(len(detections), -1), np.ones(len(state.mean), bool)
+        track_of[d[matched]], free[t[matched]] = t[matched], False
+        low = free[t] & (track_of[d] < 0) & (score >= config.low_score)
         second = low & ~refused & (pairs.iou >= LOW_IOU)
         if second.any():
-            late, none = dataclasses.replace(pairs, cost=1 - pairs.iou), np.zeros(len(weak), bool)
-            track_of, _ = self._match(late, 0 * priority, second, weak, none, lazy, track_of)
+            none = np.zeros(len(t), bool)
+            matched, _ = self._match(pairs, 1 - pairs.iou, 0.0, second, weak, none, lazy)
+            track_of[d[matched]] = t[matched]
         return track_of
 
     def _gate(self, detections: Detections, box: Array, has_appearance: bool) -> Pairs:
         """Compare tracks and detections by motion: which may belong together, and at what cost."""
         state = self.state
-        iou, share = box_iou(xyxy_from_cxcywh(state.mean[..., 0]), detections.xyxy), np.ones((1, 1))
-        if state.reach.any():
-            iou, share = overlap_within_reach(state.mean[..., 0], state.reach, box)
-        distance = squared_mahalanobis(state.mean, state.cov, box[:, :2]) / GATE_CHI2
-        t, d = pair = np.divmod(np.flatnonzero((distance < 1) | (iou > GATE_IOU)), max(len(box), 1))
-        iou, share = iou[pair], np.broadcast_to(share, iou.shape)[pair]  # (M,)
+        track, reach = state.mean[..., 0].T, state.reach.T  # (4, T) cx, cy, w, h; (2, T)
+        variance = center_variance(state.mean, state.cov).T  # (2, T)
+        gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
+        t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
+        track, seen, reach = track.take(t, 1), box.T.take(d, 1), reach.take(t, 1)  # (4, M) ...
+        iou, share = overlap_within_reach(track, reach, seen)
+        distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1)) / GATE_CHI2
         overlap = iou * share
         same_class = state.votes.argmax(1)[t] == detections.class_id[d]
         cost = (1 - DISTANCE_WEIGHT) * (1 - overlap)
-        cost += DISTANCE_WEIGHT * np.minimum(distance[pair], 1) + CLASS_COST * ~same_class
-        evidence = share * (IOU_ODDS * (iou - CLASS_COST * ~same_class) - NO_OVERLAP_ODDS)
-        good = same_class | (overlap > LOW_IOU)
+        cost += DISTANCE_WEIGHT * np.minimum(distance, 1) + CLASS_COST * ~same_class
+        good = ((distance < 1) | (iou > GATE_IOU)) & (same_class | (overlap > LOW_IOU))
         if not has_appearance:
-            growth = np.log(state.mean[t, 2:, 0] / np.maximum(box[d, 2:], 1e-3))  # (M, 2)
-            good &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(1) & (iou >= MOTION_ONLY_IOU)
-        return Pairs(*(x[good] for x in (t, d, cost, iou, evidence, same_class)))
+            growth = np.log(track[2:] / np.maximum(seen[2:], 1e-3))  # (2, M)
+            good &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(0) & (iou >= MOTION_ONLY_IOU)
+        return Pairs(*(x[good] for x in (t, d, cost, iou, share, same_class)))
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
@@ -666,29 +668,27 @@ class Tracker:
         return np.asarray(AGE_COST * age + UNCONFIRMED_COST * (self.state.identity < 0))
 
     def _match(
-        self, pairs: Pairs, priority: Array, possible: BoolArray, must_agree: BoolArray,
-        rivals: BoolArray, lazy: LazyEmbeddings, known: IntArray,
+        self, pairs: Pairs, cost: Array, priority: Array | float, possible: BoolArray,
+        must_agree: BoolArray, rivals: BoolArray, lazy: LazyEmbeddings,
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
         """Assign at least cost; compare the appearance where it must agree; assign again.
 
         Args:
-            priority: added to the cost (M,). must_agree: pairs whose appearance must agree.
-            rivals: pairs that compete. known: (D,) matches made before, or -1.
+            cost, possible: (M,). priority: added to the cost. must_agree: (M,) pairs whose
+                appearance must agree. rivals: (M,) pairs that compete.
         Returns:
-            row of the track of each detection (D,), or -1; pairs refused by appearance (M,).
+            pairs that are matched, their numbers; pairs refused by appearance (M,).
         """
-        t, d, cost = pairs.track, pairs.detection, pairs.cost
+        t, d = pairs.track, pairs.detection
         refused = np.zeros(len(cost), bool)
-        compared = np.full(len(known), not (lazy.available and self.state.embedding.shape[1]))
+        compared = np.full(len(lazy.done), not (lazy.available and self.state.embedding.shape[1]))
         while True:
             good = np.flatnonzero(possible & ~refused & (cost < MAX_COST))
             matched = good[assign(t[good], d[good], (cost + priority)[good])]
             ask = matched[must_agree[matched] & ~compared[d[matched]]]
             if not len(ask):
-                track_of = known.copy()
-                track_of[d[matched]] = t[matched]
-                return track_of, refused
-            asked_by, asked = np.zeros(len(self.state.mean), bool), np.zeros(len(known), bool)
+                return matched, refused
+            asked_by, asked = np.zeros(len(self.state.mean), bool), np.zeros_like(compared)
             asked_by[t[ask]] = True
             asked[d[ask]] = asked[d[rivals & must_agree & asked_by[t]]] = True
             asked &= ~compared
@@ -711,14 +711,12 @@ class Tracker:
         t, column = pairs.track[some], np.searchsorted(rows, pairs.detection[some])
         known = self.state.embedded[t] >= 0
         logit = self.match_calibration.logit(*(part[t, column] for part in cosines))
-        weight, cost, against = (
-            self.config.appearance_weight,
-            cost.copy(),
-            np.zeros(len(cost), bool),
-        )
-        unlike = 1 / (1 + np.exp(np.where(known, logit, 0)))
+        unlike, weight = 1 / (1 + np.exp(np.where(known, logit, 0))), self.config.appearance_weight
+        against, cost = np.zeros(len(cost), bool), cost.copy()
         cost[some] = (1 - weight) * cost[some] + weight * unlike
-        against[some] = known & (logit + pairs.evidence[some] < 0)
+        overlap = pairs.iou[some] - CLASS_COST * ~pairs.same_class[some]
+        evidence = pairs.share[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
+        against[some] = known & (logit + evidence < 0)
         return cost, against
 
     def _update_states(self, detections: Detections, box: Array, track_of: IntArray) -> None:
@@ -736,8 +734,9 @@ class Tracker:
         state = self.state
         state.hits[t] += 1
         state.missed[t] = 0
-        classes = detections.class_id[rows].clip(0)
-        state.votes = widen(state.votes, np.empty((0, int(classes.max(initial=0)) + 1)))
+        classes = detections.class_id[rows]
+        if (top := classes.max(initial=0)) >= state.votes.shape[1]:
+            state.votes = widen(state.votes, np.empty((0, top + 1)))
         state.votes[t, classes] += detections.score[rows]
 
     def _spawn(self, detections: Detections, box: Array, track_of: IntArray) -> IntArray:
@@ -890,10 +889,11 @@ class Tracker:
         coasting = np.flatnonzero((state.identity >= 0) & (state.missed > 0))
         row[state.identity[coasting]] = coasting
         row = row[identity]  # (I,)
-        center = state.mean[ready, :2, 0]
-        far = squared_mahalanobis(state.mean[row], state.cov[row], center) > JUMP_GATE * GATE_CHI2
+        center, variance = state.mean[:, :2, 0].T, center_variance(state.mean, state.cov).T
+        away = center[:, ready, None] - center[:, None, row]  # (2, n, I)
+        far = squared_mahalanobis(away, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
         placed = rows_of(self.places.known, identity, False) & (self._view is not None)
-        return np.asarray(far.T & (row >= 0) & ~placed, bool)
+        return np.asarray(far & (row >= 0) & ~placed, bool)
 
     def _report(self, detections: Detections, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""

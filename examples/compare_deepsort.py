@@ -10,8 +10,8 @@ never predicted boxes; identities of `whole chain` are decided over the whole vi
 frame by frame. Every result is kept in OUT/runs: an interrupted comparison goes on where it
 stopped, and a changed reobj_track.py runs only our own rows again.
 
-splits.json says which rooms, recordings and pedestrians are for reporting. What is not is refused;
-with --choosing it is shown, marked, and in no table of the documents. --tune wants the others only:
+splits.json says which rooms, recordings and pedestrians are for reporting. What is not is left out;
+with --choosing it is shown, marked. --tune wants the others only:
 it tries one option of every peer after the other (SWEEP) for the best HOTA over all of them and
 writes the best settings to tuned.json beside this file, which the rows `tuned` use.
 
@@ -50,7 +50,7 @@ import cv2
 import numpy as np
 import render_room
 from benchmark import TUNED, Array, IntArray, Options, Stream, run_tracker, table
-from splits import SPLITS, held_out, room_name
+from splits import MARK, SPLITS, add_choosing, held_out, room_name, usable
 
 sys.path.insert(0, os.environ.get("REOBJ_TRACK", str(Path(__file__).resolve().parent.parent)))
 import reobj_track as rt
@@ -234,7 +234,7 @@ def chosen_on(seq: Sequence) -> Sequence:
     """Mark a sequence that is not held out, and its group."""
     if seq.held_out:
         return seq
-    return replace(seq, name=f"{seq.name} (choosing)", group=f"{seq.group} (choosing)")
+    return replace(seq, name=seq.name + MARK, group=seq.group + MARK)
 
 
 # ---- Appearance --------------------------------------------------------------------------------
@@ -643,11 +643,7 @@ def wanted(args: argparse.Namespace) -> list[Sequence]:
     """The sequences asked for that may be used, and a line for each of the others."""
 
     def allowed(kind: str, name: str) -> bool:
-        if held_out(kind, name) != args.tune or (args.choosing and not args.tune):
-            return True
-        kept_for = "reporting" if args.tune else "choosing"
-        print(f"left out: {name} is for {kept_for} (examples/splits.json)", file=sys.stderr)
-        return False
+        return usable(kind, name, args.choosing, args.tune)
 
     split = args.rooms in ("reporting", "choosing")
     names = SPLITS[args.rooms]["rooms"] if split else args.rooms.split(",")
@@ -671,7 +667,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--recordings", type=Path, nargs="*", default=[], help="folders")
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
     parser.add_argument("--every", type=int, default=1, help="use every n-th frame: wide steps")
-    parser.add_argument("--choosing", action="store_true", help="also what is not held out, marked")
+    add_choosing(parser)
     parser.add_argument("--tune", action="store_true", help="find the best settings of the peers")
     parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")
     parser.add_argument("-o", "--out", type=Path, required=True)

@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
 """Measure the cameras: reconstruct clips with known poses and print one table row each.
 
-    python examples/pose_accuracy.py -o OUT [--data FOLDER] [--set FIELD=VALUE]... [NAME...]
+    python examples/pose_accuracy.py -o OUT [--choosing] [--data FOLDER] [--set FIELD=VALUE]...
+        [NAME...]
 
 Clips: the recordings of FOLDER that are there, examples/room, and every folder of
-`examples/render_room.py` given with --room. Nothing is tuned to a clip: all run with the defaults
-(but for --set, which changes a field of PosesConfig for an experiment). Each runs in a process of
-its own, so that its memory can be told.
+`examples/render_room.py` given with --room. Those that were used for choosing (splits.json: all but
+some rooms) are left out; --choosing shows them, marked. Nothing is tuned to a clip: all run with
+the defaults (but for --set, which changes a field of PosesConfig for an experiment). Each runs in a
+process of its own, so that its memory can be told.
 
 Columns: frames with a pose; error of the camera centres after a similarity alignment (Umeyama, PAMI
 1991) as median, root mean square and largest, in % of the diagonal of the path's bounding box, and
@@ -39,6 +41,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from splits import add_choosing, marked, split_name, usable
+
 import reobj_track as rt
 
 Array = npt.NDArray[Any]
@@ -57,6 +62,10 @@ class Clip:
     truth: Path | None = None
     camera: str = ""
     metric: bool = False
+
+    def title(self, name: str) -> str:
+        """Return the name, marked where the clip was used for choosing."""
+        return marked(*split_name(self.source.parent), name)
 
 
 def clips(data: Path, rooms: list[Path]) -> dict[str, Clip]:
@@ -160,6 +169,7 @@ def main() -> int:
     )
     parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
     parser.add_argument("--known-camera", action="store_true", help="give the true intrinsics")
+    add_choosing(parser)
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     found = clips(args.data, [ROOT / "examples" / "room", *args.room])
@@ -169,6 +179,9 @@ def main() -> int:
     if args.child:
         print("\n".join(rows(names[0], found[names[0]], args)))
         return 0
+    names = [n for n in names if usable(*split_name(found[n].source.parent), args.choosing)]
+    if not names:
+        parser.error("no clip is left: give --choosing, or --room with a room for reporting")
     print(HEADER, flush=True)
     for name in names:
         rest = [a for a in sys.argv[1:] if a not in args.names]
@@ -194,13 +207,13 @@ def rows(name: str, clip: Clip, args: argparse.Namespace) -> Iterator[str]:
     if clip.truth is not None:
         path = as_tum(clip.truth, work, video) if "c2w" in clip.truth.name else clip.truth
         truth = rt.read_poses(path, video, camera=clip.camera)
-    yield row(name, poses, truth, clip.metric) + end
+    yield row(clip.title(name), poses, truth, clip.metric) + end
     for message in poses.messages:
         print(f"{name}: {message}", file=sys.stderr)
     if name == "redkitchen" and truth is not None:
         dense = metric_like(dense_reference(clip.source, video, args.out / "dense"), truth)
-        yield row("redkitchen-sfm", poses, dense, True) + " | |"
-        yield row("(dense to Kinect)", dense, truth, True) + " | |"
+        yield row(clip.title("redkitchen-sfm"), poses, dense, True) + " | |"
+        yield row(clip.title("(dense to Kinect)"), dense, truth, True) + " | |"
 
 
 def as_tum(path: Path, folder: Path, video: rt.Video) -> Path:

@@ -25,7 +25,8 @@ Setups (thesis): `fg` object only, `bg` surroundings only, `concat` both (mean o
 send two masked crops an object through the backbone (`CropEmbedder`), "person" is an appearance
 network of DeepSORT's kind on the plain box.
 
-Scenes:
+Scenes (what was used for choosing, by splits.json, is left out; --choosing shows it, marked;
+--calibrate wants no others):
   --rooms SEED...    rooms of render_room.py (never train on them), rendered once into --cache;
                      one set for each --plan (home: that of examples/room; varied: another room,
                      other twins and another walk for every seed).
@@ -50,9 +51,10 @@ import csv
 import dataclasses
 import itertools
 import os
+import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,6 +74,7 @@ from reid_scenes import (
     scannet_scene,
     view_counts,
 )
+from splits import add_choosing, marked, room_of, split_name, usable
 
 import reobj_track as rt
 from reobj.files import atomic
@@ -530,7 +533,13 @@ def scene_cases(
 def print_calibration(args: Any) -> None:
     """Fit and print the constants of `reobj.identity.reid`, on rooms with and without masks."""
     plans = [(plan, seed) for plan in args.plan for seed in args.calibrate]
-    rooms = [room_scene(seed, args.cache, args.every, plan) for plan, seed in plans]
+    rooms = [
+        room_scene(seed, args.cache, args.every, plan)
+        for plan, seed in plans
+        if usable("rooms", room_of(seed, plan), False, tune=True)
+    ]
+    if not rooms:
+        raise rt.ReobjError("--calibrate: no room is left")
     rooms += [unmasked(scene) for scene in rooms]
     cases: list[Cases] = []
     for model in args.models:
@@ -727,7 +736,7 @@ def markdown_counts(counts: Sequence[dict[str, Any]]) -> str:
 
 def file_name(text: str) -> str:
     """A text without what file names should not have."""
-    return text.replace(", ", "_").replace(" ", "_").replace("/", "_")
+    return re.sub(r"[ ,/()]+", "_", text).strip("_")
 
 
 # ---- Pictures of matches -------------------------------------------------------------------------
@@ -767,7 +776,8 @@ def draw_matches(
             blank = np.full_like(cells[0], 255)
             lines.append(np.hstack(cells + [blank] * (BEST + 1 - len(cells))))
     if not lines:
-        raise rt.ReobjError(f"{path.name}: no object is seen twice beside another: no pictures")
+        print(f"no {path.name}: no object is seen twice beside another", file=sys.stderr)
+        return
     with atomic(path) as part:
         part.write_bytes(cv2.imencode(".jpg", np.vstack(lines))[1].tobytes())
 
@@ -843,22 +853,26 @@ def pyplot() -> Any:
     return plt
 
 
+def usable_scenes(args: Any) -> Iterator[tuple[str, Scene]]:
+    """The scenes that may be measured, with the title of their set."""
+    for plan, seed in itertools.product(args.plan, args.rooms):
+        room = ("rooms", room_of(seed, plan))
+        if usable(*room, args.choosing):
+            yield marked(*room, f"rooms, {plan}"), room_scene(seed, args.cache, args.every, plan)
+    for folder in (f for f in args.recording if usable(*split_name(f), args.choosing)):
+        yield marked(*split_name(folder)), recording_scene(folder, args.every)
+    for folder in (f for f in args.depth if usable(*split_name(f), args.choosing)):
+        yield marked(*split_name(folder), f"{folder.name} (depth)"), depth_scene(folder)
+    for folder in args.scannet:
+        chosen = (args.every, args.min_mask, args.min_side, args.views)
+        yield "scannet", scannet_scene(folder, *chosen)
+
+
 def scene_sets(args: Any) -> dict[str, list[Scene]]:
     """The scenes to measure, by title."""
     sets: dict[str, list[Scene]] = {}
-    if args.rooms:
-        for plan in args.plan:
-            rooms = [room_scene(seed, args.cache, args.every, plan) for seed in args.rooms]
-            sets[f"rooms, {plan}"] = rooms
-    for folder in args.recording:
-        sets[folder.name] = [recording_scene(folder, args.every)]
-    for folder in args.depth:
-        sets[f"{folder.name} (depth)"] = [depth_scene(folder)]
-    if args.scannet:
-        sets["scannet"] = [
-            scannet_scene(f, args.every, args.min_mask, args.min_side, args.views)
-            for f in args.scannet
-        ]
+    for title, scene in usable_scenes(args):
+        sets.setdefault(title, []).append(scene)
     if args.detect:
         detect = rt.OnnxDetector(args.detect, threads=1)
         for title, scenes in sets.items():
@@ -894,6 +908,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="fit the constants of the probability on these rooms, print them")  # fmt: skip
     add("--blocks", type=Path, metavar="DIR",
         help="ConvBlocks of single crops: DIR of train_head.py --crops --setups")  # fmt: skip
+    add_choosing(parser)
     add("--no-crops", action="store_true", help="leave out the slow crop references")
     add("--weight", type=float, default=rt.TrackerConfig().foreground_weight,
         help="share of the foreground in concat (default %(default)s)")  # fmt: skip
@@ -903,19 +918,35 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def check_words(args: Any) -> None:
+    """Refuse numbers and folders that cannot be meant."""
+    for name in ("every", "pictures", "away", "views"):
+        least = int(name == "every")
+        if getattr(args, name) < least:
+            raise rt.ReobjError(f"--{name} {getattr(args, name)}: expected {least} or more")
+    for folder in (*args.recording, *args.depth, *args.scannet):
+        if not folder.is_dir():
+            raise rt.ReobjError(f"{folder}: no such folder")
+
+
 def measure(args: Any) -> None:
     """Measure all sets, write the files, print the tables."""
+    check_words(args)
     if args.calibrate:
         print_calibration(args)
     sets = scene_sets(args)
     if not sets:
-        raise rt.ReobjError("nothing to measure: give --rooms, --recording, --depth or --scannet")
+        raise rt.ReobjError("nothing to measure: give --rooms, --recording, --depth or --scannet "
+                            "with some that may be shown")  # fmt: skip
     args.out.mkdir(parents=True, exist_ok=True)
     counts = [r for title, scenes in sets.items() for r in view_counts(title, scenes)]
-    write_csv(args.out / "counts.csv", counts)
     print(markdown_counts(counts))
     found = [evaluate(title, scenes, args) for title, scenes in sets.items()]
     rows, bins, trust = ([r for part in found for r in part[i]] for i in range(3))
+    if not rows:
+        raise rt.ReobjError("nothing to compare: no object is seen in two frames; a smaller "
+                            "--every takes more of them")  # fmt: skip
+    write_csv(args.out / "counts.csv", counts)
     write_csv(args.out / "rank_k.csv", rows)
     write_csv(args.out / "by_bin.csv", bins)
     plot_bins(bins, args.out)

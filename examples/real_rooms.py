@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
 """Score the whole chain on recordings of rooms whose objects are known, in one table.
 
-    python examples/real_rooms.py DATA -o OUT [--only NAME...] [--seeds 901 902]
-    python examples/real_rooms.py DATA -o OUT --without all   # leaves out one thing after the other
-    python examples/real_rooms.py DATA -o OUT --docs docs     # and fill in docs/tracking.md
+    python examples/real_rooms.py DATA -o OUT --choosing [--only NAME...] [--seeds 901 902]
+    python examples/real_rooms.py DATA -o OUT --choosing --without all # one thing after the other
+    python examples/real_rooms.py DATA -o OUT --choosing --docs docs   # fills in docs/tracking.md
 
 DATA holds hololens_kitchen, redkitchen_7scenes, office_loop, livingroom13 and studio_room; the
-example clip and rendered rooms (of --seeds, made by render_room.py) need none. Every recording runs
-at the defaults in a process of its own. OUT keeps what `run` keeps: detections, cameras and tracks
-of an earlier call are used again, so give another OUT once the detector, the cameras or the tracker
-changed; objects are made anew each time. Writes OUT/real_rooms.md and .json, with --without
-OUT/left_out.md and .json.
+example clip and rendered rooms (of --seeds, made by render_room.py) need none. All of these but
+rooms for reporting were used for choosing (splits.json): --choosing shows them, marked. Every
+recording runs at the defaults in a process of its own. OUT keeps what `run` keeps: detections,
+cameras and tracks of an earlier call are used again, so give another OUT once the detector, the
+cameras or the tracker changed; objects are made anew each time. Writes OUT/real_rooms.md and .json,
+with --without OUT/left_out.md and .json.
 
 What is counted. An object is *listed* if it is not `doubtful`; solids are those of listed objects.
     IDF1       boxes of listed identities, as in tracks.txt. hololens_kitchen: of six
@@ -54,7 +55,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import render_room
-from splits import held_out
+from splits import add_choosing, marked, room_of, usable
 from synthetic_quadrics import table, write_table
 
 import quadrics
@@ -98,13 +99,14 @@ class Case:
             f" from {self.min_score:g}" if self.min_score != DETECTOR.min_score else ""
         )
         where = self.data or ("examples/room" if self.seed is None else f"rendered {self.seed}")
-        return [where, boxes, "supplied" if self.supplied else "own"]
+        return [marked(*self.split, where), boxes, "supplied" if self.supplied else "own"]
 
     @property
-    def held_out(self) -> bool:
-        """Whether nothing was chosen on it (splits.json)."""
-        kind, name = ("recordings", self.data) if self.data else ("rooms", f"v{self.seed}")
-        return held_out(kind, name)
+    def split(self) -> tuple[str, str]:
+        """Return the kind and the name by which splits.json knows the recording."""
+        if self.data:
+            return "recordings", self.data
+        return "rooms", "0" if self.seed is None else room_of(self.seed, "varied")
 
 
 CASES = [
@@ -758,11 +760,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--seeds", nargs="*", type=int, default=[], help="also rooms rendered with these seeds")
     text = "leave these out in turn: all, " + ", ".join(WITHOUT)
     add("--without", nargs="+", default=[], metavar="NAME", help=text)
+    add_choosing(parser)
     add("--docs", type=Path, help="folder with tracking.md to fill in, and img/ for the picture")
     add("--jobs", type=int, default=1, help="processes at once")
     args = parser.parse_args(argv)
     rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
     cases, left_out = chosen([*CASES, *rooms], args.only), every_without(args.without)
+    used = [s for s in dict.fromkeys(c.split for c in cases) if usable(*s, args.choosing)]
+    if not (cases := [case for case in cases if case.split in used]):
+        raise SystemExit("error: nothing left to score")
     args.out.mkdir(parents=True, exist_ok=True)
     for folder in {case.data for case in cases if case.supplied}:
         write_poses(args.data / folder, args.out / f"poses-{folder}")
@@ -815,10 +821,8 @@ def tables(cases: Sequence[Case], made: dict[str, list[Figures]]) -> dict[str, s
         ]
         return {"left out": figures_table(["recording", "without"], rows)}
     rows = [(case.title, figures) for case, figures in zip(cases, made[""], strict=True)]
-    reported = [", ".join(case.title) for case in cases if case.held_out]
-    note = f"\n\nHeld out (`examples/splits.json`): {'; '.join(reported) or 'none of these'}."
     return {
-        "real rooms": figures_table(["recording", "boxes", "cameras"], rows) + note,
+        "real rooms": figures_table(["recording", "boxes", "cameras"], rows),
         "confidence": reliability_table(sure_by_group(cases, made[""])),
     }
 

@@ -1,8 +1,10 @@
 #!/usr/bin/env python3
 """Ellipsoids of real objects beside the true ones: by solver and category, and by tracker.
 
-    python examples/real_solids.py solvers FOLDER... -o OUT [--picture FILE]
+    python examples/real_solids.py solvers FOLDER... -o OUT [--choosing] [--picture FILE]
     python examples/real_solids.py identities FOLDER... -o OUT --peers build/peers [--own-cameras]
+
+What was used for choosing (splits.json) is left out; --choosing shows it, marked.
 
 `solvers` (the thesis's figs 4.3-4.5): every box has the identity of the true object that it shows;
 SfMO, PSfMO, LfD and `fit_objects` ("solids") then have the same boxes and the same true cameras.
@@ -56,6 +58,7 @@ from benchmark import ROWS
 from rank_k import pyplot
 from real_rooms import MIN_VISIBLE, identity_f1, judge, kinds_of, median, short, write_poses
 from reid_scenes import scannet_scene
+from splits import add_choosing, marked, split_name, usable
 from synthetic_quadrics import table
 
 import quadrics
@@ -607,7 +610,8 @@ def run_solvers(args: argparse.Namespace) -> None:
     for folder in args.folder:
         for boxes in args.boxes or [""]:
             rec = recording(folder, args.out, boxes)
-            title = rec.name + (f", {boxes} boxes" if boxes and rec.detections is None else "")
+            title = marked(*split_name(folder), rec.name)
+            title += f", {boxes} boxes" if boxes and rec.detections is None else ""
             rows += solver_rows(title, rec, compare_solvers(rec, args.out))
     write_rows(args.out, "solvers", rows, solver_table(rows))
     draw_solvers(rows, args.picture or args.out / "solvers.png")
@@ -620,7 +624,8 @@ def run_identities(args: argparse.Namespace) -> None:
         rec = recording(folder, args.out, (args.boxes or [""])[0])
         for own in (False, True) if args.own_cameras else (False,):
             found, lines = compare_identities(rec, args.out, args.peers, own)
-            rows += lines
+            title = marked(*split_name(folder), rec.name)
+            rows += [{**line, "recording": title} for line in lines]
             file = f"{rec.name}{'_own' if own else ''}"
             shown = {n: found[n] for n in SHOWN if n in found}
             draw_above(rec, shown, args.out / f"identities_{file}.png")
@@ -648,8 +653,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             add("--peers", type=Path, help="folder for the venv of SORT and DeepSORT")
             add("--own-cameras", action="store_true", help="also with reconstructed cameras")
+        add_choosing(own)
     args = parser.parse_args(argv)
     try:
+        args.folder = [f for f in args.folder if usable(*split_name(f), args.choosing)]
+        if not args.folder:
+            raise rt.ReobjError("nothing left to score")
         args.out.mkdir(parents=True, exist_ok=True)
         args.run(args)
     except (rt.ReobjError, quadrics.QuadricsError) as error:

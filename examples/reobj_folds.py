@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
 """Train and test re-OBJ's four setups on one recording, in three folds of its objects.
 
-    python examples/reobj_folds.py redkitchen_7scenes --backbone resnet50v2_gluon_s3.onnx -o OUT
+    python examples/reobj_folds.py redkitchen_7scenes --backbone resnet50v2_gluon_s3.onnx \\
+        --choosing -o OUT
 
 prints Rank-1, 5, 10, 20 of full, fg, bg and concat, not trained and trained, and writes them with
 what was used to OUT/reobj_folds.md and .csv. Needs `pip install torch onnx`; minutes on one core.
+Without --choosing only a recording that is for reporting (splits.json) is taken.
 
 Every annotated view of an object gives three crops (object alone, surroundings alone, both), each
 of which a frozen backbone turns into a map. A ConvBlock, for concat one for both maps concatenated,
@@ -40,6 +42,7 @@ import train_embedding as te  # noqa: E402  (first: it says so if there is no Py
 import torch  # noqa: E402
 from rank_k import Pairs, hit, pairs_of, rank_queries, write_csv  # noqa: E402
 from reid_scenes import Scene, recording_scene  # noqa: E402
+from splits import add_choosing, marked, split_name, usable  # noqa: E402
 from synthetic_quadrics import table  # noqa: E402
 from train_head import CROP_SETUPS, ConvBlock  # noqa: E402
 
@@ -182,6 +185,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--every", type=int, default=20, help="use every n-th frame (default %(default)s)")
     add("--away", type=int, default=30, help="frames between query and gallery")
     add("--folds", type=int, default=3)
+    add_choosing(parser)
     add("--width", type=int, default=64,
         help="channels of the ConvBlock's first stage (0: of its maps, as published)")  # fmt: skip
     add("--loss", choices=te.LOSSES, default="hardest", help="the negative (default %(default)s)")
@@ -195,7 +199,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Command line entry; 0 on success, 2 on bad input."""
     args = build_parser().parse_args(argv)
     torch.set_num_threads(1)
+    split = split_name(args.recording)
     try:
+        if not usable(*split, args.choosing):
+            raise rt.ReobjError("nothing left to train and test on")
         scene = recording_scene(args.recording, args.every)
         objects = len(np.unique(scene.identity[scene.scored]))
         if objects < 2 * args.folds:
@@ -214,8 +221,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         [r["setup"], r["trained"], r["queries"], *(f"{r[f'rank{k}']:.1f}" for k in RANKS),
          f"{r['rank1_least']:.1f} to {r['rank1_most']:.1f}"] for r in rows
     ])  # fmt: skip
-    used = (f"{text}; first width {args.width or 'as published'}, {args.steps} steps, "
-            f"loss {args.loss}, {args.repeats} repeats")  # fmt: skip
+    used = (f"{marked(*split)}: {text}; first width {args.width or 'as published'}, "
+            f"{args.steps} steps, loss {args.loss}, {args.repeats} repeats")  # fmt: skip
     with atomic(args.out / "reobj_folds.md") as part:
         part.write_text(f"{used}\n\n{lines}\n")
     print(f"{used}\n\n{lines}")

@@ -1,12 +1,14 @@
 """How far the metric scale that size priors give lies from the truth, and whether its sigma holds.
 
 Usage:
-    python examples/scale_table.py DATA [-o docs]
+    python examples/scale_table.py DATA [--choosing] [-o docs]
 
 Recordings with metric poses are scaled by a random factor and handed to `quadrics.fit_objects` with
 metric=False; its `Scale` must undo the factor. No detector and no picture is needed: rooms of
 render_room.py are drawn as maps of instances, the rest has recorded boxes. DATA holds
-redkitchen_7scenes, hololens_kitchen and tum_fr3_office; "none" leaves the rooms alone.
+redkitchen_7scenes, hololens_kitchen and tum_fr3_office; "none" leaves the rooms alone. Of the rooms
+those with a plan of their own serve that are for reporting (splits.json); --choosing shows the
+recordings too, and --rooms more rooms, marked.
 
 Who says which boxes are one object:
     true     boxes of the objects in the truth: whole, with their hidden parts; redkitchen: as seen
@@ -23,6 +25,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -35,6 +38,7 @@ from scipy.optimize import linear_sum_assignment
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import render_room as rr
+from splits import MARK, SPLITS, add_choosing, marked, room_of, usable
 from synthetic_quadrics import table, write_table
 
 import quadrics
@@ -111,7 +115,7 @@ def room(seed: int) -> list[Recording]:
     noisy = seen + rr.DetectorConfig().box_sigma * extent * rng.normal(size=seen.shape)
     names = tuple(truth.class_name for truth in made.objects)
     kinds = {"true": whole, "seen": quadrics.clip_boxes(noisy, size)}
-    title, cams = f"room {seed}", K @ poses
+    title, cams = marked("rooms", room_of(seed, "varied"), f"room {seed}"), K @ poses
     return [Recording(f"{title}: {k}", b, cams, size, names).part() for k, b in kinds.items()]
 
 
@@ -184,7 +188,7 @@ def calibration(folder: Path) -> Array:
 def kitchen(folder: Path) -> list[Recording]:
     """All boxes of redkitchen_7scenes or hololens_kitchen."""
     cams, (boxes, names) = cameras(folder), true_boxes(folder)
-    short = folder.name.split("_")[0]
+    short = marked("recordings", folder.name, folder.name.split("_")[0])
     out = [Recording(f"{short}: true", boxes, *cams, names)]
     for file in sorted(folder.glob("detections_*.csv")):
         rows, kind = np.loadtxt(file, delimiter=","), file.stem.split("_")[1]
@@ -210,8 +214,11 @@ def office(folder: Path, every: int = 4) -> list[Recording]:
     corner, extent = table_[use, 2:4], table_[use, 4:6]
     rows = np.c_[frame[use], corner, corner + extent, table_[use, 6], table_[use, 1]]
     cams = projections(folder, world_from_cam)
-    return [tracked("tum_fr3_office: tracked, yolo", rows, cams, calibration(folder))]
+    title = marked("recordings", folder.name)
+    return [tracked(f"{title}: tracked, yolo", rows, cams, calibration(folder))]
 
+
+READERS = {"redkitchen_7scenes": kitchen, "hololens_kitchen": kitchen, "tum_fr3_office": office}
 
 # ---- Variants and the table --------------------------------------------------------------------
 
@@ -274,13 +281,12 @@ def measure(case: tuple[Recording, float]) -> Row:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Share within 2 sigma and typical errors by recording, and of all."""
+    """Share within 2 sigma and typical errors by recording, and of all of a kind."""
     kinds: dict[str, list[Row]] = {}
     for row in rows:
-        name = row.name.split(" | ")[0]
-        name = "rooms: " + name.split(": ")[1] if name.startswith("room ") else name
+        name = re.sub(r"^room \d+", "rooms", row.name.split(" | ")[0])
         whole = "all rooms" if name.startswith("rooms") else "all real recordings"
-        for key in (name, whole, "all"):
+        for key in (name, whole + MARK * (MARK in name)):
             kinds.setdefault(key, []).append(row)
     lines: list[list[object]] = []
     for name in sorted(kinds, key=lambda key: key.startswith("all")):
@@ -304,19 +310,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("data", help="folder of the recordings, or none")
     parser.add_argument("-o", type=Path, metavar="DOCS", help="folder with quadrics.md to fill in")
-    parser.add_argument("--rooms", type=int, default=10, help="rendered rooms")
+    parser.add_argument("--rooms", type=int, default=10, help="rooms for choosing (--choosing)")
     parser.add_argument("--parts", type=int, default=2, help="variants of each kind a recording")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    add_choosing(parser)
     args = parser.parse_args(argv)
+    seeds = [int(name[1:]) for name in SPLITS["reporting"]["rooms"] if name.startswith("v")]
+    seeds += range(50, 50 + args.rooms) if args.choosing else []
     with ProcessPoolExecutor(args.jobs) as pool:
         recordings = []
-        for made in pool.map(room, range(50, 50 + args.rooms)):
+        for made in pool.map(room, seeds):
             recordings += made
-        if args.data != "none":
-            folder = Path(args.data)
-            for name in ("redkitchen_7scenes", "hololens_kitchen"):
-                recordings += kitchen(folder / name)
-            recordings += office(folder / "tum_fr3_office")
+        for name in READERS if args.data != "none" else ():
+            if usable("recordings", name, args.choosing):
+                recordings += READERS[name](Path(args.data) / name)
         rng = np.random.default_rng(0)
         parts = [part for whole in recordings for part in variants(whole, args.parts, rng)]
         cases = [(part, float(10 ** rng.uniform(-1, 1))) for part in parts if part.names]

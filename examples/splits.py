@@ -1,24 +1,70 @@
-"""What may be reported and what was chosen on: `splits.json`, read by the scripts that report."""
+"""What may be reported and what was chosen on: `splits.json`, obeyed by the scripts that report.
+
+What is not named for reporting is left out, with a line on stderr; --choosing shows it, marked.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
+import sys
 from pathlib import Path
 
 SPLITS = json.loads((Path(__file__).resolve().parent / "splits.json").read_text())
+MARK = " (choosing)"  # of what is not held out
 
 
 def held_out(kind: str, name: str) -> bool:
     """Tell whether a sequence is for reporting: nothing was chosen on it.
 
     Args:
-        kind: rooms, recordings or pedestrians.
+        kind: rooms, recordings, pedestrians or scans.
         name: of the recording or sequence; of a room `room_name`.
     """
-    return name in SPLITS["reporting"][kind]
+    names = SPLITS["reporting"][kind]
+    return names == "all" or name in names
+
+
+def usable(kind: str, name: str, choosing: bool, tune: bool = False) -> bool:
+    """Tell whether a sequence may be used, and say on stderr if not.
+
+    Args:
+        choosing: also what is not held out. tune: only what is not held out, whatever `choosing`.
+    """
+    if held_out(kind, name) != tune or (choosing and not tune):
+        return True
+    why = "is for reporting" if tune else "is not for reporting; --choosing shows it, marked"
+    print(f"left out (examples/splits.json): {name} {why}", file=sys.stderr)
+    return False
+
+
+def marked(kind: str, name: str, title: str = "") -> str:
+    """Return the title of a sequence (its name), marked where it is not held out."""
+    return (title or name) + ("" if held_out(kind, name) else MARK)
+
+
+def add_choosing(parser: argparse.ArgumentParser) -> None:
+    """Add the option --choosing."""
+    text = "also what was used for choosing (splits.json), marked"
+    parser.add_argument("--choosing", action="store_true", help=text)
+
+
+def split_name(folder: Path) -> tuple[str, str]:
+    """Return the kind and the name of a folder's video: a scan, a rendered room or a recording."""
+    if (folder / "color").is_dir() or (folder / "house_segmentations").is_dir():
+        return "scans", folder.name
+    truth = folder / "gt_objects.json"
+    if truth.exists() and "config" in json.loads(truth.read_text()):
+        return "rooms", room_name(folder)
+    return "recordings", folder.name
 
 
 def room_name(folder: Path) -> str:
     """Name a room of render_room.py by what it was made of: its seed, v before it if varied."""
     config = json.loads((folder / "gt_objects.json").read_text())["config"]
-    return ("v" if config.get("plan") == "varied" else "") + str(config["seed"])
+    return room_of(config["seed"], config.get("plan", ""))
+
+
+def room_of(seed: int, plan: str) -> str:
+    """Name a room of render_room.py by its seed and plan."""
+    return ("v" if plan == "varied" else "") + str(seed)

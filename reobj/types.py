@@ -227,7 +227,7 @@ class Tracks:
         return len(self.track_id)
 
     def __getitem__(self, keep: Any) -> Tracks:
-        return Tracks(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+        return Tracks(*(getattr(self, name)[keep] for name in self.__slots__))
 
     @staticmethod
     def empty() -> Tracks:
@@ -343,16 +343,13 @@ def as_detections(found: Any) -> Detections:
         found = found[0]
     if isinstance(found, Detections):
         made = _checked(found.xyxy, found.score, found.class_id, found.masks)
-        same = all(getattr(made, f.name) is getattr(found, f.name) for f in _FIELDS)
+        same = all(getattr(made, name) is getattr(found, name) for name in found.__slots__)
         return found if same else made
     if isinstance(found, Mapping):
         return _checked(*_mapping_parts(found))
     if hasattr(found, "orig_shape") and hasattr(found, "boxes"):
         return _checked(*_ultralytics_parts(found))
     return _checked(*(_box_parts(found) if hasattr(found, "xyxy") else _row_parts(found)))
-
-
-_FIELDS = dataclasses.fields(Detections)
 
 
 def _is_whole(found: Any) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from reobj.identity.assignment import AMBIGUITY_MARGIN, Pairs, ambiguous_pairs, assign
+from reobj.identity.assignment import AMBIGUITY_MARGIN, Pairs, ambiguous_pairs, assign, touching
 
 
 def random_pairs(seed: int, rows: int, columns: int, share: float) -> tuple[np.ndarray, np.ndarray]:
@@ -50,3 +50,20 @@ def test_rivals_cost_little_more_than_the_best_of_track_and_detection(share: flo
             whole_found = np.zeros((8, 7), bool)
             whole_found[tuple(pairs[found].T)] = True
             np.testing.assert_array_equal(whole_found, expected)
+
+
+def test_detections_touch_a_track_where_its_reach_and_their_box_meet_in_x_and_in_y() -> None:
+    """As pair by pair; in the order of tracks, then of detections."""
+    rng = np.random.default_rng(0)
+    center, reach = rng.uniform(0, 100, (2, 20)), rng.uniform(1, 20, (2, 20))
+    corner, size = rng.uniform(0, 100, (30, 2)), rng.uniform(0, 20, (30, 2))
+    expected = [
+        (t, d)
+        for t, d in np.ndindex(20, 30)
+        if (corner[d] <= center[:, t] + reach[:, t]).all()
+        and (corner[d] + size[d] >= center[:, t] - reach[:, t]).all()
+    ]
+    found = touching(center, reach, np.hstack([corner, corner + size]))
+    assert 20 < len(expected) < 300 and list(zip(*found, strict=True)) == expected
+    assert [len(x) for x in touching(center, reach, np.empty((0, 4)))] == [0, 0]
+    assert [len(x) for x in touching(center[:, :0], reach[:, :0], np.ones((3, 4)))] == [0, 0]

@@ -221,11 +221,13 @@ def test_the_points_in_a_box_tell_how_far_away_its_thing_is() -> None:
 def test_an_uncertain_place_overlaps_within_its_reach() -> None:
     box = np.array([[100.0, 100, 40, 20], [300, 100, 40, 20]])
     seen = np.array([[160.0, 100, 40, 20], [100, 160, 40, 20]])
-    iou, share = overlap_within_reach(box, np.zeros((2, 2)), seen)
+    columns = box.T[..., None], seen.T[:, None]
+    iou, share = overlap_within_reach(columns[0], np.zeros((2, 1, 1)), columns[1])
     boxes = xyxy_from_cxcywh(box), xyxy_from_cxcywh(seen)
     np.testing.assert_allclose(iou, box_iou(*boxes), atol=1e-9)
     assert share.ravel().tolist() == [1, 1]
-    iou, share = overlap_within_reach(box, np.array([[60.0, 0], [20, 0]]), seen)
+    reach = np.array([[60.0, 20], [0, 0]])[..., None]
+    iou, share = overlap_within_reach(columns[0], reach, columns[1])
     np.testing.assert_allclose(iou, [[1, 0], [0, 0]], atol=1e-9)  # to the side, not below
     np.testing.assert_allclose(share.ravel(), [0.25, 0.5])
 

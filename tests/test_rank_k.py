@@ -380,28 +380,30 @@ def recording(folder: Path, textured: bool) -> Path:
 @pytest.mark.parametrize("textured", [True, False])
 def test_twins_are_told_apart_by_the_background(textured: bool, tmp_path: Path) -> None:
     out, clip = tmp_path / "out", recording(tmp_path / "clip", textured)
-    assert rk.main(["--recording", str(clip), "--every", "1", "--no-crops", "-o", str(out)]) == 0
+    words = ["--every", "1", "--no-crops", "--choosing", "-o", str(out)]
+    assert rk.main(["--recording", str(clip), *words]) == 0
     with (out / "rank_k.csv").open() as file:
         table = [r for r in csv.DictReader(file) if (r["protocol"], r["gap"]) == ("twins", "any")]
     rank1 = {r["setup"]: float(r["rank1"]) for r in table}
     assert set(rank1) == {"fg", "bg", "concat"}
     assert (rank1["bg"] == 100) == textured
     assert (rank1["concat"] == 100) == textured
-    assert (out / "rank_k_clip.png").stat().st_size > 0
+    assert (out / "rank_k_clip_choosing.png").stat().st_size > 0
 
 
 def test_tables_and_pictures_of_matches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Counts, Rank-1/5/10/20, and a row of six cells for each setup of each query."""
     out, clip = tmp_path / "out", recording(tmp_path / "clip", True)
-    words = ["--every", "1", "--no-crops", "--pictures", "2", "--away", "3", "-o", str(out)]
-    assert rk.main(["--recording", str(clip), *words]) == 0
+    words = ["--every", "1", "--no-crops", "--pictures", "2", "--away", "3", "--choosing"]
+    assert rk.main(["--recording", str(clip), *words, "-o", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "| clip | chair | 16 | 2 |" in printed
-    table = next(line for line in printed.splitlines() if line.startswith("| clip | reobj, frame"))
+    assert "| clip (choosing) | chair | 16 | 2 |" in printed
+    head = "| clip (choosing) | reobj, frame"
+    table = next(line for line in printed.splitlines() if line.startswith(head))
     with (out / "rank_k.csv").open() as file:
         row = next(r for r in csv.DictReader(file) if (r["protocol"], r["gap"]) == ("open", "away"))
     assert table.split("|")[4:-1] == [f" {float(row[f'rank{k}']):.1f} " for k in (1, 5, 10, 20)]
-    picture = cv2.imread(str(out / "matches_clip_reobj_frame.jpg"))
+    picture = cv2.imread(str(out / "matches_clip_choosing_reobj_frame.jpg"))
     assert picture.shape == (2 * 3 * (rk.CELL + rk.CAPTION), 6 * rk.CELL, 3)
 
 
@@ -425,10 +427,41 @@ def test_the_frame_of_a_match_says_whether_it_is_right(tmp_path: Path) -> None:
         np.testing.assert_allclose(picture[line, k * rk.CELL + 1], color, atol=25)
 
 
-def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert rk.main(["--recording", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--choosing", "--recording", "."], "expected identities in gt_mot.txt"),
+        (["--choosing", "--recording", "nowhere"], "nowhere: no such folder"),
+        (["--scannet", "nowhere"], "nowhere: no such folder"),
+        (["--scannet", "."], "expected SCENE.aggregation.json"),
+        (["--scannet", "scene0000_00", "--every", "0"], "--every 0: expected 1 or more"),
+        (["--scannet", "scene0000_00", "--pictures", "-1"], "--pictures -1: expected 0 or more"),
+        (["--scannet", "scene0000_00", "--min-side", "999"], "no view is scored"),
+        (["--scannet", "scene0000_00", "--every", "6"], "no object is seen in two frames"),
+        (["--scannet", "scene0000_00", "--models", "nothing"], "model nothing: no such file"),
+    ],
+)
+def test_bad_input_is_one_line(
+    words: list[str], said: str, scannet: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert rk.main([*words, "--no-crops", "-o", "out"]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("error: ") and said in last
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_without_a_query_for_a_picture_there_is_none(scannet, tmp_path, capsys) -> None:
+    """One chair is masked away: nothing beside it could be taken for it."""
+    (scannet / "scene0000_00.aggregation.json").write_text(
+        json.dumps({"segGroups": [{"objectId": 0, "label": "chair"}]})
+    )
+    out = tmp_path / "out"
+    words = ["--every", "1", "--away", "0", "--pictures", "1", "--no-crops", "-o", str(out)]
+    assert rk.main(["--scannet", str(scannet), *words]) == 0
+    assert "no matches_scannet_reobj_frame.jpg: no object" in capsys.readouterr().err
+    assert (out / "rank_k.csv").exists() and not list(out.glob("*.jpg"))
 
 
 def normal_cases(n: int = 2400, objects: int = 3) -> rk.Cases:

@@ -329,7 +329,7 @@ def test_whole_table_of_a_simulated_walk(
 ) -> None:
     (tmp_path / "tracking.md").write_text("<!-- table left out -->\n<!-- end left out -->\n")
     args = [str(data), "-o", str(tmp_path), "--only", "kitchen-true", "--docs", str(tmp_path)]
-    assert rr.main([*args, "--without", "alternation"]) == 0
+    assert rr.main([*args, "--choosing", "--without", "alternation"]) == 0
     made = json.loads((tmp_path / "left_out.json").read_text())
     whole, without = (made[k]["kitchen-true"] for k in ("", "alternation"))
     for score in (whole, without):
@@ -340,7 +340,7 @@ def test_whole_table_of_a_simulated_walk(
     text = (tmp_path / "left_out.md").read_text()
     assert capsys.readouterr().out.endswith(text)
     for without in ("nothing", "alternation"):
-        assert f"| hololens_kitchen, true, supplied | {without} |" in text
+        assert f"| hololens_kitchen (choosing), true, supplied | {without} |" in text
     assert text in (tmp_path / "tracking.md").read_text()
     assert len(list((tmp_path / "poses-hololens_kitchen").glob("*.pose.txt"))) == FRAMES
 

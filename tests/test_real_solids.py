@@ -141,7 +141,8 @@ def compared(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rs.cd, "peer_run", cut)
         patch.setattr(rs, "TRACKERS", {name: "rf-sort"})
-        assert rs.main(["identities", str(room), "-o", str(work), "--peers", "peers"]) == 0
+        words = ["--choosing", "--peers", "peers"]
+        assert rs.main(["identities", str(room), "-o", str(work), *words]) == 0
     return work
 
 
@@ -161,7 +162,7 @@ def test_duplicates_count_against_a_tracker_that_does_not_recognise(compared: Pa
     assert truth["o3d"] == truth["o3d_1to1"] and float(truth["o3d"]) > 0.8
     assert float(truth["centre_m"]) < 0.03
     text = (compared / "identities.md").read_text()
-    assert "| room | true | SORT |" in text and "| 5 of 5 | 5 |" in text
+    assert "| room (choosing) | true | SORT |" in text and "| 5 of 5 | 5 |" in text
 
 
 def test_pictures_before_and_after(compared: Path, room: Path, tmp_path: Path) -> None:
@@ -196,7 +197,8 @@ def test_missing_objects_count_as_0(compared: Path, room: Path, tmp_path: Path) 
 
 def test_solvers_by_category(room: Path, tmp_path: Path, capsys) -> None:
     """Exact boxes of boxes: our solids know what they are, an ellipsoid in closed form does not."""
-    assert rs.main(["solvers", str(room), "-o", str(tmp_path), "--boxes", "true"]) == 0
+    words = ["--choosing", "--boxes", "true"]
+    assert rs.main(["solvers", str(room), "-o", str(tmp_path), *words]) == 0
     rows = {r["category"]: r for r in table_of(tmp_path / "solvers.csv")}
     assert list(rows) == ["chair", "cup", "all"]
     assert [rows[c]["true"] for c in rows] == ["4", "1", "5"]
@@ -207,7 +209,7 @@ def test_solvers_by_category(room: Path, tmp_path: Path, capsys) -> None:
     )
     assert rows["all"]["solids_found"] == "5" and float(rows["all"]["solids_centre_m"]) < 0.02
     assert cv2.imread(str(tmp_path / "solvers.png")).std() > 5
-    assert "| room, true boxes | chair | 4 |" in capsys.readouterr().out
+    assert "| room (choosing), true boxes | chair | 4 |" in capsys.readouterr().out
 
 
 # ---- ScanNet ------

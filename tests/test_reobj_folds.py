@@ -108,7 +108,9 @@ def test_four_setups_are_trained_alike_on_a_recording(folds, tmp_path, capsys) -
     command = [str(recording(tmp_path / "r")), "-o", str(tmp_path / "out"), "--width", "4"]
     command += ["--backbone", str(tmp_path / "net.onnx"), "--every", "1", "--away", "0"]
     command += ["--repeats", "2"]
-    assert folds.main([*command, "--steps", "3"]) == 0
+    assert folds.main([*command, "--steps", "3"]) == 2
+    assert "r is not for reporting" in capsys.readouterr().err
+    assert folds.main([*command, "--steps", "3", "--choosing"]) == 0
     with (tmp_path / "out" / "reobj_folds.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(r["setup"], r["trained"]) for r in rows] == [
@@ -118,7 +120,7 @@ def test_four_setups_are_trained_alike_on_a_recording(folds, tmp_path, capsys) -
     first = {(r["setup"], r["trained"]): float(r["rank1"]) for r in rows}
     assert first["bg", "no"] > 95 > 60 > first["fg", "no"]
     assert all(float(r["rank20"]) >= float(r["rank1"]) for r in rows)
-    assert "net.onnx: its own spatial output" in capsys.readouterr().out
+    assert "r (choosing): net.onnx: its own spatial output" in capsys.readouterr().out
 
 
 def test_queries_are_of_objects_that_the_block_never_saw(folds, tmp_path, monkeypatch) -> None:
@@ -145,7 +147,8 @@ def test_queries_are_of_objects_that_the_block_never_saw(folds, tmp_path, monkey
 
 def test_too_few_objects_for_the_folds(folds, tmp_path, capsys) -> None:
     folder = recording(tmp_path / "r")
-    assert folds.main([str(folder), "-o", str(tmp_path / "out"), "--folds", "4"]) == 2
+    words = ["-o", str(tmp_path / "out"), "--folds", "4", "--choosing"]
+    assert folds.main([str(folder), *words]) == 2
     assert "6 annotated objects; 8 or more are needed for 4 folds" in capsys.readouterr().err
     with pytest.raises(rt.ReobjError):
         folds.recording_scene(tmp_path / "none")

@@ -6,15 +6,20 @@ import json
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "examples"))
 import compare_deepsort  # noqa: E402
+import pose_accuracy  # noqa: E402
+import rank_k  # noqa: E402
 import real_rooms  # noqa: E402
+import real_solids  # noqa: E402
+import scale_table  # noqa: E402
 from benchmark import TUNED  # noqa: E402
-from splits import SPLITS, held_out, room_name  # noqa: E402
+from splits import SPLITS, held_out, marked, room_name, split_name  # noqa: E402
 
 
 def test_nothing_is_for_both() -> None:
@@ -65,7 +70,7 @@ def test_what_may_not_be_used_is_left_out(
     args = compare_deepsort.make_parser().parse_args(["--rooms", "0", *words, "-o", str(tmp_path)])
     assert [s.name for s in compare_deepsort.wanted(args)] == used
     said = capsys.readouterr().err
-    assert re.findall(r"left out: (\w+) is for", said) == left_out
+    assert re.findall(r"left out \(examples/splits.json\): (\w+) is", said) == left_out
 
 
 def test_every_peer_has_a_setting_within_its_sweep() -> None:
@@ -75,7 +80,89 @@ def test_every_peer_has_a_setting_within_its_sweep() -> None:
             assert value in compare_deepsort.SWEEP[peer][option][1:]
 
 
-def test_the_table_of_real_rooms_says_what_was_chosen_on() -> None:
-    rooms = [real_rooms.Case("", "", seed=seed) for seed in (901, 2006)]
-    assert [case.held_out for case in rooms] == [False, True]
-    assert not any(case.held_out for case in real_rooms.CASES)
+def test_the_table_of_real_rooms_marks_what_was_chosen_on() -> None:
+    rooms = [real_rooms.Case("", "", seed=seed).title[0] for seed in (901, 2006)]
+    assert rooms == ["rendered 901 (choosing)", "rendered 2006"]
+    assert all(case.title[0].endswith(" (choosing)") for case in real_rooms.CASES)
+
+
+RECORDING = "redkitchen_7scenes"
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (real_rooms, ["FOLDER/..", "--only", "redkitchen", "-o", "OUT"]),
+        (real_solids, ["solvers", "FOLDER", "-o", "OUT"]),
+        (real_solids, ["identities", "FOLDER", "-o", "OUT"]),
+        (rank_k, ["--recording", "FOLDER", "-o", "OUT"]),
+        (rank_k, ["--depth", "FOLDER", "-o", "OUT"]),
+        (rank_k, ["--rooms", "901", "--plan", "varied", "-o", "OUT"]),
+        (rank_k, ["--calibrate", "REPORTED", "--plan", "home", "-o", "OUT"]),
+        (rank_k, ["--calibrate", "REPORTED", "--plan", "home", "--choosing", "-o", "OUT"]),
+        (pose_accuracy, ["redkitchen", "--data", "FOLDER/..", "-o", "OUT"]),
+    ],
+)
+def test_every_script_leaves_out_what_it_may_not_use(
+    script: Any, words: list[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Before anything is computed or written."""
+    (tmp_path / RECORDING / "images").mkdir(parents=True)
+    said = {"FOLDER": str(tmp_path / RECORDING), "OUT": str(tmp_path / "out"), "REPORTED": "2001"}
+    for word, value in said.items():
+        words = [w.replace(word, value) for w in words]
+    monkeypatch.setattr(sys, "argv", ["script", *words])
+    try:
+        code = script.main() if script is pose_accuracy else script.main(words)
+    except SystemExit as error:
+        code = error.code
+    assert code not in (0, None)
+    left_out = {"901": "v901", "2001": "2001"}.get(words[1], RECORDING)
+    assert f"left out (examples/splits.json): {left_out} is " in capsys.readouterr().err
+    assert not (tmp_path / "out" / "work").exists() and not list(tmp_path.glob("out/*"))
+
+
+def test_a_folder_is_a_scan_a_room_or_a_recording(tmp_path: Path) -> None:
+    for name in ("scene0000_00/color", "17DRP5sb8fy/house_segmentations", "mine/images"):
+        (tmp_path / name).mkdir(parents=True)
+    folders = [tmp_path / n for n in ("scene0000_00", "17DRP5sb8fy", "mine")]
+    folders.append(ROOT / "examples" / "room")
+    found = [split_name(folder) for folder in folders]
+    assert [kind for kind, _ in found] == ["scans", "scans", "recordings", "rooms"]
+    assert [marked(*f) for f in found] == [
+        "scene0000_00", "17DRP5sb8fy", "mine (choosing)", "0 (choosing)",
+    ]  # fmt: skip
+
+
+def test_the_table_of_scales_has_the_rooms_for_reporting(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """And with --choosing others besides, apart."""
+    made: list[int] = []
+
+    class Pool:
+        def __init__(self, jobs: int) -> None: ...
+        def __enter__(self) -> Any:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+        def map(self, function: Any, jobs: Any) -> list[Any]:
+            made.extend(jobs if function is scale_table.room else [])
+            return []
+
+    monkeypatch.setattr(scale_table, "ProcessPoolExecutor", Pool)
+    assert scale_table.main([str(tmp_path)]) == 0
+    assert [f"v{seed}" for seed in made] == [
+        n for n in SPLITS["reporting"]["rooms"] if n.startswith("v")
+    ]
+    assert "redkitchen_7scenes is not for reporting" in capsys.readouterr().err
+    scale = scale_table.quadrics.Scale(1.0, 0.1, "priors")
+    rows = [
+        scale_table.Row(f"room {r}: true | all", 1, 1, 1, 1.0, scale)
+        for r in ("2006", "2007", "50 (choosing)")
+    ]
+    lines = [line.split("|")[1:3] for line in scale_table.summary(rows).splitlines()[2:]]
+    assert {name.strip(): int(runs) for name, runs in lines} == {
+        "rooms: true": 2, "rooms (choosing): true": 1, "all rooms": 2, "all rooms (choosing)": 1,
+    }  # fmt: skip

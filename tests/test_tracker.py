@@ -98,7 +98,8 @@ def test_gate_is_the_distance_over_the_whole_innovation() -> None:
     state = spawned(np.array([[100, 100, 80, 20], [300, 50, 30, 90.0]]), config)
     mean, cov = rt.kalman_predict(state.mean, state.cov, config)
     center = np.array([[104, 97], [280, 60], [301, 55.0]])
-    found = rt.squared_mahalanobis(mean, cov, center)
+    residual = center.T[:, None] - mean[:, :2, 0].T[..., None]  # (2, 2, 3)
+    found = rt.squared_mahalanobis(residual, rt.center_variance(mean, cov).T[..., None])
     for i, j in np.ndindex(2, 3):
         kf = filterpy_of(state, i)
         std = noise_scale(state.mean)[i] * [[config.std_position], [config.std_velocity]]
@@ -106,6 +107,17 @@ def test_gate_is_the_distance_over_the_whole_innovation() -> None:
         noise = (0.05 * noise_scale(mean)[i, :2]) ** 2
         inverse = np.linalg.inv(kf.P[:2, :2] + np.diag(noise))
         assert found[i, j] == pytest.approx(mahalanobis(center[j], kf.x[:2, 0], inverse) ** 2)
+
+
+def test_what_overlaps_passes_the_gate_though_its_centre_lies_outside() -> None:
+    """A thing of 200 px at rest, of which only the right end is detected."""
+    tracker, appearance = rt.Tracker(rt.TrackerConfig(n_init=1)), [[1.0, 0, 0]]
+    whole, end = [100, 100, 300, 300, 0.9, 0], [256, 100, 301, 300, 0.9, 0]
+    for _ in range(20):
+        tracker.update([whole], embeddings=appearance)
+    state = rt.kalman_predict(tracker.state.mean, tracker.state.cov, tracker.config)
+    assert 9.21 * rt.center_variance(*state)[0, 0] < (256 - 200) ** 2  # px, to its nearest edge
+    assert tracker.update([end], embeddings=appearance).tracklet_id.tolist() == [1]
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.3])

@@ -24,7 +24,7 @@ class Pairs:
 
     Attributes:
         track, detection: (M,) rows. cost: (M,) of overlap and gated distance, 0 to 1. iou: (M,).
-        evidence: (M,) log odds of one object that the boxes give.
+        share: (M,) of what their overlap says (`overlap_within_reach`).
         same_class: (M,) the detection has the class that the track was mostly seen as.
     """
 
@@ -32,8 +32,22 @@ class Pairs:
     detection: IntArray
     cost: Array
     iou: Array
-    evidence: Array
+    share: Array
     same_class: BoolArray
+
+
+def touching(center: Array, reach: Array, xyxy: Array) -> tuple[IntArray, IntArray]:
+    """Find the detections (D, 4) that touch the area within reach of each track.
+
+    Args:
+        center, reach: (2, T) px.
+    Returns:
+        track, detection: (M,) rows, in the order of tracks, then of detections.
+    """
+    low, high = (center - reach)[..., None], (center + reach)[..., None]  # (2, T, 1)
+    corners = np.ascontiguousarray(xyxy.T)[:, None]  # (4, 1, D)
+    touch = (corners[:2] <= high) & (corners[2:] >= low)  # (2, T, D)
+    return np.divmod(np.flatnonzero(touch[0] & touch[1]), max(len(xyxy), 1))
 
 
 def ambiguous_pairs(pairs: Pairs, possible: BoolArray) -> tuple[BoolArray, BoolArray]:
@@ -42,12 +56,14 @@ def ambiguous_pairs(pairs: Pairs, possible: BoolArray) -> tuple[BoolArray, BoolA
     A pair is a rival where it costs little more than the best of its track and detection. (Two
     boxes of two classes around one thing are no rivals: they show the same.)
     """
-    best, rivals = np.full(len(pairs.cost), np.inf), possible & pairs.same_class
+    rivals = possible & pairs.same_class
+    cost = np.where(possible, pairs.cost, np.inf)
+    best = []  # of the track and of the detection of each pair
     for side in (pairs.track, pairs.detection):
         least = np.full(side.max(initial=0) + 1, np.inf)
-        np.minimum.at(least, side[possible], pairs.cost[possible])
-        best = np.minimum(best, least[side])
-    rivals &= pairs.cost <= best + AMBIGUITY_MARGIN
+        np.minimum.at(least, side, cost)
+        best.append(least[side])
+    rivals &= pairs.cost <= np.minimum(*best) + AMBIGUITY_MARGIN
     several = [np.bincount(side, rivals)[side] > 1 for side in (pairs.track, pairs.detection)]
     return rivals & (several[0] | several[1]), rivals
 

@@ -342,6 +342,9 @@ def trained_head(model: str, head: str = "") -> Path | None:
 # ---- Embeddings on request ---------------------------------------------------------------------
 
 
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+
 def as_embeddings(
     embeddings: Embeddings | npt.ArrayLike | None, count: int, width: int = 0
 ) -> Embeddings | None:
@@ -362,7 +365,7 @@ def as_embeddings(
         if part.ndim != 2 or len(part) != count:
             raise ReobjError(f"embeddings are an array of shape {part.shape}, expected ({count}, "
                              "E): one row a detection")  # fmt: skip
-        if not (np.abs(part) <= np.finfo(np.float32).max).all():  # NaN too
+        if not np.abs(part).max(initial=0) <= FLOAT32_MAX:  # NaN neither
             raise ReobjError("embeddings are not finite as float32")
     found = embeddings.foreground.shape[1] + embeddings.background.shape[1]
     if count and (not found or width not in (0, found)):

@@ -230,10 +230,11 @@ class EllipsoidMap:
         if view is not None and len(identity):
             places = rows_of(self.project(view, image_size, 0.0), identity, np.nan)  # (I, 4)
             reach = 2 * np.abs(project_ends(rows_of(self.ends, identity, np.nan), view))
-            found, share = overlap_within_reach(places, np.nan_to_num(reach), box)  # (I, n)
+            where = (places.T[:, None], np.nan_to_num(reach).T[:, None])  # (4, 1, I), (2, 1, I)
+            found, share = overlap_within_reach(*where, box.T[..., None])  # (n, I), (1, I)
             known = rows_of(self.known, identity, False)
-            iou[:, known] = np.nan_to_num(found.T[:, known])
-            share = np.nan_to_num(share[:, 0])
+            iou[:, known] = np.nan_to_num(found[:, known])
+            share = np.nan_to_num(share[0])
         return iou, share
 
     def _grow(self, identities: int) -> None:
@@ -380,15 +381,15 @@ def overlap_within_reach(box: Array, reach: Array, detected: Array) -> tuple[Arr
     """Compare boxes whose place is uncertain with detections, each moved where it fits best.
 
     Args:
-        box: (T, 4) cx, cy, w, h. reach: (T, 2) px that it may lie to either side. detected: (D, 4).
+        box, detected: (4, ...) cx, cy, w, h. reach: (2, ...) px that a box may lie to either side.
     Returns:
-        iou: (T, D) after that move. share: (T, 1) of the reachable area that a box covers: how
-        much an overlap says.
+        iou: (...) after that move. share: (...) of the reachable area that a box covers: how much
+        an overlap says.
     """
-    offset = box[:, None, :2] - detected[:, :2]  # (T, D, 2)
-    offset = np.abs(offset - np.clip(offset, -reach[:, None], reach[:, None]))
-    a, b = box[:, None, 2:], detected[None, :, 2:]
-    overlap = np.minimum(np.minimum(a, b), (a + b) / 2 - offset).clip(0).prod(-1)  # (T, D)
-    union = a.prod(-1) + b.prod(-1) - overlap
-    share = (box[:, 2:] / (box[:, 2:] + 2 * reach).clip(1e-9)).prod(1, keepdims=True)
-    return overlap / np.maximum(union, 1e-9), share
+    away = np.maximum(np.abs(box[:2] - detected[:2]) - reach, 0)  # (2, ...)
+    a, b = box[2:], detected[2:]
+    width, height = np.maximum(np.minimum(np.minimum(a, b), (a + b) / 2 - away), 0)
+    overlap = width * height
+    union = a[0] * a[1] + b[0] * b[1] - overlap
+    x, y = a / np.maximum(a + 2 * reach, 1e-9)
+    return overlap / np.maximum(union, 1e-9), x * y
