@@ -900,8 +900,8 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t, frame = track_of[rows], np.full(len(rows), self.frame_number)
         ids = (self.state.identity[t] + 1, self.state.tracklet[t])
-        found = detections[rows]
-        return Tracks(frame, *ids, found.xyxy, found.score, found.class_id, rows)
+        found = (detections.xyxy[rows], detections.score[rows], detections.class_id[rows])
+        return Tracks(frame, *ids, *found, rows)
 
     def _retire(self) -> None:
         """Drop tracks that coasted too long; their identities stay in the gallery."""
