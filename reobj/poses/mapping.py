@@ -407,6 +407,7 @@ def _run_mapper(database: Path, mapper: str, held: bool, ids: list[int], seed: i
 def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, Any]) -> None:
     """Write the model in native pixels with the frames' names; points get a colour."""
     height, width = images.shape[1:3]
+    images = images.view(np.ndarray)  # a memmap's own rows are slow
     index = {number: k for k, number in enumerate(job["ids"])}
     for point_id in model.point3D_ids():
         point = model.point3D(point_id)
@@ -417,7 +418,7 @@ def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, An
     scale = np.array(job["size"]) / (width, height)
     for image_id, image in model.images.items():
         image.name = job["names"][index[image_id]]
-        for p in image.points2D:
+        for p in image.points2D if (scale != 1).any() else ():
             p.xy = p.xy * scale
     model.camera(1).rescale(*job["size"])
     folder.mkdir()
