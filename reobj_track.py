@@ -900,8 +900,8 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t, frame = track_of[rows], np.full(len(rows), self.frame_number)
         ids = (self.state.identity[t] + 1, self.state.tracklet[t])
-        found = detections[rows]
-        return Tracks(frame, *ids, found.xyxy, found.score, found.class_id, rows)
+        xyxy, score, class_id = detections.xyxy, detections.score, detections.class_id
+        return Tracks(frame, *ids, xyxy[rows], score[rows], class_id[rows], rows)
 
     def _retire(self) -> None:
         """Drop tracks that coasted too long; their identities stay in the gallery."""
@@ -986,7 +986,8 @@ def track(
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
     told = CamerasOfFrames(poses, video.scale)
-    for frame in video:
+    ahead = tracker.config.camera_motion and video.has_images and not video.is_live
+    for frame in tracker._camera_motion.ahead(video) if ahead else video:
         tracks = tracker.update(source(frame), frame.image, **told(frame.index))
         yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
@@ -1288,10 +1289,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except Exception as error:
         expected = isinstance(error, ReobjError | quadrics.QuadricsError | OSError)
-        trace = args.debug or not expected
-        text = (
-            without_secrets(traceback.format_exc()) if trace else f"error: {one_line(str(error))}"
-        )
+        text = f"error: {one_line(str(error))}"
+        if args.debug or not expected:
+            text = without_secrets(traceback.format_exc())
         print(text, file=sys.stderr)
         return 2 if expected else 1
 

@@ -109,8 +109,8 @@ class Camera:
         if len(self.params) != len(names):
             what = f"{len(self.params)} parameters of a {self.model} camera"
             raise ReobjError(f"{what}; expected {', '.join(names)}")
-        intrinsics = dataclasses.asdict(self) | {"params": list(self.params)}
-        return import_pycolmap().Camera(camera_id=1, **intrinsics)
+        own = {"model": self.model, "width": self.width, "height": self.height}
+        return import_pycolmap().Camera(camera_id=1, params=list(self.params), **own)
 
     def resized(self, size: tuple[int, int]) -> Camera:
         """Return the camera of the same images resized to (w, h), distortion included."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
 
+from reobj.identity import camera_motion
 from reobj.identity.camera_motion import CameraMotion
+from reobj.types import Frame
 
 
 def textured(rng: np.random.Generator, size_hw: tuple[int, int] = (480, 640)) -> np.ndarray:
@@ -39,6 +44,35 @@ def test_a_known_motion_is_recovered(size_hw: tuple[int, int], truth: np.ndarray
     corners = np.array([(x, y, 1.0) for x in (50, 250) for y in (50, 170)])
     np.testing.assert_allclose(corners @ new_from_old[:2].T, corners @ truth.T, atol=0.7)
     np.testing.assert_array_equal(motion.parallax(corners[:, :2]), np.zeros((4, 2)))  # not deep
+
+
+@pytest.mark.parametrize(("foreign", "computed_here"), [(9, 0), (3, 4)])
+def test_looking_ahead_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch, foreign: int, computed_here: int
+) -> None:
+    """The motion is known before it is asked for; after a foreign image it is computed again."""
+    rng, here = np.random.default_rng(2), []
+    wide = textured(rng, (240, 500))
+    frames = [Frame(i, i / 30, wide[:, 9 * i : 9 * i + 320].copy()) for i in range(6)]
+
+    def estimated(*args: object, step: Callable[..., object] = camera_motion._step) -> object:
+        here.append(threading.current_thread() is threading.main_thread())
+        return step(*args)
+
+    plain, ahead = CameraMotion(), CameraMotion()
+    for i, frame in enumerate(frames):
+        if i == foreign:
+            plain(wide[:, 400:])
+        plain(frame.image)
+    monkeypatch.setattr(camera_motion, "_step", estimated)
+    for i, frame in enumerate(ahead.ahead(frames)):
+        if i == foreign:
+            ahead(wide[:, 400:])
+        motion = ahead(frame.image)
+    assert sum(here) == computed_here and len(here) == len(frames) + computed_here
+    np.testing.assert_array_equal(ahead.corners, plain.corners)
+    np.testing.assert_array_equal(ahead.residual_flow, plain.residual_flow)
+    np.testing.assert_allclose(motion[:2, 2], [-9, 0], atol=0.3)
 
 
 def test_a_wide_step_needs_no_majority() -> None:

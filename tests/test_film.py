@@ -150,8 +150,13 @@ def test_frame_rates_are_kept(tmp_path: Path, encoder: str, fps: float) -> None:
     found = cv2.VideoCapture(str(film.path))
     every = 2 if encoder == "vp8" and fps > 15 else 1  # the slow encoder takes every second one
     assert found.get(cv2.CAP_PROP_FRAME_COUNT) == 4 / every
-    rel = 2e-2 if encoder == "vp8" else 1e-6  # whole ms
+    rel = 1e-5 if encoder == "vp8" else 1e-6  # whole ns
     assert found.get(cv2.CAP_PROP_FPS) == pytest.approx(fps / every, rel=rel)
+    while found.grab():
+        last_s = found.get(cv2.CAP_PROP_POS_MSEC) / 1000
+    assert last_s == pytest.approx((4 / every - 1) * every / fps, rel=rel)
+    if encoder == "vp8":
+        assert b"DURATIOND\x87\x9300:00:%012.9f" % (4 / fps) in film.path.read_bytes()
 
 
 @pytest.mark.parametrize("size", [(321, 241), (1601, 901), (3840, 2160), (64, 48)])

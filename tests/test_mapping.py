@@ -305,6 +305,29 @@ def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
     assert (tmp_path / "out" / "sparse" / "images.bin").exists()
 
 
+def test_packages_are_imported_while_the_child_maps(tmp_path, monkeypatch):
+    """Not before: until then the child needs all cores. What is not installed is passed over."""
+    told, imported = [], []
+    monkeypatch.setattr(mapping, "LATER", ("one", "two"))
+
+    def import_module(name):
+        imported.append((name, list(told)))
+        raise ImportError(name)
+
+    def run(progress):
+        for stage in ("features", "match", "mapping", "mapping"):
+            told.append(stage)
+            progress(stage, 5).close()
+        return "stopped"
+
+    monkeypatch.setattr(mapping.importlib, "import_module", import_module)
+    monkeypatch.setattr(child_room.Child, "run", lambda _, progress: run(progress))
+    messages, _ = parts_of(tmp_path, [np.zeros((48, 64, 3), np.uint8)] * 3)
+    assert "stopped" in messages[0]
+    assert [name for name, _ in imported] == ["one", "two"]
+    assert imported[0][1][:3] == ["features", "match", "mapping"]
+
+
 def test_an_aborted_child_is_reported(walk, tmp_path, monkeypatch):
     script = tmp_path / "abort.sh"
     script.write_text("#!/bin/sh\nkill -ABRT $$\n")

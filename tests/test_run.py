@@ -26,6 +26,7 @@ import quadrics
 import reobj
 import reobj_track as rt
 from reobj.poses import stage
+from reobj.results import stages as stages_room
 from reobj.results.stages import detect_all
 from reobj.results.workspace import Workspace
 from reobj.schema import validate_objects
@@ -378,6 +379,27 @@ def test_first_all_detections_then_cameras_then_tracks_with_them(
     assert counting.calls == FRAMES and len(stages.told) == FRAMES
     assert cli(*args, "--poses", "none") == 0  # other tracks, the same detections
     assert counting.calls == FRAMES and len(list((tmp_path / "out/cache").glob("tracks-*"))) == 2
+
+
+def test_masks_are_not_kept_while_tracking(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a minute of video would be gigabytes."""
+    kept: list[rt.Detections] = []
+    untracked = stages_room._untracked
+    monkeypatch.setattr(
+        stages_room, "_untracked", lambda *args: (kept.extend(args[2]), untracked(*args))[1]
+    )
+
+    def masked(image: np.ndarray) -> rt.Detections:
+        masks = np.ones((1, *image.shape[:2]), bool)
+        return rt.Detections(np.array([[100, 60, 140, 110.0]]), np.ones(1), np.zeros(1, int), masks)
+
+    output = rt.OutputConfig(overlay="none", scene=False)
+    config = rt.Config(output=output, embed=rt.EmbedConfig(model="none"))
+    rt.run(clip, tmp_path / "out", config, detections=masked, in_3d=False)
+    assert len(kept) == FRAMES
+    assert all(len(found) == 1 and found.masks is None for found in kept)
 
 
 def test_a_function_detects_once_too_and_sure_people_are_masked(

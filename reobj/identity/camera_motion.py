@@ -6,11 +6,14 @@ unexplained near a point of a deep scene. No poses and no depth: those are of `r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-from reobj.sources.video import shrunk
-from reobj.types import Array, Floats, Image
+from reobj.sources.video import Video, one_ahead, shrunk
+from reobj.types import Array, Floats, Frame, Image
 
 FLOW_SIZE_PX = 320  # longer side of the image in which corners are followed (chosen, for speed)
 FLOW_CORNERS = 100  # corners followed (chosen, for speed; BoT-SORT: 1000)
@@ -43,30 +46,34 @@ class CameraMotion:
         self.gray: Image | None = None
         self.corners: Floats | None = None
         self.residual_flow = np.empty((0, 4))
+        self._ahead: _Step | None = None  # to the image that comes next, perhaps
 
     def __call__(self, image: Image) -> Array:
         """Estimate new_from_old (3, 3) between the previous image and this one (H, W, 3) BGR.
 
         In pixels of `image`; the identity for a first image and after a change of size.
         """
-        shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
-        small = shrunk(image, FLOW_SIZE_PX)
-        gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
-        new_from_old, residual_flow = np.eye(3), np.empty((0, 4))
-        if self.gray is not None and self.corners is not None and self.gray.shape == gray.shape:
-            moved, status, _ = cv2.calcOpticalFlowPyrLK(
-                self.gray, gray, self.corners, np.empty_like(self.corners)
-            )  # (C, 1, 2), (C, 1)
-            found = status.ravel() == 1
-            fit = _fit_similarity(self.corners[found, 0], np.asarray(moved)[found, 0])
-            fit = fit or _fit_similarity(*_orb_matches(self.gray, gray))
-            new_from_old, residual_flow = fit or (new_from_old, residual_flow)
-        self.gray = gray
-        corners = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX)
-        self.corners = None if corners is None else np.asarray(corners, np.float32)
-        self.residual_flow = residual_flow / shrink
-        small_from_image = np.diag([shrink, shrink, 1.0])
-        return np.asarray(np.linalg.inv(small_from_image) @ new_from_old @ small_from_image)
+        step = self._ahead
+        if step is None or step.image is not image or step.old is not self.gray:
+            step = _step(self.gray, self.corners, image)
+        self.gray, self.corners, self.residual_flow = step.gray, step.corners, step.residual_flow
+        return step.new_from_old
+
+    def ahead(self, video: Video) -> Iterator[Frame]:
+        """Iterate over a recorded video; the motion to a frame is estimated while others are used.
+
+        A thread does so; nothing changes here before the frame's image is asked for.
+        """
+
+        def steps() -> Iterator[tuple[Frame, _Step]]:
+            gray, corners = self.gray, self.corners
+            for frame in video:
+                step = _step(gray, corners, frame.image)
+                gray, corners = step.gray, step.corners
+                yield frame, step
+
+        for frame, self._ahead in one_ahead(steps()):
+            yield frame
 
     def parallax(self, xy: Array) -> Array:
         """Estimate the parallax at points of the old image: their motion beyond the transform.
@@ -85,6 +92,48 @@ class CameraMotion:
         distance2 = ((xy[:, None] - self.residual_flow[:, :2]) ** 2).sum(-1)  # (N, K)
         nearest = distance2.argsort(1)[:, :PARALLAX_CORNERS]  # (N, 5)
         return np.asarray(np.median(self.residual_flow[nearest, 2:], 1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """The motion from one image to the next: what `CameraMotion` returns and keeps of it.
+
+    Attributes:
+        old: gray image before, None at first. image, gray: the next one, as it came and small.
+    """
+
+    old: Image | None
+    image: Image
+    gray: Image
+    corners: Floats | None
+    new_from_old: Array
+    residual_flow: Array
+
+
+def _step(old: Image | None, corners: Floats | None, image: Image) -> _Step:
+    """Estimate the motion from a small gray image, with its corners, to the next image."""
+    shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
+    small = shrunk(image, FLOW_SIZE_PX)
+    gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
+    new_from_old, residual_flow = np.eye(3), np.empty((0, 4))
+    if old is not None and corners is not None and old.shape == gray.shape:
+        moved, status, _ = cv2.calcOpticalFlowPyrLK(
+            old, gray, corners, np.empty_like(corners)
+        )  # (C, 1, 2), (C, 1)
+        found = status.ravel() == 1
+        fit = _fit_similarity(corners[found, 0], np.asarray(moved)[found, 0])
+        fit = fit or _fit_similarity(*_orb_matches(old, gray))
+        new_from_old, residual_flow = fit or (new_from_old, residual_flow)
+    good = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX)
+    small_from_image = np.diag([shrink, shrink, 1.0])
+    return _Step(
+        old,
+        image,
+        gray,
+        None if good is None else np.asarray(good, np.float32),
+        np.asarray(np.linalg.inv(small_from_image) @ new_from_old @ small_from_image),
+        residual_flow / shrink,
+    )
 
 
 ORB_POINTS = 300  # points of each image that are matched (chosen)

@@ -105,6 +105,7 @@ class Evidence:
 
 
 SOLIDS_AT_ONCE = 500  # that are projected together (chosen: memory)
+FRAMES_AT_ONCE = 64  # whose pairs are compared together (chosen: memory)
 
 
 def gather_evidence(solids: Solids, detected: Detected, least: float = MIN_LOG_ODDS) -> Evidence:
@@ -138,12 +139,15 @@ def _gather(solids: Solids, detected: Detected, share: Array, least: float) -> E
     of_detection = logit(detected.score)
     starts = detected.rows_of_view
     found: list[tuple[IntArray, IntArray, Array, Array]] = []
-    for v in range(len(cams)):
-        here = np.flatnonzero(visible[v] > MIN_VISIBLE)
-        rows = np.arange(starts[v], starts[v + 1])
-        i, j = np.nonzero(_overlapping(seen[v, here], detected.box[rows]))
-        solid, row = here[i], rows[j]
-        box = _box_log_odds(seen[v, solid], detected.box[row], size)
+    for first in range(0, len(cams), FRAMES_AT_ONCE):
+        pairs = list[tuple[IntArray, IntArray]]()
+        for v in range(first, min(first + FRAMES_AT_ONCE, len(cams))):
+            here = np.flatnonzero(visible[v] > MIN_VISIBLE)
+            rows = slice(starts[v], starts[v + 1])
+            i, j = np.nonzero(_overlapping(seen[v, here], detected.box[rows]))
+            pairs.append((here[i], starts[v] + j))
+        solid, row = (np.concatenate(column) for column in zip(*pairs, strict=True))
+        box = _box_log_odds(seen[detected.view[row], solid], detected.box[row], size)
         own, other = solids.class_id[solid], detected.class_id[row]
         named = np.log(CLASS_KEPT * (own == other) / share[other.clip(0)] + 1 - CLASS_KEPT)
         rest = of_detection[row] + named

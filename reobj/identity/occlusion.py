@@ -96,8 +96,9 @@ def _entry_depths(points: Array, camera: Array, solids: quadrics.Ellipsoids) -> 
     start = -inverse @ camera[:, 3] - solids.center_in_world  # (S, 3)
     start = np.einsum("sij,si->sj", solids.world_from_obj, start)
     ray = np.einsum("sij,ki->ksj", solids.world_from_obj, ray)  # (K, S, 3)
-    faces = np.stack([-solids.half_axes - start, solids.half_axes - start])[:, None]
+    faces = np.stack([-solids.half_axes - start, solids.half_axes - start]).transpose(0, 2, 1)
+    ray = np.ascontiguousarray(ray.transpose(2, 0, 1))  # (3, K, S): short axes first are fast
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = faces / ray  # (2, K, S, 3)
-    enter, leave = ends.min(0).max(2), ends.max(0).min(2)  # (K, S)
+        ends = faces[:, :, None] / ray  # (2, 3, K, S)
+    enter, leave = ends.min(0).max(0), ends.max(0).min(0)  # (K, S)
     return np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)

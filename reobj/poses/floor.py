@@ -176,13 +176,13 @@ def _best_level(local: Array, noise: float) -> Array | None:
     """
     steps = np.arange(-MAX_TILT_DEG, MAX_TILT_DEG + 1e-6, TILT_STEP_DEG)
     tilts = np.array([(b, c) for b in steps for c in steps if math.hypot(b, c) <= MAX_TILT_DEG])
-    best, found = 0.0, None
+    best, found, pad = 0.0, None, max(ABOVE)
     for tilt_deg, (b, c) in zip(np.hypot(*tilts.T), np.tan(np.radians(tilts)), strict=True):
         height = local[:, 2] - local[:, 0] * b - local[:, 1] * c
         low = height.min()
         count = np.bincount(((height - low) / noise).astype(np.int64))  # (B,)
-        pad = max(ABOVE)
-        lower = np.pad(np.cumsum(count), (pad + 1, pad), constant_values=(0, len(local)))
+        lower = np.repeat((0, len(local)), (pad + 1, len(count) + pad))
+        np.cumsum(count, out=lower[pad + 1 : -pad])
         below = {k: lower[pad + k : pad + k + len(count)] for k in (-2, 0, 2, *ABOVE)}  # bin + k
         on_it, width = below[2] - below[0], ABOVE[1] - ABOVE[0]
         above = (below[ABOVE[1]] - below[ABOVE[0]]) * 2 / width  # of as many bins

@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import itertools
 import json
 import shutil
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -119,7 +121,16 @@ def reconstruct(
     with atomic(path) as part:
         part.write_text(json.dumps(job))
     (folder / "messages.json").unlink(missing_ok=True)
-    problem = child.run(progress)
+    ahead = threading.Thread(target=_import_ahead)
+
+    def begun(stage: str, total: int) -> Progress:
+        if stage == MAPPING and ahead.ident is None:  # one core of the child's is idle from now on
+            ahead.start()
+        return progress(stage, total)
+
+    problem = child.run(begun)
+    if ahead.ident is not None:
+        ahead.join()
     if not (folder / "messages.json").exists():
         path.unlink()  # from the beginning the next time: what it left may be why
         why = f"no camera poses: the reconstruction {problem}; give --poses"
@@ -128,6 +139,17 @@ def reconstruct(
     for model in sorted(folder.glob("sparse*"), key=lambda p: (len(p.name), p.name)):
         models.append(model.replace(work_dir / model.name))
     return Mapped(models, list(json.loads((folder / "messages.json").read_text())))
+
+
+MAPPING = "mapping"  # stage of the child that takes one core
+LATER = ("pycolmap", "onnxruntime", "filterpy.kalman", "av")  # packages of later stages
+
+
+def _import_ahead() -> None:
+    """Import what later stages need, while this process waits."""
+    for name in LATER:
+        with contextlib.suppress(ImportError):  # optional, or said where it is needed
+            importlib.import_module(name)
 
 
 def _may_go_on(path: Path, job: dict[str, Any]) -> bool:
@@ -378,13 +400,14 @@ def _run_mapper(database: Path, mapper: str, held: bool, ids: list[int], seed: i
     options |= {"ba_refine_focal_length": not held, "ba_refine_extra_params": not held}
     options |= WEAK_GEOMETRY
     done = itertools.count(2)
-    tick = {"next_image_callback": lambda: send_progress("mapping", min(next(done), count), count)}
+    tick = {"next_image_callback": lambda: send_progress(MAPPING, min(next(done), count), count)}
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
 
 
 def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, Any]) -> None:
     """Write the model in native pixels with the frames' names; points get a colour."""
     height, width = images.shape[1:3]
+    images = images.view(np.ndarray)  # a memmap's own rows are slow
     index = {number: k for k, number in enumerate(job["ids"])}
     for point_id in model.point3D_ids():
         point = model.point3D(point_id)
@@ -395,7 +418,7 @@ def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, An
     scale = np.array(job["size"]) / (width, height)
     for image_id, image in model.images.items():
         image.name = job["names"][index[image_id]]
-        for p in image.points2D:
+        for p in image.points2D if (scale != 1).any() else ():
             p.xy = p.xy * scale
     model.camera(1).rescale(*job["size"])
     folder.mkdir()

@@ -68,11 +68,14 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
     count, found = len(arrays.ids), list[tuple[int, int, float]]()
     ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
     ray = ray[:, 0] / np.linalg.norm(ray[:, 0], axis=1, keepdims=True)  # (M, 3) in world
+    across = np.eye(3) - ray[:, :, None] * ray[:, None]  # (M, 3, 3)
+    start = (across @ arrays.centre[arrays.image][:, :, None])[:, :, 0]
+    terms = np.hstack([across.reshape(-1, 9), start, ray, np.ones((len(ray), 1))])  # (M, 16)
     for k in range(1, count):
         before, after = range(max(0, k - WINDOW), k), range(k, min(k + WINDOW, count))
         sides = list[list[list[float]]]()
         for side, seen, sign in ((before, after[:TOLD_BY], 1), (after, before[-TOLD_BY:], -1)):
-            points = _triangulate(arrays, ray, side)
+            points = _triangulate(arrays, terms, side)
             values = np.array([_log_focal(arrays, image, points) for image in seen]) * [sign, 1]
             sides.append(values[np.isfinite(values[:, 0])].tolist())
         if all(sides):  # one alone is biased by the noise of its depths
@@ -83,22 +86,19 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
     return found
 
 
-def _triangulate(arrays: ModelArrays, ray: Array, side: range) -> Array:
+def _triangulate(arrays: ModelArrays, terms: Array, side: range) -> Array:
     """Triangulate points from some images that follow each other: the nearest to all their rays.
 
     Args:
-        ray: (M, 3) unit vector of each observation, in world.
+        terms: (M, 16) of each observation with unit ray u from centre c, in world: I - u u' (9),
+            (I - u u') c, u, 1.
     Returns:
         (N, 3) points, NaN where the rays do not tell the depth.
     """
     first, last = np.searchsorted(arrays.image, (side.start, side.stop))
-    point, image, u = (a[first:last] for a in (arrays.point, arrays.image, ray))
-    at, row = np.unique(point, return_inverse=True)
-    across = (np.eye(3) - u[:, :, None] * u[:, None]).reshape(-1, 9)  # (m, 9)
-    start = (across.reshape(-1, 3, 3) @ arrays.centre[image][:, :, None])[:, :, 0]
-    one = np.ones((len(u), 1))
+    at, row = np.unique(arrays.point[first:last], return_inverse=True)
     entries = (np.ones(len(row)), (row, np.arange(len(row))))
-    sums = sparse.csr_matrix(entries, (len(at), len(row))) @ np.hstack([across, start, u, one])
+    sums = sparse.csr_matrix(entries, (len(at), len(row))) @ terms[first:last]
     n = sums[:, 15]
     told = n - (sums[:, 12:15] ** 2).sum(1) / np.maximum(n, 1) >= MIN_RAY_SPREAD
     xyz = np.full((len(arrays.xyz), 3), np.nan)

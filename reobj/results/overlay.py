@@ -344,10 +344,13 @@ def draw_wireframes(
     share = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
     line = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
     pixels = scale * image_points(camera, line) - 0.5  # OpenCV draws with the pixel's centre at 0
-    solid = frames.solid[edge]
-    near_last = sorted(set(solid.tolist()), key=lambda k: -ends[solid == k, :, 2].mean())
-    for k in near_last:
-        mine, obj = solid == k, object_id[k]
+    solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are in a row
+    own = {
+        k: slice(a, b)
+        for k, a, b in zip(solids.tolist(), first, [*first[1:], len(edge)], strict=True)
+    }
+    for k in sorted(own, key=lambda k: -ends[own[k], :, 2].mean()):  # near ones last
+        mine, obj = own[k], object_id[k]
         if not drawn[k] or not _fits(pixels[mine], image):
             continue
         lines, shown = np.round(pixels[mine] * (1 << SHIFT)).astype(np.int32), front[mine]

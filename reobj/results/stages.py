@@ -109,7 +109,7 @@ def collect_tracks(
                 frames.append(frame.index)
                 found.append(tracker.latest)
                 embedded.append(tracker.latest_embeddings())
-                detected.append(tracker.detections)
+                detected.append(dataclasses.replace(tracker.detections, masks=None))  # memory
                 progress.step()
     except KeyboardInterrupt:  # the way to end a live source
         if not video.is_live:

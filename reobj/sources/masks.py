@@ -28,8 +28,10 @@ def rle_encode(mask: BoolArray) -> Counts:
 
 def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
     """Decode run lengths to the (H, W) mask of a (w, h) image."""
-    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts) if len(counts) else np.False_
-    return np.broadcast_to(flat, size[0] * size[1]).reshape(size).T
+    if not len(counts):
+        return np.zeros(size[::-1], bool)
+    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)  # (W * H,)
+    return np.asarray(cv2.transpose(flat.view(np.uint8).reshape(size))).view(bool)
 
 
 RUN_BITS = 35  # seven characters: any uint32 with its sign; endless ones take quadratic time

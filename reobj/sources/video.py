@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -161,7 +161,7 @@ class Video:
             numbers = range(self.config.start, stop, self.config.every)
             times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
             decoded = ((i, float(times_s[i]), read_image(self.files[i])) for i in numbers)
-        for index, time_s, image in decoded if self.is_live else _one_ahead(decoded):
+        for index, time_s, image in decoded if self.is_live else one_ahead(decoded):
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 self.skipped.append(index)
                 continue
@@ -485,12 +485,13 @@ def source_fingerprint(source: Any) -> str:
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
 
 
-def _one_ahead(
-    decoded: Iterator[tuple[int, float, Image | None]],
-) -> Iterator[tuple[int, float, Image | None]]:
-    """Decode the next frame in a thread while the last one is used."""
+Item = TypeVar("Item")
+
+
+def one_ahead(items: Iterator[Item]) -> Iterator[Item]:
+    """Make the next item, which is never None, in a thread while the last one is used."""
     with ThreadPoolExecutor(1) as pool:
-        ahead = pool.submit(next, decoded, None)
-        while (frame := ahead.result()) is not None:
-            ahead = pool.submit(next, decoded, None)
-            yield frame
+        ahead = pool.submit(next, items, None)
+        while (item := ahead.result()) is not None:
+            ahead = pool.submit(next, items, None)
+            yield item
