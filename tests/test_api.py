@@ -175,7 +175,8 @@ def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
         if len(seen) == 4:
             break
     assert seen == [(3, 1, 1), (5, 1, 2), (7, 1, 2), (9, 2, 2)]
-    assert asked == [(480, 640, 3)] * 4 and read == [3, 5, 7, 9]
+    assert asked == [(480, 640, 3)] * 4
+    assert read in ([3, 5, 7, 9], [3, 5, 7, 9, 11])  # a thread is one frame ahead
 
 
 def test_track_takes_paths_and_brings_an_embedder(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,7 +64,8 @@ def seen_job(monkeypatch, video, folder, **changes):
     """What `estimate_poses` hands to the reconstruction."""
     seen = {}
 
-    def record(images, ids, names, boxes, size, **options):
+    def record(images, ids, frames, names, boxes, size, **options):
+        assert len(ids) == len(frames) == len(names) == len(images)
         seen.update(images=images, ids=ids, names=names, boxes=boxes, size=size, **options)
         return Mapped([], ["stopped here"])
 
