@@ -344,7 +344,10 @@ def with_applied(matrix: Any) -> str:
     [
         (with_applied(np.diag([-1.0, 1, 1, 1])[:3].tolist()), "mirrored"),
         (with_applied([[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "4x4 finite numbers"),
-        (TRANSFORMS.replace('"fl_x": 500', '"fl_x": 0'), r"frames\[0\]: a number is not finite, or"),
+        (
+            TRANSFORMS.replace('"fl_x": 500', '"fl_x": 0'),
+            r"frames\[0\]: a number is not finite, or",
+        ),
         (TRANSFORMS.replace('"fl_x": 500, "fl_y": 500', '"camera_angle_x": 0'), "angle_x 0"),
     ],
 )
