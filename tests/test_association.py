@@ -339,6 +339,39 @@ def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatc
     assert len(rounds) == 3
 
 
+def test_pursuit_takes_in_turn_what_adds_most() -> None:
+    """As when every solid is looked at again in every turn; of equal ones the first."""
+    three = chairs()
+    rng = np.random.default_rng(0)
+    near = three[np.tile(np.arange(3), 8)]
+    off = rng.normal(0, 0.15, near.ellipsoids.center_in_world.shape)
+    moved = dataclasses.replace(
+        near.ellipsoids, center_in_world=near.ellipsoids.center_in_world + off
+    )
+    many = Solids.concatenate([dataclasses.replace(near, ellipsoids=moved), three[[0]], three[[0]]])
+    made, _ = association_of(three, walk(30))
+    of = made._empty(many)
+    seen, cost, view = of.evidence, of.costs(), made.detected.view
+    value = np.minimum(seen.choice, seen.log_odds + association.PURSUED_CHOICE)
+    explained, expected = np.zeros(len(view)), list[int]()
+    while True:
+        gain, tops = -cost, np.zeros((len(many), len(seen.expected)))
+        np.maximum.at(tops, (seen.solid, view[seen.row]), value - explained[seen.row])
+        gain += (tops + association.MISSED * (seen.expected.T & (tops > 0))).sum(1)
+        gain[expected] = -np.inf
+        if gain.max() <= 0:
+            break
+        expected.append(int(gain.argmax()))
+        own = (seen.solid == expected[-1]) & (value > 0)
+        more = (value[own] - explained[seen.row[own]]).clip(0)
+        best = more >= tops[expected[-1], view[seen.row[own]]]
+        more = value[own] + np.where(best, 0, association.SECOND_DETECTION)
+        np.maximum.at(explained, seen.row[own], more)
+    assert len(expected) > 1 and made._pursue(of).tolist() == expected
+    few = made._empty(many, 0.0)  # pairs that speak for none add nothing
+    assert len(few.evidence.row) < len(seen.row) and made._pursue(few).tolist() == expected
+
+
 def test_pursuit_chooses_what_is_there() -> None:
     three = chairs()
     away = dataclasses.replace(

@@ -102,7 +102,8 @@ class Associator:
             if (state := now.owner.tobytes()) in known:
                 break
             known.add(state)
-        for _ in range(WIDENED * floor_known):  # not before: wide solids swallow their neighbours
+        # Not before: wide solids swallow their neighbours.
+        for _ in range(WIDENED if floor_known else 0):
             now = self._refitted(now, widened=True)
         return now
 
@@ -125,36 +126,30 @@ class Associator:
         start = np.searchsorted(solid, np.arange(len(cost) + 1))
         not_missed = MISSED * evidence.expected  # (V, S)
         explained, chosen = np.zeros(len(view)), list[int]()  # explained: log odds of each row
-        best = np.zeros(len(evidence.expected))
 
-        def gain(k: int) -> float:
-            """Return what solid k would add to those chosen so far."""
-            own = slice(start[k], start[k + 1])
-            more, at = log_odds[own] - explained[row[own]], view[row[own]]
-            more, at = more[more > 0], at[more > 0]
-            best[:] = 0
-            np.maximum.at(best, at, more)
-            return float(best.sum() + not_missed[best > 0, k].sum() - cost[k])
+        def added(k: int) -> tuple[float, Array, Array]:
+            """Return what solid k adds to those chosen: in all, by its rows, at best by frame."""
+            own = row[start[k] : start[k + 1]]
+            more = (log_odds[start[k] : start[k + 1]] - explained[own]).clip(0)
+            best = np.zeros(len(not_missed))
+            np.maximum.at(best, view[own], more)
+            return float(best.sum() + not_missed[best > 0, k].sum() - cost[k]), more, best
 
         # What a solid adds only falls as others are chosen: one that still leads after it was
         # looked at again is the best (lazy greedy, Minoux 1978).
-        queue = [(-gain(k), k) for k in range(len(cost))]
+        queue = [(-added(k)[0], k) for k in range(len(cost))]
         heapq.heapify(queue)
         while queue and queue[0][0] < 0:
-            k = heapq.heappop(queue)[1]
-            now = (-gain(k), k)
-            if queue and queue[0] < now:
-                heapq.heappush(queue, now)
+            k = queue[0][1]
+            gain, more, best = added(k)
+            if -gain > queue[0][0]:
+                heapq.heapreplace(queue, (-gain, k))
                 continue
-            if now[0] >= 0:
-                break
+            heapq.heappop(queue)
             chosen.append(k)
-            own = slice(start[k], start[k + 1])
-            at, more = view[row[own]], (log_odds[own] - explained[row[own]]).clip(0)
-            best[:] = 0
-            np.maximum.at(best, at, more)
-            value = log_odds[own] + np.where(more >= best[at], 0, SECOND_DETECTION)
-            np.maximum.at(explained, row[own], value)
+            own = row[start[k] : start[k + 1]]
+            second = np.where(more >= best[view[own]], 0, SECOND_DETECTION)
+            np.maximum.at(explained, own, log_odds[start[k] : start[k + 1]] + second)
         return np.array(chosen, np.int64)
 
     def _assign(self, solids: Solids, owner: IntArray) -> Association:
