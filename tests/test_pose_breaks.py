@@ -151,8 +151,8 @@ class FakeShelf:
 def test_breaks_keep_pictures_and_truth_together(kind: str) -> None:
     changed, original = set(), motion("orbit", 60)
     for seed in range(6):
-        clip, what = pb.KINDS[kind](FakeShelf(), ["room", "walk"], np.random.default_rng(seed))
-        again, _ = pb.KINDS[kind](FakeShelf(), ["room", "walk"], np.random.default_rng(seed))
+        clip, what = pb.KINDS[kind](FakeShelf(), ["room", "tour"], np.random.default_rng(seed))
+        again, _ = pb.KINDS[kind](FakeShelf(), ["room", "tour"], np.random.default_rng(seed))
         np.testing.assert_array_equal(clip.images, again.images)
         changed.add(what)
         assert len(clip.images) == len(clip.truth) == len(clip.world) >= 16
@@ -164,6 +164,13 @@ def test_breaks_keep_pictures_and_truth_together(kind: str) -> None:
         np.testing.assert_array_equal(flipped, clip.world < 0)
         assert flipped.any() == kind.startswith("mirrored")
     assert len(changed) == 6
+
+
+def test_two_rooms_are_two_places() -> None:
+    for seed in range(20):
+        names = ["room", "walk", "orbit", "tour"]
+        _, what = pb.two_rooms(FakeShelf(), names, np.random.default_rng(seed))
+        assert "tour" in what  # the others have one plan, in other colours
 
 
 def test_mirrored_cameras_see_the_mirrored_world() -> None:
