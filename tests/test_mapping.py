@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -136,17 +137,17 @@ def search(monkeypatch):
     return search
 
 
-def part(first=1, last=30, calibrated=True, sigma=0.0005, problem=""):
-    arrays = SimpleNamespace(ids=np.arange(first, last + 1), focal_over_size=0.8)
+def part(first=1, last=30, calibrated=True, sigma=0.0005, problem="", focal=0.8):
+    arrays = SimpleNamespace(ids=np.arange(first, last + 1), focal_over_size=focal)
     share = (last - first + 1) / 30
-    return Part("model", arrays, calibrated, 2.4, share, 20.0, sigma, 1000, problem)
+    return Part("model", arrays, calibrated, 2.4, share, 20.0, sigma, 1000, problem, arrays.ids)
 
 
 def test_a_focal_length_that_nothing_tells_is_kept_and_said(search):
     """No mapper's model determines it: the guess is held, and the user is told."""
     search.made = [part(calibrated=False)]
     _, (message,) = search.run(None, 0.8)
-    assert message.startswith("the images do not tell the focal length")
+    assert message.startswith("the images of frames 10-300 do not tell the focal length")
     assert "taken as 0.8 x" in message and "--camera" in message
     assert search.ran == [("incremental", False), ("incremental", True)]
 
@@ -159,6 +160,37 @@ def test_a_part_that_is_refused_is_said_and_why(search, monkeypatch):
     assert messages == [
         "a part of the video (frames 160-270) has no poses: the camera hardly moved"
     ]
+
+
+def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
+    """Of hololens_kitchen the incremental mapper found pieces, the global one all of it."""
+    made = {"incremental": [part(1, 15), part(16, 30, sigma=0.003)], "global": [part()]}
+    monkeypatch.setattr(search, "_parts", lambda mapper, held: made[mapper])
+    matches = sum(p.explained for p in made["global"])
+    search.pairs = replace(search.pairs, inliers=[np.zeros((matches, 2), np.int64)])
+    best, messages = search._best(0.8, True)
+    assert best is made["global"] and messages == []
+
+
+@pytest.mark.parametrize("focal, count", [(0.82, 1), (0.9, 2)])
+def test_weaker_geometry_needs_the_matches_or_another_mapper(search, monkeypatch, focal, count):
+    """They tell the focal length without any model."""
+    monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
+    search.made = [part(sigma=0.0011, focal=focal)]
+    search.run(0.8, 0.8)
+    assert len(search.ran) == count
+
+
+def test_a_zoom_in_a_part_that_is_refused_anyway_takes_no_images(search, monkeypatch):
+    """Its points have too little parallax to tell; where nothing else holds it is looked at."""
+    asked = []
+    monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
+    monkeypatch.setattr(mapping, "constant_focal", lambda a: (asked.append(a) or np.empty(0), []))
+    good, bad = part(1, 15), part(16, 30, problem="the camera hardly moved")
+    for made in ([good, bad], [bad]):
+        search.made = made
+        search.run(0.8, 0.8)
+    assert asked == [[good.arrays], [bad.arrays]]
 
 
 def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):

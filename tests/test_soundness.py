@@ -9,7 +9,7 @@ from test_consistency import Scene
 
 from reobj.poses.adjustment import _bundle_adjust, adjusted
 from reobj.poses.arrays import read_arrays
-from reobj.poses.mapping import _only
+from reobj.poses.mapping import _only, _Search
 from reobj.poses.soundness import MIN_JOINT, Part, confirmed
 from reobj.poses.uncertainty import relative_sigmas
 
@@ -101,7 +101,7 @@ def test_points_at_a_centre_tell_nothing():
 
 def part(model, sigma, problem=""):
     arrays = read_arrays(model)
-    return Part(model, arrays, True, 10.0, 1.0, 20.0, sigma, 1000, problem)
+    return Part(model, arrays, True, 10.0, 1.0, 20.0, sigma, 1000, problem, arrays.ids)
 
 
 def moved(step_m=0.0, turn_deg=0.0, count=12):
@@ -164,6 +164,17 @@ def test_pieces_of_another_mapper_count_where_points_prove_how_they_are_joined(e
     weak = part(scene.model(), 0.002)
     (found,) = confirmed([weak], [piece(*end) for end in ends], True)
     assert (not found.problem) == sure
+    if sure:  # only what both have stays
+        assert set(found.held) == {i for end in ends for i in range(*end)}
+
+
+def test_images_that_the_other_mapper_lacks_are_left_out():
+    weak = part(Scene().model(), 0.002)
+    (found,) = confirmed([weak], [piece(1, 11)], True)
+    (model,) = _Search._one_camera(None, [found])
+    assert not found.problem and sorted(model.reg_image_ids()) == list(range(1, 11))
+    (model,) = _Search._one_camera(None, [weak])
+    assert len(model.reg_image_ids()) == 12
 
 
 def test_points_are_told_by_images_whose_rays_spread():

@@ -35,7 +35,7 @@ from reobj.poses.consistency import (
     read_pairs,
 )
 from reobj.poses.features import choose_pairs, extract_features, match_pairs
-from reobj.poses.soundness import MIN_PART_IMAGES, Part, confirmed, measured
+from reobj.poses.soundness import MIN_PART_IMAGES, SURE_CENTRE_SIGMA, Part, confirmed, measured
 from reobj.poses.zoom import MIN_ZOOM, constant_focal
 from reobj.types import Array, Image, IntArray
 
@@ -202,7 +202,10 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
-GOOD_CENTRE_SIGMA = 0.0012  # of such parts; SURE_CENTRE_SIGMA is for parts of less (chosen)
+# Largest centre_sigma of such parts if the matches alone tell the focal length that came out, else
+# SURE_CENTRE_SIGMA (chosen: time), and the log of a ratio up to which it is the same (measured: of
+# ten right models nine up to .04, one .18; .18 where two halves came out 1.6 times too near)
+GOOD_CENTRE_SIGMA, SAME_FOCAL = 0.0012, 0.05
 PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
 MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
@@ -213,6 +216,7 @@ class _Search:
     Attributes:
         ids: of the keyframes in the order of time. pairs: their verified matches.
         frames: numbers of the keyframes, for messages. fixed: the intrinsics are known.
+        told: focal length that the matches tell, over the longer side.
     """
 
     def __init__(
@@ -220,6 +224,7 @@ class _Search:
     ) -> None:
         self.database, self.ids, self.pairs = database, list(frames), pairs
         self.frames, self.fixed, self.seed = frames, fixed, seed
+        self.told: float | None = None
 
     def run(self, focal: float | None, guess: float) -> tuple[list[Any], list[str]]:
         """Try mappers until sound parts hold nearly all keyframes.
@@ -231,11 +236,12 @@ class _Search:
         Returns:
             models of the parts, the largest first ([]: none is sound); messages.
         """
-        zooms = list[tuple[int, int, float]]()
+        self.told, zooms = focal, list[tuple[int, int, float]]()
         for _ in range(MAX_ROUNDS):
             best, messages = self._best(focal or guess, focal is not None)
             known = [p for p in best if self.fixed or focal is not None or p.calibrated]
-            others, changes = constant_focal([part.arrays for part in known])
+            told = [p for p in known if not p.problem] or known
+            others, changes = constant_focal([part.arrays for part in told])
             if not len(others):
                 break
             zooms += changes
@@ -288,23 +294,40 @@ class _Search:
         best = self._parts("incremental", True)
         if not self._is_sure(best):
             other = self._parts("global", True)
-            best, other = confirmed(best, other, told), confirmed(other, best, told)
-            best = max(other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1))
+            if self._is_sure(other):
+                best = other
+            else:
+                best, other = confirmed(best, other, told), confirmed(other, best, told)
+                best = max(
+                    other, best, key=lambda p: _explained(p) * (PREFERRED if p is other else 1)
+                )
         if self.fixed or not best or best[0].problem or best[0].calibrated:
             return best, []
+        ids = best[0].arrays.ids.tolist()
         return best, [
-            "the images do not tell the focal length (a camera that moves should turn too): it is "
-            f"taken as {start:.3g} x the longer side, depths are rough; give --camera fx,fy,cx,cy, "
-            "or walk around the objects"
+            f"the images of frames {self.frames[ids[0]]}-{self.frames[ids[-1]]} do not tell the "
+            "focal length (a camera that moves should turn too): it is taken as "
+            f"{start:.3g} x the longer side, depths are rough; give --camera fx,fy,cx,cy, or walk "
+            "around the objects"
         ]
 
     def _one_camera(self, sound: list[Part]) -> list[Any]:
-        """Adjust smaller parts with the camera of the largest: one camera took them all."""
-        for part in sound[1:]:
-            own, camera = part.model.camera(1), sound[0].model.camera(1)
-            own.model, own.params = camera.model, camera.params
-            refine(part.model, False)
-        return [part.model for part in sound]
+        """Adjust smaller parts with the camera of the largest: one camera took them all.
+
+        Images that are not to be kept are left out; they are located by the rest, if it sees them.
+        """
+        models = list[Any]()
+        for part in sound:
+            model, all_held = part.model, len(part.held) == len(part.arrays.ids)
+            if not all_held:
+                model = _only(model, set(part.held.tolist()))
+            if models:
+                own, camera = model.camera(1), models[0].camera(1)
+                own.model, own.params = camera.model, camera.params
+            if models or not all_held:
+                refine(model, False)
+            models.append(model)
+        return models
 
     def _of_camera(self, part: Part) -> bool:
         """True unless a part's matches contradict the focal length that it was given."""
@@ -314,9 +337,14 @@ class _Search:
 
     def _is_sure(self, parts: list[Part]) -> bool:
         """True if parts of strong geometry hold and explain nearly all."""
-        sure = [p for p in parts if not p.problem and p.centre_sigma <= GOOD_CENTRE_SIGMA]
+        sure = [p for p in parts if not p.problem and p.centre_sigma <= self._sure_sigma(p)]
         registered, matched = sum(p.registered for p in sure), sum(map(len, self.pairs.inliers))
         return registered >= GOOD_REGISTERED and _explained(sure) >= GOOD_EXPLAINED * matched
+
+    def _sure_sigma(self, part: Part) -> float:
+        """Return the centre_sigma up to which a part is believed without another mapper."""
+        same = self.told is not None and abs(np.log(self.told / part.focal)) < SAME_FOCAL
+        return GOOD_CENTRE_SIGMA if self.fixed or same else SURE_CENTRE_SIGMA
 
     def _parts(self, mapper: str, held: bool) -> list[Part]:
         """Run a mapper and measure the parts of its models that hold together, largest first.

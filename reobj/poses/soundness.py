@@ -53,6 +53,7 @@ class Part:
     centre_sigma: float  # largest of a camera's centre, over the extent of the path
     explained: int  # verified matches
     problem: str
+    held: IntArray  # ids of the images that are to be kept
 
     @property
     def focal(self) -> float:
@@ -91,13 +92,14 @@ def measured(
     )  # fmt: skip
     problem = next((text for bad, text in checks if bad), "")
     registered = images / count
-    return Part(
-        model, arrays, calibrated, angle, registered, parallax, centre_sigma, explained, problem
-    )
+    measures = angle, registered, parallax, centre_sigma, explained
+    return Part(model, arrays, calibrated, *measures, problem, arrays.ids)
 
 
 def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
     """Find a problem in parts of little parallax, unless another mapper came to the same.
+
+    Images that it has elsewhere, or not at all, are not to be kept.
 
     Args:
         told: the focal length was known before, by the user or from the matches.
@@ -106,15 +108,17 @@ def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
     for part in parts:
         if not part.problem and part.centre_sigma > SURE_CENTRE_SIGMA:
             proof = told or part.centre_sigma <= MAX_UNTOLD_SIGMA
-            if not (proof and _found_by(part.arrays, [other.arrays for other in others])):
+            held = _found_by(part.arrays, [other.arrays for other in others if proof])
+            part = replace(part, held=part.arrays.ids[held])
+            if len(held) < SAME_IMAGES * len(part.arrays.ids):
                 why = "there is too little parallax to tell where the camera was"
                 part = replace(part, problem=why)
         found.append(part)
     return sorted(found, key=lambda p: (bool(p.problem), -p.registered))
 
 
-def _found_by(one: ModelArrays, others: Sequence[ModelArrays]) -> bool:
-    """Tell whether another mapper has the cameras of a model in the same places, maybe in pieces.
+def _found_by(one: ModelArrays, others: Sequence[ModelArrays]) -> IntArray:
+    """Return the images (rows of one) that another mapper has in the same places, maybe in pieces.
 
     A piece says nothing but how its own cameras lie. What joins it to the rest are points whose
     depth both sides tell: of two worlds that look alike in part there are few, and none where
@@ -124,7 +128,7 @@ def _found_by(one: ModelArrays, others: Sequence[ModelArrays]) -> bool:
     held, todo = pieces[0] if pieces else np.empty(0, np.int64), pieces[1:]
     while joined := [p for p in todo if (one.told_by(held) & one.told_by(p)).sum() >= MIN_JOINT]:
         held, todo = np.union1d(held, joined[0]), [p for p in todo if p is not joined[0]]
-    return len(held) >= SAME_IMAGES * len(one.ids)
+    return np.sort(held)
 
 
 def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
