@@ -60,6 +60,7 @@ from synthetic_quadrics import table, write_table
 
 import quadrics
 import reobj_track as rt
+from reobj.objects import DOUBTFUL
 from reobj.results.evaluation import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.results.solids import align_with_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
@@ -135,6 +136,11 @@ def all_visible(views: Views, *_: Any) -> BoolArray:
     return np.zeros(views.boxes.shape, bool)
 
 
+def never_seen_through(solids: quadrics.Ellipsoids, *_: Any) -> Array:
+    """Stand in for what finds points behind solids."""
+    return np.zeros(len(solids))
+
+
 def untracked(rows: rt.Tracks) -> BoolArray:
     """Mark all detections that the tracker left out."""
     return np.asarray(rows.tracklet_id == 0)
@@ -162,6 +168,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
     "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
     "floor": {"reobj.identity.locate.floor_under": nothing, "reobj.parts.floor_under": nothing},
+    "seen through": {"reobj.identity.locate.seen_through": never_seen_through},
 }
 
 
@@ -667,6 +674,33 @@ def figures_table(first: Sequence[str], rows: Sequence[tuple[Sequence[str], Figu
     return table([head[i] for i in used], [[line[i] for i in used] for line in lines])
 
 
+def left_out_table(made: dict[str, list[Figures]]) -> str:
+    """Format a row for everything that is left out: means and sums over the recordings."""
+    rows = []
+    for without, figures in made.items():
+
+        def values(key: str, of: Sequence[Figures] = figures) -> Array:
+            return np.array([f.get(key) for f in of], np.float64)  # None: NaN
+
+        change = np.nan_to_num(values("idf1") - values("idf1", made[""]))
+        sums = [f"{np.nansum(values(key)):.0f}" for key in ("found", "doubles", "elsewhere")]
+        listed = [real for f in figures for sure, real, _ in f["sure"] if sure >= DOUBTFUL]
+        rows.append(
+            [
+                without or "nothing",
+                short(float(np.nanmean(values("idf1")))),
+                f"{change.min():+.3f} to {change.max():+.3f}" if without else "",
+                *sums,
+                f"{sum(listed)} of {len(listed)}",
+                short(float(np.nanmean(values("centre_m")))),
+                percent(float(np.nanmean(values("size_error")))),
+                f"{np.nansum(values('objects_s')):.0f}",
+            ]
+        )
+    head = "without,IDF1,change,found,doubles,elsewhere,real of listed,centre m,size,objects step s"
+    return table(head.split(","), rows)
+
+
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
@@ -814,12 +848,7 @@ def sure_by_group(cases: Sequence[Case], figures: Sequence[Figures]) -> dict[str
 def tables(cases: Sequence[Case], made: dict[str, list[Figures]]) -> dict[str, str]:
     """Format tables by name: the recordings and confidence; or what is left out in turn."""
     if len(made) > 1:
-        rows = [
-            ([", ".join(case.title), without or "nothing"], made[without][k])
-            for k, case in enumerate(cases)
-            for without in made
-        ]
-        return {"left out": figures_table(["recording", "without"], rows)}
+        return {"left out": left_out_table(made)}
     rows = [(case.title, figures) for case, figures in zip(cases, made[""], strict=True)]
     return {
         "real rooms": figures_table(["recording", "boxes", "cameras"], rows),

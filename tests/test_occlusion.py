@@ -10,7 +10,7 @@ from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.occlusion import hidden_edges
+from reobj.identity.occlusion import hidden_edges, seen_through
 from reobj.objects import fitter
 from reobj.views import Views, gather_views
 
@@ -110,3 +110,39 @@ def test_behind_a_hidden_edge_the_fit_goes_on(edge: int) -> None:
     assert (cut.size[:, 2] < 0.8 * true).all()
     np.testing.assert_allclose(whole.size[:, 2], true, rtol=0.15)
     assert (whole.cov[:, 5, 5] > 2 * cut.cov[:, 5, 5]).all()  # and it is said
+
+
+def seen_along(distance: float, beside: float = 0.0, count: int = 40) -> np.ndarray:
+    """Points (N, 3) around the ray of the middle camera through a chair, of distance 1 there."""
+    poses, centre = walk(5, arc_deg=8.0), np.array([0, 0, 0.41])
+    camera = -poses.cam_from_world[2, :, :3].T @ poses.cam_from_world[2, :, 3]
+    noise = np.random.default_rng(0).normal(0, 0.01, (count, 3))
+    return np.asarray(camera + distance * (centre - camera) + noise + np.array([beside, 0, 0]))
+
+
+def through(points: np.ndarray) -> float:
+    """How much is seen through a chair by five cameras, all of which observe all points."""
+    solids, _ = scene(np.array([0.2, 0.2, 0.4]))
+    every = np.indices((5, len(points))).reshape(2, -1).T
+    poses = dataclasses.replace(walk(5, arc_deg=8.0), points=points, visibility=every)
+    (found,) = seen_through(solids[[0]], np.ones((5, 1), bool), poses, poses.frame)
+    return float(found)
+
+
+@pytest.mark.parametrize("distance, seen", [(1.4, True), (1.0, False), (0.9, False), (0.6, False)])
+def test_points_behind_a_solid_tell_that_it_is_not_there(distance: float, seen: bool) -> None:
+    """Those on it and before it do not."""
+    assert through(seen_along(distance)) == pytest.approx(np.log(210 / 10) if seen else 0)
+
+
+def test_what_is_seen_on_a_solid_or_beside_it_speaks_for_it() -> None:
+    """Things have holes: twice as much may be seen through them."""
+    behind, on_it = seen_along(1.4), seen_along(1.0)
+    assert through(np.concatenate([behind, on_it[:10]])) == pytest.approx(np.log(210 / 110))
+    assert through(np.concatenate([behind, on_it[:20]])) == 0
+    assert through(seen_along(1.4, beside=0.4)) == 0
+    assert through(np.empty((0, 3))) == 0
+
+
+def test_of_very_many_points_some_are_enough() -> None:
+    assert np.log(5 * 200 / 10) < through(seen_along(1.4, count=5000)) < np.log(5 * 501 / 10)

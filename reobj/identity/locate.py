@@ -19,15 +19,16 @@ from reobj.cameras import Poses, undistort_boxes
 from reobj.identity.association import Association, Associator, Refit
 from reobj.identity.evidence import Detected, Solids, logit
 from reobj.identity.linking import cut_at_gaps
-from reobj.identity.occlusion import edges_above_floor
+from reobj.identity.occlusion import edges_above_floor, seen_through
 from reobj.identity.proposals import propose
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
 from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
 
 # Log odds that an object is there: constant, by the log of the mean odds of its scores, by the
-# share of the frames that should show it and do. Fitted to 399 solids of 17 runs (docs/tracking.md)
-CONFIDENCE = (-0.5, 1.5, 1.3)
+# share of the frames that should show it and do, by how much is seen behind it through its middle
+# (`occlusion.seen_through`). Fitted to 399 solids of 17 runs (docs/tracking.md)
+CONFIDENCE = (-0.5, 1.5, 1.3, -2.0)
 NO_SOLID = -3.3  # instead of the constant where no solid explains it (12 of 150 were real)
 # Share of a recording's mean log odds, where it is below 0, that is forgiven: some detectors score
 # low throughout, in dark rooms most
@@ -99,7 +100,8 @@ def locate(
     boxes = _projected(found.solids, views)[detected.view[owned], found.owner[owned]]
     overlap[own[owned]] = quadrics.box_iou(boxes, detected.box[owned])
     solids = Solids.concatenate([found.solids, _NO_SOLID])
-    sure = _confidence(found, detected)
+    through = seen_through(found.solids.ellipsoids, found.evidence.expected, poses, views.frame)
+    sure = _confidence(found, detected, through)
     return Located(solid, overlap, *sure, floor, solids.ellipsoids)
 
 
@@ -124,16 +126,20 @@ def floor_under(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | Non
     return None if plane is None else quadrics.Floor(plane.normal, plane.offset, plane.sigma)
 
 
-def confidence(score: Array, share: Array, usual_score: float) -> Array:
+def confidence(
+    score: Array, share: Array, usual_score: float, through: Array | float = 0.0
+) -> Array:
     """Return the probability that objects are there, each a thing of its own.
 
     Args:
         score: `log_mean_odds` of its detections.
         share: of the frames that should show it and do; NaN where no solid tells which should.
         usual_score: mean log odds of the scores of all solids' detections.
+        through: `occlusion.seen_through`.
     """
-    constant, of_score, of_share = CONFIDENCE
-    place = np.where(np.isnan(share), NO_SOLID, constant + of_share * share)
+    constant, of_score, of_share, of_through = CONFIDENCE
+    place = constant + of_share * share + of_through * through
+    place = np.where(np.isnan(share), NO_SOLID, place)
     score = score - RELATIVE * min(usual_score, 0.0)
     return np.asarray(1 / (1 + np.exp(-place - of_score * score)))
 
@@ -148,7 +154,7 @@ def log_mean_odds(score: Array, group: IntArray, count: int) -> Array:
         return np.asarray(np.log(odds / np.bincount(group, minlength=count).clip(1)))
 
 
-def _confidence(found: Association, detected: Detected) -> tuple[Array, float]:
+def _confidence(found: Association, detected: Detected, through: Array) -> tuple[Array, float]:
     """Return the `confidence` (S,) of solids, and the mean log odds of all their scores."""
     owned = np.flatnonzero(found.owner >= 0)
     solid, view = found.owner[owned], detected.view[owned]
@@ -156,7 +162,7 @@ def _confidence(found: Association, detected: Detected) -> tuple[Array, float]:
     score = log_mean_odds(detected.score[owned], solid, len(found.solids))
     shown = np.bincount(solid, expected[view, solid], len(found.solids))
     usual = float(odds.mean()) if len(odds) else 0.0
-    return confidence(score, shown / expected.sum(0).clip(1), usual), usual
+    return confidence(score, shown / expected.sum(0).clip(1), usual, through), usual
 
 
 @dataclass(frozen=True, slots=True)
