@@ -236,6 +236,7 @@ def _with_confidence(found: Object, confidence: float) -> Object:
     if confidence >= DOUBTFUL:
         return made
     why = f"{100 * confidence:.0f} % likely: its detections are weak, or in few of the frames"
+    why += ", or things behind it are seen through its place"
     if found.status == "rejected":
         why += f"; {found.reason}"
     return dataclasses.replace(made, status="doubtful", reason=why)
