@@ -843,6 +843,15 @@ def test_a_camera_line_of_colmap_is_taken_as_it_is(tmp_path: Path) -> None:
     assert "PINHOLE 640 480 492.7567" in camera
 
 
+def test_cameras_alone_that_are_not_wanted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = ROOT / "examples/room/room.mp4"
+    assert cli("poses", room, "-o", tmp_path / "out", "--stop", 5, "--poses", "none") == 2
+    assert "--poses none leaves nothing to do" in capsys.readouterr().err
+    assert not (tmp_path / "out/poses.txt").exists()
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
 def test_completion(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     """The script names the program that pip installs; bash itself completes a flag with it."""

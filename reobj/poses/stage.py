@@ -95,7 +95,11 @@ def reconstruct_cached(
     Returns:
         poses, and the folder of the COLMAP model of each part (missing if the reconstruction
         failed).
+    Raises:
+        ReobjError: no cameras are wanted.
     """
+    if config.mode == "none":
+        raise ReobjError("--poses none leaves nothing to do: leave it out, or use `track`")
     boxes = np.empty((0, 5))
     if moving is not None and len(moving):
         boxes = np.column_stack([moving.frame, moving.xyxy])
