@@ -22,8 +22,7 @@ axes; rotation world_from_obj with the object's axes as columns (third axis = up
 known); covariance order: center (3, world), log half axes (3), rotation vector (3, object frame).
 Axes of the shape comments: F frames, O objects, V views of one object, E = 4 edges of one view
 (left, top, right, bottom), B problems (object x shape x start) solved side by side.
-Constants stand where they are read. Where none is named, their source is our own choice: the
-tables of docs/quadrics.md hold for these values.
+Constants stand where they are read. Those without a source are chosen (docs/quadrics.md).
 
 References:
     [LfD]   Rubino, Crocco, Del Bue: 3D object localisation from multi-view detections. PAMI 2018
@@ -45,7 +44,6 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-__version__ = "0.1.0"
 __all__ = [
     "SUPPORTS", "Array", "BoolArray", "Ellipsoids", "FitConfig", "IntArray", "ObjectFits", "Priors",
     "PsfmoResult", "QuadricsError", "Scale", "SfmoResult", "box_iou", "boxes_from_dual_conics",
@@ -2186,6 +2184,10 @@ def _report(
         wide = _curved_covariance(fit, data, spec) + fit.spread
         # the noise level is itself estimated: Student's 95 % region for three parameters
         wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
+        if cfg.correlation_deg > 0:  # the boxes of a thing have errors in common, as large as one's
+            size_px = np.nanmedian(boxes[:, live, 2:] - boxes[:, live, :2], (0, 2))
+            edge = fit.noise * np.hypot(cfg.edge_noise_px / size_px, cfg.edge_noise_rel)
+            wide[:, [3, 4, 5], [3, 4, 5]] += 2.0 * edge[:, None] ** 2  # opposite edges, of the size
         found, cov[live], order = _vertical_axis_last(fit, wide)
         for name in ("center_in_world", "half_axes", "world_from_obj"):
             getattr(solids, name)[live] = getattr(found, name)
@@ -2196,9 +2198,8 @@ def _report(
         cov[live] *= shrink[:, :, None] * shrink[:, None]
         post = post * shrink[:, 3:6]
         share[live], angle[live] = post / prior, _parallax(fit, data)
-        value = _all_residuals(fit, data) * data.edges.sigma_px
-        count = np.maximum(fit.good.sum((1, 2)), 1)
-        rms[live] = np.sqrt((value**2 * fit.good).sum((1, 2)) / count)
+        square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.good
+        rms[live] = np.sqrt(square.sum((1, 2)) / np.maximum(fit.good.sum((1, 2)), 1))
         seen = (data.index >= 0).sum(1)
         verdict, why = _status(fit, spec, share[live], post, angle[live], seen)
         for row, k in enumerate(live.tolist()):

@@ -27,6 +27,7 @@ What is counted. An object is *listed* if it is not `doubtful`; solids are those
                has its class or one that may be taken for it; areas that are not annotated are left
                out.
     centre, size   medians over objects found; own cameras are aligned with the true ones first
+    in 2 sigma     sides of these objects whose log is within 2 sigma of the true one's
     confidence     an object is real if nothing shows a true object better, in 3D
                (hololens_kitchen) or in 2D; objects of classes that are not annotated do not count
 """
@@ -62,7 +63,7 @@ import quadrics
 import reobj_track as rt
 from reobj.objects import DOUBTFUL
 from reobj.results.evaluation import SCORED, LabelledBoxes, read_result, read_truth
-from reobj.results.solids import align_with_truth
+from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
 from reobj.views import Views
 
@@ -496,7 +497,7 @@ class Matched:
     """Solids beside true objects of their class: M pairs, and what is left over.
 
     Attributes:
-        true, solid: (M,). center_error: (M,) m. size_error: (M, 3) relative.
+        true, solid: (M,). center_error: (M,) m. size_error: (M, 3) relative; in_sigma: (M, 3).
         doubles, elsewhere: how many other solids lie in reach of a true one, and of none.
     """
 
@@ -504,6 +505,7 @@ class Matched:
     solid: IntArray
     center_error: Array
     size_error: Array
+    in_sigma: Array
     doubles: int
     elsewhere: int
 
@@ -526,7 +528,16 @@ def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
     double = able[nearest, other]
     extents = [matched_extents(axes[i], placed, j) for i, j in zip(a, b, strict=True)]
     errors = np.abs(np.reshape(extents, (-1, 3)) / size[a] - 1)
-    return Matched(a, b, full[a, b], errors, int(double.sum()), int((~double).sum()))
+    found, goal = (
+        quadrics.Ellipsoids(*arrays)
+        for arrays in (
+            (placed.center[b], placed.size[b] / 2, placed.rotation[b]),
+            (center[a], size[a] / 2, axes[a]),
+        )
+    )
+    in_sigma = sizes_in_sigma(placed.objects, b, found, goal) if len(b) else errors
+    counts = int(double.sum()), int((~double).sum())
+    return Matched(a, b, full[a, b], errors, in_sigma, *counts)
 
 
 def matched_extents(axes: Array, placed: Placed, solid: int) -> Array:
@@ -561,6 +572,7 @@ def score_solids(truth_folder: Path, folder: Path) -> Figures:
         "elsewhere": matched.elsewhere,
         "centre_m": median(matched.center_error),
         "size_error": median(matched.size_error),
+        "inside": share_inside(matched.in_sigma),
         "sure": sure_of_solids(true, placed, truth, every, rt.Result.load(folder).objects),
     }
 
@@ -620,6 +632,7 @@ def score_as_eval(truth_folder: Path, folder: Path) -> Figures:
         "found": in_3d["found"],
         "centre_m": in_3d.get("center_error_median"),
         "size_error": in_3d.get("size_error_median"),
+        "inside": in_3d.get("sizes_inside"),
         "o3d": in_3d.get("o3d_found"),
         "sure": sure_of(objects, verdicts.best(), annotated),
     }
@@ -650,6 +663,7 @@ COLUMNS: list[tuple[str, str, Callable[[Any], str]]] = [
     ("recall", "recall", short),
     ("centre_m", "centre, m", short),
     ("size_error", "size", percent),
+    ("inside", "in 2 sigma", percent),
     ("o3d", "O3D", short),
     ("objects_s", "objects step, s", "{:.1f}".format),
     ("peak_mb", "peak, MB", str),

@@ -602,6 +602,20 @@ def test_errors_are_in_units_of_the_truth(tmp_path: Path) -> None:
     assert found["o3d_all"] < 0.01  # .4 + .4 m along x: they hardly touch
 
 
+def test_sides_within_two_sigma_along_the_true_axes(tmp_path: Path) -> None:
+    """The own axes have another order; the sigma is that of the log."""
+    result, *files = half_sized(tmp_path)
+    assert score_objects(result, *files, {4: 9})["sizes_inside"] is None  # no covariance
+    (o,) = result.objects
+    axes = np.roll(np.eye(3), 1, 0)  # own x is the true y ...
+    turn = Rotation.from_quat(np.roll(o.quat_wxyz, -1)).as_matrix() @ axes
+    cov = np.diag(np.repeat([1.0, 0.1, 1.0], 3) ** 2)
+    half = np.roll(o.half_axes, -1) * np.exp([0.19, 0.21, 0.0])
+    quat = np.roll(Rotation.from_matrix(turn).as_quat(), 1)
+    result.objects = [dataclasses.replace(o, half_axes=half, quat_wxyz=quat, cov=cov)]
+    assert score_objects(result, *files, {4: 9})["sizes_inside"] == pytest.approx(2 / 3)
+
+
 @pytest.mark.parametrize("pairs", [{4: None}, {4: 8}, {}])
 def test_objects_that_the_identities_do_not_say_are_not_found(
     tmp_path: Path, pairs: dict[int, int | None]

@@ -6,6 +6,7 @@ Start at `score_objects`. Writes nothing.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import quadrics
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
 from reobj.files import load_json, read_lines
 from reobj.results.result import Object, Result
-from reobj.types import Array, ReobjError, log
+from reobj.types import Array, IntArray, ReobjError, log
 
 MIN_HALF_AXIS = 0.005  # world units of the truth, metres: a sheet is taken as 1 cm thick (chosen)
 
@@ -143,7 +144,8 @@ def score_objects(
             only if the identities say so.
     Returns:
         counts and errors by name, centre errors in units of the truth; `o3d_all` counts 0 for every
-        true object without ellipsoid; `scale_error`: of our metres per unit, relative.
+        true object without ellipsoid; `sizes_inside`: share of the sides within 2 sigma, but for
+        the scale; `scale_error`: of our metres per unit, relative.
     """
     ids, truth = read_true_solids(solids)
     located, ours, scale_errors = _solids_in_truth(result, truth_poses)
@@ -169,10 +171,35 @@ def score_objects(
         "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
         "center_error_median": float(np.median(error)),
         "size_error_median": float(np.expm1(np.median(size))),
+        "sizes_inside": share_inside(sizes_in_sigma(located, own, found, goal)),
         "scale_error": scale_errors[0],
         **({"part_scale_errors": scale_errors} if len(scale_errors) > 1 else {}),
         "objects": each,
     }
+
+
+def sizes_in_sigma(
+    objects: Sequence[Object], rows: IntArray, found: quadrics.Ellipsoids, goal: quadrics.Ellipsoids
+) -> Array:
+    """Return the errors (n, 3) of log sides along the true axes over their sigma; NaN without one.
+
+    Args:
+        rows: (n,) of the objects. found, goal: their ellipsoids and the true ones, in one world.
+    """
+    near = np.abs(goal.world_from_obj.swapaxes(1, 2) @ found.world_from_obj)  # (n, true, own axes)
+    orders = quadrics.AXIS_ORDERS
+    best = orders[near[:, np.arange(3), orders].sum(2).argmax(1)]  # (n, 3) own axis of each true
+    none = np.full((9, 9), np.nan)
+    cov = [none if (of := objects[row].cov) is None else of for row in rows.tolist()]
+    variance = np.einsum("nii->ni", np.array(cov, np.float64))[:, 3:6]
+    error = np.log(np.take_along_axis(found.half_axes, best, 1) / goal.half_axes)
+    return np.asarray(error / np.sqrt(np.take_along_axis(variance, best, 1)), np.float64)
+
+
+def share_inside(in_sigma: Array) -> float | None:
+    """Return the share of errors within 2 sigma; None if none is known."""
+    known = in_sigma[np.isfinite(in_sigma)]
+    return float((np.abs(known) < 2).mean()) if len(known) else None
 
 
 def _solids_in_truth(
