@@ -82,7 +82,7 @@ class FitConfig:
             first guess: the boxes themselves correct both by one factor an object.
         border_px: An edge this near the image border (px) only says that the object reaches it.
         correlation_deg: Views of an object nearer to each other than this (deg) repeat their errors
-            and count as fewer; 0: every view counts fully, and certainty grows with their number.
+            and count as fewer; 0: every view counts fully, and no error is common to all of them.
         max_views: An object seen in more frames is fitted from this many, spread over the path.
         start_views: On this many views the candidate orientations and shapes of an object compete;
             fewer are faster and more often let the wrong one win.
