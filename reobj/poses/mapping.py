@@ -240,8 +240,8 @@ class _Search:
         for _ in range(MAX_ROUNDS):
             best, messages = self._best(focal or guess, focal is not None)
             known = [p for p in best if self.fixed or focal is not None or p.calibrated]
-            told = [p for p in known if not p.problem] or known
-            others, changes = constant_focal([part.arrays for part in told])
+            known = [p for p in known if not p.problem] or known  # little parallax tells no zoom
+            others, changes = constant_focal([part.arrays for part in known])
             if not len(others):
                 break
             zooms += changes
