@@ -65,6 +65,7 @@ from reobj.objects import DOUBTFUL
 from reobj.results.evaluation import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
+from reobj.views import Views
 
 ROOM = Path(__file__).resolve().parent / "room"
 YOLO, FEMTO, RECORDED = "detections_yolov8s.csv", "detections_femto.csv", "detections.npz"
@@ -131,6 +132,11 @@ def nothing(*_: Any) -> None:
     """Stand in for what finds something."""
 
 
+def all_visible(views: Views, *_: Any) -> BoolArray:
+    """Stand in for what finds hidden edges."""
+    return np.zeros(views.boxes.shape, bool)
+
+
 def never_seen_through(solids: quadrics.Ellipsoids, *_: Any) -> Array:
     """Stand in for what finds points behind solids."""
     return np.zeros(len(solids))
@@ -150,6 +156,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
         "quadrics.HUBER_HIDDEN": quadrics.HUBER,
         "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
     },
+    "edges behind nearer things": {"reobj.identity.occlusion._behind_nearer": all_visible},
     "edges above the floor": {"reobj.identity.occlusion.ABOVE": np.inf},
     "widening": {f"{ASSOCIATION}.WIDENED": 0},
     "limit of a box": {f"{EVIDENCE}.MAX_BOX_LOG_ODDS": 8.0},

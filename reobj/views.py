@@ -22,8 +22,8 @@ class Views:
 
     Attributes:
         frame: (V,) source frames. boxes: (V, G, 4) xyxy in undistorted pixels, NaN where unseen.
-        score: (V, G), 0 where unseen. hidden: (V, G, 4) edges of boxes beyond which their
-        things go on. img_from_world: (V, 3, 4) K @ cam_from_world.
+        score: (V, G), 0 where unseen. hidden: (V, G, 4) edges of boxes where something nearer
+        begins. img_from_world: (V, 3, 4) K @ cam_from_world.
         image_size: (w, h) px.
     """
 

@@ -295,7 +295,7 @@ def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(result.tracks.xyxy[result.embedding_row], tracks.xyxy[rows[kept]])
 
 
-def test_solids_of_merged_objects_tell_no_hidden_edges(
+def test_solids_of_merged_objects_hide_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What stood where one of two merged objects was is not the solid of both; others keep theirs.

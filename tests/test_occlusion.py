@@ -1,4 +1,4 @@
-"""Hidden edges: where boxes end above the floor; the fit; and what is seen through."""
+"""Hidden edges: where something nearer begins, where boxes end above the floor; and the fit."""
 
 from __future__ import annotations
 
@@ -28,6 +28,43 @@ def scene(counter: np.ndarray) -> tuple[quadrics.Ellipsoids, Views]:
     cams = poses.camera.K @ poses.cam_from_world
     boxes = quadrics.solid_boxes(solids, "box", cams)
     return solids, Views(poses.frame, boxes, np.ones(boxes.shape[:2]), cams, SIZE)
+
+
+def cut_below(views: Views) -> None:
+    """Cut the boxes of the first solid where those of the second begin."""
+    views.boxes[:, 0, 3] = views.boxes[:, 1, 1]
+
+
+def test_the_edge_at_a_counter_is_hidden_and_no_other() -> None:
+    solids, views = scene(np.array([1.5, 0.1, 0.3]))
+    cut_below(views)
+    found = hidden_edges(views, solids, ELSEWHERE)
+    expected = np.zeros((5, 2, 4), bool)
+    expected[:, 0, LOWER] = True
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_what_is_farther_away_hides_nothing() -> None:
+    solids, views = scene(np.array([1.5, 0.1, 0.15]))
+    solids.center_in_world[1, 1] = 0.4
+    views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
+    cut_below(views)
+    assert not hidden_edges(views, solids, ELSEWHERE)[:, 0].any()
+    solids.center_in_world[0, 1] = 1.0
+    assert hidden_edges(views, solids, ELSEWHERE)[:, 0, LOWER].all()
+
+
+def test_what_covers_the_whole_box_hides_no_edge() -> None:
+    """The chair is seen although a solid is in the way: that is no wall."""
+    solids, views = scene(np.array([1.5, 0.1, 0.9]))
+    assert not hidden_edges(views, solids, ELSEWHERE).any()
+
+
+def test_an_unknown_solid_hides_nothing() -> None:
+    solids, views = scene(np.array([1.5, 0.1, 0.3]))
+    cut_below(views)
+    solids.center_in_world[1] = solids.half_axes[1] = np.nan
+    assert not hidden_edges(views, solids, ELSEWHERE).any()
 
 
 def test_a_box_that_ends_above_the_floor_tells_only_where_its_thing_begins() -> None:

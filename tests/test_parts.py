@@ -228,7 +228,7 @@ def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_the_last_fit_begins_with_the_places_of_the_association(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What is hidden is known from there; where nothing is associated a first fit tells."""
+    """What hides is known from there; where nothing is associated a first fit tells."""
     for link in (True, False):
         seen = Mock(wraps=reobj.parts.hidden_edges)
         monkeypatch.setattr(reobj.parts, "hidden_edges", seen)

@@ -1,7 +1,9 @@
-"""What is hidden of solids, and what is seen through them.
+"""What hides solids, and what is seen through them.
 
-The box of a thing that stands on the floor and ends above it tells less than where the thing ends.
-And where sparse points are seen behind a solid, on rays through its middle, it is not there.
+Edges of boxes tell less than where an object ends where it goes on behind something nearer. That
+shows where just outside the edge something nearer is in the way and just inside it is not; and
+where the box of a thing that stands on the floor ends above the floor. And where sparse points are
+seen behind a solid, on rays through its middle, it is not there.
 """
 
 from __future__ import annotations
@@ -13,23 +15,28 @@ from reobj.cameras import Poses, place_of
 from reobj.types import Array, BoolArray, IntArray
 from reobj.views import Views, VisiblePoints
 
+EDGE_POINTS = (np.arange(8) + 0.5) / 8  # along an edge (chosen)
+# Sizes of the box outside its edge, where something nearer must be, and inside, where it must not
+# (chosen: the outline of what hides is known no better)
+BESIDE = (0.1, -0.2)
+MIN_COVERED = 0.5  # share of these points that nearer things cover (chosen)
 # Share of its height that a box may end above the lower edge of its solid and still show the whole
 # (chosen on hololens_kitchen, where .05 to .2 are alike)
 ABOVE = 0.1
 
 
 def hidden_edges(views: Views, ellipsoids: quadrics.Ellipsoids, on_floor: BoolArray) -> BoolArray:
-    """Find the edges of boxes beyond which their things go on.
+    """Find the edges of boxes behind which their things go on.
 
     Args:
-        ellipsoids: of the G groups of the views, NaN where unknown: nothing is known to be hidden.
+        ellipsoids: of the G groups of the views, NaN where unknown: they hide nothing.
         on_floor: (G,) these stand on a known floor.
     Returns:
         (V, G, 4) left, upper, right and lower edge.
     """
     projected = quadrics.solid_boxes(ellipsoids, "box", views.img_from_world)
     hidden = edges_above_floor(views.boxes, quadrics.clip_boxes(projected, views.image_size))
-    return np.asarray(hidden & on_floor[:, None], bool)
+    return _behind_nearer(views, ellipsoids) | hidden & on_floor[:, None]
 
 
 def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
@@ -45,6 +52,59 @@ def edges_above_floor(boxes: Array, projected: Array) -> BoolArray:
     height = projected[..., 3] - projected[..., 1]
     above = boxes[..., 3] < projected[..., 3] - ABOVE * height
     return np.asarray(above[..., None] & np.array([True, False, True, True]), bool)
+
+
+def _behind_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolArray:
+    """Find the edges (V, G, 4) of boxes where something nearer begins."""
+    hidden = np.zeros(views.boxes.shape, bool)
+    known = np.isfinite(ellipsoids.half_axes.sum(1) + ellipsoids.center_in_world.sum(1))
+    seen = np.isfinite(views.boxes.sum(2)) & known  # (V, G)
+    column = np.cumsum(known) - 1  # (G,) among the S known ones
+    solids = ellipsoids[known]
+    outline = quadrics.solid_boxes(solids, "box", views.img_from_world)  # (V, S, 4)
+    for v in np.flatnonzero(seen.any(1)):
+        camera, own = views.img_from_world[v], np.flatnonzero(seen[v])  # (D,)
+        points = _beside_edges(views.boxes[v, own])  # (2, D, 4, P, 2)
+        beside = (outline[v, :, :2] > points.max((0, 1, 2, 3))).any(1)
+        beside |= (outline[v, :, 2:] < points.min((0, 1, 2, 3))).any(1)
+        front = np.flatnonzero(~beside)  # (N,) solids that some of the rays may meet
+        depth = solids.center_in_world @ camera[2, :3] + camera[2, 3]  # (S,)
+        entry = _entry_depths(points.reshape(-1, 2), camera, solids[front])
+        entry = entry.reshape(*points.shape[:4], -1)  # (2, D, 4, P, N)
+        itself = front == column[own, None]  # (D, N)
+        entry = np.where(itself[:, None, None], np.inf, entry)
+        nearest = entry.min(4, initial=np.inf)
+        covered = (nearest < depth[column[own], None, None]).mean(3) >= MIN_COVERED  # (2, D, 4)
+        hidden[v, own] = covered[0] & ~covered[1]
+    return hidden
+
+
+def _beside_edges(box: Array) -> Array:
+    """Return points (2, D, 4, P, 2) along the edges of boxes (D, 4), for each of `BESIDE`."""
+    low, high = box[:, None, :2], box[:, None, 2:]  # (D, 1, 2)
+    along = low + (high - low) * EDGE_POINTS[:, None]  # (D, P, 2)
+    found = []
+    for beyond in BESIDE:
+        off = beyond * (high - low)
+        first, last = (np.broadcast_to(edge, along.shape) for edge in (low - off, high + off))
+        sides = [(first, along), (along, first), (last, along), (along, last)]
+        found.append(np.stack([np.stack([x[..., 0], y[..., 1]], -1) for x, y in sides], 1))
+    return np.stack(found)
+
+
+def _entry_depths(points: Array, camera: Array, solids: quadrics.Ellipsoids) -> Array:
+    """Return the depths (K, S) where rays of image points (K, 2) enter boxes; inf: nowhere."""
+    inverse = np.linalg.inv(camera[:, :3])
+    ray = np.column_stack([points, np.ones(len(points))]) @ inverse.T  # (K, 3), of depth 1
+    start = -inverse @ camera[:, 3] - solids.center_in_world  # (S, 3)
+    start = np.einsum("sij,si->sj", solids.world_from_obj, start)
+    ray = np.einsum("sij,ki->ksj", solids.world_from_obj, ray)  # (K, S, 3)
+    faces = np.stack([-solids.half_axes - start, solids.half_axes - start]).transpose(0, 2, 1)
+    ray = np.ascontiguousarray(ray.transpose(2, 0, 1))  # (3, K, S): short axes first are fast
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = faces[:, :, None] / ray  # (2, 3, K, S)
+    enter, leave = ends.min(0).max(0), ends.max(0).min(0)  # (K, S)
+    return np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)
 
 
 MIDDLE = 0.6  # of the half axes, that a ray must pass the centre within (chosen)
