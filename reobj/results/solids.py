@@ -186,9 +186,9 @@ def sizes_in_sigma(
     Args:
         rows: (n,) of the objects. found, goal: their ellipsoids and the true ones, in one world.
     """
-    near = np.abs(goal.world_from_obj.swapaxes(1, 2) @ found.world_from_obj)  # (n, true, own axes)
+    cosine = np.abs(goal.world_from_obj.swapaxes(1, 2) @ found.world_from_obj)  # (n, true, own)
     orders = quadrics.AXIS_ORDERS
-    best = orders[near[:, np.arange(3), orders].sum(2).argmax(1)]  # (n, 3) own axis of each true
+    best = orders[cosine[:, np.arange(3), orders].sum(2).argmax(1)]  # (n, 3) own axis of each true
     none = np.full((9, 9), np.nan)
     cov = [none if (of := objects[row].cov) is None else of for row in rows.tolist()]
     variance = np.einsum("nii->ni", np.array(cov, np.float64))[:, 3:6]
