@@ -138,7 +138,8 @@ def search(monkeypatch):
 
 
 def part(first=1, last=30, calibrated=True, sigma=0.0005, problem="", focal=0.8):
-    arrays = SimpleNamespace(ids=np.arange(first, last + 1), focal_over_size=focal)
+    camera = SimpleNamespace(width=640, height=480)
+    arrays = SimpleNamespace(ids=np.arange(first, last + 1), focal_over_size=focal, camera=camera)
     share = (last - first + 1) / 30
     return Part("model", arrays, calibrated, 2.4, share, 20.0, sigma, 1000, problem, arrays.ids)
 
@@ -203,6 +204,19 @@ def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):
     assert len(search.ran) == mapping.MAX_ROUNDS
 
 
+def test_of_a_zoom_the_images_left_tell_the_focal_length(search, monkeypatch):
+    """Matches of pictures of two focal lengths tell one between them."""
+    ids = np.column_stack([np.arange(1, 21), np.arange(2, 22)])[np.arange(40) % 20]
+    matches = [np.zeros((50, 2), np.int64)] * 40
+    keypoints = dict.fromkeys(range(1, 31))
+    search.pairs = MatchedPairs(ids, matches, keypoints, fundamental(1.1, 40))
+    found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
+    monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
+    search.made = [part(1, 21)]
+    search.run(0.9, 0.8)
+    assert search.told == pytest.approx(1.1, rel=0.02)
+
+
 @pytest.mark.parametrize("shown, kept", [(0.8, True), (1.1, False)])
 def test_of_two_focal_lengths_the_given_camera_tells_which_is_right(
     search, monkeypatch, shown, kept
@@ -215,7 +229,6 @@ def test_of_two_focal_lengths_the_given_camera_tells_which_is_right(
     found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
     monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
     search.fixed, search.made = True, [part(1, 21)]
-    search.made[0].arrays.camera = SimpleNamespace(width=640, height=480)
     models, messages = search.run(None, 0.8)
     assert (len(models) == 1) == kept
     what = "between frames 210 and 220" if kept else "another focal length than that of the given"

@@ -41,6 +41,22 @@ def test_images_of_another_focal_length_are_found(ratio):
     np.testing.assert_allclose([r for _, _, r in changes], [ratio, 1 / ratio], rtol=0.1)
 
 
+@pytest.mark.parametrize("log, sigma, found", [(0.3, 0.03, 1), (0.2, 0.01, 0), (0.3, 0.07, 0)])
+def test_one_side_alone_must_be_clearer(monkeypatch, log, sigma, found):
+    """Seen from those before it, one image has another focal length; those behind tell nothing."""
+    views = views_of(range(0), 1.0)
+
+    def told(arrays, image, side):
+        if side.start > image:
+            return np.nan, np.nan
+        return (log, sigma) if image == 13 else (0.0, 0.003)
+
+    monkeypatch.setattr(zoom, "TOLD_BY", 1)
+    monkeypatch.setattr(zoom, "_triangulate", lambda arrays, terms, side: side)
+    monkeypatch.setattr(zoom, "_log_focal", told)
+    assert [(a, b) for a, b, _ in zoom._changes(views)] == [(13, 14)] * found
+
+
 def test_the_focal_length_of_most_images_is_kept():
     others, _ = constant_focal([views_of(range(6, 20), 1.3)])
     assert others.tolist() == list(range(1, 7))

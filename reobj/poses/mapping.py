@@ -247,6 +247,10 @@ class _Search:
             zooms += changes
             self.ids = [i for i in self.ids if i not in set(others.tolist())]
             self.pairs = self.pairs.only(self.ids)
+            if focal is not None:  # told by pictures of several focal lengths so far
+                camera = best[0].arrays.camera
+                focal = focal_from_pairs(self.pairs, (camera.width, camera.height)) or focal
+                self.told = focal
         else:
             best = [replace(part, problem="the focal length keeps changing") for part in best]
         if self.fixed and zooms:  # which of the focal lengths is that of the camera?

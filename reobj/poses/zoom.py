@@ -20,8 +20,8 @@ from reobj.types import Array, IntArray
 WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends those further off)
 MIN_POINTS = 20  # of such points seen in the image (chosen; two determine a focal length and pose)
 # Log of the focal length's change that is a zoom (measured, mean of both sides: zoomed by 1.25 to
-# 1.5 .15-.30, right models below .03; one side alone up to .12)
-MIN_ZOOM = 0.12
+# 1.5 .15-.30, right models below .03; one side alone .34-.39, right models up to .12)
+MIN_ZOOM, MIN_ZOOM_ONE_SIDE = 0.12, 0.24
 MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
 TOLD_BY = 2  # images on each side of a gap that are looked at (chosen)
 UNLIKE = 10.0  # log of a change that nothing measures: no two sides of it are alike
@@ -63,7 +63,8 @@ def _beside(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
 def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between images that follow each other.
 
-    On both sides of each gap the next images are seen from the other side; both sides must tell.
+    On both sides of each gap the next images are seen from the other side. Where one side tells
+    nothing, more is asked of the other: it is biased by the noise of its depths.
     """
     count, found = len(arrays.ids), list[tuple[int, int, float]]()
     ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
@@ -78,9 +79,10 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
             points = _triangulate(arrays, terms, side)
             values = np.array([_log_focal(arrays, image, points) for image in seen]) * [sign, 1]
             sides.append(values[np.isfinite(values[:, 0])].tolist())
-        if all(sides):  # one alone is biased by the noise of its depths
+        if any(sides):
             log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
-            if abs(log) > max(MIN_ZOOM, MIN_SIGMAS * sigma):
+            least = MIN_ZOOM if all(sides) else MIN_ZOOM_ONE_SIDE
+            if abs(log) > max(least, MIN_SIGMAS * sigma):
                 ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
                 found.append((*ids, float(np.exp(log))))
     return found
