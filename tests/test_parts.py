@@ -659,3 +659,18 @@ def test_eval_reports_both_parts(parted_folder: Path, tmp_path: Path) -> None:
     assert scores["objects"]["found"] == 3 and scores["objects"]["o3d_all"] > 0.9
     assert "scale_error" in rt.score_report(scores)
     assert scores["tracks"]["all"]["ids_per_object"] == 2
+
+
+def test_what_is_seen_through_is_less_likely_there() -> None:
+    """Every camera observes points behind the first chair, on rays through its middle."""
+    plain = finished(unlinked(walk(), tracks_of(walk()))).objects
+    poses, chair = walk(), np.array(plain[0].center)
+    camera = -np.einsum("fji,fj->fi", poses.cam_from_world[:, :, :3], poses.cam_from_world[:, :, 3])
+    points = camera + 1.5 * (chair - camera)  # (F, 3)
+    own = np.repeat(np.arange(len(points))[:, None], 2, 1)
+    colors = np.zeros(points.shape, np.uint8)
+    poses = dataclasses.replace(poses, points=points, colors=colors, visibility=own)
+    seen = finished(unlinked(poses, tracks_of(poses))).objects
+    assert [o.id for o in seen] == [o.id for o in plain]
+    change = [a.confidence - b.confidence for a, b in zip(plain, seen, strict=True)]
+    assert change[0] > 0.005 and np.allclose(change[1:], 0)
