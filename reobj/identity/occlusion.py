@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 import quadrics
-from reobj.cameras import Poses, place_of
+from reobj.cameras import Poses, invert_rigid, place_of
 from reobj.types import Array, BoolArray, IntArray
 from reobj.views import Views, VisiblePoints
 
@@ -126,8 +126,7 @@ def seen_through(
         (S,) log of points observed behind over the others on rays through the middle, at least 0.
     """
     points, row = VisiblePoints(poses), place_of(poses, frame)[0]
-    cam_from_world = poses.cam_from_world[row]
-    camera = -np.einsum("vji,vj->vi", cam_from_world[:, :, :3], cam_from_world[:, :, 3])  # (V, 3)
+    camera = invert_rigid(poses.cam_from_world[row])[:, :, 3]  # (V, 3)
     behind, rest = np.zeros((2, expected.shape[1]))
     for v in np.flatnonzero(expected.any(1)):
         seen, own = points.observed(row[v]), np.flatnonzero(expected[v])
