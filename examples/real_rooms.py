@@ -169,6 +169,8 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
     "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
     "floor": {"reobj.identity.locate.floor_under": nothing, "reobj.parts.floor_under": nothing},
+    "points before solids": {"reobj.identity.locate.SeenSurface": nothing},
+    "proposals of untracked": {"reobj.identity.locate.PROPOSING_SCORE": np.inf},
     "seen through": {"reobj.identity.locate.seen_through": never_seen_through},
 }
 
@@ -405,7 +407,8 @@ def judge(
     return Verdicts(shows, unjudged, common, boxes - outside, np.array(true_ids, np.int64))
 
 
-NEEDED_FRAMES = 10  # of a true object that a list must hold
+# Frames of a true object that a list must hold: as many, or this share of a few photos
+NEEDED_FRAMES, NEEDED_SHARE = 10, 0.25
 
 
 def score_lists(truth_folder: Path, folder: Path) -> Figures:
@@ -418,7 +421,9 @@ def score_lists(truth_folder: Path, folder: Path) -> Figures:
     verdicts = judge(truth, kinds, read_result(folder), listed)
     frames = {k: int((truth.identity == k).sum()) for k in kinds}
     needed = {k for k, kind in kinds.items() if kind.needed and not kind.ignore}
-    must = {k for k in needed if frames[k] >= NEEDED_FRAMES}
+    total = 0 if result.poses is None else len(result.poses.frame)
+    enough = min(NEEDED_FRAMES, NEEDED_SHARE * total)
+    must = {k for k in needed if frames[k] >= enough}
     shown = verdicts.shows[verdicts.shows >= 0].tolist()
     judged = int((~verdicts.unjudged).sum())
     pairs = linear_sum_assignment(-verdicts.common)

@@ -153,6 +153,22 @@ def test_weak_detections_that_agree_belong_to_the_object() -> None:
     assert all(len(np.unique(found[table.detection_index == k])) == 1 for k in range(3))
 
 
+@pytest.mark.parametrize("score, found_at_all", [(0.42, True), (0.38, False)])
+def test_good_detections_in_no_tracklet_make_an_object(score: float, found_at_all: bool) -> None:
+    """Photos with wide steps: nothing connects the boxes of a chair but its place."""
+    poses, solids = walk(12), chair_solids()[[0, 2]]
+    solids.half_axes[0] = 0.05  # a cup, which the tracker follows
+    table = table_of(poses, solids)
+    last = table.detection_index == 1
+    class_id = np.where(last, CHAIR, CUP)
+    tracklet, scores = np.where(last, 0, table.tracklet_id), np.where(last, score, 0.9)
+    table = dataclasses.replace(table, class_id=class_id)
+    found = located(dataclasses.replace(table, score=scores, tracklet_id=tracklet), poses)
+    assert (found[~last] >= 0).all() and len(np.unique(found[~last])) == 1
+    own = 1 - found[~last][0]  # of two solids
+    np.testing.assert_array_equal(found[last], own if found_at_all else -1)
+
+
 def test_strong_detections_that_do_not_agree_are_clutter() -> None:
     poses = walk()
     table = table_of(poses)

@@ -27,7 +27,7 @@ from reobj.types import Array, BoolArray, IntArray
 
 # Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).
 MISSED = 0.5  # against a solid, for each frame that should show it and has no detection of it
-NEW_SOLID = 15.0  # against each solid: five frames and more must speak for it
+NEW_SOLID = 10.0  # against each solid: three frames and more must speak for it
 # What a better box may add in step 1, so that no compromise between two things comes first
 PURSUED_CHOICE = 1.5
 KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tracklet

@@ -17,10 +17,10 @@ import numpy.typing as npt
 import quadrics
 from reobj.cameras import Poses, undistort_boxes
 from reobj.identity.association import Association, Associator, Refit
-from reobj.identity.evidence import Detected, Solids, logit
+from reobj.identity.evidence import NO_SOLIDS, Detected, Solids, logit
 from reobj.identity.linking import cut_at_gaps
-from reobj.identity.occlusion import edges_above_floor, seen_through
-from reobj.identity.proposals import propose
+from reobj.identity.occlusion import SeenSurface, edges_above_floor, seen_through
+from reobj.identity.proposals import propose, propose_along_rays
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
 from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
@@ -33,6 +33,9 @@ NO_SOLID = -3.3  # instead of the constant where no solid explains it (12 of 150
 # Share of a recording's mean log odds, where it is below 0, that is forgiven: some detectors score
 # low throughout, in dark rooms most
 RELATIVE = 0.5
+# Of a detection in no tracklet that proposes solids; .3 finds no more and takes longer
+# (docs/tracking.md)
+PROPOSING_SCORE = 0.4
 DOUBLE_IOU = 0.6  # boxes of a class that overlap more are of one thing (NMS: .5 to .7)
 UNKNOWN_LOG = 3.0  # sigma of log sizes of which nothing is known (chosen: a factor of 20)
 SIZE_SIGMAS = 6.0  # a size farther off counts as so many (chosen: a class may be wrong)
@@ -91,6 +94,8 @@ def locate(
     floor = floor_under(poses, fits)
     usual, stands = kinds.usual_size(classes), kinds.on_floor(classes)
     proposed = propose(fits, views, classes, usual, floor, stands)
+    more = _from_untracked(table, poses, kinds, fits.up, floor)
+    proposed = Solids.concatenate([proposed, more])
     detected = _detected(table, poses, views)
     scene = Scene(floor, scale=None if poses.metric else fits.scale)
     refit = _refit(detected, views, kinds, scene, fit)
@@ -103,6 +108,17 @@ def locate(
     through = seen_through(found.solids.ellipsoids, found.evidence.expected, poses, views.frame)
     sure = _confidence(found, detected, through)
     return Located(solid, overlap, *sure, floor, solids.ellipsoids)
+
+
+def _from_untracked(
+    table: Tracks, poses: Poses, kinds: Categories, up: Array, floor: quadrics.Floor | None
+) -> Solids:
+    """Propose solids along the rays of good detections in no tracklet: photos have many."""
+    table = table[(table.tracklet_id == 0) & (table.score >= PROPOSING_SCORE)]
+    views = gather_views(table, poses, np.arange(len(table)), len(table), 0.0)
+    classes = table.class_id
+    usual, stands = kinds.usual_size(classes), kinds.on_floor(classes)
+    return propose_along_rays(views, classes, usual, up, floor, stands)
 
 
 def _doubles(rows: Tracks) -> BoolArray:
@@ -229,6 +245,7 @@ def _detected(table: Tracks, poses: Poses, views: Views) -> Detected:
         after,
         views.img_from_world,
         views.image_size,
+        SeenSurface(poses, views),
     )
 
 
@@ -266,6 +283,6 @@ def _refit(detected: Detected, views: Views, kinds: Categories, scene: Scene, fi
             fits = fit(seen, classes[new].tolist(), scene)
             made = Solids(fits.ellipsoids, fits.support, classes[new])
             found.update((keys[k], made[[column]]) for column, k in enumerate(new))
-        return Solids.concatenate([_NO_SOLID[:0], *(found[key] for key in keys)])
+        return Solids.concatenate([NO_SOLIDS, *(found[key] for key in keys)])
 
     return refit

@@ -1,8 +1,8 @@
 """Where things might be: solids that the association chooses from.
 
 Of every fragment of a tracklet the solid that is fitted to its boxes; and, as few views tell no
-distance, solids at several distances along the rays of its best boxes. Which of them are right
-other fragments tell, at other times.
+distance, solids at several distances along the rays of its best boxes, and of the detections in no
+tracklet. Which of them are right other fragments tell, at other times.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 import quadrics
-from reobj.identity.evidence import Solids
+from reobj.identity.evidence import NO_SOLIDS, Solids
 from reobj.types import Array, BoolArray, IntArray
 from reobj.views import Views
 
@@ -39,14 +39,32 @@ def propose(
         the fits, and several solids along a few rays of each group.
     """
     good = np.isfinite(fits.ellipsoids.center_in_world[:, 0])
-    made = [Solids(fits.ellipsoids[good], fits.support[good], classes[good])]
+    own = Solids(fits.ellipsoids[good], fits.support[good], classes[good])
+    rays = propose_along_rays(views, classes, usual_size, fits.up, floor, on_floor)
+    return Solids.concatenate([own, rays])
+
+
+def propose_along_rays(
+    views: Views,
+    classes: IntArray,
+    usual_size: Array,
+    up: Array,
+    floor: quadrics.Floor | None,
+    on_floor: BoolArray,
+) -> Solids:
+    """Propose solids at several distances along the rays of the best boxes of G groups.
+
+    Args:
+        up: (3,) unit; all 0: unknown, and nothing is proposed. The others: as in `propose`.
+    """
+    made = [NO_SOLIDS]
     group, view = _best_views(views)
     stands = on_floor[group] & (floor is not None)
     for standing in (True, False):
-        pick = (stands == standing) & bool(fits.up.any())
+        pick = (stands == standing) & bool(up.any())
         if pick.any():
             own = (view[pick], group[pick], usual_size[group[pick]])
-            ellipsoids, of = _along_rays(views, *own, fits.up, floor if standing else None)
+            ellipsoids, of = _along_rays(views, *own, up, floor if standing else None)
             made.append(Solids(ellipsoids, np.full(len(of), "cylinder"), classes[of]))
     return Solids.concatenate(made)
 
