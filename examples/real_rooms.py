@@ -407,7 +407,7 @@ def judge(
     return Verdicts(shows, unjudged, common, boxes - outside, np.array(true_ids, np.int64))
 
 
-# Frames of a true object that a list must hold: as many, or this share of a few photos
+# Frames of a true object that a list must hold: as many, or this share of those annotated
 NEEDED_FRAMES, NEEDED_SHARE = 10, 0.25
 
 
@@ -421,8 +421,7 @@ def score_lists(truth_folder: Path, folder: Path) -> Figures:
     verdicts = judge(truth, kinds, read_result(folder), listed)
     frames = {k: int((truth.identity == k).sum()) for k in kinds}
     needed = {k for k, kind in kinds.items() if kind.needed and not kind.ignore}
-    total = 0 if result.poses is None else len(result.poses.frame)
-    enough = min(NEEDED_FRAMES, NEEDED_SHARE * total)
+    enough = min(NEEDED_FRAMES, NEEDED_SHARE * len(np.unique(truth.frame)))
     must = {k for k in needed if frames[k] >= enough}
     shown = verdicts.shows[verdicts.shows >= 0].tolist()
     judged = int((~verdicts.unjudged).sum())

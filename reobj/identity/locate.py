@@ -27,8 +27,9 @@ from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
 
 # Log odds that an object is there: constant, by the log of the mean odds of its scores, by the
 # share of the frames that should show it and do, by how much is seen behind it through its middle
-# (`occlusion.seen_through`). Fitted to 399 solids of 17 runs (docs/tracking.md)
-CONFIDENCE = (-0.5, 1.5, 1.3, -2.0)
+# (`occlusion.seen_through`). Fitted to 399 solids of 17 runs, the constant lowered by .15 since
+# solids need fewer boxes (docs/tracking.md)
+CONFIDENCE = (-0.65, 1.5, 1.3, -2.0)
 NO_SOLID = -3.3  # instead of the constant where no solid explains it (12 of 150 were real)
 # Share of a recording's mean log odds, where it is below 0, that is forgiven: some detectors score
 # low throughout, in dark rooms most
