@@ -169,7 +169,6 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
     "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
     "floor": {"reobj.identity.locate.floor_under": nothing, "reobj.parts.floor_under": nothing},
-    "points before solids": {"reobj.identity.locate.SeenSurface": nothing},
     "proposals of untracked": {"reobj.identity.locate.PROPOSING_SCORE": np.inf},
     "seen through": {"reobj.identity.locate.seen_through": never_seen_through},
 }

@@ -10,8 +10,7 @@ from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.evidence import Detected, Solids, gather_evidence
-from reobj.identity.occlusion import SeenSurface, hidden_edges, seen_through
+from reobj.identity.occlusion import hidden_edges, seen_through
 from reobj.objects import fitter
 from reobj.views import Views, gather_views
 
@@ -147,68 +146,3 @@ def test_what_is_seen_on_a_solid_or_beside_it_speaks_for_it() -> None:
 
 def test_of_very_many_points_some_are_enough() -> None:
     assert np.log(5 * 200 / 10) < through(seen_along(1.4, count=5000)) < np.log(5 * 501 / 10)
-
-
-def hidden_by(points: np.ndarray) -> np.ndarray:
-    """Frames (5,) in which points that all cameras observe hide a chair at the origin."""
-    solids, views = scene(np.array([0.2, 0.2, 0.4]))
-    every = np.indices((5, len(points))).reshape(2, -1).T
-    poses = dataclasses.replace(walk(5, arc_deg=8.0), points=points, visibility=every)
-    surface = SeenSurface(poses, views)
-    found = surface.hides(solids[[0]], views.boxes[:, :1], np.ones((5, 1), bool))
-    assert not surface.hides(solids[[0]], views.boxes[:, :1], np.zeros((5, 1), bool)).any()
-    return np.asarray(found[:, 0])
-
-
-def wall(distance: float) -> np.ndarray:
-    """Points (N, 3) all over the middle camera's view of the chair, of distance 1 there."""
-    pose = walk(5, arc_deg=8.0).cam_from_world[2]
-    camera = -pose[:, :3].T @ pose[:, 3]
-    x, z = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-0.6, 1.4, 40))
-    plane = np.stack([x, np.zeros_like(x), z], -1).reshape(-1, 3)
-    return np.asarray(camera + distance * (plane - camera))
-
-
-@pytest.mark.parametrize(
-    "distance, hidden", [(0.6, True), (0.95, False), (1.0, False), (1.5, False)]
-)
-def test_a_wall_of_points_hides_what_is_behind_it(distance: float, hidden: bool) -> None:
-    np.testing.assert_array_equal(hidden_by(wall(distance)), np.full(5, hidden))
-
-
-def test_what_covers_a_part_hides_nothing() -> None:
-    """Half of what is seen lies on the chair, or hardly anything is seen at all."""
-    near, on_it = wall(0.6), wall(1.0)
-    left = near[:, 0] < 0
-    assert not hidden_by(np.concatenate([near[left], on_it[on_it[:, 0] >= 0]])).any()
-    assert hidden_by(np.concatenate([near[left], on_it[on_it[:, 0] >= 0.25]])).all()
-    assert not hidden_by(np.empty((0, 3))).any()
-
-
-def test_one_place_of_many_is_too_few_to_hide() -> None:
-    """A few points on a lamp before a table that fills the image: one of 25 places is known."""
-    solids, views = scene(np.array([0.2, 0.2, 0.4]))
-    lamp = wall(0.6)
-    lamp = lamp[np.abs(lamp - lamp.mean(0)).max(1) < 0.04]
-    every = np.indices((5, len(lamp))).reshape(2, -1).T
-    poses = dataclasses.replace(walk(5, arc_deg=8.0), points=lamp, visibility=every)
-    whole = np.tile([0.0, 0.0, *SIZE], (5, 1, 1))
-    hides = SeenSurface(poses, views).hides
-    assert not hides(solids[[0]], whole, np.ones((5, 1), bool)).any()
-    assert hides(solids[[0]], views.boxes[:, :1], np.ones((5, 1), bool)).all()
-
-
-def test_what_is_hidden_by_points_is_not_expected() -> None:
-    solids, views = scene(np.array([0.2, 0.2, 0.4]))
-    points = wall(0.6)
-    seen_from = np.column_stack([np.full(len(points), 1), np.arange(len(points))])
-    poses = dataclasses.replace(walk(5, arc_deg=8.0), points=points, visibility=seen_from)
-    no, cams = np.empty(0, np.int64), views.img_from_world
-    chair = Solids(solids[[0]], np.array(["box"]), np.array([CHAIR]))
-    found = []
-    for surface in (None, SeenSurface(poses, views)):
-        none = Detected(no, np.empty((0, 4)), np.empty(0), no, no, no, cams, SIZE, surface)
-        found.append(gather_evidence(chair, none).expected[:, 0])
-    assert found[0].all()
-    # the frames beside it take what it observed to be what they see
-    np.testing.assert_array_equal(found[1], np.zeros(5, bool))

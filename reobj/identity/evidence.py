@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 import quadrics
-from reobj.identity.occlusion import SeenSurface
 from reobj.types import Array, BoolArray, IntArray, box_area
 
 # Chosen on hololens_kitchen and redkitchen, but for those with a source (docs/tracking.md).
@@ -40,7 +39,7 @@ class Detected:
     Attributes:
         view: (N,) frame, 0 .. V - 1, ascending. box: (N, 4) xyxy in undistorted pixels.
         score, class_id: (N,). before, after: (N,) the tracklet's rows before and after, or -1.
-        img_from_world: (V, 3, 4). image_size: (w, h) px. surface: that the frames see, if known.
+        img_from_world: (V, 3, 4). image_size: (w, h) px.
     """
 
     view: IntArray
@@ -51,7 +50,6 @@ class Detected:
     after: IntArray
     img_from_world: Array
     image_size: tuple[int, int]
-    surface: SeenSurface | None = None
 
     @property
     def rows_of_view(self) -> IntArray:
@@ -103,7 +101,7 @@ class Evidence:
     Attributes:
         solid, row: (M,). log_odds: (M,) of the solid against no solid at all. choice: (M,) the
             same without its limit, to choose among solids.
-        expected: (V, S) where a detection should be: in the image, and nothing before it.
+        expected: (V, S) where a detection should be.
     """
 
     solid: IntArray
@@ -166,10 +164,7 @@ def _gather(solids: Solids, detected: Detected, share: Array, least: float) -> E
         found.append((solid[keep], row[keep], log_odds[keep], choice[keep]))
     solid, row, log_odds, choice = (np.concatenate(column) for column in zip(*found, strict=True))
     order = np.lexsort((row, solid))
-    expected = visible > EXPECTED
-    if detected.surface is not None:
-        expected &= ~detected.surface.hides(solids.ellipsoids, seen, expected)
-    return Evidence(solid[order], row[order], log_odds[order], choice[order], expected)
+    return Evidence(solid[order], row[order], log_odds[order], choice[order], visible > EXPECTED)
 
 
 def logit(score: Array) -> Array:

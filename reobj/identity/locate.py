@@ -19,7 +19,7 @@ from reobj.cameras import Poses, undistort_boxes
 from reobj.identity.association import Association, Associator, Refit
 from reobj.identity.evidence import NO_SOLIDS, Detected, Solids, logit
 from reobj.identity.linking import cut_at_gaps
-from reobj.identity.occlusion import SeenSurface, edges_above_floor, seen_through
+from reobj.identity.occlusion import edges_above_floor, seen_through
 from reobj.identity.proposals import propose, propose_along_rays
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
@@ -34,8 +34,8 @@ NO_SOLID = -3.3  # instead of the constant where no solid explains it (12 of 150
 # Share of a recording's mean log odds, where it is below 0, that is forgiven: some detectors score
 # low throughout, in dark rooms most
 RELATIVE = 0.5
-# Of a detection in no tracklet that proposes solids; .3 finds no more and takes longer
-# (docs/tracking.md)
+# Of a detection in no tracklet that proposes solids (.3 finds 73.5 objects instead of 72, in 1.2
+# times the time: docs/trials.md)
 PROPOSING_SCORE = 0.4
 DOUBLE_IOU = 0.6  # boxes of a class that overlap more are of one thing (NMS: .5 to .7)
 UNKNOWN_LOG = 3.0  # sigma of log sizes of which nothing is known (chosen: a factor of 20)
@@ -246,7 +246,6 @@ def _detected(table: Tracks, poses: Poses, views: Views) -> Detected:
         after,
         views.img_from_world,
         views.image_size,
-        SeenSurface(poses, views),
     )
 
 

@@ -2,14 +2,11 @@
 
 Edges of boxes tell less than where an object ends where it goes on behind something nearer. That
 shows where just outside the edge something nearer is in the way and just inside it is not; and
-where the box of a thing that stands on the floor ends above the floor. Where sparse points are
-seen behind a solid, on rays through its middle, it is not there; where they are seen before it,
-nothing need show it.
+where the box of a thing that stands on the floor ends above the floor. And where sparse points are
+seen behind a solid, on rays through its middle, it is not there.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
@@ -146,67 +143,3 @@ def seen_through(
         behind[own] += (middle & through).sum(0)
         rest[own] += (middle & ~through).sum(0)
     return np.log((behind + FEW_POINTS) / (HOLES * rest + FEW_POINTS)).clip(0)
-
-
-CELLS = 20  # along the longer side of an image, in each a depth (chosen)
-# Where in a projection the depths are compared, along either side (chosen: its middle)
-COMPARED = 0.2 + 0.6 * (np.arange(5) + 0.5) / 5
-LEAST_KNOWN = 4  # of these 25 places, to say something (chosen)
-NEARER = 0.9  # of the depth of a solid's front, below which a point is before it (.8 is alike)
-# Share of the places that must lie before it. Measured (docs/tracking.md): with .5 solids are
-# believed that half of their frames contradict.
-MOSTLY = 0.7
-PAIRS_AT_ONCE = 100_000  # of a frame and a solid (chosen: memory)
-
-
-class SeenSurface:
-    """Depth of what V frames see, by their sparse points, in cells of the image.
-
-    Args:
-        poses: with points and their visibility. views: of the frames.
-    """
-
-    def __init__(self, poses: Poses, views: Views) -> None:
-        width, height = views.image_size
-        self._cell = max(width, height) / CELLS
-        columns, rows = math.ceil(width / self._cell), math.ceil(height / self._cell)
-        self._cameras = views.img_from_world
-        self._depth = np.full((len(views.frame), rows, columns), np.nan)
-        points, place = VisiblePoints(poses), place_of(poses, views.frame)[0]
-        for v, camera in enumerate(views.img_from_world):
-            xyz = poses.points[points.in_frame(int(place[v]))]
-            x, y, depth = camera[:, :3] @ xyz.T + camera[:, 3:]  # (N,) each
-            with np.errstate(divide="ignore", invalid="ignore"):
-                column, row = x / depth // self._cell, y / depth // self._cell
-            seen = (depth > 0) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-            cell, depth = (row * columns + column)[seen].astype(np.int64), depth[seen]
-            order = np.lexsort((depth, cell))
-            cell, start, count = np.unique(cell[order], return_index=True, return_counts=True)
-            self._depth[v].ravel()[cell] = depth[order][start + (count - 1) // 2]  # the median
-
-    def hides(
-        self, solids: quadrics.Ellipsoids, projected: Array, expected: BoolArray
-    ) -> BoolArray:
-        """Mark where most of what is seen in the middle of a projection lies before the solid.
-
-        Args:
-            solids: S. projected: (V, S, 4) their boxes in the images.
-            expected: (V, S) frames that should show them; the others are not looked at.
-        Returns:
-            (V, S).
-        """
-        hidden, last = np.zeros(expected.shape, bool), np.array(self._depth.shape[1:]) - 1
-        pairs = np.column_stack(np.nonzero(expected))
-        for first in range(0, len(pairs), PAIRS_AT_ONCE):
-            v, s = pairs[first : first + PAIRS_AT_ONCE].T  # (K,) each
-            low, high = projected[v, s, :2, None], projected[v, s, 2:, None]  # (K, 2, 1)
-            cell = ((low + (high - low) * COMPARED) // self._cell).astype(np.int64)  # (K, 2, 5)
-            column, row = (cell[:, i].clip(0, last[1 - i]) for i in range(2))
-            depth = self._depth[v[:, None, None], row[:, :, None], column[:, None]]  # (K, 5, 5)
-            camera = self._cameras[v, 2]  # (K, 4)
-            front = (camera[:, :3] * solids.center_in_world[s]).sum(1) + camera[:, 3]
-            front -= solids.half_axes[s].max(1)
-            known = np.isfinite(depth).sum((1, 2))
-            before = (depth < NEARER * front[:, None, None]).sum((1, 2))
-            hidden[v, s] = (known >= LEAST_KNOWN) & (before > MOSTLY * known)
-        return hidden

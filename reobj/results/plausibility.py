@@ -14,9 +14,12 @@ from reobj.results.result import Object, Result
 from reobj.types import IntArray, Tracks
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
-# Fewer of a class are normal, even if little else is listed: six chairs at a table, seven plants in
-# a living room (livingroom13). Partitions taken for refrigerators were 14 of 19 (office_loop).
-SAME_CLASS_MIN = 8
+# Fewer of a class are normal, even if little else is listed: six chairs at a table, nine plants in
+# a living room (livingroom13). Partitions taken for refrigerators were 16 of 23 (office_loop).
+SAME_CLASS_MIN = 10
+# Parallax of a thing that was walked around: a size that rests on its category all the same tells
+# of rough boxes, and walking on does not help (redkitchen)
+AROUND_DEG = 10.0
 MEASURABLE_MIN = 3  # objects; chosen: one or two that nobody walked around say nothing of a run
 BOXES_MIN = 50  # chosen: of fewer strong boxes a few more or less make the majority
 
@@ -50,8 +53,9 @@ def _few_cameras(result: Result) -> str:
 
 
 def _nothing_measured(result: Result, still: Sequence[Object]) -> str:
-    """Warn where there are cameras and objects, but no size that was measured."""
-    poses, measured = result.poses, any(o.status == "ok" for o in still)
+    """Warn where there are cameras and objects, but none was measured or seen from all around."""
+    poses = result.poses
+    measured = any(o.status == "ok" or (o.parallax_deg or 0.0) >= AROUND_DEG for o in still)
     if poses is None or not poses.known.any() or measured or len(still) < MEASURABLE_MIN:
         return ""
     cameras = "" if poses.source == "user" else "--camera (intrinsics), --poses, or "
