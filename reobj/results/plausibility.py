@@ -14,9 +14,9 @@ from reobj.results.result import Object, Result
 from reobj.types import IntArray, Tracks
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
-# Fewer of a class are normal, even if little else is listed: six chairs at a table, nine plants in
-# a living room (livingroom13). Partitions taken for refrigerators were 16 of 23 (office_loop).
-SAME_CLASS_MIN = 10
+# Fewer of a class are normal, even if little else is listed: six chairs at a table, seven plants in
+# a living room. Partitions taken for refrigerators were 8 of 10 and more (office_loop).
+SAME_CLASS_MIN = 8
 # Parallax of a thing that was walked around: a size that rests on its category all the same tells
 # of rough boxes, and walking on does not help (redkitchen)
 AROUND_DEG = 10.0
