@@ -152,7 +152,6 @@ def adjust(model: Any, loss_px: float) -> None:
     options.ceres.solver_options.num_threads = 1
     for i in model.reg_image_ids():
         chosen.add_image(i)
-    chosen.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pc.create_default_bundle_adjuster(options, chosen, model).solve()
 
 

@@ -87,6 +87,25 @@ def test_a_focal_length_is_taken_if_the_views_tell_it(turns):
     assert found.centre_sigma < np.inf
 
 
+def test_two_cameras_in_one_place_tear_no_model():
+    """Their distance, which the noise alone tells, is no measure of the others'."""
+    scene = Scene(count=8, points=400)
+    rotation = scene.truth[:, :, :3]
+    centre = -np.einsum("nji,nj->ni", rotation, scene.truth[:, :, 3])
+    centre[1:3] = centre[0] + np.array([[1e-5, 0, 0], [0, 1e-5, 0]])
+    scene.poses = scene.truth = np.append(rotation, -rotation @ centre[:, :, None], 2)
+    scene.xy = np.array([scene.project(pose)[0] for pose in scene.truth])
+    scene.seen = np.array([scene.project(pose)[1] for pose in scene.truth])
+    scene.xy = scene.xy + np.random.default_rng(0).normal(0, 0.5, scene.xy.shape)
+    model = scene.model()
+    model.camera(1).focal_length *= 1.02  # the camera of a larger part
+    _bundle_adjust(model, False, False)
+    step = np.linalg.norm(np.diff(centres_of(model), axis=0), axis=1)
+    true = np.linalg.norm(np.diff(centre, axis=0), axis=1)
+    assert step[3:] / step[3] == pytest.approx(true[3:] / true[3], rel=0.05)
+    assert step[:2].max() < 0.05 * step[3:].min()
+
+
 def test_points_at_a_centre_tell_nothing():
     """Chance matches are triangulated there; their derivatives would be infinite."""
     scene = Scene(count=6, points=300)

@@ -81,7 +81,11 @@ SOFT_L1_PX = 0.5  # from where a residual counts less, pixels of the resized ima
 
 
 def _bundle_adjust(model: Any, calibrate: bool, free_centre: bool) -> None:
-    """Adjust all images and points; the first two cameras fix the gauge."""
+    """Adjust all images and points.
+
+    Nothing fixes the gauge: no residual depends on it. COLMAP would by the first two cameras, and
+    a scale that is told by two in one place tears the model.
+    """
     pc = import_pycolmap()
     options, chosen = pc.BundleAdjustmentOptions(), pc.BundleAdjustmentConfig()
     options.print_summary = False
@@ -93,5 +97,4 @@ def _bundle_adjust(model: Any, calibrate: bool, free_centre: bool) -> None:
     options.ceres.solver_options.num_threads = 1  # the same result every time
     for i in model.reg_image_ids():
         chosen.add_image(i)
-    chosen.fix_gauge(pc.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pc.create_default_bundle_adjuster(options, chosen, model).solve()

@@ -238,8 +238,8 @@ class _Search:
         """
         self.told, zooms = focal, list[tuple[int, int, float]]()
         for _ in range(MAX_ROUNDS):
-            best, messages = self._best(focal or guess, focal is not None)
-            known = [p for p in best if self.fixed or focal is not None or p.calibrated]
+            best, messages = self._best(guess)
+            known = [p for p in best if self.fixed or self.told is not None or p.calibrated]
             known = [p for p in known if not p.problem] or known  # little parallax tells no zoom
             others, changes = constant_focal([part.arrays for part in known])
             if not len(others):
@@ -247,10 +247,10 @@ class _Search:
             zooms += changes
             self.ids = [i for i in self.ids if i not in set(others.tolist())]
             self.pairs = self.pairs.only(self.ids)
-            if focal is not None:  # told by pictures of several focal lengths so far
+            if self.told is not None:  # by pictures of several focal lengths so far
                 camera = best[0].arrays.camera
-                focal = focal_from_pairs(self.pairs, (camera.width, camera.height)) or focal
-                self.told = focal
+                size = camera.width, camera.height
+                self.told = focal_from_pairs(self.pairs, size) or self.told
         else:
             best = [replace(part, problem="the focal length keeps changing") for part in best]
         if self.fixed and zooms:  # which of the focal lengths is that of the camera?
@@ -273,7 +273,7 @@ class _Search:
                 messages.append(f"a part of the video ({ends}) has no poses: {part.problem}")
         return self._one_camera(sound), messages
 
-    def _best(self, start: float, told: bool) -> tuple[list[Part], list[str]]:
+    def _best(self, guess: float) -> tuple[list[Part], list[str]]:
         """Choose the mapper whose sound parts explain most of the verified matches.
 
         The incremental mapper is fast and right where the parallax is strong; where it is weak, it
@@ -283,9 +283,9 @@ class _Search:
         wrong one, and pieces are joined wrongly. The last adjustment frees it.
 
         Args:
-            start: focal length over the longer side. told: by the matches.
+            guess: focal length over the longer side, where the matches do not tell it.
         """
-        told = told or self.fixed
+        start, told = self.told or guess, self.fixed or self.told is not None
         if not told:
             _set_focal(self.database, start, False)
             best = confirmed(self._parts("incremental", False), [], told)
