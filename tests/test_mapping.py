@@ -169,7 +169,8 @@ def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
     monkeypatch.setattr(search, "_parts", lambda mapper, held: made[mapper])
     matches = sum(p.explained for p in made["global"])
     search.pairs = replace(search.pairs, inliers=[np.zeros((matches, 2), np.int64)])
-    best, messages = search._best(0.8, True)
+    search.told = 0.8
+    best, messages = search._best(0.8)
     assert best is made["global"] and messages == []
 
 
