@@ -174,11 +174,11 @@ def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
     assert best is made["global"] and messages == []
 
 
-@pytest.mark.parametrize("focal, count", [(0.82, 1), (0.9, 2)])
-def test_weaker_geometry_needs_the_matches_or_another_mapper(search, monkeypatch, focal, count):
-    """They tell the focal length without any model."""
+@pytest.mark.parametrize("sigma, count", [(0.0009, 1), (0.0011, 2)])
+def test_weaker_geometry_needs_another_mapper(search, monkeypatch, sigma, count):
+    """Also where the matches tell the focal length that came out: the mapper held that."""
     monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
-    search.made = [part(sigma=0.0011, focal=focal)]
+    search.made = [part(sigma=sigma)]
     search.run(0.8, 0.8)
     assert len(search.ran) == count
 

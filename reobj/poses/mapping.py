@@ -202,10 +202,6 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
-# Largest centre_sigma of such parts if the matches alone tell the focal length that came out, else
-# SURE_CENTRE_SIGMA (chosen: time), and the log of a ratio up to which it is the same (measured: of
-# ten right models nine up to .04, one .18; .18 where two halves came out 1.6 times too near)
-GOOD_CENTRE_SIGMA, SAME_FOCAL = 0.0012, 0.05
 PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
 MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
@@ -341,14 +337,9 @@ class _Search:
 
     def _is_sure(self, parts: list[Part]) -> bool:
         """True if parts of strong geometry hold and explain nearly all."""
-        sure = [p for p in parts if not p.problem and p.centre_sigma <= self._sure_sigma(p)]
+        sure = [p for p in parts if not p.problem and p.centre_sigma <= SURE_CENTRE_SIGMA]
         registered, matched = sum(p.registered for p in sure), sum(map(len, self.pairs.inliers))
         return registered >= GOOD_REGISTERED and _explained(sure) >= GOOD_EXPLAINED * matched
-
-    def _sure_sigma(self, part: Part) -> float:
-        """Return the centre_sigma up to which a part is believed without another mapper."""
-        same = self.told is not None and abs(np.log(self.told / part.focal)) < SAME_FOCAL
-        return GOOD_CENTRE_SIGMA if self.fixed or same else SURE_CENTRE_SIGMA
 
     def _parts(self, mapper: str, held: bool) -> list[Part]:
         """Run a mapper and measure the parts of its models that hold together, largest first.
