@@ -171,7 +171,7 @@ class TrackerConfig:
     low_score: float = option(0.1, "what is left is matched with scores down to this (ByteTrack)")
     new_score: float = option(0.5, "a new track starts at a detection of at least this score")
     n_init: int = option(
-        3, "detections before a new object gets its identity (DeepSORT); a return needs one less"
+        3, "detections of score .5 before a new object gets its identity; a return needs one less"
     )
     coast_frames: int = option(30, "frames that a track lives on without a detection", "--coast")
     remember: bool = option(True, "recognise objects that return, however long they were away")
@@ -234,6 +234,7 @@ class Config:
 # Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h.
 STD_MEASURE = 0.05  # of a measured box at score .8 (DeepSORT: 1/20)
 SCORE_NOISE = 0.25  # it grows with (1 - score) to this power (StrongSORT: 1)
+ORDINARY_SCORE = 0.5  # of a detection that counts once for `n_init` (default of `new_score`)
 STD_START = 0.2  # of a new track's velocity (DeepSORT: 1/16; SORT: wide)
 
 
@@ -322,7 +323,6 @@ class TrackState:
     cov: Array  # (T, 4, 3)
     tracklet: IntArray  # (T,)
     identity: IntArray  # (T,) index of the identity, -1 while tentative
-    hits: IntArray  # (T,) frames with a detection
     missed: IntArray  # (T,) frames since the last one
     first: IntArray  # (T,) frame of birth
     embedded: IntArray  # (T,) frame of the last embedding, -1: never
@@ -341,6 +341,11 @@ class TrackState:
         pairs = ((getattr(self, name), getattr(other, name)) for name in self.__slots__)
         return TrackState(*(np.concatenate([widen(a, b), widen(b, a)]) for a, b in pairs))
 
+    @property
+    def evidence(self) -> Array:
+        """Detections of ordinary score (T,) that those of a track amount to, at least one."""
+        return np.asarray(np.maximum(self.votes.sum(1) / ORDINARY_SCORE, 1))
+
     @staticmethod
     def spawn(box: Array, tracklet: IntArray, frame: int, config: TrackerConfig) -> TrackState:
         """Make tentative tracks from boxes cx, cy, w, h (N, 4), at rest; spread as in DeepSORT."""
@@ -351,14 +356,14 @@ class TrackState:
         zero = np.zeros(len(box), np.int64)
         none, nothing = np.zeros((len(box), 1)), np.zeros((len(box), 0), np.float32)
         return TrackState(
-            mean, cov, tracklet, zero - 1, zero, zero, zero + frame, zero - 1, none, nothing,
+            mean, cov, tracklet, zero - 1, zero, zero + frame, zero - 1, none, nothing,
             np.full((len(box), 2, 3), np.nan), np.full((len(box), 2), np.nan), 0 * box[:, :2],
         )  # fmt: skip
 
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 5  # of the files of Tracker.save
+STATE_VERSION = 6  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -727,16 +732,14 @@ class Tracker:
         growth = (np.maximum(1 - score, 0.05) / 0.2) ** SCORE_NOISE  # (n,) 1 at .8
         noise = STD_MEASURE * _noise_scale(mean) * growth[:, None]
         state.mean[t], state.cov[t] = kalman_update(mean, state.cov[t], box[rows], noise)
-        self._count_hits(detections, rows, t)
+        self._count(detections, rows, t)
 
-    def _count_hits(self, detections: Detections, rows: IntArray, t: IntArray) -> None:
+    def _count(self, detections: Detections, rows: IntArray, t: IntArray) -> None:
         """Count a detection for each of the tracks t, with its vote for a class."""
         state = self.state
-        state.hits[t] += 1
         state.missed[t] = 0
         classes = detections.class_id[rows]
-        if (top := classes.max(initial=0)) >= state.votes.shape[1]:
-            state.votes = widen(state.votes, np.empty((0, top + 1)))
+        state.votes = widen(state.votes, np.empty((0, classes.max(initial=0) + 1)))
         state.votes[t, classes] += detections.score[rows]
 
     def _spawn(self, detections: Detections, box: Array, track_of: IntArray) -> IntArray:
@@ -749,7 +752,7 @@ class Tracker:
         track_of[rows] = len(self.state.mean) + np.arange(len(rows))
         spawned = TrackState.spawn(box[rows], ids, self.frame_number, self.config)
         self.state = self.state.append(spawned)
-        self._count_hits(detections, rows, track_of[rows])
+        self._count(detections, rows, track_of[rows])
         return track_of
 
     def _embed(self, detections: Detections, track_of: IntArray, lazy: LazyEmbeddings) -> None:
@@ -763,7 +766,7 @@ class Tracker:
         state = self.state
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
-        soon = (state.identity[t] < 0) & (state.hits[t] >= self.config.n_init - 1)
+        soon = (state.identity[t] < 0) & (state.evidence[t] >= self.config.n_init - 1)
         due = soon | (self.frame_number % max(1, self.config.embed_every) == 0)  # all in one pass
         self._calibrate_matches(detections, track_of, rows[lazy.done[rows] | due], lazy)
         rows = rows[due]
@@ -817,19 +820,18 @@ class Tracker:
         state = self.state
         needed = self.config.n_init if len(self.last_seen) else 1
         young = (state.identity < 0) & (state.missed == 0)
-        ready = np.flatnonzero(young & (state.hits >= min(needed, self.config.n_init - 1)))
+        ready = np.flatnonzero(young & (state.evidence >= min(needed, self.config.n_init - 1)))
         seen_now = (state.identity >= 0) & (state.missed == 0)
         self.last_seen[state.identity[seen_now]] = self.frame_number
         if not len(ready):
             return track_of
         returning = self._recognise(ready)  # (n,) identity or -1
-        sure = (returning >= 0) | (state.hits[ready] >= needed)
+        sure = (returning >= 0) | (state.evidence[ready] >= needed)
         ready, returning = ready[sure], returning[sure]
         fresh, back = ready[returning < 0], ready[returning >= 0]
         ids = len(self.last_seen) + np.arange(len(fresh))
         self.last_seen = np.append(self.last_seen, np.zeros(len(fresh), np.int64))
-        own_class = state.votes[fresh].argmax(1) if len(fresh) else np.empty(0, np.int64)
-        self.identity_class = np.append(self.identity_class, own_class)
+        self.identity_class = np.append(self.identity_class, state.votes[fresh].argmax(1))
         came_back = np.zeros(len(self.last_seen) + 1, bool)  # the last one: of no identity
         came_back[returning[returning >= 0]] = True
         stale = came_back[state.identity]  # their tracks that still coast
@@ -906,7 +908,7 @@ class Tracker:
     def _retire(self) -> None:
         """Drop tracks that coasted too long; their identities stay in the gallery."""
         state, config = self.state, self.config
-        tentative = np.minimum(state.hits, config.n_init)
+        tentative = np.minimum(state.evidence, config.n_init)
         stays = state.missed <= np.where(state.identity < 0, tentative, config.coast_frames)
         if not stays.all():
             self.state = state.select(stays)
@@ -916,10 +918,8 @@ class Tracker:
 
         What `load` reads goes on exactly as this tracker does.
         """
-        arrays: dict[str, Any] = {}
-        for key, (owner, name) in self._saved().items():
-            if (value := getattr(owner, name)) is not None:
-                arrays[key] = value
+        saved = {key: getattr(owner, name) for key, (owner, name) in self._saved().items()}
+        arrays = {key: value for key, value in saved.items() if value is not None}
         save_npz(Path(path), arrays, version=STATE_VERSION, config=dataclasses.asdict(self.config))
 
     @classmethod

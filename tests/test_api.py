@@ -165,7 +165,7 @@ def test_track_is_lazy_and_numbers_frames_as_the_source() -> None:
 
     def detector(image: np.ndarray) -> list[list[float]]:
         asked.append(image.shape)
-        return [[0, 0, 50, 50, 0.9, 1], [100, 0, 150, 50, 0.9, 1]][: len(asked)]
+        return [[0, 0, 50, 50, 0.6, 1], [100, 0, 150, 50, 0.6, 1]][: len(asked)]
 
     seen = []
     for frame, tracks in rt.track(video, detector, tracker):

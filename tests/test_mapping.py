@@ -218,17 +218,17 @@ def test_of_a_zoom_the_images_left_tell_the_focal_length(search, monkeypatch):
     assert search.told == pytest.approx(1.1, rel=0.02)
 
 
-@pytest.mark.parametrize("shown, kept", [(0.8, True), (1.1, False)])
+@pytest.mark.parametrize(
+    "focal, told, kept", [(0.8, True, True), (1.1, True, False), (0.8, False, False)]
+)
 def test_of_two_focal_lengths_the_given_camera_tells_which_is_right(
-    search, monkeypatch, shown, kept
+    search, monkeypatch, focal, told, kept
 ):
     """The pictures of a zoom are left out; those that stay may be the zoomed ones."""
-    F = fundamental(shown, 40)
-    ids = np.column_stack([np.arange(1, 21), np.arange(2, 22)])[np.arange(40) % 20]
-    keypoints = dict.fromkeys(range(1, 31))
-    search.pairs = MatchedPairs(ids, [np.zeros((50, 2), np.int64)] * 40, keypoints, F)
     found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
+    freed = SimpleNamespace(arrays=SimpleNamespace(focal_over_size=focal), calibrated=told)
     monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
+    monkeypatch.setattr(mapping, "adjusted", lambda model, calibrate: freed)
     search.fixed, search.made = True, [part(1, 21)]
     models, messages = search.run(None, 0.8)
     assert (len(models) == 1) == kept

@@ -594,7 +594,8 @@ def _(lab: Lab) -> None:
     for value in (2, 5):
         tracker = lab.tracker(value)
         track(tracker, rows(BOX))
-        ids = [track(tracker, rows(BOX, FAR)).track_id[1] for _ in range(6)]
+        new = (*FAR, 0.5)
+        ids = [track(tracker, rows(BOX, new)).track_id[1] for _ in range(6)]
         assert ids == [0] * (value - 1) + [2] * (7 - value)
 
 

@@ -234,13 +234,19 @@ def test_identities_start_at_one_and_belong_to_the_tracker() -> None:
     assert tracker.update(rows((0, 0, 50, 50))).track_id.tolist() == [1]
 
 
-def test_a_newcomer_is_tentative_until_seen_n_init_times() -> None:
+@pytest.mark.parametrize(
+    ("score", "low", "first"), [(0.5, 0.5, 2), (0.74, 0.74, 2), (0.75, 0.75, 1), (0.6, 0.31, 3)]
+)
+def test_a_newcomer_is_tentative_until_its_scores_sum_to_n_init_halves(
+    score: float, low: float, first: int
+) -> None:
     """The first frame's objects are known at once: nothing is there to be confused with."""
     tracker = rt.Tracker(rt.TrackerConfig(n_init=3))
-    known = (0, 0, 50, 50)
+    known, new = (0, 0, 50, 50), (100, 0, 150, 50)
     assert tracker.update(rows(known)).track_id.tolist() == [1]
-    ids = [tracker.update(rows(known, (100, 0, 150, 50))).track_id.tolist() for _ in range(4)]
-    assert ids == [[1], [1], [1, 2], [1, 2]]
+    scores = (score, low, low, low, low)
+    ids = [tracker.update(rows(known, (*new, s))).track_id.tolist() for s in scores]
+    assert ids == [[1]] * first + [[1, 2]] * (5 - first)
 
 
 def test_a_return_is_known_one_detection_earlier_than_a_newcomer() -> None:
@@ -250,14 +256,14 @@ def test_a_return_is_known_one_detection_earlier_than_a_newcomer() -> None:
         tracker.update(rows((0, 0, 50, 50)), embeddings=views[:1])
     for _ in range(60):
         tracker.update(rt.Detections.empty())
-    both = rows((300, 0, 350, 50), (500, 0, 550, 50))
+    both = rows((300, 0, 350, 50), (500, 0, 550, 50), score=0.6)
     ids = [tracker.update(both, embeddings=views).track_id.tolist() for _ in range(3)]
     assert ids == [[], [1], [1, 2]]
 
 
 def test_latest_tells_tentative_tracks_and_their_tracklet() -> None:
     tracker = rt.Tracker(rt.TrackerConfig(n_init=2))
-    both = rows((0, 0, 50, 50), (100, 0, 150, 50))
+    both = rows((0, 0, 50, 50), (100, 0, 150, 50), score=0.6)
     first, second, third = (update(tracker, part) for part in (both[:1], both, both))
     assert [t.track_id.tolist() for t in (first, second, third)] == [[1], [1, 0], [1, 2]]
     assert second.tracklet_id.tolist() == third.tracklet_id.tolist()
@@ -842,7 +848,7 @@ def test_who_has_an_identity_chooses_first() -> None:
     for _ in range(8):
         tracker.update(rows(known))
     for _ in range(2):
-        tracks = update(tracker, rows(known, tentative))
+        tracks = update(tracker, rows(known, tentative, score=0.6))
     assert tracks.track_id.tolist() == [1, 0]
     assert tracker.update(rows((107, 100, 207, 200))).track_id.tolist() == [1]
 
@@ -876,7 +882,7 @@ def test_clear_matches_are_embedded_now_and_then(every: int) -> None:
     image = np.zeros((300, 400, 3), np.uint8)
     for i in range(3 * every):
         boxes = [(100, 100, 150, 150), (200, 100, 250, 150)][: 1 + (i >= 2 * every + 1)]
-        tracker.update(rows(*boxes), image)
+        tracker.update(rows(*boxes, score=0.6), image)
     expected = [(i * every, [0]) for i in range(3)]
     expected += [(2 * every + 2, [1]), (2 * every + 3, [1])]
     assert embedder.asked == expected

@@ -246,7 +246,7 @@ class _Search:
             if self.told is not None:  # by pictures of several focal lengths so far
                 camera = best[0].arrays.camera
                 size = camera.width, camera.height
-                self.told = focal_from_pairs(self.pairs, size) or self.told
+                self.told = focal_from_pairs(self.pairs, size)
         else:
             best = [replace(part, problem="the focal length keeps changing") for part in best]
         if self.fixed and zooms:  # which of the focal lengths is that of the camera?
@@ -325,15 +325,15 @@ class _Search:
                 own, camera = model.camera(1), models[0].camera(1)
                 own.model, own.params = camera.model, camera.params
             if models or not all_held:
-                refine(model, False)
+                refine(model)
             models.append(model)
         return models
 
     def _of_camera(self, part: Part) -> bool:
-        """True unless a part's matches contradict the focal length that it was given."""
-        camera, inside = part.arrays.camera, self.pairs.only(part.arrays.ids.tolist())
-        told = focal_from_pairs(inside, (camera.width, camera.height))
-        return told is None or abs(np.log(told / part.focal)) < MIN_ZOOM
+        """True if a part's focal length comes out as the given one when it is freed."""
+        free = adjusted(part.model, True)
+        log = np.log(free.arrays.focal_over_size / part.focal)
+        return free.calibrated and bool(abs(log) < MIN_ZOOM)
 
     def _is_sure(self, parts: list[Part]) -> bool:
         """True if parts of strong geometry hold and explain nearly all."""
