@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_consistency import Scene
 
+from reobj.poses import adjustment
 from reobj.poses.adjustment import _bundle_adjust, adjusted
 from reobj.poses.arrays import read_arrays
 from reobj.poses.mapping import _only, _Search
@@ -85,6 +86,24 @@ def test_a_focal_length_is_taken_if_the_views_tell_it(turns):
     assert found.calibrated == turns
     assert found.arrays.focal == (pytest.approx(500, rel=0.02) if turns else 550)
     assert found.centre_sigma < np.inf
+
+
+@pytest.mark.parametrize("focal, told", [(505.0, True), (430.0, False)])
+def test_a_focal_length_that_depends_on_the_principal_point_is_not_told(monkeypatch, focal, told):
+    """The principal point drifts off when it is freed: in a wrong minimum to make up for one."""
+    model, freed = noisy(Scene(count=16, points=400), 0.3, 0), []
+
+    def set_intrinsics(model, calibrate, free_centre):
+        freed.append((calibrate, free_centre))
+        if calibrate:
+            params = [500.0, 370, 240, 0, 0] if free_centre else [focal, 320, 240, 0, 0]
+            model.camera(1).params = params
+
+    monkeypatch.setattr(adjustment, "_bundle_adjust", set_intrinsics)
+    found = adjusted(model, True)
+    assert found.calibrated == told
+    assert found.arrays.focal == (focal if told else 500)
+    assert freed == [(True, True), (True, False), (False, False)][: 2 + (not told)]
 
 
 def test_two_cameras_in_one_place_tear_no_model():
