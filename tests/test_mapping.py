@@ -174,13 +174,30 @@ def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
     assert best is made["global"] and messages == []
 
 
-@pytest.mark.parametrize("sigma, count", [(0.0009, 1), (0.0011, 2)])
-def test_weaker_geometry_needs_another_mapper(search, monkeypatch, sigma, count):
-    """Also where the matches tell the focal length that came out: the mapper held that."""
+@pytest.mark.parametrize(
+    "focal, sigma, count", [(0.82, 0.0011, 1), (0.9, 0.0011, 2), (0.9, 9e-4, 1)]
+)
+def test_weaker_geometry_needs_the_matches_or_another_mapper(
+    search, monkeypatch, focal, sigma, count
+):
+    """They tell the focal length without any model."""
     monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
-    search.made = [part(sigma=sigma)]
+    search.made = [part(sigma=sigma, focal=focal)]
     search.run(0.8, 0.8)
     assert len(search.ran) == count
+
+
+def test_the_second_mapper_is_not_believed_for_the_focal_length_that_it_was_held_to(
+    search, monkeypatch
+):
+    """The first differed from what the matches tell: one of the two is wrong."""
+    made = {"incremental": [part(sigma=0.0011, focal=0.9)], "global": [part(sigma=0.00102)]}
+    asked = []
+    monkeypatch.setattr(search, "_parts", lambda mapper, held: made[mapper])
+    monkeypatch.setattr(mapping, "confirmed", lambda parts, *_: asked.append(parts) or parts)
+    search.told = 0.8
+    search._best(0.8)
+    assert asked == [made["incremental"], made["global"]]
 
 
 def test_a_zoom_in_a_part_that_is_refused_anyway_takes_no_images(search, monkeypatch):

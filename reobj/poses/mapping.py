@@ -25,7 +25,7 @@ import numpy as np
 
 from reobj.cameras import Camera, import_pycolmap
 from reobj.files import Progress, atomic, load_cached, load_json, writing
-from reobj.poses.adjustment import Adjusted, adjusted, refine
+from reobj.poses.adjustment import SAME_FOCAL, Adjusted, adjusted, refine
 from reobj.poses.child import Child, send_progress, serve
 from reobj.poses.consistency import (
     MatchedPairs,
@@ -202,6 +202,9 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
 
 GOOD_REGISTERED = 0.9  # share of the keyframes in sound parts that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
+# Largest centre_sigma of parts of the first mapper whose focal length the matches alone tell too
+# (chosen: time; not of the second: it is asked where the first differs from what they tell)
+TOLD_CENTRE_SIGMA = 0.0012
 PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
 MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
@@ -292,7 +295,7 @@ class _Search:
         if not self.fixed:
             _set_focal(self.database, start, True)
         best = self._parts("incremental", True)
-        if not self._is_sure(best):
+        if not self._is_sure(best, TOLD_CENTRE_SIGMA):
             other = self._parts("global", True)
             if self._is_sure(other):
                 best = other
@@ -335,9 +338,18 @@ class _Search:
         log = np.log(free.arrays.focal_over_size / part.focal)
         return free.calibrated and bool(abs(log) < MIN_ZOOM)
 
-    def _is_sure(self, parts: list[Part]) -> bool:
-        """True if parts of strong geometry hold and explain nearly all."""
-        sure = [p for p in parts if not p.problem and p.centre_sigma <= SURE_CENTRE_SIGMA]
+    def _is_sure(self, parts: list[Part], told_sigma: float = SURE_CENTRE_SIGMA) -> bool:
+        """True if parts of strong geometry hold and explain nearly all.
+
+        Args:
+            told_sigma: limit of centre_sigma where the matches tell the same focal length.
+        """
+        sure = list[Part]()
+        for part in parts:
+            same = self.told is not None and abs(np.log(self.told / part.focal)) < SAME_FOCAL
+            limit = told_sigma if self.fixed or same else SURE_CENTRE_SIGMA
+            if not part.problem and part.centre_sigma <= limit:
+                sure.append(part)
         registered, matched = sum(p.registered for p in sure), sum(map(len, self.pairs.inliers))
         return registered >= GOOD_REGISTERED and _explained(sure) >= GOOD_EXPLAINED * matched
 
