@@ -30,8 +30,6 @@ class Adjusted:
 # Sigma of the log of a focal length that came out (measured on parts of 6 to 136 images, median of
 # the errors: up to .005 .9 %, to .02 2 %, to .03 4 %, above more; held as the matches tell it 4 %)
 MAX_FOCAL_SIGMA = 0.03
-
-
 MAX_CENTRE_SHIFT = 0.05  # of the principal point when it is freed, over the size (chosen)
 # Log of a ratio up to which two focal lengths are the same (measured where the principal point
 # drifts off, with and without: right .0003, half as long as the true one .12 to .2)
