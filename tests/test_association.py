@@ -73,6 +73,27 @@ def test_a_thing_may_be_half_hidden_but_not_stick_out(
     assert odds_of(table, poses) >= hidden > larger + 1
 
 
+@pytest.mark.parametrize("shown", [0.5, 0.3, 0.15])
+def test_of_a_thing_any_part_may_be_hidden(shown: float) -> None:
+    """The upper end of a thing shows: hidden is as likely for each share of its height."""
+    projected, size = np.array([[100.0, 100, 180, 300]]), (640, 480)
+    part = projected.copy()
+    part[0, 3] = 100 + shown * 200
+    whole, half, some = (
+        evidence._box_log_odds(projected, box, size)[0]
+        for box in (projected, projected - [[0, 0, 0, 100]], part)
+    )
+    assert whole > half > 2
+    # The hidden edge has one density over the projection, boxes anywhere one that goes with 1 / h;
+    # the upper edge is known to a share of the mean height.
+    expected = np.log(shown / 0.5) - np.log((1 + shown) / 1.5)
+    assert some - half == pytest.approx(expected, abs=0.02)
+    beyond = projected.copy()
+    beyond[0, 3] = 100 - 30  # above its upper edge
+    beyond[0, 1] = 50
+    assert evidence._box_log_odds(projected, beyond, size)[0] < 0
+
+
 def test_scores_and_classes_count() -> None:
     poses = walk(20)
     table = table_of(poses)
@@ -337,6 +358,56 @@ def test_of_two_that_stand_for_one_thing_the_better_placed_one_stays(first: int)
     assert np.abs(centre - three.ellipsoids.center_in_world[0]).max(1).min() < 1e-9
 
 
+@pytest.mark.parametrize(
+    ("up", "height", "aside", "one"),
+    [
+        (0.0, 1.0, 0.0, True),  # the same again
+        (-0.4, 0.5, 0.0, True),  # its lower half
+        (0.4, 0.5, 0.3, True),  # its upper half, a little aside
+        (0.0, 1.0, 1.2, False),  # a neighbour that touches it
+        (1.6, 0.6, 0.0, False),  # something on top of it
+    ],
+)
+def test_a_part_of_a_thing_is_no_other_thing(
+    up: float, height: float, aside: float, one: bool
+) -> None:
+    """Offsets in half extents; whichever is listed first."""
+    solid = chairs()[[0]]
+    half, axes = solid.ellipsoids.half_axes[0], solid.ellipsoids.world_from_obj[0]
+    moved = quadrics.Ellipsoids(
+        solid.ellipsoids.center_in_world + axes @ (np.array([aside, 0, up]) * half),
+        solid.ellipsoids.half_axes * [1, 1, height],
+        solid.ellipsoids.world_from_obj,
+    )
+    other = dataclasses.replace(solid, ellipsoids=moved)
+    for pair in ([solid, other], [other, solid]):
+        found = association._coincide(Solids.concatenate(pair))
+        assert found[0, 1] == found[1, 0] == one
+
+
+@pytest.mark.parametrize("second", [0.1, 0.5, 0.9])
+def test_two_boxes_of_a_thing_in_every_frame_make_one_solid(second: float) -> None:
+    """Its upper half is boxed too, as often and as surely."""
+    poses = walk(40)
+    table = table_of(poses)
+    half = table[table.detection_index == 0]
+    box = half.xyxy.copy()
+    box[:, 3] -= 0.5 * (box[:, 3] - box[:, 1])
+    half = dataclasses.replace(half, xyxy=box, score=np.full(len(half), second))
+    both = rt.Tracks.joined([table, half])
+    both = both[np.argsort(both.frame, kind="stable")]
+    three = chairs()
+    top = dataclasses.replace(
+        three.ellipsoids,
+        center_in_world=three.ellipsoids.center_in_world
+        + three.ellipsoids.world_from_obj[:, :, 2] * three.ellipsoids.half_axes[:, [2]] / 2,
+        half_axes=three.ellipsoids.half_axes * [1, 1, 0.5],
+    )
+    many = Solids.concatenate([three, dataclasses.replace(three, ellipsoids=top)])
+    made = Associator(detected_in(both, poses), Mock(), lambda s: np.zeros(len(s)))
+    assert sorted(made._pursue(made._empty(many, 0.0)).tolist()) == [0, 1, 2]
+
+
 def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two states that follow each other for ever are looked at once each."""
     made, found = association_of(chairs(), walk(10))
@@ -379,10 +450,7 @@ def test_pursuit_takes_in_turn_what_adds_most() -> None:
             break
         expected.append(int(gain.argmax()))
         own = (seen.solid == expected[-1]) & (value > 0)
-        more = (value[own] - explained[seen.row[own]]).clip(0)
-        best = more >= tops[expected[-1], view[seen.row[own]]]
-        more = value[own] + np.where(best, 0, association.SECOND_DETECTION)
-        np.maximum.at(explained, seen.row[own], more)
+        np.maximum.at(explained, seen.row[own], value[own])
     assert len(expected) > 1 and made._pursue(of).tolist() == expected
     few = made._empty(many, 0.0)  # pairs that speak for none add nothing
     assert len(few.evidence.row) < len(seen.row) and made._pursue(few).tolist() == expected

@@ -5,6 +5,8 @@ is decided by log odds (`evidence`): of every detection with its solid, against 
 should show a solid and does not, and against every solid.
 
  1. pursue   from many proposed solids choose those that explain most of what is not yet explained
+             (in a frame one detection speaks for a solid; others that it explains as well cost
+             nothing: detectors box parts, and things twice)
  2. assign   in every frame each detection to at most one solid and back; tracklets stay together
  3. refit    each solid to its detections
  4. thin     drop solids that bring less than they cost, as others explain their detections too
@@ -31,11 +33,10 @@ NEW_SOLID = 10.0  # against each solid: three frames and more must speak for it
 # What a better box may add in step 1, so that no compromise between two things comes first
 PURSUED_CHOICE = 1.5
 KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tracklet
-# A second detection of one solid in one frame (a part of it, or a box that suppression left): one
-# in ten detections of a thing
-SECOND_DETECTION = float(np.log(0.1))
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
-COINCIDE = 0.5  # half widths; centres nearer than that are one thing, whatever else speaks for two
+# Half extents of a solid, along its axes; what has its centre nearer to its own is the same thing
+# or a part of it, whatever else speaks for two (chosen: .4 to .65 are alike)
+COINCIDE = 0.5
 ALIKE = float(np.log(1.4))  # of mean sizes; if so, also where the classes differ (laptop and tv)
 MIN_DETECTIONS = 3  # of a solid; fewer do not determine it
 MAX_ROUNDS = 10  # of steps 2 to 5 (chosen)
@@ -127,29 +128,27 @@ class Associator:
         not_missed = MISSED * evidence.expected  # (V, S)
         explained, chosen = np.zeros(len(view)), list[int]()  # explained: log odds of each row
 
-        def added(k: int) -> tuple[float, Array, Array]:
-            """Return what solid k adds to those chosen: in all, by its rows, at best by frame."""
+        def added(k: int) -> float:
+            """Return what solid k adds to those chosen, by the best of its detections a frame."""
             own = row[start[k] : start[k + 1]]
-            more = (log_odds[start[k] : start[k + 1]] - explained[own]).clip(0)
             best = np.zeros(len(not_missed))
-            np.maximum.at(best, view[own], more)
-            return float(best.sum() + not_missed[best > 0, k].sum() - cost[k]), more, best
+            np.maximum.at(best, view[own], log_odds[start[k] : start[k + 1]] - explained[own])
+            return float(best.sum() + not_missed[best > 0, k].sum() - cost[k])
 
         # What a solid adds only falls as others are chosen: one that still leads after it was
         # looked at again is the best (lazy greedy, Minoux 1978).
-        queue = [(-added(k)[0], k) for k in range(len(cost))]
+        queue = [(-added(k), k) for k in range(len(cost))]
         heapq.heapify(queue)
         while queue and queue[0][0] < 0:
             k = queue[0][1]
-            gain, more, best = added(k)
+            gain = added(k)
             if -gain > queue[0][0]:
                 heapq.heapreplace(queue, (-gain, k))
                 continue
             heapq.heappop(queue)
             chosen.append(k)
             own = row[start[k] : start[k + 1]]
-            second = np.where(more >= best[view[own]], 0, SECOND_DETECTION)
-            np.maximum.at(explained, own, log_odds[start[k] : start[k + 1]] + second)
+            explained[own] = np.maximum(explained[own], log_odds[start[k] : start[k + 1]])
         return np.array(chosen, np.int64)
 
     def _assign(self, solids: Solids, owner: IntArray) -> Association:
@@ -207,8 +206,8 @@ class Associator:
         busy[view[owned], owner[owned]] = True
         other = owned[evidence.row] & ~mine
         row, solid = evidence.row[other], evidence.solid[other]
-        missed = MISSED * evidence.expected[view[row], solid]
-        worth = np.where(busy[view[row], solid], SECOND_DETECTION, missed)
+        expected = evidence.expected & ~busy  # and not shown
+        worth = MISSED * expected[view[row], solid]
 
         def instead(value: Array) -> Array:
             """Return what the best others would bring for the detections of each solid, (S,)."""
@@ -278,7 +277,7 @@ class Associator:
         leading = np.zeros(len(key), bool)  # the best of its solid in its frame
         leading[order] = np.append(True, np.diff(key[order]) != 0)[: len(key)]
         not_missed = MISSED * evidence.expected[view[row], solid]
-        worth = log_odds + np.where(leading, not_missed, SECOND_DETECTION)
+        worth = log_odds + not_missed * leading
         gain = np.bincount(solid, worth.clip(0), len(strong)) - alone.costs()
         return np.where(np.isfinite(fitted.ellipsoids.center_in_world).all(1), gain, -np.inf)
 
@@ -290,9 +289,16 @@ def _distances(solids: Solids) -> tuple[Array, Array]:
 
 
 def _coincide(solids: Solids) -> BoolArray:
-    """Mark pairs (S, S) of solids whose centres nearly coincide: no two things are in one place."""
-    distance, width = _distances(solids)
-    return np.asarray(distance < COINCIDE * np.minimum(width[:, None], width), bool)
+    """Mark pairs (S, S) of solids that are in one place: no two things are.
+
+    The smaller has its centre in the middle of the larger: its back, its seat, or the same again.
+    """
+    centre, half = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes
+    apart = np.einsum("abi,bij->abj", centre[:, None] - centre, solids.ellipsoids.world_from_obj)
+    inside = (np.abs(apart) < COINCIDE * half).all(2)  # (S, S) a in the middle of b
+    volume = half.prod(1)
+    inside &= volume[:, None] <= volume
+    return np.asarray(inside | inside.T, bool)
 
 
 def _near_pairs(solids: Solids, gain: Array) -> tuple[IntArray, IntArray]:
