@@ -294,8 +294,8 @@ def _coincide(solids: Solids) -> BoolArray:
     The smaller has its centre in the middle of the larger: its back, its seat, or the same again.
     """
     centre, half = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes
-    apart = np.einsum("abi,bij->abj", centre[:, None] - centre, solids.ellipsoids.world_from_obj)
-    inside = (np.abs(apart) < COINCIDE * half).all(2)  # (S, S) a in the middle of b
+    a_in_b = np.einsum("abi,bij->abj", centre[:, None] - centre, solids.ellipsoids.world_from_obj)
+    inside = (np.abs(a_in_b) < COINCIDE * half).all(2)  # (S, S) a's centre in the middle of b
     volume = half.prod(1)
     inside &= volume[:, None] <= volume
     return np.asarray(inside | inside.T, bool)
