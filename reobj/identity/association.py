@@ -35,7 +35,7 @@ PURSUED_CHOICE = 1.5
 KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tracklet
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
 # Half extents of a solid, along its axes; what has its centre nearer to its own is the same thing
-# or a part of it, whatever else speaks for two (chosen: .4 to .65 are alike)
+# or a part of it, whatever else speaks for two (chosen; .4 to .6 are alike but for deimv2-femto)
 COINCIDE = 0.5
 ALIKE = float(np.log(1.4))  # of mean sizes; if so, also where the classes differ (laptop and tv)
 MIN_DETECTIONS = 3  # of a solid; fewer do not determine it
@@ -282,12 +282,6 @@ class Associator:
         return np.where(np.isfinite(fitted.ellipsoids.center_in_world).all(1), gain, -np.inf)
 
 
-def _distances(solids: Solids) -> tuple[Array, Array]:
-    """Return the distances (S, S) between solids, and their mean half widths (S,)."""
-    centre, half = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes
-    return np.linalg.norm(centre[:, None] - centre, axis=2), half[:, :2].mean(1)
-
-
 def _coincide(solids: Solids) -> BoolArray:
     """Mark pairs (S, S) of solids that are in one place: no two things are.
 
@@ -306,9 +300,11 @@ def _near_pairs(solids: Solids, gain: Array) -> tuple[IntArray, IntArray]:
 
     They are of one class, or of about one size and in one place.
     """
-    distance, width = _distances(solids)
+    centre, half = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes
+    distance = np.linalg.norm(centre[:, None] - centre, axis=2)  # (S, S)
+    width = half[:, :2].mean(1)
     adjacent = distance < MERGE_REACH * (width[:, None] + width)
-    size = np.log(solids.ellipsoids.half_axes).mean(1)
+    size = np.log(half).mean(1)
     alike = (np.abs(size[:, None] - size) < ALIKE) & _coincide(solids)
     one_kind = (solids.class_id[:, None] == solids.class_id) | alike
     a, b = np.nonzero(np.triu(adjacent & one_kind, 1))
