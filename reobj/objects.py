@@ -80,7 +80,7 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
             views.boxes, views.img_from_world, views.image_size, categories, priors,
             up=scene.up if up is None else up, support=support, score=views.score,
             hidden=views.hidden, metric=poses.metric if scene.scale is None else scene.scale,
-            known_size=known, floor=scene.floor,
+            known_size=known, floor=scene.floor, points=views.points,
         )  # fmt: skip
         known_up = up is not None or scene.up is None
         return fits if known_up else dataclasses.replace(fits, up_source="floor")

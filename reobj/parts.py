@@ -49,7 +49,7 @@ from reobj.types import (
     object_classes,
     rows_by,
 )
-from reobj.views import NOTHING_KNOWN, Fit, Scene, gather_views
+from reobj.views import NOTHING_KNOWN, Fit, Scene, gather_views, points_on
 
 
 def link_and_fit(result: Result, config: ObjectsConfig) -> None:
@@ -98,7 +98,8 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
                 floor, ellipsoids = located.floor, located.ellipsoids[solid]
             stands = on_floor(priors, [name_of(result.class_names, c) for c in classes.values()])
             hidden = hidden_edges(views, ellipsoids, stands & (floor is not None))
-            views = dataclasses.replace(views, hidden=hidden)
+            points = points_on(views, parts[k], ellipsoids)
+            views = dataclasses.replace(views, hidden=hidden, points=points)
             up = None if floor is None else floor.normal
             fits[k] = fit(views, list(classes.values()), Scene(floor, up))
         found = describe_objects(

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 import quadrics
-from reobj.cameras import Poses, undistort_boxes
-from reobj.types import Array, BoolArray, IntArray, Tracks
+from reobj.cameras import Poses, place_of, undistort_boxes
+from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +23,9 @@ class Views:
 
     Attributes:
         frame: (V,) source frames. boxes: (V, G, 4) xyxy in undistorted pixels, NaN where unseen.
-        score: (V, G), 0 where unseen. hidden: (V, G, 4) edges of boxes where something nearer
-        begins. img_from_world: (V, 3, 4) K @ cam_from_world.
-        image_size: (w, h) px.
+        score: (V, G), 0 where unseen. img_from_world: (V, 3, 4) K @ cam_from_world.
+        image_size: (w, h) px. hidden: (V, G, 4) edges of boxes where something nearer begins.
+        points: (G, P, 3) sparse points that may lie on each group's thing, NaN: fewer.
     """
 
     frame: IntArray
@@ -33,6 +34,7 @@ class Views:
     img_from_world: Array
     image_size: tuple[int, int]
     hidden: BoolArray | None = None
+    points: Array | None = None
 
 
 class Scene(NamedTuple):
@@ -141,3 +143,58 @@ def points_in_boxes(
     inside = ((xy >= boxes[..., :2]) & (xy <= boxes[..., 2:])).all(2)  # (D, N)
     box, point = np.nonzero(inside)
     return box, point, depth[point]
+
+
+INSIDE_SHARE = 0.8  # of the views that observe a point (chosen; .95 is alike: docs/trials.md)
+POINT_VIEWS = 2  # and so many (one view tells no distance)
+MIN_POINTS, MAX_POINTS = 5, 100  # of a thing (chosen: fewer may all be of something else; time)
+
+
+def points_on(views: Views, poses: Poses, solids: quadrics.Ellipsoids) -> Array:
+    """Find the points that may lie on the thing of each group: inside most of its boxes.
+
+    Where that holds for several groups, the point is of the one whose solid is nearest to it, of
+    those that hold it the smallest: the cup's and not the table's.
+
+    Args:
+        solids: of the G groups as far as they are known, else NaN.
+    Returns:
+        (G, P, 3), spread over the points of each group, NaN where there are no more.
+    """
+    visible, row = VisiblePoints(poses), place_of(poses, views.frame)[0]
+    shown, observed = np.isfinite(views.boxes[..., 0]), list[IntArray]()  # (V, G)
+    inside = [np.empty((2, 0), np.int64)]
+    for v, camera in enumerate(views.img_from_world):
+        own, group = visible.observed(row[v]), np.flatnonzero(shown[v])
+        box, point, _ = points_in_boxes(poses.points[own], camera, views.boxes[v, group])
+        inside.append(np.stack([group[box], own[point]]))
+        observed.append(np.stack([np.full(len(own), v), own]))
+    size = (shown.shape[1], len(poses.points))
+    views_inside = _counted(np.concatenate(inside, 1), size)
+    of_view = _counted(np.concatenate(observed, 1), (len(shown), size[1]))
+    seen = sparse.csr_array(shown.T.astype(np.int64)) @ of_view  # (G, P) views that observe it
+    group, point = views_inside.nonzero()
+    count = views_inside.data
+    mostly = (count >= POINT_VIEWS) & (count >= INSIDE_SHARE * seen[group, point])
+    group, point = group[mostly], point[mostly]
+    at = np.einsum(
+        "ki,kij->kj",
+        poses.points[point] - solids.center_in_world[group],
+        solids.world_from_obj[group],
+    )
+    half = solids.half_axes[group]
+    width = half.mean(1)
+    away = np.linalg.norm((np.abs(at) - half).clip(0), axis=1) / width
+    order = np.lexsort((width, np.nan_to_num(away, nan=np.inf), point))
+    order = order[np.append(True, np.diff(point[order]) != 0)[: len(order)]]  # the nearest of each
+    found = np.full((size[0], MAX_POINTS, 3), np.nan)
+    for own in rows_by(group[order]):
+        if len(own) >= MIN_POINTS:
+            own = order[own[:: -(-len(own) // MAX_POINTS)]]
+            found[group[own[0]], : len(own)] = poses.points[point[own]]
+    return found
+
+
+def _counted(pairs: IntArray, shape: tuple[int, int]) -> sparse.csr_array:
+    """Count pairs (2, K) of rows and columns."""
+    return sparse.csr_array((np.ones(len(pairs[0]), np.int64), tuple(pairs)), shape)

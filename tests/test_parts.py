@@ -225,6 +225,23 @@ def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(heights[1]) == 3 and (np.array(heights[1]) > 1.2 * np.array(heights[0])).all()
 
 
+def test_the_last_fit_knows_the_points_on_each_thing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten points on the second chair, which all frames observe; no other fit has any."""
+    points = chair_solids().center_in_world[1] + np.linspace(-0.1, 0.1, 10)[:, None]
+    every = np.indices((40, 10)).reshape(2, -1).T
+    poses = dataclasses.replace(
+        walk(), points=points, colors=np.zeros((10, 3), np.uint8), visibility=every
+    )
+    calls = Mock(wraps=quadrics.fit_objects)
+    monkeypatch.setattr(quadrics, "fit_objects", calls)
+    finished(unlinked(poses, tracks_of(poses)))
+    given = [call.kwargs["points"] for call in calls.call_args_list]
+    assert len(given) > 2 and all(own is None for own in given[:-1])
+    assert np.isfinite(given[-1]).all(2).sum(1).tolist() == [0, 10, 0]
+    found = given[-1][1][:10]
+    np.testing.assert_array_equal(found[np.argsort(found[:, 2])], points)
+
+
 def test_the_last_fit_begins_with_the_places_of_the_association(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -419,6 +419,88 @@ def test_fits_are_minima_of_the_documented_cost(
     assert linear == {-1.0, 1.0} if shift else walls >= 1
 
 
+def points_outside(
+    solid: tuple[np.ndarray, ...], delta: np.ndarray, points: np.ndarray, sigma: float
+) -> np.ndarray:
+    """How far points (P, 3) lie outside, (P, 3) in sigma, written from docs/quadrics.md."""
+    center, half = solid[0] + delta[:3], solid[1] * np.exp(delta[3:6])
+    at = (points - center) @ solid[2] @ q.rotations(delta[None, 6:])[0]
+    return np.asarray((np.abs(at) - half).clip(0) / sigma)
+
+
+def test_fits_with_points_are_minima_of_the_documented_cost() -> None:
+    """As above: of 30 points around each object some lie outside, four of them far."""
+    rng = np.random.default_rng(32)
+    boxes, cams, truth, priors, names = syn.scenes(160, 8, 60, 0.02, "box", rng)
+    spread = rng.uniform(-1, 1, (160, 30, 3)) * np.linspace(0.7, 1.1, 30)[:, None]
+    points = truth.center_in_world[:, None] + np.einsum(
+        "oij,opj->opi", truth.world_from_obj, spread * truth.half_axes[:, None]
+    )
+    points[:, :4] += 2.0
+    given = (*syn.as_one(boxes, cams), syn.IMAGE, names, priors)
+    config = q.FitConfig(edge_noise_px=400, edge_noise_rel=0, correlation_deg=0, iterations=300)
+    plain, fits = (q.fit_objects(*given, up=UP, points=p, config=config) for p in (None, points))
+    steps, moves = [], 1e-5 * np.eye(9)
+    for k in range(0, 160, 8):
+        solids = fits.ellipsoids
+        solid = (solids.center_in_world[k], solids.half_axes[k], solids.world_from_obj[k])
+        prior = np.asarray(priors.log_mean[k])
+        sigma = 0.08 * float(np.exp(prior - np.log(2)).prod() ** (1 / 3))
+
+        at_edges = ("box", boxes[k, :, 0], cams[k], 20, (prior, 0.25))
+        here, *there = (
+            np.append(cost_terms(solid, d, *at_edges), points_outside(solid, d, points[k], sigma))
+            for d in [np.zeros(9), *moves, *-moves]
+        )
+        near = 0.9 * np.exp(-0.5 * (here[-90:].reshape(30, 3) ** 2).sum(1))  # beside .1: elsewhere
+        weight = np.append(np.ones(len(here) - 90), np.repeat(20 / 30 * near / (near + 0.1), 3))
+        jacobian = (np.array(there[:9]) - np.array(there[9:])) / 2e-5  # (9, M)
+        gradient = jacobian @ (weight * here)
+        steps.append(np.sqrt(gradient @ np.linalg.solve(jacobian * weight @ jacobian.T, gradient)))
+    assert np.quantile(steps, 0.6) < 0.02
+    assert np.abs(np.log(fits.size / plain.size)).max() > 0.1  # they are not without effect
+
+
+def test_points_tell_the_distance_and_those_of_something_else_do_not() -> None:
+    """Half of the points lie on a wall behind; what the boxes tell alone is far less."""
+    boxes, cams, truth, priors, names = syn.scenes(60, 6, 4, 0.02, "box", np.random.default_rng(3))
+    rng = np.random.default_rng(4)
+    joint, flat = syn.as_one(boxes, cams)
+    on_it = rng.uniform(-1, 1, (60, 40, 3)) * truth.half_axes[:, None]
+    on_it = truth.center_in_world[:, None] + np.einsum("oij,opj->opi", truth.world_from_obj, on_it)
+    eye = -np.linalg.solve(cams[:, 0, :, :3], cams[:, 0, :, 3:])[..., 0]  # (60, 3)
+    ray = truth.center_in_world - eye
+    behind = truth.center_in_world + 0.5 * ray + rng.normal(0, 0.1, (40, 60, 3))
+    both = np.concatenate([on_it, behind.swapaxes(0, 1)], 1)
+    far = np.full((60, 7, 3), np.nan)
+
+    def depth_errors(points: np.ndarray | None) -> np.ndarray:
+        fits = q.fit_objects(joint, flat, syn.IMAGE, names, priors, up=UP, points=points)
+        off = fits.ellipsoids.center_in_world - truth.center_in_world
+        return np.abs(np.einsum("oi,oi->o", off, ray)) / np.linalg.norm(ray, axis=1)
+
+    without = np.median(depth_errors(None))
+    assert np.median(depth_errors(on_it)) < 0.5 * without
+    assert np.median(depth_errors(both)) < 0.6 * without
+    np.testing.assert_array_equal(depth_errors(far), depth_errors(None))  # NaN: no points
+
+
+def test_points_do_not_make_a_size_more_certain() -> None:
+    """They bound it from one side; they tell that it is not the prior's, though."""
+    boxes, cams, truth, priors, names = syn.scenes(40, 6, 12, 0.02, "box", np.random.default_rng(5))
+    joint, flat = syn.as_one(boxes, cams)
+    rng = np.random.default_rng(6)
+    side = np.sign(rng.normal(0, 1, (40, 40, 3)))
+    where = side * truth.half_axes[:, None]
+    points = truth.center_in_world[:, None] + np.einsum("oij,opj->opi", truth.world_from_obj, where)
+    given = (joint, flat, syn.IMAGE, names, priors)
+    plain, found = (q.fit_objects(*given, up=UP, points=p) for p in (None, points))
+    sigma = [np.sqrt(np.einsum("oii->oi", fits.cov))[:, 3:6] for fits in (plain, found)]
+    assert np.median(sigma[1] / sigma[0]) > 0.9
+    assert (found.prior_share < plain.prior_share).mean() > 0.9
+    assert (found.status == "ok").sum() > (plain.status == "ok").sum()
+
+
 def test_starts_trust_edges_less_that_may_be_hidden() -> None:
     """One edge of each object moved by 4.5 sigma: inwards, as an occluder does, or outwards.
 
@@ -893,6 +975,9 @@ def test_wrong_shapes_say_what_is_expected(arguments, message: str) -> None:
     with pytest.raises(q.QuadricsError, match=message):
         q.fit_objects(*(arguments if len(arguments) > 2 else (*arguments, (640, 480))))
     seen = (np.full((3, 2, 4), np.nan), np.zeros((3, 3, 4)), (640, 480))
+    for points in (np.zeros((3, 4, 3)), np.zeros((2, 3))):
+        with pytest.raises(q.QuadricsError, match="points has shape"):
+            q.fit_objects(*seen, points=points)
     for support, complaint in (("cone", "unknown support"), (["box"], "1 supports for 2 objects")):
         with pytest.raises(q.QuadricsError, match=complaint):
             q.fit_objects(*seen, support=support)

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from simulated import CAMERA, SIZE, tracks_of, walk, with_columns
+from simulated import CAMERA, SIZE, chair_solids, tracks_of, walk, with_columns
 
+import quadrics
 import reobj_track as rt
-from reobj.views import VisiblePoints, gather_views, points_in_boxes
+from reobj.views import VisiblePoints, gather_views, points_in_boxes, points_on
 
 
 def one_box_each(frames: list[int], box: tuple[float, ...] = (10, 20, 60, 90)) -> rt.Tracks:
@@ -172,3 +173,75 @@ def test_poses_without_points_show_none() -> None:
     assert [len(column) for column in visible.in_boxes(1, np.array([[0.0, 0, 640, 480]]))] == [
         0
     ] * 3
+
+
+CHAIRS = chair_solids()
+
+
+def seen_points(points: np.ndarray, frames: int = 8) -> tuple[rt.Poses, Any]:
+    """Poses whose frames all observe all points, and views of three chairs."""
+    poses = walk(frames)
+    every = np.indices((frames, len(points))).reshape(2, -1).T
+    colors = np.zeros((len(points), 3), np.uint8)
+    poses = dataclasses.replace(poses, points=points, colors=colors, visibility=every)
+    tracks = tracks_of(poses, 0.0)
+    return poses, gather_views(tracks, poses, tracks.track_id - 1, 3, 0.0)
+
+
+def rows_of(found: np.ndarray, points: np.ndarray) -> list[list[int]]:
+    """The numbers of the points of each group."""
+    known = [own[np.isfinite(own[:, 0])] for own in found]
+    return [[int((points == p).all(1).argmax()) for p in own] for own in known]
+
+
+def test_points_on_a_thing_are_in_most_of_its_boxes() -> None:
+    """Those far behind it are in some; six of each chair, on its front."""
+    rng = np.random.default_rng(0)
+    near = [c + rng.uniform(-0.15, 0.15, (6, 3)) for c in CHAIRS.center_in_world]
+    points = np.concatenate([*near, CHAIRS.center_in_world + np.array([0, 2.5, 0])])
+    poses, views = seen_points(points)
+    found = rows_of(points_on(views, poses, CHAIRS), points)
+    assert [sorted(own) for own in found] == [[*range(6)], [*range(6, 12)], [*range(12, 18)]]
+    views.boxes[2:5, 1] = [0, 0, 5, 5]  # in three of eight views elsewhere: not in most
+    assert rows_of(points_on(views, poses, CHAIRS), points)[1] == []
+    views.boxes[2:5, 1] = np.nan  # not seen there: that says nothing
+    assert len(rows_of(points_on(views, poses, CHAIRS), points)[1]) == 6
+
+
+def test_one_view_and_few_points_tell_nothing() -> None:
+    points = CHAIRS.center_in_world[1] + np.random.default_rng(1).uniform(-0.1, 0.1, (5, 3))
+    poses, views = seen_points(points)
+    assert len(rows_of(points_on(views, poses, CHAIRS), points)[1]) == 5
+    fewer, few = seen_points(points[:4])
+    assert not any(rows_of(points_on(few, fewer, CHAIRS), points))
+    views.boxes[1:, 1] = np.nan
+    assert not any(rows_of(points_on(views, poses, CHAIRS), points))
+
+
+def test_a_point_is_of_the_nearest_solid_that_of_two_the_smallest() -> None:
+    """A cup on a table, and its neighbour: all have the same boxes."""
+    points = np.tile([[0.0, 0, 0.5]], (12, 1)) + 0.01 * np.arange(12)[:, None]
+    poses, views = seen_points(points)
+    views.boxes[:] = [0, 0, *SIZE]
+    half = np.array([[0.2, 0.2, 0.2], [1.0, 1.0, 0.6], [0.1, 0.1, 0.1]])
+    centre = np.array([[0.0, 0, 0.5], [0, 0, 0.4], [0.6, 0, 0.5]])
+    solids = quadrics.Ellipsoids(centre, half, np.tile(np.eye(3), (3, 1, 1)))
+    assert [len(own) for own in rows_of(points_on(views, poses, solids), points)] == [12, 0, 0]
+    solids.center_in_world[0, 0] = solids.half_axes[0, 0] = np.nan  # unknown: the others are nearer
+    assert [len(own) for own in rows_of(points_on(views, poses, solids), points)] == [0, 12, 0]
+
+
+def test_of_many_points_some_are_taken_evenly() -> None:
+    points = CHAIRS.center_in_world[1] + np.linspace(-0.1, 0.1, 250)[:, None]
+    poses, views = seen_points(points)
+    found = rows_of(points_on(views, poses, CHAIRS), points)
+    assert found == [[], [*range(0, 250, 3)], []]
+
+
+def test_without_points_none_are_on_anything() -> None:
+    poses = walk(4)
+    tracks = tracks_of(poses, 0.0)
+    views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.0)
+    assert not np.isfinite(points_on(views, poses, CHAIRS)).any()
+    assert points_on(gather_views(rt.Tracks.empty(), poses, np.empty(0, np.int64), 0, 0.0), poses,
+                     CHAIRS[[]]).shape[::2] == (0, 3)  # fmt: skip
