@@ -1387,7 +1387,7 @@ def _prior_spec(
         stands = known & priors.on_floor[rows]
         own = STANDING_REL * 2.0 * np.exp(size_mean[:, 2])
         floor_sigma = np.where(stands, np.hypot(world.floor.sigma, own), np.inf)
-    there: BoolArray = np.isfinite(points).all(2)  # (O, P)
+    there = _finite(points, 2)  # (O, P)
     weight = there * np.minimum(POINTS_WORTH / np.maximum(there.sum(1, keepdims=True), 1), 1.0)
     return _Spec(
         size_mean, cov, rows, natural, allowed, round_, upright, world.up, world.tilt_rad,
