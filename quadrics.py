@@ -1857,7 +1857,8 @@ class ObjectFits:
     status: npt.NDArray[np.str_]  # (O,) "ok" | "prior_dominated" | "rejected"
     reason: list[str]  # (O,)
     parallax_deg: Array  # (O,) widest angle between inlier viewing rays
-    prior_share: Array  # (O, 3) of each log axis: sigma by boxes, points and prior / prior's sigma
+    # (O, 3) of each log axis: sigma by boxes, points and prior / the prior's; 1: cov tells no more
+    prior_share: Array
     scale: Scale
     up: Array  # (3,) unit, or zeros when unknown
     up_source: str  # "given" | "cameras" | "none"
@@ -2254,7 +2255,8 @@ def _report(
         cov[live] *= shrink[:, :, None] * shrink[:, None]
         post = post * shrink[:, 3:6]
         told = _safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]]
-        share[live] = np.sqrt(np.take_along_axis(told, order, 1)) / prior
+        rests = (shrink[:, 3:6] < 1.0).all(1)[:, None]  # all told, no side is certain
+        share[live] = np.where(rests, 1.0, np.sqrt(np.take_along_axis(told, order, 1)) / prior)
         angle[live] = _parallax(fit, data)
         square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.good
         rms[live] = np.sqrt(square.sum((1, 2)) / np.maximum(fit.good.sum((1, 2)), 1))

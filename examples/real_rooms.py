@@ -170,6 +170,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
     "floor": {"reobj.identity.locate.floor_under": nothing, "reobj.parts.floor_under": nothing},
     "proposals of untracked": {"reobj.identity.locate.PROPOSING_SCORE": np.inf},
+    "points in the fit": {"reobj.parts.points_on": nothing},
     "seen through": {"reobj.identity.locate.seen_through": never_seen_through},
 }
 
