@@ -2255,7 +2255,7 @@ def _report(
         cov[live] *= shrink[:, :, None] * shrink[:, None]
         post = post * shrink[:, 3:6]
         told = _safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]]
-        rests = (shrink[:, 3:6] < 1.0).all(1)[:, None]  # all told, no side is certain
+        rests = np.all(shrink[:, 3:6] < 1.0, axis=1, keepdims=True)  # no side is known better
         share[live] = np.where(rests, 1.0, np.sqrt(np.take_along_axis(told, order, 1)) / prior)
         angle[live] = _parallax(fit, data)
         square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.good
