@@ -162,8 +162,8 @@ def points_on(views: Views, poses: Poses, solids: quadrics.Ellipsoids) -> Array:
         (G, P, 3), spread over the points of each group, NaN where there are no more.
     """
     visible, row = VisiblePoints(poses), place_of(poses, views.frame)[0]
-    shown, observed = np.isfinite(views.boxes[..., 0]), list[IntArray]()  # (V, G)
-    inside = [np.empty((2, 0), np.int64)]
+    shown = np.isfinite(views.boxes[..., 0])  # (V, G)
+    inside, observed = ([np.empty((2, 0), np.int64)] for _ in range(2))  # rows and columns
     for v, camera in enumerate(views.img_from_world):
         own, group = visible.observed(row[v]), np.flatnonzero(shown[v])
         box, point, _ = points_in_boxes(poses.points[own], camera, views.boxes[v, group])
