@@ -80,7 +80,8 @@ class FitConfig:
         edge_noise_px, edge_noise_rel: How far a box edge lies from the object's true outline, as a
             standard deviation: hypot(edge_noise_px, edge_noise_rel * box width or height). Only a
             first guess: the boxes themselves correct both by one factor an object.
-        border_px: An edge this near the image border (px) only says that the object reaches it.
+        border_px: An edge nearer to the image border than this (px) and twice its noise only says
+            that the object reaches it.
         correlation_deg: Views of an object nearer to each other than this (deg) repeat their errors
             and count as fewer; 0: every view counts fully, and no error is common to all of them.
         max_views: An object seen in more frames is fitted from this many, spread over the path.
@@ -2015,9 +2016,9 @@ def _inlier_table(
     return inlier
 
 
-MAX_NOISE = (
-    18.0  # noise factor above which the boxes are not of one static object (a third of the size)
-)
+MAX_NOISE = 18.0  # noise factor: a third of the size; boxes that err more are not of one thing
+# Of the cut edges of real detectors a third end over 3 px inside, a tenth over this
+BORDER_SIGMAS = 2.0
 MIN_INLIER_SHARE = 0.4  # of the views; below it the object is rejected
 ABSURD_SIZE = 6.0  # sigma of growth above the prior: rejected
 ODD_SIZE = 3.5  # sigma from the prior: said in the reason
@@ -2181,11 +2182,10 @@ def fit_objects(
     cams = _cameras(given)
     usable = _usable_boxes(boxes, cams)
     quality = np.nan_to_num(np.asarray(1.0 if score is None else score, np.float64))
-    low = boxes[..., :2] <= cfg.border_px
-    high = boxes[..., 2:] >= np.array(image_size) - cfg.border_px
-    one_sided = np.concatenate([low, high], -1)  # (F, O, 4)
-    if hidden is not None:
-        one_sided |= np.asarray(hidden, bool)
+    near = cfg.border_px + BORDER_SIGMAS * cfg.edge_noise_rel * (boxes[..., 2:] - boxes[..., :2])
+    far = np.array(image_size) - near
+    one_sided = np.concatenate([boxes[..., :2] <= near, boxes[..., 2:] >= far], -1)  # (F, O, 4)
+    one_sided |= False if hidden is None else np.asarray(hidden, bool)
     quality = quality + ~one_sided.any(-1)  # (F, O), whole boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
     known = isinstance(metric, Scale) and metric.source != "none"

@@ -24,7 +24,7 @@ from reobj.identity.locate import (
     confidence,
     floor_under,
     locate,
-    log_mean_odds,
+    log_best_odds,
     on_floor,
 )
 from reobj.identity.occlusion import hidden_edges
@@ -234,8 +234,8 @@ def _confidences(
         own = solid[rows][solid[rows] >= 0]
         sure = located.confidence[own[:1]]
         if not len(own):
-            score = log_mean_odds(tracks.score[rows], np.zeros(len(rows), np.int64), 1)
-            sure = confidence(score, np.array([np.nan]), located.usual_score)
+            score = log_best_odds(tracks.score[rows], np.zeros(len(rows), np.int64), 1)
+            sure = confidence(score, np.array([np.nan]))
         found[int(tracks.track_id[rows[0]])] = float(sure[0])
     return found
 

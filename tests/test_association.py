@@ -16,7 +16,7 @@ from reobj.identity import locate as locating
 from reobj.identity.association import Association, Associator
 from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
 from reobj.identity.gaps import fill_by_place
-from reobj.identity.locate import Categories, confidence, locate, log_mean_odds
+from reobj.identity.locate import Categories, confidence, locate, log_best_odds
 from reobj.identity.proposals import propose
 from reobj.objects import fitter
 from reobj.types import class_shares
@@ -496,23 +496,24 @@ def test_a_size_is_held_against_its_category_axis_by_axis() -> None:
 
 def test_confidence_rises_with_score_and_share() -> None:
     score, share = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
-    table = confidence(score[:, None], share, 0.0)
+    table = confidence(score[:, None], share)
     assert (np.diff(table, axis=0) > 0).all() and (np.diff(table, axis=1) > 0).all()
     assert table[0, 0] < 0.1 and table[2, 2] > 0.9
-    np.testing.assert_array_equal(confidence(score, share, 2.0), table.diagonal())
-    assert (confidence(score, share, -2.0) > table.diagonal()).all()  # all its scores are low
-    assert confidence(np.zeros(1), np.array([np.nan]), 0.0)[0] < 0.1  # no solid explains it
+    assert (confidence(score, share, 0.5) < table.diagonal()).all()  # things behind it are seen
+    assert confidence(np.zeros(1), np.array([np.nan]))[0] < 0.2  # no solid explains it
 
 
 def test_the_best_views_tell_what_a_thing_scores() -> None:
-    """Ten views, nine of them half hidden; the order does not matter."""
-    score = np.r_[np.full(8, 0.2), 0.9, 0.9, 0.5]
-    group = np.r_[np.zeros(10, int), 2]
-    found = log_mean_odds(score, group, 3)
-    np.testing.assert_array_equal(found, log_mean_odds(score[::-1], group[::-1], 3))
-    odds = score / (1 - score)
-    np.testing.assert_allclose(found[[0, 2]], np.log([odds[:10].mean(), odds[10]]))
-    assert np.log(odds[:10]).mean() + 1 < found[0] < np.log(odds[9]) and found[1] == -np.inf
+    """Of 100 views seventy are half hidden, of 200 half; one of ten; the order does not matter."""
+    score = np.r_[np.full(70, 0.2), np.full(30, 0.9), np.full(100, 0.3), np.full(100, 0.8)]
+    score = np.r_[score, np.full(9, 0.2), 0.9]
+    group = np.repeat([0, 1, 3], [100, 200, 10])
+    found = log_best_odds(score, group, 4)
+    np.testing.assert_array_equal(found, log_best_odds(score[::-1], group[::-1], 4))
+    few = (9 * 0.25 + 9) / 10  # odds of .2 and .9: 1 to 4 and 9 to 1
+    np.testing.assert_allclose(np.exp(found), [9, 4, 0, few])
+    mixed = log_best_odds(np.r_[np.full(160, 0.2), np.full(40, 0.9)], np.zeros(200, int), 1)
+    np.testing.assert_allclose(np.exp(mixed), (40 * 9 + 10 * 0.25) / 50)  # its best quarter
 
 
 # ---- What follows ----

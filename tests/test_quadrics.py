@@ -574,20 +574,21 @@ def test_option_edge_noise_widens_the_covariance(name: str) -> None:
     assert 1.5 < sigma[1] / sigma[0] < 3.5  # 3, less what the boxes themselves tell
 
 
-def test_option_border_px() -> None:
-    """A detector that ends its boxes 6 px before the image border."""
+@pytest.mark.parametrize("gap_px, border_px", [(15, (3.0, 15.0)), (6, (0.0, 3.0))])
+def test_option_border_px(gap_px: int, border_px: tuple[float, float]) -> None:
+    """A detector that ends its boxes before the image border; 6 of 126 px are within their noise."""
     rng = np.random.default_rng(34)
     boxes, cams, truth, priors, names = syn.scenes(40, 8, 100, 0.005, "box", rng)
     joint, flat = syn.as_one(boxes, cams)
     size = (float(np.nanmedian(joint[..., [0, 2]].mean(-1))), syn.IMAGE[1])
-    cut = q.clip_boxes(joint, (size[0] - 6, size[1]))
+    cut = q.clip_boxes(joint, (size[0] - gap_px, size[1]))
     cut[:, np.isfinite(cut[..., 0]).sum(0) < 5] = np.nan
     scores = []
-    for border_px in (3.0, 8.0):
-        config = q.FitConfig(border_px=border_px)
+    for border in border_px:
+        config = q.FitConfig(border_px=border)
         fits = q.fit_objects(cut, flat, size, names, priors, up=UP, config=config)
         scores.append(np.nanmean(syn.box_overlap(fits.ellipsoids, truth)))
-    assert scores[1] > scores[0] + 0.1
+    assert scores[1] > max(scores[0] + 0.1, 0.9)
 
 
 def test_option_correlation_deg() -> None:

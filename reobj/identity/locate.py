@@ -25,15 +25,14 @@ from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
 from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
 
-# Log odds that an object is there: constant, by the log of the mean odds of its scores, by the
-# share of the frames that should show it and do, by how much is seen behind it through its middle
-# (`occlusion.seen_through`). Fitted to 399 solids of 17 runs, the constant lowered by .15 since
-# solids need fewer boxes (docs/tracking.md)
-CONFIDENCE = (-0.65, 1.5, 1.3, -2.0)
-NO_SOLID = -3.3  # instead of the constant where no solid explains it (12 of 150 were real)
-# Share of a recording's mean log odds, where it is below 0, that is forgiven: some detectors score
-# low throughout, in dark rooms most
-RELATIVE = 0.5
+# Log odds that an object is there: constant, by the log odds of its best scores, by the share of
+# the frames that should show it and do, by how much is seen behind it through its middle
+# (`occlusion.seen_through`). Fitted to 1,056 solids of 43 runs of 10 rooms (docs/tracking.md)
+CONFIDENCE = (-1.0, 1.5, 1.8, -1.1)
+NO_SOLID = -1.9  # instead of the constant where no solid explains it (8 of 89 were real)
+# The detections that tell whether an object is there, and the least share of all: most views of a
+# half-hidden thing are poor (20 to 40 are alike; all of them, or ten, are worse: docs/trials.md)
+BEST_DETECTIONS, BEST_SHARE = 30, 0.25
 # Of a detection in no tracklet that proposes solids (.3 finds 73.5 objects instead of 72, in 1.2
 # times the time: docs/trials.md)
 PROPOSING_SCORE = 0.4
@@ -49,14 +48,12 @@ class Located:
     Attributes:
         solid: (N,) solid that each row shows, or -1. overlap: (N,) IoU of its projection with the
             box, NaN where there is none. confidence: (S,) probability that it is there.
-        usual_score: mean log odds of the scores of all their rows. floor: of the part, or None.
-        ellipsoids: (S,) of the solids, and NaN at the end.
+        floor: of the part, or None. ellipsoids: (S,) of the solids, and NaN at the end.
     """
 
     solid: IntArray
     overlap: Array
     confidence: Array
-    usual_score: float
     floor: quadrics.Floor | None
     ellipsoids: quadrics.Ellipsoids
 
@@ -85,7 +82,7 @@ def locate(
     table, solid, overlap = rows[own], np.full(len(rows), -1), np.full(len(rows), np.nan)
     tracked = table[table.tracklet_id > 0]
     if not len(tracked):
-        return Located(solid, overlap, np.empty(0), 0.0, None, _UNKNOWN)
+        return Located(solid, overlap, np.empty(0), None, _UNKNOWN)
     fragment = cut_at_gaps(tracked)
     count = int(fragment.max()) + 1
     views = gather_views(tracked, poses, fragment, count, 0.0)
@@ -108,7 +105,7 @@ def locate(
     solids = Solids.concatenate([found.solids, _NO_SOLID])
     through = seen_through(found.solids.ellipsoids, found.evidence.expected, poses, views.frame)
     sure = _confidence(found, detected, through)
-    return Located(solid, overlap, *sure, floor, solids.ellipsoids)
+    return Located(solid, overlap, sure, floor, solids.ellipsoids)
 
 
 def _from_untracked(
@@ -143,43 +140,43 @@ def floor_under(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | Non
     return None if plane is None else quadrics.Floor(plane.normal, plane.offset, plane.sigma)
 
 
-def confidence(
-    score: Array, share: Array, usual_score: float, through: Array | float = 0.0
-) -> Array:
+def confidence(score: Array, share: Array, through: Array | float = 0.0) -> Array:
     """Return the probability that objects are there, each a thing of its own.
 
     Args:
-        score: `log_mean_odds` of its detections.
+        score: `log_best_odds` of its detections.
         share: of the frames that should show it and do; NaN where no solid tells which should.
-        usual_score: mean log odds of the scores of all solids' detections.
         through: `occlusion.seen_through`.
     """
     constant, of_score, of_share, of_through = CONFIDENCE
     place = constant + of_share * share + of_through * through
     place = np.where(np.isnan(share), NO_SOLID, place)
-    score = score - RELATIVE * min(usual_score, 0.0)
     return np.asarray(1 / (1 + np.exp(-place - of_score * score)))
 
 
-def log_mean_odds(score: Array, group: IntArray, count: int) -> Array:
-    """Return the log of the mean odds (count,) of the scores (N,) of each group, -inf without any.
+def log_best_odds(score: Array, group: IntArray, count: int) -> Array:
+    """Return the log of the mean odds (count,) of the best scores (N,) of each group, -inf: none.
 
-    The odds of the best views decide: most views of a half-hidden thing are poor.
+    These are its best 30, or best quarter if that is more.
     """
-    odds = np.bincount(group, np.exp(logit(score)), count)
+    order = np.lexsort((-score, group))
+    size = np.bincount(group, minlength=count)
+    rank = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
+    taken = np.maximum(BEST_DETECTIONS, np.ceil(BEST_SHARE * size)).clip(max=size)
+    best = order[rank < np.repeat(taken, size)]
+    odds = np.bincount(group[best], np.exp(logit(score[best])), count)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(odds / np.bincount(group, minlength=count).clip(1)))
+        return np.asarray(np.log(odds / taken.clip(1)))
 
 
-def _confidence(found: Association, detected: Detected, through: Array) -> tuple[Array, float]:
-    """Return the `confidence` (S,) of solids, and the mean log odds of all their scores."""
+def _confidence(found: Association, detected: Detected, through: Array) -> Array:
+    """Return the `confidence` (S,) of solids."""
     owned = np.flatnonzero(found.owner >= 0)
     solid, view = found.owner[owned], detected.view[owned]
-    expected, odds = found.evidence.expected, logit(detected.score[owned])
-    score = log_mean_odds(detected.score[owned], solid, len(found.solids))
+    expected = found.evidence.expected
+    score = log_best_odds(detected.score[owned], solid, len(found.solids))
     shown = np.bincount(solid, expected[view, solid], len(found.solids))
-    usual = float(odds.mean()) if len(odds) else 0.0
-    return confidence(score, shown / expected.sum(0).clip(1), usual, through), usual
+    return confidence(score, shown / expected.sum(0).clip(1), through)
 
 
 @dataclass(frozen=True, slots=True)
