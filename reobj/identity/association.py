@@ -8,8 +8,9 @@ should show a solid and does not, and against every solid.
              (in a frame one detection speaks for a solid; others that it explains as well cost
              nothing: detectors box parts, and things twice)
  2. assign   in every frame each detection to at most one solid and back; tracklets stay together
- 3. refit    each solid to its detections
- 4. thin     drop solids that bring less than they cost, as others explain their detections too
+ 3. thin     drop solids that bring less than they cost, as others explain their detections too:
+             first, so that no refit rests on the detections that several share
+ 4. refit    each solid to its detections
  5. merge    two solids where one explains the detections of both
  6. widen    refit, but boxes that end above the floor do not tell how wide a thing is
 """
@@ -98,7 +99,7 @@ class Associator:
         now = self._assign(proposed[chosen], np.full(len(self.detected.view), -1))
         known = {now.owner.tobytes()}
         for _ in range(MAX_ROUNDS):
-            for step in (self._refitted, self._thinned, self._merged):
+            for step in (self._thinned, self._refitted, self._merged):
                 now = step(now)
             if (state := now.owner.tobytes()) in known:
                 break

@@ -27,8 +27,9 @@ from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
 
 # Log odds that an object is there: constant, by the log odds of its best scores, by the share of
 # the frames that should show it and do, by how much is seen behind it through its middle
-# (`occlusion.seen_through`). Fitted to 1,056 solids of 43 runs of 10 rooms (docs/tracking.md)
-CONFIDENCE = (-1.0, 1.5, 1.8, -1.1)
+# (`occlusion.seen_through`). Fitted to 1,202 solids of 48 runs of 10 rooms (docs/tracking.md)
+CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
+USUAL_SHARE = 0.75  # where no frame should show it: a table that is always cut (their mean)
 NO_SOLID = -1.9  # instead of the constant where no solid explains it (8 of 89 were real)
 # The detections that tell whether an object is there, and the least share of all: most views of a
 # half-hidden thing are poor (20 to 40 are alike; all of them, or ten, are worse: docs/trials.md)
@@ -176,7 +177,8 @@ def _confidence(found: Association, detected: Detected, through: Array) -> Array
     expected = found.evidence.expected
     score = log_best_odds(detected.score[owned], solid, len(found.solids))
     shown = np.bincount(solid, expected[view, solid], len(found.solids))
-    return confidence(score, shown / expected.sum(0).clip(1), through)
+    share = np.where(expected.any(0), shown / expected.sum(0).clip(1), USUAL_SHARE)
+    return confidence(score, share, through)
 
 
 @dataclass(frozen=True, slots=True)
