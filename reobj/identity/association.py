@@ -8,9 +8,8 @@ should show a solid and does not, and against every solid.
              (in a frame one detection speaks for a solid; others that it explains as well cost
              nothing: detectors box parts, and things twice)
  2. assign   in every frame each detection to at most one solid and back; tracklets stay together
- 3. thin     drop solids that bring less than they cost, as others explain their detections too:
-             first, so that no refit rests on the detections that several share
- 4. refit    each solid to its detections
+ 3. refit    each solid to its detections
+ 4. thin     drop solids that bring less than they cost, as others explain their detections too
  5. merge    two solids where one explains the detections of both
  6. widen    refit, but boxes that end above the floor do not tell how wide a thing is
 """
@@ -33,7 +32,7 @@ MISSED = 0.5  # against a solid, for each frame that should show it and has no d
 NEW_SOLID = 10.0  # against each solid: three frames and more must speak for it
 # What a better box may add in step 1, so that no compromise between two things comes first
 PURSUED_CHOICE = 1.5
-KEPT_TRACKLET = 3.0  # for the solid of the detection before or after in the tracklet
+KEPT_TRACKLET = 1.5  # for the solid of the detection before or after in the tracklet
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
 # Half extents of a solid, along its axes; what has its centre nearer to its own is the same thing
 # or a part of it, whatever else speaks for two (chosen; .4 to .6 are alike but for deimv2-femto)
@@ -99,7 +98,7 @@ class Associator:
         now = self._assign(proposed[chosen], np.full(len(self.detected.view), -1))
         known = {now.owner.tobytes()}
         for _ in range(MAX_ROUNDS):
-            for step in (self._thinned, self._refitted, self._merged):
+            for step in (self._refitted, self._thinned, self._merged):
                 now = step(now)
             if (state := now.owner.tobytes()) in known:
                 break
