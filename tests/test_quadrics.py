@@ -576,7 +576,7 @@ def test_option_edge_noise_widens_the_covariance(name: str) -> None:
 
 @pytest.mark.parametrize("gap_px, border_px", [(15, (3.0, 15.0)), (6, (0.0, 3.0))])
 def test_option_border_px(gap_px: int, border_px: tuple[float, float]) -> None:
-    """A detector that ends its boxes before the image border; 6 of 126 px are within their noise."""
+    """A detector that ends boxes before the image border; 6 of 126 px are within their noise."""
     rng = np.random.default_rng(34)
     boxes, cams, truth, priors, names = syn.scenes(40, 8, 100, 0.005, "box", rng)
     joint, flat = syn.as_one(boxes, cams)
