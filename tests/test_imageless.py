@@ -293,5 +293,5 @@ def test_tums_office_has_boxes_and_motion_capture_only(tmp_path: Path) -> None:
     result = rt.run(None, tmp_path / "out", config, detections=data / "detections_yolo.csv")
     assert result.poses.known.sum() == 100 and result.poses.metric
     assert result.poses.time_s[0] == pytest.approx(1341847990.8, abs=0.5)
-    # likelier there than not; a chair that another chair's projection holds too may be its part
-    assert sum(o.located for o in result.objects) >= 6
+    # A detector that reports nothing below .4: what is in a third of the frames is doubtful there.
+    assert sum(o.located for o in result.objects) >= 4

@@ -32,7 +32,7 @@ MISSED = 0.5  # against a solid, for each frame that should show it and has no d
 NEW_SOLID = 10.0  # against each solid: three frames and more must speak for it
 # What a better box may add in step 1, so that no compromise between two things comes first
 PURSUED_CHOICE = 1.5
-KEPT_TRACKLET = 1.5  # for the solid of the detection before or after in the tracklet
+KEPT_TRACKLET = 2.5  # for the solid of the detection before or after in the tracklet
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
 # Half extents of a solid, along its axes; what has its centre nearer to its own is the same thing
 # or a part of it, whatever else speaks for two (chosen; .4 to .6 are alike but for deimv2-femto)
