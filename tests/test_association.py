@@ -16,7 +16,13 @@ from reobj.identity import locate as locating
 from reobj.identity.association import Association, Associator
 from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
 from reobj.identity.gaps import fill_by_place
-from reobj.identity.locate import Categories, confidence, locate, log_best_odds
+from reobj.identity.locate import (
+    USUAL_SHARE,
+    Categories,
+    confidence,
+    locate,
+    log_best_odds,
+)
 from reobj.identity.proposals import propose
 from reobj.objects import fitter
 from reobj.types import class_shares
@@ -514,6 +520,19 @@ def test_the_best_views_tell_what_a_thing_scores() -> None:
     np.testing.assert_allclose(np.exp(found), [9, 4, 0, few])
     mixed = log_best_odds(np.r_[np.full(160, 0.2), np.full(40, 0.9)], np.zeros(200, int), 1)
     np.testing.assert_allclose(np.exp(mixed), (40 * 9 + 10 * 0.25) / 50)  # its best quarter
+
+
+def test_where_no_frame_should_show_a_thing_the_share_is_the_usual_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Every view cuts a large table: that it is never missed does not speak against it."""
+    monkeypatch.setattr("reobj.identity.evidence.EXPECTED", 2.0)
+    poses, priors = walk(), quadrics.load_priors()
+    table = table_of(poses)
+    found = locate(table, NAMES, poses, fitter(rt.ObjectsConfig(), poses, NAMES), priors)
+    shown = found.solid >= 0
+    score = log_best_odds(table.score[shown], found.solid[shown], len(found.confidence))
+    np.testing.assert_allclose(found.confidence, confidence(score, np.full(3, USUAL_SHARE)))
 
 
 # ---- What follows ----
