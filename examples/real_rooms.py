@@ -165,6 +165,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
     "tracklets": {f"{ASSOCIATION}.KEPT_TRACKLET": 0.0},
     "untracked detections": {"reobj.identity.locate._doubles": untracked},
+    "clear detections in refits": {f"{ASSOCIATION}.CLEARLY": -np.inf},
     "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
     "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
     "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
@@ -519,12 +520,8 @@ def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
     center = np.array([t["center"] for t in true], np.float64).reshape(-1, 3)
     size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
     axes = np.array([t["R"] for t in true], np.float64).reshape(-1, 3, 3)
-    names = np.array([o.class_name for o in placed.objects], str)
-    same = np.array([t["coco"] or "" for t in true], str)[:, None] == names
-    apart = placed.center - center[:, None]  # (G, S, 3)
-    flat, full = np.linalg.norm(apart[..., [0, 2]], axis=2), np.linalg.norm(apart, axis=2)
-    reach = np.maximum(REACH_M, REACH_OF_SIDE * size.max(1, initial=0))
-    able = same & (flat <= reach[:, None])
+    full, flat, same = distances(true, placed)
+    able = same & (flat <= reach_over_ground(true)[:, None])
     a, b = linear_sum_assignment(np.where(able, full, 1e3))
     a, b = a[able[a, b]], b[able[a, b]]
     other = np.setdiff1d(np.flatnonzero(same.any(0)), b)
@@ -542,6 +539,21 @@ def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
     in_sigma = sizes_in_sigma(placed.objects, b, found, goal) if len(b) else errors
     counts = int(double.sum()), int((~double).sum())
     return Matched(a, b, full[a, b], errors, in_sigma, *counts)
+
+
+def distances(true: Sequence[dict[str, Any]], placed: Placed) -> tuple[Array, Array, BoolArray]:
+    """Return (G, S) each: metres from true objects to solids, over ground; of one class."""
+    center = np.array([t["center"] for t in true], np.float64).reshape(-1, 3)
+    names = np.array([o.class_name for o in placed.objects], str)
+    apart = placed.center - center[:, None]  # (G, S, 3)
+    flat, full = np.linalg.norm(apart[..., [0, 2]], axis=2), np.linalg.norm(apart, axis=2)
+    return full, flat, np.array([t["coco"] or "" for t in true], str)[:, None] == names
+
+
+def reach_over_ground(true: Sequence[dict[str, Any]]) -> Array:
+    """Return how far (G,) a solid may be from true objects to be one of them, m."""
+    size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
+    return np.asarray(np.maximum(REACH_M, REACH_OF_SIDE * size.max(1, initial=0)))
 
 
 def matched_extents(axes: Array, placed: Placed, solid: int) -> Array:
@@ -593,11 +605,21 @@ def sure_of_solids(
     found: LabelledBoxes,
     objects: Sequence[rt.Object],
 ) -> list[Sure]:
-    """Say which objects are real: by their solids; those without by boxes of what is left."""
-    matched = match_solids([t for t in true if t["coco"]], placed)
-    real_ids = {placed.objects[i].id for i in matched.solid.tolist()}
-    taken = [t["id"] for t in true if t["coco"]]
-    taken = [taken[i] for i in matched.true.tolist()]
+    """Say which objects are real: by their solids; those without by boxes of what is left.
+
+    The surest takes the nearest true object of its class first, as in COCO's average precision.
+    """
+    known = [t for t in true if t["coco"]]
+    full, flat, same = distances(known, placed)
+    able = same & (flat <= reach_over_ground(known)[:, None])  # (G, S)
+    sure = np.array([o.confidence or 0.0 for o in placed.objects])
+    taken, real_ids = list[int](), set[int]()
+    for s in np.argsort(-sure, kind="stable").tolist():
+        if able[:, s].any():
+            nearest = int(np.where(able[:, s], full[:, s], np.inf).argmin())
+            able[nearest] = False
+            taken.append(known[nearest]["id"])
+            real_ids.add(placed.objects[s].id)
     verdicts = judge(truth, kinds_of(truth), found, objects, AMODAL_IOU)
     bare = np.array([o.center is None for o in objects], bool)
     real = np.array([o.id in real_ids for o in objects], bool)

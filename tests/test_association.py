@@ -343,6 +343,30 @@ def test_a_double_is_dropped_and_its_detections_return() -> None:
     assert len(found.solids) == 3 and (found.owner >= 0).all()
 
 
+def test_what_another_solid_explains_does_not_tell_where_a_solid_is() -> None:
+    made, found = association_of(chairs(), walk(30))
+    assert found.clear().all()
+    slipped = np.flatnonzero(found.owner == 0)[:4]
+    found.owner[slipped] = 1  # four boxes of a chair are given to the next one
+    np.testing.assert_array_equal(np.flatnonzero(~found.clear()), slipped)
+    rows = list[np.ndarray]()
+
+    def refit(used: np.ndarray, *_: object) -> Solids:
+        rows.append(used)
+        return found.solids
+
+    made.refit = refit
+    made._refitted(found)
+    np.testing.assert_array_equal(rows[0], np.flatnonzero(found.clear()))
+
+
+def test_a_double_is_fitted_to_all_its_detections_as_none_is_clear() -> None:
+    four = Solids.concatenate([chairs(), chairs()[[0]]])
+    _, found = association_of(four, walk(30))
+    assert found.clear().all() and len(np.unique(found.owner)) >= 3
+    assert not association_of(chairs()[[]], walk(30))[1].clear().any()
+
+
 @pytest.mark.parametrize("first", [0, 3])
 def test_of_two_that_stand_for_one_thing_the_better_placed_one_stays(first: int) -> None:
     """A solid 12 cm off has half of the chair's detections, and is of a likelier size."""

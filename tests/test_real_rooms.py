@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 from pathlib import Path
@@ -216,6 +217,24 @@ def test_the_nearest_is_matched_one_to_one_and_large_things_have_a_wide_reach() 
     assert found.solid.tolist() == [1] and (found.doubles, found.elsewhere) == (1, 0)
     none = rr.match_solids(sofa, solids[np.zeros(2, bool)])
     assert len(none.true) == none.doubles == none.elsewhere == 0
+
+
+def test_the_surest_solid_is_the_real_one() -> None:
+    """A doubtful part of a chair lies nearer to its centre than the chair that is listed."""
+    solids = placed(
+        ("chair", (0.05, 0, 0)), ("chair", (0.2, 0, 0)), ("chair", (2.1, 0, 0)),
+        ("chair", (5.0, 0, 0)), turn=np.eye(3),
+    )  # fmt: skip
+    sure = (0.1, 0.9, 0.2, 0.8)
+    objects = [
+        dataclasses.replace(o, confidence=c) for o, c in zip(solids.objects, sure, strict=True)
+    ]
+    solids = dataclasses.replace(solids, objects=objects)
+    chairs = [chair | {"id": k} for k, chair in enumerate(row_of_chairs(3))]
+    # no boxes: of what has no solid nothing is asked here
+    one = boxes((0, 9, 0, "cup"))
+    judged = rr.sure_of_solids(chairs, solids, one, one, objects)
+    assert [real for _, real, _ in judged] == [False, True, True, False]
 
 
 # ---- Tables ------

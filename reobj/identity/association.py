@@ -8,7 +8,7 @@ should show a solid and does not, and against every solid.
              (in a frame one detection speaks for a solid; others that it explains as well cost
              nothing: detectors box parts, and things twice)
  2. assign   in every frame each detection to at most one solid and back; tracklets stay together
- 3. refit    each solid to its detections
+ 3. refit    each solid to the detections that are clearly its own
  4. thin     drop solids that bring less than they cost, as others explain their detections too
  5. merge    two solids where one explains the detections of both
  6. widen    refit, but boxes that end above the floor do not tell how wide a thing is
@@ -32,6 +32,9 @@ MISSED = 0.5  # against a solid, for each frame that should show it and has no d
 NEW_SOLID = 10.0  # against each solid: three frames and more must speak for it
 # What a better box may add in step 1, so that no compromise between two things comes first
 PURSUED_CHOICE = 1.5
+# A detection tells where its solid is if that explains it so much better than others do (chosen:
+# 1 and 4 are between this and all detections, docs/trials.md)
+CLEARLY = 2.0
 KEPT_TRACKLET = 2.5  # for the solid of the detection before or after in the tracklet
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
 # Half extents of a solid, along its axes; what has its centre nearer to its own is the same thing
@@ -74,6 +77,20 @@ class Association:
         solid, row = own.solid[mine], own.row[mine]
         worth = own.log_odds[mine] + MISSED * own.expected[detected.view[row], solid]
         return np.asarray(np.bincount(solid, worth, len(self.solids)) - self.costs())
+
+    def clear(self) -> BoolArray:
+        """Mark detections (N,) that their solid explains clearly better than any other does.
+
+        Of a solid that has fewer than `MIN_DETECTIONS` such all its detections are marked.
+        """
+        evidence, owned = self.evidence, self.owner >= 0
+        mine = self.owner[evidence.row] == evidence.solid
+        own, other = np.full((2, len(owned)), -np.inf)
+        own[evidence.row[mine]] = evidence.choice[mine]
+        np.maximum.at(other, evidence.row[~mine], evidence.choice[~mine])
+        clear = owned & (other < own - CLEARLY)
+        few = np.bincount(self.owner[clear], minlength=len(self.solids) + 1) < MIN_DETECTIONS
+        return np.asarray(clear | owned & few[self.owner])
 
     def costs(self) -> Array:
         """Return the log odds (S,) against each solid if nothing showed it."""
@@ -182,13 +199,13 @@ class Associator:
         return Association(solids, owner, evidence, self.size_log_odds(solids))
 
     def _refitted(self, now: Association, widened: bool = False) -> Association:
-        """Fit the solids to their detections, in the class that most of them have."""
-        owned = np.flatnonzero(now.owner >= 0)
+        """Fit the solids to the detections clearly theirs, in the class that most of all have."""
+        owned, clear = np.flatnonzero(now.owner >= 0), np.flatnonzero(now.clear())
         solid, label = now.owner[owned], self.detected.class_id[owned].clip(0)
         votes = np.zeros((len(now.solids), int(label.max(initial=0)) + 1))
         np.add.at(votes, (solid, label), self.detected.score[owned])
         classes = np.where(votes.any(1), votes.argmax(1), now.solids.class_id)
-        fitted = self.refit(owned, solid, classes, now.solids if widened else None)
+        fitted = self.refit(clear, now.owner[clear], classes, now.solids if widened else None)
         well = np.isfinite(fitted.ellipsoids.center_in_world).all(1)
         both = Solids.concatenate([now.solids, fitted])
         pick = np.arange(len(fitted)) + np.where(well, len(fitted), 0)
