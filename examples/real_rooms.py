@@ -2,7 +2,7 @@
 """Score the whole chain on recordings of rooms whose objects are known, in one table.
 
     python examples/real_rooms.py DATA -o OUT --choosing [--only NAME...] [--seeds 901 902]
-    python examples/real_rooms.py DATA -o OUT --choosing --without all # one thing after the other
+    python examples/real_rooms.py DATA -o OUT --choosing --without all --noises 3 # one by one
     python examples/real_rooms.py DATA -o OUT --choosing --docs docs   # fills in docs/tracking.md
 
 DATA holds hololens_kitchen, redkitchen_7scenes, office_loop, livingroom13 and studio_room; the
@@ -11,7 +11,8 @@ rooms for reporting were used for choosing (splits.json): --choosing shows them,
 recording runs at the defaults in a process of its own. OUT keeps what `run` keeps: detections,
 cameras and tracks of an earlier call are used again, so give another OUT once the detector, the
 cameras or the tracker changed; objects are made anew each time. Writes OUT/real_rooms.md and .json,
-with --without OUT/left_out.md and .json.
+with --without OUT/left_out.md and .json. Half a pixel moves a chair or two, so --noises N makes the
+objects N times, of boxes that far off (standard deviation), and gives the means.
 
 What is counted. An object is *listed* if it is not `doubtful`; solids are those of listed objects.
     IDF1       boxes of listed identities, as in tracks.txt. hololens_kitchen: of six
@@ -62,6 +63,7 @@ from synthetic_quadrics import table, write_table
 import quadrics
 import reobj_track as rt
 from reobj.objects import DOUBTFUL
+from reobj.parts import link_and_fit
 from reobj.results.evaluation import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
@@ -243,17 +245,53 @@ def spent(result: rt.Result) -> Figures:
     return {"objects_s": seconds["objects"], "seconds": seconds, "peak_mb": round(peak)}
 
 
-def measure(case: Case, data: Path, out: Path, without: str = "") -> Figures:
-    """Run and score a case; without a mechanism: the objects of a run are made again."""
-    if not without:
+def measure(case: Case, data: Path, out: Path, without: str = "", seed: int = 0) -> Figures:
+    """Run and score a case; else the objects of a run are made again.
+
+    Args:
+        without: a mechanism. seed: of the noise of the boxes; 0: as recorded.
+    """
+    if not without and not seed:
         return run_case(case, data, out) | score_case(case, data, out, out / case.name)
-    leave_out(without)
-    folder = out / f"{case.name} without {without}".replace(" ", "-")
+    if without:
+        leave_out(without)
+    if seed:
+        shake(seed)
+    folder = out / f"{case.name}-{without}-{seed}".replace(" ", "-")
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(out / case.name, folder)
     result = rt.refit(folder, configured(case, data, out))
     result.save(folder / WITH_DOUBTFUL, doubtful=True)
-    return spent(result) | score_case(case, data, out, folder)
+    figures = spent(result) | score_case(case, data, out, folder)
+    shutil.rmtree(folder)
+    return figures
+
+
+NOISE_PX = 0.5  # standard deviation of the edges
+
+
+def shake(seed: int) -> None:
+    """Add noise to all boxes before objects are made of them, in this process."""
+
+    def shaken(result: rt.Result, config: rt.ObjectsConfig) -> None:
+        rng = np.random.default_rng(seed)
+        for name in ("tracks", "untracked"):
+            rows = getattr(result, name)
+            xyxy = rows.xyxy + rng.normal(0, NOISE_PX, rows.xyxy.shape)
+            setattr(result, name, dataclasses.replace(rows, xyxy=xyxy))
+        link_and_fit(result, config)
+
+    rt.link_and_fit = shaken  # type: ignore[attr-defined]
+
+
+def mean_of(runs: Sequence[Figures]) -> Figures:
+    """Return the means of the figures of a case, and the confidence of the objects of all runs."""
+    found: Figures = {"sure": [row for run in runs for row in run["sure"]], "runs": len(runs)}
+    for key in {key for run in runs for key in run}:
+        known = [run[key] for run in runs if isinstance(run.get(key), int | float)]
+        if known:
+            found[key] = float(np.mean(known))
+    return found
 
 
 def score_case(case: Case, data: Path, out: Path, folder: Path) -> Figures:
@@ -520,8 +558,7 @@ def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
     center = np.array([t["center"] for t in true], np.float64).reshape(-1, 3)
     size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
     axes = np.array([t["R"] for t in true], np.float64).reshape(-1, 3, 3)
-    full, flat, same = distances(true, placed)
-    able = same & (flat <= reach_over_ground(true)[:, None])
+    full, flat, same, able = distances(true, placed)
     a, b = linear_sum_assignment(np.where(able, full, 1e3))
     a, b = a[able[a, b]], b[able[a, b]]
     other = np.setdiff1d(np.flatnonzero(same.any(0)), b)
@@ -541,19 +578,22 @@ def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
     return Matched(a, b, full[a, b], errors, in_sigma, *counts)
 
 
-def distances(true: Sequence[dict[str, Any]], placed: Placed) -> tuple[Array, Array, BoolArray]:
-    """Return (G, S) each: metres from true objects to solids, over ground; of one class."""
+def distances(
+    true: Sequence[dict[str, Any]], placed: Placed
+) -> tuple[Array, Array, BoolArray, BoolArray]:
+    """Compare true objects with solids: (G, S) each.
+
+    Returns:
+        metres between them, and over ground; they are of one class; and near enough to be one.
+    """
     center = np.array([t["center"] for t in true], np.float64).reshape(-1, 3)
+    size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
     names = np.array([o.class_name for o in placed.objects], str)
     apart = placed.center - center[:, None]  # (G, S, 3)
     flat, full = np.linalg.norm(apart[..., [0, 2]], axis=2), np.linalg.norm(apart, axis=2)
-    return full, flat, np.array([t["coco"] or "" for t in true], str)[:, None] == names
-
-
-def reach_over_ground(true: Sequence[dict[str, Any]]) -> Array:
-    """Return how far (G,) a solid may be from true objects to be one of them, m."""
-    size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
-    return np.asarray(np.maximum(REACH_M, REACH_OF_SIDE * size.max(1, initial=0)))
+    same = np.array([t["coco"] or "" for t in true], str)[:, None] == names
+    reach = np.maximum(REACH_M, REACH_OF_SIDE * size.max(1, initial=0))
+    return full, flat, same, same & (flat <= reach[:, None])
 
 
 def matched_extents(axes: Array, placed: Placed, solid: int) -> Array:
@@ -610,8 +650,7 @@ def sure_of_solids(
     The surest takes the nearest true object of its class first, as in COCO's average precision.
     """
     known = [t for t in true if t["coco"]]
-    full, flat, same = distances(known, placed)
-    able = same & (flat <= reach_over_ground(known)[:, None])  # (G, S)
+    full, _, _, able = distances(known, placed)
     sure = np.array([o.confidence or 0.0 for o in placed.objects])
     taken, real_ids = list[int](), set[int]()
     for s in np.argsort(-sure, kind="stable").tolist():
@@ -677,14 +716,19 @@ def short(value: float) -> str:
     return f"{value:.3f}".removeprefix("0")
 
 
+def count(value: float) -> str:
+    """Format a number of objects, or a mean of such."""
+    return f"{value:.1f}".removesuffix(".0")
+
+
 # Key of the figures, column of the table, format
 COLUMNS: list[tuple[str, str, Callable[[Any], str]]] = [
     ("idf1_chairs", "IDF1 chairs", short),
     ("idf1", "IDF1", short),
     ("ids", "identities per object", "{:.2f}".format),
-    ("found", "found", str),
-    ("doubles", "doubles", str),
-    ("elsewhere", "elsewhere", str),
+    ("found", "found", count),
+    ("doubles", "doubles", count),
+    ("elsewhere", "elsewhere", count),
     ("precision", "precision", short),
     ("recall", "recall", short),
     ("centre_m", "centre, m", short),
@@ -692,7 +736,7 @@ COLUMNS: list[tuple[str, str, Callable[[Any], str]]] = [
     ("inside", "in 2 sigma", percent),
     ("o3d", "O3D", short),
     ("objects_s", "objects step, s", "{:.1f}".format),
-    ("peak_mb", "peak, MB", str),
+    ("peak_mb", "peak, MB", "{:.0f}".format),
 ]
 
 
@@ -700,9 +744,9 @@ def cells(figures: Figures) -> list[str]:
     """Format the columns of a row."""
     row = ["-" if figures.get(key) is None else form(figures[key]) for key, _, form in COLUMNS]
     at = [key for key, *_ in COLUMNS].index("found")
-    row[at] = f"{row[at]} of {figures['true']}"
+    row[at] = f"{row[at]} of {count(figures['true'])}"
     if counts := figures.get("counts"):
-        row[at] += "; listed " + ", ".join(f"{count} {name}" for name, count in counts.items())
+        row[at] += "; listed " + ", ".join(f"{number} {name}" for name, number in counts.items())
     return row
 
 
@@ -723,15 +767,16 @@ def left_out_table(made: dict[str, list[Figures]]) -> str:
             return np.array([f.get(key) for f in of], np.float64)  # None: NaN
 
         change = np.nan_to_num(values("idf1") - values("idf1", made[""]))
-        sums = [f"{np.nansum(values(key)):.0f}" for key in ("found", "doubles", "elsewhere")]
-        listed = [real for f in figures for sure, real, _ in f["sure"] if sure >= DOUBTFUL]
+        sums = [count(float(np.nansum(values(key)))) for key in ("found", "doubles", "elsewhere")]
+        listed = [(f.get("runs", 1), r) for f in figures for c, r, _ in f["sure"] if c >= DOUBTFUL]
+        real, every = sum(r / runs for runs, r in listed), sum(1 / runs for runs, _ in listed)
         rows.append(
             [
                 without or "nothing",
                 short(float(np.nanmean(values("idf1")))),
                 f"{change.min():+.3f} to {change.max():+.3f}" if without else "",
                 *sums,
-                f"{sum(listed)} of {len(listed)}",
+                f"{count(real)} of {count(every)}",
                 short(float(np.nanmean(values("centre_m")))),
                 percent(float(np.nanmean(values("size_error")))),
                 f"{np.nansum(values('objects_s')):.0f}",
@@ -836,6 +881,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--without", nargs="+", default=[], metavar="NAME", help=text)
     add_choosing(parser)
     add("--docs", type=Path, help="folder with tracking.md to fill in, and img/ for the picture")
+    text = "make the objects N times, of boxes half a pixel off, and give means"
+    add("--noises", type=int, default=0, metavar="N", help=text)
     add("--jobs", type=int, default=1, help="processes at once")
     args = parser.parse_args(argv)
     rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
@@ -848,16 +895,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_poses(args.data / folder, args.out / f"poses-{folder}")
     context = multiprocessing.get_context("spawn")  # memory and patches end with a process
     with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
-        made: dict[str, list[Figures]] = {}
-        for without in ("", *left_out):
-            tasks = [pool.submit(measure, case, args.data, args.out, without) for case in cases]
-            made[without] = []
-            for case, task in zip(cases, tasks, strict=True):
-                try:
-                    made[without].append(task.result())
-                except rt.ReobjError as error:
-                    raise SystemExit(f"error: {case.name}: {error}") from None
-                print(f"done: {case.name} without {without or 'nothing'}", file=sys.stderr)
+        made = {"": scores(pool, cases, args.data, args.out)}  # leaves in OUT what the others need
+        for without in ["", *left_out] if args.noises else left_out:
+            seeds = range(1, args.noises + 1) if args.noises else [0]
+            made[without] = scores(pool, cases, args.data, args.out, without, seeds)
     name = "left_out" if left_out else "real_rooms"
     found = tables(cases, made)
     page = "\n\n".join(found.values()) + "\n"
@@ -873,6 +914,27 @@ def main(argv: Sequence[str] | None = None) -> int:
             drawn = {k: v for k, v in groups.items() if v and k in ("other boxes", DETECTOR.model)}
             draw_reliability(drawn, args.docs / "img" / "confidence.png")
     return 0
+
+
+def scores(
+    pool: ProcessPoolExecutor,
+    cases: Sequence[Case],
+    data: Path,
+    out: Path,
+    without: str = "",
+    seeds: Sequence[int] = (0,),
+) -> list[Figures]:
+    """Measure the cases, each with the noise of every seed."""
+    tasks = [[pool.submit(measure, c, data, out, without, seed) for seed in seeds] for c in cases]
+    found = list[Figures]()
+    for case, own in zip(cases, tasks, strict=True):
+        try:
+            runs = [task.result() for task in own]
+        except rt.ReobjError as error:
+            raise SystemExit(f"error: {case.name}: {error}") from None
+        found.append(runs[0] if len(runs) == 1 else mean_of(runs))
+        print(f"done: {case.name} without {without or 'nothing'}", file=sys.stderr)
+    return found
 
 
 def sure_by_group(cases: Sequence[Case], figures: Sequence[Figures]) -> dict[str, list[Sure]]:
