@@ -33,7 +33,7 @@ NEW_SOLID = 10.0  # against each solid: three frames and more must speak for it
 # What a better box may add in step 1, so that no compromise between two things comes first
 PURSUED_CHOICE = 1.5
 # A detection tells where its solid is if that explains it so much better than others do (chosen:
-# 1 and 4 are between this and all detections, docs/trials.md)
+# 1 and 4 gain less, docs/trials.md)
 CLEARLY = 2.0
 KEPT_TRACKLET = 2.5  # for the solid of the detection before or after in the tracklet
 MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
