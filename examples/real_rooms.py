@@ -167,7 +167,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
     "tracklets": {f"{ASSOCIATION}.KEPT_TRACKLET": 0.0},
     "untracked detections": {"reobj.identity.locate._doubles": untracked},
-    "clear detections in refits": {f"{ASSOCIATION}.CLEARLY": -np.inf},
+    "clear detections in refits": {f"{ASSOCIATION}.CLEARLY": -1e3},
     "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
     "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
     "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
@@ -555,9 +555,7 @@ class Matched:
 
 def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
     """Match solids to true objects of their class one to one, in reach over ground (x, z)."""
-    center = np.array([t["center"] for t in true], np.float64).reshape(-1, 3)
-    size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
-    axes = np.array([t["R"] for t in true], np.float64).reshape(-1, 3, 3)
+    center, size, axes = boxes_of(true)
     full, flat, same, able = distances(true, placed)
     a, b = linear_sum_assignment(np.where(able, full, 1e3))
     a, b = a[able[a, b]], b[able[a, b]]
@@ -578,6 +576,14 @@ def match_solids(true: Sequence[dict[str, Any]], placed: Placed) -> Matched:
     return Matched(a, b, full[a, b], errors, in_sigma, *counts)
 
 
+def boxes_of(true: Sequence[dict[str, Any]]) -> tuple[Array, Array, Array]:
+    """Return centres (G, 3), sizes (G, 3) and axes (G, 3, 3), columns, of true objects."""
+    center, size, axes = (
+        np.array([t[key] for t in true], np.float64) for key in ("center", "size", "R")
+    )
+    return center.reshape(-1, 3), size.reshape(-1, 3), axes.reshape(-1, 3, 3)
+
+
 def distances(
     true: Sequence[dict[str, Any]], placed: Placed
 ) -> tuple[Array, Array, BoolArray, BoolArray]:
@@ -586,8 +592,7 @@ def distances(
     Returns:
         metres between them, and over ground; they are of one class; and near enough to be one.
     """
-    center = np.array([t["center"] for t in true], np.float64).reshape(-1, 3)
-    size = np.array([t["size"] for t in true], np.float64).reshape(-1, 3)
+    center, size, _ = boxes_of(true)
     names = np.array([o.class_name for o in placed.objects], str)
     apart = placed.center - center[:, None]  # (G, S, 3)
     flat, full = np.linalg.norm(apart[..., [0, 2]], axis=2), np.linalg.norm(apart, axis=2)
@@ -885,6 +890,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--noises", type=int, default=0, metavar="N", help=text)
     add("--jobs", type=int, default=1, help="processes at once")
     args = parser.parse_args(argv)
+    if args.noises and args.docs and not args.without:
+        parser.error("--docs: tables of recordings are as recorded: leave out --noises")
     rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
     cases, left_out = chosen([*CASES, *rooms], args.only), every_without(args.without)
     used = [s for s in dict.fromkeys(c.split for c in cases) if usable(*s, args.choosing)]

@@ -379,6 +379,13 @@ def test_whole_table_of_a_simulated_walk(
     assert len(list((tmp_path / "poses-hololens_kitchen").glob("*.pose.txt"))) == FRAMES
 
 
+def test_tables_of_recordings_are_as_recorded(tmp_path: Path) -> None:
+    args = [str(tmp_path), "-o", str(tmp_path / "out"), "--choosing", "--noises", "2"]
+    with pytest.raises(SystemExit) as stop:
+        rr.main([*args, "--docs", str(tmp_path)])
+    assert stop.value.code == 2 and not (tmp_path / "out").exists()
+
+
 def test_solids_of_each_part_come_into_the_true_world(parted: rt.Result, tmp_path: Path) -> None:
     """Two worlds of other units and directions, both of the same three chairs."""
     true = walk(len(parted.poses.frame), 200.0).cam_from_world
