@@ -23,7 +23,8 @@ FLOORS = {
     2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
     "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
-    3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video reobj.sources.weights "
+    3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video "
+    "reobj.sources.weights "
     "reobj.sources.recorded reobj.poses.child reobj.poses.uncertainty reobj.results.edits",
     4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
