@@ -21,11 +21,12 @@ FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
     2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
-    "reobj.sources.masks reobj.sources.tiles reobj.sources.looked "
+    "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video "
     "reobj.sources.weights "
-    "reobj.sources.recorded reobj.poses.child reobj.poses.uncertainty reobj.results.edits",
+    "reobj.sources.recorded reobj.sources.looked reobj.poses.child reobj.poses.uncertainty "
+    "reobj.results.edits",
     4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
     "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "

@@ -43,7 +43,7 @@ class Intervals:
 
     def looked_at(self, frame: int) -> bool:
         """Tell whether the detector was run on a frame without a box."""
-        if self.count > 1 and self.step > 1:
+        if self.count > 2 and self.step > 1:
             return (frame - self.first) % self.step == 0
         return not self.irregular
 
@@ -72,7 +72,7 @@ def frames_looked_at(frame: IntArray, frame_count: int) -> IntArray | None:
     known = Intervals()
     for at, count in zip(seen.tolist(), boxes.tolist(), strict=True):
         known.add(at, count)
-    if known.step > 1:
+    if known.count > 2 and known.step > 1:
         end = max(frame_count, known.last + 1)
         return np.arange(known.first % known.step, end, known.step)
     return seen if known.irregular else None
