@@ -251,9 +251,7 @@ def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray
     return Tracks.joined([tracks, untracked]), source[order]
 
 
-def _with_tracklets(
-    table: Tracks, solid: IntArray, looked: IntArray | None = None
-) -> Tracks:
+def _with_tracklets(table: Tracks, solid: IntArray, looked: IntArray | None = None) -> Tracks:
     """Give rows in no tracklet that of the row before of their solid, or one of their own.
 
     A tracklet ends where more than FRAGMENT_GAP frames looked at lie between two rows.

@@ -19,14 +19,8 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj_track as rt
 from reobj.results.evaluation import (
-    ABSENT,
-    IGNORED,
-    SCORED,
-    LabelledBoxes,
     drop_ignored,
     identity_map,
-    labelled,
-    read_truth,
     return_ranks,
     score_report,
     score_tracks,
@@ -34,6 +28,7 @@ from reobj.results.evaluation import (
 )
 from reobj.results.result import VideoInfo
 from reobj.results.solids import read_true_solids, score_objects
+from reobj.results.truth import ABSENT, IGNORED, SCORED, LabelledBoxes, labelled, read_truth
 from reobj.results.workspace import Workspace
 from reobj.types import Embeddings
 

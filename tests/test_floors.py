@@ -41,7 +41,7 @@ FLOORS = {
     "reobj.poses.depth reobj.results.result",
     6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
     "reobj.results.workspace "
-    "reobj.results.overlay reobj.results.solids reobj.results.plausibility",
+    "reobj.results.overlay reobj.results.solids reobj.results.truth reobj.results.plausibility",
     7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
     "reobj.results.stages reobj.results.export reobj.results.scene",
     8: "reobj_track",
