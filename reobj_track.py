@@ -1194,7 +1194,8 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.embedding_row = detected[result.embedding_row]
     result.seconds["objects"] = time.monotonic() - started
     result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
-    result.warnings += implausible(result, config.tracker.high_score, config.objects.moving_classes)
+    scores = (config.tracker.high_score, config.objects.moving_classes, config.tracker.new_score)
+    result.warnings += implausible(result, *scores)
     result.warnings += unused_sizes(config.objects, result.objects)
     started = time.monotonic()
     shown = config.output

@@ -136,7 +136,22 @@ def collect_tracks(
             "a live source cannot be read twice: identities only; record it for 3D",
         ]
     if not len(result.tracks):
-        result.warnings.append(
-            "no object was tracked: no detections, or all below tracker.new_score"
-        )
+        score = result.untracked.score
+        result.warnings.append(f"no object was tracked: {_why_none(score, sum(looked), tracker)}")
     return result
+
+
+def _why_none(score: Array, looked: int, tracker: Any) -> str:
+    """Say why nothing was tracked.
+
+    Args:
+        score: of all detections. looked: frames that the detector was run on.
+    """
+    least = tracker.config.new_score
+    if not looked:
+        return "the detector was run on no frame (it gave None each time)"
+    if not len(score):
+        return f"no detections in the {looked} frames that the detector was run on"
+    if score.max() < least:
+        return f"all {len(score)} detections are below tracker.new_score={least:g}"
+    return f"none of the {len(score)} detections was followed by enough others (tracker.n_init)"

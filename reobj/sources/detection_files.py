@@ -480,6 +480,11 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
         keep &= np.isin(found.class_id, class_filter(config.classes, found.class_names))
     if not len(found):
         found.messages.append("no detections in this file")
+    elif not keep.any():
+        found.messages.append(
+            f"none of {len(found)} boxes is left: those of score {config.min_score:g} or more "
+            f"(detect.min_score){f' and class {config.classes}' * bool(config.classes)} are used"
+        )
     rows = np.flatnonzero(keep)
     rows = rows[np.lexsort((rows, -found.score[rows], found.frame[rows]))]  # best first
     frame = found.frame[rows]
