@@ -219,7 +219,11 @@ def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray
         What each column holds (a name of ROLES), the N rows of cells, the lines they stand on (N,),
         and whether it is MOT (no header). Other columns of a header are left out.
     """
-    reader = csv.reader(read_lines(path), strict=True)
+    lines_read = read_lines(path)
+    first = next((line for line in lines_read if line.strip()), "")
+    if "," not in first and len(first.split()) in range(6, 11):  # MOT with spaces
+        lines_read = [",".join(line.split()) for line in lines_read]
+    reader = csv.reader(lines_read, strict=True)
     columns: tuple[str, ...] = ()
     expected, is_mot = "6 to 10 (frame, id, left, top, w, h, score)", False
     kept, lines = list[list[str]](), list[int]()
