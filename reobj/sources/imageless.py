@@ -51,7 +51,7 @@ class ImagelessVideo(Video):
         self.scale = 1.0
         self.names, self.files = list(names), []
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
-        self.times_s = given
+        self.times_s, self.times_are_known = given, given is not None
         self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
         if given is not None and len(given) < self.frame_count:
             what = f"{len(given)} times of {self.frame_count} frames"

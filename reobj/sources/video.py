@@ -107,6 +107,8 @@ class Video:
         fingerprint: changes with the source or its files; does not tell what a URL hides.
         files, names: paths and file names of images by frame number, [] for videos.
         times_s: (F,) of images whose names are time stamps, else None: they come at 30 Hz.
+        times_are_known: the times of the frames are measured; False: only their order is known,
+            and `IMAGE_FPS` is assumed.
         has_images: False where frames have none (`ImagelessVideo`).
         is_live: a camera or stream, which cannot be read twice.
         read, dropped: wanted frames of a live source so far, and those of them never yielded.
@@ -133,6 +135,7 @@ class Video:
         self.files = [] if self._is_url else _image_files(self.source)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
+        self.times_are_known = not self.files or self.times_s is not None
         self.is_live = self._is_url or (self.source.isdecimal() and not Path(self.source).exists())
         self.size, self.fps, self.frame_count = self._probe()
         if 0 < self.frame_count <= self.config.start:
