@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reobj.sources.video import IMAGE_FPS, InputConfig, Video, source_fingerprint, times_of_names
+from reobj.sources.image_files import IMAGE_FPS, times_of_names
+from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.types import Frame, ReobjError
 
 NO_IMAGE: Any = None
