@@ -21,7 +21,8 @@ FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
     2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
-    "reobj.sources.masks reobj.sources.tiles "
+    "reobj.sources.masks reobj.sources.tiles reobj.sources.image_files "
+    "reobj.sources.container_files reobj.runtime "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video "
     "reobj.sources.weights "

@@ -22,8 +22,9 @@ from reobj.sources.detection_files import (
     read_tracks,
     recorded_times,
 )
+from reobj.sources.image_files import sorted_names
 from reobj.sources.imageless import ImagelessVideo
-from reobj.sources.video import InputConfig, Video, by_number
+from reobj.sources.video import InputConfig, Video
 from reobj.types import ReobjError
 
 
@@ -86,7 +87,7 @@ def _frames_of(
         return ImagelessVideo(source, size, config, times_s=times_s)
     first = ImagelessVideo(source, size, config)
     images = {Path(name).name for name in image_names(boxes) or given.names}
-    names = sorted(images, key=by_number)
+    names = sorted_names(images)
     if boxes.suffix.lower() not in (".xml", ".zip"):
         found = read_detections(boxes, first, DetectConfig(min_score=0.0)).frame
     else:

@@ -21,7 +21,8 @@ import quadrics
 from reobj.cameras import Camera
 from reobj.results.film import FilmWriter
 from reobj.results.result import Result
-from reobj.sources.video import IMAGE_FPS, Video
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
 
 LAYERS = ("boxes", "solids", "ellipses", "trails")

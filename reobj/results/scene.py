@@ -28,7 +28,8 @@ from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.poses.floor import NOISE
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.result import Object, Result, World, sides, significant
-from reobj.sources.video import IMAGE_FPS, Video, shrunk
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.sources.video import Video, shrunk
 from reobj.types import (
     Frame,
     Image,
