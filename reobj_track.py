@@ -119,6 +119,7 @@ from reobj.schema import validate_objects
 from reobj.solvers import solve_again
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
+from reobj.sources.looked import Intervals
 from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
@@ -173,7 +174,9 @@ class TrackerConfig:
     n_init: int = option(
         3, "detections of score .5 before a new object gets its identity; a return needs one less"
     )
-    coast_frames: int = option(30, "frames that a track lives on without a detection", "--coast")
+    coast_frames: int = option(
+        30, "frames, of those looked at, that a track lives on without a detection", "--coast"
+    )
     remember: bool = option(True, "recognise objects that return, however long they were away")
     std_position: float = option(
         0.05, "process noise of a position, over the box size; more for jerky cameras"
@@ -185,7 +188,7 @@ class TrackerConfig:
     foreground_weight: float = option(
         0.5, "share of the foreground in the appearance; less trusts the surroundings more"
     )
-    embed_every: int = option(10, "frames after which every track is embedded again")
+    embed_every: int = option(10, "frames looked at after which every track is embedded again")
     return_probability: float = option(
         0.5, "probability from which on a return is recognised; more for fewer wrong identities"
     )
@@ -323,7 +326,7 @@ class TrackState:
     cov: Array  # (T, 4, 3)
     tracklet: IntArray  # (T,)
     identity: IntArray  # (T,) index of the identity, -1 while tentative
-    missed: IntArray  # (T,) frames since the last one
+    missed: IntArray  # (T,) frames looked at since the last detection
     first: IntArray  # (T,) frame of birth
     embedded: IntArray  # (T,) frame of the last embedding, -1: never
     votes: Array  # (T, C) score sums of the classes
@@ -363,7 +366,7 @@ class TrackState:
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 6  # of the files of Tracker.save
+STATE_VERSION = 7  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -394,8 +397,9 @@ PLACE_IN_VIEW = 0.5  # share of a projected box in the image from which a detect
 class Tracker:
     """Give every detection of a video the identity of its physical object.
 
-    Call `update` once a frame, also with no detections. Identities start at 1, belong to this
-    tracker alone and are never given to another object. An object that was away is recognised by
+    Call `update` once a frame: with [] where the detector found nothing, with None where it was not
+    run. Identities start at 1, belong to this tracker alone and are never given to
+    another object. An object that was away is recognised by
     appearance, whatever its place in the image, unless two identities fit about equally well: then
     it gets a new identity (the linker of `run` decides later, with 3D evidence).
 
@@ -422,6 +426,9 @@ class Tracker:
         """Forget everything: the next video starts with identity 1."""
         none = np.empty(0, np.int64)
         self.frame_number = -1
+        self.looked = False  # whether the detector was run on the latest frame
+        self._looks = -1  # frames that it was run on, but for the first
+        self._intervals = Intervals()  # of the frames with detections
         self.state = TrackState.spawn(np.empty((0, 4)), none, 0, self.config)
         self.gallery = Gallery()
         self.reid_calibration = SimilarityCalibration()  # of views some time apart
@@ -450,32 +457,47 @@ class Tracker:
         camera: Camera | None = None,
         points: Array | None = None,
         part: int = 0,
+        looked: bool | None = None,
     ) -> Tracks:
         """Track the detections of the next frame.
 
         Args:
             detections: `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics'
                 Results or Boxes; supervision's Detections; or a dict of boxes, scores, labels.
+                None: the detector was not run on this frame; tracks are predicted, and none counts
+                as missed.
             frame: (H, W, 3) uint8 BGR image: camera motion, and the input of the embedder.
             embeddings: of all detections: an (D, E) array or `Embeddings`, of one width E always.
             cam_from_world: (3, 4) pose of this frame, with `camera`: objects are known by their
                 place in 3D. NaN: not known.
             points: (N, 3) in world, seen in this frame: how far away a new track is.
             part: of the cameras' path; each has a world of its own, and places in it.
+            looked: the detector was run on this frame. None: that depends on the detections; no
+                detection is a frame not looked at only where the frames with detections so far
+                come at a regular interval, or most of them alone.
         Returns:
             The detections that belong to a confirmed track; decided once.
         Raises:
             ReobjError: something that cannot be meant; the tracker stays as it was.
         """
-        detections = as_detections(detections)
+        run = detections is not None and looked is not False
+        detections = as_detections(detections) if run else Detections.empty()
         frame = None if frame is None else as_frame(frame, detections.masks)
         given = as_embeddings(embeddings, len(detections), self.state.embedding.shape[1])
         pose = checked_pose(cam_from_world, camera, points, part)
         self.frame_number += 1
+        if len(detections):
+            self._intervals.add(self.frame_number, len(detections))
+        elif run and looked is None:
+            run = self._intervals.looked_at(self.frame_number)
+        self.looked, self._looks = run, self._looks + run
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, frame, detections, weight)
         self._enter(part)
         self._predict(frame, pose, camera)
+        if not run:
+            self._lazy, self._latest, self.detections = None, Tracks.empty(), detections
+            return self._latest
         box = cxcywh_from_xyxy(detections.xyxy)
         track_of = self._associate(detections, box, lazy)  # (D,) row of the track's state, or -1
         self._update_states(detections, box, track_of)
@@ -498,18 +520,19 @@ class Tracker:
         return Tracks.empty() if self._latest is None else self._latest
 
     def predicted(self, frames: int = 5) -> Tracks:
-        """Return the boxes predicted in the latest frame for identities that were missed in it.
+        """Return the boxes predicted in the latest frame for identities not detected in it.
 
         They lie where the track's motion and the camera's lead, perhaps beyond the image's border.
 
         Args:
-            frames: since the last detection, at most; 5 has the best HOTA on benchmark.py's steady
-                stream of 50 objects (none .857, 1 .901, 5 .907, 10 .907).
+            frames: looked at since the last detection, at most; 5 has the best HOTA on
+                benchmark.py's steady stream of 50 objects (none .857, 1 .901, 5 .907, 10 .907).
         Returns:
             Tracks of score 0 and detection_index -1, as filled gaps are.
         """
         state = self.state
-        t = np.flatnonzero((state.identity >= 0) & (state.missed > 0) & (state.missed <= frames))
+        absent = (state.missed > 0) | (not self.looked)
+        t = np.flatnonzero((state.identity >= 0) & absent & (state.missed <= frames))
         t = t[state.mean[t, 0, 0] > OUT_OF_VIEW / 2]
         box, none = xyxy_from_cxcywh(state.mean[t, :, 0]), np.full(len(t), -1)
         ids = (np.full(len(t), self.frame_number), state.identity[t] + 1, state.tracklet[t])
@@ -558,7 +581,8 @@ class Tracker:
         in_view = np.ones(len(state.mean), bool)
         if pose is not None and camera is not None:
             in_view = self._follow_places(pose, camera, before)
-        state.missed += in_view | (state.missed == 0)
+        if self.looked:
+            state.missed += in_view | (state.missed == 0)
 
     def _follow_places(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
         """Move tracks of known place as the image of their ellipsoid or of their span does.
@@ -616,7 +640,7 @@ class Tracker:
         identity = confirmed.track_id - 1
         self.places.add(self.frame_number, identity, confirmed.xyxy, view)
         due = self.places.due
-        if self.frame_number % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
+        if self._looks % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
             self.places.refit(self._image_size)
 
     def _associate(self, detections: Detections, box: Array, lazy: LazyEmbeddings) -> IntArray:
@@ -767,7 +791,7 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
         soon = (state.identity[t] < 0) & (state.evidence[t] >= self.config.n_init - 1)
-        due = soon | (self.frame_number % max(1, self.config.embed_every) == 0)  # all in one pass
+        due = soon | (self._looks % max(1, self.config.embed_every) == 0)  # all in one pass
         self._calibrate_matches(detections, track_of, rows[lazy.done[rows] | due], lazy)
         rows = rows[due]
         t = track_of[rows]
@@ -944,7 +968,7 @@ class Tracker:
 
     def _saved(self) -> dict[str, tuple[Any, str]]:
         """List all that changes from frame to frame: owner and attribute, by its name in files."""
-        own = "frame_number last_seen identity_class _next_tracklet _last_pose part"
+        own = "frame_number _looks last_seen identity_class _next_tracklet _last_pose part"
         parts: dict[str, tuple[Any, Sequence[str]]] = {
             "tracker": (self, own.split()),
             "state": (self.state, [f.name for f in dataclasses.fields(TrackState)]),
@@ -953,6 +977,7 @@ class Tracker:
             "reid_calibration": (self.reid_calibration, SimilarityCalibration.ARRAYS),
             "match_calibration": (self.match_calibration, SimilarityCalibration.ARRAYS),
             "camera_motion": (self._camera_motion, CameraMotion.ARRAYS),
+            "intervals": (self._intervals, [f.name for f in dataclasses.fields(Intervals)]),
         }
         return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
 
@@ -972,7 +997,8 @@ def track(
     Args:
         video: a `Video`, or what makes one: file, folder of images, glob, camera index, stream URL.
         detector: function image -> detections (`OnnxDetector`, your own), a file of recorded
-            detections, or a `DetectionSource`; default: the default detector.
+            detections, or a `DetectionSource`; default: the default detector. A function that
+            returns None did not look at the frame.
         tracker: default: one with our embedder.
         poses: known cameras of the video; objects are then known by their place in 3D too.
     Yields:
@@ -985,10 +1011,10 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    told = CamerasOfFrames(poses, video.scale)
+    told, always = CamerasOfFrames(poses, video.scale), True if source.always_looks else None
     ahead = tracker.config.camera_motion and video.has_images and not video.is_live
     for frame in tracker._camera_motion.ahead(video) if ahead else video:
-        tracks = tracker.update(source(frame), frame.image, **told(frame.index))
+        tracks = tracker.update(source.look(frame), frame.image, looked=always, **told(frame.index))
         yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 
@@ -1168,8 +1194,8 @@ def _finish(
     result.edits = result.edits or kept_edits(workspace.out)
     with Progress("objects"):
         link_and_fit(result, config.objects)
-    gap = 0 if result.identities_given else config.output.fill_gaps
-    filled = fill(result, video.size, gap)  # by our own solids, whatever solver is asked for
+    gap, every = 0 if result.identities_given else config.output.fill_gaps, video.config.every
+    filled = fill(result, video.size, gap, every)  # by our own solids, whatever solver is asked for
     solve_again(result, config.objects)
     result.tracks, result.out = filled, workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in

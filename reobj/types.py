@@ -503,6 +503,20 @@ def frame_step(table: Tracks) -> int:
     return int(np.diff(frames).min()) if len(frames) > 1 else 1
 
 
+def looks(table: Tracks, looked: IntArray | None) -> tuple[IntArray, int]:
+    """Count the frames that the detector was run on.
+
+    Args:
+        looked: (F,) their numbers, ascending; None: all that were read, `frame_step` apart.
+    Returns:
+        (N,) a number of the frame of each row, and how much it grows from one such frame to the
+        next.
+    """
+    if looked is None:
+        return table.frame, frame_step(table)
+    return np.searchsorted(looked, table.frame), 1
+
+
 def object_classes(table: Tracks) -> dict[int, int]:
     """Return the class of each object: the one with the largest sum of scores."""
     objects, row = np.unique(table.track_id, return_inverse=True)

@@ -22,7 +22,7 @@ FLOORS = {
     1: "reobj.types",
     2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
     "reobj.sources.masks reobj.sources.tiles reobj.sources.image_files "
-    "reobj.sources.container_files reobj.runtime "
+    "reobj.sources.container_files reobj.runtime reobj.sources.looked "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video "
     "reobj.sources.weights "

@@ -271,6 +271,7 @@ class Result:
             here (no cameras, or read from a folder).
         embeddings: (n, E1) and (n, E2), fused: foreground and background of the rows
             `embedding_row` (n,) of the tracks that the tracker embedded.
+        looked: (F,) frames that the detector was run on, ascending; None: all that were read.
         identities_given: the user gave the identities; nothing may join, split or renumber them.
         seconds: wall time by stage. warnings: what the user should know. edits: made by hand.
         out: the folder that it was saved to or loaded from.
@@ -286,6 +287,7 @@ class Result:
     embeddings: Embeddings = field(default_factory=Embeddings.empty)
     embedding_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     untracked: Tracks = field(default_factory=Tracks.empty)
+    looked: IntArray | None = None
     identities_given: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -437,13 +439,14 @@ class Result:
 
     def save_tracked(self, path: Path) -> None:
         """Write tracks and embeddings, before anything is linked or fitted, as npz."""
+        looked = {} if self.looked is None else {"looked": self.looked}
         columns = {f.name: getattr(self.tracks, f.name) for f in dataclasses.fields(Tracks)}
         columns |= {f"untracked_{n}": getattr(self.untracked, n) for n in columns}
         columns |= {name: getattr(self.embeddings, name) for name in ("foreground", "background")}
         facts = {"class_names": self.class_names, "warnings": self.warnings,
                  "identities_given": self.identities_given,
                  "video": dataclasses.asdict(self.video), "version": __version__}  # fmt: skip
-        save_npz(path, columns | {"embedding_row": self.embedding_row}, **facts)
+        save_npz(path, columns | looked | {"embedding_row": self.embedding_row}, **facts)
 
     @staticmethod
     def load_tracked(path: Path) -> Result:
@@ -459,6 +462,7 @@ class Result:
                 untracked=Tracks(
                     *(data[f"untracked_{f.name}"] for f in dataclasses.fields(Tracks))
                 ),
+                looked=data.get("looked"),
                 identities_given=bool(facts["identities_given"]),
                 warnings=list(facts["warnings"]),
             )

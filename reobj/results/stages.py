@@ -103,12 +103,14 @@ def collect_tracks(
     found: list[Tracks] = []
     embedded: list[tuple[IntArray, Floats]] = []
     detected: list[Detections] = []
+    looked: list[bool] = []
     try:
         with Progress("track", video.expected) as progress:
             for frame, _ in steps:
                 frames.append(frame.index)
                 found.append(tracker.latest)
                 embedded.append(tracker.latest_embeddings())
+                looked.append(tracker.looked)
                 detected.append(dataclasses.replace(tracker.detections, masks=None))  # memory
                 progress.step()
     except KeyboardInterrupt:  # the way to end a live source
@@ -124,6 +126,8 @@ def collect_tracks(
     tracks = Tracks.concatenate(frames, found, video.scale)
     result = Result(tracks, source.class_names, VideoInfo.of(video))
     result.untracked = _untracked(tracks, frames, detected, video.scale)
+    if not all(looked):
+        result.looked = np.array(frames, np.int64)[np.array(looked, bool)]
     result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
     result.warnings += [*source.messages, *video.messages]
     if video.is_live:

@@ -30,6 +30,7 @@ from reobj.files import (
     read_lines,
     shortened,
 )
+from reobj.sources.looked import frames_looked_at, looked_message
 from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
 from reobj.sources.recorded import RecordedDetections, read_npz
 from reobj.sources.video import Video
@@ -111,6 +112,14 @@ def read_detections(
         ReobjError: names the file, the line and what was expected there.
     """
     path, config = Path(path), config or DetectConfig()
+    found = _read(path, video, config)
+    _note_looked(found, video.frame_count)
+    _check(found, path, config, video.frame_count)
+    return found
+
+
+def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
+    """Read a file of any format as it is, unchecked."""
     if not path.is_file():
         raise ReobjError(f"{path}: no such file of detections")
     names = load_class_names(config.class_names) if config.class_names else ()
@@ -124,8 +133,18 @@ def read_detections(
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise ReobjError(f"{path}: an entry is not as expected: {error!r}") from error
-    _check(found, path, config, video.frame_count)
     return found
+
+
+def _note_looked(found: RecordedDetections, frame_count: int) -> None:
+    """Note which frames the detector was run on: those that the file lists, else inferred."""
+    listed = found.looked is not None
+    if found.looked is None:
+        found.looked = frames_looked_at(found.frame, frame_count)
+    elif not 0 < len(found.looked) < (frame_count or sys.maxsize):
+        found.looked = None
+    if found.looked is not None:
+        found.messages.append(looked_message(found.looked, listed))
 
 
 def read_mot_rows(path: Path) -> Array:
@@ -370,6 +389,7 @@ def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetect
          for at, entry in enumerate(entries)],
         tuple(classes), video.size, video.working_size, np.arange(len(entries)), "entry", messages,
         np.array([entry.get("track_id", entry.get("instance_id", -1)) for entry in entries]),
+        np.array(sorted({f for f in frame_of.values() if f >= 0}), np.int64) if frame_of else None,
     )  # fmt: skip
 
 
@@ -530,9 +550,9 @@ def read_tracks(
     limit = dataclasses.replace(config, min_score=0.0, max_detections=sys.maxsize)
     if path.suffix.lower() in (".xml", ".zip"):
         found = _read_cvat(path, video)
-        _check(found, path, limit, video.frame_count)
     else:
-        found = read_detections(path, video, limit)
+        found = _read(path, video, limit)
+    _check(found, path, limit, video.frame_count)
     kind = found.identity.dtype.kind
     if len(found.identity) and (kind not in "iu" or found.identity.max() > WHOLE_MAX):
         raise ReobjError(f"{path}: identities are {found.identity.dtype}, expected whole numbers")

@@ -236,6 +236,7 @@ class DetectionCache:
         self.folder, self.image_size = Path(folder), image_size
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._fresh: dict[int, Detections] = {}  # by frame, not on disk yet
+        self._skipped: set[int] = set()  # frames that were not looked at; of this run only
         chunks = sorted(p for p in self.folder.glob("chunk_*.npz") if p.stem[6:].isdecimal())
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
@@ -250,14 +251,21 @@ class DetectionCache:
         chunk, done = read_npz(path, self.image_size, self.image_size, sealed=True)
         self._stored |= dict.fromkeys(done.tolist(), chunk)
 
+    def __contains__(self, index: int) -> bool:
+        """Tell whether a frame was put here, also one that was not looked at."""
+        return index in self._fresh or index in self._stored or index in self._skipped
+
     def get(self, index: int) -> Detections | None:
-        """Return the detections of a frame, None if it was not detected yet."""
+        """Return the detections of a frame, None if it was not detected yet or not looked at."""
         if index in self._fresh:
             return self._fresh[index]
         return self._stored[index].at(index) if index in self._stored else None
 
-    def put(self, index: int, detections: Detections) -> None:
-        """Store the detections of a frame, also when there are none."""
+    def put(self, index: int, detections: Detections | None) -> None:
+        """Store the detections of a frame, also when there are none or (None) nobody looked."""
+        if detections is None:
+            self._skipped.add(index)
+            return
         self._fresh[index] = detections
         if len(self._fresh) >= CACHE_FRAMES:
             self.flush()
@@ -280,33 +288,40 @@ class DetectionSource:
     """Answer for the detections of a frame, wherever they come from: `source(frame)`.
 
     Attributes:
-        detect: Frame -> Detections in px of its image.
+        detect: Frame -> Detections in px of its image; None: the frame is not looked at.
         class_names: by class id.
         key: changes with everything that the detections depend on besides the video; "": unknown,
             then nothing that follows from them may be cached either.
         messages: for the user.
         slow: worth keeping on disk. cache: where they are kept.
         recorded: those of a file, all known beforehand.
+        always_looks: where it finds nothing, there is nothing; None alone is a frame not looked at.
     """
 
-    detect: Callable[[Frame], Detections]
+    detect: Callable[[Frame], Detections | None]
     class_names: tuple[str, ...] = COCO_NAMES
     key: str = ""
     messages: Sequence[str] = ()
     slow: bool = False
     cache: DetectionCache | None = None
     recorded: RecordedDetections | None = None
+    always_looks: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "class_names", tuple(map(visible_name, self.class_names)))
 
     def __call__(self, frame: Frame) -> Detections:
-        """Return the detections of a frame, from the cache if they are there."""
-        found = None if self.cache is None else self.cache.get(frame.index)
-        if found is None:
-            found = self.detect(frame)
-            if self.cache is not None:
-                self.cache.put(frame.index, found)
+        """Return the detections of a frame; none of one that is not looked at."""
+        found = self.look(frame)
+        return Detections.empty() if found is None else found
+
+    def look(self, frame: Frame) -> Detections | None:
+        """Return the detections of a frame, from the cache if they are there; None: not looked."""
+        if self.cache is not None and frame.index in self.cache:
+            return self.cache.get(frame.index)
+        found = self.detect(frame)
+        if self.cache is not None:
+            self.cache.put(frame.index, found)
         return found
 
     def cached(self, folder: str | Path, image_size: tuple[int, int]) -> DetectionSource:
@@ -367,25 +382,33 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     Args:
         detector: a DetectionSource, RecordedDetections (asked by frame number), an OnnxDetector, or
             any function of a BGR image (H, W, 3) uint8 that returns what `Tracker.update` takes,
-            boxes in its px.
+            boxes in its px; None: it did not look at this image.
         class_names: of a function; ahead of its own attribute `class_names` or `names`
             (ultralytics) and of COCO's.
     """
     if isinstance(detector, DetectionSource):
         return detector
     if isinstance(detector, RecordedDetections):
+        looked = None if detector.looked is None else set(detector.looked.tolist())
+
+        def recorded(frame: Frame) -> Detections | None:
+            return detector.at(frame.index) if looked is None or frame.index in looked else None
+
+        names = detector.class_names
         return DetectionSource(
-            lambda frame: detector.at(frame.index), detector.class_names, "", detector.messages,
-            recorded=detector,
-        )  # fmt: skip
+            recorded, names, "", detector.messages, recorded=detector, always_looks=True
+        )
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
     names = tuple(class_names) or _own_names(detector)
 
-    def detect(frame: Frame) -> Detections:
+    def detect(frame: Frame) -> Detections | None:
         try:
-            found = as_detections(detector(frame.image))
+            made = detector(frame.image)
+            if made is None:
+                return None
+            found = as_detections(made)
         except ReobjError as error:
             raise ReobjError(f"frame {frame.index}: {error}") from error
         if len(found) and found.class_id.max() >= len(names):
@@ -393,7 +416,7 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
             raise ReobjError(f"frame {frame.index}: {text}")
         return found
 
-    return DetectionSource(detect, names)
+    return DetectionSource(detect, names, always_looks=isinstance(detector, OnnxDetector))
 
 
 def _own_names(detector: Any) -> tuple[str, ...]:

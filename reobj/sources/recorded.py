@@ -30,6 +30,7 @@ class RecordedDetections:
         line: (N,) where each stands in the file, counted in `unit`s, for messages.
         messages: what was dropped or assumed, for the user.
         identity: (N,) as the file has it, or empty.
+        looked: frames that the detector was run on, ascending; None: all.
     """
 
     frame: IntArray
@@ -44,6 +45,7 @@ class RecordedDetections:
     unit: str
     messages: list[str] = field(default_factory=list)
     identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    looked: IntArray | None = None
 
     def __post_init__(self) -> None:
         self.class_names = tuple(map(visible_name, self.class_names))
@@ -76,9 +78,9 @@ def pack_detections(
     """Pack (frame number, Detections) pairs into the arrays of our npz format.
 
     Returns:
-        frame (N,), xyxy (N, 4), score (N,), class_id (N,), class_names (C,), image_size (w, h), and
-        the run lengths of the masks: those of row i are mask_counts[mask_offsets[i] :
-        mask_offsets[i + 1]].
+        frame (N,), xyxy (N, 4), score (N,), class_id (N,), class_names (C,), image_size (w, h),
+        done (F,) the frames, and the run lengths of the masks: those of row i are
+        mask_counts[mask_offsets[i] : mask_offsets[i + 1]].
     """
     parts = [Detections.empty(), *(found for _, found in frames)]
     runs = [NO_RUNS]
@@ -99,6 +101,7 @@ def pack_detections(
         "image_size": np.array(size, np.int64),
         "mask_counts": np.concatenate(runs),
         "mask_offsets": np.cumsum([len(run) for run in runs]),
+        "done": np.unique(np.array([i for i, _ in frames], np.int64)),
     }
 
 
@@ -111,7 +114,8 @@ def write_detections_npz(
     """Write detections to an npz file for `read_detections`.
 
     Args:
-        frames: (frame number of the source, Detections) pairs; boxes and masks in its pixels.
+        frames: (frame number of the source, Detections) pairs of all frames that the detector was
+            run on, also those without a detection; boxes and masks in its pixels.
         class_names: by class id. image_size: (w, h) of the source.
     """
     save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
@@ -121,7 +125,12 @@ KINDS = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_
          "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
 
 
-SIZES = {"frame": LINES_MAX, "class_names": CLASS_MAX, "mask_counts": NPZ_MAX // 4}  # as uint32
+SIZES = {
+    "frame": LINES_MAX,
+    "done": LINES_MAX,
+    "class_names": CLASS_MAX,
+    "mask_counts": NPZ_MAX // 4,
+}  # as uint32
 
 
 def read_npz(
@@ -165,4 +174,15 @@ def read_npz(
         np.split(runs.astype(np.uint32), offsets[1:])[:count],
         tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
     )  # fmt: skip
-    return recorded, data.get("done", recorded.frame)
+    recorded.looked = _frames_done(data, path)
+    return recorded, recorded.frame if recorded.looked is None else recorded.looked
+
+
+def _frames_done(data: dict[str, Any], path: Path) -> IntArray | None:
+    """Return the frames, ascending, that a file says were looked at; None: it does not say."""
+    if "done" not in data:
+        return None
+    done = np.asarray(data["done"])
+    if done.ndim != 1 or (done.size and done.dtype.kind not in "iu"):
+        raise ReobjError(f"{path}: array done is {done.dtype} {done.shape}, expected frames (F,)")
+    return np.unique(done).astype(np.int64)
