@@ -93,9 +93,9 @@ from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
-    check_directions,
     poses_key,
     reconstruct_cached,
+    settled_poses,
     supplied_poses,
     write_supplied_model,
 )
@@ -1056,7 +1056,7 @@ def run(
         viewer = Viewer(VideoInfo.of(video)) if show else None
         seconds: dict[str, float] = {}
         in_3d = in_3d and config.poses.mode != "none"
-        poses = supplied_poses(video, config.poses, workspace) if in_3d else None
+        readings, poses = supplied_poses(video, config.poses) if in_3d else [], None
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
             boxes, names = result.tracks, result.class_names
@@ -1071,8 +1071,9 @@ def run(
             names = found.class_names
         check_known_size(config.objects, names)
         model = None
-        if poses is not None:
-            check_directions(poses, boxes if tracks else _tracklets(boxes))
+        if readings:
+            shown = boxes if tracks else _tracklets(boxes)
+            poses = settled_poses(readings, shown, video, config.poses, workspace)
         elif in_3d and not video.is_live:
             moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
             rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
@@ -1248,8 +1249,10 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     video = Video(args.video, config.input)
     with Workspace(args.out, args.overwrite) as workspace:
         workspace.bind(video, args.overwrite)
-        poses, model = supplied_poses(video, config.poses, workspace), None
-        if poses is None:
+        model = None
+        if readings := supplied_poses(video, config.poses):
+            poses = settled_poses(readings, Tracks.empty(), video, config.poses, workspace)
+        else:
             poses, model = reconstruct_cached(video, config.poses, workspace)
         with replaced(workspace.out, ("poses.txt", MODEL)) as new:
             copy_models(model or (), new)

@@ -116,9 +116,11 @@ class Camera:
         rows = np.flatnonzero(np.isfinite(flat).all(1))
         if len(rows):
             ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
-            ray, rows = ray[ray[:, 2] > 0], rows[ray[:, 2] > 0]
+            ahead = np.isfinite(ray).all(1) & (ray[:, 2] > 0)
+            ray, rows = ray[ahead], rows[ahead]
             back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
-            good = np.linalg.norm(back - flat[rows], axis=1) < INVERSE_PX
+            off = np.abs(back - flat[rows]).max(1, initial=0)  # of terms without bounds it is inf
+            good = off < INVERSE_PX
             ray, rows = ray[good], rows[good]
             ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
