@@ -59,7 +59,7 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.commands import SecretFormatter, make_parser, short_help
+from reobj.commands import SecretFormatter, make_parser, say, short_help, with_streams
 from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
 from reobj.identity.assignment import Pairs, ambiguous_pairs, assign, touching
 from reobj.identity.camera_motion import CameraMotion
@@ -93,16 +93,16 @@ from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
-    check_directions,
     poses_key,
     reconstruct_cached,
+    settled_poses,
     supplied_poses,
     write_supplied_model,
 )
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
-from reobj.results.folder import write_trajectories
+from reobj.results.folder import CONFIG_FILE, MODEL, copy_models, replaced, write_trajectories
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import (
@@ -114,7 +114,7 @@ from reobj.results.result import (
 )
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
-from reobj.results.workspace import CONFIG_FILE, Workspace
+from reobj.results.workspace import Workspace
 from reobj.schema import validate_objects
 from reobj.solvers import solve_again
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
@@ -1056,7 +1056,7 @@ def run(
         viewer = Viewer(VideoInfo.of(video)) if show else None
         seconds: dict[str, float] = {}
         in_3d = in_3d and config.poses.mode != "none"
-        poses = supplied_poses(video, config.poses, workspace) if in_3d else None
+        readings, poses = supplied_poses(video, config.poses) if in_3d else [], None
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
             boxes, names = result.tracks, result.class_names
@@ -1071,8 +1071,9 @@ def run(
             names = found.class_names
         check_known_size(config.objects, names)
         model = None
-        if poses is not None:
-            check_directions(poses, boxes if tracks else _tracklets(boxes))
+        if readings:
+            shown = boxes if tracks else _tracklets(boxes)
+            poses = settled_poses(readings, shown, video, config.poses, workspace)
         elif in_3d and not video.is_live:
             moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
             rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
@@ -1081,8 +1082,7 @@ def run(
             seconds["poses"] = time.monotonic() - started
         if not tracks:
             result = _track_video(video, workspace, config, found, poses, seconds, viewer)
-        workspace.save_last(result, poses)
-        workspace.publish_model(model)
+        workspace.save_last(result, poses, model or [])
         result.poses, result.seconds = poses, seconds
         result = _finish(result, video, workspace, config)
         if viewer is not None:
@@ -1104,7 +1104,8 @@ def refit(
     if tracks and edits:
         raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")
     with Workspace.open(out) as workspace:
-        result, video = workspace.load_last(), workspace.video()
+        result = workspace.load_last()
+        video = workspace.video() if tracks else workspace.video_or_facts(result)
         result.edits = read_edits(edits) if edits else None
         config = dataclasses.replace(config or _last_config(out), input=video.config)
         _check_objects(config.objects)
@@ -1112,7 +1113,7 @@ def refit(
         if tracks:
             poses = result.poses
             result = _given_tracks(tracks, video, config.detect, result)
-            workspace.save_last(result, poses)
+            workspace.save_last(result, poses, workspace.last_models())
             result.poses = poses
         return _finish(result, video, workspace, config)
 
@@ -1180,8 +1181,16 @@ def _given_tracks(
     )
 
 
-def _finish(result: Result, video: Video, workspace: Workspace, config: Config) -> Result:
-    """Link tracklets, fit one solid an object, and write all files of the output folder."""
+def _finish(
+    result: Result,
+    video: Video,
+    workspace: Workspace,
+    config: Config,
+) -> Result:
+    """Link tracklets, fit one solid an object, and write all files of the output folder.
+
+    The pictures come last: the results are written whatever becomes of them.
+    """
     started, poses = time.monotonic(), result.poses
     result.edits = result.edits or kept_edits(workspace.out)
     with Progress("objects"):
@@ -1198,14 +1207,20 @@ def _finish(result: Result, video: Video, workspace: Workspace, config: Config) 
     result.warnings += implausible(result, *scores)
     result.warnings += unused_sizes(config.objects, result.objects)
     started = time.monotonic()
-    shown = config.output
+    shown, models = config.output, workspace.last_models()
 
-    def pictures(folder: Path) -> None:
-        write_pictures(result, folder, video, shown.overlay, shown.scene, shown.doubtful)
+    def more(folder: Path) -> None:
+        write_config(config, folder / CONFIG_FILE)
+        if models is not None:
+            copy_models(models, folder)
+            write_supplied_model(poses, video, folder)
 
-    result.save(workspace.out, shown.doubtful, pictures)
-    write_config(config, workspace.out / CONFIG_FILE)
-    write_supplied_model(poses, video, workspace.out)
+    stale = (MODEL,) if models is not None or poses is None else ()
+    result.save(workspace.out, shown.doubtful, more, stale)
+    options = (shown.overlay, shown.scene, shown.doubtful)
+    if faults := write_pictures(result, workspace.out, video, *options):
+        result.warnings += faults
+        result.write_objects(workspace.out / "objects.json")
     result.seconds["write"] = time.monotonic() - started
     for warning in result.warnings:
         log.warning(warning)
@@ -1235,12 +1250,15 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     video = Video(args.video, config.input)
     with Workspace(args.out, args.overwrite) as workspace:
         workspace.bind(video, args.overwrite)
-        poses, model = supplied_poses(video, config.poses, workspace), None
-        if poses is None:
+        model = None
+        if readings := supplied_poses(video, config.poses):
+            poses = settled_poses(readings, Tracks.empty(), video, config.poses, workspace)
+        else:
             poses, model = reconstruct_cached(video, config.poses, workspace)
-        workspace.publish_model(model)
-        write_trajectories(workspace.out, poses)
-        write_supplied_model(poses, video, workspace.out)
+        with replaced(workspace.out, ("poses.txt", MODEL)) as new:
+            copy_models(model or (), new)
+            write_trajectories(new, poses)
+            write_supplied_model(poses, video, new)
     known, count = poses.known.sum(), len(poses.frame)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
@@ -1266,10 +1284,10 @@ def _cmd_eval(args: argparse.Namespace) -> int:
         poses = next((p for p in beside if p.exists()), None)
     classes = [c.strip() for c in args.classes.split(",") if c.strip()]
     scores = evaluate(args.out, args.gt, args.gt_objects, poses, classes, args.min_visibility)
-    print(score_report(scores))
     if args.out.is_dir():
         with atomic(args.out / "eval.json") as part:
             part.write_text(json.dumps(scores, indent=1))
+    print(score_report(scores))
     return 0
 
 
@@ -1295,31 +1313,34 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Ctrl-C is the way to end a live source: its files are written, and 0 is returned.
     """
-    parser, words = _parser(), list(sys.argv[1:] if argv is None else argv)
-    if (text := short_help(parser, words)) is not None:
-        print(text, file=sys.stderr)
-        return 2
-    args = parser.parse_args(words)
-    level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
-    logging.addLevelName(logging.WARNING, "warning")
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(SecretFormatter("%(levelname)s: %(message)s"))
-    logging.basicConfig(level=level, handlers=[handler], force=True)
+    return with_streams(lambda: _main(list(sys.argv[1:] if argv is None else argv)))
+
+
+def _main(words: Sequence[str]) -> int:
+    """Parse the words and run the command; an exception becomes a message and an exit code."""
+    parser, args = _parser(), None
     try:
+        if (text := short_help(parser, words)) is not None:
+            say(text)
+            return 2
+        args = parser.parse_args(words)
+        level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
+        logging.addLevelName(logging.WARNING, "warning")
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(SecretFormatter("%(levelname)s: %(message)s"))
+        logging.basicConfig(level=level, handlers=[handler], force=True)
         return int(args.func(args))
     except KeyboardInterrupt:
-        text = "interrupted: what was computed is kept; run the same command again to go on"
-        print(f"\n{text}", file=sys.stderr)
+        say("\ninterrupted: what was computed is kept; run the same command again to go on")
         return 130
-    except BrokenPipeError:  # the reader of our output (head, less) has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except BrokenPipeError:  # `with_streams` handles it
+        raise
     except Exception as error:
         expected = isinstance(error, ReobjError | quadrics.QuadricsError | OSError)
         text = f"error: {one_line(str(error))}"
-        if args.debug or not expected:
+        if not expected or (args is not None and args.debug):
             text = without_secrets(traceback.format_exc())
-        print(text, file=sys.stderr)
+        say(text)
         return 2 if expected else 1
 
 

@@ -9,10 +9,12 @@ are written (npz, TUM, COLMAP).
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
+import importlib
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,17 +27,39 @@ from reobj.files import atomic, load_npz, save_npz
 from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers
 
 
-def import_pycolmap() -> Any:
-    """Import pycolmap when it is needed: without its log on stderr, and SIGTERM still ends us."""
-    if "pycolmap" in sys.modules:
-        return sys.modules["pycolmap"]
-    handler = signal.getsignal(signal.SIGTERM)
-    import pycolmap
+@contextlib.contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Keep what this process does on signals, whatever a package that is loaded here installs.
 
-    with contextlib.suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGTERM, handler or signal.SIG_DFL)
-    pycolmap.logging.minloglevel = 3
-    return pycolmap
+    By the C library, because Python sets handlers in the main thread only; what it stores of one
+    (struct sigaction, 152 bytes on Linux) is handed back unread.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    libc, before = ctypes.CDLL(None), {}
+    for name in ("SIGTERM", "SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL"):  # glog's
+        before[int(signal.Signals[name])] = ctypes.create_string_buffer(1024)
+    for number, action in before.items():
+        libc.sigaction(number, None, action)
+    try:
+        yield
+    finally:
+        for number, action in before.items():
+            libc.sigaction(number, action, None)
+
+
+def import_pycolmap() -> Any:
+    """Import pycolmap when it is needed: without its log on stderr and its handlers of signals.
+
+    They print a C++ trace where a process is ended (SIGTERM), also in processes forked from it.
+    """
+    if "pycolmap" not in sys.modules:
+        with _signals_kept():
+            import pycolmap
+
+        pycolmap.logging.minloglevel = 3
+    return importlib.import_module("pycolmap")  # waits for another thread that imports it
 
 
 def camera_parameters(model: str) -> list[str]:
@@ -92,9 +116,11 @@ class Camera:
         rows = np.flatnonzero(np.isfinite(flat).all(1))
         if len(rows):
             ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
-            ray, rows = ray[ray[:, 2] > 0], rows[ray[:, 2] > 0]
+            ahead = np.isfinite(ray).all(1) & (ray[:, 2] > 0)
+            ray, rows = ray[ahead], rows[ahead]
             back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
-            good = np.linalg.norm(back - flat[rows], axis=1) < INVERSE_PX
+            off = np.abs(back - flat[rows]).max(1, initial=0)  # of terms without bounds it is inf
+            good = off < INVERSE_PX
             ray, rows = ray[good], rows[good]
             ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))

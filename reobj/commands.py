@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -50,6 +52,57 @@ class SecretFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
         return without_secrets(super().format(record))
+
+
+def with_streams(program: Callable[[], int]) -> int:
+    """Run a program whose standard streams may be closed, full, or a pipe that nobody reads.
+
+    Returns:
+        the exit code of the program; 0 where the reader of its output (head, less) has seen enough
+        before it ended; 2 where the output cannot be written.
+    Raises:
+        SystemExit: of argparse, after --help and for wrong words.
+    """
+    for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:  # closed: a file opened next would get its number, and C code's messages
+            while os.open(os.devnull, os.O_RDWR) < number:
+                pass
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r+"))
+    code, left = 0, None
+    try:
+        code = program()
+    except BrokenPipeError:
+        pass
+    except SystemExit as error:
+        left = error
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        _discard(sys.stdout)
+        if not isinstance(error, BrokenPipeError):
+            say(f"error: the output cannot be written ({error.strerror})")
+            return 2
+    if left is not None:
+        raise left
+    return code
+
+
+def say(text: str) -> None:
+    """Print a line on stderr, if anyone reads it."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except OSError:
+        _discard(sys.stderr)
+
+
+def _discard(stream: Any) -> None:
+    """Send what is left in a buffer nowhere, so that the interpreter's own flush succeeds."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 class _ListOptions(argparse.Action):

@@ -60,6 +60,7 @@ DISK_ERRORS = {
     errno.EPERM: "choose a folder that you may write into",
     errno.EEXIST: "a file stands where a folder should be: move it away",
     errno.ENOTDIR: "a file stands where a folder should be: move it away",
+    errno.EISDIR: "a folder stands where a file should be: move it away",
     errno.EIO: "look at the disk: it fails",
 }  # what to do about them
 NUMPY_FULL = re.compile(r"\d+ requested and \d+ written")  # its error without a number
@@ -145,7 +146,11 @@ def staged(folder: Path) -> Iterator[Path]:
     """Yield an empty folder whose files replace those of `folder` at the end of the block.
 
     All of them are there before the first one is replaced: an exception in the block leaves
-    `folder` as it was. Files that were not made anew stay.
+    `folder` as it was, and so does a folder where a file belongs. Files that were not made anew
+    stay.
+
+    Raises:
+        ReobjError: as `check_places`, or the disk is why it cannot be written.
     """
     part = folder / PART_RESULTS
     with writing(folder):
@@ -153,13 +158,28 @@ def staged(folder: Path) -> Iterator[Path]:
         part.mkdir(parents=True)
         try:
             yield part
-            for file in sorted(part.rglob("*")):
-                if file.is_file():
-                    target = folder / file.relative_to(part)
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    file.replace(target)
+            made = [file.relative_to(part) for file in sorted(part.rglob("*")) if file.is_file()]
+            check_places(folder, made)
+            for name in made:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (part / name).replace(folder / name)
         finally:
             shutil.rmtree(part, ignore_errors=True)
+
+
+def check_places(folder: Path, names: Iterable[str | Path]) -> None:
+    """Refuse files (paths within a folder) that cannot be replaced by new ones of that name.
+
+    Raises:
+        ReobjError: a folder is where a file belongs, or something else where a folder belongs.
+    """
+    for name in map(Path, names):
+        above = [folder / parent for parent in name.parents[:-1]]
+        for path in above:
+            if os.path.lexists(path) and not path.is_dir():
+                raise ReobjError(f"{path}: is no folder, but one is written here; move it away")
+        if (path := folder / name).is_dir() and not path.is_symlink():
+            raise ReobjError(f"{path}: is a folder, but a file is written here; move it away")
 
 
 def _sync(path: Path) -> None:
@@ -320,7 +340,7 @@ class Progress:
         self.stage, self.total, self.done = stage, total, 0
         self.started = self.shown = time.monotonic()
         self.marks = [(self.started, 0)]  # time and steps, of the last WINDOW_S
-        self.enabled = sys.stderr.isatty()
+        self.enabled = sys.stderr is not None and sys.stderr.isatty()
 
     def __enter__(self) -> Progress:
         if self.enabled:

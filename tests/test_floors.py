@@ -21,25 +21,28 @@ FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
     2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
-    "reobj.sources.masks reobj.sources.tiles "
+    "reobj.sources.masks reobj.sources.tiles reobj.sources.image_files "
+    "reobj.sources.container_files reobj.runtime "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video "
     "reobj.sources.weights "
-    "reobj.sources.recorded reobj.sources.looked reobj.poses.child reobj.poses.uncertainty "
+    "reobj.sources.recorded reobj.sources.looked reobj.poses.child reobj.poses.simple_yaml "
+    "reobj.poses.uncertainty "
     "reobj.results.edits",
     4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.detection_files "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
     "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "
     "reobj.poses.soundness "
     "reobj.poses.adjustment "
-    "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
-    "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film "
+    "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching reobj.poses.pose_file "
+    "reobj.poses.checks reobj.poses.evidence reobj.poses.floor reobj.results.ply reobj.results.film "
     "reobj.results.folder",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
-    "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
+    "reobj.poses.mapping reobj.poses.localize reobj.poses.colmap_model reobj.poses.pose_formats "
+    "reobj.poses.points "
     "reobj.poses.depth reobj.results.result",
-    6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
+    6: "reobj.poses.readers reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
     "reobj.results.workspace "
     "reobj.results.overlay reobj.results.solids reobj.results.truth reobj.results.plausibility",
     7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "

@@ -38,13 +38,19 @@ class PosesConfig:
     )
     fmt: str = option(
         "auto",
-        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit",
+        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit, matrices, "
+        "euroc, stray, arkitscenes, scannetpp, llff, splatting, rows",
         "--pose-format",
+    )
+    frames_by: str = option(
+        "",
+        "how supplied poses find their frames where the file leaves it open (an error names the "
+        "ways): number0, number1, every6, time, order, ...",
     )
     camera: str = option(
         "",
         "intrinsics, native pixels (COLMAP: centre + .5): fx,fy,cx,cy[,k1,k2,p1,p2[,k3]], "
-        "MODEL WIDTH HEIGHT PARAMS, or a file (cameras.txt, K.txt, intrinsics.json)",
+        "MODEL WIDTH HEIGHT PARAMS, or a file (cameras.txt, K.txt, intrinsics.json, camera.yaml)",
         "--camera",
     )
     metric: bool = option(False, "supplied poses are in metres, whatever their format", "--metric")

@@ -12,7 +12,14 @@ import numpy as np
 
 from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import stated_camera
-from reobj.poses.matching import numbers_of_times, rows_by_number
+from reobj.poses.matching import (
+    UNITS,
+    Source,
+    by_numbers,
+    numbers_of_names,
+    numbers_of_times,
+    unit_of_stamps,
+)
 from reobj.poses.readers import PoseFile, read_pose_file
 from reobj.sources.detection_files import (
     DetectConfig,
@@ -22,8 +29,9 @@ from reobj.sources.detection_files import (
     read_tracks,
     recorded_times,
 )
+from reobj.sources.image_files import sorted_names
 from reobj.sources.imageless import ImagelessVideo
-from reobj.sources.video import InputConfig, Video, by_number
+from reobj.sources.video import InputConfig, Video
 from reobj.types import ReobjError
 
 
@@ -60,8 +68,8 @@ def open_video(
     stated = stated_camera(poses.camera, size)
     size = size or (unknown if stated is None else (stated.width, stated.height))
     given = read_pose_file(Path(posed), poses.fmt, size)
-    if size == unknown and given.camera is not None:
-        size = (given.camera.width, given.camera.height)
+    if size == unknown and (own := next(filter(None, given.cameras), None)) is not None:
+        size = (own.width, own.height)
     if size == unknown:
         raise ReobjError(f"{posed}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS")
     video = _frames_of(given, path, size, posed, config)
@@ -86,19 +94,27 @@ def _frames_of(
         return ImagelessVideo(source, size, config, times_s=times_s)
     first = ImagelessVideo(source, size, config)
     images = {Path(name).name for name in image_names(boxes) or given.names}
-    names = sorted(images, key=by_number)
+    names = sorted_names(images)
     if boxes.suffix.lower() not in (".xml", ".zip"):
         found = read_detections(boxes, first, DetectConfig(min_score=0.0)).frame
     else:
         found = read_tracks(boxes, first)[0].frame
     count = int(found.max(initial=-1)) + 1
     if names and count > len(names):
-        row = rows_by_number(names, np.arange(count), ())
-        names = [names[r] if r >= 0 else "" for r in row]
+        number = numbers_of_names(names, source)
+        every = Source(np.arange(count), np.arange(count) / 1.0, count)
+        ways = [r for r in by_numbers(number, every, "numbers", source) if not r.outside]
+        if len(ways) != 1:
+            last = int(number.max()) + 1
+            return ImagelessVideo(source, size, config, count=count if ways else max(count, last))
+        names = [names[r] if r >= 0 else "" for r in ways[0].row]
     if names:
         return ImagelessVideo(source, size, config, names=names)
-    rows, stamps_s = len(given.cam_from_world), given.stamps_s
+    rows, stamps_s = len(given.cam_from_world), given.stamps
     if stamps_s is not None:
+        stamps_s = stamps_s / (
+            dict(UNITS)[given.unit] if given.unit else unit_of_stamps(stamps_s)[1]
+        )
         number = numbers_of_times(stamps_s)
         times_s = np.interp(np.arange(number[-1] + 1), number, stamps_s)
         rows = len(times_s)

@@ -142,11 +142,13 @@ def reconstruct(
 
 
 MAPPING = "mapping"  # stage of the child that takes one core
-LATER = ("pycolmap", "onnxruntime", "filterpy.kalman", "av")  # packages of later stages
+LATER = ("onnxruntime", "filterpy.kalman", "av")  # packages of later stages, beside pycolmap
 
 
 def _import_ahead() -> None:
     """Import what later stages need, while this process waits."""
+    with contextlib.suppress(ImportError):
+        import_pycolmap()  # leaves signals alone, which a plain import does not
     for name in LATER:
         with contextlib.suppress(ImportError):  # optional, or said where it is needed
             importlib.import_module(name)

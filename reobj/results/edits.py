@@ -146,15 +146,11 @@ def _box_ref(item: Any) -> BoxRef:
 
 
 def write_edits(folder: Path, edits: Edits | None) -> None:
-    """Keep edits in an output folder, for later fits; an empty list removes those that it has."""
-    path = folder / EDITS
-    if edits is None:
-        return
-    if not edits.edits:
-        path.unlink(missing_ok=True)
+    """Write edits into a new folder of results, for later fits; an empty list makes no file."""
+    if edits is None or not edits.edits:
         return
     data = {"format": FORMAT, "version": FORMAT_VERSION, "edits": edits.entries}
-    with atomic(path) as part:
+    with atomic(folder / EDITS) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
 
 

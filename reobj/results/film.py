@@ -69,12 +69,14 @@ class FilmWriter:
         self.part = self.path.with_name(f".part-{self.path.name}")
         shrink = min(1.0, (VP8_SIZE_PX if av is None else H264_SIZE_PX) / max(size))
         self.every = 1 if av else math.ceil(fps / VP8_FPS - 1e-3)  # 30.0001 fps is 30
-        self.size = (int(size[0] * shrink) // 2 * 2, int(size[1] * shrink) // 2 * 2)
+        self.size = (max(int(size[0] * shrink) // 2, 1) * 2, max(int(size[1] * shrink) // 2, 1) * 2)
         self.count = 0
-        with self._named():
+        with self._named(), contextlib.ExitStack() as stack:
+            stack.callback(self.part.unlink, missing_ok=True)
             self.part.touch()  # PyAV finds out at the first frame only
             made = (self.part, fps / self.every, self.size)
             self.sink = _VP8(*made) if av is None else _H264(av, *made)
+            stack.pop_all()
         self.encoder = ThreadPoolExecutor(1)  # encodes a frame while the next one is drawn
         self.pending: Future[None] | None = None
 

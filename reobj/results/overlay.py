@@ -21,7 +21,8 @@ import quadrics
 from reobj.cameras import Camera
 from reobj.results.film import FilmWriter
 from reobj.results.result import Result
-from reobj.sources.video import IMAGE_FPS, Video
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
 
 LAYERS = ("boxes", "solids", "ellipses", "trails")
@@ -345,10 +346,8 @@ def draw_wireframes(
     line = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
     pixels = scale * image_points(camera, line) - 0.5  # OpenCV draws with the pixel's centre at 0
     solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are in a row
-    own = {
-        k: slice(a, b)
-        for k, a, b in zip(solids.tolist(), first, [*first[1:], len(edge)], strict=True)
-    }
+    ends_at = np.append(first, len(edge))[1:]  # as many as solids, also of none
+    own = {k: slice(a, b) for k, a, b in zip(solids.tolist(), first, ends_at, strict=True)}
     for k in sorted(own, key=lambda k: -ends[own[k], :, 2].mean()):  # near ones last
         mine, obj = own[k], object_id[k]
         if not drawn[k] or not _fits(pixels[mine], image):

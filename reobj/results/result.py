@@ -36,8 +36,8 @@ from reobj.files import (
     wrapped,
 )
 from reobj.poses.floor import Floor
-from reobj.results.edits import Edits, write_edits
-from reobj.results.folder import LAST_POSES, replaced, write_mot, write_trajectories
+from reobj.results.edits import EDITS, Edits, write_edits
+from reobj.results.folder import LAST_POSES, STALE, replaced, write_mot, write_trajectories
 from reobj.results.ply import write_ply
 from reobj.schema import faults, objects_schema
 from reobj.sources.detection_files import read_mot_rows
@@ -347,18 +347,28 @@ class Result:
         return quadrics.Ellipsoids(center, half_axes, axes)
 
     def save(
-        self, out: str | Path, doubtful: bool = False, more: Callable[[Path], None] | None = None
+        self,
+        out: str | Path,
+        doubtful: bool = False,
+        more: Callable[[Path], None] | None = None,
+        stale: Sequence[str] = (),
     ) -> None:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
 
         Doubtful objects are in objects.json, in tracks.txt only if `doubtful`. Of several parts
         each has its own poses and objects: poses_part1.txt, objects_part1.ply, ... All of them
-        appear together, when all are complete, instead of those of an earlier run, pictures too;
-        so does what `more` writes into the folder that it is given.
+        appear together, when all are complete, instead of those of an earlier run, whose film and
+        page are removed.
+
+        Args:
+            more: writes more files into the folder that it is given; they appear with the others.
+            stale: names that are removed where `more` does not write them.
         """
-        with replaced(Path(out)) as new:
+        edited = () if self.edits is None else (EDITS,)
+        with replaced(Path(out), (*STALE, *edited, *stale)) as new:
             write_mot(new / "tracks.txt", (self if doubtful else self.without_doubtful()).tracks)
-            self._write_objects(new / "objects.json")
+            self.write_objects(new / "objects.json")
+            write_edits(new, self.edits)
             if self.poses is not None:
                 save_poses(new / LAST_POSES, self.poses)
                 write_trajectories(new, self.poses)
@@ -369,7 +379,6 @@ class Result:
             if more is not None:
                 more(new)
         self.out = Path(out)
-        write_edits(self.out, self.edits)
 
     @staticmethod
     def load(out: str | Path) -> Result:
@@ -518,7 +527,8 @@ class Result:
             lines += wrapped(f"part {k}: " + "; ".join(facts))
         return lines
 
-    def _write_objects(self, path: Path) -> None:
+    def write_objects(self, path: Path) -> None:
+        """Write objects.json."""
         versions = {}
         for name in ("numpy", "scipy", "opencv-python-headless", "pycolmap", "onnxruntime"):
             with contextlib.suppress(PackageNotFoundError):  # installed under another name

@@ -8,9 +8,13 @@ The page's sources are in page/, beside this file: page.html names the others, t
 from __future__ import annotations
 
 import base64
+import contextlib
+import dataclasses
 import json
 import math
+import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +28,19 @@ from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.poses.floor import NOISE
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.result import Object, Result, World, sides, significant
-from reobj.sources.video import IMAGE_FPS, Video, shrunk
-from reobj.types import Frame, Image, IntArray, Tracks, object_color, rows_by
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.sources.video import Video, shrunk
+from reobj.types import (
+    Frame,
+    Image,
+    IntArray,
+    ReobjError,
+    Tracks,
+    log,
+    object_color,
+    one_line,
+    rows_by,
+)
 
 # Chosen so that the page of a video of three minutes with 50 objects stays below 10 MB.
 SCENE_CROPS = 8  # pictures of each object in scene.html
@@ -309,32 +324,82 @@ def write_pictures(
     overlay: str = "solids",
     scene: bool = True,
     doubtful: bool = False,
-) -> None:
+) -> list[str]:
     """Write the film and scene.html in one pass over the video.
+
+    Each file appears only when it is complete. A live source cannot be read again, and frames may
+    have no images: no overlay then, and a page without pictures.
 
     Args:
         overlay: what the film shows (`film_layers`); "none": no film.
         doubtful: show doubtful objects in the film, and at first on the page, which holds them.
-
-    Each file appears only when it is complete. A live source cannot be read again, and frames may
-    have no images: no overlay then, and a page without pictures.
+    Returns:
+        what could not be made, why, and the option that leaves it out. With the environment
+        variable REOBJ_RAISE, as in our tests, faults of the program are raised instead.
     """
     visible = video.has_images and not video.is_live
-    drawn = film_layers(overlay) and visible
     shown = result if doubtful else result.without_doubtful()
-    film = Overlay(shown, out / "overlay.mp4", video, overlay) if drawn else None
-    pictures = Pictures(result, video) if scene else None
-    sinks = [sink for sink in (film, pictures) if sink is not None and visible]
+    faults = _Faults()
+    film = pictures = None
+    if film_layers(overlay) and visible:
+        with faults.of("overlay"):
+            film = Overlay(shown, out / "overlay.mp4", video, overlay)
+    if scene:
+        with faults.of("scene"):
+            pictures = Pictures(result, video)
+    sinks = [(n, sink) for n, sink in (("overlay", film), ("scene", pictures)) if sink and visible]
     progress, complete = Progress("write", video.expected), False
     try:
-        for frame in video if sinks else ():
-            for sink in sinks:
-                sink.take(frame)
-            progress.step()
-        complete = True
+        with faults.of("video"):
+            for frame in video if sinks else ():
+                for name, sink in sinks:
+                    if name not in faults.found:
+                        with faults.of(name):
+                            sink.take(frame)
+                progress.step()
+        complete = "video" not in faults.found
     finally:
         progress.close(complete)
         if film is not None:
-            film.close(complete)
-    if pictures is not None:
-        write_scene(result, pictures, out / "scene.html", video, doubtful)
+            with faults.of("overlay"):
+                film.close(complete and "overlay" not in faults.found)
+    if pictures is not None and "scene" not in faults.found:
+        with faults.of("scene"):
+            page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
+            write_scene(page, pictures, out / "scene.html", video, doubtful)
+    return faults.messages()
+
+
+class _Faults:
+    """What went wrong with the pictures of a result, each once.
+
+    Attributes:
+        found: the first error of each: "video", and the options of the section `output`.
+    """
+
+    def __init__(self) -> None:
+        self.found: dict[str, Exception] = {}
+
+    @contextlib.contextmanager
+    def of(self, name: str) -> Iterator[None]:
+        """Keep an exception of the block."""
+        try:
+            yield
+        except Exception as error:
+            if not isinstance(error, ReobjError | OSError) and os.environ.get("REOBJ_RAISE"):
+                raise
+            log.debug("pictures: fault in %s", name, exc_info=True)
+            self.found.setdefault(name, error)
+
+    def messages(self) -> list[str]:
+        """Name what is missing, the reason, and the option to leave it out."""
+        texts = {
+            "video": "no film, and a page without the pictures from there on: reading the video "
+            "again failed with {} (--set output.overlay=none leaves the film out)",
+            "overlay": "no film: {} (--set output.overlay=none leaves it out)",
+            "scene": "no scene.html: {} (--set output.scene=false leaves it out)",
+        }
+        return [
+            one_line(texts[name].format(f"{type(error).__name__}: {error}"))
+            for name, error in self.found.items()
+        ]

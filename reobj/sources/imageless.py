@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reobj.sources.video import IMAGE_FPS, InputConfig, Video, source_fingerprint, times_of_names
+from reobj.sources.image_files import IMAGE_FPS, times_of_names
+from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.types import Frame, ReobjError
 
 NO_IMAGE: Any = None
@@ -51,7 +52,7 @@ class ImagelessVideo(Video):
         self.scale = 1.0
         self.names, self.files = list(names), []
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
-        self.times_s = given
+        self.times_s, self.times_are_known = given, given is not None
         self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
         if given is not None and len(given) < self.frame_count:
             what = f"{len(given)} times of {self.frame_count} frames"
