@@ -43,7 +43,6 @@ import dataclasses
 import json
 import logging
 import math
-import os
 import sys
 import time
 import traceback

@@ -391,7 +391,7 @@ def write_tum(path: Path, poses: Poses) -> None:
     xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
     units = "units: metres" if poses.metric else NO_SCALE
-    rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
+    rows = [" ".join([f"{row[0]:.9f}", *(f"{v:.12g}" for v in row[1:])]) for row in table]
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:
         part.write_text("\n".join([header, *rows]) + "\n")

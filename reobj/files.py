@@ -41,14 +41,27 @@ def atomic(path: Path) -> Iterator[Path]:
         ReobjError: the disk is full, may not be written, or fails: where, why and what to do.
     """
     part = path.with_name(f".part-{path.name}")
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path), _folder(path.parent):
         try:
             yield part
             _sync(part)
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _folder(path: Path) -> Iterator[None]:
+    """Make a folder; those that were not there are removed again if the block fails."""
+    new = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in new:
+            with contextlib.suppress(OSError):  # not empty
+                folder.rmdir()
+        raise
 
 
 DISK_ERRORS = {
@@ -142,20 +155,22 @@ PART_RESULTS = ".part-results"
 
 
 @contextlib.contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def staged(folder: Path, name: str = PART_RESULTS) -> Iterator[Path]:
     """Yield an empty folder whose files replace those of `folder` at the end of the block.
 
     All of them are there before the first one is replaced: an exception in the block leaves
     `folder` as it was, and so does a folder where a file belongs. Files that were not made anew
     stay.
 
+    Args:
+        name: of the empty folder, in `folder`.
     Raises:
         ReobjError: as `check_places`, or the disk is why it cannot be written.
     """
-    part = folder / PART_RESULTS
-    with writing(folder):
+    part = folder / name
+    with writing(folder), _folder(folder):
         shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
+        part.mkdir()
         try:
             yield part
             made = [file.relative_to(part) for file in sorted(part.rglob("*")) if file.is_file()]
@@ -413,6 +428,15 @@ def shortened(items: Sequence[Any]) -> str:
     return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
 
 
+def cut(text: str, most: int) -> str:
+    """Shorten a text to at most `most` characters.
+
+    >>> cut("refrigerator", 8)
+    'refri...'
+    """
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 PRINT_WIDTH = 100  # columns of what is printed
 
 
@@ -467,9 +491,22 @@ def texts_with_sigma(values: Array, sigma: Array | None) -> list[tuple[str, ...]
     return [(f"{a:.{digits}f}", f"{b:.{digits}f}") for a, b in zip(values, sigma, strict=True)]
 
 
-def numbers(values: Array) -> list[float]:
-    """Round to six significant digits, for JSON: far below any accuracy, and stable text."""
-    return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
+def numbers(values: Array, size: float = math.inf) -> list[float]:
+    """Round to six significant digits, for JSON: far below any accuracy, and stable text.
+
+    Args:
+        size: of what lies at these coordinates; they are rounded to a millionth of it where that is
+            finer: those of a map projection have seven digits before the point.
+
+    >>> numbers(np.array([5400000.1234567, 0.00012345678]), 0.9)
+    [5400000.123457, 0.000123457]
+    """
+    kept = [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
+    if not 0 < size < math.inf:
+        return kept
+    fine = [round(float(v), 6 - math.ceil(math.log10(size))) for v in np.asarray(values).ravel()]
+    pairs = zip(np.asarray(values).ravel(), kept, fine, strict=True)
+    return [min(a, b, key=lambda text: abs(text - v)) for v, a, b in pairs]
 
 
 def base64_text(values: npt.NDArray[Any], kind: str) -> str:

@@ -40,10 +40,11 @@ FLOORS = {
     "reobj.poses.depth reobj.results.result",
     6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
     "reobj.results.workspace "
-    "reobj.results.overlay reobj.results.solids reobj.results.plausibility",
+    "reobj.results.origin reobj.results.solids reobj.results.plausibility",
     7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
-    "reobj.results.stages reobj.results.export reobj.results.scene",
-    8: "reobj_track",
+    "reobj.results.stages reobj.results.export reobj.results.overlay",
+    8: "reobj.results.scene",
+    9: "reobj_track",
 }
 FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {  # optional, or slow to load
