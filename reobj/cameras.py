@@ -420,7 +420,7 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
         f"{i + 1} {' '.join(map(repr, row))} 1 {image_names[i]}\n\n"
         for i, row in zip(np.flatnonzero(poses.known).tolist(), values.tolist(), strict=True)
     ]
-    (path / "images.txt").write_text("".join(lines))
+    (path / "images.txt").write_text("".join(lines), "utf-8", "surrogateescape")
     points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
     rows = [" ".join(map(repr, (i, *xyz, *rgb, 0))) for i, (xyz, rgb) in enumerate(points, 1)]
     (path / "points3D.txt").write_text("".join(f"{row}\n" for row in rows))

@@ -230,14 +230,14 @@ JSON_BYTES = {"{": 200, "[": 64, ",": 64}  # that what follows takes, about (sys
 NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
 
 
-def read_text(path: Path, most: int | None = None) -> str:
+def read_text(path: Path, most: int | None = None, errors: str = "strict") -> str:
     """Read a UTF-8 file, with or without a byte order mark.
 
-    most: characters that it may have; default: TEXT_MAX.
+    most: characters that it may have; default: TEXT_MAX. errors: as in `open`.
     """
     most = most or TEXT_MAX
     try:
-        with path.open(encoding="utf-8-sig") as file:
+        with path.open(encoding="utf-8-sig", errors=errors) as file:
             text = file.read(most + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ReobjError(f"{path}: cannot be read as text ({error})") from error

@@ -11,6 +11,8 @@ import dataclasses
 import itertools
 import json
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,7 @@ from reobj.types import (
     log,
     object_classes,
     object_color,
+    visible_name,
 )
 
 
@@ -165,7 +168,7 @@ def export_cvat(result: Result, path: Path) -> None:
     root = ET.Element("annotations")
     ET.SubElement(root, "version").text = "1.1"
     task = ET.SubElement(ET.SubElement(root, "meta"), "task")
-    for key, value in (("name", Path(video.path).name), ("mode", "interpolation"),
+    for key, value in (("name", visible_name(Path(video.path).name)), ("mode", "interpolation"),
                        ("start_frame", 0), ("stop_frame", max(frames, default=0))):  # fmt: skip
         ET.SubElement(task, key).text = str(value)
     labels, size = ET.SubElement(task, "labels"), ET.SubElement(task, "original_size")
@@ -419,7 +422,8 @@ class Viewer:
             raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
         self.rr, self.video, self.followed = rr, video, False
         self.shrink = min(1.0, RRD_SIZE_PX / max(video.width, video.height, 1))
-        self.rec = rr.RecordingStream("reobj_track", recording_id=Path(video.path).name)
+        name = visible_name(Path(video.path).name)
+        self.rec = rr.RecordingStream("reobj_track", recording_id=name)
         self.rec.set_log_time_enabled(False)  # when the export was made is of no interest
         if start is None:
             self.rec.spawn()
@@ -532,10 +536,16 @@ def _pose_by_frame(poses: Poses | None) -> dict[int, Array]:
 
 def export_rrd(result: Result, path: Path) -> None:
     """Write a recording for the rerun viewer with rerun-sdk: what `Viewer` shows, with images."""
-    with atomic(path) as part:
-        viewer = Viewer(result.video, lambda rec: rec.save(part))
+    with atomic(path) as part, tempfile.TemporaryDirectory() as folder:
+        try:
+            place = os.fsencode(part).decode()
+        except UnicodeDecodeError:  # rerun takes no other names
+            place = f"{folder}/scene.rrd"
+        viewer = Viewer(result.video, lambda rec: rec.save(place))
         viewer.show(result, path, images=True)
         viewer.close()
+        if not part.exists():
+            shutil.move(place, part)
 
 
 EXPORTS: dict[str, tuple[str, Callable[[Result, Path], None]]] = {  # name: file in OUT, writer

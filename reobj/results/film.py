@@ -71,6 +71,11 @@ class FilmWriter:
         self.every = 1 if av else math.ceil(fps / VP8_FPS - 1e-3)  # 30.0001 fps is 30
         self.size = (max(int(size[0] * shrink) // 2, 1) * 2, max(int(size[1] * shrink) // 2, 1) * 2)
         self.count = 0
+        try:
+            os.fsencode(self.path).decode()
+        except UnicodeDecodeError:  # OpenCV 5.0 ends the process
+            where = ascii(str(self.path))
+            raise OSError(f"{where}: a film needs a folder whose name is UTF-8") from None
         with self._named(), contextlib.ExitStack() as stack:
             stack.callback(self.part.unlink, missing_ok=True)
             self.part.touch()  # PyAV finds out at the first frame only

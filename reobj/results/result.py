@@ -481,8 +481,9 @@ class Result:
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "
             part = f", part {o.part}" if len(self.world.parts) > 1 else ""
+            name = cut(o.class_name, CLASS_MAX)
             lines.append(
-                f"{o.id:>6}  {cut(o.class_name, CLASS_MAX):<14} {o.frames_seen:>6} {len(o.visits):>6}  "
+                f"{o.id:>6}  {name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
                 f"{sizes * sized}{o.status}{part}"
             )
         reasons: dict[str, list[int]] = {}  # each once, with the objects that it holds for
