@@ -186,13 +186,16 @@ def check_places(folder: Path, names: Iterable[str | Path]) -> None:
     """Refuse files (paths within a folder) that cannot be replaced by new ones of that name.
 
     Raises:
-        ReobjError: a folder is where a file belongs, or something else where a folder belongs.
+        ReobjError: a folder is where a file belongs, something else where a folder belongs, or a
+            folder may not be written into.
     """
     for name in map(Path, names):
-        above = [folder / parent for parent in name.parents[:-1]]
-        for path in above:
+        for path in (folder / parent for parent in name.parents):
             if os.path.lexists(path) and not path.is_dir():
                 raise ReobjError(f"{path}: is no folder, but one is written here; move it away")
+            if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+                what = "is not writable, but results are written here; allow it (chmod u+w)"
+                raise ReobjError(f"{path}: {what}")
         if (path := folder / name).is_dir() and not path.is_symlink():
             raise ReobjError(f"{path}: is a folder, but a file is written here; move it away")
 

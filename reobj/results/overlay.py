@@ -386,7 +386,7 @@ class Overlay:
 
     def __init__(self, result: Result, path: Path, video: Video, layers: str = "solids") -> None:
         """Open the film; its suffix is that of the format that can be written here."""
-        self.fps = max(1.0, (video.fps or IMAGE_FPS) / video.config.every)
+        self.fps = (video.fps or IMAGE_FPS) / video.config.every
         self.writer = FilmWriter(path, self.fps, video.size)
         self.path, self.size, self.layers = self.writer.path, self.writer.size, film_layers(layers)
         self.scale, self.tracks = self.size[0] / video.size[0], result.tracks
