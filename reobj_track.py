@@ -43,7 +43,6 @@ import dataclasses
 import json
 import logging
 import math
-import os
 import sys
 import time
 import traceback
@@ -1284,10 +1283,12 @@ def _cmd_eval(args: argparse.Namespace) -> int:
         poses = next((p for p in beside if p.exists()), None)
     classes = [c.strip() for c in args.classes.split(",") if c.strip()]
     scores = evaluate(args.out, args.gt, args.gt_objects, poses, classes, args.min_visibility)
-    if args.out.is_dir():
-        with atomic(args.out / "eval.json") as part:
-            part.write_text(json.dumps(scores, indent=1))
-    print(score_report(scores))
+    try:
+        if args.out.is_dir():
+            with atomic(args.out / "eval.json") as part:
+                part.write_text(json.dumps(scores, indent=1))
+    finally:
+        print(score_report(scores))
     return 0
 
 

@@ -417,7 +417,7 @@ def write_tum(path: Path, poses: Poses) -> None:
     xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
     units = "units: metres" if poses.metric else NO_SCALE
-    rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
+    rows = [" ".join([f"{row[0]:.9f}", *(f"{v:.12g}" for v in row[1:])]) for row in table]
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:
         part.write_text("\n".join([header, *rows]) + "\n")
@@ -446,7 +446,7 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
         f"{i + 1} {' '.join(map(repr, row))} 1 {image_names[i]}\n\n"
         for i, row in zip(np.flatnonzero(poses.known).tolist(), values.tolist(), strict=True)
     ]
-    (path / "images.txt").write_text("".join(lines))
+    (path / "images.txt").write_text("".join(lines), "utf-8", "surrogateescape")
     points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
     rows = [" ".join(map(repr, (i, *xyz, *rgb, 0))) for i, (xyz, rgb) in enumerate(points, 1)]
     (path / "points3D.txt").write_text("".join(f"{row}\n" for row in rows))

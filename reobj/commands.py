@@ -6,6 +6,7 @@ What a command does is the business of `reobj_track`.
 from __future__ import annotations
 
 import argparse
+import io
 import logging
 import os
 import re
@@ -63,14 +64,7 @@ def with_streams(program: Callable[[], int]) -> int:
     Raises:
         SystemExit: of argparse, after --help and for wrong words.
     """
-    for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:  # closed: a file opened next would get its number, and C code's messages
-            while os.open(os.devnull, os.O_RDWR) < number:
-                pass
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "r+"))
+    _open_streams()
     code, left = 0, None
     try:
         code = program()
@@ -88,6 +82,22 @@ def with_streams(program: Callable[[], int]) -> int:
     if left is not None:
         raise left
     return code
+
+
+def _open_streams() -> None:
+    """Open the standard streams that are closed; what they cannot encode is escaped."""
+    for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:  # closed: a file opened next would get its number, and C code's messages
+            while os.open(os.devnull, os.O_RDWR) < number:
+                pass
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r+"))
+    for stream in (sys.stdout, sys.stderr):  # no name of a class or file ends a run
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            utf8 = stream.encoding.lower().replace("-", "") == "utf8"
+            stream.reconfigure(errors="surrogateescape" if utf8 else "backslashreplace")
 
 
 def say(text: str) -> None:

@@ -54,6 +54,7 @@ def remove_stale(
     kept = {out / path for path in made}
     for name in stale:
         for found in (out / name, *part_paths(out / name)):
+            found.with_name(f".part-{found.name}").unlink(missing_ok=True)  # of a killed run
             if name == MODEL and found.is_dir() and not found.is_symlink():
                 for old in set(found.iterdir()) - kept:
                     shutil.rmtree(old) if old.is_dir() else old.unlink()

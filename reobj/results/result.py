@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ from reobj import __version__
 from reobj.cameras import Poses, load_poses, save_poses
 from reobj.files import (
     atomic,
+    cut,
     load_json,
     load_npz,
     numbers,
@@ -66,6 +68,7 @@ CONVENTIONS = {
     "ellipsoid": "inscribed in a box or cylinder",
     "cov": "9x9: center, log half axes, rotation vector in object axes",
 }
+CLASS_MAX = 40  # characters of a class name in the table (chosen: a line of 120)
 EVIDENCE_DIGITS = 4  # of overlaps and log odds in the links; chosen: a box is measured to 1 in 100
 _JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
 
@@ -482,8 +485,9 @@ class Result:
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "
             part = f", part {o.part}" if len(self.world.parts) > 1 else ""
+            name = cut(o.class_name, CLASS_MAX)
             lines.append(
-                f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
+                f"{o.id:>6}  {name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
                 f"{sizes * sized}{o.status}{part}"
             )
         reasons: dict[str, list[int]] = {}  # each once, with the objects that it holds for
@@ -555,9 +559,12 @@ def _scale_text(scale: quadrics.Scale) -> str:
     return f"{scale.value} m per unit, sigma {sigma} (from {scale.source})"
 
 
-def significant(values: Array) -> Array:
-    """Round an array to six significant digits, as its text in objects.json has them."""
-    return np.array(numbers(values), np.float64).reshape(np.shape(values))
+def significant(values: Array, size: float = math.inf) -> Array:
+    """Round an array to six significant digits, as its text in objects.json has them.
+
+    size: of what lies at these coordinates, as in `numbers`.
+    """
+    return np.array(numbers(values, size), np.float64).reshape(np.shape(values))
 
 
 def _plain(value: Any) -> Any:

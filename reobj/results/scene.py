@@ -26,11 +26,13 @@ import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.poses.floor import NOISE
+from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.result import Object, Result, World, sides, significant
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video, shrunk
 from reobj.types import (
+    Array,
     Frame,
     Image,
     IntArray,
@@ -136,6 +138,8 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
         poses: of the object's part.
     """
     rows = np.flatnonzero(tracks.track_id == found.id)
+    if not len(rows):
+        return rows
     frame, box = tracks.frame[rows], tracks.xyxy[rows]
     quality = tracks.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
     place = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
@@ -143,7 +147,7 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
         at, known = place_of(poses, frame)
         eye = invert_rigid(poses.cam_from_world[at])[:, :, 3]  # (N, 3)
         ray = np.where(known[:, None], eye - found.center, np.nan)
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), np.finfo(float).tiny)
         place = np.hstack([place, np.nan_to_num(ray)])  # (N, 4)
         quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # no pose: last
     chosen = [int(quality.argmax())]
@@ -181,7 +185,8 @@ def write_scene(
 ) -> None:
     """Write scene.html: solids, cameras, points and pictures in one page that needs no network.
 
-    Its data are objects.json's entries, and base64 of little-endian float32 / uint8 arrays.
+    Its data are objects.json's entries, and base64 of little-endian float32 / uint8 arrays. A world
+    far from its origin is moved: `origin` of its part says where that is now.
 
     Args:
         doubtful: show the doubtful objects at first; a switch of the page shows and hides them.
@@ -191,6 +196,7 @@ def write_scene(
     seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
     of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
     thin = math.ceil(0 if poses is None else len(poses.points) / SCENE_POINTS) or 1
+    parts, origins = zip(*(centred(part) for part in result.parts()), strict=True)
     data = {
         "title": Path(str(video.source)).name,
         "warnings": result.warnings,
@@ -198,15 +204,21 @@ def write_scene(
             link | {key: rounded(link[key], 2) for key in ("place_iou", "appearance_log_odds")}
             for link in result.world.to_json()["links"]
         ],
-        "objects": [_scene_object(o, result.tracks, steps, pictures) for o in result.objects],
+        "objects": [
+            _scene_object(o, origins[o.part], result.tracks, steps, pictures)
+            for o in result.objects
+        ],
         "thumbs": [[frame, data, _boxes_in(result, frame)] for frame, data in pictures.frames],
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
         "edits": [] if result.edits is None else result.edits.entries,
         "why_flat": _why_flat(result),
         "steps": {"frame": steps.tolist(), "seconds": seconds, "part": of_part.tolist()},
-        **_scene_cameras(result, steps),
-        "parts": [_scene_part(k, part, thin) for k, part in enumerate(result.parts())],
+        **_scene_cameras(result, steps, np.array(origins)),
+        "parts": [
+            _scene_part(k, part, thin) | {"origin": origin.tolist()}
+            for k, (part, origin) in enumerate(zip(parts, origins, strict=True))
+        ],
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = page_text().split("@DATA@")
@@ -228,13 +240,19 @@ def _boxes_in(result: Result, frame: int) -> list[list[float]]:
 SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .4 MB of the page)
 
 
-def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
-    """Collect the intrinsics and the cameras of the steps, each in the world of its part."""
+def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str, Any]:
+    """Collect the intrinsics and the cameras of the steps, each in the world of its part.
+
+    Args:
+        origins: (P, 3) of the parts.
+    """
     poses = result.poses
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": ""}
     size, K = {"width": poses.camera.width, "height": poses.camera.height}, poses.camera.K
-    shown = invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)])
+    rows = np.isin(poses.frame, steps)
+    shown = invert_rigid(poses.cam_from_world[rows])
+    shown[:, :, 3] -= origins[poses.part[rows]]
     inside = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     return {"camera": size | inside, "poses": base64_text(shown, "<f4")}
 
@@ -267,7 +285,7 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
 
 
 def _scene_object(
-    found: Object, tracks: Tracks, steps: IntArray, pictures: Pictures
+    found: Object, origin: Array, tracks: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
     """Describe an object for the page.
 
@@ -286,6 +304,7 @@ def _scene_object(
         box = detected.xyxy[best].round(1).tolist()
         visits.append([*detected.frame[rows[[0, -1]]].tolist(), int(detected.frame[best]), *box])
     return found.to_json() | {
+        "center": None if found.center is None else (found.center - origin).tolist(),
         "cov": "" if found.cov is None else base64_text(found.cov, "<f4"),
         "color": object_color(found.id)[::-1],
         "sides": sides(found),
