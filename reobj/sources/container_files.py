@@ -77,14 +77,15 @@ def missing_bytes(path: Path) -> int:
                 end += length
             return max(0, end - size)
         if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
-            end = 0
+            end = padded = 0
             while end + 8 <= size:
                 file.seek(end)
                 kind, length = struct.unpack("<4sI", file.read(8))
                 if kind != b"RIFF" or length in (0, 0xFFFFFFFF):  # other data, or never finished
                     return 0
-                end += 8 + length + length % 2
-            return max(0, end - length % 2 - size)
+                padded = int(length) % 2
+                end += 8 + int(length) + padded
+            return max(0, end - padded - size)
     return 0
 
 
