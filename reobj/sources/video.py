@@ -260,7 +260,7 @@ class Video:
         complete = not 0 < self.config.stop <= len(raw_s)
         times_s, restarts, known = settled_times(np.array(raw_s), 1 / self._announced_fps)
         if restarts:
-            self._warn(f"its clock begins again {restarts} time(s): its times are counted on from there")
+            self._warn(f"its clock begins again {restarts} time(s): counted on from there")
         if not known:
             self._warn(f"it holds no times: {self._announced_fps:g} frames a second are assumed")
         if complete and not self._is_url and (text := self._missing_end(times_s)):
@@ -455,9 +455,9 @@ class Video:
         wide, high = (high, wide) if turned else (wide, high)
         if wide > 0 and high > 0 and abs(wide / high - 1) > SQUARE:
             self.pixel_aspect = wide / high
-            self._warn(f"its pixels are {wide}:{high}, not square: cameras cannot be found from "
-                       "them; convert the video (ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT), "
-                       "or give --camera")  # fmt: skip
+            self._warn(f"its pixels are {wide}:{high}, not square, as it says: boxes are in stored "
+                       "pixels, cameras have two focal lengths; where that is wrong, correct its "
+                       "sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:
