@@ -89,6 +89,18 @@ def missing_bytes(path: Path) -> int:
     return 0
 
 
+HEAD_BYTES = 1 << 16  # chosen: the tracks are described before the first frame
+
+
+def holds_pictures_only(path: Path) -> bool:
+    """Tell whether a file is Matroska or WebM without a track of sound; other containers: False."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+        # TrackType (RFC 9559, 5.1.4.1.3): 2 is audio
+        return head.startswith(EBML) and b"\x83\x81\x02" not in head
+    return False
+
+
 def _matroska_end(head: bytes) -> int:
     """Return where the segment, which holds all but the header, ends; 0: not announced."""
     at, length = _vint(head, len(EBML))

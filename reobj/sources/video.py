@@ -28,7 +28,7 @@ import numpy as np
 
 from reobj.files import shortened
 from reobj.runtime import check_versions, quiet_opencv
-from reobj.sources.container_files import missing_bytes, settled_times
+from reobj.sources.container_files import holds_pictures_only, missing_bytes, settled_times
 from reobj.sources.image_files import (
     IMAGE_FPS,
     PIXELS_MAX,
@@ -274,23 +274,21 @@ class Video:
         """Say what is missing at the end of a file; "": nothing that can be known.
 
         What a container announces is no evidence alone: Matroska's duration is that of the sound
-        too, and some announce a rate that no frame has.
+        too, and some announce a rate that no frame has. But in a file of pictures alone most bytes
+        are those of its frames.
         """
         read, last_s = len(times_s), float(times_s[-1])
-        announced_s = self._announced / self._announced_fps
         if self._announced - read <= max(1.0, MISSING_SHARE * self._announced):
             return ""
         what, stored = f"{read} frames up to {last_s:.2f} s can be read", Path(self._address)
         if lost := missing_bytes(stored):
             return f"the file ends early: {lost} bytes are missing at its end; {what}"
-        step_s = last_s / max(1, read - 1)
-        if announced_s - last_s - step_s <= max(step_s, MISSING_SHARE * announced_s):
-            return ""
         _, stored_s, size = self._packets()
-        if stored_s - last_s > max(step_s, MISSING_SHARE * announced_s):
+        if stored_s - last_s > max(1 / self._announced_fps, MISSING_SHARE * stored_s):
             return f"the file is damaged: {what}, frames up to {stored_s:.2f} s are stored"
-        if 2 * size < stored.stat().st_size:  # what is not read is no sound
-            return f"the file is damaged: {what}, {announced_s:.2f} s are announced"
+        total = stored.stat().st_size
+        if 2 * size < total and holds_pictures_only(stored):
+            return f"the file is damaged: {what}, {size} of its {total} bytes"
         return ""
 
     def _packets(self) -> tuple[int, float, int]:
