@@ -305,8 +305,13 @@ def fake_video(
         (60, 100, set(), 100, ""),
         (0, 8, set(), 8, ""),  # unknown number
         (100, 100, set(range(10, 73)), 37, "63 frames skipped (unreadable): 10, 11"),  # 2 s
-        (100, 100, set(range(10, 74)), 10,
-         "damaged: 10 frames up to 0.90 s can be read, frames up to 9.90 s are stored"),
+        (
+            100,
+            100,
+            set(range(10, 74)),
+            10,
+            "damaged: 10 frames up to 0.90 s can be read, frames up to 9.90 s are stored",
+        ),
         (100, 100, {98, 99}, 98, ""),  # damaged to the end: as if they were not there
     ],
 )

@@ -30,6 +30,7 @@ from reobj.files import shortened
 from reobj.runtime import check_versions, quiet_opencv
 from reobj.sources.container_files import holds_pictures_only, missing_bytes, settled_times
 from reobj.sources.image_files import (
+    FRAME_STEPS_S,
     IMAGE_FPS,
     PIXELS_MAX,
     ImageList,
@@ -167,10 +168,16 @@ class Video:
         if not self.files and not self.is_live and self.times_are_known:
             times_s = self._measured().times_s
         if times_s is None or len(times_s) < 2:
-            return announced
+            return self._assumed_fps
         steps, seconds = len(times_s) - 1, float(np.ptp(times_s))
         same = abs(steps / announced - seconds) <= ROUNDING_S
         return announced if same else steps / seconds
+
+    @property
+    def _assumed_fps(self) -> float:
+        """Return the rate where nothing measures it: as announced, unless no camera has it."""
+        announced = self._announced_fps
+        return announced if announced <= 1 / FRAME_STEPS_S[0] else IMAGE_FPS
 
     @functools.cached_property
     def times_are_known(self) -> bool:
@@ -258,11 +265,12 @@ class Video:
     def _keep(self, raw_s: Sequence[float]) -> Clock:
         """Make times of those that the container gives, and say what is wrong with them."""
         complete = not 0 < self.config.stop <= len(raw_s)
-        times_s, restarts, known = settled_times(np.array(raw_s), 1 / self._announced_fps)
+        fps = self._assumed_fps
+        times_s, restarts, known = settled_times(np.array(raw_s), 1 / fps)
         if restarts:
             self._warn(f"its clock begins again {restarts} time(s): counted on from there")
         if not known:
-            self._warn(f"it holds no times: {self._announced_fps:g} frames a second are assumed")
+            self._warn(f"it holds no times: {fps:g} frames a second are assumed")
         if complete and not self._is_url and (text := self._missing_end(times_s)):
             self._warn(text)
         self._clock = Clock(times_s, complete, known)

@@ -90,14 +90,16 @@ FILES = {  # what is wrong with what is announced: how to write it, and its time
         lambda d: write_video(d / "a.avi", EVEN, rate=1000, codec="mjpeg"), EVEN),
     "begins at 5 s": (lambda d: write_video(d / "a.mkv", 5000 + EVEN), EVEN),
     "sound goes on for 3 s": (lambda d: write_video(d / "a.mkv", EVEN, sound_s=4), EVEN),
-    "bare H.264": (lambda d: write_video(d / "a.h264", EVEN), np.arange(40) * 40),
+    "bare H.264": (lambda d: write_video(d / "a.h264", EVEN), None),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", FILES)
 def test_frames_are_counted_and_timed_as_they_are_decoded(what: str, tmp_path: Path) -> None:
     make, times_ms = FILES[what]
-    path, count = make(tmp_path), len(times_ms)
+    path, count = make(tmp_path), 40
+    if times_ms is None:  # OpenCV 4 announces 1000 frames a second, OpenCV 5 25
+        times_ms = np.arange(40) * (40 if cv2.__version__ >= "5" else 1000 / 30)
     shown = np.arange(count) % (20 if path.suffix == ".ts" else count)
     (tmp_path / "d.txt").write_text("".join(f"{i + 1},-1,5,6,20,20,0.9\n" for i in range(count)))
     for asked_first in (True, False):  # before it is read, and after
