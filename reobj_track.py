@@ -1261,7 +1261,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     known, count = poses.known.sum(), len(poses.frame)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
-    for message in (*poses.messages, *parts_message(poses)):
+    for message in (*video.messages, *poses.messages, *parts_message(poses)):
         log.warning(message)
     return 0
 

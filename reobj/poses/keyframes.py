@@ -38,8 +38,17 @@ class ResizedFrame:
     gray: Image
 
 
+def _square(image: Image, aspect: float) -> Image:
+    """Widen an image, or heighten it, so that pixels of this width over height become square."""
+    if aspect == 1:
+        return image
+    height, width = image.shape[:2]
+    size = (round(width * max(aspect, 1)), round(height / min(aspect, 1)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
 class ResizedVideo:
-    """A video whose frames are resized to a longer side of at most `size_px`.
+    """A video whose frames have square pixels and a longer side of at most `size_px`.
 
     Attributes:
         frames, times_s: numbers and times of the frames, known after `first_pass`.
@@ -47,6 +56,7 @@ class ResizedVideo:
 
     def __init__(self, video: Any, size_px: int, cache_mb: float = CACHE_MB) -> None:
         self.video, self.size_px, self.cache_mb = video, size_px, cache_mb
+        self.aspect = float(getattr(video, "pixel_aspect", 1.0))
         self.frames: list[int] = []
         self.times_s: list[float] = []
         self.cache: list[Image] = []
@@ -54,7 +64,7 @@ class ResizedVideo:
 
     def __iter__(self) -> Iterator[ResizedFrame]:
         for row, frame in enumerate(self.video):
-            bgr = shrunk(frame.image, self.size_px)
+            bgr = shrunk(_square(frame.image, self.aspect), self.size_px)
             gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
             yield ResizedFrame(row, frame.index, frame.time_s, bgr, gray)
 

@@ -197,7 +197,8 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
         return pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, *size)
     model, params = job["camera"]
     width, height = job["size"]
-    camera = Camera(model, width, height, tuple(params)).resized(size).to_pycolmap()
+    camera = Camera(model, width, height, tuple(params)).to_pycolmap()
+    _rescale(camera, size)
     camera.has_prior_focal_length = True
     return camera
 
@@ -441,6 +442,20 @@ def _run_mapper(database: Path, mapper: str, held: bool, ids: list[int], seed: i
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
 
 
+TWO_FOCALS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
+
+
+def _rescale(camera: Any, size: Sequence[int]) -> None:
+    """Rescale a pycolmap camera to (w, h); to pixels of another shape with two focal lengths."""
+    width, height = size
+    if abs(width / camera.width * camera.height - height) > 2 and camera.model.name in TWO_FOCALS:
+        focal, x, y, *terms = camera.params
+        camera.model = getattr(import_pycolmap().CameraModelId, TWO_FOCALS[camera.model.name])
+        most = len(camera.params_info.split(",")) - 4
+        camera.params = [focal, focal, x, y, *terms, *[0.0] * (most - len(terms))]
+    camera.rescale(*size)
+
+
 def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, Any]) -> None:
     """Write the model in native pixels with the frames' names; points get a colour."""
     height, width = images.shape[1:3]
@@ -457,7 +472,7 @@ def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, An
         image.name = job["names"][index[image_id]]
         for p in image.points2D if (scale != 1).any() else ():
             p.xy = p.xy * scale
-    model.camera(1).rescale(*job["size"])
+    _rescale(model.camera(1), job["size"])
     folder.mkdir()
     model.write(str(folder))
 

@@ -77,15 +77,28 @@ def missing_bytes(path: Path) -> int:
                 end += length
             return max(0, end - size)
         if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
-            end = 0
+            end = padded = 0
             while end + 8 <= size:
                 file.seek(end)
                 kind, length = struct.unpack("<4sI", file.read(8))
                 if kind != b"RIFF" or length in (0, 0xFFFFFFFF):  # other data, or never finished
                     return 0
-                end += 8 + length + length % 2
-            return max(0, end - length % 2 - size)
+                padded = int(length) % 2
+                end += 8 + int(length) + padded
+            return max(0, end - padded - size)
     return 0
+
+
+HEAD_BYTES = 1 << 16  # chosen: the tracks are described before the first frame
+
+
+def holds_pictures_only(path: Path) -> bool:
+    """Tell whether a file is Matroska or WebM without a track of sound; other containers: False."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+        # TrackType (RFC 9559, 5.1.4.1.3): 2 is audio
+        return head.startswith(EBML) and b"\x83\x81\x02" not in head
+    return False
 
 
 def _matroska_end(head: bytes) -> int:

@@ -49,7 +49,7 @@ class ImagelessVideo(Video):
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.size = self.working_size = (int(size[0]), int(size[1]))
-        self.scale = 1.0
+        self.scale = self.pixel_aspect = 1.0
         self.names, self.files = list(names), []
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
         self.times_s, self.times_are_known = given, given is not None

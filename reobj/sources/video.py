@@ -28,8 +28,9 @@ import numpy as np
 
 from reobj.files import shortened
 from reobj.runtime import check_versions, quiet_opencv
-from reobj.sources.container_files import missing_bytes, settled_times
+from reobj.sources.container_files import holds_pictures_only, missing_bytes, settled_times
 from reobj.sources.image_files import (
+    FRAME_STEPS_S,
     IMAGE_FPS,
     PIXELS_MAX,
     ImageList,
@@ -167,10 +168,16 @@ class Video:
         if not self.files and not self.is_live and self.times_are_known:
             times_s = self._measured().times_s
         if times_s is None or len(times_s) < 2:
-            return announced
+            return self._assumed_fps
         steps, seconds = len(times_s) - 1, float(np.ptp(times_s))
         same = abs(steps / announced - seconds) <= ROUNDING_S
         return announced if same else steps / seconds
+
+    @property
+    def _assumed_fps(self) -> float:
+        """Return the rate where nothing measures it: as announced, unless no camera has it."""
+        announced = self._announced_fps
+        return announced if announced <= 1 / FRAME_STEPS_S[0] else IMAGE_FPS
 
     @functools.cached_property
     def times_are_known(self) -> bool:
@@ -258,11 +265,12 @@ class Video:
     def _keep(self, raw_s: Sequence[float]) -> Clock:
         """Make times of those that the container gives, and say what is wrong with them."""
         complete = not 0 < self.config.stop <= len(raw_s)
-        times_s, restarts, known = settled_times(np.array(raw_s), 1 / self._announced_fps)
+        fps = self._assumed_fps
+        times_s, restarts, known = settled_times(np.array(raw_s), 1 / fps)
         if restarts:
-            self._warn(f"its clock begins again {restarts} time(s): its times are counted on from there")
+            self._warn(f"its clock begins again {restarts} time(s): counted on from there")
         if not known:
-            self._warn(f"it holds no times: {self._announced_fps:g} frames a second are assumed")
+            self._warn(f"it holds no times: {fps:g} frames a second are assumed")
         if complete and not self._is_url and (text := self._missing_end(times_s)):
             self._warn(text)
         self._clock = Clock(times_s, complete, known)
@@ -274,23 +282,21 @@ class Video:
         """Say what is missing at the end of a file; "": nothing that can be known.
 
         What a container announces is no evidence alone: Matroska's duration is that of the sound
-        too, and some announce a rate that no frame has.
+        too, and some announce a rate that no frame has. But in a file of pictures alone most bytes
+        are those of its frames.
         """
         read, last_s = len(times_s), float(times_s[-1])
-        announced_s = self._announced / self._announced_fps
         if self._announced - read <= max(1.0, MISSING_SHARE * self._announced):
             return ""
         what, stored = f"{read} frames up to {last_s:.2f} s can be read", Path(self._address)
         if lost := missing_bytes(stored):
             return f"the file ends early: {lost} bytes are missing at its end; {what}"
-        step_s = last_s / max(1, read - 1)
-        if announced_s - last_s - step_s <= max(step_s, MISSING_SHARE * announced_s):
-            return ""
         _, stored_s, size = self._packets()
-        if stored_s - last_s > max(step_s, MISSING_SHARE * announced_s):
+        if stored_s - last_s > max(1 / self._announced_fps, MISSING_SHARE * stored_s):
             return f"the file is damaged: {what}, frames up to {stored_s:.2f} s are stored"
-        if 2 * size < stored.stat().st_size:  # what is not read is no sound
-            return f"the file is damaged: {what}, {announced_s:.2f} s are announced"
+        total = stored.stat().st_size
+        if 2 * size < total and holds_pictures_only(stored):
+            return f"the file is damaged: {what}, {size} of its {total} bytes"
         return ""
 
     def _packets(self) -> tuple[int, float, int]:
@@ -455,9 +461,9 @@ class Video:
         wide, high = (high, wide) if turned else (wide, high)
         if wide > 0 and high > 0 and abs(wide / high - 1) > SQUARE:
             self.pixel_aspect = wide / high
-            self._warn(f"its pixels are {wide}:{high}, not square: cameras cannot be found from "
-                       "them; convert the video (ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT), "
-                       "or give --camera")  # fmt: skip
+            self._warn(f"its pixels are {wide}:{high}, not square, as it says: boxes are in stored "
+                       "pixels, cameras have two focal lengths; where that is wrong, correct its "
+                       "sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:
