@@ -32,15 +32,17 @@ FLOORS = {
     "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "
     "reobj.poses.soundness "
     "reobj.poses.adjustment "
-    "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching reobj.poses.pose_file "
-    "reobj.poses.checks reobj.poses.evidence reobj.poses.floor reobj.results.ply reobj.results.film "
-    "reobj.results.folder",
+    "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
+    "reobj.poses.pose_file "
+    "reobj.poses.checks reobj.poses.evidence reobj.poses.floor reobj.results.ply "
+    "reobj.results.film reobj.results.folder",
     5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.colmap_model reobj.poses.pose_formats "
     "reobj.poses.points "
     "reobj.poses.depth reobj.results.result",
-    6: "reobj.poses.readers reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
+    6: "reobj.poses.readers reobj.identity.locate reobj.sources.detectors "
+    "reobj.poses.estimate reobj.objects "
     "reobj.results.workspace "
     "reobj.results.overlay reobj.results.solids reobj.results.plausibility",
     7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "

@@ -77,11 +77,12 @@ def _rays_of_track(poses: Poses, frame: IntArray, xy: Array) -> tuple[IntArray, 
     thin = np.linspace(0, len(use) - 1, min(len(use), MAX_VIEWS))
     use = use[np.unique(thin.round().astype(int))]
     ideal = poses.camera.undistort(xy[use])
-    place, use, ideal = (v[np.isfinite(ideal).all(1)] for v in (place[use], use, ideal))
+    whole = np.isfinite(ideal).all(1)
+    use, ideal = use[whole], ideal[whole]
     if len(use) < MIN_VIEWS:
         return None
     rays = np.column_stack([ideal, np.ones(len(use))]) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
-    return place, rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return place[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def _residual_deg(cam_from_world: Array, rays_in_cam: Array) -> float:
