@@ -7,7 +7,6 @@ are the business of `readers`.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -229,7 +228,8 @@ def _even_numbers(stamps_s: Array) -> IntArray | None:
 
 EPOCH_S = (946684800.0, 4102444800.0)  # 2000 to 2100, in s since 1970
 UNITS = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
-STEP_MAX_S = 10.0  # between poses (chosen: photos taken one by one)
+STEP_MIN_S = 1e-3  # between poses (chosen: motion capture at 1 kHz)
+STEP_MAX_S = 10.0  # (chosen: photos taken one by one)
 LEAST_STAMP = 1e9  # whole numbers below are counters (chosen: s since 1970 have ten digits)
 
 
@@ -247,9 +247,10 @@ def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> tuple[str, float]:
         if EPOCH_S[0] < stamps[0] / unit[1] < EPOCH_S[1]:
             return unit
     if end_s > 0 and np.median(stamps) > end_s:
-        off = [abs(math.log(stamps[-1] / unit[1] / end_s)) for unit in UNITS]
-        if min(off) < math.log(2):
-            return UNITS[int(np.argmin(off))]
+        for unit in UNITS:
+            ends = 0.5 < stamps[-1] / unit[1] / end_s < 2
+            if ends and STEP_MIN_S <= step / unit[1] <= STEP_MAX_S:
+                return unit
     if is_whole(stamps) and stamps[-1] >= LEAST_STAMP:
         return next((unit for unit in UNITS if step / unit[1] <= STEP_MAX_S), UNITS[0])
     return UNITS[0]
