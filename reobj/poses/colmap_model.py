@@ -71,7 +71,8 @@ def read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     note = f"{named[chosen]} taken, the model with most images ({count.max()}), not "
     messages = (f"{path}: {note}{', '.join(others)}",) if others else ()
     form = "binary" if models[chosen].suffix == ".bin" else "text"
-    kind = f"COLMAP model ({form}) {models[chosen].parent}"
+    folder = models[chosen].parent
+    kind = f"COLMAP model ({form})" + (f" in {folder}" if folder != path else "")
     return dataclasses.replace(found[chosen], kind=kind, messages=messages)
 
 

@@ -38,14 +38,14 @@ class PosesConfig:
     )
     fmt: str = option(
         "auto",
-        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit, matrices, "
-        "euroc, stray, arkitscenes, scannetpp, llff, splatting, rows",
+        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit, "
+        "matrices, euroc, stray, arkitscenes, scannetpp, llff, splatting, rows",
         "--pose-format",
     )
     frames_by: str = option(
         "",
         "how supplied poses find their frames where the file leaves it open (an error names the "
-        "ways): number0, number1, every6, time, order, ...",
+        "ways): number0, number1, every6from1, time, order, ...",
     )
     camera: str = option(
         "",

@@ -43,7 +43,7 @@ class PoseReading:
 
     def with_message(self, path: Path) -> Poses:
         """Return the poses, with what the file was taken for and how its frames were found."""
-        text = f"{path}: {self.kind or 'poses'}; frames found by {self.rule}"
+        text = f"{path}: read as {self.kind}; frames found by {self.rule}"
         text += f" ({self.measured})" if self.measured else ""
         return dataclasses.replace(self.poses, messages=(*self.poses.messages, text))
 
@@ -105,7 +105,7 @@ def by_images(found: Sequence[PoseReading], video: Any) -> list[PoseReading]:
     rows = {row for some in [*pairs.values(), *own] for pair in some for row in pair}
     wanted = set(found[0].poses.frame[sorted(rows)].tolist())
     row_of = {frame: row for row, frame in enumerate(found[0].poses.frame.tolist())}
-    sift = cv2.SIFT_create(FEATURES)
+    sift = cv2.SIFT.create(FEATURES)
     features = {
         row_of[frame.index]: _features(sift, frame.image, found[0].poses.camera)
         for frame in video

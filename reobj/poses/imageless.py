@@ -20,7 +20,8 @@ from reobj.poses.matching import (
     numbers_of_times,
     unit_of_stamps,
 )
-from reobj.poses.readers import PoseFile, read_pose_file
+from reobj.poses.pose_file import PoseFile
+from reobj.poses.readers import read_pose_file
 from reobj.sources.detection_files import (
     DetectConfig,
     image_names,

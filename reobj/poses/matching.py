@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -123,36 +124,40 @@ def by_numbers(number: IntArray, source: Source, noun: str, where: str) -> list[
     known = number >= 0
     if not known.any():
         return []
-    least, most = int(number[known].min()), int(number[known].max())
     images = numbers_of_names(source.images, where) if source.images else np.arange(0)
     if len(images) and (images >= 0).all():
-        frame_of = {n: frame for frame, n in enumerate(images.tolist())}
-        offsets = [("number", "", 0)]
-        if least >= 1 and images.min() == 0:
-            offsets.append(("number1", " counted from 1, those of the images from 0", -1))
-        if least == 0 and images.min() == 1:
-            offsets.append(("number0", " counted from 0, those of the images from 1", 1))
-        found = []
-        for key, rule, offset in offsets:
-            frame = np.array([frame_of.get(n + offset, -1) for n in number.tolist()], np.int64)
-            found.append(_reading(key, noun + rule, np.where(known, frame, -1), source))
-        if known.all() and len(number) == len(images):
-            order = np.argsort(np.argsort(number))
-            found.append(_reading("order", f"order of the {noun}", order, source))
-        return found
-    found = []
-    for first in (0, 1):
-        if least >= first:
-            frame = np.where(known, number - first, -1)
-            rule = f"{noun}, counted from {first}"
-            found.append(_reading(f"number{first}", rule, frame, source))
+        return _by_image_numbers(number, images, source, noun)
+    least, most = int(number[known].min()), int(number[known].max())
+    ways = [(f"number{first}", 1, first) for first in (0, 1)]
     for step in _steps(most - min(least, 1) + 1, int(known.sum()), source.count):
-        for first in (0, 1):
-            frame = np.where(known, step * (number - first), -1)
-            if least >= first and frame.max() < source.count:
-                key = f"every{step}" + ("" if first == min(least, 1) else f"from{first}")
-                rule = f"{noun}, counted from {first}, of every {step}th frame"
-                found.append(_reading(key, rule, frame, source))
+        ways += [(f"every{step}from{first}", step, first) for first in (0, 1)]
+    found = []
+    for key, step, first in ways:
+        frame = np.where(known, step * (number - first), -1)
+        if least >= first and (step == 1 or frame.max() < source.count):
+            of = f" of every {step}th frame" if step > 1 else ""
+            found.append(_reading(key, f"{noun}{of}, counted from {first}", frame, source))
+    return found
+
+
+def _by_image_numbers(
+    number: IntArray, images: IntArray, source: Source, noun: str
+) -> list[Reading]:
+    """List what numbers (N,) of poses may mean beside those of images (F,)."""
+    known = number >= 0
+    frame_of = {n: frame for frame, n in enumerate(images.tolist())}
+    ways = [("number", noun, 0)]
+    if number[known].min() >= 1 and images.min() == 0:
+        ways.append(("number1", f"{noun}, counted from 1, those of the images from 0", -1))
+    if number[known].min() == 0 and images.min() == 1:
+        ways.append(("number0", f"{noun}, counted from 0, those of the images from 1", 1))
+    found = []
+    for key, rule, offset in ways:
+        frame = np.array([frame_of.get(n + offset, -1) for n in number.tolist()], np.int64)
+        found.append(_reading(key, rule, np.where(known, frame, -1), source))
+    if known.all() and len(number) == len(images):
+        order = np.argsort(np.argsort(number))
+        found.append(_reading("order", f"order of the {noun}", order, source))
     return found
 
 
@@ -223,22 +228,29 @@ def _even_numbers(stamps_s: Array) -> IntArray | None:
 
 EPOCH_S = (946684800.0, 4102444800.0)  # 2000 to 2100, in s since 1970
 UNITS = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
-STEP_MAX_S = 10.0  # between poses (chosen: photos taken one by one)
+STEP_MIN_S = 1e-3  # between poses (chosen: motion capture at 1 kHz)
+STEP_MAX_S = 10.0  # (chosen: photos taken one by one)
 LEAST_STAMP = 1e9  # whole numbers below are counters (chosen: s since 1970 have ten digits)
 
 
-def unit_of_stamps(stamps: Array) -> tuple[str, float]:
+def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> tuple[str, float]:
     """Tell the unit of ascending stamps (N,), and how many of it are a second.
 
-    It is the one that gives a date after 2000, else the first with plausible steps. Stamps in other
-    units than s have no fractions that count.
+    It is the one that gives a date after 2000. Else it is s, unless most stamps in s lie after the
+    end of the video and another unit ends with it, or ones of ten digits have a plausible step.
+
+    Args:
+        end_s: of the video; 0: unknown.
     """
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     for unit in UNITS:
         if EPOCH_S[0] < stamps[0] / unit[1] < EPOCH_S[1]:
             return unit
-    if stamps[-1] < LEAST_STAMP and step <= STEP_MAX_S:
-        return UNITS[0]
+    if end_s > 0 and np.median(stamps) > end_s:
+        for unit in UNITS:
+            ends = 0.5 < stamps[-1] / unit[1] / end_s < 2
+            if ends and STEP_MIN_S <= step / unit[1] <= STEP_MAX_S:
+                return unit
     if is_whole(stamps) and stamps[-1] >= LEAST_STAMP:
         return next((unit for unit in UNITS if step / unit[1] <= STEP_MAX_S), UNITS[0])
     return UNITS[0]
@@ -266,9 +278,13 @@ def _by_stamps(stamps_s: Array, source: Source, own: bool) -> list[Reading]:
         tolerance = max(step / 2, STAMP_TOLERANCE_S)
         outside = (stamps_s < start - tolerance) | (stamps_s > end + tolerance)
         found.append(Reading("time", "time stamps", row, int(outside.sum())))
-    if own and found:
+    if found and (own or (found[0].row < 0).all()):  # the same clock, none within the tolerance
         return found
-    clock = "" if not source.timed or found else ", of another clock than the frames"
+    clock = (
+        ""
+        if found or not source.timed
+        else ", the time stamps are of another clock than the frames"
+    )
     if is_whole(stamps_s) and 0 <= stamps_s[0] and stamps_s[-1] < LEAST_STAMP:
         noun = "whole numbers in place of time stamps"
         found += by_numbers(stamps_s.astype(np.int64), source, noun, "")
@@ -281,7 +297,7 @@ def _by_stamps(stamps_s: Array, source: Source, own: bool) -> list[Reading]:
     if count == source.count:
         rule = f"order, one row for each frame of the source{clock}"
         found.append(_reading("order", rule, np.arange(count), source))
-    elif count == len(source.frame) and clock:
+    elif count == len(source.frame) and not found:
         rule = f"order, one row for each frame that is read{clock}"
         found.append(Reading("order", rule, np.arange(count), 0))
     return found
@@ -334,43 +350,49 @@ def interpolated(cam_from_world: Array, stamps_s: Array, time_s: Array) -> tuple
 
 def _by_order(count: int, source: Source, where: str) -> list[Reading]:
     """Read `count` rows without names or times: one a frame, or rows numbered as the images are."""
-    found, rows = list[Reading](), np.arange(count)
-    images = source.images if len(source.images) != count else ()
-    number = numbers_of_names(images, where) if images else rows[:0]
-    if len(number) and (number >= 0).all():  # images that were picked out of `count`
-        frame_of = {n: frame for frame, n in enumerate(number.tolist())}
-        for first in (0, 1):
-            if first <= number.min() and number.max() < count + first:
-                frame = np.array([frame_of.get(n + first, -1) for n in rows.tolist()], np.int64)
-                rule = f"numbers in the image names, rows counted from {first}"
-                found.append(_reading(f"number{first}", rule, frame, source))
-        if found:
-            return [Reading(r.key, r.rule, r.row, 0) for r in found]
+    if picked := _by_picked_images(count, source, where):
+        return picked
+    rows, last = np.arange(count), int(source.frame[-1])
     if count == source.count:
         return [_reading("order", "order, one row for each frame of the source", rows, source)]
     if count == len(source.frame):
         return [Reading("order", "order, one row for each frame that is read", rows, 0)]
-    if source.frame[-1] < count:
+    if last < count:
         rule = f"order, row n for frame n of {source.count or 'an unknown number of'}"
         return [Reading("order", rule, source.frame.copy(), 0)]
-    for step in range(2, source.count // max(count - 1, 1) + 1):
-        if -(-source.count // step) == count:
-            rule = f"order, a row for every {step}th frame"
-            found.append(_reading(f"every{step}", rule, step * rows, source))
+    steps = range(2, source.count // max(count - 1, 1) + 1)
+    found = [
+        _reading(f"every{k}", f"order, a row for every {k}th frame", k * rows, source)
+        for k in steps
+        if -(-source.count // k) == count
+    ]
     if not found:
-        what = f"{count} rows, frame numbers up to {source.frame[-1]}"
+        what = f"{count} rows, frame numbers up to {last}"
         raise ReobjError(f"{where}: {what}; expected one row a frame")
     return found
 
 
-def source_of(video: object, frame: IntArray, time_s: Array) -> Source:
+def _by_picked_images(count: int, source: Source, where: str) -> list[Reading]:
+    """Read rows by the numbers in the names of images that were picked out of `count`."""
+    images = source.images if len(source.images) != count else ()
+    number = numbers_of_names(images, where) if images else np.arange(0)
+    found = []
+    for first in (0, 1) if len(number) and (number >= 0).all() else ():
+        if first <= number.min() and number.max() < count + first:
+            frame_of = {n - first: frame for frame, n in enumerate(number.tolist())}
+            frame = np.array([frame_of.get(n, -1) for n in range(count)], np.int64)
+            rule = f"numbers in the image names, rows counted from {first}"
+            found.append(Reading(f"number{first}", rule, _reading("", "", frame, source).row, 0))
+    return found
+
+
+def source_of(video: Any, frame: IntArray, time_s: Array) -> Source:
     """Describe a `Video` whose frames (F,) were read at times (F,) in s."""
-    get = lambda name, default: getattr(video, name, default)  # noqa: E731
-    paths = [str(Path(f).absolute()) for f in get("files", ())]
-    config = get("config", None)
-    count = int(get("frame_count", 0))
-    if config is None or (not config.stop and config.every == 1):
-        count = max(int(frame[-1]) + 1, 0) if not paths and not get("names", ()) else count
-    images = tuple(paths or get("names", ()))
-    timed = not images or get("times_s", None) is not None
-    return Source(frame, time_s, count, images, timed)
+    paths = [str(Path(file).absolute()) for file in getattr(video, "files", ())]
+    images = tuple(paths or video.names)
+    config, count = getattr(video, "config", None), int(video.frame_count)
+    if not images and (config is None or (not config.stop and config.every == 1)):
+        count = int(frame[-1]) + 1  # what was decoded, not what the container claims
+    return Source(
+        frame, time_s, count, images, not images or getattr(video, "times_s", None) is not None
+    )

@@ -76,7 +76,7 @@ def _named_columns(header: str, count: int) -> list[int] | None:
     """
     for line in header.lower().splitlines()[::-1]:
         words = re.sub(r"\[.*?\]|\(.*?\)", "", line).replace(",", " ").lstrip("# ").split()
-        place = {}
+        place: dict[str, int] = {}
         for i, word in enumerate(words):
             found = re.fullmatch(
                 r"(q|rot|orient|p|t|pos|trans|)[a-z]*?[._]?(?:rs_)?(?:r_)?([xyzw])", word
@@ -101,7 +101,7 @@ def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     kept, messages = _by_time(rows[:, 0], path)
     return PoseFile(
         invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], own=OWN_HEADER in header,
-        metric=not re.search(f"#.*{NO_SCALE}", header), kind=f"TUM rows {path}", messages=messages,
+        metric=not re.search(f"#.*{NO_SCALE}", header), kind="TUM rows", messages=messages,
     )  # fmt: skip
 
 
@@ -118,8 +118,8 @@ def _by_time(stamps: Array, path: Path) -> tuple[IntArray, tuple[str, ...]]:
 def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read EuRoC's CSV of 8 or 17 columns: ns, world_from_body, quaternion w first; metres.
 
-    `T_BS` of the camera's sensor.yaml, beside it or in cam0 beside its folder, leads from the camera
-    to the body; without one the body is taken for the camera, and this is said.
+    `T_BS` of the camera's sensor.yaml, beside it or in cam0 beside its folder, leads from camera to
+    body; without one the body is taken for the camera, and this is said.
     """
     path = path / "data.csv" if path.is_dir() else path
     rows, where, header = _table(path, (8, 17), "EuRoC rows: ns, x, y, z, qw, qx, qy, qz[, 9 more]")
@@ -143,7 +143,7 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
         camera = camera_from_yaml(data, size)
     return PoseFile(
         invert_rigid(world_from_cam)[kept], () if camera is None else (camera,),
-        stamps=rows[kept, 0], unit="ns", metric=True, kind=f"EuRoC rows {path}", messages=messages,
+        stamps=rows[kept, 0], unit="ns", metric=True, kind="EuRoC rows", messages=messages,
     )  # fmt: skip
 
 
@@ -159,9 +159,7 @@ def _sensor_of(path: Path) -> Path | None:
 def read_matrices(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read rows of 12 (KITTI) or 16 numbers (Replica, NICE-SLAM): world_from_cam, OpenCV axes."""
     rows, where = matrix_rows(path)
-    return PoseFile(
-        invert_rigid(checked_rigid(rows, where)), metric=True, kind=f"rows of matrices {path}"
-    )
+    return PoseFile(invert_rigid(checked_rigid(rows, where)), metric=True, kind="rows of matrices")
 
 
 def matrix_rows(path: Path) -> tuple[Array, list[str]]:
@@ -189,7 +187,7 @@ def read_traj(path: Path, size: tuple[int, int]) -> PoseFile:
         cameras.append(Camera("PINHOLE", image_side(width), image_side(height), tuple(params)))
     return PoseFile(
         checked_rigid(poses, where)[kept], tuple(cameras), stamps=rows[kept, 0], unit="s",
-        metric=True, up_in_world=Z_UP, kind=f"ARKitScenes poses {path}", messages=messages,
+        metric=True, up_in_world=Z_UP, kind="ARKitScenes poses", messages=messages,
     )  # fmt: skip
 
 
@@ -218,14 +216,14 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
     rows = np.array(table).reshape(-1, 8)
     world_from_cam = from_quaternions(rows[:, 4:], rows[:, 1:4], where)
     names = tuple(f"{number:06d}" for number in rows[:, 0].astype(int).tolist())
-    matrix, cameras = path.with_name("camera_matrix.csv"), ()
+    matrix, cameras = path.with_name("camera_matrix.csv"), list[Camera]()
     if matrix.is_file():
         K = read_table(matrix, (3,), "3 rows of 3 numbers")[0]
         raise_where([K.shape != (3, 3)], [str(matrix)], "expected 3 rows of 3 numbers")
-        cameras = (brown_camera(_size_of(K, size, PHONE), K[0, 0], K[1, 1], K[0, 2], K[1, 2]),)
+        cameras.append(brown_camera(_size_of(K, size, PHONE), K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     return PoseFile(
-        invert_rigid(world_from_cam), cameras, names, metric=True, up_in_world=Y_UP,
-        kind=f"Stray Scanner folder {path.parent}",
+        invert_rigid(world_from_cam), tuple(cameras), names, metric=True, up_in_world=Y_UP,
+        kind="Stray Scanner folder",
     )  # fmt: skip
 
 
@@ -259,9 +257,7 @@ def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
     where = [f"{path}, poses[{i}]" for i in range(len(rows))]
     world_from_gl = from_quaternions(rows[:, :4], rows[:, 4:], where)
     poses = CV_FROM_GL @ invert_rigid(world_from_gl)
-    return PoseFile(
-        poses, (camera,), metric=True, up_in_world=Y_UP, kind=f"Record3D metadata {path}"
-    )
+    return PoseFile(poses, (camera,), metric=True, up_in_world=Y_UP, kind="Record3D metadata")
 
 
 def _metadata_of_r3d(path: Path) -> dict[str, Any]:
@@ -300,7 +296,7 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
         camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
     up = np.array([0, 0, 1.0]) if folder.name == "pose" else None
     names = tuple(file.stem for file in files)
-    kind = f"ScanNet poses {folder}" if folder.name == "pose" else f"7-Scenes poses {folder}"
+    kind = "ScanNet poses" if folder.name == "pose" else "7-Scenes poses"
     poses, cameras = invert_rigid(world_from_cam), () if camera is None else (camera,)
     return PoseFile(poses, cameras, names, metric=True, up_in_world=up, kind=kind)
 
@@ -336,7 +332,7 @@ def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
             raise ReobjError(f"{at}: no camera; expected numbers {what}") from None
     poses = CV_FROM_GL @ invert_rigid(checked_rigid(np.array(matrices), where))
     names, up = tuple(file.stem for file in files), np.array([0, 1.0, 0])
-    kind = f"raw ARKit export {files[0].parent}"
+    kind = "raw ARKit export"
     return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=up, kind=kind)
 
 
@@ -373,7 +369,7 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     applied[:3] = checked_rigid(applied[None], [f"{path}, applied_transform"])[0]
     world_from_gl = checked_rigid(np.array(matrices), where)
     poses = CV_FROM_GL @ invert_rigid(world_from_gl) @ applied  # (N, 3, 4)
-    return PoseFile(poses, tuple(cameras), tuple(names), kind=f"transforms {path}")
+    return PoseFile(poses, tuple(cameras), tuple(names), kind="transforms")
 
 
 # ---- Datasets and radiance fields ----------------------------------------------------------------
@@ -401,7 +397,7 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
     poses = invert_rigid(checked_rigid(np.array(matrices), where))
     aligned = all("aligned_pose" in data[name] for name in names)
     up = Z_UP if aligned else None
-    kind = f"ScanNet++ iPhone poses {path}"
+    kind = "ScanNet++ iPhone poses"
     return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=up, kind=kind)
 
 
@@ -429,7 +425,7 @@ def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
         for h, w, f in table[:, :, 4].tolist()
     ]
     poses = invert_rigid(checked_rigid(world_from_cam, where))
-    return PoseFile(poses, tuple(cameras), kind=f"LLFF poses {path}")
+    return PoseFile(poses, tuple(cameras), kind="LLFF poses")
 
 
 def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -456,4 +452,4 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
     if not matrices:
         raise ReobjError(f"{path}: expected a list of cameras, as Gaussian splatting writes it")
     poses = invert_rigid(checked_rigid(np.array(matrices), where))
-    return PoseFile(poses, tuple(cameras), tuple(names), kind=f"Gaussian splatting cameras {path}")
+    return PoseFile(poses, tuple(cameras), tuple(names), kind="Gaussian splatting cameras")

@@ -90,7 +90,8 @@ def pose_readings(
     if not times:
         raise ReobjError("the video has no frame that can be read: poses belong to nothing")
     frame, time_s = np.array([n for n, _ in times], np.int64), np.array([t for _, t in times])
-    source, (stamps_s, messages) = source_of(video, frame, time_s), _in_seconds(given, path)
+    source = source_of(video, frame, time_s)
+    stamps_s, messages = _in_seconds(given, path, source)
     count = len(given.cam_from_world)
     found = readings(count, given.names, stamps_s, source, str(path), given.own)
     if not found:
@@ -122,13 +123,16 @@ def pose_readings(
     return result
 
 
-def _in_seconds(given: PoseFile, path: Path) -> tuple[Array | None, tuple[str, ...]]:
+def _in_seconds(
+    given: PoseFile, path: Path, source: Source
+) -> tuple[Array | None, tuple[str, ...]]:
     """Convert the stamps (N,) of a file into seconds; which unit was found, if the file is mute."""
     if given.stamps is None:
         return None, ()
-    unit, per_s = (
-        (given.unit, dict(UNITS)[given.unit]) if given.unit else unit_of_stamps(given.stamps)
-    )
+    unit, per_s = given.unit, dict(UNITS).get(given.unit, 1.0)
+    if not unit:
+        end_s = float(source.time_s[-1]) if source.timed else 0.0
+        unit, per_s = unit_of_stamps(given.stamps, end_s)
     said = unit != "s" and not given.unit
     return given.stamps / per_s, (f"{path}: time stamps taken for {unit}",) * said
 
@@ -229,7 +233,7 @@ def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
     given = reader(own, size)
     if len(kinds) > 1:
         others = ", ".join(sorted(set(kinds) - {name}))
-        note = f"{path}: read as {given.kind}; what is there of {others}: --pose-format"
+        note = f"{path}: read as {name}; --pose-format chooses what else is there: {others}"
         given = given.with_messages(note)
     return given
 
@@ -266,6 +270,8 @@ def _format_of_file(path: Path) -> str:
         return "colmap"
     if path.name == "odometry.csv":
         return "stray"
+    if path.name == "transforms.json":
+        return "transforms"
     if path.suffix == ".json" or path.name == "metadata":
         content = load_json(path)
         if isinstance(content, list):
