@@ -41,16 +41,16 @@ def imported(node: ast.AST) -> set[str]:
         elif isinstance(part, ast.ImportFrom):
             assert part.level == 0, f"line {part.lineno}: relative import"
             found |= {str(part.module)}
-            found |= {f"{part.module}.{a.name}" for a in part.names} & set(ROOMS)
+            found |= {f"{part.module}.{a.name}" for a in part.names} & set(MODULES)
     return found
 
 
-ROOMS = {name_of(path): path for path in PATHS}
+MODULES = {name_of(path): path for path in PATHS}
 
 
 def arrows() -> dict[str, set[str]]:
-    """The rooms that each room imports."""
-    return {name: imported(tree_of(path)) & set(ROOMS) for name, path in ROOMS.items()}
+    """The modules that each module imports."""
+    return {name: imported(tree_of(path)) & set(MODULES) for name, path in MODULES.items()}
 
 
 def test_there_is_no_circle() -> None:
@@ -63,7 +63,7 @@ def test_there_is_no_circle() -> None:
 
 def test_every_kind_of_import_is_seen() -> None:
     code = "from reobj.results import scene\nimport reobj_track\ndef f():\n    import reobj.files"
-    found = imported(ast.parse(code)) & set(ROOMS)
+    found = imported(ast.parse(code)) & set(MODULES)
     assert found == {"reobj.results", "reobj.results.scene", "reobj_track", "reobj.files"}
 
 
@@ -71,7 +71,7 @@ def test_imports_stand_at_the_top() -> None:
     """But for packages that are optional, or slow to load."""
     inner = {
         f"{name}.{function.name}": others
-        for name, path in ROOMS.items()
+        for name, path in MODULES.items()
         for function in ast.walk(tree_of(path))
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
         and (others := {m.partition(".")[0] for m in imported(function)} - LAZY)
@@ -79,10 +79,10 @@ def test_imports_stand_at_the_top() -> None:
     assert inner == {}
 
 
-def test_private_names_stay_in_their_room() -> None:
+def test_private_names_stay_in_their_module() -> None:
     crossing = {
         f"{name}: {alias.name}"
-        for name, path in ROOMS.items()
+        for name, path in MODULES.items()
         for node in ast.walk(tree_of(path))
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
