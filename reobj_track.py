@@ -1042,13 +1042,13 @@ def run(
                 started = time.monotonic()
                 found, boxes = detect_all(found, video, workspace)
                 seconds["detect"] = time.monotonic() - started
-            names = found.class_names
+            names = tuple(found.class_names)
         check_known_size(config.objects, names)
         model = None
         if poses is not None:
             check_directions(poses, boxes if tracks else _tracklets(boxes))
         elif in_3d and not video.is_live:
-            moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
+            moving = np.isin([*names, ""], config.objects.moving_classes)[boxes.class_id]
             rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
             started = time.monotonic()
             poses, model = reconstruct_cached(video, config.poses, workspace, rows)

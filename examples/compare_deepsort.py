@@ -62,7 +62,7 @@ from reobj.results.evaluation import (
     return_ranks,
     score_tracks,
 )
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own_models
 from reobj.types import Image
 

@@ -32,7 +32,7 @@ from reobj.results.evaluation import (
     read_truth,
 )
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.types import Array, Image, IntArray, box_iou
 
 WIDTH_PX, CAPTION_PX = 300, 22

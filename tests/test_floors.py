@@ -20,13 +20,15 @@ PATHS = [
 FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
-    2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
+    2: "reobj.files reobj.frame_lookup reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
     "reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
-    3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video "
+    3: "reobj.cameras reobj.options reobj.schema reobj.sources.video "
     "reobj.sources.weights "
-    "reobj.sources.recorded reobj.poses.child reobj.poses.uncertainty reobj.results.edits",
-    4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.detection_files "
+    "reobj.sources.recorded reobj.sources.class_names reobj.sources.image_frames reobj.poses.child reobj.poses.uncertainty "
+    "reobj.results.edits",
+    4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.tables "
+    "reobj.sources.coco reobj.sources.cvat reobj.sources.label_folders "
     "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
     "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "
     "reobj.poses.soundness "
@@ -34,14 +36,15 @@ FLOORS = {
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
     "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film "
     "reobj.results.folder",
-    5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
+    5: "reobj.sources.detection_files reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
     "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
     "reobj.poses.depth reobj.results.result",
     6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
     "reobj.results.workspace "
     "reobj.results.overlay reobj.results.solids reobj.results.plausibility",
-    7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
+    7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless "
+    "reobj.results.evaluation "
     "reobj.results.stages reobj.results.export reobj.results.scene",
     8: "reobj_track",
 }

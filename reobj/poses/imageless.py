@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from reobj.frame_lookup import frames_by_name
 from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import stated_camera
 from reobj.poses.matching import numbers_of_times, rows_by_number
@@ -54,7 +55,7 @@ def open_video(
             "--tracks FILE), --poses FILE and --camera MODEL WIDTH HEIGHT PARAMS, or a file"
         )
     path, posed, unknown = Path(boxes), poses.mode, (1, 1)
-    if not path.is_file():
+    if not path.exists():
         raise ReobjError(f"{path}: no such file of detections")
     size = image_size(path)
     stated = stated_camera(poses.camera, size)
@@ -84,9 +85,12 @@ def _frames_of(
     """
     if (times_s := recorded_times(boxes)) is not None:
         return ImagelessVideo(source, size, config, times_s=times_s)
-    first = ImagelessVideo(source, size, config)
-    images = {Path(name).name for name in image_names(boxes) or given.names}
-    names = sorted(images, key=by_number)
+    named = {Path(name.replace("\\", "/")).name for name in image_names(boxes)}
+    posed = {Path(name).name for name in given.names}
+    if named and posed and (frames_by_name(sorted(named), sorted(posed))[0] >= 0).all():
+        named = posed  # those of the boxes and more, with their suffixes
+    names = sorted(named or posed, key=by_number)
+    first = ImagelessVideo(source, size, config, names=names if named else ())
     if boxes.suffix.lower() not in (".xml", ".zip"):
         found = read_detections(boxes, first, DetectConfig(min_score=0.0)).frame
     else:

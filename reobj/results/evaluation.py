@@ -21,7 +21,7 @@ from reobj.files import load_json, wrapped
 from reobj.results.result import Result
 from reobj.results.solids import score_objects
 from reobj.results.workspace import LAST_TRACKS, Workspace
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.sources.video import InputConfig
 from reobj.types import (
     CLASS_MAX,

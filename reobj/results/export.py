@@ -32,7 +32,7 @@ from reobj.files import Progress, atomic, spans
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import CVAT_BOX
+from reobj.sources.cvat import CVAT_BOX
 from reobj.sources.video import IMAGE_FPS, Video
 from reobj.types import (
     Array,
