@@ -1024,7 +1024,8 @@ def run(
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
-    video = open_video(source, config.input, config.poses, tracks or detections)
+    boxes_file = tracks or detections
+    video = open_video(source, config.input, config.poses, boxes_file, config.detect)
     with Workspace(out, overwrite) as workspace:
         workspace.bind(video, overwrite)
         viewer = Viewer(VideoInfo.of(video)) if show else None

@@ -387,8 +387,9 @@ def text_labels(found: Any) -> list[str] | None:
         labels: Any = next((found[key] for key in keys if _is_text(found.get(key))), None)
     elif hasattr(found, "orig_shape") and getattr(found, "boxes", None) is not None:
         names, kinds = getattr(found, "names", None), as_numbers(found.boxes.cls, "classes")
-        named = isinstance(names, Mapping) and all(int(kind) in names for kind in kinds)
-        labels = [str(names[int(kind)]) for kind in kinds] if names and named else None
+        names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
+        named = all(int(kind) in names for kind in kinds)
+        labels = [str(names[int(kind)]) for kind in kinds] if named else None
     else:
         data = getattr(found, "data", None)
         labels = data.get("class_name") if isinstance(data, Mapping) else None

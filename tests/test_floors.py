@@ -20,12 +20,13 @@ PATHS = [
 FLOORS = {
     0: "reobj quadrics",
     1: "reobj.types",
-    2: "reobj.files reobj.frame_lookup reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
-    "reobj.sources.masks reobj.sources.tiles "
+    2: "reobj.files reobj.frame_lookup reobj.identity.assignment reobj.identity.evidence "
+    "reobj.identity.sampling reobj.sources.masks reobj.sources.tiles "
     "reobj.poses.arrays",
     3: "reobj.cameras reobj.options reobj.schema reobj.sources.video "
     "reobj.sources.weights "
-    "reobj.sources.recorded reobj.sources.class_names reobj.sources.image_frames reobj.poses.child reobj.poses.uncertainty "
+    "reobj.sources.recorded reobj.sources.class_names reobj.sources.image_frames "
+    "reobj.poses.child reobj.poses.uncertainty "
     "reobj.results.edits",
     4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.tables "
     "reobj.sources.coco reobj.sources.cvat reobj.sources.label_folders "
@@ -36,8 +37,9 @@ FLOORS = {
     "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
     "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film "
     "reobj.results.folder",
-    5: "reobj.sources.detection_files reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
-    "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
+    5: "reobj.sources.detection_files reobj.sources.onnx_layouts reobj.identity.crops "
+    "reobj.identity.linking reobj.identity.association reobj.identity.proposals "
+    "reobj.identity.occlusion "
     "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
     "reobj.poses.depth reobj.results.result",
     6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "

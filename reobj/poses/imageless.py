@@ -5,6 +5,7 @@ Start at `open_video`. What such frames are is said in `sources.imageless`.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,14 @@ def open_video(
     config: InputConfig,
     poses: PosesConfig,
     boxes: Any = None,
+    detect: DetectConfig | None = None,
 ) -> Video:
     """Open a video, or without one the frames that detections and poses speak of.
 
     Args:
         source: as `Video` takes it; None: there is none.
         poses, boxes: file of poses, and of detections or identities; of use without a video.
+        detect: how the detections are read.
     Raises:
         ReobjError: no video, and no file of detections, poses or size of the images either;
             options that ask for what is not there.
@@ -65,7 +68,7 @@ def open_video(
         size = (given.camera.width, given.camera.height)
     if size == unknown:
         raise ReobjError(f"{posed}: no image size in it; give --camera MODEL WIDTH HEIGHT PARAMS")
-    video = _frames_of(given, path, size, posed, config)
+    video = _frames_of(given, path, size, posed, config, detect or DetectConfig())
     video.messages.append(
         f"no images: {video.frame_count} frames of {size[0]}x{size[1]} as {posed} and {path} "
         "have them; tracked by motion and cameras alone, no appearance, no pictures"
@@ -74,7 +77,12 @@ def open_video(
 
 
 def _frames_of(
-    given: PoseFile, boxes: Path, size: tuple[int, int], source: str, config: InputConfig
+    given: PoseFile,
+    boxes: Path,
+    size: tuple[int, int],
+    source: str,
+    config: InputConfig,
+    detect: DetectConfig,
 ) -> ImagelessVideo:
     """Number the frames of poses and detections as a folder of their images would be.
 
@@ -91,10 +99,11 @@ def _frames_of(
         named = posed  # those of the boxes and more, with their suffixes
     names = sorted(named or posed, key=by_number)
     first = ImagelessVideo(source, size, config, names=names if named else ())
+    every = dataclasses.replace(detect, min_score=0.0, classes="", max_detections=0)
     if boxes.suffix.lower() not in (".xml", ".zip"):
-        found = read_detections(boxes, first, DetectConfig(min_score=0.0)).frame
+        found = read_detections(boxes, first, every).frame
     else:
-        found = read_tracks(boxes, first)[0].frame
+        found = read_tracks(boxes, first, every)[0].frame
     count = int(found.max(initial=-1)) + 1
     if names and count > len(names):
         row = rows_by_number(names, np.arange(count), ())

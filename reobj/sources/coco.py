@@ -112,12 +112,16 @@ def _beside(path: Path, entries: Sequence[Mapping[str, Any]]) -> Dataset | None:
         ReobjError: several fit and differ in what the ids mean; or none, and the results say
             nothing else of their images.
     """
-    found = []
+    found, faults = list[Dataset](), list[ReobjError]()
     for other in sorted(path.parent.glob("*.json")):
+        data = None
         with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
             data = load_json(other) if other != path else None
-            if isinstance(data, dict) and isinstance(data.get("images"), list) and data["images"]:
+        if isinstance(data, dict) and data.get("images"):
+            try:
                 found.append(parse_dataset(other, data))
+            except ReobjError as error:
+                faults.append(error)
     ids = {entry["image_id"] for entry in entries}
     kinds = {e["category_id"] for e in entries if _is_id(e.get("category_id"))}
     fit = [d for d in found if ids <= d.images.keys()]
@@ -132,8 +136,12 @@ def _beside(path: Path, entries: Sequence[Mapping[str, Any]]) -> Dataset | None:
             both = " and ".join(d.path.name for d in fit[:2])
             raise ReobjError(f"{path}: {both} beside it both have the ids of its images, for other "
                              "images or classes; leave the one that belongs to it")  # fmt: skip
-    if fit or not found or all("file_name" in e or isinstance(e["image_id"], str) for e in entries):
+    if fit or all("file_name" in e or isinstance(e["image_id"], str) for e in entries):
         return fit[0] if fit else None
+    if faults:
+        raise faults[0]
+    if not found:
+        return None
     only = found[0]
     lost: list[Any] = sorted(ids - only.images.keys(), key=str)
     what = f"image_id {lost[0]}" if lost else f"category_id {min(kinds, key=str)}"
@@ -186,7 +194,7 @@ def _read_coco(
     messages: list[str] = []
     class_id, class_names = _categories(path, entries, dataset, names, messages)
     frame, size = _images(path, entries, dataset, video, first, messages)
-    box = np.array([entry["bbox"] for entry in entries], np.float64).reshape(-1, 4)  # x, y, w, h
+    box, score = _box_and_score(path, entries)
     scale = scale_to(video.size, size, frame >= 0, str(path), messages)
     masks = [
         _mask(entry.get("segmentation"), video.size, ratio, f"{path}, entry {at}")
@@ -194,11 +202,24 @@ def _read_coco(
     ]
     return RecordedDetections(
         frame, np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) * scale,
-        np.array([entry.get("score", 1.0) for entry in entries], np.float64), class_id, masks,
+        score, class_id, masks,
         class_names, video.size, video.working_size, np.arange(len(entries)), "entry", messages,
         np.array([_identity(entry, f"{path}, entry {at}") for at, entry in enumerate(entries)],
                  np.int64),
     )  # fmt: skip
+
+
+def _box_and_score(path: Path, entries: Sequence[Mapping[str, Any]]) -> tuple[Array, Array]:
+    """Return the boxes (N, 4) x, y, w, h and scores (N,); an error names the entry."""
+    rows = []
+    for at, entry in enumerate(entries):
+        row = [*entry["bbox"], entry.get("score", 1.0)]
+        if any(isinstance(v, bool) or not isinstance(v, int | float) for v in row):
+            found = {key: entry.get(key) for key in ("bbox", "score")}
+            raise ReobjError(f"{path}, entry {at}: {found!r:.80}, expected numbers")
+        rows.append(row)
+    values = np.array(rows, np.float64).reshape(-1, 5)
+    return values[:, :4], values[:, 4]
 
 
 def _identity(entry: Mapping[str, Any], where: str) -> int:

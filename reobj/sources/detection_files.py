@@ -84,7 +84,7 @@ def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
     Raises:
         ReobjError: a name that is not among `names`.
     """
-    known = {name.lower(): i for i, name in enumerate(names)}
+    known = {name.lower().replace("_", " "): i for i, name in enumerate(names)}
     chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
     unknown = [name for name in chosen if name not in known]
     if unknown:

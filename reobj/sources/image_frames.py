@@ -31,11 +31,27 @@ class Frames(Protocol):
     source: str
 
 
+ROBOFLOW = re.compile(r"_(jpe?g|png|bmp|webp|tiff?)\.rf\.[^./\\]+", re.IGNORECASE)
+
+
+def original_name(name: str) -> str:
+    """Return the name that an image had before Roboflow exported it, other names as they are.
+
+    >>> original_name("frame_0001_png.rf.3f2a9c.jpg")
+    'frame_0001.png'
+    """
+    found = ROBOFLOW.search(name)
+    return f"{name[: found.start()]}.{found[1]}" if found else name
+
+
 def last_numbers(names: Sequence[str]) -> IntArray:
-    """Return the last whole number in each name without its suffix (N,), -1 where there is none."""
+    """Return the last whole number in each name without its suffix (N,), -1 where there is none.
+
+    Numbers before a letter do not count: in names with a hash in them.
+    """
     stems = [re.split(r"[\\/]", name)[-1] for name in names]
     stems = [stem.rpartition(".")[0] or stem for stem in stems]
-    digits = [re.findall(r"\d+", stem) for stem in stems]
+    digits = [re.findall(r"\d+(?![0-9A-Za-z])", stem) for stem in stems]
     return np.array([int(d[-1][-18:]) if d else -1 for d in digits], np.int64)  # int64 has 18
 
 
@@ -108,7 +124,7 @@ def frames_of_names(
         ReobjError: no rule fits, or several do.
     """
     distinct, row = np.unique(np.array(names, object), return_inverse=True)
-    given = distinct.tolist()
+    given = [original_name(name) for name in distinct.tolist()]
     if not given:
         return np.empty(0, np.int64), ""
     if video.names:
@@ -125,7 +141,7 @@ def frames_of_names(
         raise ReobjError(f"{where}: names such as {name!r} mean no frame of the video ({why}); "
                          f"expected {expected}")  # fmt: skip
     frame, text = _by_image_number(number, video, given)
-    if text:
+    if text and not first:
         return frame[row], text
     frame, text = frames_of_numbers(number, video.frame_count, first, usual, listed, where)
     said = "the number in a name is the frame's"

@@ -503,7 +503,8 @@ def _is_boxmot(table: Table, score: Array, number: IntArray) -> bool:
     if not ((extra > 0) & (extra < 1)).all():
         return False
     no_truth = (table.numbers("id") < 0).all() or (number == 0).any()
-    return bool(no_truth or len(extra) >= VISIBLE_ROWS)
+    as_written = all(re.fullmatch(r"0?\.\d{6}", cell) for cell in table.cells["extra"])  # %.6f
+    return bool(no_truth or as_written or len(extra) >= VISIBLE_ROWS)
 
 
 def _without_ignored(found: RecordedDetections) -> RecordedDetections:
