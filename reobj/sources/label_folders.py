@@ -65,6 +65,11 @@ def read_label_folder(
     """
     files = label_files(path)
     messages = [f"a folder of YOLO labels: {len(files)} files"]
+    of_video = re.compile(re.escape(Path(video.source).stem) + r"_\d+")
+    ours = [] if video.names else [f for f in files if of_video.fullmatch(f.stem)]
+    if ours and len(ours) < len(files):
+        messages.append(f"{len(files) - len(ours)} files of other names than the video's left out")
+        files = ours
     if not names and (beside := names_file(path)) is not None:
         names = load_class_names(beside)
         messages.append(f"class names of {beside.name}")
@@ -80,9 +85,8 @@ def read_label_folder(
         if len(rows) > LINES_MAX:
             raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
     box, score, identity = _columns(rows)
-    ours = all(re.fullmatch(re.escape(Path(video.source).stem) + r"_\d+", f.stem) for f in files)
     stems = [str(file.relative_to(path)) for file in files]
-    usual = 1 if ours and not video.names else None
+    usual = 1 if ours else None
     frame, text = frames_of_names(stems, video, str(path), first, usual, not ours)
     messages += [text] if text else []
     scaled = xyxy_from_cxcywh(box) * np.tile(np.array(video.size, np.float64), 2)

@@ -137,6 +137,12 @@ def _is_number(cell: str) -> bool:
     return False
 
 
+def _are_numbers(cells: Sequence[str]) -> bool:
+    with contextlib.suppress(ValueError):
+        return np.array(cells, np.float64).ndim == 1
+    return all(map(_is_number, cells))
+
+
 def _separator(line: str) -> str:
     """Find what separates the cells of a line: of ; tab and comma the one that makes most."""
     best = max(";\t,", key=line.count)
@@ -161,6 +167,8 @@ def _rows(path: Path) -> tuple[list[list[str]], list[int], str]:
             raise ReobjError(f"{path}, line {reader.line_num}: no table ({error})") from error
     kept = [([cell.strip() for cell in cells], i) for cells, i in split]
     kept = [(cells, i) for cells, i in kept if any(cells)]
+    if kept and kept[0][0][0] == "#":  # of a header, apart from its first name
+        kept[0][0].pop(0)
     return [cells for cells, _ in kept], [i for _, i in kept], separator
 
 
@@ -309,8 +317,10 @@ def _drop_rows(table: Table) -> None:
             table.messages.append(f"{(~keep).sum()} rows DontCare left out")
             table.rows(keep)
     roles = [role for role in ("x1", "y1", "x2", "y2", "w", "h", "cx", "cy") if role in table.cells]
-    boxes = zip(*(table.cells[role] for role in roles), strict=True)
-    none = np.array([all(map(_is_empty, cells)) for cells in boxes], bool)
+    none = np.ones(len(table.line), bool)
+    for role in roles:
+        rows = np.flatnonzero(none)
+        none[rows] = [_is_empty(table.cells[role][row]) for row in rows]
     if none.any():
         first = f"{table.unit} {table.line[none][0]}"
         table.messages.append(f"{none.sum()} rows without a box left out, the first at {first}")
@@ -340,7 +350,7 @@ USUAL_FIRST = {"MOT": 1, "KITTI": 0, "CSV": 0}  # number of the first frame
 
 def _frames(table: Table, video: Video, first: str) -> IntArray:
     """Return the frames of the source (N,), -1: none."""
-    if "frame" in table.cells and all(map(_is_number, table.cells["frame"])):
+    if "frame" in table.cells and _are_numbers(table.cells["frame"]):
         usual = USUAL_FIRST[table.kind]
         if any(name.startswith("bb_") for name in table.header):  # MOTChallenge's own names
             usual = 1
@@ -361,7 +371,7 @@ def image_names_of(table: Table) -> list[str]:
     if "frame" in table.cells or "image" not in table.cells:
         return []
     names = list(dict.fromkeys(table.cells["image"]))
-    return [] if all(map(_is_number, names)) else names
+    return [] if _are_numbers(names) else names
 
 
 def seconds(table: Table) -> Array:

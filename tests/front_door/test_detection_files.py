@@ -145,6 +145,8 @@ TABLES = {
     "mot with floats as numpy writes them": mot(tail="9.0e-01,57.0"),
     "mot with CRLF and a byte order mark": "\ufeff" + mot().replace("\n", "\r\n"),
     "mot from 0": mot(first=0),
+    "mot in columns": mot("   ").replace("1 ", " 1 "),
+    "a header of words": csv("# frame x1 y1 x2 y2 score class", "{f} {x1} {y1} {x2} {y2} .9 chair"),
     "boxmot: 1, class from 0, score": mot(tail=f"1,{CHAIR},0.873000"),
     "boxmot's detections, no identity": mot(tail=f"1,{CHAIR},.87", identity=-1),
     "csv": csv("frame,x1,y1,x2,y2,score,class", CSV_ROW),
@@ -357,6 +359,26 @@ def test_label_files_that_cannot_be_meant(
     assert made.code == 2 and "without label files" in made.said
 
 
+def test_labels_of_several_videos_in_one_folder(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    labels = yolo_folder(tmp_path / "labels", yolo, "v_{}.txt", 1)
+    for f in range(4):
+        (labels / f"other_{f + 1}.txt").write_text("1 .5 .5 .2 .2\n")
+    made = tracked(film(tmp_path / "v.avi"), "--detections", labels)
+    assert is_truth(made) and "4 files of other names than the video's left out" in made.said
+
+
+def test_labels_from_roboflow(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    """Its names have the original one before a hash, whose digits are no frame number."""
+    source = images(tmp_path / "im", [f"room{f}.png" for f in range(FRAMES)])
+    folder = tmp_path / "train/labels"
+    folder.mkdir(parents=True)
+    for f in range(FRAMES):
+        (folder / f"room{f}_png.rf.ab{90 - f}cd{7 * f}.txt").write_text(yolo(f))
+    assert is_truth(tracked(source, "--detections", tmp_path / "train"))
+
+
 # ---- What is left out is counted -----------------------------------------------------------------
 
 
@@ -395,6 +417,28 @@ def test_what_is_left_out_or_guessed_is_said_once(
     (tmp_path / "det.txt").write_text(text)
     made = tracked(film(tmp_path / "v.avi"), "--detections", tmp_path / "det.txt")
     assert made.code == 0 and made.said.count(said) == 1, made.said
+
+
+@pytest.mark.parametrize(
+    ("name", "per_s"),
+    [("timestamp", 1), ("time_ns", 1e9), ("timestamp", 1e9), ("Timestamp [ms]", 1e3),
+     ("timestamp_us", 1e6)],
+)  # fmt: skip
+def test_times_in_every_unit(
+    tmp_path: Path, tracked: Callable[..., Tracked], name: str, per_s: float
+) -> None:
+    """Of images named by times since 1970: in the unit of the column, or that of the date."""
+    start = 1341847980
+    source = images(tmp_path / "im", [f"{start + f / 25:.6f}.png" for f in range(FRAMES)])
+    row = "{f},{x1},{y1},{x2},{y2},.9,chair"
+    text = csv(f"{name},x1,y1,x2,y2,score,class", row).splitlines(keepends=True)
+    times = [
+        f"{round((start + f / 25) * per_s, 6 if per_s == 1 else 0):.6f}" for f in range(FRAMES)
+    ]
+    rows = [t + line[line.index(",") :] for t, line in zip(times, text[1:], strict=True)]
+    (tmp_path / "det.csv").write_text(text[0] + "".join(rows))
+    made = tracked(source, "--detections", tmp_path / "det.csv")
+    assert is_truth(made), made
 
 
 def test_csv_from_1_that_does_not_show_it(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
