@@ -25,6 +25,7 @@ from reobj.sources.recorded import RecordedDetections
 from reobj.sources.video import EPOCH_S, Video
 from reobj.types import (
     CLASS_MAX,
+    CLASS_NAME_MAX,
     COCO_NAMES,
     COORDINATE_MAX,
     Array,
@@ -420,8 +421,9 @@ def _text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[st
         known = list(names or COCO_NAMES)
         class_id[~blank] = numbers
     else:
-        for row in np.flatnonzero(~blank):
-            check_length(cells[row], table.where(int(row)))
+        for name in set(filled):
+            if len(name) > CLASS_NAME_MAX:
+                check_length(name, table.where(cells.index(name)))
         base = list(names) if table.kind == "KITTI" else list(names or COCO_NAMES)
         new = sorted(set(filled) - set(base))
         known = [*base, *new]
