@@ -1049,7 +1049,8 @@ def run(
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
-    video = open_video(source, config.input, config.poses, tracks or detections)
+    boxes_file = tracks or detections
+    video = open_video(source, config.input, config.poses, boxes_file, config.detect)
     with Workspace(out, overwrite) as workspace:
         workspace.bind(video, overwrite)
         viewer = Viewer(VideoInfo.of(video)) if show else None
@@ -1067,14 +1068,14 @@ def run(
                 started = time.monotonic()
                 found, boxes = detect_all(found, video, workspace)
                 seconds["detect"] = time.monotonic() - started
-            names = found.class_names
+            names = tuple(found.class_names)
         check_known_size(config.objects, names)
         model = None
         if readings:
             shown = boxes if tracks else _tracklets(boxes)
             poses = settled_poses(readings, shown, video, config.poses, workspace)
         elif in_3d and not video.is_live:
-            moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
+            moving = np.isin([*names, ""], config.objects.moving_classes)[boxes.class_id]
             rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
             started = time.monotonic()
             poses, model = reconstruct_cached(video, config.poses, workspace, rows)

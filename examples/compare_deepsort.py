@@ -57,7 +57,7 @@ import reobj_track as rt
 from reobj.files import atomic
 from reobj.results.evaluation import return_ranks, score_tracks
 from reobj.results.truth import LabelledBoxes, labelled, read_truth
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session, own_models
 from reobj.types import Image
 

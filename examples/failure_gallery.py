@@ -27,7 +27,7 @@ import reobj_track as rt
 from reobj.results.evaluation import identity_map, matched_rows
 from reobj.results.truth import LabelledBoxes, read_result, read_truth
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.types import Array, Image, IntArray, box_iou
 
 WIDTH_PX, CAPTION_PX = 300, 22

@@ -22,7 +22,12 @@ from reobj.types import ReobjError, one_line, without_secrets
 
 Command = Callable[[argparse.Namespace], int]
 SHELLS = ("bash", "zsh")  # shtab's script for tcsh knows no flags of commands
-TRACKS_HELP = "identities from a file instead of the tracker: CVAT XML, COCO-VID JSON, MOT, CSV"
+TRACKS_HELP = (
+    "identities from a file instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, YOLO labels"
+)
+DETECTIONS_HELP = (
+    "recorded detections instead: MOT, KITTI, CSV, COCO JSON, folder of YOLO labels, CVAT, npz"
+)
 
 
 class Parser(argparse.ArgumentParser):
@@ -201,7 +206,7 @@ def _add_run(command: Any, name: str, text: str) -> None:
     add("-o", "--out", required=True, help="output folder")
     add("--overwrite", action="store_true", help="write into a folder that holds something else")
     if name != "poses":
-        add("--detections", help="recorded detections instead: MOT txt, CSV, COCO JSON, npz")
+        add("--detections", help=DETECTIONS_HELP)
         add("--tracks", help=TRACKS_HELP)
         add("--show", action="store_true", help="follow it live in rerun's viewer (needs rerun)")
 

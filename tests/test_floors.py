@@ -8,7 +8,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-
 ROOT = Path(__file__).resolve().parent.parent
 PATHS = [
     ROOT / "reobj_track.py",

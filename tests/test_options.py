@@ -471,11 +471,26 @@ def _(lab: Lab) -> None:
     assert source.class_names == ("mouse", "stool", "chair")
 
 
+@shows("detect.first_frame")
+def _(lab: Lab) -> None:
+    """A frame 1 of two is the second one as CSV counts, the first where the user says so."""
+    (lab.path / "det.csv").write_text("frame,x1,y1,x2,y2\n1,1,2,30,40\n")
+    video = rt.Video(images(lab.path / "images", 3))
+    for value, frame in (("", 1), ("0", 1), ("1", 0)):
+        config = lab.config(value).detect
+        assert rt.read_detections(lab.path / "det.csv", video, config).frame.tolist() == [frame]
+    with pytest.raises(rt.ReobjError, match=r"detect\.first_frame 2: expected 0 or 1"):
+        rt.read_detections(lab.path / "det.csv", video, lab.config("2").detect)
+
+
 @shows("detect.max_detections")
 def _(lab: Lab) -> None:
     assert by_file(lab, 1)[0].score.tolist() == [0.9]
-    lab.patch.setattr(Session, "BOXES", tuple((10 + 12 * i, 9, 8, 8, 0.9, 1) for i in range(4)))
-    assert [len(by_network(lab, value)[0]) for value in (3, 9)] == [3, 4]
+    many = tuple((5 + 12 * (i % 5), 9 + 12 * (i // 5), 8, 8, 0.9, 1) for i in range(10))
+    lab.patch.setattr(Session, "BOXES", many)
+    lab.patch.setattr(detectors, "MODEL_DETECTIONS", 6)
+    assert [len(by_network(lab, value)[0]) for value in (3, 9, 0)] == [3, 9, 6]
+    assert [len(by_file(lab, value)[0]) for value in (3, 9, 0)] == [3, 9, 10]  # 0: all of a file
 
 
 # ---- embed, threads, device, offline: what reaches the networks of a run ----

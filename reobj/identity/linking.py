@@ -123,8 +123,8 @@ class Linker:
         self.tracklets = self.tracks.tracklet_id[first]
         self.identity = self.tracks.track_id[first]
         self.classes = class_shares(self.tracks, self.fragment, len(first)).argmax(1)
-        names = np.array([*class_names, ""])[self.classes.clip(max=len(class_names))]
-        self.moving = np.isin(names, list(moving))
+        moves = np.isin([*class_names, ""], list(moving))  # (C + 1,), the last: unknown
+        self.moving = moves[self.classes.clip(max=len(class_names))]
 
     def _co_occurrence(self) -> tuple[BoolArray, BoolArray]:
         """Find fragments that are seen in the same frame.

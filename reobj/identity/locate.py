@@ -81,8 +81,10 @@ def locate(
             missed; None: all.
     """
     names = np.array([*class_names, ""])
-    label = names[rows.class_id.clip(-1, len(class_names))]  # (N,)
-    fixed = ~np.isin(label, list(moving)) & np.isin(rows.frame, poses.frame[poses.known])
+    moves = np.isin(names, list(moving))  # (C + 1,), -1: unknown
+    fixed = ~moves[rows.class_id.clip(-1, len(class_names))] & np.isin(
+        rows.frame, poses.frame[poses.known]
+    )
     own = np.flatnonzero(fixed & ~_doubles(rows))
     table, solid, overlap = rows[own], np.full(len(rows), -1), np.full(len(rows), np.nan)
     tracked = table[table.tracklet_id > 0]

@@ -16,6 +16,7 @@ import numpy as np
 
 from reobj.files import atomic, load_json, shortened
 from reobj.types import (
+    CLASS_NAME_MAX,
     COORDINATE_MAX,
     Array,
     BoolArray,
@@ -127,6 +128,8 @@ def _parse(entry: Any) -> Edit:
     name = entry.get("class", "")
     if not isinstance(name, str) or ("class" in fields and not name.strip()):
         raise ValueError(f"class {name!r} is no name")
+    if len(name) > CLASS_NAME_MAX:
+        raise ValueError(f"class of {len(name)} characters, at most {CLASS_NAME_MAX} are taken")
     if not name.isprintable():
         raise ValueError(f"class {name!r} has characters that cannot be printed")
     visits = tuple(_box_ref(item) for item in entry.get("visits", ()))

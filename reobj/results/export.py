@@ -35,7 +35,7 @@ from reobj.results.origin import centred, far_origin, shifted
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import CVAT_BOX
+from reobj.sources.cvat import CVAT_BOX
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
 from reobj.types import (

@@ -42,7 +42,7 @@ from reobj.results.edits import EDITS, Edits, write_edits
 from reobj.results.folder import LAST_POSES, STALE, replaced, write_mot, write_trajectories
 from reobj.results.ply import write_ply
 from reobj.schema import faults, objects_schema
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.sources.video import Video
 from reobj.types import (
     Array,

@@ -124,7 +124,7 @@ def collect_tracks(
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
     tracks = Tracks.concatenate(frames, found, video.scale)
-    result = Result(tracks, source.class_names, VideoInfo.of(video))
+    result = Result(tracks, tuple(source.class_names), VideoInfo.of(video))
     result.untracked = _untracked(tracks, frames, detected, video.scale)
     if not all(looked):
         result.looked = np.array(frames, np.int64)[np.array(looked, bool)]

@@ -21,10 +21,12 @@ import numpy.typing as npt
 
 from reobj.files import load_json, read_lines, shortened
 from reobj.results.result import Result
-from reobj.sources.detection_files import WHOLE_MAX, _read_cvat, read_mot_rows
+from reobj.sources.cvat import read_cvat
+from reobj.sources.tables import WHOLE_MAX, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
 
 SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
+NO_VIDEO = SimpleNamespace(size=(0, 0), working_size=(0, 0), names=[], frame_count=0)
 UNNAMED = ("", "object")  # names of boxes without a class
 
 
@@ -77,7 +79,7 @@ def read_truth(
     """
     said = [] if said is None else said
     if path.suffix.lower() in (".xml", ".zip"):
-        found = _read_cvat(path, SimpleNamespace(size=(0, 0), working_size=(0, 0)))  # type: ignore[arg-type]
+        found = read_cvat(path, NO_VIDEO)  # type: ignore[arg-type]
         names = np.array(found.class_names, str)[found.class_id]
         role = np.full(len(names), SCORED)
         truth = LabelledBoxes(found.frame + 1, found.identity, found.xyxy, names, role)
