@@ -226,7 +226,8 @@ def scale_to(
     """Return the factors (N, 4) from the images that boxes were made for to those of the video.
 
     Args:
-        size: (w, h) of the video, (0, 0): unknown, then nothing is scaled. made_for: (N, 2) of each box's image, 0: unknown. used: (N,)
+        size: (w, h) of the video, (0, 0): unknown, then nothing is scaled.
+        made_for: (N, 2) of each box's image, 0: unknown. used: (N,)
             whether the box belongs to a frame.
     Raises:
         ReobjError: images of another shape.
