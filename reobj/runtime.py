@@ -17,9 +17,9 @@ from reobj.types import ReobjError
 # The lower bounds of pyproject.toml; the tests run with them too (.ci/lowest.txt).
 LEAST_VERSIONS = {
     "opencv-python-headless": "4.10",
-    "numpy": "1.26",
-    "scipy": "1.13",
-    "onnxruntime": "1.19",
+    "numpy": "1.26.4",
+    "scipy": "1.13.1",
+    "onnxruntime": "1.19.2",
     "pycolmap": "4.2.1",
     "filterpy": "1.4.5",
 }

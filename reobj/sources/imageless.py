@@ -57,7 +57,7 @@ class ImagelessVideo(Video):
         if given is not None and len(given) < self.frame_count:
             what = f"{len(given)} times of {self.frame_count} frames"
             raise ReobjError(f"{self.source}: {what}; expected one each")
-        self.fps = IMAGE_FPS
+        self._clock, self._announced, self.fps = None, self.frame_count, IMAGE_FPS
         if given is not None and len(given) > 1:
             self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
         self.is_live, self.read, self.dropped = False, 0, 0

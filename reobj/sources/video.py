@@ -150,8 +150,8 @@ class Video:
     @property
     def expected(self) -> int:
         """Count the frames that an iteration yields, about: as announced before it was measured."""
-        known = self.files or (self._clock is not None and self._clock.complete)
-        count = self.frame_count if known else self._announced
+        clock, count = self._clock, self._announced
+        count = len(clock.times_s) if clock is not None and clock.complete else count
         stop = min(self.config.stop or count, count or self.config.stop)
         return max(math.ceil((stop - self.config.start) / self.config.every), 0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fractions
+import re
 import struct
 import subprocess
 import sys
@@ -482,12 +483,19 @@ def test_a_process_that_is_ended_prints_no_trace() -> None:
     assert (done.returncode, done.stderr) == (-15, "")
 
 
+@pytest.mark.parametrize("file", ["pyproject.toml", "requirements.txt", ".ci/lowest.txt"])
+def test_lower_bounds_are_the_same_everywhere(file: str) -> None:
+    text = (ROOT / file).read_text()
+    for package, least in runtime.LEAST_VERSIONS.items():
+        assert re.search(rf'^ *"?{package}[=>]={re.escape(least)}', text, re.MULTILINE), package
+
+
 @pytest.mark.parametrize(
     ("package", "version", "said"),
     [
         ("cv2", "4.9.0", "OpenCV 4.9.0 is installed, 4.10 or later is needed: pip install"),
         ("cv2", "3.4.18-dev", "OpenCV 3.4.18-dev is installed"),
-        ("numpy", "1.24.4", "numpy 1.24.4 is installed"),
+        ("numpy", "1.24.4", "numpy 1.24.4 is installed, 1.26.4 or later is needed"),
         ("cv2", "4.10.0", ""),
         ("cv2", "6.0.0-pre", ""),
     ],
