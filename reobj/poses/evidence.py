@@ -87,9 +87,11 @@ SIZE_PX = 640  # longer side of the images in which features are matched (as the
 FEATURES = 1000  # SIFT features an image (chosen: time)
 RATIO = 0.8  # of the distances to the nearest and the second descriptor (Lowe, IJCV 2004)
 MIN_MATCHES = 20  # of a pair that says something (chosen)
-PAIRS = 12  # pairs of images that two readings are compared by (chosen: time)
+PAIRS = 20  # pairs of images that two readings are compared by (chosen: time)
+MIN_PAIRS = 3  # fewer say nothing (chosen)
 STEPS = (1, 2, 5, 10)  # frames with a pose between the two of a pair (chosen)
-MAX_TURN_DEG = 25.0  # between the two of a pair: half of a usual field of view (chosen)
+MAX_TURN_DEG = 30.0  # between the two of a pair: half of a usual field of view (chosen)
+ENOUGH_DEG = 8.0  # of difference: more says no more, and narrow pairs match better (chosen)
 TURN_PER_DEG = 0.1  # a translation's direction counts so much less than the rotation (chosen)
 
 
@@ -138,11 +140,11 @@ def _pairs_that_differ(one: Poses, other: Poses | None) -> list[tuple[int, int]]
     Args:
         other: None: pairs of one reading, those with the widest motion.
     Returns:
-        rows of the poses; [] with fewer than PAIRS / 2 pairs that have poses in both.
+        rows of the poses; [] with fewer than MIN_PAIRS pairs that have poses in both.
     """
     rows = np.flatnonzero(one.known if other is None else one.known & other.known)
     pairs = np.array([p for s in STEPS for p in zip(rows[:-s], rows[s:], strict=True)], np.int64)
-    if len(pairs) < PAIRS // 2:
+    if len(pairs) < MIN_PAIRS:
         return []
     turn, way = _relative(one, pairs)
     change, slide = turn, np.zeros(len(pairs))
@@ -154,7 +156,8 @@ def _pairs_that_differ(one: Poses, other: Poses | None) -> list[tuple[int, int]]
         cosine = (way * other_way).sum(1) / np.maximum(norm, 1e-12)
         slide = np.where(norm > 0, np.degrees(np.arccos(cosine.clip(-1, 1))), 0.0)
         near &= _angle_deg(other_turn) < MAX_TURN_DEG
-    score = np.where(near, _angle_deg(change) + TURN_PER_DEG * slide, -1.0)
+    differ = (_angle_deg(change) + TURN_PER_DEG * slide).clip(max=ENOUGH_DEG)
+    score = np.where(near, differ, -1.0)
     chosen: list[tuple[int, int]] = []
     apart = len(rows) / (2 * PAIRS)  # so that they are spread over the video
     for k in np.argsort(-score, kind="stable").tolist():

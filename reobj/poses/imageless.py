@@ -117,7 +117,7 @@ def _frames_of(
     if names and count > len(names):
         number = numbers_of_names(names, source)
         frames = Source(np.arange(count), np.arange(count) / 1.0, count)
-        ways = [r for r in by_numbers(number, frames, "numbers", source) if not r.outside]
+        ways = [r for r in by_numbers(number, frames, "numbers") if not r.outside]
         if len(ways) != 1:
             last = int(number.max()) + 1
             return ImagelessVideo(source, size, config, count=count if ways else max(count, last))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -262,11 +263,11 @@ def camera_from_yaml(data: dict[str, Any], size: tuple[int, int] | None) -> Came
     if len(kalibr) > 1:
         raise ReobjError(f"cameras {', '.join(kalibr)}; expected one: leave the others out")
     data = data[kalibr[0]] if kalibr else data
-    known = {key.partition(".")[2] if key.startswith("Camera") else key: data[key] for key in data}
+    known = {re.sub(r"^Camera1?\.", "", key): data[key] for key in data}
     plain = {key.replace("_", "").lower(): own for key, own in known.items()}
     for key in ("camera_matrix", "distortion_coefficients"):  # Camera_Matrix, cameraMatrix
-        if key.replace("_", "") in plain:
-            known[key] = plain[key.replace("_", "")]
+        if (word := key.replace("_", "")) in plain:
+            known[key] = plain[word]
     if "distortion_coeffs" in known:
         known["distortion_coefficients"] = known["distortion_coeffs"]
     if len(known.get("resolution", ())) == 2:

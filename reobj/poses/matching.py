@@ -112,10 +112,10 @@ def _by_names(names: Sequence[str], source: Source, where: str) -> list[Reading]
         frame, rule = frames_by_name(names, source.images, where)
         if (frame >= 0).any():
             return [_reading("name", rule, frame, source)]
-    return by_numbers(numbers_of_names(names, where), source, "numbers in the image names", where)
+    return by_numbers(numbers_of_names(names, where), source, "numbers in the image names")
 
 
-def by_numbers(number: IntArray, source: Source, noun: str, where: str) -> list[Reading]:
+def by_numbers(number: IntArray, source: Source, noun: str) -> list[Reading]:
     """List what numbers (N,) of poses may mean; negative: none. `noun` names them in the rules.
 
     Of images, whose names have numbers too: the same; or one side counts from 0, the other from 1.
@@ -124,8 +124,8 @@ def by_numbers(number: IntArray, source: Source, noun: str, where: str) -> list[
     known = number >= 0
     if not known.any():
         return []
-    images = numbers_of_names(source.images, where) if source.images else np.arange(0)
-    if len(images) and (images >= 0).all():
+    images = _numbers_of_images(source.images)
+    if len(images):
         return _by_image_numbers(number, images, source, noun)
     least, most = int(number[known].min()), int(number[known].max())
     ways = [(f"number{first}", 1, first) for first in (0, 1)]
@@ -155,6 +155,12 @@ def _by_image_numbers(
     for key, rule, offset in ways:
         frame = np.array([frame_of.get(n + offset, -1) for n in number.tolist()], np.int64)
         found.append(_reading(key, rule, np.where(known, frame, -1), source))
+    if found[0].outside:  # not all of them are numbers of images
+        for first in (0, 1):
+            rule = f"{noun} as places in the order of the images, counted from {first}"
+            found.append(
+                _reading(f"place{first}", rule, np.where(known, number - first, -1), source)
+            )
     if known.all() and len(number) == len(images):
         order = np.argsort(np.argsort(number))
         found.append(_reading("order", f"order of the {noun}", order, source))
@@ -201,6 +207,15 @@ def numbers_of_names(names: Sequence[str], where: str) -> IntArray:
                 "of a frame; give the poses of one camera, or a folder of images with these names"
             )
     raise ReobjError(f"{where}: {names[0]!r} is there twice; expected each image once")
+
+
+def _numbers_of_images(images: Sequence[str]) -> IntArray:
+    """Return the numbers (F,) in the names of images; (0,) where they are no unique keys."""
+    try:
+        number = numbers_of_names(images, "")
+    except ReobjError:
+        return np.arange(0)
+    return number if (number >= 0).all() else number[:0]
 
 
 # ---- Time stamps ---------------------------------------------------------------------------------
@@ -287,7 +302,7 @@ def _by_stamps(stamps_s: Array, source: Source, own: bool) -> list[Reading]:
     )
     if is_whole(stamps_s) and 0 <= stamps_s[0] and stamps_s[-1] < LEAST_STAMP:
         noun = "whole numbers in place of time stamps"
-        found += by_numbers(stamps_s.astype(np.int64), source, noun, "")
+        found += by_numbers(stamps_s.astype(np.int64), source, noun)
     elif not source.timed and count != source.count:
         number = _even_numbers(stamps_s)
         if number is not None:
@@ -350,7 +365,7 @@ def interpolated(cam_from_world: Array, stamps_s: Array, time_s: Array) -> tuple
 
 def _by_order(count: int, source: Source, where: str) -> list[Reading]:
     """Read `count` rows without names or times: one a frame, or rows numbered as the images are."""
-    if picked := _by_picked_images(count, source, where):
+    if picked := _by_picked_images(count, source):
         return picked
     rows, last = np.arange(count), int(source.frame[-1])
     if count == source.count:
@@ -372,12 +387,11 @@ def _by_order(count: int, source: Source, where: str) -> list[Reading]:
     return found
 
 
-def _by_picked_images(count: int, source: Source, where: str) -> list[Reading]:
+def _by_picked_images(count: int, source: Source) -> list[Reading]:
     """Read rows by the numbers in the names of images that were picked out of `count`."""
-    images = source.images if len(source.images) != count else ()
-    number = numbers_of_names(images, where) if images else np.arange(0)
+    number = _numbers_of_images(source.images if len(source.images) != count else ())
     found = []
-    for first in (0, 1) if len(number) and (number >= 0).all() else ():
+    for first in (0, 1) if len(number) else ():
         if first <= number.min() and number.max() < count + first:
             frame_of = {n - first: frame for frame, n in enumerate(number.tolist())}
             frame = np.array([frame_of.get(n, -1) for n in range(count)], np.int64)
