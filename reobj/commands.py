@@ -101,8 +101,7 @@ def _open_streams() -> None:
             setattr(sys, name, open(os.devnull, "r+"))
     for stream in (sys.stdout, sys.stderr):  # no name of a class or file ends a run
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            utf8 = stream.encoding.lower().replace("-", "") == "utf8"
-            stream.reconfigure(errors="surrogateescape" if utf8 else "backslashreplace")
+            stream.reconfigure(errors="backslashreplace")
 
 
 def say(text: str) -> None:
