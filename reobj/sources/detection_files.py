@@ -558,7 +558,7 @@ def read_tracks(
     path, config = Path(path), config or DetectConfig()
     limit = dataclasses.replace(config, min_score=0.0, max_detections=sys.maxsize)
     if path.suffix.lower() in (".xml", ".zip"):
-        found = _read_cvat(path, video)
+        found = read_cvat(path, video)
     else:
         found = _read(path, video, limit)
     _check(found, path, limit, video.frame_count)
@@ -600,7 +600,7 @@ def _lend(known: Tracks, tracks: Tracks, unnamed: bool) -> Tracks:
     return dataclasses.replace(tracks, class_id=class_id, score=score)
 
 
-def _read_cvat(path: Path, video: Video) -> RecordedDetections:
+def read_cvat(path: Path, video: Video) -> RecordedDetections:
     """Read the boxes of "CVAT for video 1.1" that are not "outside"; identity is track id + 1."""
     try:
         check_unpacked(path.stat().st_size, XML_MAX)
