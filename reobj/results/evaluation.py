@@ -358,7 +358,8 @@ def evaluate(
         workspace = Workspace.open(out)
         tracked = workspace.load_last()
         names = tracked.class_names
-    truth = read_truth(Path(gt), names, min_visibility, said)
+    size = (0, 0) if tracked is None else (tracked.video.width, tracked.video.height)
+    truth = read_truth(Path(gt), names, min_visibility, said, size)
     check_counts(truth, Path(gt))
     if tracked is not None:
         read = truth[_was_read(truth.frame - 1, workspace.source[1])]

@@ -26,7 +26,6 @@ from reobj.sources.tables import WHOLE_MAX, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
 
 SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
-NO_VIDEO = SimpleNamespace(size=(0, 0), working_size=(0, 0), names=[], frame_count=0)
 UNNAMED = ("", "object")  # names of boxes without a class
 
 
@@ -67,19 +66,25 @@ def read_truth(
     class_names: Sequence[str],
     min_visibility: float,
     said: list[str] | None = None,
+    size: tuple[int, int] = (0, 0),
 ) -> LabelledBoxes:
     """Read true boxes: MOTChallenge rows, KITTI tracking labels, CVAT for video, COCO-VID.
 
     Args:
         class_names: by the numbers of files that do not name their classes (from 0).
         min_visibility: rows that are less visible are IGNORED.
-        said: what was assumed of the file is appended.
+        said: what was assumed of the file is appended. size: (w, h) of the video, (0, 0): unknown.
     Raises:
         ReobjError: the file cannot be read, or an identity has two boxes in a frame.
     """
     said = [] if said is None else said
     if path.suffix.lower() in (".xml", ".zip"):
-        found = read_cvat(path, NO_VIDEO)  # type: ignore[arg-type]
+        video: Any = SimpleNamespace(size=size, working_size=size, names=[], frame_count=0)
+        found = read_cvat(path, video)
+        if not len(found.identity):
+            raise ReobjError(
+                f"{path}: boxes of images, without identities; expected CVAT for video"
+            )
         names = np.array(found.class_names, str)[found.class_id]
         role = np.full(len(names), SCORED)
         truth = LabelledBoxes(found.frame + 1, found.identity, found.xyxy, names, role)
