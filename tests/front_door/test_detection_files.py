@@ -236,6 +236,15 @@ def test_json(tmp_path: Path, tracked: Callable[..., Tracked], what: str, begin:
     assert ("scaled" in made.said) == ("size" in what)
 
 
+def test_ids_from_0_of_images_whose_names_count_from_1(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """There is no image 0: the ids are positions."""
+    (tmp_path / "res.json").write_text(json.dumps(JSONS["numbers in the names"]()))
+    source = images(tmp_path / "images", [f"frame_{f + 1:05d}.png" for f in range(FRAMES)])
+    assert is_truth(tracked(source, "--detections", tmp_path / "res.json"))
+
+
 def test_numbers_of_other_videos_are_not_taken(
     tmp_path: Path, tracked: Callable[..., Tracked]
 ) -> None:
@@ -439,6 +448,20 @@ def test_times_in_every_unit(
     (tmp_path / "det.csv").write_text(text[0] + "".join(rows))
     made = tracked(source, "--detections", tmp_path / "det.csv")
     assert is_truth(made), made
+
+
+@pytest.mark.parametrize(("count", "names"), [(57, {"chair", "object"}), (58, {"couch", "person"})])
+def test_a_class_0_counts_from_0_where_that_fits_the_names(
+    tmp_path: Path, count: int, names: set[str]
+) -> None:
+    """57 names and a class 57: they count from 1, and 0 is no class."""
+    (tmp_path / "names.txt").write_text("\n".join(rt.COCO_NAMES[:count]))
+    (tmp_path / "det.txt").write_text(mot(tail=".9,57") + "2,1,200,100,40,40,.9,0\n")
+    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
+    video = rt.Video(film(tmp_path / "v.avi"))
+    found = rt.read_detections(tmp_path / "det.txt", video, config)
+    assert {found.class_names[c] for c in found.class_id} == names
+    assert len(found) == 9 and "class numbers" in found.messages[0]
 
 
 def test_csv_from_1_that_does_not_show_it(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
