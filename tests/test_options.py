@@ -479,7 +479,7 @@ def _(lab: Lab) -> None:
     for value, frame in (("", 1), ("0", 1), ("1", 0)):
         config = lab.config(value).detect
         assert rt.read_detections(lab.path / "det.csv", video, config).frame.tolist() == [frame]
-    with pytest.raises(rt.ReobjError, match="detect.first_frame 2: expected 0 or 1"):
+    with pytest.raises(rt.ReobjError, match=r"detect\.first_frame 2: expected 0 or 1"):
         rt.read_detections(lab.path / "det.csv", video, lab.config("2").detect)
 
 
