@@ -146,6 +146,8 @@ TABLES = {
     "mot with CRLF and a byte order mark": "\ufeff" + mot().replace("\n", "\r\n"),
     "mot from 0": mot(first=0),
     "mot in columns": mot("   ").replace("1 ", " 1 "),
+    "mot after a remark": "# made by some tool, 1 line\n" + mot(),
+    "mot with a comma at the end": mot().replace("\n", ",\n"),
     "a header of words": csv("# frame x1 y1 x2 y2 score class", "{f} {x1} {y1} {x2} {y2} .9 chair"),
     "boxmot: 1, class from 0, score": mot(tail=f"1,{CHAIR},0.873000"),
     "boxmot's detections, no identity": mot(tail=f"1,{CHAIR},.87", identity=-1),
@@ -592,8 +594,10 @@ def test_two_datasets_beside_a_result_file(tmp_path: Path, tracked: Callable[...
     (tmp_path / "res/instances.json").write_text(json.dumps(dataset()))
     command = (source, "--detections", tmp_path / "res/results.json", "--overwrite")
     assert is_truth(tracked(*command))
-    (tmp_path / "res/zzz.json").write_text(json.dumps(dataset()))
-    assert is_truth(tracked(*command))
+    other = dataset(categories=[{"id": 9, "name": "sofa"}])  # the images fit, the classes do not
+    for others in (dataset(), other):
+        (tmp_path / "res/zzz.json").write_text(json.dumps(others))
+        assert is_truth(tracked(*command))
     other = dataset(categories=[{"id": 1, "name": "sofa"}])
     (tmp_path / "res/zzz.json").write_text(json.dumps(other))
     with pytest.raises(rt.ReobjError, match=r"instances\.json and zzz\.json beside it both"):
