@@ -154,9 +154,18 @@ def _separator(line: str) -> str:
     return best
 
 
+def _is_remark(line: str) -> bool:
+    """Tell whether a line begins with # and is no header."""
+    if line[:1] != "#":
+        return False
+    words = set(re.split(r"[^a-z0-9]+", line.lower())) | set(re.split(r"\W+", line.lower()))
+    return not words & {name for role in ("frame", "image", "time") for name in ALIASES[role]}
+
+
 def _rows(path: Path) -> tuple[list[list[str]], list[int], str]:
     """Split a file into rows of cells, the lines on which they end, and the separator."""
     lines = read_lines(path)
+    lines = ["\n" if _is_remark(line) else line for line in lines]
     first = next((line for line in lines if line.strip()), "")
     separator = _separator(first)
     if separator == " ":
@@ -194,6 +203,9 @@ def read_cells(path: Path) -> Table:
         columns, count, rows, lines = table.header, len(table.header), rows[1:], lines[1:]
         table.line = table.line[1:]
         expected = str(count)
+    elif count > 1 and not any(cells[-1] for cells in rows):  # each line ends in a separator
+        rows, count = [cells[:-1] for cells in rows], count - 1
+        expected = str(count) if 6 <= count <= len(MOT_COLUMNS) else expected
     elif len(first) in (17, 18) and not _is_number(first[2]):
         table.kind, columns, expected = "KITTI", KITTI_COLUMNS, str(count)
     elif 6 <= count <= len(MOT_COLUMNS):

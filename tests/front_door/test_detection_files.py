@@ -146,6 +146,8 @@ TABLES = {
     "mot with CRLF and a byte order mark": "\ufeff" + mot().replace("\n", "\r\n"),
     "mot from 0": mot(first=0),
     "mot in columns": mot("   ").replace("1 ", " 1 "),
+    "mot after a remark": "# made by some tool, 1 line\n" + mot(),
+    "mot with a comma at the end": mot().replace("\n", ",\n"),
     "a header of words": csv("# frame x1 y1 x2 y2 score class", "{f} {x1} {y1} {x2} {y2} .9 chair"),
     "boxmot: 1, class from 0, score": mot(tail=f"1,{CHAIR},0.873000"),
     "boxmot's detections, no identity": mot(tail=f"1,{CHAIR},.87", identity=-1),
@@ -234,6 +236,15 @@ def test_json(tmp_path: Path, tracked: Callable[..., Tracked], what: str, begin:
     made = tracked(source, "--detections", tmp_path / "pred" / "predictions.json")
     assert is_truth(made), made
     assert ("scaled" in made.said) == ("size" in what)
+
+
+def test_ids_from_0_of_images_whose_names_count_from_1(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """There is no image 0: the ids are positions."""
+    (tmp_path / "res.json").write_text(json.dumps(JSONS["numbers in the names"]()))
+    source = images(tmp_path / "images", [f"frame_{f + 1:05d}.png" for f in range(FRAMES)])
+    assert is_truth(tracked(source, "--detections", tmp_path / "res.json"))
 
 
 def test_numbers_of_other_videos_are_not_taken(
@@ -441,6 +452,20 @@ def test_times_in_every_unit(
     assert is_truth(made), made
 
 
+@pytest.mark.parametrize(("count", "names"), [(57, {"chair", "object"}), (58, {"couch", "person"})])
+def test_a_class_0_counts_from_0_where_that_fits_the_names(
+    tmp_path: Path, count: int, names: set[str]
+) -> None:
+    """57 names and a class 57: they count from 1, and 0 is no class."""
+    (tmp_path / "names.txt").write_text("\n".join(rt.COCO_NAMES[:count]))
+    (tmp_path / "det.txt").write_text(mot(tail=".9,57") + "2,1,200,100,40,40,.9,0\n")
+    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
+    video = rt.Video(film(tmp_path / "v.avi"))
+    found = rt.read_detections(tmp_path / "det.txt", video, config)
+    assert {found.class_names[c] for c in found.class_id} == names
+    assert len(found) == 9 and "class numbers" in found.messages[0]
+
+
 def test_csv_from_1_that_does_not_show_it(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
     """Frames 1 to 7 of 8: read as documented, from 0, and said; the other reading on request."""
     text = "".join(TABLES["csv"].splitlines(keepends=True)[:1] + TABLES["csv"].splitlines(True)[2:])
@@ -569,8 +594,10 @@ def test_two_datasets_beside_a_result_file(tmp_path: Path, tracked: Callable[...
     (tmp_path / "res/instances.json").write_text(json.dumps(dataset()))
     command = (source, "--detections", tmp_path / "res/results.json", "--overwrite")
     assert is_truth(tracked(*command))
-    (tmp_path / "res/zzz.json").write_text(json.dumps(dataset()))
-    assert is_truth(tracked(*command))
+    other = dataset(categories=[{"id": 9, "name": "sofa"}])  # the images fit, the classes do not
+    for others in (dataset(), other):
+        (tmp_path / "res/zzz.json").write_text(json.dumps(others))
+        assert is_truth(tracked(*command))
     other = dataset(categories=[{"id": 1, "name": "sofa"}])
     (tmp_path / "res/zzz.json").write_text(json.dumps(other))
     with pytest.raises(rt.ReobjError, match=r"instances\.json and zzz\.json beside it both"):
