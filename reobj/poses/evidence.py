@@ -127,7 +127,7 @@ def by_images(found: Sequence[PoseReading], video: Any) -> list[PoseReading]:
     def compare(one: Poses, other: Poses) -> tuple[Array, Array]:
         i, j = (next(k for k, r in enumerate(found) if r.poses is p) for p in (one, other))
         common = pairs[min(i, j), max(i, j)]
-        if common:
+        if len(common) >= MIN_PAIRS:
             return residuals(one, common), residuals(other, common)
         return residuals(one, own[i]), residuals(other, own[j])
 
@@ -155,7 +155,7 @@ def _pairs_that_differ(one: Poses, other: Poses | None) -> list[tuple[int, int]]
         norm = np.linalg.norm(way, axis=1) * np.linalg.norm(other_way, axis=1)
         cosine = (way * other_way).sum(1) / np.maximum(norm, 1e-12)
         slide = np.where(norm > 0, np.degrees(np.arccos(cosine.clip(-1, 1))), 0.0)
-        near &= _angle_deg(other_turn) < MAX_TURN_DEG
+        near |= _angle_deg(other_turn) < MAX_TURN_DEG  # one of them is right
     differ = (_angle_deg(change) + TURN_PER_DEG * slide).clip(max=ENOUGH_DEG)
     score = np.where(near, differ, -1.0)
     chosen: list[tuple[int, int]] = []

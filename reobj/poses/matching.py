@@ -135,7 +135,7 @@ def by_numbers(number: IntArray, source: Source, noun: str) -> list[Reading]:
     for key, step, first in ways:
         frame = np.where(known, step * (number - first), -1)
         if least >= first and (step == 1 or frame.max() < source.count):
-            of = f" of every {step}th frame" if step > 1 else ""
+            of = f" of one frame in {step}" if step > 1 else ""
             found.append(_reading(key, f"{noun}{of}, counted from {first}", frame, source))
     return found
 
@@ -377,7 +377,7 @@ def _by_order(count: int, source: Source, where: str) -> list[Reading]:
         return [Reading("order", rule, source.frame.copy(), 0)]
     steps = range(2, source.count // max(count - 1, 1) + 1)
     found = [
-        _reading(f"every{k}", f"order, a row for every {k}th frame", k * rows, source)
+        _reading(f"every{k}", f"order, a row for one frame in {k}", k * rows, source)
         for k in steps
         if -(-source.count // k) == count
     ]
