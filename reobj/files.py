@@ -175,9 +175,9 @@ def staged(folder: Path, name: str = PART_RESULTS) -> Iterator[Path]:
             yield part
             made = [file.relative_to(part) for file in sorted(part.rglob("*")) if file.is_file()]
             check_places(folder, made)
-            for name in made:
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (part / name).replace(folder / name)
+            for file in made:
+                (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                (part / file).replace(folder / file)
         finally:
             shutil.rmtree(part, ignore_errors=True)
 
