@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from simulated import unlinked, walk
 import reobj_track as rt
 from reobj.identity.gaps import fill_gaps
 from reobj.parts import link_and_fit
+from reobj.sources.detectors import DetectionCache, as_source
 from reobj.sources.looked import frames_looked_at
 
 TABLE, CHAIR = 60, 56
@@ -98,7 +100,8 @@ def test_a_saved_tracker_goes_on_as_the_other_does(tmp_path: Path) -> None:
         ([*range(10), *range(50, 60)], 3, None),  # a wall for most of the time
         (range(0, 60, 3), 1, range(0, 60, 3)),
         ([0, 6, 9, 21, 24, 30, 51], 1, range(0, 60, 3)),  # nothing found in many of them
-        (range(4, 50, 5), 2, range(4, 60, 5)),
+        (range(7, 50, 5), 2, range(2, 60, 5)),
+        ([0, 1, 10, 11, 30], 3, None),  # as many alone as not
         ([3, 4, 9, 12, 20, 22, 31, 40, 47, 51], 3, [3, 4, 9, 12, 20, 22, 31, 40, 47, 51]),
         ([3, 4, 9, 12, 20, 22, 31, 40, 47, 51], 1, None),  # one thing that is rarely found
         ([5, 40], 3, None),  # two frames are no interval
@@ -209,6 +212,26 @@ def test_a_function_that_returns_none_did_not_look(images: Path, tmp_path: Path)
     assert result.looked is not None and result.looked.tolist() == list(range(0, FRAMES, 4))
     nothing = rt.run(images, tmp_path / "none", config, detections=lambda image: None)
     assert "run on no frame (it gave None each time)" in nothing.warnings[-1]
+
+
+def test_a_cache_knows_the_frames_that_nobody_looked_at(images: Path, tmp_path: Path) -> None:
+    """Of a function that is asked for all frames before the cameras are known."""
+    calls = list[int]()
+    made = as_source(lambda image: calls.append(0))  # returns None
+    source = dataclasses.replace(made, cache=DetectionCache(tmp_path / "cache", (640, 480)))
+    frame = next(iter(rt.Video(images)))
+    assert source.look(frame) is None and source.look(frame) is None and len(calls) == 1
+    assert len(source(frame)) == 0
+
+
+def test_tracks_are_embedded_again_by_frames_looked_at() -> None:
+    tracker, seen = rt.Tracker(rt.TrackerConfig(embed_every=2)), list[int]()
+    for frame in range(13):
+        looked = frame % 4 == 0
+        boxes, vectors = (scene(0), [[1.0, 0.0]]) if looked else (None, None)
+        tracker.update(boxes, embeddings=vectors)
+        seen.append(int(tracker.state.embedded[0]))
+    assert seen[::4] == [0, 0, 8, 8]
 
 
 def test_why_nothing_was_tracked_or_is_left(images: Path, tmp_path: Path) -> None:
