@@ -29,7 +29,6 @@ from reobj.sources.detection_files import (
     image_names,
     image_size,
     read_detections,
-    read_tracks,
     recorded_times,
 )
 from reobj.sources.image_files import sorted_names
@@ -109,10 +108,7 @@ def _frames_of(
     names = sorted_names(named or posed)
     first = ImagelessVideo(source, size, config, names=names if named else ())
     every = dataclasses.replace(detect, min_score=0.0, classes="", max_detections=0)
-    if boxes.suffix.lower() not in (".xml", ".zip"):
-        found = read_detections(boxes, first, every).frame
-    else:
-        found = read_tracks(boxes, first, every)[0].frame
+    found = read_detections(boxes, first, every).frame
     count = int(found.max(initial=-1)) + 1
     if names and count > len(names):
         number = numbers_of_names(names, source)

@@ -505,7 +505,7 @@ def test_boxes_of_frames_that_were_not_turned_upright(
     folder.mkdir()
     for f in range(FRAMES):
         cv2.imwrite(str(folder / f"{f}.png"), np.zeros((320, 240, 3), np.uint8))
-    rows = [f"{f + 1},-1,{x},50,60,80,.9\n" for f in range(FRAMES) for x in (20, 120, 250)]
+    rows = [f"{f + 1},-1,{x},50,60,80,.9\n" for f in range(FRAMES) for x in (20, 120, 260)]
     (tmp_path / "det.txt").write_text("".join(rows))
     made = tracked(folder, "--detections", tmp_path / "det.txt")
     assert made.code == 2 and "all fit the frame turned by 90 deg, (320, 240)" in made.said
