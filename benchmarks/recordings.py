@@ -53,7 +53,7 @@ from truth import (
 ROOT = Path(__file__).resolve().parent.parent
 FLOORS = Path(__file__).resolve().with_suffix(".json")
 FAST, YOLO, RECORDED, MOT = "fast", "detections_yolov8s.csv", "detections.npz", "det"
-TIMEOUT_S = 400.0
+TIMEOUT_S = 900.0
 Figures = dict[str, Any]
 
 COCO = {56: "chair", 57: "couch", 58: "potted plant", 60: "dining table", 62: "tv"}

