@@ -8,8 +8,8 @@ which lines of the core does each execute, and how long does it take? Then, for 
 (drawn by the seed among the lines that some test executes, alike over the modules), the tests that
 execute its line run until one fails: the change is killed. Tests longer than --longest seconds are
 left out. Prints the share of killed changes of each module, and those that survived;
-OUT/mutants.json holds them all. What survives may be the same program (`<` for `<=` where equality never happens), a
-tuning constant, or a hole in the tests: only reading decides.
+OUT/mutants.json holds them all. What survives may be the same program (`<` for `<=` where equality
+never happens), a tuning constant, or a hole in the tests: only reading decides.
 """
 
 from __future__ import annotations
@@ -91,6 +91,7 @@ def run_pytest(words: Sequence[str], plugins: Sequence[Any] = ()) -> int:
     """Run tests of the working folder in this process; returns pytest's exit code."""
     import pytest
 
+    sys.path.insert(0, os.getcwd())
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)
@@ -283,7 +284,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     if not (args.out / "lines.json").exists():
         trace_tests(root, files, args.tests, args.out.resolve())
-    by_test = json.loads((args.out / "lines.json").read_text())
+    if not (by_test := json.loads((args.out / "lines.json").read_text())):
+        raise SystemExit(f"error: no test ran: python -m pytest in {root} says why")
     tests_of: dict[tuple[str, int], list[str]] = defaultdict(list)
     for test, (seconds, lines) in sorted(by_test.items(), key=lambda item: item[1][0]):
         if seconds <= args.longest:

@@ -59,10 +59,10 @@ def true_objects() -> list[dict[str, Any]]:
 
 
 @cache
-def true_boxes() -> scores.Truth:
-    """Return the true boxes of the clip."""
+def true_boxes(min_visible: float = 0.0) -> scores.Truth:
+    """Return the true boxes of the clip; less visible ones are not `clear`."""
     names = {o["class_id"]: o["class"] for o in true_objects()}
-    return scores.read_mot_truth(ROOM / "gt_mot.txt", names)
+    return scores.read_mot_truth(ROOM / "gt_mot.txt", names, min_visible=min_visible)
 
 
 @cache
