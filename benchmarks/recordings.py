@@ -57,7 +57,6 @@ TIMEOUT_S = 900.0
 Figures = dict[str, Any]
 
 COCO = {56: "chair", 57: "couch", 58: "potted plant", 60: "dining table", 62: "tv"}
-PEOPLE = (-1, 1)  # class numbers of pedestrians
 RED_COMPLETE = ("chair", "dining table", "cup")  # classes of which all objects are annotated
 
 
@@ -250,7 +249,7 @@ def classes(path: Path) -> dict[int, str]:
 def read_people(path: Path, case: Case) -> Truth:
     """Read boxes of pedestrians; recorded boxes have no class and are called `object`."""
     name = "person" if case.boxes == FAST else "object"
-    return read_mot_truth(path, dict.fromkeys(PEOPLE, name), complete=[name], min_visible=-1)
+    return read_mot_truth(path, name, complete=[name])
 
 
 KNOWN_NUMBERS = {

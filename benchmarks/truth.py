@@ -65,7 +65,7 @@ class Truth:
 
 def read_mot_truth(
     path: Path,
-    names: Mapping[int, str],
+    names: Mapping[int, str] | str,
     objects_2d: Path | None = None,
     complete: Collection[str] = (),
     min_visible: float = 0.0,
@@ -73,9 +73,13 @@ def read_mot_truth(
     """Read rows `frame (1-based), id, left, top, width, height, flag, class, visibility`.
 
     Args:
-        names: of class numbers. objects_2d: JSON of the objects, whose classes count instead.
+        names: of class numbers; one name: that of all objects, and whatever stands in the columns
+            of class and visibility is not read. objects_2d: JSON of the objects, whose classes
+            count instead.
     """
-    rows = np.loadtxt(path, delimiter=",", usecols=range(9), ndmin=2)
+    rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    if isinstance(names, str):
+        rows, names = np.column_stack([rows[:, :7], np.ones((len(rows), 2))]), {1: names}
     identity = rows[:, 1].astype(np.int64)
     if objects_2d:
         kinds = {int(o["id"]): _kind(o) for o in json.loads(objects_2d.read_text())}

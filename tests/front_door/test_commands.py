@@ -1,4 +1,7 @@
-"""Every command, solver, exporter and format of poses, as a user calls them, against the truth."""
+"""Every command, solver, exporter and format of poses, as a user calls them, against the truth.
+
+The completion of a shell is asked in tests/test_run.py.
+"""
 
 from __future__ import annotations
 
@@ -335,7 +338,7 @@ def test_every_export(out: Path, to: str, capsys: pytest.CaptureFixture[str]) ->
     EXPORTED[to](path)
 
 
-# ---- models, --options, --version, --completion, --help ----
+# ---- models, --options, --version, --help ----
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -379,14 +382,3 @@ def test_a_reader_that_stops_early_is_no_fault() -> None:
     command = f"{sys.executable} {ROOT / 'reobj_track.py'} --options | head -n 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
     assert done.stderr == "" and done.stdout
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion_is_a_script_of_that_shell(
-    shell: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("shtab")
-    script = said(capsys, "--completion", shell)
-    if path := shutil.which(shell):
-        subprocess.run([path, "-n"], input=script, text=True, check=True)
-    assert "--detections" in script and "reobj-track" in script
