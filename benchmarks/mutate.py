@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Change operators and constants of the core one at a time: do the tests notice?
 
-    python benchmarks/mutate.py -o OUT [--count 250] [--seed 0] [--only MODULE...] [--longest 8]
+    python benchmarks/mutate.py -o OUT [--count 250] [--seed 0] [--only FILE...] [--jobs 2]
 
 A copy of the checkout is changed, never the checkout. First the tests of FILES run once, traced:
 which lines of the core does each execute, and how long does it take? Then, for each changed place
@@ -28,6 +28,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -209,7 +210,9 @@ def try_mutant(root: Path, mutant: Mutant, tests: Sequence[str], limit_s: float)
     """Change the copy, run the tests, change it back."""
     path = root / mutant.file
     source = path.read_bytes()
-    path.write_bytes(source[: mutant.begin] + mutant.text.encode() + source[mutant.end :])
+    new = source[: mutant.begin] + mutant.text.encode() + source[mutant.end :]
+    compile(new, mutant.file, "exec")
+    path.write_bytes(new)
     began = time.monotonic()
 
     def child() -> None:
@@ -229,6 +232,17 @@ def try_mutant(root: Path, mutant: Mutant, tests: Sequence[str], limit_s: float)
     finally:
         path.write_bytes(source)
         mutant.seconds = round(time.monotonic() - began, 1)
+
+
+def affordable(tests: Sequence[str], seconds_of: dict[str, float], budget_s: float) -> list[str]:
+    """Return the first of the tests, up to so many seconds in all, and one at least."""
+    found: list[str] = []
+    for test in tests:
+        budget_s -= seconds_of[test]
+        if found and budget_s < 0:
+            break
+        found.append(test)
+    return found
 
 
 def chosen(by_file: dict[str, list[Mutant]], count: int) -> list[Mutant]:
@@ -257,6 +271,26 @@ def report(mutants: Sequence[Mutant]) -> str:
     return "\n".join(lines)
 
 
+def copy_checkout(folder: Path) -> Path:
+    """Copy what git knows of the checkout."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    for name in listed.stdout.splitlines():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / name)
+    return folder
+
+
+def tests_by_line(by_test: dict[str, Any], longest_s: float) -> dict[tuple[str, int], list[str]]:
+    """Return the tests that execute each line, the shortest first."""
+    tests_of: dict[tuple[str, int], list[str]] = defaultdict(list)
+    for test, (seconds, lines) in sorted(by_test.items(), key=lambda item: item[1][0]):
+        if seconds <= longest_s:
+            for file, numbers in lines.items():
+                for number in numbers:
+                    tests_of[file, number].append(test)
+    return tests_of
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Trace the tests, try the changes, print the report."""
     parser = argparse.ArgumentParser(
@@ -269,13 +303,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--only", nargs="+", default=[], metavar="FILE", help="files of the core, as in the report")
     add("--tests", nargs="+", default=FILES, metavar="NAME", help="test files and folders")
     add("--longest", type=float, default=8.0, help="seconds of the longest test that is used")
+    add("--seconds", type=float, default=30.0, help="of the tests of a change, the shortest first")
+    add("--jobs", type=int, default=1, help="changes at once")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    root = args.out.resolve() / "copy"
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
-    for name in listed.stdout.splitlines():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / name, root / name)
+    root = copy_checkout(args.out.resolve() / "copy")
     sys.dont_write_bytecode = True
     files = [str(p.relative_to(root)) for glob in CORE for p in sorted(root.glob(glob))]
     import cv2  # noqa: F401  loaded once, before the forks
@@ -287,12 +319,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         trace_tests(root, files, args.tests, args.out.resolve())
     if not (by_test := json.loads((args.out / "lines.json").read_text())):
         raise SystemExit(f"error: no test ran: python -m pytest in {root} says why")
-    tests_of: dict[tuple[str, int], list[str]] = defaultdict(list)
-    for test, (seconds, lines) in sorted(by_test.items(), key=lambda item: item[1][0]):
-        if seconds <= args.longest:
-            for file, numbers in lines.items():
-                for number in numbers:
-                    tests_of[file, number].append(test)
+    tests_of = tests_by_line(by_test, args.longest)
     rng = random.Random(args.seed)
     by_file = {
         file: mutants_of(root, file, {n for f, n in tests_of if f == file}, rng)
@@ -300,13 +327,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not args.only or file in args.only
     }
     mutants = chosen(by_file, args.count)
-    for number, mutant in enumerate(mutants):
-        tests = tests_of[mutant.file, mutant.line][:60]
-        limit = 60 + 5 * sum(by_test[test][0] for test in tests)
-        try_mutant(root, mutant, tests, limit)
-        state = mutant.killed_by or "SURVIVED"
-        print(number, mutant.file, mutant.line, state, mutant.seconds, file=sys.stderr, flush=True)
-        (args.out / "mutants.json").write_text(json.dumps([asdict(m) for m in mutants], indent=1))
+    seconds_of = {test: seconds for test, (seconds, _) in by_test.items()}
+
+    def work(job: int) -> None:
+        own = args.out.resolve() / f"copy{job}"
+        shutil.copytree(root, own, dirs_exist_ok=True)
+        for number, mutant in enumerate(mutants):
+            if number % args.jobs == job:
+                tests = affordable(tests_of[mutant.file, mutant.line], seconds_of, args.seconds)
+                limit = 60 + 5 * sum(seconds_of[test] for test in tests)
+                try_mutant(own, mutant, tests, limit)
+                state = f"{mutant.killed_by or 'SURVIVED'} {mutant.seconds}"
+                print(number, mutant.file, mutant.line, state, file=sys.stderr, flush=True)
+
+    with ThreadPoolExecutor(args.jobs) as pool:
+        list(pool.map(work, range(args.jobs)))
+    (args.out / "mutants.json").write_text(json.dumps([asdict(m) for m in mutants], indent=1))
     print(report(mutants))
     return 0
 
