@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import struct
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,8 +16,6 @@ from reobj.poses.estimate import rows_around_breaks
 from reobj.poses.mapping import Mapped
 
 pycolmap = pytest.importorskip("pycolmap")
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-ROOM = Path(__file__).resolve().parents[1] / "examples" / "room"
 
 
 def config(**changes):
@@ -262,29 +259,3 @@ def test_the_exif_focal_length_is_the_guess_before_the_usual_one(tmp_path, monke
     guess = seen_job(monkeypatch, video, tmp_path / "work")["focal_guess"]
     exif = 48 / np.hypot(36, 24) * np.hypot(480, 360) / 480
     assert guess == (pytest.approx(exif, rel=1e-3) if focal_35mm else 0.8)
-
-
-# ---- Recordings ----------------------------------------------------------------------------------
-
-
-def test_living_room(tmp_path):
-    folder = SHARED / "livingroom13" / "images"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not here")
-    files = sorted(folder.glob("*.jpg"))
-    video = FakeVideo([cv2.imread(str(f)) for f in files], [f.name for f in files])
-    poses = rt.estimate_poses(video, rt.PosesConfig(), tmp_path)
-    assert poses.known.all() and 0.4 < poses.camera.params[0] / 1920 < 0.6
-
-
-def test_rendered_room_against_its_truth(tmp_path):
-    if not (ROOM / "room.mp4").exists() or not (ROOM / "camera.txt").exists():
-        pytest.skip("examples/room/room.mp4 is not here")
-    video = rt.Video(ROOM / "room.mp4", rt.InputConfig())
-    poses = rt.estimate_poses(video, rt.PosesConfig(), tmp_path)
-    camera = ",".join((ROOM / "camera.txt").read_text().split()[4:])
-    truth = rt.read_poses(ROOM / "poses.txt", video, camera=camera)
-    both = poses.known & truth.known
-    error = ate_percent(poses.cam_from_world[both], truth.cam_from_world[both])
-    assert both.mean() > 0.95 and error < 0.6
-    assert poses.camera.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)
