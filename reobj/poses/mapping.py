@@ -52,10 +52,12 @@ class Mapped:
     Attributes:
         models: folders of COLMAP models, one for each rigid part, the largest first; in native
             pixels, with the names that were given. messages: what the user should know.
+        alone: ids of keyframes without a verified match with another one.
     """
 
     models: list[Path]
     messages: list[str]
+    alone: frozenset[int] = frozenset()
 
 
 def mapping_child(work_dir: Path) -> Child:
@@ -138,7 +140,8 @@ def reconstruct(
     models = []
     for model in sorted(folder.glob("sparse*"), key=lambda p: (len(p.name), p.name)):
         models.append(model.replace(work_dir / model.name))
-    return Mapped(models, list(json.loads((folder / "messages.json").read_text())))
+    said = json.loads((folder / "messages.json").read_text())
+    return Mapped(models, said["messages"], frozenset(said["alone"]))
 
 
 MAPPING = "mapping"  # stage of the child that takes one core
@@ -182,7 +185,8 @@ def _reconstruct_job(folder: Path) -> None:
     for number, part in enumerate(parts):
         name = f"sparse_part{number}" if number else "sparse"
         _write_native_model(part, images, folder / name, job)
-    (folder / "messages.json").write_text(json.dumps(messages))
+    alone = sorted(set(job["ids"]) - set(np.unique(pairs.image_ids[pairs.enough]).tolist()))
+    (folder / "messages.json").write_text(json.dumps({"messages": messages, "alone": alone}))
 
 
 FOCAL_GUESS = 0.8  # focal length over the longer side where nothing tells it (phones: .72-.85)
