@@ -1214,9 +1214,8 @@ def _cmd_poses(args: argparse.Namespace) -> int:
         workspace.publish_model(model)
         write_trajectories(workspace.out, poses)
         write_supplied_model(poses, video, workspace.out)
-    known, count = poses.known.sum(), len(poses.frame)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
-    print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
+    print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
     for message in (*poses.messages, *parts_message(poses)):
         log.warning(message)
     return 0

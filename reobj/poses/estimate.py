@@ -314,9 +314,9 @@ def _breaks(poses: Poses) -> list[str]:
     where = [f"{a} and {b}" for a, b in ends]
     more = f" and {len(where) - MAX_BREAKS} more" if len(where) > MAX_BREAKS else ""
     return [
-        f"the reconstruction broke between frames {', '.join(where[:MAX_BREAKS])}{more}: what both "
-        "sides see does not fit together, also with more keyframes there; more overlap, slower "
-        "turns, or --camera help"
+        f"the reconstruction broke between frames {', '.join(where[:MAX_BREAKS])}{more}: no model "
+        "of both sides holds together, also with more keyframes there; more overlap, slower turns, "
+        "or --camera help"
     ]
 
 

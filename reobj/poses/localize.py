@@ -236,9 +236,9 @@ def _interpolated(ends: Array, times_s: Array, wanted_s: Array) -> Array:
 
 def _points_around(model: SparseModel, key_rows: IntArray, a: int, b: int) -> Array:
     """Return the points (n, 3) that the keyframes around the rows a to b see."""
-    reach = int(NEAR_SPANS * (b - a))
-    first = np.searchsorted(key_rows, a - reach, "right") - 1  # one before that, one after
-    images = np.arange(max(first, 0), np.searchsorted(key_rows, b + reach) + 1)
+    reach = round(NEAR_SPANS * (b - a))
+    first = int(np.searchsorted(key_rows, a - reach, "right")) - 1  # one before that, one after
+    images = np.arange(max(first, 0), int(np.searchsorted(key_rows, b + reach)) + 1)
     seen = np.unique(model.obs_point[np.isin(model.obs_image, images)])
     return model.points[seen[:: max(1, len(seen) // SHIFT_POINTS)]]
 
@@ -266,7 +266,7 @@ def _interpolation_px(
     """
     before, after = sides
     start_s, end_s = time_s[before[-1]], time_s[after[0]]
-    span, worst = end_s - start_s, 0.0
+    span, worst = float(end_s - start_s), 0.0
     if min(len(before), len(after)) < 2:
         return np.inf
     for side, edge_s in ((before, start_s), (after, end_s)):
