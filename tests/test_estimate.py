@@ -100,8 +100,8 @@ def reconstructed(walk, monkeypatch):
     """The keyframes' reconstruction is that of `walk` and takes no time."""
 
     def copy(*args, work_dir, **options):
-        shutil.copytree(walk[2] / "sparse", work_dir / "sparse")
-        (work_dir / "mapping").mkdir()
+        shutil.copytree(walk[2] / "sparse", work_dir / "sparse", dirs_exist_ok=True)
+        (work_dir / "mapping").mkdir(exist_ok=True)
         return Mapped([work_dir / "sparse"], [])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", copy)

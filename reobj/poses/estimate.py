@@ -118,7 +118,7 @@ def estimate_poses(
         best = attempt(keys)
         wanted = set(best.more_keyframes())
         extra = [k for k in resized if k.row in wanted and k.has_texture] if wanted else []
-        if extra and len(keys) + len(extra) <= MAX_KEYFRAMES:
+        if extra:
             _move_models(best.found.models, kept)
             again = attempt(sorted([*keys, *extra], key=lambda key: key.row))
             if again.located > best.located:
