@@ -139,7 +139,8 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
     assert ("2 interpolated" in found.cameras_text) == filled and found.measured.sum() == 28
     assert bool(found.messages) != filled
     if not filled:
-        assert "2 of 30 frames have no camera (frames 11-12: 011.jpg, 012.jpg)" in found.messages[0]
+        assert "2 of 30 frames have no camera: frames 11-12 (2: 011.jpg, 012" in found.messages[0]
+        assert "show too few points" in found.messages[0] and "lie at" not in found.messages[0]
 
 
 # ---- Failures ------------------------------------------------------------------------------------

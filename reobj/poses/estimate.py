@@ -20,9 +20,9 @@ from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_spar
 from reobj.files import Progress, spans
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import MAX_FLOW, MIN_FLOW, ResizedFrame, ResizedVideo, pick_keyframes
-from reobj.poses.localize import fill_gaps, locate_between
-from reobj.poses.mapping import FOCAL_GUESS, Mapped, mapping_child, reconstruct
-from reobj.types import Array, IntArray, ReobjError, option
+from reobj.poses.localize import beside_held, fill_gaps, locate_between
+from reobj.poses.mapping import FOCAL_GUESS, HOW_TO_FILM, Mapped, mapping_child, reconstruct
+from reobj.types import Array, BoolArray, IntArray, ReobjError, option
 
 MAX_GAP = 15  # most lost frames in a row that are interpolated (chosen: half a second at 30 Hz)
 
@@ -129,7 +129,7 @@ def estimate_poses(
         shutil.rmtree(folder, ignore_errors=True)
     poses, messages = best.poses, best.found.messages
     if poses.known.any():
-        messages = [*messages, *_breaks(poses), *_lost_frames(poses, video)]
+        messages = [*messages, *_breaks(poses), *_lost_frames(poses, best.reached, video)]
     return dataclasses.replace(poses, messages=tuple(messages))
 
 
@@ -161,6 +161,12 @@ class _Attempt:
         """Count the pairs of frames whose poses are measured in one world."""
         measured = self.poses.known & (self.poses.status != "interpolated")
         return int((np.bincount(self.poses.part[measured], minlength=1) ** 2).sum())
+
+    @property
+    def reached(self) -> BoolArray:
+        """Mark the frames (F,) at or beside a keyframe that a model holds: others are not tried."""
+        held = np.concatenate([np.empty(0, np.int64), *self.part_rows])
+        return beside_held(self.key_rows, held, len(self.poses.frame))
 
     def more_keyframes(self) -> list[int]:
         """Choose frames for more keyframes: around breaks, and where frames were not located."""
@@ -323,19 +329,26 @@ def _breaks(poses: Poses) -> list[str]:
 MAX_NAMED = 5  # files named in a message (chosen)
 
 
-def _lost_frames(poses: Poses, video: Any) -> list[str]:
-    """Say which frames have no pose, what is known of them, and what helps; [] if all have one."""
+def _lost_frames(poses: Poses, reached: BoolArray, video: Any) -> list[str]:
+    """Say which frames have no camera, what is known of them, and what helps; [] if all have one.
+
+    Args:
+        reached: (F,) frames that the points of the reconstruction were followed to.
+    """
     frame, lost = poses.frame, ~poses.known
-    if not lost.any():
+    step, whys = int(np.median(np.diff(frame))) if len(frame) > 1 else 1, []
+    for mine, why in (
+        (lost & reached, "show too few points of the reconstruction again"),
+        (lost & ~reached, "lie at keyframes that no part of the reconstruction holds for certain"),
+    ):
+        numbers = frame[mine].tolist()
+        files = [str(video.names[number]) for number in numbers[:MAX_NAMED]] if video.names else []
+        more = " ..." if files and len(numbers) > MAX_NAMED else ""
+        named = f": {', '.join(files)}{more}" if files else ""
+        whys += [f"{spans(numbers, step)} ({len(numbers)}{named}) {why}"] if numbers else []
+    if not whys:
         return []
-    step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
-    numbers = frame[lost].tolist()
-    files = [str(video.names[number]) for number in numbers[:MAX_NAMED]] if video.names else []
-    more = " ..." if files and len(numbers) > MAX_NAMED else ""
-    named = f": {', '.join(files)}{more}" if files else ""
     return [
-        f"{lost.sum()} of {len(frame)} frames have no camera (frames {spans(numbers, step)}"
-        f"{named}): too few points of the reconstruction were found again in them; where they are "
-        "dark, blurred or turned away from the rest, film slower, with more overlap, or give "
-        "--poses"
+        f"{lost.sum()} of {len(frame)} frames have no camera: frames {'; frames '.join(whys)}; "
+        f"{HOW_TO_FILM}, or --poses"
     ]

@@ -45,9 +45,7 @@ def locate_between(
     count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
     cam_from_world[key_rows], status[key_rows] = model.cam_from_world, "keyframe"
-    keys, rows = np.union1d(key_rows, left_out), np.arange(count)
-    held = np.concatenate([[False], np.isin(keys, key_rows), [False]])  # -1 and K: no keyframe
-    reached = held[np.searchsorted(keys, rows, "right")] | held[np.searchsorted(keys, rows) + 1]
+    reached = beside_held(np.union1d(key_rows, left_out), key_rows, count)
 
     def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
         before, after, run = segment
@@ -73,6 +71,18 @@ def locate_between(
     jump = _detours(cam_from_world) & (status == "pnp")
     cam_from_world[jump], status[jump] = np.nan, "none"
     return cam_from_world, status
+
+
+def beside_held(keys: IntArray, held: IntArray, count: int) -> BoolArray:
+    """Mark the frames (F,) whose keyframe before or after them is held by a model, or is they.
+
+    Args:
+        keys: (K,) rows of all keyframes, ascending. held: of those that a model has. count: F.
+    """
+    rows, has = np.arange(count), np.isin(keys, held)
+    has = np.concatenate([[False], has, [False]])  # -1 and K: no keyframe
+    before, after = has[np.searchsorted(keys, rows, "right")], has[np.searchsorted(keys, rows) + 1]
+    return np.asarray(before | after, bool)
 
 
 MAX_RUN = 1000  # frames held in memory between two keyframes (chosen: .3 GB of 640x480)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, import_pycolmap
-from reobj.files import Progress, atomic, load_cached, load_json, writing
+from reobj.files import Progress, atomic, load_cached, load_json, spans, writing
 from reobj.poses.adjustment import SAME_FOCAL, Adjusted, adjusted, refine
 from reobj.poses.child import Child, send_progress, serve
 from reobj.poses.consistency import (
@@ -273,6 +273,13 @@ class _Search:
             f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
             for a, b, ratio in zooms
         ] + messages
+        for part in sound:
+            if len(unsure := np.setdiff1d(part.arrays.ids, part.held)):
+                frames = spans([self.frames[i] for i in unsure.tolist()])
+                messages.append(
+                    f"keyframes {frames} are left out: where they are is uncertain, and no second "
+                    "way of mapping puts them in the same place"
+                )
         for part in best:
             ids = part.arrays.ids.tolist()
             if part.problem and len(ids) >= MIN_PART_IMAGES:
