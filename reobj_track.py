@@ -1259,9 +1259,8 @@ def _cmd_poses(args: argparse.Namespace) -> int:
             copy_models(model or (), new)
             write_trajectories(new, poses)
             write_supplied_model(poses, video, new)
-    known, count = poses.known.sum(), len(poses.frame)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
-    print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
+    print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
     for message in (*video.messages, *poses.messages, *parts_message(poses)):
         log.warning(message)
     return 0

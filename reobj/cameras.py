@@ -261,6 +261,18 @@ class Poses:
             object.__setattr__(self, "part", np.zeros(len(self.frame), np.int64))
 
     @property
+    def measured(self) -> BoolArray:
+        """Mark the frames (F,) whose pose was not interpolated between those of others."""
+        return np.asarray(self.known & (self.status != "interpolated"), bool)
+
+    @property
+    def cameras_text(self) -> str:
+        """Say how many frames have a camera, and how many of these are interpolated."""
+        known, between = int(self.known.sum()), int((self.known & ~self.measured).sum())
+        text = f"cameras: {known} of {len(self.frame)} frames ({self.source})"
+        return f"{text}, {between} interpolated" if between else text
+
+    @property
     def part_count(self) -> int:
         """Number of parts, at least 1."""
         return int(self.part.max(initial=0)) + 1

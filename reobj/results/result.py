@@ -516,12 +516,10 @@ class Result:
             return []
         if len(world.parts) < 2:
             scale = [f"scale: {_scale_text(world.scale)}"] if world.scale else []
-            known, count = world.registered_frames, world.frames
-            return [f"cameras: {known} of {count} frames ({self.poses.source})", *scale]
-        known = sum(part.registered_frames for part in world.parts)
+            return [self.poses.cameras_text, *scale]
         lines = [
-            f"cameras: {known} of {world.frames} frames ({self.poses.source}) in "
-            f"{len(world.parts)} parts, each in a frame and scale of its own"
+            f"{self.poses.cameras_text} in {len(world.parts)} parts, each in a frame and scale of "
+            "its own"
         ]
         for k, part in enumerate(world.parts):
             count = sum(o.part == k for o in self.objects)
