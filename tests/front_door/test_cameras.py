@@ -64,8 +64,9 @@ def test_some_pictures_without_the_scene_cost_no_camera_of_the_others(
     assert "cameras: 25 of 30 frames (pycolmap)," in text and "012.png" in text
 
 
-def test_only_gaps_with_a_small_error_are_interpolated(walk, tmp_path, capsys, caplog):
+def test_only_gaps_with_a_small_error_are_interpolated(walk, tmp_path, monkeypatch, capsys, caplog):
     """The shaking hand is off by 2 px in one lost frame, and by 8 px in five; both are said."""
+    monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)
     images, truth = walk
     lost = [7, *range(15, 20)]
     images = [SPOILED["blur"](im, k) if k in lost else im for k, im in enumerate(images)]
