@@ -85,7 +85,7 @@ def measured(
     parallax = _parallax_px(arrays)
     few = images < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
     focal = arrays.focal_over_size
-    # with a wrong focal length, or pixels that are not square, a walk along a wall looks like a turn
+    # at a wrong focal length a walk along a wall looks like a turn
     no_depth = ": there is no depth" if calibrated else f", at a focal length of {focal:.2f} widths"
     checks = (
         (few, f"only {images} of {count} keyframes connect", ""),
