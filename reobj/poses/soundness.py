@@ -85,16 +85,19 @@ def measured(
     parallax = _parallax_px(arrays)
     few = images < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
     focal = arrays.focal_over_size
+    # at a wrong focal length a walk along a wall looks like a turn
+    no_depth = ": there is no depth" if calibrated else f", at a focal length of {focal:.2f} widths"
     checks = (
         (few, f"only {images} of {count} keyframes connect", ""),
         (len(arrays.xyz) < MIN_POINTS, f"only {len(arrays.xyz)} points could be triangulated", ""),
         (np.median(seen) < MIN_POINTS_PER_IMAGE,
          f"half of the keyframes see {np.median(seen):.0f} points or fewer", ""),
         (parallax < MIN_PARALLAX_PX,
-         f"a mere turn of the camera explains all images to {parallax:.1f} px: there is no depth",
-         SIDEWAYS),
+         f"a mere turn of the camera explains all images to {parallax:.1f} px{no_depth}",
+         SIDEWAYS if calibrated else ""),
         (angle < MIN_TRI_ANGLE_DEG,
-         f"half of the points are seen from directions within {angle:.1f} deg", SIDEWAYS),
+         f"half of the points are seen from directions within {angle:.1f} deg",
+         SIDEWAYS if calibrated else ""),
         (camera.has_bogus_params(*FOCAL_RANGE, 1.0),
          f"the focal length came out as {focal:.2f} x the longer side", LENS),
     )  # fmt: skip
