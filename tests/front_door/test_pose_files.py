@@ -335,7 +335,7 @@ def test_a_folder_says_what_it_was_taken_for(tmp_path: Path) -> None:
     model(tmp_path / "sparse" / "0", ALL, names)
     poses = rt.read_poses(tmp_path, rt.Video(folder_of(tmp_path)))
     assert any("read as transforms; --pose-format chooses" in text for text in poses.messages)
-    assert "read as transforms; frames found by file names" in poses.messages[-1]
+    assert poses.reading == "transforms, frames by file names"
 
 
 def with_cameras(folder: Path, cameras: list[str], of_image: list[int]) -> Path:
