@@ -320,6 +320,7 @@ def describe_world(
         parts,
         first.floor,
         first.floor_reason,
+        poses.reading,
     )
 
 

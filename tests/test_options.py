@@ -993,7 +993,7 @@ def _(lab: Lab) -> None:
     for value, count in ((False, 0), (True, 2)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(reobj.objects, "DOUBTFUL", 1.1)
-            shown = Mock()
+            shown = Mock(return_value=[])
             patch.setattr(rt, "write_pictures", shown)
             assert {found.status for found in lab.refit(value).objects} == {"doubtful"}
         result, out, video, *_, doubtful = shown.call_args[0]
