@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import dataclasses
-import importlib
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -59,7 +58,9 @@ def import_pycolmap() -> Any:
             import pycolmap
 
         pycolmap.logging.minloglevel = 3
-    return importlib.import_module("pycolmap")  # waits for another thread that imports it
+    import pycolmap  # waits for another thread that imports it
+
+    return pycolmap
 
 
 def camera_parameters(model: str) -> list[str]:

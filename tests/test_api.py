@@ -38,25 +38,6 @@ def test_public_names_are_few_sorted_and_documented() -> None:
         assert not name.startswith("_"), name
 
 
-def help_lines(thing: Any) -> int:
-    """Lines that were written for a reader: signatures and docstrings, of public methods too.
-
-    (`help` itself adds thirty lines to every dataclass: dunder methods and descriptors.)
-    """
-    count = 2 + len((inspect.getdoc(thing) or "").splitlines())
-    if inspect.isclass(thing):
-        own = {n: v for n, v in vars(thing).items() if not n.startswith("_")}
-        parts = [getattr(v, "__func__", v) for v in own.values()]
-        public = [v for v in parts if inspect.isfunction(v) or isinstance(v, property)]
-        count += sum(2 + len((inspect.getdoc(v) or "").splitlines()) for v in public)
-    return count
-
-
-def test_help_fits_on_a_few_screens() -> None:
-    module = len((rt.__doc__ or "").splitlines())
-    assert module + sum(help_lines(getattr(rt, name)) for name in rt.__all__) <= 765  # 43 names
-
-
 def test_every_public_method_has_a_docstring() -> None:
     missing = [
         f"{name}.{method}"

@@ -117,7 +117,7 @@ def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
 
     monkeypatch.setattr("reobj.poses.estimate.locate_between", note)
     poses = rt.estimate_poses(reconstructed[0], config(seed=4), tmp_path)
-    assert seeds == [4] and not poses.known.any()
+    assert set(seeds) == {4} and not poses.known.any()
 
 
 @pytest.mark.parametrize("max_gap, filled", [(2, True), (1, False)])
@@ -226,7 +226,7 @@ def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, mon
     assert poses.visibility[:, 1].max() < len(poses.points)
     seen = poses.part[poses.visibility[:, 0]]  # (M,) rows of points of part 0 come first
     assert poses.visibility[seen == 0, 1].max() < poses.visibility[seen == 1, 1].min()
-    assert "broke between frames 18 and 23" in poses.messages[0]
+    assert "broke between frames 22 and 23" in poses.messages[0]
 
 
 def test_a_mirrored_half_is_a_part_of_its_own(tmp_path):

@@ -364,7 +364,7 @@ def test_an_installed_copy_runs_its_own_child(walk, tmp_path):
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
     )
     out = result.stdout.strip()
-    assert str(tmp_path / "site") in out and out.endswith("messages=[])")
+    assert str(tmp_path / "site") in out and "messages=[]" in out
     assert (tmp_path / "out" / "sparse" / "images.bin").exists()
 
 

@@ -434,6 +434,8 @@ import multiprocessing, sys
 import cv2, numpy as np
 import reobj_track
 from reobj.poses.keyframes import follow_points
+from reobj.runtime import guard_forks
+guard_forks()  # as `Video` does
 def use(threads):
     image = np.random.default_rng(0).integers(0, 255, (480, 640), np.uint8)
     for n in threads:
