@@ -368,9 +368,15 @@ class Priors:
     def index(self, categories: Sequence[str | None]) -> IntArray:
         """Find the row of each category (O,), -1 where it is not in the table."""
         table = {_plain(name): k for k, name in enumerate(self.names)}
-        for alias, name in self.aliases.items():
-            table.setdefault(_plain(alias), table.get(_plain(name), -1))
-        return np.array([table.get(_plain(c or ""), -1) for c in categories], np.int64)
+        named = self.canonical([c or "" for c in categories])
+        return np.array([table.get(name, -1) for name in named], np.int64)
+
+    def canonical(self, names: Sequence[str]) -> list[str]:
+        """Return one name for all synonyms, in small letters; of unknown names their own."""
+        own = {_plain(name) for name in self.names}
+        aliases = {_plain(alias): _plain(name) for alias, name in self.aliases.items()}
+        plain = [_plain(name) for name in names]
+        return [name if name in own else aliases.get(name, name) for name in plain]
 
 
 def _plain(name: str) -> str:
@@ -1413,8 +1419,8 @@ def _prior_spec(
     there = _finite(points, 2)  # (O, P)
     weight = there * np.minimum(POINTS_WORTH / np.maximum(there.sum(1, keepdims=True), 1), 1.0)
     return _Spec(
-        obj, log_odds, size_mean, cov, rows, natural, allowed, round_, upright, world.up, world.tilt_rad,
-        plane, floor_sigma, np.where(there[..., None], points, 0.0), weight,
+        obj, log_odds, size_mean, cov, rows, natural, allowed, round_, upright, world.up,
+        world.tilt_rad, plane, floor_sigma, np.where(there[..., None], points, 0.0), weight,
     )  # fmt: skip
 
 
@@ -1583,7 +1589,7 @@ class _Fit(_Rows):
 
 
 def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Problem:
-    """Gather the fixed terms of fits of hypotheses `hyp` with support `code`, vertical axis `axis` (B,)."""
+    """Gather the fixed terms of fits: hypothesis, support `code`, vertical axis, each (B,)."""
     mean = spec.size_mean[hyp]
     shift = _shape_shift(mean, spec.natural[hyp], code)
     tilt = np.full((len(hyp), 3), 1.0 / spec.tilt_rad**2) * bool(np.any(spec.up))
@@ -1981,9 +1987,14 @@ def _pool_categories(middle: Array, variance: Array) -> tuple[float, float]:
 
 def _known_sizes(
     known_size: Mapping[str | int, tuple[str | int, float]] | None,
-    categories: Sequence[str | None] | None, live: IntArray,
+    categories: Sequence[str | None] | None, live: IntArray, priors: Priors | None,
 ) -> list[tuple[int, int, float]]:  # fmt: skip
     """Match the sizes that the user knows to live objects: (row, axis, metres) each."""
+
+    def same(a: str, b: str) -> bool:
+        one, other = [_plain(a), _plain(b)] if priors is None else priors.canonical([a, b])
+        return one == other
+
     out = []
     for key, (name, metres) in (known_size or {}).items():
         axis = name if isinstance(name, int) else "wdh".find(name[:1].lower())
@@ -1991,7 +2002,7 @@ def _known_sizes(
             raise QuadricsError(f"known_size[{key!r}] = {name, metres}: give (w|d|h, metres > 0)")
         for row, number in enumerate(live.tolist()):
             own = None if categories is None else categories[number]
-            if key == number or (isinstance(key, str) and _plain(key) == _plain(own or "")):
+            if key == number or (isinstance(key, str) and same(key, own or "")):
                 out.append((row, axis, metres))
     return out
 
@@ -2244,7 +2255,7 @@ def fit_objects(
     quality = quality + ~one_sided.any(-1)  # (F, O), whole boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
     known = isinstance(metric, Scale) and metric.source != "none"
-    sizes = [] if known else _known_sizes(known_size, categories, live)
+    sizes = [] if known else _known_sizes(known_size, categories, live, priors)
     world = _first_world(up, metric if known else bool(metric is True and not sizes), cams, floor)
     if not len(live):
         return _report(None, boxes, one_sided, usable, cams, live, world, cfg)
