@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_quadrics as syn
+from simulated import tracks_of, unlinked, walk
 
 import quadrics as q
 from reobj.objects import ObjectsConfig, check_known_size, unused_sizes
+from reobj.parts import link_and_fit
+from reobj.results.edits import read_edits
 
 UP = (0.0, 0.0, 1.0)
 PRIORS = q.load_priors()
@@ -110,3 +113,26 @@ def test_known_size_takes_synonyms() -> None:
     known = {"sofa": ("h", 2.0)}
     fits = q.fit_objects(boxes, cams, syn.IMAGE, ["couch"] * 4, PRIORS, up=UP, known_size=known)
     assert fits.scale.source == "known_size"
+
+
+@pytest.mark.parametrize(("label", "same"), [("my favourite seat", True), ("cup", False)])
+def test_a_label_that_no_prior_knows_keeps_the_category(
+    tmp_path: Path, label: str, same: bool
+) -> None:
+    """Three frames hardly show a size: it is that of the category."""
+    poses = walk()
+    tracks = tracks_of(poses)
+    tracks = tracks[tracks.frame < 3]
+    box = tracks.xyxy[tracks.track_id == 2][0].tolist()
+    entry = {"do": "rename", "object": {"id": 2, "frame": 0, "box": box}, "class": label}
+    path = tmp_path / "e.json"
+    path.write_text(json.dumps({"format": "reobj-edits", "version": 1, "edits": [entry]}))
+    sizes = []
+    for edits in (None, read_edits(path)):
+        result = unlinked(poses, tracks)
+        result.edits = edits
+        link_and_fit(result, ObjectsConfig(link=False))
+        found = {o.id: o for o in result.objects}[2]
+        sizes.append(np.array(found.size))
+    assert found.class_name == label
+    assert np.allclose(*sizes) == same
