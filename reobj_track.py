@@ -43,7 +43,6 @@ import dataclasses
 import json
 import logging
 import math
-import os
 import sys
 import time
 import traceback
@@ -59,7 +58,7 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.commands import SecretFormatter, make_parser, short_help
+from reobj.commands import SecretFormatter, make_parser, say, short_help, with_streams
 from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
 from reobj.identity.assignment import Pairs, ambiguous_pairs, assign, touching
 from reobj.identity.camera_motion import CameraMotion
@@ -93,16 +92,16 @@ from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
-    check_directions,
     poses_key,
     reconstruct_cached,
+    settled_poses,
     supplied_poses,
     write_supplied_model,
 )
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
-from reobj.results.folder import write_trajectories
+from reobj.results.folder import CONFIG_FILE, MODEL, copy_models, replaced, write_trajectories
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
 from reobj.results.result import (
@@ -114,11 +113,12 @@ from reobj.results.result import (
 )
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
-from reobj.results.workspace import CONFIG_FILE, Workspace
+from reobj.results.workspace import Workspace
 from reobj.schema import validate_objects
 from reobj.solvers import solve_again
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
+from reobj.sources.looked import Intervals
 from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
@@ -173,7 +173,9 @@ class TrackerConfig:
     n_init: int = option(
         3, "detections of score .5 before a new object gets its identity; a return needs one less"
     )
-    coast_frames: int = option(30, "frames that a track lives on without a detection", "--coast")
+    coast_frames: int = option(
+        30, "frames, of those looked at, that a track lives on without a detection", "--coast"
+    )
     remember: bool = option(True, "recognise objects that return, however long they were away")
     std_position: float = option(
         0.05, "process noise of a position, over the box size; more for jerky cameras"
@@ -185,7 +187,7 @@ class TrackerConfig:
     foreground_weight: float = option(
         0.5, "share of the foreground in the appearance; less trusts the surroundings more"
     )
-    embed_every: int = option(10, "frames after which every track is embedded again")
+    embed_every: int = option(10, "frames looked at after which every track is embedded again")
     return_probability: float = option(
         0.5, "probability from which on a return is recognised; more for fewer wrong identities"
     )
@@ -323,7 +325,7 @@ class TrackState:
     cov: Array  # (T, 4, 3)
     tracklet: IntArray  # (T,)
     identity: IntArray  # (T,) index of the identity, -1 while tentative
-    missed: IntArray  # (T,) frames since the last one
+    missed: IntArray  # (T,) frames looked at since the last detection
     first: IntArray  # (T,) frame of birth
     embedded: IntArray  # (T,) frame of the last embedding, -1: never
     votes: Array  # (T, C) score sums of the classes
@@ -363,7 +365,7 @@ class TrackState:
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 6  # of the files of Tracker.save
+STATE_VERSION = 7  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -394,8 +396,9 @@ PLACE_IN_VIEW = 0.5  # share of a projected box in the image from which a detect
 class Tracker:
     """Give every detection of a video the identity of its physical object.
 
-    Call `update` once a frame, also with no detections. Identities start at 1, belong to this
-    tracker alone and are never given to another object. An object that was away is recognised by
+    Call `update` once a frame: with [] where the detector found nothing, with None where it was not
+    run. Identities start at 1, belong to this tracker alone and are never given to
+    another object. An object that was away is recognised by
     appearance, whatever its place in the image, unless two identities fit about equally well: then
     it gets a new identity (the linker of `run` decides later, with 3D evidence).
 
@@ -422,6 +425,9 @@ class Tracker:
         """Forget everything: the next video starts with identity 1."""
         none = np.empty(0, np.int64)
         self.frame_number = -1
+        self.looked = False  # whether the detector was run on the latest frame
+        self._looks = -1  # frames that it was run on, but for the first
+        self._intervals = Intervals()  # of the frames with detections
         self.state = TrackState.spawn(np.empty((0, 4)), none, 0, self.config)
         self.gallery = Gallery()
         self.reid_calibration = SimilarityCalibration()  # of views some time apart
@@ -450,32 +456,47 @@ class Tracker:
         camera: Camera | None = None,
         points: Array | None = None,
         part: int = 0,
+        looked: bool | None = None,
     ) -> Tracks:
         """Track the detections of the next frame.
 
         Args:
             detections: `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics'
                 Results or Boxes; supervision's Detections; or a dict of boxes, scores, labels.
+                None: the detector was not run on this frame; tracks are predicted, and none counts
+                as missed.
             frame: (H, W, 3) uint8 BGR image: camera motion, and the input of the embedder.
             embeddings: of all detections: an (D, E) array or `Embeddings`, of one width E always.
             cam_from_world: (3, 4) pose of this frame, with `camera`: objects are known by their
                 place in 3D. NaN: not known.
             points: (N, 3) in world, seen in this frame: how far away a new track is.
             part: of the cameras' path; each has a world of its own, and places in it.
+            looked: the detector was run on this frame. None: that depends on the detections; no
+                detection is a frame not looked at only where the frames with detections so far
+                come at a regular interval, or most of them alone.
         Returns:
             The detections that belong to a confirmed track; decided once.
         Raises:
             ReobjError: something that cannot be meant; the tracker stays as it was.
         """
-        detections = as_detections(detections)
+        run = detections is not None and looked is not False
+        detections = as_detections(detections) if run else Detections.empty()
         frame = None if frame is None else as_frame(frame, detections.masks)
         given = as_embeddings(embeddings, len(detections), self.state.embedding.shape[1])
         pose = checked_pose(cam_from_world, camera, points, part)
         self.frame_number += 1
+        if len(detections):
+            self._intervals.add(self.frame_number, len(detections))
+        elif run and looked is None:
+            run = self._intervals.looked_at(self.frame_number)
+        self.looked, self._looks = run, self._looks + run
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, frame, detections, weight)
         self._enter(part)
         self._predict(frame, pose, camera)
+        if not run:
+            self._lazy, self._latest, self.detections = None, Tracks.empty(), detections
+            return self._latest
         box = cxcywh_from_xyxy(detections.xyxy)
         track_of = self._associate(detections, box, lazy)  # (D,) row of the track's state, or -1
         self._update_states(detections, box, track_of)
@@ -498,18 +519,19 @@ class Tracker:
         return Tracks.empty() if self._latest is None else self._latest
 
     def predicted(self, frames: int = 5) -> Tracks:
-        """Return the boxes predicted in the latest frame for identities that were missed in it.
+        """Return the boxes predicted in the latest frame for identities not detected in it.
 
         They lie where the track's motion and the camera's lead, perhaps beyond the image's border.
 
         Args:
-            frames: since the last detection, at most; 5 has the best HOTA on benchmark.py's steady
-                stream of 50 objects (none .857, 1 .901, 5 .907, 10 .907).
+            frames: looked at since the last detection, at most; 5 has the best HOTA on
+                benchmark.py's steady stream of 50 objects (none .857, 1 .901, 5 .907, 10 .907).
         Returns:
             Tracks of score 0 and detection_index -1, as filled gaps are.
         """
         state = self.state
-        t = np.flatnonzero((state.identity >= 0) & (state.missed > 0) & (state.missed <= frames))
+        absent = (state.missed > 0) | (not self.looked)
+        t = np.flatnonzero((state.identity >= 0) & absent & (state.missed <= frames))
         t = t[state.mean[t, 0, 0] > OUT_OF_VIEW / 2]
         box, none = xyxy_from_cxcywh(state.mean[t, :, 0]), np.full(len(t), -1)
         ids = (np.full(len(t), self.frame_number), state.identity[t] + 1, state.tracklet[t])
@@ -558,7 +580,8 @@ class Tracker:
         in_view = np.ones(len(state.mean), bool)
         if pose is not None and camera is not None:
             in_view = self._follow_places(pose, camera, before)
-        state.missed += in_view | (state.missed == 0)
+        if self.looked:
+            state.missed += in_view | (state.missed == 0)
 
     def _follow_places(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
         """Move tracks of known place as the image of their ellipsoid or of their span does.
@@ -616,7 +639,7 @@ class Tracker:
         identity = confirmed.track_id - 1
         self.places.add(self.frame_number, identity, confirmed.xyxy, view)
         due = self.places.due
-        if self.frame_number % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
+        if self._looks % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
             self.places.refit(self._image_size)
 
     def _associate(self, detections: Detections, box: Array, lazy: LazyEmbeddings) -> IntArray:
@@ -767,7 +790,7 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
         soon = (state.identity[t] < 0) & (state.evidence[t] >= self.config.n_init - 1)
-        due = soon | (self.frame_number % max(1, self.config.embed_every) == 0)  # all in one pass
+        due = soon | (self._looks % max(1, self.config.embed_every) == 0)  # all in one pass
         self._calibrate_matches(detections, track_of, rows[lazy.done[rows] | due], lazy)
         rows = rows[due]
         t = track_of[rows]
@@ -944,7 +967,7 @@ class Tracker:
 
     def _saved(self) -> dict[str, tuple[Any, str]]:
         """List all that changes from frame to frame: owner and attribute, by its name in files."""
-        own = "frame_number last_seen identity_class _next_tracklet _last_pose part"
+        own = "frame_number _looks last_seen identity_class _next_tracklet _last_pose part"
         parts: dict[str, tuple[Any, Sequence[str]]] = {
             "tracker": (self, own.split()),
             "state": (self.state, [f.name for f in dataclasses.fields(TrackState)]),
@@ -953,6 +976,7 @@ class Tracker:
             "reid_calibration": (self.reid_calibration, SimilarityCalibration.ARRAYS),
             "match_calibration": (self.match_calibration, SimilarityCalibration.ARRAYS),
             "camera_motion": (self._camera_motion, CameraMotion.ARRAYS),
+            "intervals": (self._intervals, [f.name for f in dataclasses.fields(Intervals)]),
         }
         return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
 
@@ -972,7 +996,8 @@ def track(
     Args:
         video: a `Video`, or what makes one: file, folder of images, glob, camera index, stream URL.
         detector: function image -> detections (`OnnxDetector`, your own), a file of recorded
-            detections, or a `DetectionSource`; default: the default detector.
+            detections, or a `DetectionSource`; default: the default detector. A function that
+            returns None did not look at the frame.
         tracker: default: one with our embedder.
         poses: known cameras of the video; objects are then known by their place in 3D too.
     Yields:
@@ -985,10 +1010,10 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    told = CamerasOfFrames(poses, video.scale)
+    told, always = CamerasOfFrames(poses, video.scale), True if source.always_looks else None
     ahead = tracker.config.camera_motion and video.has_images and not video.is_live
     for frame in tracker._camera_motion.ahead(video) if ahead else video:
-        tracks = tracker.update(source(frame), frame.image, **told(frame.index))
+        tracks = tracker.update(source.look(frame), frame.image, looked=always, **told(frame.index))
         yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 
@@ -1024,13 +1049,14 @@ def run(
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
-    video = open_video(source, config.input, config.poses, tracks or detections)
+    boxes_file = tracks or detections
+    video = open_video(source, config.input, config.poses, boxes_file, config.detect)
     with Workspace(out, overwrite) as workspace:
         workspace.bind(video, overwrite)
         viewer = Viewer(VideoInfo.of(video)) if show else None
         seconds: dict[str, float] = {}
         in_3d = in_3d and config.poses.mode != "none"
-        poses = supplied_poses(video, config.poses, workspace) if in_3d else None
+        readings, poses = supplied_poses(video, config.poses) if in_3d else [], None
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
             boxes, names = result.tracks, result.class_names
@@ -1042,21 +1068,21 @@ def run(
                 started = time.monotonic()
                 found, boxes = detect_all(found, video, workspace)
                 seconds["detect"] = time.monotonic() - started
-            names = found.class_names
+            names = tuple(found.class_names)
         check_known_size(config.objects, names)
         model = None
-        if poses is not None:
-            check_directions(poses, boxes if tracks else _tracklets(boxes))
+        if readings:
+            shown = boxes if tracks else _tracklets(boxes)
+            poses = settled_poses(readings, shown, video, config.poses, workspace)
         elif in_3d and not video.is_live:
-            moving = np.isin(np.array([*names, ""]), config.objects.moving_classes)[boxes.class_id]
+            moving = np.isin([*names, ""], config.objects.moving_classes)[boxes.class_id]
             rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
             started = time.monotonic()
             poses, model = reconstruct_cached(video, config.poses, workspace, rows)
             seconds["poses"] = time.monotonic() - started
         if not tracks:
             result = _track_video(video, workspace, config, found, poses, seconds, viewer)
-        workspace.save_last(result, poses)
-        workspace.publish_model(model)
+        workspace.save_last(result, poses, model or [])
         result.poses, result.seconds = poses, seconds
         result = _finish(result, video, workspace, config)
         if viewer is not None:
@@ -1078,7 +1104,8 @@ def refit(
     if tracks and edits:
         raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")
     with Workspace.open(out) as workspace:
-        result, video = workspace.load_last(), workspace.video()
+        result = workspace.load_last()
+        video = workspace.video() if tracks else workspace.video_or_facts(result)
         result.edits = read_edits(edits) if edits else None
         config = dataclasses.replace(config or _last_config(out), input=video.config)
         _check_objects(config.objects)
@@ -1086,7 +1113,7 @@ def refit(
         if tracks:
             poses = result.poses
             result = _given_tracks(tracks, video, config.detect, result)
-            workspace.save_last(result, poses)
+            workspace.save_last(result, poses, workspace.last_models())
             result.poses = poses
         return _finish(result, video, workspace, config)
 
@@ -1154,31 +1181,46 @@ def _given_tracks(
     )
 
 
-def _finish(result: Result, video: Video, workspace: Workspace, config: Config) -> Result:
-    """Link tracklets, fit one solid an object, and write all files of the output folder."""
+def _finish(
+    result: Result,
+    video: Video,
+    workspace: Workspace,
+    config: Config,
+) -> Result:
+    """Link tracklets, fit one solid an object, and write all files of the output folder.
+
+    The pictures come last: the results are written whatever becomes of them.
+    """
     started, poses = time.monotonic(), result.poses
     result.edits = result.edits or kept_edits(workspace.out)
     with Progress("objects"):
         link_and_fit(result, config.objects)
-    gap = 0 if result.identities_given else config.output.fill_gaps
-    filled = fill(result, video.size, gap)  # by our own solids, whatever solver is asked for
+    gap, every = 0 if result.identities_given else config.output.fill_gaps, video.config.every
+    filled = fill(result, video.size, gap, every)  # by our own solids, whatever solver is asked for
     solve_again(result, config.objects)
     result.tracks, result.out = filled, workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
     result.embedding_row = detected[result.embedding_row]
     result.seconds["objects"] = time.monotonic() - started
     result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
-    result.warnings += implausible(result, config.tracker.high_score, config.objects.moving_classes)
+    scores = (config.tracker.high_score, config.objects.moving_classes, config.tracker.new_score)
+    result.warnings += implausible(result, *scores)
     result.warnings += unused_sizes(config.objects, result.objects)
     started = time.monotonic()
-    shown = config.output
+    shown, models = config.output, workspace.last_models()
 
-    def pictures(folder: Path) -> None:
-        write_pictures(result, folder, video, shown.overlay, shown.scene, shown.doubtful)
+    def more(folder: Path) -> None:
+        write_config(config, folder / CONFIG_FILE)
+        if models is not None:
+            copy_models(models, folder)
+            write_supplied_model(poses, video, folder)
 
-    result.save(workspace.out, shown.doubtful, pictures)
-    write_config(config, workspace.out / CONFIG_FILE)
-    write_supplied_model(poses, video, workspace.out)
+    stale = (MODEL,) if models is not None or poses is None else ()
+    result.save(workspace.out, shown.doubtful, more, stale)
+    options = (shown.overlay, shown.scene, shown.doubtful)
+    if faults := write_pictures(result, workspace.out, video, *options):
+        result.warnings += faults
+        result.write_objects(workspace.out / "objects.json")
     result.seconds["write"] = time.monotonic() - started
     for warning in result.warnings:
         log.warning(warning)
@@ -1208,16 +1250,18 @@ def _cmd_poses(args: argparse.Namespace) -> int:
     video = Video(args.video, config.input)
     with Workspace(args.out, args.overwrite) as workspace:
         workspace.bind(video, args.overwrite)
-        poses, model = supplied_poses(video, config.poses, workspace), None
-        if poses is None:
+        model = None
+        if readings := supplied_poses(video, config.poses):
+            poses = settled_poses(readings, Tracks.empty(), video, config.poses, workspace)
+        else:
             poses, model = reconstruct_cached(video, config.poses, workspace)
-        workspace.publish_model(model)
-        write_trajectories(workspace.out, poses)
-        write_supplied_model(poses, video, workspace.out)
-    known, count = poses.known.sum(), len(poses.frame)
+        with replaced(workspace.out, ("poses.txt", MODEL)) as new:
+            copy_models(model or (), new)
+            write_trajectories(new, poses)
+            write_supplied_model(poses, video, new)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
-    print(f"cameras: {known} of {count} frames, {len(poses.points)} points; look at: {where}")
-    for message in (*poses.messages, *parts_message(poses)):
+    print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
+    for message in (*video.messages, *poses.messages, *parts_message(poses)):
         log.warning(message)
     return 0
 
@@ -1239,10 +1283,12 @@ def _cmd_eval(args: argparse.Namespace) -> int:
         poses = next((p for p in beside if p.exists()), None)
     classes = [c.strip() for c in args.classes.split(",") if c.strip()]
     scores = evaluate(args.out, args.gt, args.gt_objects, poses, classes, args.min_visibility)
-    print(score_report(scores))
-    if args.out.is_dir():
-        with atomic(args.out / "eval.json") as part:
-            part.write_text(json.dumps(scores, indent=1))
+    try:
+        if args.out.is_dir():
+            with atomic(args.out / "eval.json") as part:
+                part.write_text(json.dumps(scores, indent=1))
+    finally:
+        print(score_report(scores))
     return 0
 
 
@@ -1268,31 +1314,34 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Ctrl-C is the way to end a live source: its files are written, and 0 is returned.
     """
-    parser, words = _parser(), list(sys.argv[1:] if argv is None else argv)
-    if (text := short_help(parser, words)) is not None:
-        print(text, file=sys.stderr)
-        return 2
-    args = parser.parse_args(words)
-    level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
-    logging.addLevelName(logging.WARNING, "warning")
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(SecretFormatter("%(levelname)s: %(message)s"))
-    logging.basicConfig(level=level, handlers=[handler], force=True)
+    return with_streams(lambda: _main(list(sys.argv[1:] if argv is None else argv)))
+
+
+def _main(words: Sequence[str]) -> int:
+    """Parse the words and run the command; an exception becomes a message and an exit code."""
+    parser, args = _parser(), None
     try:
+        if (text := short_help(parser, words)) is not None:
+            say(text)
+            return 2
+        args = parser.parse_args(words)
+        level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
+        logging.addLevelName(logging.WARNING, "warning")
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(SecretFormatter("%(levelname)s: %(message)s"))
+        logging.basicConfig(level=level, handlers=[handler], force=True)
         return int(args.func(args))
     except KeyboardInterrupt:
-        text = "interrupted: what was computed is kept; run the same command again to go on"
-        print(f"\n{text}", file=sys.stderr)
+        say("\ninterrupted: what was computed is kept; run the same command again to go on")
         return 130
-    except BrokenPipeError:  # the reader of our output (head, less) has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except BrokenPipeError:  # `with_streams` handles it
+        raise
     except Exception as error:
         expected = isinstance(error, ReobjError | quadrics.QuadricsError | OSError)
         text = f"error: {one_line(str(error))}"
-        if args.debug or not expected:
+        if not expected or (args is not None and args.debug):
             text = without_secrets(traceback.format_exc())
-        print(text, file=sys.stderr)
+        say(text)
         return 2 if expected else 1
 
 

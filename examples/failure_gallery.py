@@ -24,15 +24,10 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
-from reobj.results.evaluation import (
-    LabelledBoxes,
-    identity_map,
-    matched_rows,
-    read_result,
-    read_truth,
-)
+from reobj.results.evaluation import identity_map, matched_rows
+from reobj.results.truth import LabelledBoxes, read_result, read_truth
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.types import Array, Image, IntArray, box_iou
 
 WIDTH_PX, CAPTION_PX = 300, 22

@@ -124,7 +124,7 @@ def main(argv: list[str] | None = None) -> int:
     except rt.ReobjError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    solids, entries = objects_of(tracker, detect.class_names)
+    solids, entries = objects_of(tracker, tuple(detect.class_names))
     args.out.mkdir(parents=True, exist_ok=True)
     write_mot(args.out / "tracks.txt", tracks)
     with atomic(args.out / "live_objects.json") as part:

@@ -64,8 +64,8 @@ import quadrics
 import reobj_track as rt
 from reobj.objects import DOUBTFUL
 from reobj.parts import link_and_fit
-from reobj.results.evaluation import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
+from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
 from reobj.views import Views
 

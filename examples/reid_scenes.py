@@ -26,7 +26,7 @@ import quadrics
 import reobj_track as rt
 from reobj.cameras import viewing_rays
 from reobj.files import atomic
-from reobj.results.evaluation import ABSENT, SCORED, read_truth
+from reobj.results.truth import ABSENT, SCORED, read_truth
 from reobj.sources.masks import NO_RUNS, rle_decode, rle_encode
 from reobj.types import Array, Image, IntArray
 

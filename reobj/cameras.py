@@ -9,10 +9,12 @@ are written (npz, TUM, COLMAP).
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
+import importlib
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,17 +27,39 @@ from reobj.files import atomic, load_npz, save_npz
 from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers
 
 
-def import_pycolmap() -> Any:
-    """Import pycolmap when it is needed: without its log on stderr, and SIGTERM still ends us."""
-    if "pycolmap" in sys.modules:
-        return sys.modules["pycolmap"]
-    handler = signal.getsignal(signal.SIGTERM)
-    import pycolmap
+@contextlib.contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Keep what this process does on signals, whatever a package that is loaded here installs.
 
-    with contextlib.suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGTERM, handler or signal.SIG_DFL)
-    pycolmap.logging.minloglevel = 3
-    return pycolmap
+    By the C library, because Python sets handlers in the main thread only; what it stores of one
+    (struct sigaction, 152 bytes on Linux) is handed back unread.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    libc, before = ctypes.CDLL(None), {}
+    for name in ("SIGTERM", "SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL"):  # glog's
+        before[int(signal.Signals[name])] = ctypes.create_string_buffer(1024)
+    for number, action in before.items():
+        libc.sigaction(number, None, action)
+    try:
+        yield
+    finally:
+        for number, action in before.items():
+            libc.sigaction(number, action, None)
+
+
+def import_pycolmap() -> Any:
+    """Import pycolmap when it is needed: without its log on stderr and its handlers of signals.
+
+    They print a C++ trace where a process is ended (SIGTERM), also in processes forked from it.
+    """
+    if "pycolmap" not in sys.modules:
+        with _signals_kept():
+            import pycolmap
+
+        pycolmap.logging.minloglevel = 3
+    return importlib.import_module("pycolmap")  # waits for another thread that imports it
 
 
 def camera_parameters(model: str) -> list[str]:
@@ -92,9 +116,11 @@ class Camera:
         rows = np.flatnonzero(np.isfinite(flat).all(1))
         if len(rows):
             ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
-            ray, rows = ray[ray[:, 2] > 0], rows[ray[:, 2] > 0]
+            ahead = np.isfinite(ray).all(1) & (ray[:, 2] > 0)
+            ray, rows = ray[ahead], rows[ahead]
             back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
-            good = np.linalg.norm(back - flat[rows], axis=1) < INVERSE_PX
+            off = np.abs(back - flat[rows]).max(1, initial=0)  # of terms without bounds it is inf
+            good = off < INVERSE_PX
             ray, rows = ray[good], rows[good]
             ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
@@ -233,6 +259,18 @@ class Poses:
     def __post_init__(self) -> None:
         if len(self.part) != len(self.frame):
             object.__setattr__(self, "part", np.zeros(len(self.frame), np.int64))
+
+    @property
+    def measured(self) -> BoolArray:
+        """Mark the frames (F,) whose pose was not interpolated between those of others."""
+        return np.asarray(self.known & (self.status != "interpolated"), bool)
+
+    @property
+    def cameras_text(self) -> str:
+        """Say how many frames have a camera, and how many of these are interpolated."""
+        known, between = int(self.known.sum()), int((self.known & ~self.measured).sum())
+        text = f"cameras: {known} of {len(self.frame)} frames ({self.source})"
+        return f"{text}, {between} interpolated" if between else text
 
     @property
     def part_count(self) -> int:
@@ -391,7 +429,7 @@ def write_tum(path: Path, poses: Poses) -> None:
     xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
     units = "units: metres" if poses.metric else NO_SCALE
-    rows = [" ".join(f"{value:.9f}" for value in row) for row in table]
+    rows = [" ".join([f"{row[0]:.9f}", *(f"{v:.12g}" for v in row[1:])]) for row in table]
     header = f"# t tx ty tz qx qy qz qw (world_from_cam, seconds, {units})"
     with atomic(path) as part:
         part.write_text("\n".join([header, *rows]) + "\n")
@@ -420,7 +458,7 @@ def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
         f"{i + 1} {' '.join(map(repr, row))} 1 {image_names[i]}\n\n"
         for i, row in zip(np.flatnonzero(poses.known).tolist(), values.tolist(), strict=True)
     ]
-    (path / "images.txt").write_text("".join(lines))
+    (path / "images.txt").write_text("".join(lines), "utf-8", "surrogateescape")
     points = zip(poses.points.tolist(), poses.colors.tolist(), strict=True)
     rows = [" ".join(map(repr, (i, *xyz, *rgb, 0))) for i, (xyz, rgb) in enumerate(points, 1)]
     (path / "points3D.txt").write_text("".join(f"{row}\n" for row in rows))

@@ -6,8 +6,11 @@ What a command does is the business of `reobj_track`.
 from __future__ import annotations
 
 import argparse
+import io
 import logging
+import os
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -19,7 +22,12 @@ from reobj.types import ReobjError, one_line, without_secrets
 
 Command = Callable[[argparse.Namespace], int]
 SHELLS = ("bash", "zsh")  # shtab's script for tcsh knows no flags of commands
-TRACKS_HELP = "identities from a file instead of the tracker: CVAT XML, COCO-VID JSON, MOT, CSV"
+TRACKS_HELP = (
+    "identities from a file instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, YOLO labels"
+)
+DETECTIONS_HELP = (
+    "recorded detections instead: MOT, KITTI, CSV, COCO JSON, folder of YOLO labels, CVAT, npz"
+)
 
 
 class Parser(argparse.ArgumentParser):
@@ -50,6 +58,65 @@ class SecretFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
         return without_secrets(super().format(record))
+
+
+def with_streams(program: Callable[[], int]) -> int:
+    """Run a program whose standard streams may be closed, full, or a pipe that nobody reads.
+
+    Returns:
+        the exit code of the program; 0 where the reader of its output (head, less) has seen enough
+        before it ended; 2 where the output cannot be written.
+    Raises:
+        SystemExit: of argparse, after --help and for wrong words.
+    """
+    _open_streams()
+    code, left = 0, None
+    try:
+        code = program()
+    except BrokenPipeError:
+        pass
+    except SystemExit as error:
+        left = error
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        _discard(sys.stdout)
+        if not isinstance(error, BrokenPipeError):
+            say(f"error: the output cannot be written ({error.strerror})")
+            return 2
+    if left is not None:
+        raise left
+    return code
+
+
+def _open_streams() -> None:
+    """Open the standard streams that are closed; what they cannot encode is escaped."""
+    for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:  # closed: a file opened next would get its number, and C code's messages
+            while os.open(os.devnull, os.O_RDWR) < number:
+                pass
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r+"))
+    for stream in (sys.stdout, sys.stderr):  # no name of a class or file ends a run
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
+def say(text: str) -> None:
+    """Print a line on stderr, if anyone reads it."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except OSError:
+        _discard(sys.stderr)
+
+
+def _discard(stream: Any) -> None:
+    """Send what is left in a buffer nowhere, so that the interpreter's own flush succeeds."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 class _ListOptions(argparse.Action):
@@ -138,7 +205,7 @@ def _add_run(command: Any, name: str, text: str) -> None:
     add("-o", "--out", required=True, help="output folder")
     add("--overwrite", action="store_true", help="write into a folder that holds something else")
     if name != "poses":
-        add("--detections", help="recorded detections instead: MOT txt, CSV, COCO JSON, npz")
+        add("--detections", help=DETECTIONS_HELP)
         add("--tracks", help=TRACKS_HELP)
         add("--show", action="store_true", help="follow it live in rerun's viewer (needs rerun)")
 

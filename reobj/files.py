@@ -41,14 +41,27 @@ def atomic(path: Path) -> Iterator[Path]:
         ReobjError: the disk is full, may not be written, or fails: where, why and what to do.
     """
     part = path.with_name(f".part-{path.name}")
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path), _folder(path.parent):
         try:
             yield part
             _sync(part)
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _folder(path: Path) -> Iterator[None]:
+    """Make a folder; those that were not there are removed again if the block fails."""
+    new = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in new:
+            with contextlib.suppress(OSError):  # not empty
+                folder.rmdir()
+        raise
 
 
 DISK_ERRORS = {
@@ -60,6 +73,7 @@ DISK_ERRORS = {
     errno.EPERM: "choose a folder that you may write into",
     errno.EEXIST: "a file stands where a folder should be: move it away",
     errno.ENOTDIR: "a file stands where a folder should be: move it away",
+    errno.EISDIR: "a folder stands where a file should be: move it away",
     errno.EIO: "look at the disk: it fails",
 }  # what to do about them
 NUMPY_FULL = re.compile(r"\d+ requested and \d+ written")  # its error without a number
@@ -141,25 +155,49 @@ PART_RESULTS = ".part-results"
 
 
 @contextlib.contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def staged(folder: Path, name: str = PART_RESULTS) -> Iterator[Path]:
     """Yield an empty folder whose files replace those of `folder` at the end of the block.
 
     All of them are there before the first one is replaced: an exception in the block leaves
-    `folder` as it was. Files that were not made anew stay.
+    `folder` as it was, and so does a folder where a file belongs. Files that were not made anew
+    stay.
+
+    Args:
+        name: of the empty folder, in `folder`.
+    Raises:
+        ReobjError: as `check_places`, or the disk is why it cannot be written.
     """
-    part = folder / PART_RESULTS
-    with writing(folder):
+    part = folder / name
+    with writing(folder), _folder(folder):
         shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
+        part.mkdir()
         try:
             yield part
-            for file in sorted(part.rglob("*")):
-                if file.is_file():
-                    target = folder / file.relative_to(part)
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    file.replace(target)
+            made = [p.relative_to(part) for p in sorted(part.rglob("*")) if p.is_file()]
+            check_places(folder, made)
+            for file in made:
+                (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                (part / file).replace(folder / file)
         finally:
             shutil.rmtree(part, ignore_errors=True)
+
+
+def check_places(folder: Path, names: Iterable[str | Path]) -> None:
+    """Refuse files (paths within a folder) that cannot be replaced by new ones of that name.
+
+    Raises:
+        ReobjError: a folder is where a file belongs, something else where a folder belongs, or a
+            folder may not be written into.
+    """
+    for name in map(Path, names):
+        for path in (folder / parent for parent in name.parents):
+            if os.path.lexists(path) and not path.is_dir():
+                raise ReobjError(f"{path}: is no folder, but one is written here; move it away")
+            if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+                what = "is not writable, but results are written here; allow it (chmod u+w)"
+                raise ReobjError(f"{path}: {what}")
+        if (path := folder / name).is_dir() and not path.is_symlink():
+            raise ReobjError(f"{path}: is a folder, but a file is written here; move it away")
 
 
 def _sync(path: Path) -> None:
@@ -195,14 +233,14 @@ JSON_BYTES = {"{": 200, "[": 64, ",": 64}  # that what follows takes, about (sys
 NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
 
 
-def read_text(path: Path, most: int | None = None) -> str:
+def read_text(path: Path, most: int | None = None, errors: str = "strict") -> str:
     """Read a UTF-8 file, with or without a byte order mark.
 
-    most: characters that it may have; default: TEXT_MAX.
+    most: characters that it may have; default: TEXT_MAX. errors: as in `open`.
     """
     most = most or TEXT_MAX
     try:
-        with path.open(encoding="utf-8-sig") as file:
+        with path.open(encoding="utf-8-sig", errors=errors) as file:
             text = file.read(most + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ReobjError(f"{path}: cannot be read as text ({error})") from error
@@ -320,7 +358,7 @@ class Progress:
         self.stage, self.total, self.done = stage, total, 0
         self.started = self.shown = time.monotonic()
         self.marks = [(self.started, 0)]  # time and steps, of the last WINDOW_S
-        self.enabled = sys.stderr.isatty()
+        self.enabled = sys.stderr is not None and sys.stderr.isatty()
 
     def __enter__(self) -> Progress:
         if self.enabled:
@@ -393,6 +431,15 @@ def shortened(items: Sequence[Any]) -> str:
     return ", ".join(map(str, items[:5])) + (", ..." if len(items) > 5 else "")
 
 
+def cut(text: str, most: int) -> str:
+    """Shorten a text to at most `most` characters.
+
+    >>> cut("refrigerator", 8)
+    'refri...'
+    """
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 PRINT_WIDTH = 100  # columns of what is printed
 
 
@@ -447,9 +494,22 @@ def texts_with_sigma(values: Array, sigma: Array | None) -> list[tuple[str, ...]
     return [(f"{a:.{digits}f}", f"{b:.{digits}f}") for a, b in zip(values, sigma, strict=True)]
 
 
-def numbers(values: Array) -> list[float]:
-    """Round to six significant digits, for JSON: far below any accuracy, and stable text."""
-    return [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
+def numbers(values: Array, size: float = math.inf) -> list[float]:
+    """Round to six significant digits, for JSON: far below any accuracy, and stable text.
+
+    Args:
+        size: of what lies at these coordinates; they are rounded to a millionth of it where that is
+            finer: those of a map projection have seven digits before the point.
+
+    >>> numbers(np.array([5400000.1234567, 0.00012345678]), 0.9)
+    [5400000.123457, 0.000123457]
+    """
+    kept = [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
+    if not 0 < size < math.inf:
+        return kept
+    fine = [round(float(v), 6 - math.ceil(math.log10(size))) for v in np.asarray(values).ravel()]
+    pairs = zip(np.asarray(values).ravel(), kept, fine, strict=True)
+    return [min(a, b, key=lambda text: abs(text - v)) for v, a, b in pairs]
 
 
 def base64_text(values: npt.NDArray[Any], kind: str) -> str:

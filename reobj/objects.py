@@ -17,7 +17,7 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
-from reobj.files import did_you_mean, load_json, rounded, shortened
+from reobj.files import did_you_mean, load_json, numbers, rounded, shortened
 from reobj.identity.evidence import CLASS_KEPT
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
@@ -275,6 +275,9 @@ def _with_solid(
         }
         unknown = {k for k, v in values.items() if v is None or not np.isfinite(v).all()}
         solid = {k: None if k in unknown else significant(v) for k, v in values.items()}
+        if solid["center"] is not None:
+            size = float(np.max(values["half_axes"]))
+            solid["center"] = significant(values["center"], size)
     return dataclasses.replace(
         found,
         status=status,
@@ -325,7 +328,7 @@ def _describe_part(poses: Poses, part: int, fits: quadrics.ObjectFits | None) ->
     scale, up = None, poses.up_in_world
     up_source = "none" if up is None else "poses"
     if fits is not None:
-        value, sigma = round(fits.scale.value, 6), round(fits.scale.rel_sigma, 4)
+        (value,), sigma = numbers(np.array([fits.scale.value]), 1.0), round(fits.scale.rel_sigma, 4)
         scale = quadrics.Scale(value, sigma, fits.scale.source)
         if fits.up.any():
             up, up_source = fits.up, fits.up_source

@@ -98,7 +98,7 @@ def read_config(config: C, path: str | Path) -> C:
     """
     path = Path(path)
     try:
-        table = tomllib.loads(read_text(path, CONFIG_MAX))
+        table = tomllib.loads(read_text(path, CONFIG_MAX, "surrogateescape"))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ReobjError(f"{path}: not valid TOML ({error})") from None
     for key, value in table.items():
@@ -126,7 +126,8 @@ def write_config(config: Any, path: str | Path) -> None:
         sections = section
     head = "# Options of reobj_track that differ from the defaults; --options lists all.\n"
     with atomic(Path(path)) as part:
-        part.write_text(head + "\n".join(lines) + "\n" * bool(lines), encoding="utf-8")
+        text = head + "\n".join(lines) + "\n" * bool(lines)
+        part.write_text(text, encoding="utf-8", errors="surrogateescape")  # paths are bytes
 
 
 def _toml(value: str | float) -> str:

@@ -45,7 +45,7 @@ from reobj.types import (
     LinkEvent,
     ReobjError,
     Tracks,
-    frame_step,
+    looks,
     object_classes,
     rows_by,
 )
@@ -204,17 +204,17 @@ def _link_parts(
         located = None
         if config.link and fit is not None and parts[k].known.sum() >= config.min_views:
             names, moving = result.class_names, config.moving_classes
-            located = locate(table[rows], names, parts[k], fit, priors, moving)
+            located = locate(table[rows], names, parts[k], fit, priors, moving, result.looked)
         solid = np.full(len(rows), -1) if located is None else located.solid
         keep = (source[rows] >= 0) | (solid >= 0)
         rows, solid = rows[keep], solid[keep]
-        own = _with_tracklets(table[rows], solid)
+        own = _with_tracklets(table[rows], solid, result.looked)
         if config.link:
             own, found = link(
                 own, result.class_names, *_embeddings_of(result, source[rows]),
                 None if located is None else parts[k], moving=config.moving_classes,
                 solid=None if located is None else solid,
-                overlap=None if located is None else located.overlap[keep],
+                overlap=None if located is None else located.overlap[keep], looked=result.looked,
             )  # fmt: skip
             made.events += found
         else:
@@ -269,14 +269,14 @@ def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray
     return Tracks.joined([tracks, untracked]), source[order]
 
 
-def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:
+def _with_tracklets(table: Tracks, solid: IntArray, looked: IntArray | None = None) -> Tracks:
     """Give rows in no tracklet that of the row before of their solid, or one of their own.
 
-    A tracklet ends where more than FRAGMENT_GAP frames lie between two rows.
+    A tracklet ends where more than FRAGMENT_GAP frames looked at lie between two rows.
     """
     tracklet = table.tracklet_id.copy()
     fresh = int(tracklet.max(initial=0)) + 1
-    longest = FRAGMENT_GAP * frame_step(table)
+    number, unit = looks(table, looked)
     taken = set(zip(table.frame.tolist(), tracklet.tolist(), strict=True))
     for rows in rows_by(solid):
         if solid[rows[0]] < 0:
@@ -284,7 +284,7 @@ def _with_tracklets(table: Tracks, solid: IntArray) -> Tracks:
         for before, row in itertools.pairwise([-1, *rows.tolist()]):
             if tracklet[row]:
                 continue
-            continues = before >= 0 and table.frame[row] - table.frame[before] <= longest
+            continues = before >= 0 and number[row] - number[before] <= FRAGMENT_GAP * unit
             key = int(table.frame[row]), int(tracklet[before])
             if continues and key not in taken:
                 tracklet[row] = tracklet[before]
@@ -349,14 +349,18 @@ def _part_with_most_boxes(
     return np.asarray(votes.argmax(1), np.int64)
 
 
-def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
-    """Fill gaps between detections of an identity: by its solid where it has one."""
+def fill(result: Result, image_size: tuple[int, int], max_gap: int, every: int) -> Tracks:
+    """Fill gaps between detections of an identity: by its solid where it has one.
+
+    Args:
+        image_size: (w, h). max_gap: as of `fill_gaps`. every: frames from one read to the next.
+    """
     tracks = result.tracks
     for part in result.parts() if max_gap else ():
         if part.poses is not None and (own := part.located):
             identity, support = np.array([o.id for o in own]), [str(o.support) for o in own]
             tracks = fill_by_place(tracks, part.poses, identity, part.ellipsoids(), support)
-    return fill_gaps(tracks, image_size, max_gap)
+    return fill_gaps(tracks, image_size, max_gap, result.looked, every)
 
 
 OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are by object

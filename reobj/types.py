@@ -320,11 +320,12 @@ EXPECTED = (
 )
 COORDINATE_MAX = 1e7  # px; chosen: a thousand times the widest images; beyond it is a mistake
 CLASS_MAX = 32_767  # chosen: above ImageNet-21k's 21,841; a class costs each track 8 bytes
+CLASS_NAME_MAX = 200  # characters; chosen: arrays of names are as wide as the longest
 DETECTIONS_MAX = 3_000  # in a frame; chosen: pairs with as many tracks take 72 MB a matrix
 MASK_THRESHOLD = 0.5  # of masks that are probabilities (torchvision, Mask R-CNN)
 
 
-def as_detections(found: Any) -> Detections:
+def as_detections(found: Any, class_id: Any = None) -> Detections:
     """Convert the detections of one frame, as the libraries of the field hand them over.
 
     Takes `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class, as array, tensor or list;
@@ -333,14 +334,17 @@ def as_detections(found: Any) -> Detections:
     for a batch of one image. Class ids stay what they are (torchvision counts COCO's from 1).
     Nothing is reshaped, clipped, reordered or dropped.
 
+    Args:
+        class_id: (D,) in place of the classes that it has, such as the numbers of `text_labels`.
     Returns:
         The same object where it is ours already.
     Raises:
         ReobjError: anything else, or values that cannot be meant: inverted boxes, coordinates that
             are not finite or beyond 1e7, scores outside [0, 1], classes that are no index.
     """
-    if isinstance(found, list | tuple) and len(found) == 1 and _is_whole(found[0]):
-        found = found[0]
+    found = _only(found)
+    if class_id is not None:
+        return _with_classes(found, class_id)
     if isinstance(found, Detections):
         made = _checked(found.xyxy, found.score, found.class_id, found.masks)
         same = all(getattr(made, name) is getattr(found, name) for name in found.__slots__)
@@ -350,6 +354,55 @@ def as_detections(found: Any) -> Detections:
     if hasattr(found, "orig_shape") and hasattr(found, "boxes"):
         return _checked(*_ultralytics_parts(found))
     return _checked(*(_box_parts(found) if hasattr(found, "xyxy") else _row_parts(found)))
+
+
+def _only(found: Any) -> Any:
+    """Return the detections of a batch of one image, anything else as it is."""
+    if isinstance(found, list | tuple) and len(found) == 1 and _is_whole(found[0]):
+        return found[0]
+    return found
+
+
+def _with_classes(found: Any, class_id: Any) -> Detections:
+    """Convert detections as they are handed over, with other classes (D,)."""
+    if isinstance(found, Mapping):
+        return as_detections({**found, "labels": class_id})
+    if hasattr(found, "orig_shape") and hasattr(found, "boxes"):
+        box, score, _, masks = _ultralytics_parts(found)
+    else:
+        box, score, _, masks = _box_parts(found)
+    return _checked(box, score, class_id, masks)
+
+
+def text_labels(found: Any) -> list[str] | None:
+    """Return the labels of detections that come as text, None where only class numbers do.
+
+    Of dicts `labels`, `text_labels` or `class_names` of strings (transformers' open-vocabulary
+    models); of ultralytics' `Results` by its `names`; of supervision's `Detections`
+    `data["class_name"]`.
+    """
+    found = _only(found)
+    if isinstance(found, Mapping):
+        keys = ("text_labels", "labels", "class_names")
+        labels: Any = next((found[key] for key in keys if _is_text(found.get(key))), None)
+    elif hasattr(found, "orig_shape") and getattr(found, "boxes", None) is not None:
+        names, kinds = getattr(found, "names", None), as_numbers(found.boxes.cls, "classes")
+        names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
+        named = all(int(kind) in names for kind in kinds)
+        labels = [str(names[int(kind)]) for kind in kinds] if named else None
+    else:
+        data = getattr(found, "data", None)
+        labels = data.get("class_name") if isinstance(data, Mapping) else None
+        labels = labels if _is_text(labels) else None
+    return None if labels is None else [str(label) for label in labels]
+
+
+def _is_text(labels: Any) -> bool:
+    """Tell whether labels are a list or array of strings, with one at least."""
+    if isinstance(labels, np.ndarray):
+        labels = labels.tolist()
+    usable = isinstance(labels, list | tuple) and len(labels) > 0
+    return usable and all(isinstance(label, str) for label in labels)
 
 
 def _is_whole(found: Any) -> bool:
@@ -372,6 +425,9 @@ def _mapping_parts(found: Mapping[str, Any]) -> tuple[Any, ...]:
     missing = [key for key in ("boxes", "scores", "labels") if key not in found]
     if missing:
         raise ReobjError(f"detections are a dict without {', '.join(missing)}; {EXPECTED}")
+    if _is_text(found["labels"]):
+        raise ReobjError("labels are text; a `Tracker` takes class numbers, functions given to "
+                         "`track` and `run` may return text")  # fmt: skip
     masks = None if found.get("masks") is None else as_numbers(found["masks"], "masks")
     if masks is not None and masks.ndim == 4 and masks.shape[1] == 1:
         masks = masks[:, 0]
@@ -501,6 +557,20 @@ def frame_step(table: Tracks) -> int:
     """Return the frames from one that was read to the next: more than 1 with `--every`."""
     frames = np.unique(table.frame)
     return int(np.diff(frames).min()) if len(frames) > 1 else 1
+
+
+def looks(table: Tracks, looked: IntArray | None) -> tuple[IntArray, int]:
+    """Count the frames that the detector was run on.
+
+    Args:
+        looked: (F,) their numbers, ascending; None: all that were read, `frame_step` apart.
+    Returns:
+        (N,) a number of the frame of each row, and how much it grows from one such frame to the
+        next.
+    """
+    if looked is None:
+        return table.frame, frame_step(table)
+    return np.searchsorted(looked, table.frame), 1
 
 
 def object_classes(table: Tracks) -> dict[int, int]:

@@ -62,18 +62,19 @@ def gather_views(
 
     Args:
         groups: (N,) group of each row of the table, 0 .. count - 1, one row a frame and group.
-        min_score: rows below it, and rows of frames without a pose, are left out.
+        min_score: rows below it, and rows of frames without a measured pose, are left out.
     """
-    view_of = {frame: view for view, frame in enumerate(poses.frame[poses.known].tolist())}
+    seen, measured = poses.frame[poses.known], poses.measured[poses.known]
+    view_of = {int(seen[view]): int(view) for view in np.flatnonzero(measured)}
     view = np.array([view_of.get(frame, -1) for frame in table.frame.tolist()], np.int64)  # (N,)
     use = (view >= 0) & (table.score >= min_score)
-    boxes = np.full((len(view_of), count, 4), np.nan)
-    score = np.zeros((len(view_of), count))
+    boxes = np.full((len(seen), count, 4), np.nan)
+    score = np.zeros((len(seen), count))
     boxes[view[use], groups[use]] = undistort_boxes(table.xyxy[use], poses.camera)
     score[view[use], groups[use]] = table.score[use]
     img_from_world = poses.camera.K @ poses.cam_from_world[poses.known]  # (V, 3, 4)
     size = (poses.camera.width, poses.camera.height)
-    return Views(poses.frame[poses.known], boxes, score, img_from_world, size)
+    return Views(seen, boxes, score, img_from_world, size)
 
 
 class VisiblePoints:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ else:  # the same cases each time, within a minute; `--hypothesis-profile long` 
     settings.register_profile("long", max_examples=2000, deadline=None, database=None)
     settings.load_profile("ci")
 
+os.environ["REOBJ_RAISE"] = "1"  # a fault of the program in a picture fails the test
 ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
 CAMERA = "492.756788421,492.756788421,320,240"  # of examples/room/camera.txt
 FEW = ("--every", 3, "--stop", 120)  # frames of the example room that are enough for files

@@ -54,7 +54,7 @@ def help_lines(thing: Any) -> int:
 
 def test_help_fits_on_a_few_screens() -> None:
     module = len((rt.__doc__ or "").splitlines())
-    assert module + sum(help_lines(getattr(rt, name)) for name in rt.__all__) <= 750  # 43 names
+    assert module + sum(help_lines(getattr(rt, name)) for name in rt.__all__) <= 765  # 43 names
 
 
 def test_every_public_method_has_a_docstring() -> None:

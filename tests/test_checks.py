@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pose_worlds import FOCAL, SIZE, motion, supplied
+from scipy.spatial.transform import Rotation
 
 from reobj.cameras import invert_rigid
 from reobj.poses.checks import check_poses
@@ -57,6 +58,28 @@ def test_wrong_poses_are_named(kind, mistake):
             "both": "inverted and with OpenGL",
         }
         assert named[mistake] in message
+
+
+def test_quaternions_in_the_other_order_are_named():
+    for kind in ("orbit", "walk", "pan"):
+        cams = motion(kind)
+        given = invert_rigid(cams)
+        xyzw = Rotation.from_matrix(given[:, :, :3]).as_quat()
+        for places, named in ((1, "w first given as"), (-1, "w last given as")):
+            given[:, :, :3] = Rotation.from_quat(np.roll(xyzw, places, 1)).as_matrix()
+            message = check_poses(supplied(invert_rigid(given)), box_tracks(cams, 4, 0))
+            assert message is not None and named in message
+
+
+@pytest.mark.parametrize("kind", ["orbit", "walk", "forward"])
+def test_poses_of_other_frames_are_not_called_inverted(kind):
+    """Every 6th pose given to every frame, another path, the path read backwards."""
+    cams = motion(kind, 240)
+    other = motion("walk" if kind == "orbit" else "orbit")
+    for seed in range(5):
+        tracks = box_tracks(cams[:60], 4, seed)
+        for given in (cams[::4], other, cams[59::-1], cams[30:90]):
+            assert check_poses(supplied(given), tracks) is None
 
 
 def test_check_needs_tracks():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import struct
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,8 +16,6 @@ from reobj.poses.estimate import rows_around_breaks
 from reobj.poses.mapping import Mapped
 
 pycolmap = pytest.importorskip("pycolmap")
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-ROOM = Path(__file__).resolve().parents[1] / "examples" / "room"
 
 
 def config(**changes):
@@ -100,8 +97,8 @@ def reconstructed(walk, monkeypatch):
     """The keyframes' reconstruction is that of `walk` and takes no time."""
 
     def copy(*args, work_dir, **options):
-        shutil.copytree(walk[2] / "sparse", work_dir / "sparse")
-        (work_dir / "mapping").mkdir()
+        shutil.copytree(walk[2] / "sparse", work_dir / "sparse", dirs_exist_ok=True)
+        (work_dir / "mapping").mkdir(exist_ok=True)
         return Mapped([work_dir / "sparse"], [])
 
     monkeypatch.setattr("reobj.poses.estimate.reconstruct", copy)
@@ -120,21 +117,27 @@ def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
 
     monkeypatch.setattr("reobj.poses.estimate.locate_between", note)
     poses = rt.estimate_poses(reconstructed[0], config(seed=4), tmp_path)
-    assert seeds == [4] and "30 of 30 frames have no pose (frames 0-29)" in poses.messages[0]
+    assert seeds == [4] and not poses.known.any()
 
 
 @pytest.mark.parametrize("max_gap, filled", [(2, True), (1, False)])
 def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max_gap, filled):
+    """Where the error is small enough; frames without a camera are named."""
     monkeypatch.setattr("reobj.poses.estimate.MAX_GAP", max_gap)
+    monkeypatch.setattr("reobj.poses.localize.INTERPOLATED_PX", 1000.0)  # the hand shakes
     video, _, _, poses = reconstructed
+    video = FakeVideo(video.images, [f"{k:03d}.jpg" for k in range(30)])
     cams, status = poses.cam_from_world.copy(), poses.status.copy()
     cams[11:13], status[11:13] = np.nan, "none"
+    monkeypatch.setattr("reobj.poses.estimate._frame_name", lambda _, k: f"frame_{k:06d}.jpg")
     monkeypatch.setattr("reobj.poses.estimate.locate_between", lambda *a: (cams, status))
     found = rt.estimate_poses(video, config(), tmp_path)
     assert found.known.all() == filled and (found.status[11] == "interpolated") == filled
+    assert ("2 interpolated" in found.cameras_text) == filled and found.measured.sum() == 28
     assert bool(found.messages) != filled
     if not filled:
-        assert "2 of 30 frames have no pose (frames 11-12)" in found.messages[0]
+        assert "2 of 30 frames have no camera: frames 11-12 (2: 011.jpg, 012" in found.messages[0]
+        assert "show too few points" in found.messages[0] and "lie at" not in found.messages[0]
 
 
 # ---- Failures ------------------------------------------------------------------------------------
@@ -144,7 +147,7 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
     "images, message",
     [
         (textured_room(1, 0)[0], "only 1 different view"),
-        ([np.zeros((240, 320, 3), np.uint8)] * 45, "only 2 different views"),  # black
+        ([np.zeros((240, 320, 3), np.uint8)] * 45, "no picture shows anything"),  # black
         (textured_room(1, 0)[0] * 45, "only 2 different views"),  # still
     ],
 )
@@ -262,29 +265,3 @@ def test_the_exif_focal_length_is_the_guess_before_the_usual_one(tmp_path, monke
     guess = seen_job(monkeypatch, video, tmp_path / "work")["focal_guess"]
     exif = 48 / np.hypot(36, 24) * np.hypot(480, 360) / 480
     assert guess == (pytest.approx(exif, rel=1e-3) if focal_35mm else 0.8)
-
-
-# ---- Recordings ----------------------------------------------------------------------------------
-
-
-def test_living_room(tmp_path):
-    folder = SHARED / "livingroom13" / "images"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not here")
-    files = sorted(folder.glob("*.jpg"))
-    video = FakeVideo([cv2.imread(str(f)) for f in files], [f.name for f in files])
-    poses = rt.estimate_poses(video, rt.PosesConfig(), tmp_path)
-    assert poses.known.all() and 0.4 < poses.camera.params[0] / 1920 < 0.6
-
-
-def test_rendered_room_against_its_truth(tmp_path):
-    if not (ROOM / "room.mp4").exists() or not (ROOM / "camera.txt").exists():
-        pytest.skip("examples/room/room.mp4 is not here")
-    video = rt.Video(ROOM / "room.mp4", rt.InputConfig())
-    poses = rt.estimate_poses(video, rt.PosesConfig(), tmp_path)
-    camera = ",".join((ROOM / "camera.txt").read_text().split()[4:])
-    truth = rt.read_poses(ROOM / "poses.txt", video, camera=camera)
-    both = poses.known & truth.known
-    error = ate_percent(poses.cam_from_world[both], truth.cam_from_world[both])
-    assert both.mean() > 0.95 and error < 0.6
-    assert poses.camera.K[0, 0] == pytest.approx(truth.camera.K[0, 0], rel=0.02)

@@ -1,4 +1,4 @@
-"""The rooms and their floors: imports run downwards only; what is heavy is loaded when needed."""
+"""Imports: no cycles; optional or heavy packages are loaded only when they are needed."""
 
 from __future__ import annotations
 
@@ -8,44 +8,12 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parent.parent
 PATHS = [
     ROOT / "reobj_track.py",
     ROOT / "quadrics.py",
     *sorted((ROOT / "reobj").rglob("*.py")),
 ]
-# A room imports only from rooms of a lower floor.
-FLOORS = {
-    0: "reobj quadrics",
-    1: "reobj.types",
-    2: "reobj.files reobj.identity.assignment reobj.identity.evidence reobj.identity.sampling "
-    "reobj.sources.masks reobj.sources.tiles "
-    "reobj.poses.arrays",
-    3: "reobj.cameras reobj.frame_lookup reobj.options reobj.schema reobj.sources.video "
-    "reobj.sources.weights "
-    "reobj.sources.recorded reobj.poses.child reobj.poses.uncertainty reobj.results.edits",
-    4: "reobj.views reobj.commands reobj.sources.imageless reobj.sources.detection_files "
-    "reobj.identity.camera_motion reobj.identity.embedding reobj.identity.reid "
-    "reobj.identity.places reobj.identity.gaps reobj.poses.keyframes reobj.poses.features "
-    "reobj.poses.soundness "
-    "reobj.poses.adjustment "
-    "reobj.poses.consistency reobj.poses.zoom reobj.poses.intrinsics reobj.poses.matching "
-    "reobj.poses.checks reobj.poses.floor reobj.results.ply reobj.results.film "
-    "reobj.results.folder",
-    5: "reobj.sources.onnx_layouts reobj.identity.crops reobj.identity.linking "
-    "reobj.identity.association reobj.identity.proposals reobj.identity.occlusion "
-    "reobj.poses.mapping reobj.poses.localize reobj.poses.readers reobj.poses.points "
-    "reobj.poses.depth reobj.results.result",
-    6: "reobj.identity.locate reobj.sources.detectors reobj.poses.estimate reobj.objects "
-    "reobj.results.workspace "
-    "reobj.results.overlay reobj.results.solids reobj.results.plausibility",
-    7: "reobj.parts reobj.solvers reobj.poses.stage reobj.poses.imageless reobj.results.evaluation "
-    "reobj.results.stages reobj.results.export reobj.results.scene",
-    8: "reobj_track",
-}
-FLOOR = {room: floor for floor, rooms in FLOORS.items() for room in rooms.split()}
 LAZY = {  # optional, or slow to load
     "pycolmap", "onnxruntime", "filterpy", "jsonschema", "trimesh", "rerun", "supervision", "av",
     "shtab",
@@ -72,43 +40,29 @@ def imported(node: ast.AST) -> set[str]:
         elif isinstance(part, ast.ImportFrom):
             assert part.level == 0, f"line {part.lineno}: relative import"
             found |= {str(part.module)}
-            found |= {f"{part.module}.{a.name}" for a in part.names} & set(ROOMS)
+            found |= {f"{part.module}.{a.name}" for a in part.names} & set(MODULES)
     return found
 
 
-ROOMS = {name_of(path): path for path in PATHS}
-EMPTY = {"reobj.sources", "reobj.identity", "reobj.poses", "reobj.results"}  # packages
+MODULES = {name_of(path): path for path in PATHS}
 
 
 def arrows() -> dict[str, set[str]]:
-    """The rooms that each room imports."""
-    return {name: imported(tree_of(path)) & set(ROOMS) for name, path in ROOMS.items()}
-
-
-def test_every_room_has_a_floor() -> None:
-    assert set(ROOMS) - EMPTY == set(FLOOR)
-    for name in EMPTY:
-        assert len(tree_of(ROOMS[name]).body) <= 1, f"{name}: only a docstring"
-
-
-@pytest.mark.parametrize("room", sorted(FLOOR))
-def test_imports_run_downwards(room: str) -> None:
-    """Strictly: so that there is no circle, and nothing in reobj/ imports the tool."""
-    uphill = {other for other in arrows()[room] - EMPTY if FLOOR[other] >= FLOOR[room]}
-    assert uphill == set()
+    """The modules that each module imports."""
+    return {name: imported(tree_of(path)) & set(MODULES) for name, path in MODULES.items()}
 
 
 def test_there_is_no_circle() -> None:
-    """Found by taking away rooms that import none of those left, floors aside."""
+    """Found by taking away modules that import none of those left."""
     left = arrows()
     while free := {name for name, used in left.items() if not used & set(left) - {name}}:
         left = {name: used for name, used in left.items() if name not in free}
     assert left == {}
 
 
-def test_an_arrow_that_runs_up_would_be_found(tmp_path: Path) -> None:
+def test_every_kind_of_import_is_seen() -> None:
     code = "from reobj.results import scene\nimport reobj_track\ndef f():\n    import reobj.files"
-    found = imported(ast.parse(code)) & set(ROOMS)
+    found = imported(ast.parse(code)) & set(MODULES)
     assert found == {"reobj.results", "reobj.results.scene", "reobj_track", "reobj.files"}
 
 
@@ -116,7 +70,7 @@ def test_imports_stand_at_the_top() -> None:
     """But for packages that are optional, or slow to load."""
     inner = {
         f"{name}.{function.name}": others
-        for name, path in ROOMS.items()
+        for name, path in MODULES.items()
         for function in ast.walk(tree_of(path))
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
         and (others := {m.partition(".")[0] for m in imported(function)} - LAZY)
@@ -124,10 +78,10 @@ def test_imports_stand_at_the_top() -> None:
     assert inner == {}
 
 
-def test_private_names_stay_in_their_room() -> None:
+def test_private_names_stay_in_their_module() -> None:
     crossing = {
         f"{name}: {alias.name}"
-        for name, path in ROOMS.items()
+        for name, path in MODULES.items()
         for node in ast.walk(tree_of(path))
         if isinstance(node, ast.ImportFrom)
         for alias in node.names

@@ -9,7 +9,7 @@ import live_ar
 import numpy as np
 import pytest
 
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 

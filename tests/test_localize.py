@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pose_worlds import DotWorld, FakeVideo, look_at, sideways, some_cameras, turn_deg
+from pose_worlds import DotWorld, FakeVideo, sideways, some_cameras, turn_deg
+from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
 from reobj.cameras import SparseModel, invert_rigid
 from reobj.files import Progress
 from reobj.poses.keyframes import ResizedVideo
-from reobj.poses.localize import absolute_pose, fill_gaps, locate_between
+from reobj.poses.localize import _interpolated, absolute_pose, fill_gaps, locate_between
 
 pytest.importorskip("pycolmap")
 
@@ -155,26 +156,85 @@ def test_where_a_camera_turns_back_is_no_jump():
 # ---- Gaps ----------------------------------------------------------------------------------------
 
 
-def with_gaps(cams, lost):
-    cams = cams.copy()
-    cams[lost] = np.nan
-    return cams, np.where(np.isnan(cams[:, 0, 0]), "none", "pnp").astype("<U12")
+def filled(cams, lost, max_gap=15, left_out=(), frame=None, time_s=None):
+    """Poses and status after `fill_gaps`, by a model of every fifth frame."""
+    frame = np.arange(len(cams)) if frame is None else frame
+    keys = np.setdiff1d(np.arange(0, len(cams), 5), lost)
+    known, status = cams.copy(), np.full(len(cams), "pnp", "<U12")
+    known[lost], status[lost] = np.nan, "none"
+    return fill_gaps(
+        true_model(cams, keys),
+        keys,
+        frame,
+        frame / 30 if time_s is None else time_s,
+        known,
+        status,
+        max_gap,
+        1.0,
+        left_out,
+    )
 
 
-def test_gaps_are_filled_on_a_line_and_never_beyond():
-    path = np.linspace([0, 0, 0], [1, 0.2, 0.1], 11)
-    cams = np.array([look_at(c, c + np.array([0.1, 4, -1])) for c in path])
-    lost, status = with_gaps(cams, [0, 1, 4, 5, 6])
-    filled, new = fill_gaps(np.arange(11), lost, status, 3)
-    np.testing.assert_allclose(filled[2:], cams[2:], atol=1e-9)  # straight and without turning
-    expected = ["none"] * 2 + ["pnp"] * 2 + ["interpolated"] * 3 + ["pnp"] * 4
-    assert np.isnan(filled[:2]).all() and new.tolist() == expected
-    untouched, _ = fill_gaps(np.arange(11), lost, status, 2)
-    assert np.isnan(untouched[4:7]).all()
-    refused, _ = fill_gaps(np.arange(11), lost, status, 3, [5])
-    assert np.isnan(refused[4:7]).all()
-    sparse, _ = fill_gaps(10 * np.arange(11), lost, status, 3)  # every 10th frame: 39 are missing
-    assert np.isnan(sparse[4:7]).all() and np.isnan(lost[4:7]).all()
+def test_gaps_of_an_even_motion_are_filled_and_never_beyond():
+    cams = sideways(40)
+    lost = [0, 1, 15, 16, 17]
+    poses, status = filled(cams, lost)
+    np.testing.assert_allclose(poses[2:], cams[2:], atol=1e-3)
+    assert np.isnan(poses[:2]).all() and np.isin(status[:2], "none").all()
+    assert (status[15:18] == "interpolated").all() and (status[18:] == "pnp").all()
+    for refused in (
+        filled(cams, lost, max_gap=2),
+        filled(cams, lost, left_out=[16]),
+        filled(cams, lost, frame=10 * np.arange(40)),  # every 10th frame: 39 are missing
+    ):
+        assert np.isnan(refused[0][15:18]).all() and np.isin(refused[1][15:18], "none").all()
+
+
+def test_a_gap_is_filled_by_time():
+    """At an uneven rate: the lost frame comes just after the one before it."""
+    moment = 10 * np.arange(40)
+    moment[15] = 141
+    cams = sideways(400, step=0.002)[moment]
+    poses, _ = filled(cams, [15], time_s=moment / 300)
+    np.testing.assert_allclose(centres(poses[15]), centres(cams[15]), atol=1e-3)
+
+
+def turned(cams, row, degrees):
+    """The camera turns by so much in the frames from `row` to `row` + 5, and goes on as before."""
+    share = np.clip((np.arange(len(cams)) - row) / 5, 0, 1)[:, None]
+    turn = Rotation.from_rotvec(np.radians(degrees) * share * [0, 1, 0]).as_matrix()
+    rotation = turn @ cams[:, :, :3]
+    return np.concatenate([rotation, -rotation @ centres(cams)[:, :, None]], 2)
+
+
+def test_a_turn_in_the_gap_is_not_filled():
+    """Even motion on both sides, and other than the one between: a blurred corner."""
+    gap = [16, 17, 18, 19]
+    assert (filled(turned(sideways(40), 15, 0.3), gap)[1][gap] == "interpolated").all()
+    assert (filled(turned(sideways(40), 15, 20.0), gap)[1][gap] == "none").all()
+
+
+def test_no_gap_of_a_shaking_camera_or_between_photos_is_filled():
+    """Before the gap or after it, interpolation would be wrong where the pose is known."""
+    rng = np.random.default_rng(0)
+    for first, last in ((0, 14), (20, 40)):
+        shaken = sideways(40)
+        for row in range(first, last):
+            shake = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
+            centre = centres(shaken[row])
+            shaken[row, :, :3] = shake @ shaken[row, :, :3]
+            shaken[row, :, 3] = -shaken[row, :, :3] @ centre
+        assert (filled(shaken, [16, 17])[1][[16, 17]] == "none").all()
+    photos = sideways(40)
+    photos[:, :, 3] -= np.einsum("nij,nj->ni", photos[:, :, :3], rng.uniform(-0.3, 0.3, (40, 3)))
+    assert filled(photos, [16])[1][16] == "none"
+
+
+def test_with_few_frames_beside_it_nothing_is_known_of_a_gap():
+    assert filled(sideways(40), [2])[1][2] == "none"
+    assert filled(sideways(40), [3])[1][3] == "interpolated"
+    assert filled(sideways(40), [36])[1][36] == "interpolated"
+    assert filled(sideways(40), [37])[1][37] == "none"
 
 
 def test_a_turning_camera_keeps_its_centre_on_the_line_and_turns_evenly():
@@ -185,7 +245,5 @@ def test_a_turning_camera_keeps_its_centre_on_the_line_and_turns_evenly():
         c, s = np.cos(angle), np.sin(angle)
         cams[i, :, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
         cams[i, :, 3] = -cams[i, :, :3] @ [i, 2 * i, 0]
-    filled, _ = fill_gaps(np.arange(5), *with_gaps(cams, [1, 2, 3]), 3)
-    np.testing.assert_allclose(filled, cams, atol=1e-9)
-    uneven, _ = fill_gaps(np.array([0, 1, 4]), *with_gaps(cams[[0, 1, 4]], [1]), 3)
-    np.testing.assert_allclose(uneven[1], cams[1], atol=1e-9)
+    between = _interpolated(cams[[0, 4]], np.array([0.0, 4.0]), np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(between, cams[1:4], atol=1e-9)

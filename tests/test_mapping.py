@@ -289,7 +289,7 @@ def test_features_lie_where_the_dots_are(tmp_path):
 
 # ---- Refusals ------------------------------------------------------------------------------------
 
-TURNED = "mere turn|from clearly different places|keyframes connect"
+TURNED = "turn of the camera explains|make a first model|keyframes connect"
 # images, words of the message
 REFUSED = {
     "two images": (lambda: textured_room(2, 0.5)[0], "only 2 different views"),

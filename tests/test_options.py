@@ -43,6 +43,7 @@ from reobj.options import (
     write_config,
 )
 from reobj.results.workspace import Workspace
+from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.weights import own_models
 
 CHAIR = 56
@@ -471,11 +472,26 @@ def _(lab: Lab) -> None:
     assert source.class_names == ("mouse", "stool", "chair")
 
 
+@shows("detect.first_frame")
+def _(lab: Lab) -> None:
+    """A frame 1 of two is the second one as CSV counts, the first where the user says so."""
+    (lab.path / "det.csv").write_text("frame,x1,y1,x2,y2\n1,1,2,30,40\n")
+    video = rt.Video(images(lab.path / "images", 3))
+    for value, frame in (("", 1), ("0", 1), ("1", 0)):
+        config = lab.config(value).detect
+        assert rt.read_detections(lab.path / "det.csv", video, config).frame.tolist() == [frame]
+    with pytest.raises(rt.ReobjError, match=r"detect\.first_frame 2: expected 0 or 1"):
+        rt.read_detections(lab.path / "det.csv", video, lab.config("2").detect)
+
+
 @shows("detect.max_detections")
 def _(lab: Lab) -> None:
     assert by_file(lab, 1)[0].score.tolist() == [0.9]
-    lab.patch.setattr(Session, "BOXES", tuple((10 + 12 * i, 9, 8, 8, 0.9, 1) for i in range(4)))
-    assert [len(by_network(lab, value)[0]) for value in (3, 9)] == [3, 4]
+    many = tuple((5 + 12 * (i % 5), 9 + 12 * (i // 5), 8, 8, 0.9, 1) for i in range(10))
+    lab.patch.setattr(Session, "BOXES", many)
+    lab.patch.setattr(detectors, "MODEL_DETECTIONS", 6)
+    assert [len(by_network(lab, value)[0]) for value in (3, 9, 0)] == [3, 9, 6]
+    assert [len(by_file(lab, value)[0]) for value in (3, 9, 0)] == [3, 9, 10]  # 0: all of a file
 
 
 # ---- embed, threads, device, offline: what reaches the networks of a run ----
@@ -710,10 +726,10 @@ def _(lab: Lab) -> None:
     video = rt.Video(images(lab.path / "images", 4))
     path = tum_file(lab.path / "cams.txt", arc(4))
     config = lab.config(path, poses__camera=CAMERA_TEXT)
-    found = stage.supplied_poses(video, config.poses)
-    assert found is not None and found.known.all() and found.source == "user"
+    (found,) = stage.supplied_poses(video, config.poses)
+    assert found.poses.known.all() and found.poses.source == "user"
     for mode in ("auto", "none"):
-        assert stage.supplied_poses(video, lab.config(mode).poses) is None
+        assert stage.supplied_poses(video, lab.config(mode).poses) == []
     asked = lab.caught(rt, "reconstruct_cached", "video")
     for mode, count in (("none", 0), ("auto", 1)):
         config = lab.config(mode, embed__model="none", output__overlay="none", output__scene=False)
@@ -726,7 +742,7 @@ def _(lab: Lab) -> None:
     video = rt.Video(images(lab.path / "images", 4))
     path = tum_file(lab.path / "cams.dat", arc(4))
     options = {"poses__mode": path, "poses__camera": CAMERA_TEXT}
-    assert stage.supplied_poses(video, lab.config("tum", **options).poses) is not None
+    assert len(stage.supplied_poses(video, lab.config("tum", **options).poses)) == 1
     for fmt in ("transforms", "nonsense"):
         with pytest.raises(rt.ReobjError, match=r"JSON|format nonsense"):
             stage.supplied_poses(video, lab.config(fmt, **options).poses)
@@ -737,8 +753,8 @@ def _(lab: Lab) -> None:
     """Of supplied poses and of a reconstruction."""
     video = rt.Video(images(lab.path / "images", 4))
     path = tum_file(lab.path / "cams.txt", arc(4))
-    found = stage.supplied_poses(video, lab.config(CAMERA_TEXT, poses__mode=path).poses)
-    assert found is not None and found.camera == CAMERA
+    (found,) = stage.supplied_poses(video, lab.config(CAMERA_TEXT, poses__mode=path).poses)
+    assert found.poses.camera == CAMERA
     with pytest.raises(rt.ReobjError, match="no intrinsics"):
         stage.supplied_poses(video, lab.config("", poses__mode=path).poses)
     poses = rt.estimate_poses(video, lab.config(CAMERA_TEXT).poses, lab.path / "work")
@@ -775,7 +791,9 @@ def _(lab: Lab) -> None:
     path = tum_file(lab.path / "cams.txt", arc(4))
     options = {"poses__mode": path, "poses__camera": CAMERA_TEXT}
     for depth in ("", "maps:5000"):
-        stage.supplied_poses(video, lab.config(depth, **options).poses, workspace)
+        own = lab.config(depth, **options).poses
+        found = stage.supplied_poses(video, own)
+        stage.settled_poses(found, rt.Tracks.empty(), video, own, workspace)
         known = rt.Poses(CAMERA, np.arange(4), np.arange(4) / 30, arc(4), np.full(4, "pnp"), "x")
         lab.patch.setattr(stage, "estimate_poses", lambda *_, p=known, **__: write_model(p, lab))
         stage.reconstruct_cached(video, lab.config(depth).poses, workspace)
@@ -812,6 +830,20 @@ def reconstructed(lab: Lab, value: Any) -> rt.Poses:
     return poses
 
 
+@shows("poses.frames_by")
+def _(lab: Lab) -> None:
+    """Numbers in names of a video's frames, none 0 and none the last: from 0, or from 1."""
+    cams = rt.Poses(CAMERA, np.arange(4), np.arange(4) / 30, arc(4), np.full(4, "pnp"), "pycolmap")
+    write_colmap(lab.path / "model", cams, [f"{i}.png" for i in range(1, 5)])
+    video = ImagelessVideo(lab.path / "model", (CAMERA.width, CAMERA.height), count=6)
+    for value, first in (("number0", 1), ("number1", 0)):
+        config = lab.config(value, poses__mode=str(lab.path / "model"))
+        (found,) = stage.supplied_poses(video, config.poses)
+        assert np.flatnonzero(found.poses.known).tolist() == list(range(first, first + 4))
+    config = lab.config("", poses__mode=str(lab.path / "model"))
+    assert len(stage.supplied_poses(video, config.poses)) == 2
+
+
 @shows("poses.metric")
 def _(lab: Lab) -> None:
     """Of a model without scale; a reconstruction cannot be declared metric."""
@@ -820,8 +852,8 @@ def _(lab: Lab) -> None:
     write_colmap(lab.path / "model", cams, video.names)
     for value in (False, True):
         config = lab.config(value, poses__mode=str(lab.path / "model"))
-        found = stage.supplied_poses(video, config.poses)
-        assert found is not None and found.known.all() and found.metric is value
+        (found,) = stage.supplied_poses(video, config.poses)
+        assert found.poses.known.all() and found.poses.metric is value
     with pytest.raises(rt.ReobjError, match="--metric"):
         stage.supplied_poses(video, lab.config(True).poses)
 

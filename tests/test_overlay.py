@@ -520,3 +520,93 @@ def test_the_legend_tells_what_is_there(chairs: rt.Result, tmp_path: Path) -> No
     draw_legend(image, [("box", "a"), ("dashed", "b"), ("solid", "c"), ("thin", "d")])
     assert (image[-10:, 200:] == 127).all() and (image[:100] == 127).all()
     assert (image[110:190, 10:40].max(2) > 150).any()
+
+
+# ---- Where exactly ----
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+def test_edges_lie_on_the_two_faces_that_meet_there(kind: str) -> None:
+    """And the middle of the solid is inside of all faces."""
+    center = (0.2, 0.1, 4.0)
+    frames, _ = one_solid(kind, center, (0.2, 0.5, 0.9))
+    ends = frames.points[frames.edges]  # (E, 2, 3)
+    planes = frames.planes[frames.faces]  # (E, 2, 4)
+    off = np.einsum("efk,epk->efp", planes[..., :3], ends) - planes[..., 3:]
+    np.testing.assert_allclose(off, 0, atol=1e-9)
+    assert (frames.planes[:, :3] @ np.array(center) < frames.planes[:, 3]).all()
+    assert len(np.unique(np.sort(frames.edges, 1), axis=0)) == len(frames.edges)
+    assert (frames.faces[:, 0] != frames.faces[:, 1]).all()
+    assert len(frames.edges) == {"box": 12, "cylinder": 144}[kind]
+    assert frames.crease.sum() == {"box": 12, "cylinder": 96}[kind]
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_lines_are_centred_on_the_edges(scale: float) -> None:
+    """To a tenth of a pixel, also in smaller pictures: the front face of a box straight ahead."""
+    frames, _ = one_solid("box", (0.1, -0.05, 4.0), (0.3, 0.2, 0.5), np.eye(3))
+    image = np.zeros((120, 200, 3), np.uint8)
+    draw_wireframes(image, frames, PINHOLE, STILL, scale, [1], np.ones(1, bool), set())
+    weight = image.astype(float).sum(2)
+    left, right = (scale * (100 + 300 * (0.1 + side * 0.3) / 3.5) for side in (-1, 1))
+    top, bottom = (scale * (60 + 300 * (-0.05 + side * 0.2) / 3.5) for side in (-1, 1))
+    row, column = round(scale * (60 - 300 * 0.05 / 3.5)), round(scale * (100 + 300 * 0.1 / 3.5))
+    for values, places in ((weight[row], (left, right)), (weight[:, column], (top, bottom))):
+        middle = len(values[values > 0]) and round(sum(places) / 2)
+        for part, place in ((slice(None, middle), places[0]), (slice(middle, None), places[1])):
+            at = np.arange(len(values))[part] + 0.5
+            assert (at @ values[part]) / values[part].sum() == pytest.approx(place, abs=0.1)
+
+
+def test_no_edge_in_view_draws_nothing() -> None:
+    """No solid with edges, one behind the camera, one that the camera is in the middle of."""
+    solids = chair_solids()
+    for kinds, pose in (
+        ([None] * 3, STILL),
+        (["box"] * 3, np.c_[np.diag([-1.0, 1, -1]), [0, 0, -9.0]]),
+    ):
+        image = grey()
+        frames = wireframes(solids, kinds)
+        draw_wireframes(image, frames, PINHOLE, pose, 1.0, [1, 2, 3], np.ones(3, bool), {1, 2, 3})
+        assert (image == 127).all()
+    empty = wireframes(solids[np.zeros(3, bool)], [])
+    draw_wireframes(grey(), empty, PINHOLE, STILL, 1.0, [], np.ones(0, bool), set())
+
+
+def test_thin_lines_are_thinner() -> None:
+    """In the legend, and of a box whose solid is drawn too."""
+
+    def ink(image: np.ndarray) -> int:
+        return int((np.abs(image.astype(int) - object_color(1)).max(2) < 90).sum())
+
+    pictures = [grey(300, 60) for _ in range(4)]
+    draw_legend(pictures[0], [("thin", "")])
+    draw_legend(pictures[1], [("solid", "")])
+    row = one_row((40, 10, 160, 50), 1)
+    draw_tracks(pictures[2], row, {1: ""}, 1.0, thin=frozenset({1}))
+    draw_tracks(pictures[3], row, {1: ""}, 1.0, thin=frozenset({2}))
+    assert 0 < 1.4 * ink(pictures[0]) < ink(pictures[1])
+    assert 0 < 1.4 * ink(pictures[2]) < ink(pictures[3])
+
+
+def test_long_class_names_are_cut(chairs: rt.Result, tmp_path: Path) -> None:
+    result = dataclasses.replace(chairs)
+    result.objects = [dataclasses.replace(o, class_name="b" * 5000) for o in chairs.objects]
+    overlay = Overlay(result, tmp_path / "o.mp4", rt.Video(frames(tmp_path / "f", 1, SIZE)))
+    overlay.close(False)
+    assert overlay.labels[1] == f"1 {'b' * 21}..."
+    image = grey()
+    draw_tracks(image, one_row((60, 30, 90, 50), 1), overlay.labels, 1.0)
+    x1, y1, x2, y2 = drawn_in(image, object_color(1))
+    assert x1 >= 0 and y1 >= 0 and x2 <= 200 and y2 <= 120
+
+
+def test_labels_are_beside_their_boxes() -> None:
+    """Above, with the same left edge, where there is room; never farther than the box's sides."""
+    box, size = np.array([[100, 80, 160, 140]]), np.array([[50, 17]])
+    assert place_labels([1], size, box, (320, 240), {}) == [(100, 63)]
+    at_top = np.array([[100, 5, 160, 140]])
+    assert place_labels([1], size, at_top, (320, 240), {}) == [(100, 0)]
+    crowd = place_labels(range(9), np.tile(size, (9, 1)), np.tile(box, (9, 1)), (320, 240), {})
+    for x, y in (spot for spot in crowd if spot):
+        assert 100 - 50 <= x <= 160 and 80 - 17 <= y <= 140

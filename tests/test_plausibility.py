@@ -145,6 +145,40 @@ def test_most_strong_boxes_unexplained(untracked: int, score: float, warned: boo
         assert "--detector" in lines[0] and "doubtful" not in lines[0]
 
 
+def boxes(count: int, x: float, score: float = 0.9, apart: int = 1) -> rt.Tracks:
+    """Boxes of a chair in every `apart`-th frame at one place, in no track."""
+    found = rows(count, 0, CHAIR, score)
+    xyxy = np.tile([x, 10, x + 40, 60], (count, 1)).astype(float)
+    return dataclasses.replace(found, frame=found.frame * apart, xyxy=xyxy)
+
+
+def elsewhere(found: rt.Tracks) -> rt.Tracks:
+    """The same, at another place in each frame."""
+    shift = 100.0 * np.arange(len(found))[:, None]
+    return dataclasses.replace(found, xyxy=found.xyxy + shift)
+
+
+@pytest.mark.parametrize(
+    ("untracked", "cause"),
+    [
+        (boxes(70, 300, 0.45), "below the score at which a track starts (tracker.new_score=0.5)"),
+        (rt.Tracks.joined([boxes(70, 300), boxes(70, 302, 0.8), boxes(70, 301, 0.7)]),
+         "lie on another box of their class in the same frame"),
+        (boxes(70, 300), ""),  # they go on: no cause is known
+        (elsewhere(boxes(70, 300)), "no other near them in the frames before and after"),
+    ],
+)  # fmt: skip
+def test_the_cause_that_most_unexplained_boxes_have(untracked: rt.Tracks, cause: str) -> None:
+    """Another detector is advised only where boxes come and go."""
+    found = result({CHAIR: 3, FRIDGE: 3}, status="tracked")
+    number = 100 + np.arange(len(untracked))
+    found.untracked = dataclasses.replace(untracked, detection_index=number)
+    (line,) = implausible(found, HIGH, MOVING, 0.5)
+    assert line.startswith(f"{len(number)} of {60 + len(number)} boxes of score 0.4 or more")
+    assert cause in line and line.endswith("listed object") == (not cause)
+    assert ("--detector" in line) == ("before and after" in cause)
+
+
 def test_boxes_of_doubtful_objects_are_unexplained_and_filled_ones_are_none() -> None:
     found = result({CHAIR: 3, FRIDGE: 3})
     for k in range(4):

@@ -26,8 +26,8 @@ from reobj.objects import parse_known_size, parse_up
 from reobj.options import read_config, with_option
 from reobj.poses.intrinsics import parse_camera
 from reobj.results.edits import apply_edits, read_edits
-from reobj.results.evaluation import read_truth
 from reobj.results.solids import read_true_solids
+from reobj.results.truth import read_truth
 from reobj.results.workspace import Workspace
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.recorded import read_npz

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import struct
+import zipfile
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import reobj_track as rt
 from reobj.cameras import import_pycolmap, invert_rigid, write_colmap, write_tum
-from reobj.poses import readers
+from reobj.poses import colmap_model
 
 CAMERA = f"{FOCAL},{FOCAL},320,240"
 K = [[FOCAL, 0, 320], [0, FOCAL, 240], [0, 0, 1]]
@@ -166,6 +167,113 @@ def text(path, rows, head=""):
     return path
 
 
+def as_kitti(folder, cams):
+    return text(folder / "00.txt", [w.ravel() for w in invert_rigid(cams)])
+
+
+def as_replica(folder, cams):
+    return text(folder / "traj.txt", [w.ravel() for w in full(invert_rigid(cams))]).parent
+
+
+def table(path, head, rows):
+    path.write_text(f"{head}\n" + "".join(", ".join(map(str, row)) + "\n" for row in rows))
+    return path
+
+
+BODY_FROM_CAM = np.array([[0, 0, 1.0, 0.1], [-1, 0, 0, 0.2], [0, -1, 0, 0.3], [0, 0, 0, 1]])
+SENSOR = """#Default
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [{},
+         {}]
+resolution: [640, 480]
+distortion_model: radial-tangential
+distortion_coefficients: [0, 0, 0, 0]
+intrinsics: [500.0, 500.0, 320, 240] #fu, fv, cu, cv
+"""
+
+
+def as_euroc(folder, cams, sensor=True):
+    """Poses of the body, ns, w first, 17 columns; sensor.yaml of the camera in cam0 beside."""
+    w = full(invert_rigid(cams)) @ np.linalg.inv(BODY_FROM_CAM if sensor else np.eye(4))
+    q = Rotation.from_matrix(w[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    (folder / "gt").mkdir()
+    (folder / "cam0").mkdir()
+    if sensor:
+        numbers = [repr(v) for v in BODY_FROM_CAM.ravel().tolist()]
+        text_ = SENSOR.format(", ".join(numbers[:7]), ", ".join(numbers[7:]))
+        (folder / "cam0" / "sensor.yaml").write_text(text_)
+    head = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
+    head += "q_RS_z [], " + ", ".join(f"v_RS_R_{a} [m s^-1]" for a in "xyz")
+    head += "".join(f", b_{s}_RS_S_{a} []" for s in "wa" for a in "xyz")
+    rows = [[i * 33333333, *w[i, :3, 3], *q[i], *[0.0] * 9] for i in range(len(w))]
+    return table(folder / "gt" / "data.csv", head, rows).parent
+
+
+def as_orbslam3(folder, cams):
+    """ns since the start, x first, spaces."""
+    w = invert_rigid(cams)
+    q = Rotation.from_matrix(w[:, :, :3]).as_quat()
+    rows = [[i * 1e9 / 30, *w[i, :, 3], *q[i]] for i in range(len(w))]
+    return text(folder / "KeyFrameTrajectory.txt", rows)
+
+
+def as_stray(folder, cams):
+    w = invert_rigid(cams)
+    q = Rotation.from_matrix(w[:, :, :3]).as_quat()
+    rows = [[100 + i / 60, f"{i:06d}", *w[i, :, 3], *q[i]] for i in range(len(w))]
+    table(folder / "odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw", rows)
+    return table(folder / "camera_matrix.csv", "500.0, 0.0, 320.0", K[1:]).parent
+
+
+def as_arkitscenes(folder, cams):
+    turn = Rotation.from_matrix(cams[:, :, :3]).as_rotvec()
+    rows = [[i / 30, *turn[i], *cams[i, :, 3]] for i in range(len(cams))]
+    (folder / "lowres_wide_intrinsics").mkdir()
+    for i in range(len(cams)):
+        path = folder / "lowres_wide_intrinsics" / f"41048190_{i / 30:.3f}.pincam"
+        text(path, [[640, 480, FOCAL, FOCAL, 320, 240]])
+    return text(folder / "lowres_wide.traj", rows).parent
+
+
+def as_scannetpp(folder, cams):
+    entries = {
+        f"frame_{i:06d}": {"aligned_pose": w.tolist(), "pose": np.eye(4).tolist(), "intrinsic": K}
+        for i, w in enumerate(full(invert_rigid(cams)))
+    }
+    return text(folder / "pose_intrinsic_imu.json", json.dumps(entries))
+
+
+def as_llff(folder, cams):
+    w = invert_rigid(cams)
+    right, down, forward = (w[:, :, k] for k in range(3))
+    hwf = np.tile([480, 640, FOCAL], (len(w), 1))
+    rows = np.stack([down, right, -forward, w[:, :, 3], hwf], 2).reshape(-1, 15)
+    np.save(folder / "poses_bounds.npy", np.column_stack([rows, np.ones((len(w), 2))]))
+    return folder
+
+
+def as_splatting(folder, cams):
+    w = invert_rigid(cams)
+    entries = [
+        {"id": i, "img_name": f"{i:04d}", "width": 640, "height": 480, "fx": FOCAL, "fy": FOCAL,
+         "position": w[i, :, 3].tolist(), "rotation": w[i, :, :3].tolist()} for i in range(len(w))
+    ]  # fmt: skip
+    return text(folder / "cameras.json", json.dumps(entries))
+
+
+def as_r3d(folder, cams):
+    with zipfile.ZipFile(folder / "scan.r3d", "w") as file:
+        file.writestr("metadata", as_record3d(folder, cams).read_text())
+    return folder / "scan.r3d"
+
+
+def as_r3d_folder(folder, cams):
+    return as_record3d(folder, cams).parent
+
+
 # writer, metric, up in world
 FORMATS = [
     (as_tum, True, None), (as_record3d, True, (0, 1, 0)), (as_scannet, True, (0, 0, 1)),
@@ -174,10 +282,16 @@ FORMATS = [
     (as_colmap_with_observations, False, None), (as_colmap_binary, False, None),
     (as_seven_scenes, True, None), (as_polycam, True, (0, 1, 0)),
     (as_3d_scanner_app, True, (0, 1, 0)),
+    (as_kitti, True, None), (as_replica, True, None), (as_euroc, True, None),
+    (as_orbslam3, True, None), (as_stray, True, (0, 1, 0)), (as_arkitscenes, True, (0, 0, 1)),
+    (as_scannetpp, True, (0, 0, 1)), (as_llff, False, None), (as_splatting, False, None),
+    (as_r3d, True, (0, 1, 0)), (as_r3d_folder, True, (0, 1, 0)),
 ]  # fmt: skip
+BY_ORDER = (as_record3d, as_kitti, as_replica, as_llff, as_r3d, as_r3d_folder)
+BY_TIME = (as_tum, as_euroc, as_orbslam3, as_arkitscenes)
 
 
-WITHOUT_CAMERA = (as_tum, as_seven_scenes)
+WITHOUT_CAMERA = (as_tum, as_seven_scenes, as_kitti, as_replica, as_orbslam3)
 
 
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
@@ -194,14 +308,14 @@ def test_poses_of_some_frames_say_which_have_none(tmp_path, write, metric, up, n
     path, cams = write(tmp_path, some_cameras()), some_cameras()
     names = [f"{i:04d}.jpg" for i in range(FRAMES + 2)] if named else ()
     video, camera = blank(FRAMES + 2, names), CAMERA if write in WITHOUT_CAMERA else ""
-    if write is as_record3d:
+    if write in BY_ORDER:
         with pytest.raises(rt.ReobjError, match="6 rows, frame numbers up to 7"):
-            read(path, video)
+            read(path, video, camera=camera)
         return
     poses = read(path, video, camera=camera)
     assert poses.known.tolist() == [True] * 6 + [False] * 2
     np.testing.assert_allclose(poses.cam_from_world[:6], cams, atol=1e-9)
-    assert "6 of 8 frames, none for 6-7" in poses.messages[0]
+    assert any("6 of 8 frames, none for 6-7" in message for message in poses.messages)
 
 
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
@@ -210,8 +324,8 @@ def test_some_images_of_those_with_poses_find_theirs(tmp_path, write, metric, up
     path, cams = write(tmp_path, some_cameras()), some_cameras()
     name = {as_seven_scenes: "frame-{:06d}.color.png", as_3d_scanner_app: "frame_{:05d}.jpg"}
     names = [name.get(write, "{:04d}.jpg").format(i) for i in (0, 2, 4)]
-    if write is as_tum:
-        return  # by time
+    if write in BY_TIME:
+        return
     poses = read(path, blank(3, names), camera=CAMERA if write in WITHOUT_CAMERA else "")
     np.testing.assert_allclose(poses.cam_from_world, cams[::2], atol=1e-9)
 
@@ -492,10 +606,10 @@ def test_a_binary_model_that_claims_more_than_it_holds(tmp_path, name, what):
     pc = import_pycolmap()
     truth = pc.synthesize_dataset(pc.SyntheticDatasetOptions())
     truth.write_binary(str(tmp_path))
-    readers._check_counts(tmp_path)
+    colmap_model._check_counts(tmp_path)
     data, at = bytearray((tmp_path / name).read_bytes()), 0
     if what == "entries":
-        head, number, size = readers.RECORDS[name]
+        head, number, size = colmap_model.RECORDS[name]
         if not size:
             pytest.skip("records of one size")
         at = 8 + head
@@ -520,8 +634,9 @@ def test_missing_unknown_and_without_intrinsics(tmp_path):
         read(tmp_path / "no.txt")
     with pytest.raises(rt.ReobjError, match="--camera"):
         read(as_tum(tmp_path, some_cameras()))
+    (tmp_path / "empty").mkdir()
     with pytest.raises(rt.ReobjError, match=r"no images\.bin"):
-        read(tmp_path)
+        read(tmp_path / "empty")
     with pytest.raises(rt.ReobjError, match="unknown; known are auto, colmap"):
         read(tmp_path, fmt="xyz")
     with pytest.raises(rt.ReobjError, match="no frame"):
@@ -557,7 +672,7 @@ def test_stamps_of_another_clock_may_be_one_a_frame_of_the_source(
         return
     poses = read(path, video, camera=CAMERA)
     np.testing.assert_allclose(poses.cam_from_world, cams[[1, 3, 5]], atol=1e-9)
-    assert "matched in order" in poses.messages[0]
+    assert "order, one row for each frame of the source" in poses.messages[-1]
 
 
 def test_lost_scannet_frames_have_no_pose(tmp_path):
@@ -658,22 +773,26 @@ def test_time_stamps_of_another_clock_are_refused_when_counts_differ(tmp_path):
         read(path, blank(FRAMES), camera=CAMERA)
 
 
-def test_numbers_in_names_are_frame_numbers_for_a_video(tmp_path):
-    cams = some_cameras(3)
-    names = ["f_0001.png", "f_0003.png", "f_0005.png"]
-    text(tmp_path / "transforms.json", transforms(full(invert_rigid(cams)), names, fl_x=FOCAL))
-    poses = read(tmp_path, blank(FRAMES))
-    assert np.flatnonzero(poses.known).tolist() == [1, 3, 5]
-    text(
-        tmp_path / "transforms.json",
-        transforms(full(invert_rigid(cams)), ["1.png", "2.png", "6.png"], fl_x=FOCAL),
-    )
-    poses = read(tmp_path, blank(FRAMES))
-    assert np.flatnonzero(poses.known).tolist() == [
-        0,
-        1,
-        5,
-    ]  # no 0 and one more than frames: counted from 1
+@pytest.mark.parametrize(
+    ("numbers", "frames_by", "known"),
+    [
+        ((0, 3, 5), "", [0, 3, 5]),  # a 0: counted from 0
+        ((1, 2, 6), "", [0, 1, 5]),  # a 6 of six frames: from 1
+        ((1, 3, 5), "number0", [1, 3, 5]),
+        ((1, 3, 5), "number1", [0, 2, 4]),
+        ((1, 3, 5), "", None),  # nothing tells, and the images are blank
+    ],
+)
+def test_numbers_in_names_are_frame_numbers_for_a_video(tmp_path, numbers, frames_by, known):
+    names = [f"f_{n:04d}.png" for n in numbers]
+    matrices = full(invert_rigid(some_cameras(3)))
+    text(tmp_path / "transforms.json", transforms(matrices, names, fl_x=FOCAL))
+    if known is None:
+        with pytest.raises(rt.ReobjError, match=r"2 ways.*number0.*counted from 0.*number1"):
+            read(tmp_path, blank(FRAMES))
+        return
+    poses = read(tmp_path, blank(FRAMES), frames_by=frames_by)
+    assert np.flatnonzero(poses.known).tolist() == known
 
 
 def test_intrinsics_follow_the_size_of_the_frames(tmp_path):
@@ -701,13 +820,13 @@ def test_slightly_different_focal_lengths_are_one_camera(tmp_path):
 def test_rotations_of_binary_models_are_checked(tmp_path, monkeypatch):
     """pycolmap takes a quaternion of any length; nearly right ones are made right."""
     path = as_colmap_binary(tmp_path, some_cameras())
-    model = readers.read_sparse_model(path)
+    model = colmap_model.read_sparse_model(path)
 
     def scaled(factor):
         wrong = model.cam_from_world.copy()
         wrong[3, :, :3] *= factor
         monkeypatch.setattr(
-            readers,
+            colmap_model,
             "read_sparse_model",
             lambda _: dataclasses.replace(model, cam_from_world=wrong),
         )

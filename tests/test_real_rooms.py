@@ -15,8 +15,9 @@ from simulated import CAMERA, SIZE, chair_solids, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.results.evaluation import IGNORED, SCORED, LabelledBoxes, score_tracks
+from reobj.results.evaluation import score_tracks
 from reobj.results.result import VideoInfo
+from reobj.results.truth import IGNORED, SCORED, LabelledBoxes
 
 FRAMES = 20
 

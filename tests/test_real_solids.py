@@ -15,7 +15,7 @@ from simulated import CAMERA, CUP, SIZE, chair_solids, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.results.evaluation import SCORED, LabelledBoxes
+from reobj.results.truth import SCORED, LabelledBoxes
 
 FRAMES = 16
 CHAIR = rt.COCO_NAMES.index("chair")

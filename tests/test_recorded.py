@@ -32,7 +32,8 @@ def test_round_trip(tmp_path: Path) -> None:
     path = write(tmp_path / "d.npz", *frames)
     found, done = recorded.read_npz(path, SIZE, SIZE)
     assert found.class_names == ("cup", "box") and len(found) == 7
-    assert found.frame.tolist() == [3, 3, 3, 6, 8, 8, 8] == done.tolist()
+    assert found.frame.tolist() == [3, 3, 3, 6, 8, 8, 8]
+    assert done.tolist() == [3, 5, 6, 8] == found.looked.tolist()  # also the one without a box
     for index, expected in frames:
         got = found.at(index)
         np.testing.assert_array_equal(got.xyxy, expected.xyxy)
@@ -49,8 +50,17 @@ def test_round_trip(tmp_path: Path) -> None:
 
 def test_a_file_may_say_which_frames_were_done(tmp_path: Path) -> None:
     path = write(tmp_path / "a.npz", (3, three()))
-    np.savez(path, done=[2, 3, 4], **np.load(path))
-    assert recorded.read_npz(path, SIZE, SIZE)[1].tolist() == [2, 3, 4]
+    arrays = dict(np.load(path))
+    np.savez(path, **arrays | {"done": [4, 3, 2]})
+    found, done = recorded.read_npz(path, SIZE, SIZE)
+    assert done.tolist() == found.looked.tolist() == [2, 3, 4]
+    del arrays["done"]  # files of version 0.2 do not say
+    np.savez(path, **arrays)
+    found, done = recorded.read_npz(path, SIZE, SIZE)
+    assert found.looked is None and done.tolist() == [3, 3, 3]
+    np.savez(path, **arrays | {"done": [[2.5]]})
+    with pytest.raises(rt.ReobjError, match="array done is float64"):
+        recorded.read_npz(path, SIZE, SIZE)
 
 
 def test_boxes_and_masks_follow_the_working_size(tmp_path: Path) -> None:

@@ -598,15 +598,6 @@ def posed_run(tmp_path: Path, poses: str) -> tuple[object, ...]:
     return ("run", frames, "-o", tmp_path / "out", *files, *QUICK)
 
 
-def test_supplied_poses_give_ellipsoids_in_metres(tmp_path: Path) -> None:
-    args = posed_run(tmp_path, "right")
-    assert cli(*args, "--support", "ellipsoid") == 0
-    data = json.loads((tmp_path / "out/objects.json").read_text())
-    assert data["world"]["units"] == "m" and data["world"]["registered_frames"] == 30
-    centers = np.array([o["center"] for o in data["objects"]])
-    np.testing.assert_allclose(centers[np.argsort(centers[:, 2])], PLACES, atol=0.05)
-
-
 def test_poses_in_the_wrong_direction_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -655,7 +646,7 @@ def test_disk_full_leaves_nothing_half_written(
 def test_overlay_cut_by_a_full_disk_is_not_kept(
     clip: Path, detections: Path, tmp_path: Path
 ) -> None:
-    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk."""
+    """A real limit on file sizes (RLIMIT_FSIZE) stands for the full disk; the rest is written."""
     code = (
         "import resource, sys, reobj_track as rt; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (10000, 10000)); "
@@ -668,9 +659,11 @@ def test_overlay_cut_by_a_full_disk_is_not_kept(
         text=True,
         cwd=Path(rt.__file__).parent,
     )
-    assert done.returncode == 2, done.stderr
+    assert done.returncode == 0, done.stderr
     assert "/overlay." in done.stderr and done.stderr.count("\n") == 1
+    assert "warning: no film: OSError" in done.stderr and "output.overlay=none" in done.stderr
     assert not list((tmp_path / "out").glob("*overlay*"))
+    assert (tmp_path / "out/tracks.txt").exists() and (tmp_path / "out/config.toml").exists()
 
 
 # ---- Promises of the module ----
@@ -1064,18 +1057,6 @@ def test_stale_3d_files_go_when_the_options_change(tmp_path: Path) -> None:
     assert cli(*args) == 0 and all((tmp_path / "out" / name).exists() for name in made)
     assert cli(*args, "--poses", "none") == 0
     assert not any((tmp_path / "out" / name).exists() for name in made)
-
-
-def test_poses_command_takes_supplied_poses(tmp_path: Path) -> None:
-    """`poses VIDEO --poses FILE` converts: TUM in, TUM and COLMAP out."""
-    run_args = posed_run(tmp_path, "right")
-    source, given = run_args[1], run_args[run_args.index("--poses") + 1]
-    args = ("poses", source, "-o", tmp_path / "out", "--poses", given)
-    assert cli(*args, "--camera", "300,300,160,120") == 0
-    np.testing.assert_allclose(
-        np.loadtxt(tmp_path / "out/poses.txt"), np.loadtxt(str(given)), atol=1e-6
-    )
-    assert (tmp_path / "out/sparse/images.txt").exists()
 
 
 URL = "rtsp://me:w0rd@127.0.0.1:9/cam?pwd=w0rd"

@@ -26,7 +26,7 @@ import pytest
 
 import reobj_track as rt
 from reobj.sources import video as video_room
-from reobj.sources.video import times_of_names
+from reobj.sources.image_files import Header, header_of, times_of_names
 from reobj.types import Image
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -215,7 +215,9 @@ def test_bad_images_are_skipped(tmp_path: Path) -> None:
     (folder / "3.png").write_bytes(b"no image")
     video = rt.Video(folder)
     assert [f.index for f in video] == [0, 4]
-    assert video.skipped == [1, 2, 3] and "3 frames skipped" in video.messages[0]
+    assert video.skipped == [1, 2, 3]
+    assert "2 frames skipped (unreadable): 2.png, 3.png" in video.messages[0]
+    assert "1 frames skipped (not 64x48, the size of most): 1.png" in video.messages[1]
 
 
 @pytest.mark.parametrize(
@@ -258,8 +260,11 @@ def test_bad_sources_give_one_clear_line(tmp_path: Path, make: Any, expected: st
 class FakeFile:
     """A capture of frames 0, 1, ... of which some are damaged, with or without times."""
 
-    def __init__(self, announced: int, frames: int, damaged: set[int], times: bool = True) -> None:
-        self.announced, self.frames, self.damaged, self.times = announced, frames, damaged, times
+    def __init__(
+        self, announced: int, frames: int, damaged: set[int], times: bool = True, raw: bool = False
+    ) -> None:
+        self.announced, self.frames, self.times = announced, frames, times
+        self.damaged = set() if raw else damaged  # raw: what is stored, undecoded
         self.n = -1
 
     def isOpened(self) -> bool:
@@ -272,11 +277,10 @@ class FakeFile:
 
     def grab(self) -> bool:
         self.n += 1
-        return self.n < self.frames
+        return self.n < self.frames and self.n not in self.damaged
 
     def retrieve(self) -> tuple[bool, Any]:
-        ok = self.n not in self.damaged
-        return ok, picture(self.n) if ok else None
+        return True, picture(self.n)
 
     def read(self) -> tuple[bool, Any]:
         return self.retrieve() if self.grab() else (False, None)
@@ -286,19 +290,28 @@ def fake_video(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *args: Any, **options: Any
 ) -> rt.Video:
     (tmp_path / "a.mp4").touch()
-    monkeypatch.setattr(cv2, "VideoCapture", lambda source: FakeFile(*args, **options))
+    monkeypatch.setattr(
+        cv2, "VideoCapture",
+        lambda source, api, params: FakeFile(*args, **options, raw=bool(params)),
+    )  # fmt: skip
     return rt.Video(tmp_path / "a.mp4")
 
 
 @pytest.mark.parametrize(
     ("announced", "frames", "damaged", "read", "message"),
     [
-        (100, 98, set(), 98, ""),  # 2 % fewer than announced: nobody minds
-        (100, 97, set(), 97, "the file ends early: 97 of 100 frames can be read"),
-        (9, 8, set(), 8, ""),
+        (100, 98, set(), 98, ""),  # the count is an estimate
+        (100, 60, set(), 60, ""),
+        (60, 100, set(), 100, ""),
         (0, 8, set(), 8, ""),  # unknown number
-        (100, 100, set(range(10, 73)), 37, "63 frames skipped"),  # 2 s, then it goes on
-        (100, 100, set(range(10, 74)), 10, "the file ends early: 10 of 100"),
+        (100, 100, set(range(10, 73)), 37, "63 frames skipped (unreadable): 10, 11"),  # 2 s
+        (
+            100,
+            100,
+            set(range(10, 74)),
+            10,
+            "damaged: 10 frames up to 0.90 s can be read, frames up to 9.90 s are stored",
+        ),
         (100, 100, {98, 99}, 98, ""),  # damaged to the end: as if they were not there
     ],
 )
@@ -317,13 +330,14 @@ def test_a_file_without_times_has_those_of_its_rate(
 ) -> None:
     video = fake_video(tmp_path, monkeypatch, 5, 5, set(), times=False)
     assert [f.time_s for f in video] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert not video.times_are_known and "10 frames a second are assumed" in video.messages[0]
 
 
-def test_the_number_of_frames_may_be_unknown(
+def test_the_number_of_frames_may_not_be_announced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     video = fake_video(tmp_path, monkeypatch, 0, 5, set())
-    assert video.frame_count == video.expected == 0
+    assert video.expected == 0 and video.frame_count == 5
     limited = rt.Video(tmp_path / "a.mp4", rt.InputConfig(start=1, stop=4, every=2))
     assert limited.expected == 2 and [f.index for f in limited] == [1, 3]
 
@@ -431,9 +445,9 @@ def test_headers_tell_the_number_of_pixels(
     noise = np.random.default_rng(0).integers(0, 256, (*size[::-1], 3), dtype=np.uint8)
     cv2.imwrite(str(tmp_path / name), noise, options)
     data = (tmp_path / name).read_bytes()
-    assert video_room.claimed_pixels(data) == size[0] * size[1]
+    assert header_of(data) == Header(size, 3, 8)
     for end in range(0, len(data), 3):  # cut anywhere: no error
-        video_room.claimed_pixels(data[:end])
+        header_of(data[:end])
 
 
 def test_a_name_that_is_no_utf8_is_one_line(tmp_path: Path, movie: Path) -> None:

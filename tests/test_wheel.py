@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOM = ROOT / "examples" / "room"
 BESIDE = ("priors.json", "quadrics.py", "reobj_track.py")  # in site-packages, as in the repository
 DATA = (
     "*.onnx",
@@ -126,18 +125,3 @@ def test_a_users_program_sees_the_types(installed: Path, tmp_path: Path) -> None
     assert len(said) == len(SAID), said
     for line, expected in zip(said, SAID, strict=True):
         assert re.fullmatch(rf"program\.py:{expected}", line), line
-
-
-def test_the_command_runs_from_another_folder(installed: Path, tmp_path: Path) -> None:
-    tool = program(installed, "reobj-track")
-    version = call(tool, "--version", cwd=tmp_path).split()[-1]
-    assert (site_packages(installed) / f"reobj_track-{version}.dist-info").is_dir()
-    models = call(tool, "models", cwd=tmp_path).splitlines()
-    states = {line.split()[0]: line for line in models}
-    assert "verified" in states["reobj"] and "missing" in states["deimv2-n"]
-    detections = ("--detections", ROOM / "detections.npz")
-    options = ("--stop", "40", "--offline", "--set", "output.overlay=false")
-    call(tool, "run", ROOM / "room.mp4", *detections, *options, "-o", "out", cwd=tmp_path)
-    assert "src=" not in (tmp_path / "out/scene.html").read_text()[:2000]
-    assert (tmp_path / "out/objects.ply").is_file()
-    assert call(tool, "objects", "out", "--validate", cwd=tmp_path) == "valid\n"

@@ -15,6 +15,7 @@ import pytest
 from simulated import fitted, tracks_of, walk
 
 import reobj_track as rt
+from reobj.results.folder import copy_models, replaced
 from reobj.results.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -119,6 +120,7 @@ def test_a_run_that_failed_does_not_claim_the_folder(video: rt.Video, tmp_path: 
 
 HOLD = """
 import os, sys, time
+from reobj.results.folder import copy_models, replaced
 from reobj.results.workspace import Workspace
 with Workspace(sys.argv[1]):
     print("held", flush=True)
@@ -228,66 +230,43 @@ def test_the_latest_tracks_and_poses_are_kept(tmp_path: Path) -> None:
     assert not [p for p in space.out.rglob("*") if p.name.startswith(".part-")]
 
 
-def test_the_published_model_is_a_copy(tmp_path: Path) -> None:
-    space = Workspace(tmp_path / "out")
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / name).write_text(name)
-        space.publish_model([tmp_path / name])
-        assert [p.name for p in (space.out / "sparse").iterdir()] == [name]
-    shutil.rmtree(tmp_path / "b")
-    assert (space.out / "sparse/b").read_text() == "b"
-    space.publish_model([tmp_path / "b"])  # a failed reconstruction has none
-    assert not (space.out / "sparse").exists()
-    space.publish_model([tmp_path / "a"])
-    space.publish_model(None)
-    assert sorted(p.name for p in space.out.iterdir()) == ["cache"]
+def published(out: Path, models: list[Path] | None) -> dict[str, list[str]]:
+    """Names of the files in each folder sparse* after models of these folders were published."""
+    with replaced(out, () if models is None else ("sparse",)) as new:
+        copy_models(models or (), new)
+    found = {p.name: sorted(f.name for f in p.iterdir()) for p in out.glob("sparse*")}
+    assert not list(out.glob(".part*"))
+    return found
 
 
 def test_every_part_has_its_model(tmp_path: Path) -> None:
-    """Of fewer parts than before, the models of the others go; what is no part's stays."""
-    space, models = Workspace(tmp_path / "out"), [tmp_path / name for name in "abc"]
+    """Copies; of fewer parts than before, the models of the others go; what is no part's stays."""
+    out, models = tmp_path / "out", [tmp_path / name for name in "abc"]
     for model in models:
         model.mkdir()
         (model / model.name).write_text(model.name)
-    (space.out / "sparse_participants").mkdir()
-
-    def published() -> dict[str, list[str]]:
-        found = {p.name: sorted(f.name for f in p.iterdir()) for p in space.out.iterdir()}
-        return {name: files for name, files in found.items() if name.startswith("sparse")}
-
-    space.publish_model(models)
+    (out / "sparse_participants").mkdir(parents=True)
     kept: dict[str, list[str]] = {"sparse_participants": []}
-    assert published() == kept | {"sparse": ["a"], "sparse_part1": ["b"], "sparse_part2": ["c"]}
-    space.publish_model(models[1:])
-    assert published() == kept | {"sparse": ["b"], "sparse_part1": ["c"]}
+    three = kept | {"sparse": ["a"], "sparse_part1": ["b"], "sparse_part2": ["c"]}
+    assert published(out, models) == three
+    assert published(out, None) == three
+    assert published(out, models[1:]) == kept | {"sparse": ["b"], "sparse_part1": ["c"]}
     shutil.rmtree(models[1])
-    space.publish_model(models[:2])
-    assert published() == kept | {"sparse": ["a"]}
-    space.publish_model(None)
-    assert published() == kept
+    assert (out / "sparse/b").read_text() == "b"
+    assert published(out, models[:2]) == kept | {"sparse": ["a"]}  # a failed one has none
+    assert published(out, []) == kept
 
 
-def test_a_model_is_published_whole_or_not_at_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    space = Workspace(tmp_path / "out")
-    (tmp_path / "model").mkdir()
-    for name in ("1", "2"):
-        (tmp_path / "model" / name).write_text("first")
-    space.publish_model([tmp_path / "model"])
-
-    def interrupted(source: Path, target: Path) -> None:
-        target.mkdir()
-        (target / "1").write_text("second")
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(shutil, "copytree", interrupted)
-        space.publish_model([tmp_path / "model"])
-    assert [(space.out / "sparse" / n).read_text() for n in ("1", "2")] == ["first", "first"]
-    space.publish_model([tmp_path / "model"])
-    assert sorted(p.name for p in space.out.iterdir()) == ["cache", "sparse"]
+def test_models_of_a_run_that_was_killed_are_published_later(tmp_path: Path) -> None:
+    """They are remembered with the poses until the results are written."""
+    space, poses = Workspace(tmp_path / "out"), walk(2)
+    result = fitted(tracks_of(poses), poses)
+    space.save_last(result, poses, [space.cache / "poses-1.sparse"])
+    assert space.last_models() == [space.cache / "poses-1.sparse"]
+    result.save(space.out)
+    assert space.last_models() is None
+    space.save_last(result, None, [])
+    assert space.last_models() is None
 
 
 def test_the_binding_is_written_whole_or_not_at_all(

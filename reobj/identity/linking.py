@@ -19,7 +19,7 @@ from reobj.types import (
     Tracks,
     box_iou,
     class_shares,
-    frame_step,
+    looks,
     rows_by,
     unit_rows,
 )
@@ -44,6 +44,7 @@ def link(
     moving: Collection[str] = (),
     solid: IntArray | None = None,
     overlap: Array | None = None,
+    looked: IntArray | None = None,
 ) -> tuple[Tracks, list[LinkEvent]]:
     """Decide over the whole video which tracklets are one object.
 
@@ -54,12 +55,13 @@ def link(
         moving: names of the classes that move; they stay as the tracker has them.
         solid, overlap: (N,) the solid that shows in each row, or -1 (`locate`), and the IoU of its
             projection with the box; rows of one solid are one object. None: appearance decides.
+        looked: frames that the detector was run on; None: all that were read.
     Returns:
         the rows with the objects' identities, and every join and split with its evidence.
     """
     if not len(tracks):
         return tracks, []
-    linker = Linker(tracks, class_names, poses, moving)
+    linker = Linker(tracks, class_names, poses, moving, looked)
     linker.measure_appearance(embeddings, embedding_row)
     identity = linker.by_appearance()
     if solid is not None:
@@ -107,9 +109,10 @@ class Linker:
         class_names: Sequence[str],
         poses: Poses | None,
         moving: Collection[str],
+        looked: IntArray | None = None,
     ) -> None:
         self.tracks, self.poses = tracks, poses
-        self.fragment = cut_at_gaps(tracks)  # (N,)
+        self.fragment = cut_at_gaps(tracks, looked)  # (N,)
         self._describe_fragments(class_names, moving)
         self.co_occur, self.distinct = self._co_occurrence()
         self.log_odds = np.full(self.co_occur.shape, -np.inf)
@@ -120,8 +123,8 @@ class Linker:
         self.tracklets = self.tracks.tracklet_id[first]
         self.identity = self.tracks.track_id[first]
         self.classes = class_shares(self.tracks, self.fragment, len(first)).argmax(1)
-        names = np.array([*class_names, ""])[self.classes.clip(max=len(class_names))]
-        self.moving = np.isin(names, list(moving))
+        moves = np.isin([*class_names, ""], list(moving))  # (C + 1,), the last: unknown
+        self.moving = moves[self.classes.clip(max=len(class_names))]
 
     def _co_occurrence(self) -> tuple[BoolArray, BoolArray]:
         """Find fragments that are seen in the same frame.
@@ -287,15 +290,18 @@ def _agglomerate(
     return np.unique(group, return_inverse=True)[1]
 
 
-def cut_at_gaps(tracks: Tracks) -> IntArray:
-    """Cut tracklets where more than FRAGMENT_GAP frames that were read pass without a detection.
+def cut_at_gaps(tracks: Tracks, looked: IntArray | None = None) -> IntArray:
+    """Cut tracklets where more than FRAGMENT_GAP frames looked at pass without a detection.
 
+    Args:
+        looked: frames that the detector was run on; None: all that were read.
     Returns:
         fragment of each row (N,), numbered from 0.
     """
     order = np.lexsort((tracks.frame, tracks.tracklet_id))
-    tracklet, frame = tracks.tracklet_id[order], tracks.frame[order]
-    gone = np.diff(frame) > FRAGMENT_GAP * frame_step(tracks)
+    number, unit = looks(tracks, looked)
+    tracklet, number = tracks.tracklet_id[order], number[order]
+    gone = np.diff(number) > FRAGMENT_GAP * unit
     begins = np.append(True, (np.diff(tracklet) != 0) | gone)[: len(order)]
     fragment = np.empty(len(order), np.int64)
     fragment[order] = np.cumsum(begins) - 1

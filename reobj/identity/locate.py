@@ -6,6 +6,7 @@ solid. What moves, and what no solid explains, is left to appearance (`reobj.ide
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -70,30 +71,41 @@ def locate(
     fit: Fit,
     priors: quadrics.Priors,
     moving: Collection[str] = (),
+    looked: IntArray | None = None,
 ) -> Located:
     """Associate the detections of a part with solids.
 
     Args:
         rows: all detections by frame, tracklet 0: in none. moving: names of classes that move.
+        looked: frames that the detector was run on, the only ones in which a detection can be
+            missed; None: all.
     """
     names = np.array([*class_names, ""])
-    label = names[rows.class_id.clip(-1, len(class_names))]  # (N,)
-    fixed = ~np.isin(label, list(moving)) & np.isin(rows.frame, poses.frame[poses.known])
+    moves = np.isin(names, list(moving))  # (C + 1,), -1: unknown
+    fixed = ~moves[rows.class_id.clip(-1, len(class_names))] & np.isin(
+        rows.frame, poses.frame[poses.known]
+    )
     own = np.flatnonzero(fixed & ~_doubles(rows))
     table, solid, overlap = rows[own], np.full(len(rows), -1), np.full(len(rows), np.nan)
     tracked = table[table.tracklet_id > 0]
     if not len(tracked):
         return Located(solid, overlap, np.empty(0), None, _UNKNOWN)
-    fragment = cut_at_gaps(tracked)
+    fragment = cut_at_gaps(tracked, looked)
     count = int(fragment.max()) + 1
-    views = gather_views(tracked, poses, fragment, count, 0.0)
+    seen = poses
+    if looked is not None:
+        unseen = ~np.isin(poses.frame, looked)[:, None, None]
+        seen = dataclasses.replace(
+            poses, cam_from_world=np.where(unseen, np.nan, poses.cam_from_world)
+        )
+    views = gather_views(tracked, seen, fragment, count, 0.0)
     classes = class_shares(tracked, fragment, count).argmax(1)
     fits = fit(views, classes.tolist(), NOTHING_KNOWN)
     kinds = Categories(priors, names, fits.scale)
     floor = floor_under(poses, fits)
     usual, stands = kinds.usual_size(classes), kinds.on_floor(classes)
     proposed = propose(fits, views, classes, usual, floor, stands)
-    more = _from_untracked(table, poses, kinds, fits.up, floor)
+    more = _from_untracked(table, seen, kinds, fits.up, floor)
     proposed = Solids.concatenate([proposed, more])
     detected = _detected(table, poses, views)
     scene = Scene(floor, scale=None if poses.metric else fits.scale)

@@ -39,6 +39,11 @@ class MatchedPairs:
     keypoints: dict[int, Array]
     fundamental: Array
 
+    @property
+    def enough(self) -> BoolArray:
+        """Mark the pairs (P,) with as many verified matches as register an image."""
+        return np.array([len(found) >= MIN_MATCHES for found in self.inliers], bool)
+
     def only(self, ids: Sequence[int]) -> MatchedPairs:
         """Return the pairs of some images."""
         rows = np.flatnonzero(np.isin(self.image_ids, ids).all(1))

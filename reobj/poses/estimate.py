@@ -20,8 +20,8 @@ from reobj.cameras import Camera, Poses, SparseModel, import_pycolmap, read_spar
 from reobj.files import Progress, spans
 from reobj.poses.intrinsics import parse_camera
 from reobj.poses.keyframes import MAX_FLOW, MIN_FLOW, ResizedFrame, ResizedVideo, pick_keyframes
-from reobj.poses.localize import fill_gaps, locate_between
-from reobj.poses.mapping import FOCAL_GUESS, mapping_child, reconstruct
+from reobj.poses.localize import beside_held, fill_gaps, locate_between
+from reobj.poses.mapping import FOCAL_GUESS, HOW_TO_FILM, Mapped, mapping_child, reconstruct
 from reobj.types import Array, BoolArray, IntArray, ReobjError, option
 
 MAX_GAP = 15  # most lost frames in a row that are interpolated (chosen: half a second at 30 Hz)
@@ -38,13 +38,19 @@ class PosesConfig:
     )
     fmt: str = option(
         "auto",
-        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit",
+        "format of supplied poses: auto, colmap, tum, transforms, scannet, record3d, arkit, "
+        "matrices, euroc, stray, arkitscenes, scannetpp, llff, splatting, rows",
         "--pose-format",
+    )
+    frames_by: str = option(
+        "",
+        "how supplied poses find their frames where the file leaves it open (an error names the "
+        "ways): number0, number1, every6from1, time, order, ...",
     )
     camera: str = option(
         "",
         "intrinsics, native pixels (COLMAP: centre + .5): fx,fy,cx,cy[,k1,k2,p1,p2[,k3]], "
-        "MODEL WIDTH HEIGHT PARAMS, or a file (cameras.txt, K.txt, intrinsics.json)",
+        "MODEL WIDTH HEIGHT PARAMS, or a file (cameras.txt, K.txt, intrinsics.json, camera.yaml)",
         "--camera",
     )
     metric: bool = option(False, "supplied poses are in metres, whatever their format", "--metric")
@@ -82,12 +88,13 @@ def estimate_poses(
         raise ReobjError("a live camera gives no poses: record a video first, or --poses none")
     size = (int(video.size[0]), int(video.size[1]))
     camera, resized = parse_camera(config.camera, size), ResizedVideo(video, config.size_px)
+    kept = work_dir / "first"
     with mapping_child(work_dir) as child:
         line = progress("keyframes", video.expected)
         keys = _enough_keyframes(resized, MAX_KEYFRAMES, line)
         focal = _exif_focal(video) or FOCAL_GUESS
 
-        def mapped(keys: list[ResizedFrame]) -> tuple[list[SparseModel], list[str]]:
+        def attempt(keys: list[ResizedFrame]) -> _Attempt:
             found = reconstruct(
                 [key.bgr for key in keys],
                 [key.row + 1 for key in keys],
@@ -106,31 +113,74 @@ def estimate_poses(
                 work_dir=work_dir,
                 progress=progress,
             )  # fmt: skip
-            return [read_sparse_model(model) for model in found.models], found.messages
+            models = [read_sparse_model(model) for model in found.models]
+            part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
+            matched = np.array([k.row for k in keys if k.row + 1 not in found.alone], np.int64)
+            line = progress("pnp", len(resized.frames))
+            poses = _locate_all(models, part_rows, matched, resized, config, line)
+            return _Attempt(poses, part_rows, matched, found)
 
         row_of = {_frame_name(video, number): row for row, number in enumerate(resized.frames)}
-        models, messages = mapped(keys)
-        part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
-        more = rows_around_breaks([key.row for key in keys], part_rows)
-        if models and more:  # the same again with more keyframes where it broke
-            wanted = set(more)
-            extra = [frame for frame in resized if frame.row in wanted]
-            keys = sorted([*keys, *extra], key=lambda key: key.row)
-            models, messages = mapped(keys)
-            part_rows = [np.array([row_of[name] for name in model.names]) for model in models]
-    shutil.rmtree(work_dir / "mapping", ignore_errors=True)
-    frame, time_s = np.array(resized.frames, np.int64), np.array(resized.times_s, np.float64)
-    if not models:
-        guess = (FOCAL_GUESS * max(size), size[0] / 2, size[1] / 2)
-        camera = camera or Camera("SIMPLE_PINHOLE", *size, guess)
-        nothing, none = np.full((len(frame), 3, 4), np.nan), np.full(len(frame), "none")
-        return Poses(camera, frame, time_s, nothing, none, "none", messages=tuple(messages))
-    line = progress("pnp", len(frame))
-    key_rows = np.array([key.row for key in keys])
-    poses = _locate_all(models, part_rows, key_rows, resized, config, line)
-    messages += _breaks(poses)
-    messages += _lost_frames(frame, poses.known)
+        best = attempt(keys)
+        wanted = set(best.more_keyframes())
+        extra = [k for k in resized if k.row in wanted and k.has_texture] if wanted else []
+        if extra:
+            _move_models(best.found.models, kept)
+            again = attempt(sorted([*keys, *extra], key=lambda key: key.row))
+            if again.located > best.located:
+                best = again
+            else:
+                _move_models(sorted(kept.iterdir()), work_dir)
+    for folder in (work_dir / "mapping", kept):
+        shutil.rmtree(folder, ignore_errors=True)
+    poses, messages = best.poses, best.found.messages
+    if poses.known.any():
+        messages = [*messages, *_breaks(poses), *_lost_frames(poses, best.reached, video)]
     return dataclasses.replace(poses, messages=tuple(messages))
+
+
+def _move_models(models: list[Path], folder: Path) -> None:
+    """Move COLMAP models into a folder, in the place of those that are there."""
+    for old in folder.glob("sparse*"):
+        shutil.rmtree(old)
+    folder.mkdir(exist_ok=True)
+    for model in models:
+        model.replace(folder / model.name)
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """A reconstruction of some keyframes and the poses of all frames by it.
+
+    Attributes:
+        part_rows: row of each image of each model. key_rows: (K,) of all keyframes whose matches
+            with another one were verified, ascending. found: the models and messages.
+    """
+
+    poses: Poses
+    part_rows: list[IntArray]
+    key_rows: IntArray
+    found: Mapped
+
+    @property
+    def located(self) -> int:
+        """Count the pairs of frames whose poses are measured in one world."""
+        measured = self.poses.known & (self.poses.status != "interpolated")
+        return int((np.bincount(self.poses.part[measured], minlength=1) ** 2).sum())
+
+    @property
+    def reached(self) -> BoolArray:
+        """Mark the frames (F,) at or beside a keyframe that a model holds: others are not tried."""
+        held = np.concatenate([np.empty(0, np.int64), *self.part_rows])
+        return beside_held(self.key_rows, held, len(self.poses.frame))
+
+    def more_keyframes(self) -> list[int]:
+        """Choose frames for more keyframes: around breaks, and where frames were not located."""
+        if not self.part_rows:
+            return []
+        lost = np.flatnonzero((self.poses.status == "none") | (self.poses.status == "interpolated"))
+        around = rows_around_breaks(self.key_rows.tolist(), self.part_rows)
+        return sorted({*around, *rows_of_lost(self.key_rows, lost)})
 
 
 def _locate_all(
@@ -149,11 +199,20 @@ def _locate_all(
     frame, time_s = np.array(video.frames, np.int64), np.array(video.times_s, np.float64)
     cam_from_world = np.full((len(frame), 3, 4), np.nan)
     status, part = np.full(len(frame), "none", "<U12"), np.full(len(frame), -1)
+    if not models:
+        size = (int(video.video.size[0]), int(video.video.size[1]))
+        guess = (FOCAL_GUESS * max(size), size[0] / 2, size[1] / 2)
+        camera = parse_camera(config.camera, size) or Camera("SIMPLE_PINHOLE", *size, guess)
+        return Poses(camera, frame, time_s, cam_from_world, status, "none")
     seen, first = [], 0
     for number, (model, rows) in enumerate(zip(models, part_rows, strict=True)):
         left_out = np.setdiff1d(key_rows, rows)
         cameras, found = locate_between(model, rows, left_out, video, config.seed, line)
-        cameras, found = fill_gaps(frame, cameras, found, MAX_GAP, left_out)
+        size = model.cameras[0].width, model.cameras[0].height
+        shrink = min(1.0, config.size_px / max(size))
+        cameras, found = fill_gaps(
+            model, rows, frame, time_s, cameras, found, MAX_GAP, shrink, left_out
+        )
         mine = (found != "none") & (part < 0)
         mine |= np.isin(np.arange(len(frame)), rows)  # its own keyframes
         cam_from_world[mine], status[mine], part[mine] = cameras[mine], found[mine], number
@@ -185,7 +244,7 @@ def _enough_keyframes(video: ResizedVideo, most: int, line: Progress) -> list[Re
     Of so few pictures all are taken: they are photos, with wide steps.
     """
     keys, max_flow = pick_keyframes(video.first_pass(line), most), MAX_FLOW
-    if not keys:
+    if not video.frames:
         raise ReobjError("the video has no frame that can be read: nothing to reconstruct")
     if len(video.frames) <= MIN_KEYFRAMES:
         return list(video)
@@ -221,6 +280,22 @@ def rows_around_breaks(key_rows: list[int], part_rows: list[IntArray]) -> list[i
     return sorted(rows - set(key_rows))
 
 
+def rows_of_lost(key_rows: IntArray, lost: IntArray) -> list[int]:
+    """Choose of the lost frames between two keyframes at most MAX_EXTRA for more keyframes.
+
+    Args:
+        key_rows: rows of the keyframes, ascending. lost: (L,) rows of frames without a measured
+            pose, ascending.
+    Returns:
+        rows of frames that are no keyframes yet, ascending.
+    """
+    lost = np.setdiff1d(lost, key_rows)
+    rows: list[int] = []
+    for run in np.split(lost, np.flatnonzero(np.diff(np.searchsorted(key_rows, lost))) + 1):
+        rows += run[np.linspace(0, len(run) - 1, min(MAX_EXTRA, len(run))).astype(int)].tolist()
+    return rows
+
+
 def _frame_name(video: Any, number: int) -> str:
     return str(video.names[number]) if video.names else f"frame_{number:06d}.jpg"
 
@@ -251,19 +326,35 @@ def _breaks(poses: Poses) -> list[str]:
     where = [f"{a} and {b}" for a, b in ends]
     more = f" and {len(where) - MAX_BREAKS} more" if len(where) > MAX_BREAKS else ""
     return [
-        f"the reconstruction broke between frames {', '.join(where[:MAX_BREAKS])}{more}: what both "
-        "sides see does not fit together, also with more keyframes there; more overlap, slower "
-        "turns, or --camera help"
+        f"the reconstruction broke between frames {', '.join(where[:MAX_BREAKS])}{more}: no model "
+        "of both sides holds together, also with more keyframes there; more overlap, slower turns, "
+        "or --camera help"
     ]
 
 
-def _lost_frames(frame: IntArray, known: BoolArray) -> list[str]:
-    """Say which frames have no pose and what helps; [] if all have one."""
-    if known.all():
+MAX_NAMED = 5  # files named in a message (chosen)
+
+
+def _lost_frames(poses: Poses, reached: BoolArray, video: Any) -> list[str]:
+    """Say which frames have no camera, what is known of them, and what helps; [] if all have one.
+
+    Args:
+        reached: (F,) frames that the points of the reconstruction were followed to.
+    """
+    frame, lost = poses.frame, ~poses.known
+    step, whys = int(np.median(np.diff(frame))) if len(frame) > 1 else 1, []
+    for mine, why in (
+        (lost & reached, "show too few points of the reconstruction again"),
+        (lost & ~reached, "lie at keyframes that no part of the reconstruction holds for certain"),
+    ):
+        numbers = frame[mine].tolist()
+        files = [str(video.names[number]) for number in numbers[:MAX_NAMED]] if video.names else []
+        more = " ..." if files and len(numbers) > MAX_NAMED else ""
+        named = f": {', '.join(files)}{more}" if files else ""
+        whys += [f"{spans(numbers, step)} ({len(numbers)}{named}) {why}"] if numbers else []
+    if not whys:
         return []
-    step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
     return [
-        f"{(~known).sum()} of {len(frame)} frames have no pose (frames "
-        f"{spans(frame[~known].tolist(), step)}): these parts do not connect to the rest; slower "
-        "turns, fewer blurred frames and more texture help, or give --poses"
+        f"{lost.sum()} of {len(frame)} frames have no camera: frames {'; frames '.join(whys)}; "
+        f"{HOW_TO_FILM}, or --poses"
     ]

@@ -97,9 +97,11 @@ def find_floor(
     foot = np.array([*middle, plane[0]]) @ axes
     tilt_deg = math.degrees(np.sqrt(np.linalg.eigvalsh(cov[1:, 1:])[-1].clip(0)))
     sigma = math.hypot(math.sqrt(cov[0, 0]), SYSTEMATIC * distance)
-    values = (float(normal @ foot), sigma, math.hypot(tilt_deg, SYSTEMATIC_DEG))
-    offset, sigma, tilt_sigma_deg = numbers(np.array(values))  # as objects.json has them
-    directions = (np.array(numbers(normal)), offset, np.array(numbers(foot)))
+    values = (sigma, math.hypot(tilt_deg, SYSTEMATIC_DEG))
+    sigma, tilt_sigma_deg = numbers(np.array(values))  # as objects.json has them
+    normal, foot = np.array(numbers(normal)), np.array(numbers(foot, distance))
+    (offset,) = numbers(normal @ foot, distance)  # of the rounded plane: it goes through `foot`
+    directions = (normal, offset, foot)
     floor = Floor(*directions, sigma, tilt_sigma_deg, int(on_it.sum()))
     height_m = float(np.median(centres @ floor.normal - floor.offset)) * metres_per_unit
     off = local[:, 2] - np.column_stack([np.ones(len(local)), local[:, :2]]) @ plane

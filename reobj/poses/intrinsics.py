@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from reobj.cameras import Camera, camera_parameters, checked_camera
 from reobj.files import load_json, read_text
+from reobj.poses.simple_yaml import read_yaml
 from reobj.types import COORDINATE_MAX, ReobjError
 
 NUMBERS = "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]"  # OpenCV's order
@@ -27,7 +29,7 @@ def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
     Args:
         text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]`, pixels; `[ID] MODEL WIDTH HEIGHT PARAMS`;
             or a file that holds one of these (a cameras.txt of one camera), a matrix K of 3x3 or
-            4x4, or JSON (`camera_from_json`).
+            4x4, JSON (`camera_from_json`), YAML (`camera_from_yaml`), or ARKitScenes' .pincam.
         size: (w, h) of the frames, and of a camera that does not state its own.
     Returns:
         the camera of the frames: one of another size but the same shape is resized; None of an
@@ -58,6 +60,11 @@ def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
         content = read_text(Path(text), CAMERA_MAX) if is_file else text
         if is_file and content.lstrip()[:1] in ("{", "["):
             camera = camera_from_json(load_json(Path(text)), size)
+        elif is_file and (content.startswith("%YAML") or text.endswith((".yaml", ".yml"))):
+            camera = camera_from_yaml(read_yaml(Path(text)), size)
+        elif is_file and text.endswith(".pincam"):  # w h fx fy cx cy
+            width, height, *params = map(float, content.split())
+            camera = brown_camera((image_side(width), image_side(height)), *params)
         else:
             camera = _camera_from_text(content, size)
         if camera is None:
@@ -82,7 +89,42 @@ def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
             f"{where}: a camera of {width}x{height} images, but the frames are {size[0]}x{size[1]};"
             " expected the same shape (rotated or cropped video?)"
         )
-    return checked_camera(camera.resized(size), where)
+    camera = checked_camera(camera.resized(size), where)
+    least = MIN_PINHOLE if camera.model in BROWN_LENSES else MIN_FISHEYE
+    if (share := pinhole_share(camera)) < least:
+        raise ReobjError(
+            f"{where}: {camera_line(camera)}: its distortion leaves {100 * share:.0f} % of the "
+            "image's pixels; expected a lens that such images can be of (is the order of the terms "
+            "another one?)"
+        )
+    return camera
+
+
+BROWN_LENSES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+MIN_PINHOLE = 0.4  # share of the pixels of such a lens (chosen: usual ones keep .7 and more)
+MIN_FISHEYE = 0.1  # of others (chosen: fisheyes of 180 deg keep .4)
+GRID = 16  # pixels a side that are tried (chosen)
+MAX_STRETCH = 3.0  # of a radius by distortion (chosen: beyond what a pinhole image can show)
+
+
+def pinhole_share(camera: Camera) -> float:
+    """Return the share of a camera's pixels that a pinhole image of the same focal length has too.
+
+    The distortion must not fold the image on the way from its centre to them, nor move them to
+    more than MAX_STRETCH times their radius, or a share of it as small.
+    """
+    x, y = ((np.arange(GRID) + 0.5) / GRID * side for side in (camera.width, camera.height))
+    pixel = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    centre = camera.K[:2, 2]
+    ideal = camera.undistort(pixel) - centre
+    radius, own = np.linalg.norm(pixel - centre, axis=1), np.linalg.norm(ideal, axis=1)
+    good = np.isfinite(own) & (own < MAX_STRETCH * radius) & (radius < MAX_STRETCH * own)
+    ray = np.linalg.solve(camera.K[:2, :2], ideal[good].T).T  # (n, 2)
+    steps = np.linspace(0, 1, GRID)[:, None, None] * ray  # (GRID, n, 2)
+    rays = np.concatenate([steps, np.ones((*steps.shape[:2], 1))], 2).reshape(-1, 3)
+    seen = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64).reshape(steps.shape)
+    outwards = np.diff(np.linalg.norm(seen - centre, axis=2), axis=0) > 0
+    return float(outwards.all(0).sum()) / len(pixel)
 
 
 def camera_line(camera: Camera) -> str:
@@ -166,8 +208,9 @@ DISTORTIONS = ("distortion_coefficients", "dist_coeffs", "distortion", "dist", "
 BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE = ("k1", "k2", "k3", "k4")
 BROWN_MODELS = (
-    "", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
-    "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL",
+    "", "NONE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
+    "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL-TANGENTIAL",
+    "RADIAL_TANGENTIAL",
 )  # fmt: skip
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4")
 
@@ -186,8 +229,13 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
         the camera at the size of the data; None without a focal length.
     """
     data = data | next((data[k] for k in ("camera", "intrinsics") if _is_object(data.get(k))), {})
-    size = next(((image_side(data[w]), image_side(data[h])) for w, h in SIZES if w in data), size)
+    size = next(
+        ((image_side(data[w]), image_side(data[h])) for w, h in SIZES if w in data and h in data),
+        size,
+    )
     model = str(data.get("model", data.get("camera_model", ""))).upper()
+    lens = str(data.get("distortion_model", "")).upper()  # of ROS and Kalibr
+    model = lens if model in ("", "PINHOLE") and lens else model
     if size and model and "params" in data:
         return colmap_camera([model, *map(str, (*size, *data["params"]))])
     pinhole = _pinhole_of_json(data, size)
@@ -199,6 +247,34 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
     if model in BROWN_MODELS:
         return brown_camera(size, *pinhole, *_terms(data, BROWN))
     return _camera_of_names(model, data, pinhole, _sized(size))
+
+
+def camera_from_yaml(data: dict[str, Any], size: tuple[int, int] | None) -> Camera | None:
+    """Make a camera of the YAML of OpenCV, ROS, Kalibr (`cam0`), EuRoC or ORB-SLAM (`Camera.fx`).
+
+    Args:
+        data: as `read_yaml` returns it. size: (w, h) where the data have none.
+    Returns:
+        the camera at the size of the data; None without a focal length.
+    Raises:
+        ReobjError: several cameras, or a lens that is none of ours.
+    """
+    kalibr = [name for name, own in data.items() if _is_object(own) and "intrinsics" in own]
+    if len(kalibr) > 1:
+        raise ReobjError(f"cameras {', '.join(kalibr)}; expected one: leave the others out")
+    data = data[kalibr[0]] if kalibr else data
+    known = {re.sub(r"^Camera1?\.", "", key): data[key] for key in data}
+    plain = {key.replace("_", "").lower(): own for key, own in known.items()}
+    for key in ("camera_matrix", "distortion_coefficients"):  # Camera_Matrix, cameraMatrix
+        if (word := key.replace("_", "")) in plain:
+            known[key] = plain[word]
+    if "distortion_coeffs" in known:
+        known["distortion_coefficients"] = known["distortion_coeffs"]
+    if len(known.get("resolution", ())) == 2:
+        known["width"], known["height"] = known.pop("resolution")
+    if isinstance(known.get("intrinsics"), list):
+        known |= dict(zip(("fx", "fy", "cx", "cy"), known.pop("intrinsics"), strict=True))
+    return camera_from_json(known, size)
 
 
 def image_side(value: Any) -> int:

@@ -37,9 +37,23 @@ class ResizedFrame:
     bgr: Image
     gray: Image
 
+    @property
+    def has_texture(self) -> bool:
+        """False for a picture in which nothing can be followed, such as a black one."""
+        return len(_corners(self.gray)) >= MIN_CORNERS
+
+
+def _square(image: Image, aspect: float) -> Image:
+    """Widen an image, or heighten it, so that pixels of this width over height become square."""
+    if aspect == 1:
+        return image
+    height, width = image.shape[:2]
+    size = (round(width * max(aspect, 1)), round(height / min(aspect, 1)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+
 
 class ResizedVideo:
-    """A video whose frames are resized to a longer side of at most `size_px`.
+    """A video whose frames have square pixels and a longer side of at most `size_px`.
 
     Attributes:
         frames, times_s: numbers and times of the frames, known after `first_pass`.
@@ -47,6 +61,7 @@ class ResizedVideo:
 
     def __init__(self, video: Any, size_px: int, cache_mb: float = CACHE_MB) -> None:
         self.video, self.size_px, self.cache_mb = video, size_px, cache_mb
+        self.aspect = float(getattr(video, "pixel_aspect", 1.0))
         self.frames: list[int] = []
         self.times_s: list[float] = []
         self.cache: list[Image] = []
@@ -54,7 +69,7 @@ class ResizedVideo:
 
     def __iter__(self) -> Iterator[ResizedFrame]:
         for row, frame in enumerate(self.video):
-            bgr = shrunk(frame.image, self.size_px)
+            bgr = shrunk(_square(frame.image, self.aspect), self.size_px)
             gray = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
             yield ResizedFrame(row, frame.index, frame.time_s, bgr, gray)
 
@@ -110,32 +125,36 @@ CORNER_SPACING = 1 / 80  # between two corners, over the longer side (chosen)
 MIN_CORNERS = 20  # with fewer an image counts as textureless (chosen)
 
 
+def _corners(gray: Image) -> Array:
+    """Find the corners (N, 2) of an image that can be followed."""
+    spacing = max(gray.shape) * CORNER_SPACING
+    found = cv2.goodFeaturesToTrack(gray, CORNERS, CORNER_QUALITY, spacing)
+    return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
+
+
 class _KeyframeFlow:
     """Optical flow since a keyframe: its corners, followed from frame to frame."""
 
     def __init__(self, key: ResizedFrame) -> None:
         self.row, self.gray = key.row, key.gray
-        self.start = self.at = self._corners(key.gray)  # (N, 2) there and in the last frame
-        self.count = len(self.start)
+        self.start = self.at = _corners(key.gray)  # (N, 2) there and in the last frame
+        self.count = max(len(self.start), 1)
 
-    def _corners(self, gray: Image) -> Array:
-        spacing = max(gray.shape) * CORNER_SPACING
-        found = cv2.goodFeaturesToTrack(gray, CORNERS, CORNER_QUALITY, spacing)
-        return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
-
-    def update(self, gray: Image) -> tuple[float, float]:
+    def update(self, frame: ResizedFrame) -> tuple[float, float] | None:
         """Follow the corners into the next frame.
 
         Returns:
             the median flow since the keyframe over the image's width, and the share of the corners
-            that is left. Of a textureless keyframe nothing is left once a frame has texture.
+            that is left. None for a frame without texture: the next one is compared with the last
+            that had some.
         """
-        if self.count < MIN_CORNERS:
-            return 0.0, float(len(self._corners(gray)) < MIN_CORNERS)
-        ahead, kept = follow_points(self.gray, gray, self.at)
-        self.start, self.at, self.gray = self.start[kept], ahead[kept], gray
+        ahead, kept = follow_points(self.gray, frame.gray, self.at)
+        if kept.sum() < MIN_CORNERS_LEFT * self.count and not frame.has_texture:
+            return None
+        self.start, self.at, self.gray = self.start[kept], ahead[kept], frame.gray
         flow = np.linalg.norm(self.at - self.start, axis=1)
-        return float(np.median(flow)) / gray.shape[1] if kept.any() else 0.0, len(flow) / self.count
+        share = len(flow) / self.count
+        return float(np.median(flow)) / frame.gray.shape[1] if kept.any() else 0.0, share
 
 
 MAX_FLOW = 0.12  # median flow that makes a keyframe, over the width (chosen)
@@ -151,7 +170,8 @@ def pick_keyframes(
     """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
     When there are more than `max_keyframes`, every second one is dropped and the thresholds double:
-    one pass, bounded memory, the same choice every time.
+    one pass, bounded memory, the same choice every time. A picture without texture (black, white)
+    is none: the reconstruction can do nothing with it, and it hides no motion.
 
     Args:
         max_flow: median flow since the last keyframe, over the width, that makes the next one.
@@ -161,11 +181,13 @@ def pick_keyframes(
     window: list[ResizedFrame] = []  # frames near the threshold
     stream, last, track, wider, flow = iter(frames), None, None, 1, 0.0
     while (frame := replay.popleft() if replay else next(stream, None)) is not None:
-        last = frame
         if track is None:
-            keys, track = [frame], _KeyframeFlow(frame)
+            if frame.has_texture:
+                keys, track, last = [frame], _KeyframeFlow(frame), frame
             continue
-        flow, left = track.update(frame.gray)
+        if (update := track.update(frame)) is None:
+            continue
+        last, (flow, left) = frame, update
         if flow >= SHARP_WINDOW * wider * max_flow:
             window.append(frame)
         late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW

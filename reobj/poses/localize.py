@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from reobj.cameras import Camera, SparseModel, import_pycolmap, invert_rigid
@@ -44,9 +45,7 @@ def locate_between(
     count, camera = len(video.frames), model.cameras[0]
     cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
     cam_from_world[key_rows], status[key_rows] = model.cam_from_world, "keyframe"
-    keys, rows = np.union1d(key_rows, left_out), np.arange(count)
-    held = np.concatenate([[False], np.isin(keys, key_rows), [False]])  # -1 and K: no keyframe
-    reached = held[np.searchsorted(keys, rows, "right")] | held[np.searchsorted(keys, rows) + 1]
+    reached = beside_held(np.union1d(key_rows, left_out), key_rows, count)
 
     def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
         before, after, run = segment
@@ -72,6 +71,18 @@ def locate_between(
     jump = _detours(cam_from_world) & (status == "pnp")
     cam_from_world[jump], status[jump] = np.nan, "none"
     return cam_from_world, status
+
+
+def beside_held(keys: IntArray, held: IntArray, count: int) -> BoolArray:
+    """Mark the frames (F,) whose keyframe before or after them is held by a model, or is they.
+
+    Args:
+        keys: (K,) rows of all keyframes, ascending. held: of those that a model has. count: F.
+    """
+    rows, has = np.arange(count), np.isin(keys, held)
+    has = np.concatenate([[False], has, [False]])  # -1 and K: no keyframe
+    before, after = has[np.searchsorted(keys, rows, "right")], has[np.searchsorted(keys, rows) + 1]
+    return np.asarray(before | after, bool)
 
 
 MAX_RUN = 1000  # frames held in memory between two keyframes (chosen: .3 GB of 640x480)
@@ -174,36 +185,147 @@ def _detours(cam_from_world: Array) -> BoolArray:
     return detour
 
 
+INTERPOLATED_PX = PNP_ERROR_PX  # an interpolated pose may be off by what a located one may
+SHIFT_POINTS = 200  # whose shift in the image is measured, at least (chosen: time)
+NEAR_SPANS = 2.0  # times the gap's length, before and after it, in which the error is measured
+
+
 def fill_gaps(
+    model: SparseModel,
+    key_rows: IntArray,
     frame: IntArray,
+    time_s: Array,
     cam_from_world: Array,
     status: npt.NDArray[np.str_],
     max_gap: int,
+    shrink: float,
     left_out: Sequence[int] | IntArray = (),
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate the poses of at most `max_gap` lost frames in a row, never beyond the ends.
+    """Interpolate the poses of at most `max_gap` lost frames in a row where that can be right.
 
-    Nor past a row of `left_out`, a keyframe that mapping took out.
-
-    The rotation is interpolated by slerp and the camera's centre along a line; the translation of
-    cam_from_world on a line would bend the path.
+    That is where the error (`_interpolation_px`) is below `INTERPOLATED_PX`; never beyond the ends,
+    nor past a row of `left_out`, a keyframe that mapping took out. The rotation is interpolated by
+    slerp and the camera's centre along a line.
 
     Args:
-        frame: (F,) source numbers: frames that were not read count too. cam_from_world: (F, 3, 4),
-            NaN where lost. status: (F,) as in `Poses`.
+        model: whose points the frames see. key_rows: (R,) row of each of its images, ascending.
+        frame: (F,) source numbers: frames that were not read count too. time_s: (F,).
+        cam_from_world: (F, 3, 4), NaN where lost. status: (F,) as in `Poses`.
+        shrink: side of the resized image, in whose pixels errors are counted, over the native one.
     Returns:
         copies of cam_from_world and status, the latter "interpolated" where filled.
     """
     filled, status = cam_from_world.copy(), status.copy()
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
-    for a, b in itertools.pairwise(known):
-        taken_out = any(a < row < b for row in left_out)
-        if b - a > 1 and frame[b] - frame[a] - 1 <= max_gap and not taken_out:
-            share = (frame[a + 1 : b] - frame[a]) / (frame[b] - frame[a])  # (n,)
-            ends = invert_rigid(cam_from_world[[a, b]])  # (2, 3, 4) world_from_cam
-            between = Slerp([0, 1], Rotation.from_matrix(ends[:, :, :3]))
-            turn = between(share).as_matrix()  # (n, 3, 3)
-            centre = ends[0, :, 3] + share[:, None] * (ends[1, :, 3] - ends[0, :, 3])  # (n, 3)
-            filled[a + 1 : b] = invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
-            status[a + 1 : b] = "interpolated"
+    for k in np.flatnonzero(np.diff(known) > 1).tolist():
+        a, b = int(known[k]), int(known[k + 1])
+        if frame[b] - frame[a] - 1 > max_gap or any(a < row < b for row in left_out):
+            continue
+        camera, points = model.cameras[0], _points_around(model, key_rows, a, b)
+        size = shrink * np.array([camera.width, camera.height])
+        sides, focal = (known[: k + 1], known[k + 1 :]), float(shrink * camera.K[0, 0])
+        error = _interpolation_px(sides, time_s, cam_from_world, points, focal, size)
+        if error <= INTERPOLATED_PX:
+            inner = np.arange(a + 1, b, dtype=np.int64)
+            filled[inner] = _interpolated(cam_from_world[[a, b]], time_s[[a, b]], time_s[inner])
+            status[inner] = "interpolated"
     return filled, status
+
+
+def _interpolated(ends: Array, times_s: Array, wanted_s: Array) -> Array:
+    """Interpolate between two poses (2, 3, 4) at times (n,): slerp, and a line of the centre.
+
+    The translation of cam_from_world on a line would bend the path.
+    """
+    world_from_cam = invert_rigid(ends)
+    turn = Slerp(times_s, Rotation.from_matrix(world_from_cam[:, :, :3]))(wanted_s).as_matrix()
+    share = ((wanted_s - times_s[0]) / (times_s[1] - times_s[0]))[:, None]
+    centre = world_from_cam[0, :, 3] + share * (world_from_cam[1] - world_from_cam[0])[:, 3]
+    return invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
+
+
+def _points_around(model: SparseModel, key_rows: IntArray, a: int, b: int) -> Array:
+    """Return the points (n, 3) that the keyframes around the rows a to b see."""
+    reach = round(NEAR_SPANS * (b - a))
+    first = int(np.searchsorted(key_rows, a - reach, "right")) - 1  # one before that, one after
+    images = np.arange(max(first, 0), int(np.searchsorted(key_rows, b + reach)) + 1)
+    seen = np.unique(model.obs_point[np.isin(model.obs_image, images)])
+    return model.points[seen[:: max(1, len(seen) // SHIFT_POINTS)]]
+
+
+def _interpolation_px(
+    sides: tuple[IntArray, IntArray],
+    time_s: Array,
+    cam_from_world: Array,
+    points: Array,
+    focal: float,
+    size: Array,
+) -> float:
+    """Estimate the error that interpolation over a gap makes, as a shift of points in the image.
+
+    It is the largest of: the errors that it makes at located frames near the gap, on each side of
+    it, where as long a time is left out; and the distance between the line and the cubic Hermite
+    path, which leaves and reaches the gap with the velocities measured at its ends. The second is
+    large where the camera moves otherwise in the gap than beside it, the first where it shakes, and
+    between photos.
+
+    Args:
+        sides: located rows before and after the gap, ascending. points: (N, 3). focal, size: px.
+    Returns:
+        pixels; infinite where too few frames are located beside the gap.
+    """
+    before, after = sides
+    start_s, end_s = time_s[before[-1]], time_s[after[0]]
+    span, worst = float(end_s - start_s), 0.0
+    if min(len(before), len(after)) < 2:
+        return np.inf
+    for side, edge_s in ((before, start_s), (after, end_s)):
+        near = side[np.abs(time_s[side] - edge_s) <= NEAR_SPANS * span * (1 + 1e-6)]
+        until = np.searchsorted(time_s[near], time_s[near] + span * (1 - 1e-6))
+        errors = []
+        for i, j in enumerate(until.tolist()):
+            if j < len(near) and j > i + 1:
+                ends, inner = near[[i, j]], near[i + 1 : j]
+                guess = _interpolated(cam_from_world[ends], time_s[ends], time_s[inner])
+                errors.append(_shift_px(guess, cam_from_world[inner], points, focal, size))
+        if not errors:
+            return np.inf
+        worst = max(worst, *errors)
+    at = np.array([before[-2], before[-1], after[0], after[1]])
+    ends = at[[1, 2]]
+    inner_s = np.linspace(start_s, end_s, 9)[1:-1]
+    line = _interpolated(cam_from_world[ends], time_s[ends], inner_s)
+    curve = _hermite(cam_from_world[at], time_s[at], inner_s)
+    return max(worst, _shift_px(line, curve, points, focal, size))
+
+
+def _hermite(poses: Array, times_s: Array, wanted_s: Array) -> Array:
+    """Interpolate between the inner two of four poses (4, 3, 4) by a cubic in (rotation, centre).
+
+    The velocities at its ends are those from the first to the second and from the third to the
+    fourth; rotations count as rotation vectors from the second.
+    """
+    world_from_cam = invert_rigid(poses)
+    turn = Rotation.from_matrix(world_from_cam[:, :, :3])
+    path = np.hstack([(turn[1].inv() * turn).as_rotvec(), world_from_cam[:, :, 3]])  # (4, 6)
+    speed = np.diff(path, axis=0) / np.diff(times_s)[:, None]  # (3, 6)
+    at = CubicHermiteSpline(times_s[1:3], path[1:3], speed[[0, 2]])(wanted_s)  # (n, 6)
+    turned = (turn[1] * Rotation.from_rotvec(at[:, :3])).as_matrix()
+    return invert_rigid(np.concatenate([turned, at[:, 3:, None]], 2))
+
+
+def _shift_px(one: Array, other: Array, points: Array, focal: float, size: Array) -> float:
+    """Return the largest shift of the image between two poses each (n, 3, 4).
+
+    The shift of a pair is the median over the points that the second pose has in its image; it is
+    infinite where that is none.
+    """
+    (x1, z1), (x2, z2) = (
+        (focal * found[..., :2] / found[..., 2:], found[..., 2])
+        for found in (np.einsum("nij,pj->npi", p[:, :, :3], points) + p[:, None, :, 3]
+                      for p in (one, other))
+    )  # fmt: skip
+    inside = (z2 > 0) & (np.abs(x2) < size / 2).all(2)  # (n, N)
+    shift = np.where(z1 > 0, np.linalg.norm(x1 - x2, axis=2), np.inf)
+    medians = [np.median(s[i]) if i.any() else np.inf for s, i in zip(shift, inside, strict=True)]
+    return float(max(medians))

@@ -24,10 +24,11 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import Camera, import_pycolmap
-from reobj.files import Progress, atomic, load_cached, load_json, writing
+from reobj.files import Progress, atomic, load_cached, load_json, spans, writing
 from reobj.poses.adjustment import SAME_FOCAL, Adjusted, adjusted, refine
 from reobj.poses.child import Child, send_progress, serve
 from reobj.poses.consistency import (
+    MIN_MATCHES,
     MatchedPairs,
     consistent_groups,
     count_explained,
@@ -39,10 +40,11 @@ from reobj.poses.soundness import MIN_PART_IMAGES, SURE_CENTRE_SIGMA, Part, conf
 from reobj.poses.zoom import MIN_ZOOM, constant_focal
 from reobj.types import Array, Image, IntArray
 
-HOW_TO_FILM = (
-    "move the camera sideways around the objects (turning on the spot gives no depth), keep things "
-    "with texture in view, avoid blurred frames, or give --poses; identities in 2D need none"
+HOW_TO_FILM = (  # said where no cause is established
+    "what helps: things with texture in view, more overlap, sharp pictures, a camera that moves "
+    "sideways and does not only turn, measured intrinsics (--camera)"
 )
+OR_POSES = "or give --poses; identities in 2D need none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +54,12 @@ class Mapped:
     Attributes:
         models: folders of COLMAP models, one for each rigid part, the largest first; in native
             pixels, with the names that were given. messages: what the user should know.
+        alone: ids of keyframes without a verified match with another one.
     """
 
     models: list[Path]
     messages: list[str]
+    alone: frozenset[int] = frozenset()
 
 
 def mapping_child(work_dir: Path) -> Child:
@@ -95,7 +99,9 @@ def reconstruct(
     for old in work_dir.glob("sparse*"):
         shutil.rmtree(old)
     if len(images) < 3:
-        return Mapped([], [f"no camera poses: only {len(images)} different views; {HOW_TO_FILM}"])
+        blank = "no picture shows anything that can be followed (black, blank or blurred)"
+        what = f"only {len(images)} different views" if len(images) else blank
+        return Mapped([], [f"no camera poses: {what}; {HOW_TO_FILM}; {OR_POSES}"])
     scale = np.tile(np.array(images[0].shape[1::-1]) / size, 2)
     boxes = [(xyxy * scale).tolist() for xyxy in moving_boxes]
     job = {
@@ -138,15 +144,18 @@ def reconstruct(
     models = []
     for model in sorted(folder.glob("sparse*"), key=lambda p: (len(p.name), p.name)):
         models.append(model.replace(work_dir / model.name))
-    return Mapped(models, list(json.loads((folder / "messages.json").read_text())))
+    said = json.loads((folder / "messages.json").read_text())
+    return Mapped(models, said["messages"], frozenset(said["alone"]))
 
 
 MAPPING = "mapping"  # stage of the child that takes one core
-LATER = ("pycolmap", "onnxruntime", "filterpy.kalman", "av")  # packages of later stages
+LATER = ("onnxruntime", "filterpy.kalman", "av")  # packages of later stages, beside pycolmap
 
 
 def _import_ahead() -> None:
     """Import what later stages need, while this process waits."""
+    with contextlib.suppress(ImportError):
+        import_pycolmap()  # leaves signals alone, which a plain import does not
     for name in LATER:
         with contextlib.suppress(ImportError):  # optional, or said where it is needed
             importlib.import_module(name)
@@ -182,7 +191,8 @@ def _reconstruct_job(folder: Path) -> None:
     for number, part in enumerate(parts):
         name = f"sparse_part{number}" if number else "sparse"
         _write_native_model(part, images, folder / name, job)
-    (folder / "messages.json").write_text(json.dumps(messages))
+    alone = sorted(set(job["ids"]) - set(np.unique(pairs.image_ids[pairs.enough]).tolist()))
+    (folder / "messages.json").write_text(json.dumps({"messages": messages, "alone": alone}))
 
 
 FOCAL_GUESS = 0.8  # focal length over the longer side where nothing tells it (phones: .72-.85)
@@ -195,7 +205,8 @@ def _start_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
         return pc.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, *size)
     model, params = job["camera"]
     width, height = job["size"]
-    camera = Camera(model, width, height, tuple(params)).resized(size).to_pycolmap()
+    camera = Camera(model, width, height, tuple(params)).to_pycolmap()
+    _rescale(camera, size)
     camera.has_prior_focal_length = True
     return camera
 
@@ -257,20 +268,36 @@ class _Search:
             best = [part if self._of_camera(part) else replace(part, problem=why) for part in best]
         sound = [part for part in best if not part.problem]
         if not sound:
-            why = "no two keyframes show the same points from clearly different places"
-            problem = best[0].problem if best else why
-            return [], [f"no camera poses: {problem}; {HOW_TO_FILM}"]
+            problem = best[0].problem if best else "no two keyframes make a first model"
+            advice = (best[0].help if best else "") or HOW_TO_FILM
+            return [], [f"no camera poses: {problem}; {self._matched()}; {advice}; {OR_POSES}"]
         messages = [
             f"the focal length changed between frames {self.frames[a]} and {self.frames[b]} "
             f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
             for a, b, ratio in zooms
         ] + messages
+        for part in sound:
+            if len(unsure := np.setdiff1d(part.arrays.ids, part.held)):
+                frames = spans([self.frames[i] for i in unsure.tolist()])
+                messages.append(
+                    f"keyframes {frames} are left out: where they are is uncertain, and no second "
+                    "way of mapping puts them in the same place"
+                )
         for part in best:
             ids = part.arrays.ids.tolist()
             if part.problem and len(ids) >= MIN_PART_IMAGES:
                 ends = f"frames {self.frames[ids[0]]}-{self.frames[ids[-1]]}"
                 messages.append(f"a part of the video ({ends}) has no poses: {part.problem}")
         return self._one_camera(sound), messages
+
+    def _matched(self) -> str:
+        """Say what the matches of the keyframes are like."""
+        enough = self.pairs.enough
+        flat = int(np.isnan(self.pairs.fundamental[enough, 0, 0]).sum())
+        return (
+            f"{enough.sum()} pairs of {len(self.ids)} keyframes have {MIN_MATCHES} verified "
+            f"matches at least, {flat} of them as a plane or a mere turn gives them"
+        )
 
     def _best(self, guess: float) -> tuple[list[Part], list[str]]:
         """Choose the mapper whose sound parts explain most of the verified matches.
@@ -439,6 +466,20 @@ def _run_mapper(database: Path, mapper: str, held: bool, ids: list[int], seed: i
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())
 
 
+TWO_FOCALS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
+
+
+def _rescale(camera: Any, size: Sequence[int]) -> None:
+    """Rescale a pycolmap camera to (w, h); to pixels of another shape with two focal lengths."""
+    width, height = size
+    if abs(width / camera.width * camera.height - height) > 2 and camera.model.name in TWO_FOCALS:
+        focal, x, y, *terms = camera.params
+        camera.model = getattr(import_pycolmap().CameraModelId, TWO_FOCALS[camera.model.name])
+        most = len(camera.params_info.split(",")) - 4
+        camera.params = [focal, focal, x, y, *terms, *[0.0] * (most - len(terms))]
+    camera.rescale(*size)
+
+
 def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, Any]) -> None:
     """Write the model in native pixels with the frames' names; points get a colour."""
     height, width = images.shape[1:3]
@@ -455,7 +496,7 @@ def _write_native_model(model: Any, images: Any, folder: Path, job: dict[str, An
         image.name = job["names"][index[image_id]]
         for p in image.points2D if (scale != 1).any() else ():
             p.xy = p.xy * scale
-    model.camera(1).rescale(*job["size"])
+    _rescale(model.camera(1), job["size"])
     folder.mkdir()
     model.write(str(folder))
 

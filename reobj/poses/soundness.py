@@ -40,6 +40,10 @@ MIN_REGISTERED = 0.5  # share of the keyframes that makes a model worth having .
 MIN_PART_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
 
 
+SIDEWAYS = "move the camera sideways around the objects (turning on the spot gives no depth)"
+LENS = "give measured intrinsics (--camera); pixels must be square"
+
+
 @dataclass(frozen=True, slots=True)
 class Part:
     """A model that holds together, and the measures that tell a sound one from a wrong one."""
@@ -52,8 +56,9 @@ class Part:
     parallax_px: float  # what turns of the camera alone cannot explain
     centre_sigma: float  # largest of a camera's centre, over the extent of the path
     explained: int  # verified matches
-    problem: str
+    problem: str  # what was measured
     held: IntArray  # ids of the images that are to be kept
+    help: str = ""  # what the user can do, where the cause is established
 
     @property
     def focal(self) -> float:
@@ -79,25 +84,31 @@ def measured(
     seen = np.bincount(arrays.image, minlength=max(images, 1))  # (R,)
     parallax = _parallax_px(arrays)
     few = images < min(MIN_REGISTERED * count, MIN_PART_IMAGES)
+    focal = arrays.focal_over_size
+    # at a wrong focal length a walk along a wall looks like a turn
+    no_depth = ": there is no depth" if calibrated else f", at a focal length of {focal:.2f} widths"
     checks = (
-        (few, f"only {images} of {count} keyframes connect"),
-        (len(arrays.xyz) < MIN_POINTS, f"only {len(arrays.xyz)} points could be triangulated"),
-        (np.median(seen) < MIN_POINTS_PER_IMAGE, "the images share too few points"),
+        (few, f"only {images} of {count} keyframes connect", ""),
+        (len(arrays.xyz) < MIN_POINTS, f"only {len(arrays.xyz)} points could be triangulated", ""),
+        (np.median(seen) < MIN_POINTS_PER_IMAGE,
+         f"half of the keyframes see {np.median(seen):.0f} points or fewer", ""),
         (parallax < MIN_PARALLAX_PX,
-         "a mere turn of the camera explains all images, so there is no depth"),
+         f"a mere turn of the camera explains all images to {parallax:.1f} px{no_depth}",
+         SIDEWAYS if calibrated else ""),
         (angle < MIN_TRI_ANGLE_DEG,
-         f"rays meet at {angle:.1f} deg only: the camera hardly moved sideways"),
+         f"half of the points are seen from directions within {angle:.1f} deg",
+         SIDEWAYS if calibrated else ""),
         (camera.has_bogus_params(*FOCAL_RANGE, 1.0),
-         f"the focal length came out as {arrays.focal_over_size:.2f} x the width"),
+         f"the focal length came out as {focal:.2f} x the longer side", LENS),
     )  # fmt: skip
-    problem = next((text for bad, text in checks if bad), "")
+    problem, advice = next(((text, what) for bad, text, what in checks if bad), ("", ""))
     registered = images / count
     measures = angle, registered, parallax, centre_sigma, explained
-    return Part(model, arrays, calibrated, *measures, problem, arrays.ids)
+    return Part(model, arrays, calibrated, *measures, problem, arrays.ids, advice)
 
 
 def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
-    """Find a problem in parts of little parallax, unless another mapper came to the same.
+    """Find a problem in parts of uncertain cameras, unless another mapper came to the same.
 
     Images that it has elsewhere, or not at all, are not to be kept.
 
@@ -111,7 +122,11 @@ def confirmed(parts: list[Part], others: list[Part], told: bool) -> list[Part]:
             held = _found_by(part.arrays, [other.arrays for other in others if proof])
             part = replace(part, held=part.arrays.ids[held])
             if len(held) < SAME_IMAGES * len(part.arrays.ids):
-                why = "there is too little parallax to tell where the camera was"
+                why = (
+                    "where the camera was is uncertain, and no second way of mapping confirms it "
+                    f"(largest sigma {100 * part.centre_sigma:.2g} % of the path, parallax "
+                    f"{part.parallax_px:.0f} px, rays meet at {part.tri_angle_deg:.1f} deg)"
+                )
                 part = replace(part, problem=why)
         found.append(part)
     return sorted(found, key=lambda p: (bool(p.problem), -p.registered))

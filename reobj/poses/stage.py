@@ -14,28 +14,48 @@ from reobj.files import load_cached, load_npz, part_path
 from reobj.poses.checks import check_poses
 from reobj.poses.depth import add_depth
 from reobj.poses.estimate import PosesConfig, estimate_poses
+from reobj.poses.evidence import PoseReading, by_images, by_tracks
 from reobj.poses.intrinsics import camera_line, parse_camera
 from reobj.poses.points import triangulate
-from reobj.poses.readers import read_poses
+from reobj.poses.readers import pose_readings, the_reading
 from reobj.results.workspace import Workspace
 from reobj.sources.video import Video, source_fingerprint
 from reobj.types import ReobjError, Tracks, rows_by
 
 
-def supplied_poses(
-    video: Video, config: PosesConfig, workspace: Workspace | None = None
-) -> Poses | None:
-    """Read poses given by the user; None if they are to be reconstructed.
+def supplied_poses(video: Video, config: PosesConfig) -> list[PoseReading]:
+    """Read poses given by the user, in all the ways that file and images leave open.
 
-    Args:
-        workspace: the poses get points, from depth maps or triangulated, and these are kept there.
+    Returns:
+        [] if poses are to be reconstructed.
     """
     if config.mode in ("auto", "none"):
         if config.metric:
             raise ReobjError("--metric is said of supplied poses; a reconstruction has no scale")
-        return None
-    poses = read_poses(config.mode, video, config.fmt, config.camera, config.metric)
-    return poses if workspace is None else with_points(poses, video, config, workspace)
+        return []
+    found = pose_readings(
+        config.mode, video, config.fmt, config.camera, config.metric, config.frames_by
+    )
+    return by_images(found, video)
+
+
+def settled_poses(
+    found: list[PoseReading],
+    tracks: Tracks,
+    video: Video,
+    config: PosesConfig,
+    workspace: Workspace,
+) -> Poses:
+    """Decide between readings of supplied poses by tracks, check them, and add points.
+
+    Args:
+        tracks: of the video's detections, none where there are none.
+    Raises:
+        ReobjError: the tracks do not decide, or contradict the poses' direction or axes.
+    """
+    poses = the_reading(by_tracks(found, tracks), Path(config.mode))
+    check_directions(poses, tracks)
+    return with_points(poses, video, config, workspace)
 
 
 def with_points(poses: Poses, video: Video, config: PosesConfig, workspace: Workspace) -> Poses:

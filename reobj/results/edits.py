@@ -16,6 +16,7 @@ import numpy as np
 
 from reobj.files import atomic, load_json, shortened
 from reobj.types import (
+    CLASS_NAME_MAX,
     COORDINATE_MAX,
     Array,
     BoolArray,
@@ -127,6 +128,8 @@ def _parse(entry: Any) -> Edit:
     name = entry.get("class", "")
     if not isinstance(name, str) or ("class" in fields and not name.strip()):
         raise ValueError(f"class {name!r} is no name")
+    if len(name) > CLASS_NAME_MAX:
+        raise ValueError(f"class of {len(name)} characters, at most {CLASS_NAME_MAX} are taken")
     if not name.isprintable():
         raise ValueError(f"class {name!r} has characters that cannot be printed")
     visits = tuple(_box_ref(item) for item in entry.get("visits", ()))
@@ -146,15 +149,11 @@ def _box_ref(item: Any) -> BoxRef:
 
 
 def write_edits(folder: Path, edits: Edits | None) -> None:
-    """Keep edits in an output folder, for later fits; an empty list removes those that it has."""
-    path = folder / EDITS
-    if edits is None:
-        return
-    if not edits.edits:
-        path.unlink(missing_ok=True)
+    """Write edits into a new folder of results, for later fits; an empty list makes no file."""
+    if edits is None or not edits.edits:
         return
     data = {"format": FORMAT, "version": FORMAT_VERSION, "edits": edits.entries}
-    with atomic(path) as part:
+    with atomic(folder / EDITS) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,21 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from reobj import __version__
-from reobj.files import load_json, wrapped
+from reobj.files import wrapped
 from reobj.results.result import Result
 from reobj.results.solids import score_objects
+from reobj.results.truth import (
+    IGNORED,
+    SCORED,
+    LabelledBoxes,
+    check_counts,
+    read_result,
+    read_truth,
+    with_common_names,
+)
 from reobj.results.workspace import LAST_TRACKS, Workspace
-from reobj.sources.detection_files import read_mot_rows
 from reobj.sources.video import InputConfig
 from reobj.types import (
-    CLASS_MAX,
     COCO_NAMES,
     Array,
     BoolArray,
@@ -35,84 +41,8 @@ from reobj.types import (
     unit_rows,
 )
 
-SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
 MATCH_IOU = 0.5 - 1e-12  # of a box and its truth, but for HOTA (MOTChallenge); .5 itself is enough
 TINY = 1e-12  # of scores and unions: not zero
-
-
-@dataclass(frozen=True, slots=True)
-class LabelledBoxes:
-    """Boxes of a whole video with identities and classes: truth, or what is to be scored.
-
-    Attributes (N rows in any order):
-        frame: (N,) from 1, as in MOTChallenge files. identity: (N,). xyxy: (N, 4) native pixels.
-        name: (N,) class names; "" matches every class.
-        role: (N,) SCORED, IGNORED or ABSENT; all SCORED in a result.
-    """
-
-    frame: IntArray
-    identity: IntArray
-    xyxy: Array
-    name: npt.NDArray[np.str_]
-    role: IntArray
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def __getitem__(self, keep: Any) -> LabelledBoxes:
-        return LabelledBoxes(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
-
-
-def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
-    """Make labelled boxes of MOTChallenge rows (N, 6+); name, role: one for all rows, or (N,)."""
-    n, box = len(rows), rows[:, 2:6]
-    xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
-    whole = rows[:, :2].astype(np.int64)
-    names, roles = np.broadcast_to(np.asarray(name, str), n), np.broadcast_to(role, n)
-    return LabelledBoxes(whole[:, 0], whole[:, 1], xyxy, names, np.asarray(roles, np.int64))
-
-
-MOT_DISTRACTORS = (2, 7, 8, 12)  # on a vehicle, static, distractor, reflection (MOT16 and later)
-
-
-def read_truth(path: Path, class_names: Sequence[str], min_visibility: float) -> LabelledBoxes:
-    """Read true boxes from a MOTChallenge gt.txt.
-
-    Column 7 is a flag (0: the row does not count). Column 8 is a class only in files of nine
-    columns: of MOT16 and later if seqinfo.ini stands beside the gt folder; else as
-    `gt_mot_format.json` beside the file names it, else an index into class_names. Column 9 is the
-    visibility; rows below min_visibility are IGNORED.
-    """
-    rows = read_mot_rows(path)
-    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
-    if rows.shape[1] != 9:  # MOT15 has ten: world coordinates in place of class and visibility
-        return labelled(rows, "", np.where(flagged, ABSENT, SCORED))
-    number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
-    if (path.parent.parent / "seqinfo.ini").exists():
-        role = np.where(flagged | (number != 1), ABSENT, SCORED)
-        role[np.isin(number, MOT_DISTRACTORS)] = IGNORED
-        return labelled(rows, "", role)
-    hidden = flagged | (rows[:, 8] < min_visibility)
-    known = path.with_name("gt_mot_format.json")
-    names = {str(i): n for i, n in enumerate(class_names)}
-    if known.exists():
-        stated = load_json(known)
-        stated = stated.get("classes") if isinstance(stated, dict) else None
-        names = {str(k): str(v) for k, v in (stated if isinstance(stated, dict) else names).items()}
-    return labelled(rows, [names.get(str(n), str(n)) for n in number], hidden * IGNORED)
-
-
-def read_result(out: Path) -> LabelledBoxes:
-    """Read boxes, identities and classes of an output folder; or, without classes, a tracks.txt."""
-    if not out.is_dir():
-        return labelled(read_mot_rows(out))
-    result = Result.load(out)
-    tracks, names = result.tracks, np.array([*result.class_names, ""], str)  # -1: unknown
-    role = np.full(len(tracks), SCORED)
-    return LabelledBoxes(
-        tracks.frame + 1, tracks.track_id, tracks.xyxy, names[tracks.class_id], role
-    )
-
 
 _Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), IoU (g, p)
 
@@ -202,6 +132,12 @@ def visits(truth: LabelledBoxes, away: int = AWAY_FRAMES) -> IntArray:
     return visit
 
 
+def _visit_of_object(truth: LabelledBoxes, visit: IntArray) -> IntArray:
+    """Number the visits (N,) of all objects, by object and then by time."""
+    number = np.unique(truth.identity, return_inverse=True)[1]
+    return np.asarray(visit + (visit.max(initial=0) + 1) * number, np.int64)
+
+
 def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, IntArray]:
     """Match truth and result frame by frame, at IoU >= .5 and of the largest total IoU.
 
@@ -226,7 +162,7 @@ def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
     g, p = matched_rows(truth, found)
     known: dict[int, set[int]] = {}
     kept = []
-    for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+    for rows in rows_by(_visit_of_object(truth, visit)[g]):
         ids, votes = np.unique(found.identity[p[rows]], return_counts=True)
         before = known.setdefault(int(truth.identity[g[rows[0]]]), set())
         kept += [int(ids[votes.argmax()]) in before] if before else []
@@ -256,7 +192,7 @@ def return_ranks(
     use = np.isfinite(embedding[p]).all(1)
     g, p = g[use], p[use]
     ranks = []
-    for rows in rows_by(visit[g] + (visit.max(initial=0) + 1) * truth.identity[g]):
+    for rows in rows_by(_visit_of_object(truth, visit)[g]):
         start, own = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
         known = np.flatnonzero(truth.frame[g] < start)
         known = known[truth.name[g[known]] == truth.name[g[rows[0]]]]
@@ -316,7 +252,7 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
         before[g] = p
     gt, pr = int(gt_size.sum()), int(pr_size.sum())
     return {
-        "MOTA": 1 - (gt + pr - 2 * hits + switches) / max(gt, 1),
+        "MOTA": 1 - (gt + pr - 2 * hits + switches) / gt if gt else 0.0,
         "IDSW": switches,
         "Frag": int((starts - 1).clip(0).sum()),
         "recall": hits / max(gt, 1),
@@ -383,6 +319,8 @@ def score_report(scores: dict[str, Any]) -> str:
     if "objects" in scores:
         numbers = {k: v for k, v in scores["objects"].items() if isinstance(v, int | float)}
         lines.append("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in numbers.items()))
+    for text in scores.get("messages", ()):
+        lines += wrapped(f"note: {text}")
     return "\n".join(lines)
 
 
@@ -396,41 +334,90 @@ def evaluate(
 ) -> dict[str, Any]:
     """Score an output folder of `run`, or a tracks.txt, against ground truth.
 
-    Truth of frames that --start, --stop and --every left out does not count.
+    Truth of frames that --start, --stop and --every left out, or that the detector was not run on,
+    does not count; nor do boxes in the latter.
 
     Args:
-        gt: MOTChallenge gt.txt. solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam
-            a line. classes: only these. min_visibility: truth that is less visible is ignored.
+        out: folder; or MOT rows. The tracks.txt in an output folder stands for the folder.
+        gt: MOTChallenge gt.txt, KITTI tracking labels, CVAT for video, COCO-VID.
+        solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam a line. classes: only
+            these. min_visibility: truth that is less visible is ignored.
     Returns:
-        {"tracks": scores by class, "ranks": Rank-k of the returns, "objects": scores in 3D}.
+        {"tracks": scores by class, "ranks": Rank-k of the returns, "objects": scores in 3D,
+        "messages": what was assumed}.
     Raises:
-        ReobjError: a file is missing or of another form, or a class is in none of them.
+        ReobjError: a file is missing or of another form, no true box counts, an identity has two
+            boxes in a frame, or a class is in none of them.
     """
     out, names, tracked = Path(out), COCO_NAMES, None
-    found = read_result(out)
+    if out.name == TRACKS_FILE and (out.parent / LAST_TRACKS).exists():
+        out = out.parent
+    said: list[str] = []
+    found = read_result(out, said)
     if (out / LAST_TRACKS).exists():
         workspace = Workspace.open(out)
         tracked = workspace.load_last()
         names = tracked.class_names
-    truth = read_truth(Path(gt), names, min_visibility)
+    size = (0, 0) if tracked is None else (tracked.video.width, tracked.video.height)
+    truth = read_truth(Path(gt), names, min_visibility, said, size)
+    check_counts(truth, Path(gt))
     if tracked is not None:
-        truth = truth[_was_read(truth.frame - 1, workspace.source[1])]
-    wanted = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
+        read = truth[_was_read(truth.frame - 1, workspace.source[1])]
+        check_counts(
+            read, Path(gt), "none lies in a frame that was read (--start, --stop, --every)"
+        )
+        truth, found = _looked_at(read, found, tracked.looked, said)
+        check_counts(truth, Path(gt), "none lies in a frame that the detector was run on")
+    truth, found, named = with_common_names(truth, found, said)
     unknown = set(classes) - set(truth.name) - set(found.name)
     if unknown:
         raise ReobjError(f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor found")
+    wanted = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
     if classes:
-        truth, found = (x[np.isin(x.name, [*classes, ""])] for x in (truth, found))
+        truth, found = _of_classes(truth, found, classes, named)
+        check_counts(truth, Path(gt), f"none is of {', '.join(classes)}")
     scores = {"all": score_tracks(truth, found)}
-    if len(wanted) > 1:
+    if named and len(wanted) > 1:
         for name in wanted:
-            scores[name] = score_tracks(*(x[np.isin(x.name, [name, ""])] for x in (truth, found)))
+            scores[name] = score_tracks(*_of_classes(truth, found, [name], named))
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
     result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
+    result["messages"] = said
     if solids is not None:
         pairs, poses = identity_map(truth, found), Path(truth_poses) if truth_poses else None
         result["objects"] = score_objects(Result.load(out), Path(solids), poses, pairs)
     return result
+
+
+TRACKS_FILE = "tracks.txt"  # of an output folder
+
+
+def _of_classes(
+    truth: LabelledBoxes, found: LabelledBoxes, classes: Sequence[str], named: bool
+) -> tuple[LabelledBoxes, LabelledBoxes]:
+    """Keep the rows of some classes.
+
+    Where the result has no classes (not `named`), boxes on other truth are dropped with it.
+    """
+    mine, theirs = (np.isin(x.name, [*classes, ""]) for x in (truth, found))
+    if named:
+        return truth[mine], found[theirs]
+    role = np.where(mine | (truth.role != SCORED), truth.role, IGNORED)
+    return dataclasses.replace(truth, role=role), found
+
+
+def _looked_at(
+    truth: LabelledBoxes, found: LabelledBoxes, looked: IntArray | None, said: list[str]
+) -> tuple[LabelledBoxes, LabelledBoxes]:
+    """Keep the frames that the detector was run on (None: all)."""
+    if looked is None:
+        return truth, found
+    kept = truth[np.isin(truth.frame - 1, looked)]
+    said.append(
+        f"{len(truth) - len(kept)} of {len(truth)} true boxes do not count: they lie in frames "
+        f"that the detector was not run on (it was on {len(looked)})"
+    )
+    return kept, found[np.isin(found.frame - 1, looked)]
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:

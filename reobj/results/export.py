@@ -11,6 +11,8 @@ import dataclasses
 import itertools
 import json
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,12 +30,14 @@ from reobj.cameras import (
     invert_rigid,
     quat_wxyz_from_matrix,
 )
-from reobj.files import Progress, atomic, spans
+from reobj.files import Progress, atomic, spans, staged
+from reobj.results.origin import centred, far_origin, shifted
 from reobj.results.ply import write_ply, write_point_ply
 from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
-from reobj.sources.detection_files import CVAT_BOX
-from reobj.sources.video import IMAGE_FPS, Video
+from reobj.sources.cvat import CVAT_BOX
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.sources.video import Video
 from reobj.types import (
     Array,
     Frame,
@@ -43,6 +47,7 @@ from reobj.types import (
     log,
     object_classes,
     object_color,
+    visible_name,
 )
 
 
@@ -164,7 +169,7 @@ def export_cvat(result: Result, path: Path) -> None:
     root = ET.Element("annotations")
     ET.SubElement(root, "version").text = "1.1"
     task = ET.SubElement(ET.SubElement(root, "meta"), "task")
-    for key, value in (("name", Path(video.path).name), ("mode", "interpolation"),
+    for key, value in (("name", visible_name(Path(video.path).name)), ("mode", "interpolation"),
                        ("start_frame", 0), ("stop_frame", max(frames, default=0))):  # fmt: skip
         ET.SubElement(task, key).text = str(value)
     labels, size = ET.SubElement(task, "labels"), ET.SubElement(task, "original_size")
@@ -210,6 +215,13 @@ def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[floa
     return metres or 1.0, np.asarray(turn)
 
 
+def _say_origin(origin: Array, path: Path) -> None:
+    """Say by how much a world far from its origin was moved: the format has float32."""
+    if origin.any():
+        place = ", ".join(f"{value:.12g}" for value in origin)
+        log.warning("%s: its origin is %s of the world: the format has float32", path, place)
+
+
 def export_glb(result: Result, path: Path) -> None:
     """Write binary glTF 2.0 with trimesh: a mesh an object, the sparse points, the camera path.
 
@@ -220,11 +232,12 @@ def export_glb(result: Result, path: Path) -> None:
         import trimesh
     except ImportError as error:
         raise ReobjError("trimesh is not installed: pip install 'reobj-track[viewer]'") from error
-    result = _largest_part(result, path)
+    result, origin = centred(_largest_part(result, path))
     scale, turn = _upright(result, path, [0.0, 1, 0])
+    _say_origin(origin, path)
     world, poses = np.eye(4), result.poses
     world[:3, :3] = scale * turn
-    scene: Any = trimesh.Scene()
+    scene: Any = trimesh.Scene(metadata={"origin_in_world": origin.tolist()})
     ellipsoids = result.ellipsoids()
     columns = ellipsoids.world_from_obj * ellipsoids.half_axes[:, None]  # (O, 3, 3)
     for o, axes, center in zip(result.located, columns, ellipsoids.center_in_world, strict=True):
@@ -309,28 +322,39 @@ def export_nerfstudio(result: Result, path: Path) -> None:
 
     Ref: docs.nerf.studio, "Data conventions": camera axes of OpenGL, world_from_cam.
     """
-    result = _largest_part(result, path)
+    result, origin = centred(_largest_part(result, path))
     poses, video = result.poses, _video_of(result)
     if poses is None or not poses.known.any():
         raise ReobjError(f"{path}: no cameras here, see `run`")
     if video is None:
         raise ReobjError(f"{path}: the video is gone, and nerfstudio needs its images")
-    folder = path.parent
-    folder.mkdir(parents=True, exist_ok=True)
+    if not video.has_images:
+        raise ReobjError(f"{path}: this run had no images, and nerfstudio needs them; try --to rrd")
+    with staged(path.parent, ".part-nerfstudio") as folder:
+        _write_nerfstudio(poses, origin, video, path, folder)
+
+
+def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, folder: Path) -> None:
+    """Write what becomes `path`, its points and images into a new folder.
+
+    Args:
+        origin: (3,) in the world of poses.txt, of the one that is written.
+    """
     world_from_cam = np.tile(np.eye(4), (len(poses.frame), 1, 1))
     world_from_cam[:, :3] = invert_rigid(poses.cam_from_world)
-    files = _image_files(video, poses, folder)
+    files = _image_files(video, poses, path.parent, folder)
     frames = [
         {"file_path": files[frame], "transform_matrix": (pose @ GL_FROM_CV).tolist()}
         for frame, pose in zip(poses.frame.tolist(), world_from_cam, strict=True)
         if frame in files and np.isfinite(pose).all()
     ]
     data = _nerf_camera(poses.camera, path) | {"frames": frames}
+    if origin.any():  # nerfstudio has float32
+        data["applied_transform"] = np.column_stack([np.eye(3), -origin]).tolist()
     if len(poses.points):
         write_point_ply(folder / "sparse_pc.ply", poses.points, poses.colors)
         data["ply_file_path"] = "sparse_pc.ply"
-    with atomic(path) as part:
-        part.write_text(json.dumps(data, indent=1) + "\n")
+    (folder / path.name).write_text(json.dumps(data, indent=1) + "\n")
 
 
 def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
@@ -349,13 +373,17 @@ def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
     return {"camera_model": model, **{k: float(v) for k, v in facts.items()}, **size, **known}
 
 
-def _image_files(video: Video, poses: Poses, folder: Path) -> dict[int, str]:
-    """Name the image file of each frame, as seen from a folder; frames of a video are written."""
+def _image_files(video: Video, poses: Poses, place: Path, folder: Path) -> dict[int, str]:
+    """Name the image file of each frame, as seen from `place`; those of a video are written.
+
+    Args:
+        folder: a new one, whose files are moved to `place`.
+    """
     source, names = Path(str(video.source)), video.names
     if names:
         where = source if source.is_dir() else source.parent
         return {
-            frame: Path(os.path.relpath(where / names[frame], folder)).as_posix()
+            frame: Path(os.path.relpath(where / names[frame], place)).as_posix()
             for frame in poses.frame.tolist()
         }
     files, wanted = {}, set(poses.frame[poses.known].tolist())
@@ -365,8 +393,8 @@ def _image_files(video: Video, poses: Poses, folder: Path) -> dict[int, str]:
                 name = f"images/frame_{frame.index:06d}.jpg"
                 image = cv2.resize(frame.image, video.size) if video.scale != 1 else frame.image
                 data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-                with atomic(folder / name) as part:
-                    part.write_bytes(data.tobytes())
+                (folder / name).parent.mkdir(exist_ok=True)
+                (folder / name).write_bytes(data.tobytes())
                 files[frame.index] = name
                 progress.step()
     return files
@@ -395,7 +423,8 @@ class Viewer:
             raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
         self.rr, self.video, self.followed = rr, video, False
         self.shrink = min(1.0, RRD_SIZE_PX / max(video.width, video.height, 1))
-        self.rec = rr.RecordingStream("reobj_track", recording_id=Path(video.path).name)
+        name = visible_name(Path(video.path).name)
+        self.rec = rr.RecordingStream("reobj_track", recording_id=name)
         self.rec.set_log_time_enabled(False)  # when the export was made is of no interest
         if start is None:
             self.rec.spawn()
@@ -411,6 +440,8 @@ class Viewer:
     ) -> Iterator[tuple[Frame, Tracks]]:  # fmt: skip
         """Show each frame of a running `track` as it comes, and hand it on."""
         self.followed = True
+        if poses is not None:
+            poses = shifted(poses, far_origin(poses))
         pose_of = _pose_by_frame(poses)
         if poses is not None:
             cloud = self.rr.Points3D(poses.points, colors=poses.colors)
@@ -431,8 +462,9 @@ class Viewer:
         Args:
             path: for warnings. images: read the video again and log its images.
         """
-        rr, rec, largest = self.rr, self.rec, _largest_part(result, path)
+        rr, rec, (largest, origin) = self.rr, self.rec, centred(_largest_part(result, path))
         scale, turn = _upright(largest, path, [0.0, 0, 1])
+        _say_origin(origin, path)
         names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
         ellipsoids = largest.ellipsoids()
@@ -505,10 +537,16 @@ def _pose_by_frame(poses: Poses | None) -> dict[int, Array]:
 
 def export_rrd(result: Result, path: Path) -> None:
     """Write a recording for the rerun viewer with rerun-sdk: what `Viewer` shows, with images."""
-    with atomic(path) as part:
-        viewer = Viewer(result.video, lambda rec: rec.save(part))
+    with atomic(path) as part, tempfile.TemporaryDirectory() as folder:
+        try:
+            place = os.fsencode(part).decode()
+        except UnicodeDecodeError:  # rerun takes no other names
+            place = f"{folder}/scene.rrd"
+        viewer = Viewer(result.video, lambda rec: rec.save(place))
         viewer.show(result, path, images=True)
         viewer.close()
+        if not part.exists():
+            shutil.move(place, part)
 
 
 EXPORTS: dict[str, tuple[str, Callable[[Result, Path], None]]] = {  # name: file in OUT, writer

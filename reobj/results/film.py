@@ -37,6 +37,8 @@ H264 = {
     "crf": "23",
     "x264-params": "bframes=0:threads=1:rc-lookahead=0:mbtree=0",
 }
+LEAST_FPS = 1.0  # slower frames are repeated: VP8's are at most 4 s long in WebM, as it is written
+LEAST_PX = 16  # of a side: a block of the codecs, OpenCV's VP8 fails below
 KEYFRAME_S = 2  # between frames that a player can jump to (chosen)
 WEBM_HEAD = 1 << 16  # bytes that hold all before the first frame (FFmpeg: under 1000)
 MAX_DENOMINATOR = 1001  # of frame rates: 30000/1001
@@ -59,7 +61,7 @@ class FilmWriter:
     Attributes:
         path: of the file, with the suffix of its format. part: of what is written of it.
         size: (w, h) of the frames, even: codecs want that. count: frames so far.
-        every: one frame of so many is in the film.
+        every: one frame of so many is in the film. repeat: it is so many pictures there.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
@@ -68,13 +70,22 @@ class FilmWriter:
         self.path = path.with_suffix(".webm" if av is None else ".mp4")
         self.part = self.path.with_name(f".part-{self.path.name}")
         shrink = min(1.0, (VP8_SIZE_PX if av is None else H264_SIZE_PX) / max(size))
-        self.every = 1 if av else math.ceil(fps / VP8_FPS - 1e-3)  # 30.0001 fps is 30
-        self.size = (int(size[0] * shrink) // 2 * 2, int(size[1] * shrink) // 2 * 2)
+        self.every = 1 if av else max(math.ceil(fps / VP8_FPS - 1e-3), 1)  # 30.0001 fps is 30
+        self.repeat = math.ceil(LEAST_FPS / fps)
+        width, height = (max(int(side * shrink) // 2 * 2, LEAST_PX) for side in size)
+        self.size = (width, height)
         self.count = 0
-        with self._named():
+        try:
+            os.fsencode(self.path).decode()
+        except UnicodeDecodeError:  # OpenCV 5.0 ends the process
+            where = ascii(str(self.path))
+            raise OSError(f"{where}: a film needs a folder whose name is UTF-8") from None
+        with self._named(), contextlib.ExitStack() as stack:
+            stack.callback(self.part.unlink, missing_ok=True)
             self.part.touch()  # PyAV finds out at the first frame only
-            made = (self.part, fps / self.every, self.size)
+            made = (self.part, fps / self.every * self.repeat, self.size)
             self.sink = _VP8(*made) if av is None else _H264(av, *made)
+            stack.pop_all()
         self.encoder = ThreadPoolExecutor(1)  # encodes a frame while the next one is drawn
         self.pending: Future[None] | None = None
 
@@ -82,8 +93,12 @@ class FilmWriter:
         """Append one frame of (w, h) `size`, BGR, which must not change afterwards."""
         if self.count % self.every == 0:
             self._wait()
-            self.pending = self.encoder.submit(self.sink.write, image)
+            self.pending = self.encoder.submit(self._encode, image)
         self.count += 1
+
+    def _encode(self, image: Image) -> None:
+        for _ in range(self.repeat):
+            self.sink.write(image)
 
     def _wait(self) -> None:
         """Wait for the frame that is being encoded."""
@@ -101,7 +116,7 @@ class FilmWriter:
                 finally:
                     self.encoder.shutdown()
                     self.sink.close()
-            if complete and self._frames_on_disk() != -(-self.count // self.every):
+            if complete and self._frames_on_disk() != self.repeat * -(-self.count // self.every):
                 raise OSError(f"{self.path}: not all frames could be written; is the disk full?")
             if complete:
                 self.part.replace(self.path)

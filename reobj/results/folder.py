@@ -3,40 +3,72 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from reobj.cameras import Poses, write_tum
-from reobj.files import atomic, part_path, part_paths, staged
+from reobj.files import atomic, check_places, part_path, part_paths, staged
 from reobj.types import Tracks
 
 LAST_POSES = "cache/last-poses.npz"  # in an output folder
-STALE = (  # files of an earlier run, which another run may not write; cameras.csv: before 0.2
-    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm",
-    "scene.html",
+MODEL = "sparse"  # folder of a COLMAP model
+STALE = (  # of an earlier run, which another run may not write; cameras.csv: before 0.2
+    "poses.txt", "cameras.csv", "objects.ply", "overlay.mp4", "overlay.webm", "scene.html",
+    LAST_POSES,
 )  # fmt: skip
+CONFIG_FILE = "config.toml"  # options of the last run
+FILES = (*STALE, "tracks.txt", "objects.json", "edits.json", CONFIG_FILE, f"{MODEL}/cameras.txt")
+
+
+def check_results(out: Path) -> None:
+    """Refuse an output folder in which results cannot be written, before they are computed."""
+    check_places(out, FILES)
 
 
 @contextlib.contextmanager
-def replaced(out: Path) -> Iterator[Path]:
+def replaced(out: Path, stale: Sequence[str] = STALE) -> Iterator[Path]:
     """Yield an empty folder whose files become those of the result in `out`, instead of all old.
 
     An exception in the block leaves the old ones as they were.
+
+    Args:
+        stale: names of what is removed from `out` where the block does not write it.
     """
     with staged(out) as new:
         yield new
-        if not (new / LAST_POSES).exists():
-            (out / LAST_POSES).unlink(missing_ok=True)
-        remove_stale(out)
+        made = {path.relative_to(new) for path in new.rglob("*")}
+    remove_stale(out, stale, made)
 
 
-def remove_stale(out: Path) -> None:
-    """Remove what an earlier run wrote and another one may not: of further parts too."""
-    for path in (out / name for name in STALE):
-        for file in (path, *part_paths(path)):
-            file.unlink(missing_ok=True)
+def remove_stale(
+    out: Path, stale: Sequence[str] = STALE, made: Iterable[Path] = frozenset()
+) -> None:
+    """Remove what an earlier run wrote and another one may not: of further parts too.
+
+    Args:
+        made: what stays, relative to `out`; of a folder in it only the files in it.
+    """
+    kept = {out / path for path in made}
+    for name in stale:
+        for found in (out / name, *part_paths(out / name)):
+            found.with_name(f".part-{found.name}").unlink(missing_ok=True)  # of a killed run
+            if name == MODEL and found.is_dir() and not found.is_symlink():
+                for old in set(found.iterdir()) - kept:
+                    shutil.rmtree(old) if old.is_dir() else old.unlink()
+                if found not in kept:
+                    found.rmdir()
+            elif found not in kept:
+                found.unlink(missing_ok=True)
+
+
+def copy_models(models: Sequence[Path], folder: Path) -> None:
+    """Copy COLMAP models, one of each part, to sparse/, sparse_part1/, ...; missing ones not."""
+    for k, model in enumerate(models):
+        if model.is_dir():
+            shutil.copytree(model, part_path(folder / MODEL, k))
 
 
 def write_trajectories(out: Path, poses: Poses) -> None:

@@ -19,9 +19,12 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Camera
+from reobj.files import cut
 from reobj.results.film import FilmWriter
+from reobj.results.origin import centred
 from reobj.results.result import Result
-from reobj.sources.video import IMAGE_FPS, Video
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
 
 LAYERS = ("boxes", "solids", "ellipses", "trails")
@@ -50,6 +53,7 @@ def film_layers(text: str) -> frozenset[str]:
 # ---- Boxes and labels --------------------------------------------------------------------------
 
 FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45  # readable at 640 px width (chosen)
+LABEL_MAX = 24  # characters of a class name in the film (chosen: 200 px)
 DASH_PX = 6  # of boxes that fill a gap
 
 
@@ -345,10 +349,8 @@ def draw_wireframes(
     line = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
     pixels = scale * image_points(camera, line) - 0.5  # OpenCV draws with the pixel's centre at 0
     solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are in a row
-    own = {
-        k: slice(a, b)
-        for k, a, b in zip(solids.tolist(), first, [*first[1:], len(edge)], strict=True)
-    }
+    ends_at = np.append(first, len(edge))[1:]  # as many as solids, also of none
+    own = {k: slice(a, b) for k, a, b in zip(solids.tolist(), first, ends_at, strict=True)}
     for k in sorted(own, key=lambda k: -ends[own[k], :, 2].mean()):  # near ones last
         mine, obj = own[k], object_id[k]
         if not drawn[k] or not _fits(pixels[mine], image):
@@ -385,12 +387,12 @@ class Overlay:
 
     def __init__(self, result: Result, path: Path, video: Video, layers: str = "solids") -> None:
         """Open the film; its suffix is that of the format that can be written here."""
-        self.fps = max(1.0, (video.fps or IMAGE_FPS) / video.config.every)
+        self.fps = (video.fps or IMAGE_FPS) / video.config.every
         self.writer = FilmWriter(path, self.fps, video.size)
         self.path, self.size, self.layers = self.writer.path, self.writer.size, film_layers(layers)
         self.scale, self.tracks = self.size[0] / video.size[0], result.tracks
         self.sure = {o.id for o in result.located if o.status == "ok"}
-        self.labels = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
+        self.labels = {o.id: f"{o.id} {cut(o.class_name, LABEL_MAX)}" for o in result.objects}
         self.outlines = _project_all(result, self.scale, self.layers)
         self.places: dict[int, int] = {}
         self.cameras = _cameras(result) if "solids" in self.layers else {}
@@ -442,8 +444,11 @@ class Overlay:
 
 
 def _located_by_part(result: Result) -> list[tuple[Result, list[int]]]:
-    """List the parts with cameras and solids, and the identities of these."""
-    parts = [(part, [o.id for o in part.located]) for part in result.parts()]
+    """List the parts with cameras and solids, and the identities of these.
+
+    A world far from its origin is moved: dual quadrics hold squares of coordinates.
+    """
+    parts = [(centred(part)[0], [o.id for o in part.located]) for part in result.parts()]
     return [(p, ids) for p, ids in parts if p.poses is not None and ids and p.poses.known.any()]
 
 

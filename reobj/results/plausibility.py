@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reobj.results.result import Object, Result
-from reobj.types import IntArray, Tracks
+from reobj.types import BoolArray, IntArray, Tracks, box_iou, rows_by
 
 OTHER_BOXES = "another detector (--detector, or other boxes with --detections)"
 # Fewer of a class are normal, even if little else is listed: six chairs at a table, seven plants in
@@ -24,17 +24,19 @@ MEASURABLE_MIN = 3  # objects; chosen: one or two that nobody walked around say 
 BOXES_MIN = 50  # chosen: of fewer strong boxes a few more or less make the majority
 
 
-def implausible(result: Result, high_score: float, moving: Sequence[str]) -> list[str]:
+def implausible(
+    result: Result, high_score: float, moving: Sequence[str], new_score: float = 0.0
+) -> list[str]:
     """Say what looks wrong in a finished result, one line each.
 
     Args:
         high_score: boxes of less are weak, and often of nothing. moving: classes that get no
-            solid; they come in crowds.
+            solid; they come in crowds. new_score: no track starts at boxes of less.
     """
     still = [o for o in result.objects if o.status != "doubtful" and o.class_name not in moving]
     found = [_few_cameras(result), _nothing_measured(result, still)]
     if not result.identities_given:  # else the user said which boxes are which objects
-        found += [_one_class(result, still), _unexplained(result, high_score)]
+        found += [_one_class(result, still), _unexplained(result, high_score, new_score)]
     return [text for text in found if text]
 
 
@@ -79,8 +81,11 @@ def _one_class(result: Result, still: Sequence[Object]) -> str:
     )
 
 
-def _unexplained(result: Result, high_score: float) -> str:
-    """Warn where most strong boxes are of no listed object."""
+def _unexplained(result: Result, high_score: float, new_score: float) -> str:
+    """Warn where most strong boxes are of no listed object, with the cause that most of them have.
+
+    Another detector is advised only where boxes come and go, or where objects are doubtful.
+    """
     doubtful = [o.id for o in result.objects if o.status == "doubtful"]
     tracks, weak = result.tracks, result.tracks.score < high_score
     listed = tracks[~weak & ~np.isin(tracks.track_id, doubtful)]
@@ -88,11 +93,51 @@ def _unexplained(result: Result, high_score: float) -> str:
     count, total = len(_distinct(listed)), len(_distinct(strong))
     if total < BOXES_MIN or 2 * count >= total:
         return ""
-    shown = "look at the doubtful objects (--set output.doubtful=true), or " if doubtful else ""
+    text = f"{total - count} of {total} boxes of score {high_score:g} or more"
+    text += " belong to no listed object"
+    rest = result.untracked[result.untracked.score >= high_score]
+    if 2 * len(rest) > total - count:  # else they are of doubtful objects
+        if 2 * (rest.score < new_score).sum() > len(rest):
+            return (f"{text}: most of them are below the score at which a track starts "
+                    f"(tracker.new_score={new_score:g})")  # fmt: skip
+        doubled, alone = _doubled(rest, strong), _alone(rest, strong)
+        if 2 * doubled.sum() > len(rest):
+            return (f"{text}: most of them lie on another box of their class in the same frame "
+                    "(boxes without non-maximum suppression)")  # fmt: skip
+        if 2 * alone.sum() <= len(rest):
+            return text
+        text += ": most of them have no other near them in the frames before and after"
+        return f"{text}: boxes of other frames, photos far apart, or try {OTHER_BOXES}"
     return (
-        f"{total - count} of {total} boxes of score {high_score:g} or more belong to no listed "
-        f"object: {shown}try {OTHER_BOXES}"
+        f"{text}: look at the doubtful objects (--set output.doubtful=true), or try {OTHER_BOXES}"
     )
+
+
+DOUBLED_IOU, SAME_IOU = 0.6, 0.3  # of two boxes on one object: in a frame (NMS: .5 to .7), and in
+# successive ones (as tracks are matched, reobj_track.LOW_IOU)
+
+
+def _doubled(rows: Tracks, others: Tracks) -> BoolArray:
+    """Mark rows on which a better box of their class lies in the same frame."""
+    found = np.zeros(len(rows), bool)
+    for own in rows_by(rows.frame):
+        there = others[others.frame == rows.frame[own[0]]]
+        same = box_iou(rows.xyxy[own], there.xyxy) > DOUBLED_IOU
+        same &= rows.class_id[own][:, None] == there.class_id
+        found[own] = (same & (there.score > rows.score[own][:, None])).any(1)
+    return found
+
+
+def _alone(rows: Tracks, others: Tracks) -> BoolArray:
+    """Mark rows without a box of their class near them in the frames with boxes beside theirs."""
+    frames, found = np.unique(others.frame), np.ones(len(rows), bool)
+    for own in rows_by(rows.frame):
+        at = np.searchsorted(frames, rows.frame[own[0]])
+        beside = frames[[k for k in (at - 1, at + 1) if 0 <= k < len(frames)]]
+        there = others[np.isin(others.frame, beside)]
+        near = box_iou(rows.xyxy[own], there.xyxy) > SAME_IOU
+        found[own] = ~(near & (rows.class_id[own][:, None] == there.class_id)).any(1)
+    return found
 
 
 def _distinct(rows: Tracks) -> IntArray:

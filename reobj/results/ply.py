@@ -1,4 +1,7 @@
-"""Ellipsoids and solids as coloured triangle meshes, and points: PLY files."""
+"""Ellipsoids and solids as coloured triangle meshes, and points: PLY files.
+
+Coordinates are doubles: those of a map projection have a step of .5 m in float32.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ def write_ply(
     for k, (identity, shape) in enumerate(zip(object_id, shapes, strict=True)):
         unit, triangles = meshes.get(shape, meshes[None])  # (P, 3), (T, 3)
         points = (ellipsoids.half_axes[k] * unit) @ ellipsoids.world_from_obj[k].T
-        vertex = np.zeros(len(unit), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+        vertex = np.zeros(len(unit), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
         vertex["xyz"] = points + ellipsoids.center_in_world[k]
         vertex["rgb"] = object_color(identity)[::-1]
         face = np.zeros(len(triangles), [("n", "u1"), ("i", "<i4", 3)])
@@ -44,7 +47,7 @@ def write_ply(
         vertices.append(vertex.tobytes())
         faces.append(face.tobytes())
         start += len(unit)
-    names = [f"property float {n}\n" for n in "xyz"]
+    names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
     what, count = "ellipsoids" if support is None else "solids", sum(map(len, faces)) // FACE_BYTES
     header = (
@@ -58,9 +61,9 @@ def write_ply(
 
 def write_point_ply(path: Path, points: Array, colors: npt.NDArray[np.uint8]) -> None:
     """Write points (N, 3) with RGB colours (N, 3) as PLY, binary little endian."""
-    vertex = np.zeros(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertex = np.zeros(len(points), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
     vertex["xyz"], vertex["rgb"] = points, colors
-    names = [f"property float {n}\n" for n in "xyz"]
+    names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
     header = f"element vertex {len(points)}\n{''.join(names)}end_header\n"
     with atomic(path) as part:

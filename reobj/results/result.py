@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ from reobj import __version__
 from reobj.cameras import Poses, load_poses, save_poses
 from reobj.files import (
     atomic,
+    cut,
     load_json,
     load_npz,
     numbers,
@@ -36,11 +38,11 @@ from reobj.files import (
     wrapped,
 )
 from reobj.poses.floor import Floor
-from reobj.results.edits import Edits, write_edits
-from reobj.results.folder import LAST_POSES, replaced, write_mot, write_trajectories
+from reobj.results.edits import EDITS, Edits, write_edits
+from reobj.results.folder import LAST_POSES, STALE, replaced, write_mot, write_trajectories
 from reobj.results.ply import write_ply
 from reobj.schema import faults, objects_schema
-from reobj.sources.detection_files import read_mot_rows
+from reobj.sources.tables import read_mot_rows
 from reobj.sources.video import Video
 from reobj.types import (
     Array,
@@ -66,6 +68,7 @@ CONVENTIONS = {
     "ellipsoid": "inscribed in a box or cylinder",
     "cov": "9x9: center, log half axes, rotation vector in object axes",
 }
+CLASS_MAX = 40  # characters of a class name in the table (chosen: a line of 120)
 EVIDENCE_DIGITS = 4  # of overlaps and log odds in the links; chosen: a box is measured to 1 in 100
 _JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
 
@@ -271,6 +274,7 @@ class Result:
             here (no cameras, or read from a folder).
         embeddings: (n, E1) and (n, E2), fused: foreground and background of the rows
             `embedding_row` (n,) of the tracks that the tracker embedded.
+        looked: (F,) frames that the detector was run on, ascending; None: all that were read.
         identities_given: the user gave the identities; nothing may join, split or renumber them.
         seconds: wall time by stage. warnings: what the user should know. edits: made by hand.
         out: the folder that it was saved to or loaded from.
@@ -286,6 +290,7 @@ class Result:
     embeddings: Embeddings = field(default_factory=Embeddings.empty)
     embedding_row: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     untracked: Tracks = field(default_factory=Tracks.empty)
+    looked: IntArray | None = None
     identities_given: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -345,18 +350,28 @@ class Result:
         return quadrics.Ellipsoids(center, half_axes, axes)
 
     def save(
-        self, out: str | Path, doubtful: bool = False, more: Callable[[Path], None] | None = None
+        self,
+        out: str | Path,
+        doubtful: bool = False,
+        more: Callable[[Path], None] | None = None,
+        stale: Sequence[str] = (),
     ) -> None:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
 
         Doubtful objects are in objects.json, in tracks.txt only if `doubtful`. Of several parts
         each has its own poses and objects: poses_part1.txt, objects_part1.ply, ... All of them
-        appear together, when all are complete, instead of those of an earlier run, pictures too;
-        so does what `more` writes into the folder that it is given.
+        appear together, when all are complete, instead of those of an earlier run, whose film and
+        page are removed.
+
+        Args:
+            more: writes more files into the folder that it is given; they appear with the others.
+            stale: names that are removed where `more` does not write them.
         """
-        with replaced(Path(out)) as new:
+        edited = () if self.edits is None else (EDITS,)
+        with replaced(Path(out), (*STALE, *edited, *stale)) as new:
             write_mot(new / "tracks.txt", (self if doubtful else self.without_doubtful()).tracks)
-            self._write_objects(new / "objects.json")
+            self.write_objects(new / "objects.json")
+            write_edits(new, self.edits)
             if self.poses is not None:
                 save_poses(new / LAST_POSES, self.poses)
                 write_trajectories(new, self.poses)
@@ -367,7 +382,6 @@ class Result:
             if more is not None:
                 more(new)
         self.out = Path(out)
-        write_edits(self.out, self.edits)
 
     @staticmethod
     def load(out: str | Path) -> Result:
@@ -428,13 +442,14 @@ class Result:
 
     def save_tracked(self, path: Path) -> None:
         """Write tracks and embeddings, before anything is linked or fitted, as npz."""
+        looked = {} if self.looked is None else {"looked": self.looked}
         columns = {f.name: getattr(self.tracks, f.name) for f in dataclasses.fields(Tracks)}
         columns |= {f"untracked_{n}": getattr(self.untracked, n) for n in columns}
         columns |= {name: getattr(self.embeddings, name) for name in ("foreground", "background")}
         facts = {"class_names": self.class_names, "warnings": self.warnings,
                  "identities_given": self.identities_given,
                  "video": dataclasses.asdict(self.video), "version": __version__}  # fmt: skip
-        save_npz(path, columns | {"embedding_row": self.embedding_row}, **facts)
+        save_npz(path, columns | looked | {"embedding_row": self.embedding_row}, **facts)
 
     @staticmethod
     def load_tracked(path: Path) -> Result:
@@ -450,6 +465,7 @@ class Result:
                 untracked=Tracks(
                     *(data[f"untracked_{f.name}"] for f in dataclasses.fields(Tracks))
                 ),
+                looked=data.get("looked"),
                 identities_given=bool(facts["identities_given"]),
                 warnings=list(facts["warnings"]),
             )
@@ -469,8 +485,9 @@ class Result:
             sigma = "-" if o.size_rel_sigma is None else f"{100 * o.size_rel_sigma.max():.0f} %"
             sizes = f"{text:<26} {sigma:>6}  "
             part = f", part {o.part}" if len(self.world.parts) > 1 else ""
+            name = cut(o.class_name, CLASS_MAX)
             lines.append(
-                f"{o.id:>6}  {o.class_name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
+                f"{o.id:>6}  {name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
                 f"{sizes * sized}{o.status}{part}"
             )
         reasons: dict[str, list[int]] = {}  # each once, with the objects that it holds for
@@ -499,12 +516,10 @@ class Result:
             return []
         if len(world.parts) < 2:
             scale = [f"scale: {_scale_text(world.scale)}"] if world.scale else []
-            known, count = world.registered_frames, world.frames
-            return [f"cameras: {known} of {count} frames ({self.poses.source})", *scale]
-        known = sum(part.registered_frames for part in world.parts)
+            return [self.poses.cameras_text, *scale]
         lines = [
-            f"cameras: {known} of {world.frames} frames ({self.poses.source}) in "
-            f"{len(world.parts)} parts, each in a frame and scale of its own"
+            f"{self.poses.cameras_text} in {len(world.parts)} parts, each in a frame and scale of "
+            "its own"
         ]
         for k, part in enumerate(world.parts):
             count = sum(o.part == k for o in self.objects)
@@ -514,7 +529,8 @@ class Result:
             lines += wrapped(f"part {k}: " + "; ".join(facts))
         return lines
 
-    def _write_objects(self, path: Path) -> None:
+    def write_objects(self, path: Path) -> None:
+        """Write objects.json."""
         versions = {}
         for name in ("numpy", "scipy", "opencv-python-headless", "pycolmap", "onnxruntime"):
             with contextlib.suppress(PackageNotFoundError):  # installed under another name
@@ -541,9 +557,12 @@ def _scale_text(scale: quadrics.Scale) -> str:
     return f"{scale.value} m per unit, sigma {sigma} (from {scale.source})"
 
 
-def significant(values: Array) -> Array:
-    """Round an array to six significant digits, as its text in objects.json has them."""
-    return np.array(numbers(values), np.float64).reshape(np.shape(values))
+def significant(values: Array, size: float = math.inf) -> Array:
+    """Round an array to six significant digits, as its text in objects.json has them.
+
+    size: of what lies at these coordinates, as in `numbers`.
+    """
+    return np.array(numbers(values, size), np.float64).reshape(np.shape(values))
 
 
 def _plain(value: Any) -> Any:

@@ -8,9 +8,13 @@ The page's sources are in page/, beside this file: page.html names the others, t
 from __future__ import annotations
 
 import base64
+import contextlib
+import dataclasses
 import json
 import math
+import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +26,23 @@ import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
 from reobj.files import Progress, atomic, base64_text, rounded
 from reobj.poses.floor import NOISE
+from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
 from reobj.results.result import Object, Result, World, sides, significant
-from reobj.sources.video import IMAGE_FPS, Video, shrunk
-from reobj.types import Frame, Image, IntArray, Tracks, object_color, rows_by
+from reobj.sources.image_files import IMAGE_FPS
+from reobj.sources.video import Video, shrunk
+from reobj.types import (
+    Array,
+    Frame,
+    Image,
+    IntArray,
+    ReobjError,
+    Tracks,
+    log,
+    object_color,
+    one_line,
+    rows_by,
+)
 
 # Chosen so that the page of a video of three minutes with 50 objects stays below 10 MB.
 SCENE_CROPS = 8  # pictures of each object in scene.html
@@ -121,6 +138,8 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
         poses: of the object's part.
     """
     rows = np.flatnonzero(tracks.track_id == found.id)
+    if not len(rows):
+        return rows
     frame, box = tracks.frame[rows], tracks.xyxy[rows]
     quality = tracks.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
     place = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
@@ -128,7 +147,7 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
         at, known = place_of(poses, frame)
         eye = invert_rigid(poses.cam_from_world[at])[:, :, 3]  # (N, 3)
         ray = np.where(known[:, None], eye - found.center, np.nan)
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), np.finfo(float).tiny)
         place = np.hstack([place, np.nan_to_num(ray)])  # (N, 4)
         quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # no pose: last
     chosen = [int(quality.argmax())]
@@ -166,7 +185,8 @@ def write_scene(
 ) -> None:
     """Write scene.html: solids, cameras, points and pictures in one page that needs no network.
 
-    Its data are objects.json's entries, and base64 of little-endian float32 / uint8 arrays.
+    Its data are objects.json's entries, and base64 of little-endian float32 / uint8 arrays. A world
+    far from its origin is moved: `origin` of its part says where that is now.
 
     Args:
         doubtful: show the doubtful objects at first; a switch of the page shows and hides them.
@@ -176,6 +196,7 @@ def write_scene(
     seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
     of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
     thin = math.ceil(0 if poses is None else len(poses.points) / SCENE_POINTS) or 1
+    parts, origins = zip(*(centred(part) for part in result.parts()), strict=True)
     data = {
         "title": Path(str(video.source)).name,
         "warnings": result.warnings,
@@ -183,15 +204,21 @@ def write_scene(
             link | {key: rounded(link[key], 2) for key in ("place_iou", "appearance_log_odds")}
             for link in result.world.to_json()["links"]
         ],
-        "objects": [_scene_object(o, result.tracks, steps, pictures) for o in result.objects],
+        "objects": [
+            _scene_object(o, origins[o.part], result.tracks, steps, pictures)
+            for o in result.objects
+        ],
         "thumbs": [[frame, data, _boxes_in(result, frame)] for frame, data in pictures.frames],
         "doubtful": doubtful,
         "size": {"width": result.video.width, "height": result.video.height},
         "edits": [] if result.edits is None else result.edits.entries,
         "why_flat": _why_flat(result),
         "steps": {"frame": steps.tolist(), "seconds": seconds, "part": of_part.tolist()},
-        **_scene_cameras(result, steps),
-        "parts": [_scene_part(k, part, thin) for k, part in enumerate(result.parts())],
+        **_scene_cameras(result, steps, np.array(origins)),
+        "parts": [
+            _scene_part(k, part, thin) | {"origin": origin.tolist()}
+            for k, (part, origin) in enumerate(zip(parts, origins, strict=True))
+        ],
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = page_text().split("@DATA@")
@@ -213,13 +240,19 @@ def _boxes_in(result: Result, frame: int) -> list[list[float]]:
 SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .4 MB of the page)
 
 
-def _scene_cameras(result: Result, steps: IntArray) -> dict[str, Any]:
-    """Collect the intrinsics and the cameras of the steps, each in the world of its part."""
+def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str, Any]:
+    """Collect the intrinsics and the cameras of the steps, each in the world of its part.
+
+    Args:
+        origins: (P, 3) of the parts.
+    """
     poses = result.poses
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": ""}
     size, K = {"width": poses.camera.width, "height": poses.camera.height}, poses.camera.K
-    shown = invert_rigid(poses.cam_from_world[np.isin(poses.frame, steps)])
+    rows = np.isin(poses.frame, steps)
+    shown = invert_rigid(poses.cam_from_world[rows])
+    shown[:, :, 3] -= origins[poses.part[rows]]
     inside = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     return {"camera": size | inside, "poses": base64_text(shown, "<f4")}
 
@@ -252,7 +285,7 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
 
 
 def _scene_object(
-    found: Object, tracks: Tracks, steps: IntArray, pictures: Pictures
+    found: Object, origin: Array, tracks: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
     """Describe an object for the page.
 
@@ -271,6 +304,7 @@ def _scene_object(
         box = detected.xyxy[best].round(1).tolist()
         visits.append([*detected.frame[rows[[0, -1]]].tolist(), int(detected.frame[best]), *box])
     return found.to_json() | {
+        "center": None if found.center is None else (found.center - origin).tolist(),
         "cov": "" if found.cov is None else base64_text(found.cov, "<f4"),
         "color": object_color(found.id)[::-1],
         "sides": sides(found),
@@ -309,32 +343,82 @@ def write_pictures(
     overlay: str = "solids",
     scene: bool = True,
     doubtful: bool = False,
-) -> None:
+) -> list[str]:
     """Write the film and scene.html in one pass over the video.
+
+    Each file appears only when it is complete. A live source cannot be read again, and frames may
+    have no images: no overlay then, and a page without pictures.
 
     Args:
         overlay: what the film shows (`film_layers`); "none": no film.
         doubtful: show doubtful objects in the film, and at first on the page, which holds them.
-
-    Each file appears only when it is complete. A live source cannot be read again, and frames may
-    have no images: no overlay then, and a page without pictures.
+    Returns:
+        what could not be made, why, and the option that leaves it out. With the environment
+        variable REOBJ_RAISE, as in our tests, faults of the program are raised instead.
     """
     visible = video.has_images and not video.is_live
-    drawn = film_layers(overlay) and visible
     shown = result if doubtful else result.without_doubtful()
-    film = Overlay(shown, out / "overlay.mp4", video, overlay) if drawn else None
-    pictures = Pictures(result, video) if scene else None
-    sinks = [sink for sink in (film, pictures) if sink is not None and visible]
+    faults = _Faults()
+    film = pictures = None
+    if film_layers(overlay) and visible:
+        with faults.of("overlay"):
+            film = Overlay(shown, out / "overlay.mp4", video, overlay)
+    if scene:
+        with faults.of("scene"):
+            pictures = Pictures(result, video)
+    sinks = [(n, sink) for n, sink in (("overlay", film), ("scene", pictures)) if sink and visible]
     progress, complete = Progress("write", video.expected), False
     try:
-        for frame in video if sinks else ():
-            for sink in sinks:
-                sink.take(frame)
-            progress.step()
-        complete = True
+        with faults.of("video"):
+            for frame in video if sinks else ():
+                for name, sink in sinks:
+                    if name not in faults.found:
+                        with faults.of(name):
+                            sink.take(frame)
+                progress.step()
+        complete = "video" not in faults.found
     finally:
         progress.close(complete)
         if film is not None:
-            film.close(complete)
-    if pictures is not None:
-        write_scene(result, pictures, out / "scene.html", video, doubtful)
+            with faults.of("overlay"):
+                film.close(complete and "overlay" not in faults.found)
+    if pictures is not None and "scene" not in faults.found:
+        with faults.of("scene"):
+            page = dataclasses.replace(result, warnings=[*result.warnings, *faults.messages()])
+            write_scene(page, pictures, out / "scene.html", video, doubtful)
+    return faults.messages()
+
+
+class _Faults:
+    """What went wrong with the pictures of a result, each once.
+
+    Attributes:
+        found: the first error of each: "video", and the options of the section `output`.
+    """
+
+    def __init__(self) -> None:
+        self.found: dict[str, Exception] = {}
+
+    @contextlib.contextmanager
+    def of(self, name: str) -> Iterator[None]:
+        """Keep an exception of the block."""
+        try:
+            yield
+        except Exception as error:
+            if not isinstance(error, ReobjError | OSError) and os.environ.get("REOBJ_RAISE"):
+                raise
+            log.debug("pictures: fault in %s", name, exc_info=True)
+            self.found.setdefault(name, error)
+
+    def messages(self) -> list[str]:
+        """Name what is missing, the reason, and the option to leave it out."""
+        texts = {
+            "video": "no film, and a page without the pictures from there on: reading the video "
+            "again failed with {} (--set output.overlay=none leaves the film out)",
+            "overlay": "no film: {} (--set output.overlay=none leaves it out)",
+            "scene": "no scene.html: {} (--set output.scene=false leaves it out)",
+        }
+        return [
+            one_line(texts[name].format(f"{type(error).__name__}: {error}"))
+            for name, error in self.found.items()
+        ]

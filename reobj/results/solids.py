@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
 from reobj.files import load_json, read_lines
+from reobj.poses.pose_formats import matrix_rows
 from reobj.results.result import Object, Result
 from reobj.types import Array, IntArray, ReobjError, log
 
@@ -105,19 +106,23 @@ SAME_TIME_S = 0.02  # of a frame and its true pose; chosen: half a frame at 25 H
 def _true_cameras(path: Path, poses: Poses) -> Array:
     """Read world_from_cam (F, 3, 4) of the poses' frames, NaN where unknown.
 
-    TUM rows belong to the frame of their time; of 4x4 world_from_cam, row n belongs to frame n.
+    TUM rows belong to the frame of their time; of rows of 12 or 16 numbers, row n to frame n.
     """
     try:
         table = np.loadtxt(read_lines(path), ndmin=2)
     except ValueError as error:
-        raise ReobjError(f"{path}: {error}; expected TUM rows or 16 numbers a line") from error
-    if table.shape[1] == 16:
+        raise ReobjError(
+            f"{path}: {error}; expected TUM rows, or 12 or 16 numbers a line"
+        ) from error
+    if table.shape[1] in (12, 16):
         frame = poses.frame.clip(0, len(table) - 1)
-        rows = table[frame].reshape(-1, 4, 4)[:, :3]
+        rows = matrix_rows(path)[0][frame, :3]
         return np.where((frame == poses.frame)[:, None, None], rows, np.nan)
     if table.shape[1] != 8:
         found = f"{table.shape[1]} columns"
-        raise ReobjError(f"{path}: {found}; expected TUM rows of 8 numbers, or 16 numbers a line")
+        raise ReobjError(
+            f"{path}: {found}; expected TUM rows of 8 numbers, or 12 or 16 numbers a line"
+        )
     table = table[np.argsort(table[:, 0], kind="stable")]
     after = np.searchsorted(table[:, 0], poses.time_s).clip(max=len(table) - 1)  # (F,)
     pair = np.stack([(after - 1).clip(0), after])  # (2, F) the rows before and after

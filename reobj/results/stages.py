@@ -103,12 +103,14 @@ def collect_tracks(
     found: list[Tracks] = []
     embedded: list[tuple[IntArray, Floats]] = []
     detected: list[Detections] = []
+    looked: list[bool] = []
     try:
         with Progress("track", video.expected) as progress:
             for frame, _ in steps:
                 frames.append(frame.index)
                 found.append(tracker.latest)
                 embedded.append(tracker.latest_embeddings())
+                looked.append(tracker.looked)
                 detected.append(dataclasses.replace(tracker.detections, masks=None))  # memory
                 progress.step()
     except KeyboardInterrupt:  # the way to end a live source
@@ -122,8 +124,10 @@ def collect_tracks(
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
     tracks = Tracks.concatenate(frames, found, video.scale)
-    result = Result(tracks, source.class_names, VideoInfo.of(video))
+    result = Result(tracks, tuple(source.class_names), VideoInfo.of(video))
     result.untracked = _untracked(tracks, frames, detected, video.scale)
+    if not all(looked):
+        result.looked = np.array(frames, np.int64)[np.array(looked, bool)]
     result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
     result.warnings += [*source.messages, *video.messages]
     if video.is_live:
@@ -132,7 +136,22 @@ def collect_tracks(
             "a live source cannot be read twice: identities only; record it for 3D",
         ]
     if not len(result.tracks):
-        result.warnings.append(
-            "no object was tracked: no detections, or all below tracker.new_score"
-        )
+        score = result.untracked.score
+        result.warnings.append(f"no object was tracked: {_why_none(score, sum(looked), tracker)}")
     return result
+
+
+def _why_none(score: Array, looked: int, tracker: Any) -> str:
+    """Say why nothing was tracked.
+
+    Args:
+        score: of all detections. looked: frames that the detector was run on.
+    """
+    least = tracker.config.new_score
+    if not looked:
+        return "the detector was run on no frame (it gave None each time)"
+    if not len(score):
+        return f"no detections in the {looked} frames that the detector was run on"
+    if score.max() < least:
+        return f"all {len(score)} detections are below tracker.new_score={least:g}"
+    return f"none of the {len(score)} detections was followed by enough others (tracker.n_init)"

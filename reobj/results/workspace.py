@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,13 +21,12 @@ from reobj.files import (
     atomic,
     load_cached,
     load_json,
+    load_npz,
     locked,
-    part_path,
-    part_paths,
     writing,
 )
 from reobj.results.edits import EDITS
-from reobj.results.folder import LAST_POSES, remove_stale
+from reobj.results.folder import LAST_POSES, check_results, remove_stale
 from reobj.results.result import Result, load_last_poses, written_by
 from reobj.schema import faults
 from reobj.sources.imageless import ImagelessVideo
@@ -37,7 +35,6 @@ from reobj.types import COORDINATE_MAX, ReobjError
 
 LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
 SOURCE = "cache/source.json"
-CONFIG_FILE = "config.toml"  # options of the last run, in an output folder
 LOCK = "cache/lock"
 
 
@@ -98,6 +95,7 @@ class Workspace:
             self.cache.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> Workspace:
+        check_results(self.out)
         try:
             self._held.enter_context(locked(self.out / LOCK))
         except LockedError:
@@ -169,6 +167,26 @@ class Workspace:
         more = {k: frames[k] for k in ("times_s", "names", "count") if k in frames}
         return ImagelessVideo(source, frames["size"], config, **more)
 
+    def video_or_facts(self, result: Result) -> Video:
+        """Open the video; where it was moved or deleted since, its frames without images.
+
+        Args:
+            result: of the folder, with its poses; takes the warning.
+        """
+        try:
+            return self.video()
+        except ReobjError as error:
+            if not (self.out / SOURCE).is_file():
+                raise
+            source, config = self.source
+            info, poses = result.video, result.poses
+            last = result.tracks.frame if poses is None else poses.frame
+            count = int(last.max(initial=-1)) + 1
+            video = ImagelessVideo(source, (info.width, info.height), config, count=count)
+            video.fps = info.fps
+            result.warnings.append(f"no film, and a page without pictures: {error}")
+            return video
+
     def _binding(self) -> dict[str, Any]:
         """Read what `bind` wrote."""
         path = self.out / SOURCE
@@ -186,10 +204,15 @@ class Workspace:
         text = json.dumps([__version__, key], sort_keys=True, default=dataclasses.asdict)
         return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
-    def save_last(self, tracked: Result, poses: Poses | None) -> None:
+    def save_last(
+        self, tracked: Result, poses: Poses | None, models: Sequence[Path] | None = None
+    ) -> None:
         """Keep the latest tracks and poses for `objects OUT`, `eval` and `export`.
 
         Given identities take the place of earlier corrections, which are removed.
+
+        Args:
+            models: folders of COLMAP models in the cache, one of each part, for `last_models`.
         """
         tracked.save_tracked(self.out / LAST_TRACKS)
         if tracked.identities_given and (self.out / EDITS).exists():
@@ -198,7 +221,14 @@ class Workspace:
         if poses is None:
             (self.out / LAST_POSES).unlink(missing_ok=True)
         else:
-            save_poses(self.out / LAST_POSES, poses)
+            names = None if models is None else [path.name for path in models]
+            save_poses(self.out / LAST_POSES, poses, models=names)
+
+    def last_models(self) -> list[Path] | None:
+        """Return the COLMAP models that belong in the folder; None if they are there already."""
+        path = self.out / LAST_POSES
+        names = load_npz(path)[1].get("models") if path.is_file() else None
+        return None if names is None else [self.cache / Path(name).name for name in names]
 
     @property
     def last_tracks(self) -> Result | None:
@@ -213,20 +243,3 @@ class Workspace:
             raise ReobjError(f"{self.out}: no tracks here; make them first with `run` or `track`")
         tracked.poses = load_last_poses(self.out)
         return tracked
-
-    def publish_model(self, models: Sequence[Path] | None) -> None:
-        """Make OUT/sparse, OUT/sparse_part1, ... copies of COLMAP models, one of each part.
-
-        Those of an earlier run are removed; a folder that does not exist is left out.
-        """
-        path, copy = self.out / "sparse", self.out / ".part-sparse"
-        for left in (copy, *part_paths(copy)):  # of a run that was killed here
-            shutil.rmtree(left, ignore_errors=True)
-        for k, model in enumerate(models or ()):
-            if model.is_dir():
-                shutil.copytree(model, part_path(copy, k))
-        for old in (path, *part_paths(path)):
-            shutil.rmtree(old, ignore_errors=True)
-        for k in range(len(models or ())):
-            if part_path(copy, k).is_dir():
-                part_path(copy, k).replace(part_path(path, k))

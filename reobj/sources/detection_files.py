@@ -1,42 +1,39 @@
-"""Recorded detections and tracks of other tools: read MOT, CSV, COCO, CVAT, and our own npz.
+"""Recorded detections and tracks of other tools, in one table of readers, checked in one place.
 
-Start at `read_detections`, `read_tracks` and `read_mot_rows`. Every reader makes a
-`RecordedDetections`, which is then checked in one place: what cannot be meant is an error that
-names the line, single rows that are of no use are dropped and counted in its messages.
+Start at `read_detections` and `read_tracks`. Every reader makes a `RecordedDetections`, which is
+then checked here: what cannot be meant is an error that names the line, single rows that are of no
+use are dropped and counted in its messages.
 """
 
 from __future__ import annotations
 
-import contextlib
-import csv
 import dataclasses
 import math
-import re
 import sys
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from reobj.files import (
-    check_unpacked,
-    did_you_mean,
-    load_json,
-    load_npz,
-    read_lines,
-    shortened,
+from reobj.files import did_you_mean, load_json, shortened
+from reobj.sources import coco, tables
+from reobj.sources.class_names import check_length, load_class_names
+from reobj.sources.cvat import read_cvat
+from reobj.sources.label_folders import label_files, read_label_folder
+from reobj.sources.looked import frames_looked_at, looked_message
+from reobj.sources.recorded import (
+    NORMALISED_MAX,
+    RecordedDetections,
+    npz_image_size,
+    read_npz,
 )
-from reobj.sources.masks import NO_RUNS, Counts, coco_runs, polygon_runs
-from reobj.sources.recorded import RecordedDetections, read_npz
+from reobj.sources.tables import read_cells, read_table, recorded_table, seconds, table_of_records
 from reobj.sources.video import Video
 from reobj.types import (
-    CLASS_MAX,
-    COCO_NAMES,
+    CLASS_NAME_MAX,
     COORDINATE_MAX,
+    DETECTIONS_MAX,
     Array,
     BoolArray,
     IntArray,
@@ -44,7 +41,6 @@ from reobj.types import (
     Tracks,
     box_iou,
     option,
-    printable,
     rows_by,
 )
 
@@ -66,16 +62,15 @@ class DetectConfig:
     )
     min_score: float = option(0.1, "drop detections with a lower score (ByteTrack: .1)")
     classes: str = option("", "comma-separated class names to keep (default: all)", "--classes")
-    class_names: str = option("", "text file, one class name a line, where they are not COCO's")
-    max_detections: int = option(100, "most detections that are kept in a frame, best scores first")
-
-
-def load_class_names(path: str | Path) -> tuple[str, ...]:
-    """Read class names, one a line in the order of their ids; empty lines do not count."""
-    names = tuple(filter(None, (line.strip() for line in read_lines(Path(path)))))
-    if len(names) > CLASS_MAX:
-        raise ReobjError(f"{path}: {len(names)} class names, at most {CLASS_MAX} are taken")
-    return names
+    class_names: str = option(
+        "", "class names where they are not COCO's: a text file, one a line, or a data.yaml"
+    )
+    first_frame: str = option(
+        "", "number that a file of detections gives the first frame, 0 or 1 (default: found out)"
+    )
+    max_detections: int = option(
+        0, "most detections that are kept in a frame, best first (0: 100 of a model, all of a file)"
+    )
 
 
 def unnamed_class(class_id: int, count: int) -> str:
@@ -90,7 +85,7 @@ def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
     Raises:
         ReobjError: a name that is not among `names`.
     """
-    known = {name.lower(): i for i, name in enumerate(names)}
+    known = {name.lower().replace("_", " "): i for i, name in enumerate(names)}
     chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
     unknown = [name for name in chosen if name not in known]
     if unknown:
@@ -102,330 +97,99 @@ def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
 def read_detections(
     path: str | Path, video: Video, config: DetectConfig | None = None
 ) -> RecordedDetections:
-    """Read recorded detections of a video: MOT txt, CSV with a header, COCO JSON or our npz.
+    """Read recorded detections of a video, in any format of READERS.
 
     Args:
-        path: the file; boxes in px of the source, frame numbers of the source (MOT: from 1).
-        config: min_score, classes, class_names and max_detections apply.
+        path: the file, or a folder of YOLO labels; boxes in px of the source, frame numbers of the
+            source.
+        config: min_score, classes, class_names, first_frame and max_detections apply.
     Raises:
         ReobjError: names the file, the line and what was expected there.
     """
     path, config = Path(path), config or DetectConfig()
-    if not path.is_file():
-        raise ReobjError(f"{path}: no such file of detections")
-    names = load_class_names(config.class_names) if config.class_names else ()
-    try:
-        if path.suffix.lower() == ".npz":
-            found, _ = read_npz(path, video.size, video.working_size)
-        else:
-            read = _read_coco if path.suffix.lower() == ".json" else _read_table
-            found = read(path, names, video)
-    except ReobjError:
-        raise
-    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ReobjError(f"{path}: an entry is not as expected: {error!r}") from error
+    found = _read(path, video, config)
+    _note_looked(found, video.frame_count)
     _check(found, path, config, video.frame_count)
     return found
 
 
-def read_mot_rows(path: Path) -> Array:
-    """Read a MOTChallenge file as numbers.
-
-    Returns:
-        (N, 6 to 10) frame (from 1), id, left, top, w, h[, score[, class or x[, y[, z]]]]; of an
-        empty file (0, 10).
-    Raises:
-        ReobjError: names the line that has another number of columns or is no number.
-    """
-    columns, cells, lines, is_mot = _table_cells(path)
-    if not is_mot:
-        raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
-    texts = [[row[i] for row in cells] for i in range(len(columns))]
-    rows = np.stack([_column(column, lines, path) for column in texts], 1)  # (N, 6 to 10)
-    for at in (0, 1):
-        _check_whole(rows[:, at], texts[at], lines, path, columns[at])
-    if (far := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
-        box, line = rows[far][0, 2:6], lines[far][0]
-        raise ReobjError(f"{path}, line {line}: box {box}, expected at most {COORDINATE_MAX:g} px")
-    return rows
-
-
-MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "", "")
-NUMBERS = ("frame", "time", "id", "x1", "y1", "x2", "y2", "w", "h", "score")
-ROLES = (*NUMBERS, "class")  # of columns; those before hold numbers
-
-
-WHOLE_MAX = 2.0**53  # of frame and identity; beyond, a float skips whole numbers
-
-
-def _read_table(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
-    """Read MOT rows (frame from 1, id, left, top, w, h[, score[, class]]), or CSV with a header."""
-    columns, cells, lines, is_mot = _table_cells(path)
-    texts = {role: [row[i] for row in cells] for i, role in enumerate(columns)}
-    column = {role: _column(texts[role], lines, path) for role in NUMBERS if role in texts}
-    if is_mot and (column["id"] % 1 != 0).any():
-        raise ReobjError(f"{path}: the second column is no identity. If this is no MOT file: CSV "
-                         "needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
-    for role in ("frame", "id"):
-        if role in column:
-            _check_whole(column[role], texts[role], lines, path, role)
-    if "x2" not in column:
-        column["x2"], column["y2"] = column["x1"] + column["w"], column["y1"] + column["h"]
-    xyxy = np.stack([column[role] for role in ("x1", "y1", "x2", "y2")], 1)  # (N, 4)
-    count = len(lines)
+def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
+    """Read a file of any format as it is, unchecked."""
+    if not path.exists():
+        raise ReobjError(f"{path}: no such file of detections")
+    if config.first_frame not in ("", "0", "1"):
+        raise ReobjError(f"detect.first_frame {config.first_frame}: expected 0 or 1")
+    names = load_class_names(config.class_names) if config.class_names else ()
     try:
-        class_id, names, new = _table_classes(texts.get("class", [""] * count), is_mot, names)
-    except (OverflowError, ReobjError) as error:
-        raise ReobjError(f"{path}: {error}") from error
-    messages = (
-        [f"{len(new)} class names not in the list: {printable(shortened(new))}"] if new else []
-    )
-    if "frame" not in column:
-        column["frame"] = _frames_at(column["time"], video, path)
-    frame = column["frame"].astype(np.int64) - is_mot
-    if frame.min(initial=0) == -1 and is_mot:
-        frame += 1
-        messages.append("MOT frames start at 1, this file has a frame 0: taken as 0-based")
-    return RecordedDetections(
-        frame, xyxy, column.get("score", np.ones(count)), class_id, [NO_RUNS] * count, tuple(names),
-        video.size, video.working_size, lines, "line", messages,
-        column["id"].astype(np.int64) if "id" in column else np.empty(0, np.int64),
-    )  # fmt: skip
+        return READERS[_kind(path)](path, names, video, config.first_frame)
+    except ReobjError:
+        raise
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise ReobjError(f"{path}: an entry is not as expected: {error!r}") from error
 
 
-def _table_cells(path: Path) -> tuple[tuple[str, ...], list[list[str]], IntArray, bool]:
-    """Split a table into cells.
-
-    Returns:
-        What each column holds (a name of ROLES), the N rows of cells, the lines they stand on (N,),
-        and whether it is MOT (no header). Other columns of a header are left out.
-    """
-    reader = csv.reader(read_lines(path), strict=True)
-    columns: tuple[str, ...] = ()
-    expected, is_mot = "6 to 10 (frame, id, left, top, w, h, score)", False
-    kept, lines = list[list[str]](), list[int]()
-    used: list[int] = []  # numbers of the columns that mean something here
-    try:
-        for cells in filter(None, reader):
-            if not columns:
-                is_mot = cells[0].strip()[:1] in "+-.0123456789"
-                columns = MOT_COLUMNS[: len(cells)] if is_mot else _csv_columns(cells, path)
-                used = [i for i, role in enumerate(columns) if is_mot or role in ROLES]
-                if not is_mot or len(cells) in range(6, 11):
-                    expected = str(len(columns))
-                if not is_mot:
-                    continue
-            if str(len(cells)) != expected:
-                where = f"{path}, line {reader.line_num}"
-                raise ReobjError(f"{where}: {len(cells)} columns, expected {expected}")
-            kept.append([cells[i].strip() for i in used])
-            lines.append(reader.line_num)
-    except csv.Error as error:
-        raise ReobjError(f"{path}, line {reader.line_num}: no table ({error})") from error
-    is_mot, columns = is_mot or not columns, columns or MOT_COLUMNS
-    roles = tuple(columns[i] for i in used) if used else columns
-    return roles, kept, np.array(lines, np.int64), is_mot
+def _note_looked(found: RecordedDetections, frame_count: int) -> None:
+    """Note which frames the detector was run on: those that the file lists, else inferred."""
+    listed = found.looked is not None
+    if found.looked is None:
+        found.looked = frames_looked_at(found.frame, frame_count)
+    elif not 0 < len(found.looked) < (frame_count or sys.maxsize):
+        found.looked = None
+    if found.looked is not None:
+        found.messages.append(looked_message(found.looked, listed))
 
 
-def _frames_at(time_s: Array, video: Video, path: Path) -> Array:
-    """Find the frames at times (N,) in s, -1 where none is within half a frame interval."""
-    if video.times_s is None:
-        raise ReobjError(f"{path}, line 1: no column frame; time stamps are of use only where the "
-                         "names of the images are time stamps too")  # fmt: skip
-    half = 0.5 * float(np.median(np.diff(video.times_s))) if len(video.times_s) > 1 else 0.0
-    after = np.searchsorted(video.times_s, time_s).clip(max=len(video.times_s) - 1)  # (N,)
-    pair = np.stack([(after - 1).clip(0), after], 1)  # (N, 2)
-    offset = np.abs(video.times_s[pair] - time_s[:, None])
-    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
-    return np.where(offset.min(1) <= half, nearest, -1).astype(np.float64)
+Reader = Callable[[Path, Sequence[str], Video, str], RecordedDetections]
+READERS: dict[str, Reader] = {
+    "npz": lambda path, _, video, __: read_npz(path, video.size, video.working_size)[0],
+    "json": lambda path, names, video, first: _read_json(path, names, video, first),
+    "cvat": lambda path, _, video, first: read_cvat(path, video, first),
+    "folder": read_label_folder,
+    "table": read_table,
+}
+SUFFIXES = {".npz": "npz", ".json": "json", ".xml": "cvat", ".zip": "cvat"}  # others: table
+
+
+def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
+    """Read a table of records, or one of COCO's kinds."""
+    data = load_json(path)
+    table = table_of_records(path, data)
+    if table is not None:
+        return recorded_table(table, names, video, first)
+    return coco.read_coco(path, data, names, video, first)
+
+
+def _kind(path: Path) -> str:
+    """Return the reader that a file is for."""
+    return "folder" if path.is_dir() else SUFFIXES.get(path.suffix.lower(), "table")
 
 
 def recorded_times(path: Path) -> Array | None:
-    """Return the distinct times, ascending, of a CSV with a column of them and none of frames."""
-    if path.suffix.lower() in (".npz", ".json", ".xml", ".zip"):
+    """Return the distinct times in s, ascending, of a table with times and without frames."""
+    if _kind(path) != "table":
         return None
-    columns, cells, lines, _ = _table_cells(path)
-    if "frame" in columns or "time" not in columns:
+    table = read_cells(path)
+    if "time" not in table.cells or "frame" in table.cells or "image" in table.cells:
         return None
-    at = columns.index("time")
-    return np.unique(_column([row[at] for row in cells], lines, path))
+    return np.unique(seconds(table))
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
     """Return the (w, h) of the images that a file of detections was made for, if it says so."""
-    data: Any = {}
-    if path.suffix.lower() == ".npz":
-        data = load_npz(path)[0].get("image_size", ())
-    elif path.suffix.lower() == ".json":
-        images = (_dataset(path, load_json(path)) or {}).get("images") or [{}]
-        first = images[0]
-        data = [first[key] for key in ("width", "height") if key in first]
-    return (int(data[0]), int(data[1])) if len(data) == 2 else None
+    kind = _kind(path)
+    if kind == "npz":
+        return npz_image_size(path)
+    return coco.image_size_of(coco.dataset_of(path, load_json(path))) if kind == "json" else None
 
 
 def image_names(path: Path) -> list[str]:
-    """List the images of a COCO dataset, in the file or beside it; [] of any other file."""
-    if path.suffix.lower() != ".json":
-        return []
-    images = (_dataset(path, load_json(path)) or {}).get("images", ())
-    return [Path(image["file_name"]).name for image in images if "file_name" in image]
-
-
-CSV_ALIASES = {"x": "x1", "y": "y1", "width": "w", "height": "h", "confidence": "score",
-               "conf": "score", "class_id": "class", "class_name": "class",
-               "coco80_class": "class", "timestamp": "time", "time_s": "time"}  # fmt: skip
-
-
-def _csv_columns(cells: Sequence[str], path: Path) -> tuple[str, ...]:
-    """Name the columns by a header, without its remarks in () and after ;."""
-    header = re.sub(r"\(.*?\)", "", ",".join(cells)).split(";")[0].lower()
-    plain = [name.strip() for name in header.lstrip("# ").split(",")]
-    columns = tuple(CSV_ALIASES.get(name, name) for name in plain)
-    ends = ("w", "h") if "w" in columns else ("x2", "y2")
-    when = "time" if "time" in columns else "frame"
-    missing = [role for role in (when, "x1", "y1", *ends) if role not in columns]
-    if missing:
-        raise ReobjError(f"{path}, line 1: no column {', '.join(missing)} in the header {header}: "
-                         "expected one such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
-    return columns
-
-
-def _column(cells: Sequence[str], lines: IntArray, path: Path) -> Array:
-    """Convert a column to finite numbers (N,); an error names the line."""
-    with contextlib.suppress(ValueError):
-        values = np.array(cells, np.float64)
-        if np.isfinite(values).all():
-            return values
-    values = np.full(len(cells), np.nan)
-    for i, cell in enumerate(cells):
-        with contextlib.suppress(ValueError):
-            values[i] = float(cell)
-        if not math.isfinite(values[i]):
-            raise ReobjError(f"{path}, line {lines[i]}: {cell!r} is no finite number")
-    return values
-
-
-def _check_whole(
-    values: Array, cells: Sequence[str], lines: IntArray, path: Path, role: str
-) -> None:
-    """Refuse a column of numbers (N,) that are not whole, or beyond WHOLE_MAX."""
-    bad = (np.abs(values) > WHOLE_MAX) | (values % 1 != 0)
-    if bad.any():
-        row = int(bad.argmax())
-        where = f"{path}, line {lines[row]}: {role}"
-        raise ReobjError(f"{where} {cells[row]}, expected a whole number")
-
-
-def _table_classes(
-    cells: Sequence[str], is_mot: bool, names: Sequence[str]
-) -> tuple[IntArray, Sequence[str], list[str]]:
-    """Read the column of classes: ids or names; in MOT ids from 1, and -1 for "no class".
-
-    Returns:
-        Class ids (N,) from 0, class names, and those of them that were not among `names`.
-    """
-    ids = np.array([int(cell) if cell.isdigit() else -1 for cell in cells], np.int64)
-    if not any(cells) or (is_mot and ids.min() < 1):
-        return np.zeros_like(ids), ("object",), []
-    if is_mot and ids.max() > CLASS_MAX:
-        raise ReobjError(f"class number {ids.max()}, expected at most {CLASS_MAX}")
-    if is_mot:
-        return ids - 1, [*names, *(f"class {i + 1}" for i in range(len(names), ids.max()))], []
-    names = names or COCO_NAMES
-    if ids.min() >= 0:
-        return ids, names, []
-    new = sorted(set(cells) - set(names))
-    index = {name: i for i, name in enumerate([*names, *new])}
-    return np.array([index[cell] for cell in cells], np.int64), list(index), new
-
-
-def _read_coco(path: Path, names: Sequence[str], video: Video) -> RecordedDetections:
-    """Read COCO results, or a COCO or COCO-VID dataset that holds its annotations itself."""
-    entries = data = load_json(path)
-    if isinstance(data, dict) and "images" in data:
-        entries = data.get("annotations")
-    if not isinstance(entries, list):
-        raise ReobjError(f"{path}: expected COCO results: [{{image_id, category_id, bbox, score}}]")
-    frame_of, name_of, messages = _coco_dataset(path, names, video, data)
-    for at, entry in enumerate(entries):
-        found = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
-        if None in found.values() or len(entry["bbox"]) != 4:
-            raise ReobjError(f"{path}, entry {at}: {found}, expected two ids and a bbox of 4")
-        if entry["category_id"] not in name_of:
-            raise ReobjError(f"{path}, entry {at}: category_id {entry['category_id']} is unknown: "
-                             "put the dataset JSON beside this file, or give a file of names (ids "
-                             "from 0) with --set detect.class_names=FILE")  # fmt: skip
-        if frame_of and entry["image_id"] not in frame_of:
-            raise ReobjError(f"{path}, entry {at}: image_id {entry['image_id']} is not in the "
-                             "dataset JSON beside this file")  # fmt: skip
-    box = np.array([entry["bbox"] for entry in entries], np.float64).reshape(-1, 4)  # x, y, w, h
-    classes = list(dict.fromkeys(name_of.values()))
-    image_ids = [entry["image_id"] for entry in entries]
-    return RecordedDetections(
-        np.array([frame_of.get(i, i) for i in image_ids], np.int64),
-        np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]),
-        np.array([entry.get("score", 1.0) for entry in entries], np.float64),
-        np.array([classes.index(name_of[entry["category_id"]]) for entry in entries], np.int64),
-        [_coco_mask(entry.get("segmentation"), video.size, f"{path}, entry {at}")
-         for at, entry in enumerate(entries)],
-        tuple(classes), video.size, video.working_size, np.arange(len(entries)), "entry", messages,
-        np.array([entry.get("track_id", entry.get("instance_id", -1)) for entry in entries]),
-    )  # fmt: skip
-
-
-COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's ids 1 to 90, without a class
-
-
-def _coco_dataset(
-    path: Path, names: Sequence[str], video: Video, own: Any
-) -> tuple[dict[int, int], dict[int, str], list[str]]:
-    """Look up what image and category ids mean, in the file itself or in a dataset beside it.
-
-    A dataset is a JSON file with `images`. They belong to frames by `file_name`; where the video
-    has no file names by `frame_id` (COCO-VID), else by their order.
-
-    Args:
-        own: content of the file.
-    Returns:
-        Frame by image id (empty: the id is the frame), class name by category id, and messages.
-    """
-    data = _dataset(path, own)
-    ids = list(range(len(names))) or [i for i in range(1, 91) if i not in COCO_GAPS]
-    name_of = dict(zip(ids, names or COCO_NAMES, strict=True))
-    if data is None:
-        return {}, name_of, ["no dataset JSON beside it: image_id is taken as the 0-based frame"]
-    if data.get("categories") and not names:
-        name_of = {c["id"]: c["name"] for c in data["categories"]}
-        if not all(isinstance(name, str) for name in name_of.values()):
-            raise ReobjError(f"{path}: a category without a name, expected {{id, name}}")
-    row = {name: i for i, name in enumerate(video.names)}
-    frame_of = {
-        image["id"]: row.get(Path(image["file_name"]).name, -1) if row else image.get("frame_id", i)
-        for i, image in enumerate(data["images"])
-    }
-    return frame_of, name_of, []
-
-
-def _dataset(path: Path, own: Any) -> dict[str, Any] | None:
-    """Return the COCO dataset that a file holds (its content is `own`) or that lies beside it."""
-    data = own if isinstance(own, dict) else None
-    for other in sorted(path.parent.glob("*.json")) if data is None else ():
-        with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
-            found = load_json(other) if other != path else None
-            data = found if isinstance(found, dict) and found.get("images") else data
-    return data
-
-
-def _coco_mask(mask: Any, size: tuple[int, int], where: str) -> Counts:
-    """Read a COCO segmentation as run lengths: RLE (compressed or not), polygons or none."""
-    if not mask:
-        return NO_RUNS
-    if not isinstance(mask, dict):
-        return polygon_runs(mask, size)
-    counts = mask["counts"]
-    if tuple(mask["size"]) != size[::-1]:
-        raise ReobjError(f"{where}: mask of (h, w) {mask['size']} in a video of {size[::-1]}")
-    return coco_runs(counts) if isinstance(counts, str) else np.array(counts, np.uint32).ravel()
+    """List the images that a file of detections or a dataset beside it names; [] where none."""
+    kind = _kind(path)
+    if kind == "json":
+        return coco.image_names_of(path, load_json(path))
+    if kind == "folder":
+        return [str(file.relative_to(path)) for file in label_files(path)]
+    return tables.image_names_of(read_cells(path)) if kind == "table" else []
 
 
 def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_count: int) -> None:
@@ -433,47 +197,90 @@ def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_co
 
     Errors for what cannot be meant, messages for single rows.
     """
-    with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
-        finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
-    finite &= (np.abs(found.xyxy) <= COORDINATE_MAX).all(1)
-    named = np.isin(found.class_id, np.arange(len(found.class_names)))
-    pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,)
-    masked = np.array([len(runs) > 0 for runs in found.runs], bool)
-    fits = ~masked | (pixels == math.prod(found.size))
-    for row in np.flatnonzero(~(finite & named & fits))[:1]:
-        text = f"mask of {pixels[row]} pixels in a video of {found.size}"
-        if not finite[row]:
-            text = f"{found.xyxy[row]}, {found.score[row]}: NaN, infinite or beyond 1e7 pixels"
-        elif not named[row]:
-            text = unnamed_class(int(found.class_id[row]), len(found.class_names))
-        raise ReobjError(f"{path}, {found.unit} {found.line[row]}: {text}")
+    _check_rows(found, path)
     keep = _usable(found, path, frame_count)
-    if len(found) and (found.score == -1).all():
-        found.messages.append("scores are all -1: taken as 1")
-        found.score = -found.score
-    if ((found.score < 0) | (found.score > 1)).any():
-        found.messages.append(f"scores from {found.score.min():g} to {found.score.max():g} clipped "
-                              "to [0, 1]")  # fmt: skip
-        found.score = np.clip(found.score, 0, 1)
+    _check_scores(found)
+    if (low := keep & (found.score < config.min_score)).any():
+        text = f"{low.sum()} of {len(found)} boxes have a score below {config.min_score:g}"
+        found.messages.append(f"{text} (detect.min_score): left out")
     keep &= found.score >= config.min_score
     if config.classes:
         keep &= np.isin(found.class_id, class_filter(config.classes, found.class_names))
     if not len(found):
         found.messages.append("no detections in this file")
+    elif not keep.any():
+        found.messages.append(
+            f"none of {len(found)} boxes is left: those of score {config.min_score:g} or more "
+            f"(detect.min_score){f' and class {config.classes}' * bool(config.classes)} are used"
+        )
     rows = np.flatnonzero(keep)
     rows = rows[np.lexsort((rows, -found.score[rows], found.frame[rows]))]  # best first
-    frame = found.frame[rows]
-    rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
-    rows = rows[rank < config.max_detections]
-    found.identity = found.identity[rows] if len(found.identity) else found.identity
-    for name in ("frame", "xyxy", "score", "class_id", "line"):
-        setattr(found, name, getattr(found, name)[rows])
-    found.runs = [found.runs[row] for row in rows]
+    found.select(_most(found, rows, path, config.max_detections))
     found.messages[:] = [f"{path.name}: {text}" for text in found.messages]
 
 
-NORMALISED_MAX = 1.5  # px; chosen: boxes wholly below are shares of the image, some a bit outside
+def _check_rows(found: RecordedDetections, path: Path) -> None:
+    """Refuse values and masks that cannot be meant; names the first row at fault."""
+    with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
+        finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
+    finite &= (np.abs(found.xyxy) <= COORDINATE_MAX).all(1)
+    named = np.isin(found.class_id, np.arange(len(found.class_names)))
+    lengths = np.array([*map(len, found.class_names), 0])
+    short = lengths[np.where(named, found.class_id, -1)] <= CLASS_NAME_MAX
+    pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,)
+    masked = np.array([len(runs) > 0 for runs in found.runs], bool)
+    fits = ~masked | (pixels == math.prod(found.size))
+    for row in np.flatnonzero(~(finite & named & short & fits))[:1]:
+        where = f"{path}, {found.unit} {found.line[row]}"
+        text = f"mask of {pixels[row]} pixels in a video of {found.size}"
+        if not finite[row]:
+            text = f"{found.xyxy[row]}, {found.score[row]}: NaN, infinite or beyond 1e7 pixels"
+        elif not named[row]:
+            text = unnamed_class(int(found.class_id[row]), len(found.class_names))
+        elif not short[row]:
+            check_length(found.class_names[found.class_id[row]], where)
+        raise ReobjError(f"{where}: {text}")
+    for name in found.class_names:
+        check_length(name, f"{path}, class names")
+
+
+PERCENT = 100.0
+PERCENT_MIN = 2.0  # a file whose best detection has 2 % holds no percents
+
+
+def _check_scores(found: RecordedDetections) -> None:
+    """Bring scores to [0, 1] and say how: no scores at all, percents, or clipped."""
+    low, high = found.score.min(initial=0), found.score.max(initial=0)
+    if len(found) and (found.score == -1).all():
+        found.messages.append("scores are all -1: taken as 1")
+        found.score = -found.score
+    elif PERCENT_MIN < high <= PERCENT and low >= 0:
+        found.messages.append(f"scores from {found.score.min():g} to {high:g} are taken as percent")
+        found.score = found.score / PERCENT
+    elif low < 0 or high > 1:
+        out = (found.score < 0) | (found.score > 1)
+        text = f"scores from {found.score.min():g} to {high:g} clipped to [0, 1]"
+        found.messages.append(f"{text}: {out.sum()} of {len(found)} boxes")
+        found.score = np.clip(found.score, 0, 1)
+
+
+def _most(found: RecordedDetections, rows: IntArray, path: Path, most: int) -> IntArray:
+    """Keep of the rows, sorted by frame and score, the best `most` (0: all) of each frame."""
+    frame = found.frame[rows]
+    rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
+    if most and (rank >= most).any():
+        text = f"{(rank >= most).sum()} boxes beyond the best {most} of a frame left out"
+        found.messages.append(f"{text} (detect.max_detections)")
+        return rows[rank < most]
+    if (worst := int(rank.max(initial=-1)) + 1) > DETECTIONS_MAX:
+        text = f"{worst} boxes in frame {frame[rank.argmax()]} (0-based)"
+        advice = "raise detect.min_score, or keep the best with --set detect.max_detections=N"
+        raise ReobjError(f"{path}: {text}, at most {DETECTIONS_MAX} are taken; {advice}")
+    return rows
+
+
 UNUSABLE_SHARE = 0.5  # chosen: where most boxes are of no use, it is the format that is wrong
+EDGE_PX = 1.0  # chosen: detectors round boxes at the border to whole pixels
 
 
 def _usable(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
@@ -485,6 +292,8 @@ def _usable(found: RecordedDetections, path: Path, frame_count: int) -> BoolArra
     if count and found.xyxy.max() <= NORMALISED_MAX:
         raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
                          "Multiply them by the image size")  # fmt: skip
+    if reading := _other_reading(found.xyxy, found.size):
+        raise ReobjError(f"{path}: {reading}")
     if (empty | outside).sum() > UNUSABLE_SHARE * count:
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
@@ -503,9 +312,36 @@ def _usable(found: RecordedDetections, path: Path, frame_count: int) -> BoolArra
     return np.logical_not(empty | outside | missing)
 
 
-XML_MAX = 1 << 27  # bytes; chosen: 800,000 boxes; the parser takes ten times as much
-CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
+def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
+    """Name what boxes (N, 4) fit that cannot be meant as they are, "" where they can.
+
+    A box with its second corner before the first, or with its centre outside the image, cannot.
+    Then the usual mistakes are tried; one counts if all boxes fit the image with it.
+    """
+    image = np.array(size, np.float64)
+    centre = (xyxy[:, :2] + xyxy[:, 2:]) / 2
+    inverted = (xyxy[:, 2:] < xyxy[:, :2]).any(1)
+    beyond = ((centre < 0) | (centre > image)).any(1)
+    if not (inverted | beyond).any():
+        return ""
+    why = f"{inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and {beyond.sum()} have "
+    why += f"their centre outside the image of {size}"
+    added = np.hstack([xyxy[:, :2], xyxy[:, :2] + xyxy[:, 2:]])
+    taken = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
+    for box, limit, what in (
+        (xyxy, image[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames "
+                            "that were not turned upright? Detect on upright frames"),
+        (added, image, "all fit it as x, y, w, h: name the columns so, or give corners"),
+        (taken, image, "all fit it if w and h are the corner x2, y2: name them so, or give sizes"),
+    ):  # fmt: skip
+        inside = (box >= -EDGE_PX).all(1) & (box[:, :2] <= box[:, 2:]).all(1)
+        if (inside & (box[:, 2:] <= limit + EDGE_PX).all(1)).all():
+            return f"{why}; {what}"
+    return ""
+
+
 SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
+SAME_OBJECT = 0.5  # overlap (IoU) from which two boxes show one object (PASCAL VOC)
 
 
 def read_tracks(
@@ -518,26 +354,20 @@ def read_tracks(
     """Read identities made elsewhere or corrected by hand.
 
     Args:
-        path: CVAT for video 1.1 (XML or its zip), COCO-VID JSON (track_id or instance_id), MOT rows
-            or CSV with ids, in native pixels; frames that the video's options leave out are not
-            used.
+        path: any file of `read_detections` that has identities: CVAT for video 1.1 (XML or its
+            zip), COCO (track_id or instance_id, also in CVAT's attributes), MOT, KITTI, CSV,
+            YOLO labels; frames that the video's options leave out are not used.
         known, known_names: earlier tracks of the video and their class names: they lend their
             scores to boxes that were not moved, and their classes to files that have none.
     Returns:
         tracks, their class names, and messages for the user.
     """
     path, config = Path(path), config or DetectConfig()
-    limit = dataclasses.replace(config, min_score=0.0, max_detections=sys.maxsize)
-    if path.suffix.lower() in (".xml", ".zip"):
-        found = _read_cvat(path, video)
-        _check(found, path, limit, video.frame_count)
-    else:
-        found = read_detections(path, video, limit)
-    kind = found.identity.dtype.kind
-    if len(found.identity) and (kind not in "iu" or found.identity.max() > WHOLE_MAX):
-        raise ReobjError(f"{path}: identities are {found.identity.dtype}, expected whole numbers")
-    if len(found) and (not len(found.identity) or found.identity.min() < 0):
-        raise ReobjError(f"{path}: not every box has an identity: no file of tracks")
+    limit = dataclasses.replace(config, min_score=0.0, max_detections=0)
+    found = _read(path, video, limit)
+    _check(found, path, limit, video.frame_count)
+    if len(found):
+        _check_identities(found, path)
     start, stop, every = video.config.start, video.config.stop, video.config.every
     use = (found.frame >= start) & ((found.frame - start) % every == 0)
     use &= found.frame < (stop or sys.maxsize)
@@ -555,46 +385,48 @@ def read_tracks(
         unnamed = names == ("object",)
         tracks = _lend(known, tracks, unnamed)
         names = tuple(known_names) if unnamed else names
+        if unnamed:
+            without = (tracks.class_id < 0).sum()
+            text = f"{path.name}: no classes: {len(tracks) - without} boxes have the class of the "
+            found.messages.append(f"{text}earlier object that they show, {without} are `object`")
     return tracks, names, found.messages
 
 
+def _check_identities(found: RecordedDetections, path: Path) -> None:
+    """Leave out boxes without an identity (-1), and count from 1; refuse a file without any."""
+    has = found.identity >= 0 if len(found.identity) else np.zeros(len(found), bool)
+    if not has.any():
+        raise ReobjError(f"{path}: not every box has an identity, none has: no file of tracks")
+    if not has.all():
+        text = f"{path.name}: {(~has).sum()} of {len(found)} boxes without an identity left out"
+        found.messages.append(text)
+        found.select(np.flatnonzero(has))
+    if found.identity.min() == 0:
+        found.messages.append(f"{path.name}: there is an identity 0: 1 is added to all of them")
+        found.identity = found.identity + 1
+
+
 def _lend(known: Tracks, tracks: Tracks, unnamed: bool) -> Tracks:
-    """Give unmoved boxes their earlier scores, and unnamed ones the class that overlaps most."""
+    """Give unmoved boxes their earlier scores, and unnamed objects their class.
+
+    The class is that of the earlier boxes that overlap an object's most, in sum over its frames,
+    -1 where none shows it.
+    """
     class_id, score = tracks.class_id.copy(), tracks.score.copy()
+    overlap, old_class = np.zeros(len(tracks)), np.full(len(tracks), -1, np.int64)
     for rows in rows_by(tracks.frame):
         there = known[known.frame == tracks.frame[rows[0]]]
-        iou = np.hstack([box_iou(tracks.xyxy[rows], there.xyxy), np.zeros((len(rows), 1))])
-        best, same = iou.argmax(1), iou.max(1) > SAME_BOX
+        if not len(there):
+            continue
+        iou = box_iou(tracks.xyxy[rows], there.xyxy)  # (n, m)
+        best, most = iou.argmax(1), iou.max(1)
+        same = most > SAME_BOX
         score[rows[same]] = there.score[best[same]]
-        if unnamed:
-            class_id[rows] = np.append(there.class_id, -1)[best]  # -1: "object"
+        overlap[rows] = np.where(most >= SAME_OBJECT, most, 0)
+        old_class[rows] = np.where(most >= SAME_OBJECT, there.class_id[best], -1)
+    if unnamed:
+        for rows in rows_by(tracks.track_id):
+            votes = rows[old_class[rows] >= 0]
+            shares = np.bincount(old_class[votes], overlap[votes])
+            class_id[rows] = int(shares.argmax()) if len(votes) else -1
     return dataclasses.replace(tracks, class_id=class_id, score=score)
-
-
-def _read_cvat(path: Path, video: Video) -> RecordedDetections:
-    """Read the boxes of "CVAT for video 1.1" that are not "outside"; identity is track id + 1."""
-    try:
-        check_unpacked(path.stat().st_size, XML_MAX)
-        text = path.read_bytes()
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as packed:
-                check_unpacked(packed.getinfo("annotations.xml").file_size, XML_MAX)
-                text = packed.read("annotations.xml")
-        tracks = [(t, b) for t in ET.fromstring(text).iter("track") for b in t.iter("box")]
-        tracks = [(t, b) for t, b in tracks if b.attrib.get("outside") != "1"]
-        xyxy = [[float(b.attrib[k]) for k in CVAT_BOX] for _, b in tracks]
-        frame = np.array([int(b.attrib["frame"]) for _, b in tracks], np.int64)
-        ids = np.array([int(t.attrib["id"]) + 1 for t, _ in tracks], np.int64)
-        labels = [t.attrib["label"] for t, _ in tracks]
-    except ReobjError as error:
-        raise ReobjError(f"{path}: {error}") from error
-    except Exception as error:  # zip and zlib have their own for damaged files, and so has expat
-        raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r:.200})") from None
-    if not tracks:
-        raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
-    names, class_id = np.unique(labels, return_inverse=True)
-    n = len(tracks)
-    return RecordedDetections(
-        frame, np.array(xyxy, np.float64), np.ones(n), class_id.astype(np.int64), [NO_RUNS] * n,
-        tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box", [], ids,
-    )  # fmt: skip

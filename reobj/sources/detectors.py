@@ -20,11 +20,10 @@ import cv2
 import numpy as np
 
 from reobj.files import save_npz
+from reobj.sources.class_names import Vocabulary, check_length, load_class_names
 from reobj.sources.detection_files import (
-    NORMALISED_MAX,
     DetectConfig,
     class_filter,
-    load_class_names,
     read_detections,
     unnamed_class,
 )
@@ -37,7 +36,7 @@ from reobj.sources.onnx_layouts import (
     Trial,
     fit_image,
 )
-from reobj.sources.recorded import RecordedDetections, pack_detections, read_npz
+from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections, pack_detections, read_npz
 from reobj.sources.tiles import detect_in_tiles, parse_tiles
 from reobj.sources.video import Video, source_fingerprint
 from reobj.sources.weights import known_weights, model_path, onnx_session
@@ -52,10 +51,12 @@ from reobj.types import (
     as_detections,
     as_frame,
     log,
+    text_labels,
     visible_name,
 )
 
 DYNAMIC_SIDE = 640  # px, longer side that models for any size are fed (YOLO11 was trained so)
+MODEL_DETECTIONS = 100  # in a frame (COCO's own limit, maxDets)
 NMS_IOU = 0.6  # boxes of a class that overlap by more are one, where NMS is left to us (NanoDet)
 SIZE_MULTIPLE = 32  # px; such models want multiples of their largest stride
 
@@ -86,6 +87,7 @@ class OnnxDetector:
     ) -> None:
         self.config = config or DetectConfig()
         name = path_or_name or self.config.model
+        self._most = self.config.max_detections or MODEL_DETECTIONS
         self._grid, weights = parse_tiles(self.config.tiles), known_weights(name)
         self.path = model_path(name, offline)
         self._session = onnx_session(self.path, threads, device)
@@ -116,7 +118,7 @@ class OnnxDetector:
         if self._grid == (1, 1):
             return self._detect(image)
         found = detect_in_tiles(self._detect, image, self._grid)
-        return found[: self.config.max_detections]
+        return found[: self._most]
 
     def _detect(self, image: Image) -> Detections:
         """Run the network once, on the whole of an image."""
@@ -161,7 +163,7 @@ class OnnxDetector:
         rows = rows[np.argsort(-score[rows], kind="stable")][:MAX_CANDIDATES]
         if self._layout.nms:
             rows = rows[nms(boxes[rows], label[rows], NMS_IOU)]
-        return rows[: self.config.max_detections]
+        return rows[: self._most]
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the (w, h) to feed for an image: the model's, or the image's at DYNAMIC_SIDE."""
@@ -236,6 +238,7 @@ class DetectionCache:
         self.folder, self.image_size = Path(folder), image_size
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._fresh: dict[int, Detections] = {}  # by frame, not on disk yet
+        self._skipped: set[int] = set()  # frames that were not looked at; of this run only
         chunks = sorted(p for p in self.folder.glob("chunk_*.npz") if p.stem[6:].isdecimal())
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
@@ -250,14 +253,21 @@ class DetectionCache:
         chunk, done = read_npz(path, self.image_size, self.image_size, sealed=True)
         self._stored |= dict.fromkeys(done.tolist(), chunk)
 
+    def __contains__(self, index: int) -> bool:
+        """Tell whether a frame was put here, also one that was not looked at."""
+        return index in self._fresh or index in self._stored or index in self._skipped
+
     def get(self, index: int) -> Detections | None:
-        """Return the detections of a frame, None if it was not detected yet."""
+        """Return the detections of a frame, None if it was not detected yet or not looked at."""
         if index in self._fresh:
             return self._fresh[index]
         return self._stored[index].at(index) if index in self._stored else None
 
-    def put(self, index: int, detections: Detections) -> None:
-        """Store the detections of a frame, also when there are none."""
+    def put(self, index: int, detections: Detections | None) -> None:
+        """Store the detections of a frame, also when there are none or (None) nobody looked."""
+        if detections is None:
+            self._skipped.add(index)
+            return
         self._fresh[index] = detections
         if len(self._fresh) >= CACHE_FRAMES:
             self.flush()
@@ -280,33 +290,42 @@ class DetectionSource:
     """Answer for the detections of a frame, wherever they come from: `source(frame)`.
 
     Attributes:
-        detect: Frame -> Detections in px of its image.
-        class_names: by class id.
+        detect: Frame -> Detections in px of its image; None: the frame is not looked at.
+        class_names: by class id; a `Vocabulary` grows with the labels of an open-vocabulary
+            detector.
         key: changes with everything that the detections depend on besides the video; "": unknown,
             then nothing that follows from them may be cached either.
         messages: for the user.
         slow: worth keeping on disk. cache: where they are kept.
         recorded: those of a file, all known beforehand.
+        always_looks: where it finds nothing, there is nothing; None alone is a frame not looked at.
     """
 
-    detect: Callable[[Frame], Detections]
-    class_names: tuple[str, ...] = COCO_NAMES
+    detect: Callable[[Frame], Detections | None]
+    class_names: Sequence[str] = COCO_NAMES
     key: str = ""
     messages: Sequence[str] = ()
     slow: bool = False
     cache: DetectionCache | None = None
     recorded: RecordedDetections | None = None
+    always_looks: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "class_names", tuple(map(visible_name, self.class_names)))
+        if not isinstance(self.class_names, Vocabulary):
+            object.__setattr__(self, "class_names", tuple(map(visible_name, self.class_names)))
 
     def __call__(self, frame: Frame) -> Detections:
-        """Return the detections of a frame, from the cache if they are there."""
-        found = None if self.cache is None else self.cache.get(frame.index)
-        if found is None:
-            found = self.detect(frame)
-            if self.cache is not None:
-                self.cache.put(frame.index, found)
+        """Return the detections of a frame; none of one that is not looked at."""
+        found = self.look(frame)
+        return Detections.empty() if found is None else found
+
+    def look(self, frame: Frame) -> Detections | None:
+        """Return the detections of a frame, from the cache if they are there; None: not looked."""
+        if self.cache is not None and frame.index in self.cache:
+            return self.cache.get(frame.index)
+        found = self.detect(frame)
+        if self.cache is not None:
+            self.cache.put(frame.index, found)
         return found
 
     def cached(self, folder: str | Path, image_size: tuple[int, int]) -> DetectionSource:
@@ -349,8 +368,9 @@ def open_detections(
         key = _cache_key(config, path.name, path.stat().st_size, device)
         return dataclasses.replace(as_source(detector), key=key, slow=True)
     if isinstance(detections, str | Path):
-        recorded = as_source(read_detections(detections, video, config))
-        return dataclasses.replace(recorded, key=_cache_key(config, source_fingerprint(detections)))
+        recorded = read_detections(detections, video, config)
+        key = _cache_key(config, recorded.fingerprint())
+        return dataclasses.replace(as_source(recorded), key=key)
     names = load_class_names(config.class_names) if config.class_names else ()
     return as_source(detections, names)
 
@@ -367,39 +387,67 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     Args:
         detector: a DetectionSource, RecordedDetections (asked by frame number), an OnnxDetector, or
             any function of a BGR image (H, W, 3) uint8 that returns what `Tracker.update` takes,
-            boxes in its px.
+            boxes in its px; None: it did not look at this image.
         class_names: of a function; ahead of its own attribute `class_names` or `names`
             (ultralytics) and of COCO's.
     """
     if isinstance(detector, DetectionSource):
         return detector
     if isinstance(detector, RecordedDetections):
-        return DetectionSource(
-            lambda frame: detector.at(frame.index), detector.class_names, "", detector.messages,
-            recorded=detector,
-        )  # fmt: skip
+        return _recorded_source(detector)
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
-    names = tuple(class_names) or _own_names(detector)
+    own = tuple(class_names) or _own_names(detector)
+    names, by_number = Vocabulary(own or COCO_NAMES), bool(own)
+    for name in names:
+        check_length(name, "class names of the detector")
 
-    def detect(frame: Frame) -> Detections:
+    def detect(frame: Frame) -> Detections | None:
+        nonlocal by_number
         try:
-            found = as_detections(detector(frame.image))
+            answer = detector(frame.image)
+            if answer is None:
+                return None
+            labels = None if class_names else text_labels(answer)
+            kinds = None if labels is None else np.array(names.numbers(labels), np.int64)
+            found = as_detections(answer, kinds)
         except ReobjError as error:
             raise ReobjError(f"frame {frame.index}: {error}") from error
         if len(found) and found.class_id.max() >= len(names):
             text = unnamed_class(int(found.class_id.max()), len(names))
             raise ReobjError(f"frame {frame.index}: {text}")
+        if isinstance(answer, Mapping) and kinds is None and not by_number and len(found):
+            log.warning(ASSUMED_NAMES)
+            by_number = True  # said once
         return found
 
-    return DetectionSource(detect, names)
+    return DetectionSource(detect, names, always_looks=isinstance(detector, OnnxDetector))
+
+
+def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
+    """Make a source of the detections of a file; of frames that were not looked at None."""
+    looked = None if recorded.looked is None else set(recorded.looked.tolist())
+
+    def detect(frame: Frame) -> Detections | None:
+        return recorded.at(frame.index) if looked is None or frame.index in looked else None
+
+    names = recorded.class_names
+    return DetectionSource(
+        detect, names, "", recorded.messages, recorded=recorded, always_looks=True
+    )
+
+
+ASSUMED_NAMES = (
+    "class numbers of the detector are named as COCO's 80, from 0; torchvision and DETR count its "
+    "91 from 1: give the names (detect.class_names, or an attribute `names` of the function)"
+)
 
 
 def _own_names(detector: Any) -> tuple[str, ...]:
-    """Return the class names that a detector states, a list or a dict by id; else COCO's."""
+    """Return the class names that a detector states, a list or a dict by id; () if it has none."""
     names = getattr(detector, "class_names", None) or getattr(detector, "names", None)
     if isinstance(names, Mapping):
         ids = range(max((int(i) for i in names), default=-1) + 1)
-        return tuple(str(names.get(i, f"class {i}")) for i in ids) or COCO_NAMES
-    return tuple(map(str, names)) if isinstance(names, list | tuple) else COCO_NAMES
+        return tuple(str(names.get(i, f"class {i}")) for i in ids)
+    return tuple(map(str, names)) if isinstance(names, list | tuple) else ()

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reobj.sources.video import IMAGE_FPS, InputConfig, Video, source_fingerprint, times_of_names
+from reobj.sources.image_files import IMAGE_FPS, times_of_names
+from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.types import Frame, ReobjError
 
 NO_IMAGE: Any = None
@@ -48,15 +49,15 @@ class ImagelessVideo(Video):
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.size = self.working_size = (int(size[0]), int(size[1]))
-        self.scale = 1.0
+        self.scale = self.pixel_aspect = 1.0
         self.names, self.files = list(names), []
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
-        self.times_s = given
+        self.times_s, self.times_are_known = given, given is not None
         self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
         if given is not None and len(given) < self.frame_count:
             what = f"{len(given)} times of {self.frame_count} frames"
             raise ReobjError(f"{self.source}: {what}; expected one each")
-        self.fps = IMAGE_FPS
+        self._clock, self._announced, self.fps = None, self.frame_count, IMAGE_FPS
         if given is not None and len(given) > 1:
             self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
         self.is_live, self.read, self.dropped = False, 0, 0

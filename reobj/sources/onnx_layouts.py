@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from reobj.sources.detection_files import NORMALISED_MAX
+from reobj.sources.recorded import NORMALISED_MAX
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD
 from reobj.types import Array, BoolArray, Image, IntArray, xyxy_from_cxcywh
 

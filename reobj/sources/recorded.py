@@ -5,6 +5,7 @@ Other formats are read in `detection_files`; what is wrong with the content is c
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from reobj.files import LINES_MAX, NPZ_MAX, load_npz, save_npz
 from reobj.sources.masks import NO_RUNS, Counts, rle_decode, rle_encode
@@ -27,9 +29,10 @@ class RecordedDetections:
         xyxy: (N, 4) px of the source. score: (N,) in [0, 1]. class_id: (N,) index into class_names.
         runs: run lengths of the N masks (see `masks`), empty where there is none.
         size, working_size: (w, h) of the masks, and of the frames that `at` answers for.
-        line: (N,) where each stands in the file, counted in `unit`s, for messages.
+        line: (N,) where each stands in the file, counted in `unit`s, or as text; for messages.
         messages: what was dropped or assumed, for the user.
         identity: (N,) as the file has it, or empty.
+        looked: frames that the detector was run on, ascending; None: all.
     """
 
     frame: IntArray
@@ -40,16 +43,32 @@ class RecordedDetections:
     class_names: tuple[str, ...]
     size: tuple[int, int]
     working_size: tuple[int, int]
-    line: IntArray
+    line: npt.NDArray[Any]
     unit: str
     messages: list[str] = field(default_factory=list)
     identity: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    looked: IntArray | None = None
 
     def __post_init__(self) -> None:
         self.class_names = tuple(map(visible_name, self.class_names))
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def select(self, rows: IntArray) -> None:
+        """Keep the rows (n,), in their order."""
+        self.identity = self.identity[rows] if len(self.identity) else self.identity
+        for name in ("frame", "xyxy", "score", "class_id", "line"):
+            setattr(self, name, getattr(self, name)[rows])
+        self.runs = [self.runs[row] for row in rows]
+
+    def fingerprint(self) -> str:
+        """Hash what `at` answers with, whatever the file looks like."""
+        digest = hashlib.sha256(repr((self.class_names, self.size)).encode())
+        own: list[npt.NDArray[Any]] = [self.frame, self.xyxy, self.score, self.class_id]
+        for values in own + list(self.runs):
+            digest.update(repr(values.shape).encode() + np.ascontiguousarray(values).tobytes())
+        return digest.hexdigest()[:16]
 
     def at(self, frame_index: int) -> Detections:
         """Return the detections of a frame in px of the working size; decodes its masks."""
@@ -76,9 +95,9 @@ def pack_detections(
     """Pack (frame number, Detections) pairs into the arrays of our npz format.
 
     Returns:
-        frame (N,), xyxy (N, 4), score (N,), class_id (N,), class_names (C,), image_size (w, h), and
-        the run lengths of the masks: those of row i are mask_counts[mask_offsets[i] :
-        mask_offsets[i + 1]].
+        frame (N,), xyxy (N, 4), score (N,), class_id (N,), class_names (C,), image_size (w, h),
+        done (F,) the frames, and the run lengths of the masks: those of row i are
+        mask_counts[mask_offsets[i] : mask_offsets[i + 1]].
     """
     parts = [Detections.empty(), *(found for _, found in frames)]
     runs = [NO_RUNS]
@@ -99,6 +118,7 @@ def pack_detections(
         "image_size": np.array(size, np.int64),
         "mask_counts": np.concatenate(runs),
         "mask_offsets": np.cumsum([len(run) for run in runs]),
+        "done": np.unique(np.array([i for i, _ in frames], np.int64)),
     }
 
 
@@ -111,17 +131,33 @@ def write_detections_npz(
     """Write detections to an npz file for `read_detections`.
 
     Args:
-        frames: (frame number of the source, Detections) pairs; boxes and masks in its pixels.
+        frames: (frame number of the source, Detections) pairs of all frames that the detector was
+            run on, also those without a detection; boxes and masks in its pixels.
         class_names: by class id. image_size: (w, h) of the source.
     """
     save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
 
 
+NORMALISED_MAX = 1.5  # px; chosen: boxes wholly below are shares of the image, some a bit outside
 KINDS = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_names": "U",
          "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
 
 
-SIZES = {"frame": LINES_MAX, "class_names": CLASS_MAX, "mask_counts": NPZ_MAX // 4}  # as uint32
+SIZES = {
+    "frame": LINES_MAX,
+    "done": LINES_MAX,
+    "class_names": CLASS_MAX,
+    "mask_counts": NPZ_MAX // 4,
+}  # as uint32
+
+
+def npz_image_size(path: Path) -> tuple[int, int]:
+    """Return the (w, h) of the images that an npz file of detections was made for."""
+    found = np.asarray(load_npz(path)[0].get("image_size", ()))
+    if found.shape != (2,) or found.dtype.kind not in "iu" or (found < 1).any():
+        text = f"array image_size is {found.shape} of {found.dtype}"
+        raise ReobjError(f"{path}: {text}, expected (w, h) in whole pixels")
+    return int(found[0]), int(found[1])
 
 
 def read_npz(
@@ -158,11 +194,55 @@ def read_npz(
     if runs.ndim != 1 or not ordered or (runs < 0).any():
         raise ReobjError(f"{path}: mask_counts and mask_offsets do not fit each other")
     if (made_for := tuple(data["image_size"].tolist())) != size:
-        raise ReobjError(f"{path}: made for images of {made_for} px, but the video is {size} px")
+        turned = ": made on frames that were not turned upright?" if made_for == size[::-1] else ""
+        text = f"made for images of {made_for} px, but the video is {size} px"
+        raise ReobjError(f"{path}: {text}{turned}")
     recorded = RecordedDetections(
         data["frame"].astype(np.int64), data["xyxy"].astype(np.float64),
         data["score"].astype(np.float64), data["class_id"].astype(np.int64),
         np.split(runs.astype(np.uint32), offsets[1:])[:count],
         tuple(data["class_names"].tolist()), size, working_size, np.arange(count), "row",
     )  # fmt: skip
-    return recorded, data.get("done", recorded.frame)
+    recorded.looked = _frames_done(data, path)
+    return recorded, recorded.frame if recorded.looked is None else recorded.looked
+
+
+def _frames_done(data: dict[str, Any], path: Path) -> IntArray | None:
+    """Return the frames, ascending, that a file says were looked at; None: it does not say."""
+    if "done" not in data:
+        return None
+    done = np.asarray(data["done"])
+    if done.ndim != 1 or (done.size and done.dtype.kind not in "iu"):
+        raise ReobjError(f"{path}: array done is {done.dtype} {done.shape}, expected frames (F,)")
+    return np.unique(done).astype(np.int64)
+
+
+SAME_SHAPE_PX = 1.0  # sides of resized images are rounded to whole pixels
+
+
+def scale_to(
+    size: tuple[int, int], made_for: Array, used: Any, where: str, messages: list[str]
+) -> Array:
+    """Return the factors (N, 4) from the images that boxes were made for to those of the video.
+
+    Args:
+        size: (w, h) of the video, (0, 0): unknown, then nothing is scaled.
+        made_for: (N, 2) of each box's image, 0: unknown. used: (N,)
+            whether the box belongs to a frame.
+    Raises:
+        ReobjError: images of another shape.
+    """
+    scale = np.ones((len(made_for), 4))
+    sizes = np.unique(made_for[used & (made_for > 0).all(1)], axis=0)
+    if size == (0, 0):
+        return scale
+    for w, h in sizes[(sizes != size).any(1)].tolist():
+        text = f"made for images of {w:g}x{h:g}, but the video is {size[0]}x{size[1]}"
+        if abs(w * size[1] / size[0] - h) > SAME_SHAPE_PX:
+            turned = (h, w) == size
+            why = ": made on frames that were not turned upright?" if turned else ": other images?"
+            raise ReobjError(f"{where}: {text}{why} Detect on the frames of this video")
+        rows = (made_for == (w, h)).all(1)
+        scale[rows] = np.tile([size[0] / w, size[1] / h], 2)
+        messages.append(f"{text}: boxes are scaled")
+    return scale

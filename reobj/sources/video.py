@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import glob
 import hashlib
 import json
@@ -14,8 +15,6 @@ import math
 import os
 import queue
 import re
-import struct
-import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -26,12 +25,20 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from reobj.files import shortened
+from reobj.runtime import check_versions, quiet_opencv
+from reobj.sources.container_files import holds_pictures_only, missing_bytes, settled_times
+from reobj.sources.image_files import (
+    FRAME_STEPS_S,
+    IMAGE_FPS,
+    PIXELS_MAX,
+    ImageList,
+    list_images,
+    read_image,
+    times_of_names,
+)
 from reobj.types import Array, Frame, Image, ReobjError, log, option, without_secrets
-
-IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +59,9 @@ class InputConfig:
 STREAM_URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
 MAX_UNREADABLE = 64  # frames in a row; chosen: 2 s without a picture, then the video has ended
 MISSING_SHARE = 0.02  # of the announced frames; chosen: containers often announce a few too many
+ROUNDING_S = 1e-3  # containers round times to a ms
+NO_TIME_S = 1e9  # chosen: beyond 30 years; FFmpeg's AV_NOPTS_VALUE is -9e18 units
+SQUARE = 0.01  # that pixels may be wider than high, or higher; chosen: 1 px in 100 is not seen
 LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: one to work on next and the newest one
 LIVE_POLL_S = 0.5  # chosen: longer than the reading thread takes to say that it ends
 LIVE_TIMEOUT_S = 2.0  # chosen: no frame for so long, and a live source has ended
@@ -59,38 +69,16 @@ OPEN_TIMEOUT_S = 5.0  # chosen: cameras answer within 2 s; OpenCV's own is 30 s
 RECONNECT_S = (1.0, 30.0)  # chosen: before the first attempt, twice as long before each, at most
 
 
-# Image names that are time stamps (TUM: 1305031102.175304.png)
-STAMPS_PER_S = (1.0, 1e3, 1e6, 1e9)  # s, ms, us, ns
-EPOCH_S = (946684800.0, 4102444800.0)  # 2000 to 2100, in s since 1970
-FRAME_STEPS_S = (1 / 240, 10.0)  # between two images: the fastest phones; photos one by one
-LEAST_STAMP = 1e9  # whole numbers below are counters (chosen: s since 1970 have ten digits)
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Times (F,) in s of a file's frames, all of them if complete; known: the file has times."""
+
+    times_s: Array
+    complete: bool
+    known: bool
 
 
-def times_of_names(names: Sequence[str]) -> Array | None:
-    """Read the times of images (F,) in s from names that are time stamps; None if they are none.
-
-    The last number of every name counts if it has a decimal point, or at least ten digits. Its
-    unit, s, ms, us or ns, is the one in which the images have a plausible rate, a plausible date
-    since 1970 first.
-    """
-    words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
-    if not words or not all(words):
-        return None
-    numbers = np.array([float(word) for (word,) in words])
-    if not (all("." in word for (word,) in words) or numbers.min() >= LEAST_STAMP):
-        return None
-    steps = np.diff(numbers)
-    if (steps <= 0).any():
-        return None
-    found = []
-    for per_s in STAMPS_PER_S:
-        step_s = float(np.median(steps)) / per_s if len(steps) else 1 / IMAGE_FPS
-        first_s = float(numbers[0]) / per_s
-        dated = EPOCH_S[0] < first_s < EPOCH_S[1]
-        clock = dated or (first_s < EPOCH_S[0] and len(steps) > 0)  # or since it was switched on
-        if clock and FRAME_STEPS_S[0] <= step_s <= FRAME_STEPS_S[1]:
-            found.append((not dated, abs(math.log(step_s * IMAGE_FPS)), per_s))
-    return numbers / min(found)[2] if found else None
+MEASURED: dict[tuple[str, str, int], Clock] = {}  # by path, fingerprint and frame to stop before
 
 
 class Video:
@@ -107,12 +95,17 @@ class Video:
         fingerprint: changes with the source or its files; does not tell what a URL hides.
         files, names: paths and file names of images by frame number, [] for videos.
         times_s: (F,) of images whose names are time stamps, else None: they come at 30 Hz.
+        times_are_known: the times of the frames are measured; False: only their order is known,
+            and an even rate is assumed.
         has_images: False where frames have none (`ImagelessVideo`).
         is_live: a camera or stream, which cannot be read twice.
         read, dropped: wanted frames of a live source so far, and those of them never yielded.
         size: (w, h) of the source in px, after rotation by its metadata.
         working_size: (w, h) of the frames that are yielded, px; scale: working px per native px.
-        fps: mean frame rate, Hz. frame_count: of the source (0: unknown).
+        fps: mean rate of the frames, Hz. frame_count: frames that can be decoded (0: unknown, of
+            a live source). Both are measured, of a file once, by decoding it up to `config.stop`
+            when they are first asked for, unless it was read before.
+        pixel_aspect: width over height of a pixel; 1: square.
         skipped: numbers of the frames, in the last iteration, that could not be read or had
             another size. messages: warnings for the user, each once.
     """
@@ -120,6 +113,7 @@ class Video:
     has_images = True
 
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
+        check_versions()
         self._address, self.config = str(source), config or InputConfig()
         self.source = without_secrets(self._address)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
@@ -130,13 +124,19 @@ class Video:
         self._opened: Any = None  # capture of a live source, until it is iterated
         self._is_url = bool(STREAM_URL.match(self._address))
         self.fingerprint = source_fingerprint(source)
-        self.files = [] if self._is_url else _image_files(self.source)
+        images = ImageList([], [], []) if self._is_url else list_images(self.source)
+        self.files = images.files
+        self._clock: Clock | None = None
+        for text in images.messages:
+            self._warn(text)
         self.names = [path.name for path in self.files]
         self.times_s = times_of_names(self.names)
         self.is_live = self._is_url or (self.source.isdecimal() and not Path(self.source).exists())
-        self.size, self.fps, self.frame_count = self._probe()
-        if 0 < self.frame_count <= self.config.start:
-            raise ReobjError(f"{self.source}: --start {self.config.start}, but it has only "
+        self.pixel_aspect = 1.0
+        self.size, self._announced_fps, self._announced = self._probe(images.usual)
+        start = self.config.start
+        if start and not self.is_live and not start < self.frame_count:
+            raise ReobjError(f"{self.source}: --start {start}, but it has only "
                              f"{self.frame_count} frames")  # fmt: skip
         ratio = min(1.0, self.config.max_size / max(self.size)) if self.config.max_size else 1.0
         width, height = (max(round(side * ratio), 1) for side in self.size)
@@ -149,9 +149,41 @@ class Video:
 
     @property
     def expected(self) -> int:
-        """Count the frames that an iteration yields at most (0: unknown)."""
-        stop = min(self.config.stop or self.frame_count, self.frame_count or self.config.stop)
+        """Count the frames that an iteration yields, about: as announced before it was measured."""
+        clock, count = self._clock, self._announced
+        count = len(clock.times_s) if clock is not None and clock.complete else count
+        stop = min(self.config.stop or count, count or self.config.stop)
         return max(math.ceil((stop - self.config.start) / self.config.every), 0)
+
+    @functools.cached_property
+    def frame_count(self) -> int:
+        if self.files or self.is_live:
+            return len(self.files)
+        clock = self._measured()
+        return len(clock.times_s) if clock.complete else max(len(clock.times_s), self._packets()[0])
+
+    @functools.cached_property
+    def fps(self) -> float:
+        announced, times_s = self._announced_fps, self.times_s
+        if not self.files and not self.is_live and self.times_are_known:
+            times_s = self._measured().times_s
+        if times_s is None or len(times_s) < 2:
+            return self._assumed_fps
+        steps, seconds = len(times_s) - 1, float(np.ptp(times_s))
+        same = abs(steps / announced - seconds) <= ROUNDING_S
+        return announced if same else steps / seconds
+
+    @property
+    def _assumed_fps(self) -> float:
+        """Return the rate where nothing measures it: as announced, unless no camera has it."""
+        announced = self._announced_fps
+        return announced if announced <= 1 / FRAME_STEPS_S[0] else IMAGE_FPS
+
+    @functools.cached_property
+    def times_are_known(self) -> bool:
+        if self.files or self.is_live:
+            return self.is_live or self.times_s is not None
+        return self._measured().known
 
     def __iter__(self) -> Iterator[Frame]:
         self.skipped.clear()
@@ -161,17 +193,21 @@ class Video:
             numbers = range(self.config.start, stop, self.config.every)
             times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
             decoded = ((i, float(times_s[i]), read_image(self.files[i])) for i in numbers)
+        unreadable, other_size = list[int](), list[int]()
         for index, time_s, image in decoded if self.is_live else one_ahead(decoded):
             if image is None or (image.shape[1], image.shape[0]) != self.size:
+                (unreadable if image is None else other_size).append(index)
                 self.skipped.append(index)
                 continue
             if self.working_size != self.size:
                 small = cv2.resize(image, self.working_size, interpolation=cv2.INTER_AREA)
                 image = np.asarray(small, np.uint8)
             yield Frame(index, time_s, image)
-        if self.skipped:
-            self._warn(f"{len(self.skipped)} frames skipped (unreadable or of another size): "
-                       f"{shortened(self.skipped)}")  # fmt: skip
+        most = f"not {self.size[0]}x{self.size[1]}, the size of most"
+        for skipped, why in ((unreadable, "unreadable"), (other_size, most)):
+            if skipped:
+                which = [self.name(index) or index for index in skipped]
+                self._warn(f"{len(skipped)} frames skipped ({why}): {shortened(which)}")
 
     def _warn(self, text: str) -> None:
         if (text := f"{self.source}: {text}") not in self.messages:
@@ -180,33 +216,99 @@ class Video:
     def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
         """Decode a file: yield number, time in s and image of the wanted frames.
 
-        The image is None if it cannot be read. Frames that cannot be grabbed are held back until a
-        later one can: at the end of the file they do not exist.
+        The image is None if it cannot be read.
         """
-        capture, start, every = self._open(), self.config.start, self.config.every
-        previous_s, unreadable, index = -1.0, 0, -1
-        pending: list[tuple[int, float, Image | None]] = []  # unreadable, or after the end
-        for index in range(self.config.stop or sys.maxsize):
-            wanted = index >= start and (index - start) % every == 0
-            grabbed = capture.grab()
-            # Right after the grab this is the frame's true time, also at a variable rate.
-            time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            if time_s <= previous_s:  # some containers hold no times
-                time_s = previous_s + 1 / self.fps
-            ok, image = capture.retrieve() if grabbed and wanted else (grabbed, None)
-            if not ok:
-                unreadable += 1
-                pending += [(index, time_s, None)] if wanted else []
-                if unreadable >= MAX_UNREADABLE:
-                    break
+        start, every, raw_s = self.config.start, self.config.every, list[float]()
+        capture = self._open()
+        for index, seconds in enumerate(self._grabbed(capture)):
+            if not seconds > max(raw_s[-1:], default=-math.inf):
+                self._measured()  # from here on times depend on all that follow
+            raw_s.append(seconds)
+            if index >= start and (index - start) % every == 0:
+                ok, image = (False, None) if math.isnan(seconds) else capture.retrieve()
+                time_s = seconds if self._clock is None else float(self._clock.times_s[index])
+                yield index, time_s, image if ok else None
+        if self._clock is None:
+            self._keep(raw_s)
+
+    def _grabbed(self, capture: Any) -> Iterator[float]:
+        """Decode the frames before `config.stop` one by one; yield their times in s, NaN: none.
+
+        Frames that cannot be decoded are held back until a later one can: at the end of the file
+        they do not exist.
+        """
+        index = failed = 0
+        while failed < MAX_UNREADABLE and not 0 < self.config.stop <= index:
+            if not capture.grab():
+                failed += 1
                 continue
-            yield from pending
-            pending, unreadable, previous_s = [], 0, time_s
-            if wanted:
-                yield index, time_s, image
-        read, stop = index + 1 - unreadable, self.config.stop or self.frame_count
-        if min(stop, self.frame_count) - read > max(1.0, MISSING_SHARE * self.frame_count):
-            self._warn(f"the file ends early: {read} of {self.frame_count} frames can be read")
+            for _ in range(failed):
+                index += 1
+                yield math.nan
+            index, failed = index + 1, 0
+            # Right after the grab this is the frame's true time, also at a variable rate.
+            seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            yield seconds if abs(seconds) < NO_TIME_S else math.nan
+
+    def _measured(self) -> Clock:
+        """Return the times of the frames, of which a file is decoded once in a process."""
+        if self._clock is None:
+            for stop in (0, self.config.stop):
+                self._clock = self._clock or MEASURED.get(self._key(stop))
+        if self._clock is None:
+            self._clock = self._keep(list(self._grabbed(self._open())))
+        return self._clock
+
+    def _key(self, stop: int) -> tuple[str, str, int]:
+        return os.path.abspath(self._address), self.fingerprint, stop
+
+    def _keep(self, raw_s: Sequence[float]) -> Clock:
+        """Make times of those that the container gives, and say what is wrong with them."""
+        complete = not 0 < self.config.stop <= len(raw_s)
+        fps = self._assumed_fps
+        times_s, restarts, known = settled_times(np.array(raw_s), 1 / fps)
+        if restarts:
+            self._warn(f"its clock begins again {restarts} time(s): counted on from there")
+        if not known:
+            self._warn(f"it holds no times: {fps:g} frames a second are assumed")
+        if complete and not self._is_url and (text := self._missing_end(times_s)):
+            self._warn(text)
+        self._clock = Clock(times_s, complete, known)
+        if not self._is_url:
+            MEASURED[self._key(0 if complete else self.config.stop)] = self._clock
+        return self._clock
+
+    def _missing_end(self, times_s: Array) -> str:
+        """Say what is missing at the end of a file; "": nothing that can be known.
+
+        What a container announces is no evidence alone: Matroska's duration is that of the sound
+        too, and some announce a rate that no frame has. But in a file of pictures alone most bytes
+        are those of its frames.
+        """
+        read, last_s = len(times_s), float(times_s[-1])
+        if self._announced - read <= max(1.0, MISSING_SHARE * self._announced):
+            return ""
+        what, stored = f"{read} frames up to {last_s:.2f} s can be read", Path(self._address)
+        if lost := missing_bytes(stored):
+            return f"the file ends early: {lost} bytes are missing at its end; {what}"
+        _, stored_s, size = self._packets()
+        if stored_s - last_s > max(1 / self._announced_fps, MISSING_SHARE * stored_s):
+            return f"the file is damaged: {what}, frames up to {stored_s:.2f} s are stored"
+        total = stored.stat().st_size
+        if 2 * size < total and holds_pictures_only(stored):
+            return f"the file is damaged: {what}, {size} of its {total} bytes"
+        return ""
+
+    def _packets(self) -> tuple[int, float, int]:
+        """Count the frames that a file stores, undecoded; also time in s of the last, and bytes."""
+        capture = self._open([cv2.CAP_PROP_FORMAT, -1])
+        count, last_s, size = 0, 0.0, 0
+        while capture.grab():
+            count += 1
+            last_s = max(last_s, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+            data = capture.retrieve()[1]
+            size += 0 if data is None else data.size
+        return count, last_s, size
 
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
         """Yield number, time in s since the start and image of the newest frames of a live source.
@@ -299,23 +401,25 @@ class Video:
                     frames.put(None, timeout=0.1)
                     break
 
-    def _open(self) -> Any:
+    def _open(self, params: Sequence[int] = ()) -> Any:
         """Open the source with OpenCV, which turns frames upright by the file's rotation tag."""
         if any("\ud800" <= letter <= "\udfff" for letter in self._address):  # OpenCV crashes
             raise ReobjError(f"{self.source!r}: this name is no UTF-8; rename the file")
         if not self.is_live and not self._is_url and not Path(self.source).is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
-        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         is_camera = self.is_live and self._address.isdecimal()
-        timeout_ms = round(1000 * OPEN_TIMEOUT_S)
-        timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
-        timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
-        if self._is_url:
-            capture = cv2.VideoCapture(self._address, cv2.CAP_ANY, timeouts)
-        else:
-            capture = cv2.VideoCapture(int(self._address) if is_camera else self._address)
-        cv2.utils.logging.setLogLevel(level)
+        with quiet_opencv():
+            if self._is_url:
+                timeout_ms = round(1000 * OPEN_TIMEOUT_S)
+                timeouts = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms]
+                timeouts += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
+                capture = cv2.VideoCapture(self._address, cv2.CAP_ANY, [*timeouts, *params])
+            elif is_camera:
+                capture = cv2.VideoCapture(int(self._address))
+            else:  # the whole path: FFmpeg takes 12:30.mp4 for a protocol
+                path = os.path.abspath(self._address)
+                capture = cv2.VideoCapture(path, cv2.CAP_FFMPEG if params else cv2.CAP_ANY, params)
         if not capture.isOpened():
             what = "video (damaged, or no video)"
             if self.is_live:
@@ -323,16 +427,14 @@ class Video:
             raise ReobjError(f"{self.source}: cannot be opened as a {what}")
         return capture
 
-    def _probe(self) -> tuple[tuple[int, int], float, int]:
-        """Read the first readable frame.
+    def _probe(self, usual: Sequence[Path]) -> tuple[tuple[int, int], float, int]:
+        """Read the first readable frame, of images the first of the `usual` ones.
 
         Returns:
-            (w, h) in px, frame rate in Hz, and number of frames (0: unknown).
+            (w, h) in px, frame rate in Hz, and number of frames (0: unknown), both as announced.
         """
-        images: Iterator[Image | None] = map(read_image, self.files)
+        images: Iterator[Image | None] = map(read_image, [*usual, *self.files])
         fps, count = IMAGE_FPS, len(self.files)
-        if self.times_s is not None and count > 1:
-            fps = float((count - 1) / np.ptp(self.times_s))
         if not self.files:
             capture = self._open()
             images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
@@ -348,101 +450,20 @@ class Video:
         image = next((image for image in images if image is not None), None)
         if image is None:
             raise ReobjError(f"{self.source}: not one frame can be decoded")
+        if not self.files and not self.is_live:
+            self._check_pixels(capture)
         return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
 
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-
-
-def _image_files(source: str) -> list[Path]:
-    """List the images of a folder, glob or single file, image2 before image10; [] for videos."""
-    path = Path(source)
-    if path.is_file():
-        return [path] if path.suffix.lower() in IMAGE_SUFFIXES else []
-    if not path.is_dir() and not re.search(r"[*?\[]", source):
-        return []
-    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(source))
-    files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
-    if not files:
-        raise ReobjError(f"{source}: no images there (looked for {' '.join(IMAGE_SUFFIXES)})")
-    return sorted(files, key=lambda p: by_number(p.name))
-
-
-def by_number(name: str) -> str:
-    """Return a key that sorts names by the numbers in them."""
-    return re.sub(r"\d+", lambda n: n[0].zfill(20), name)
-
-
-PIXELS_MAX = 1 << 28  # of an image; chosen: above the 200 megapixels of phones; 800 MB as BGR
-
-
-def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
-    """Read an image file as OpenCV's `flags` say; None if it is no image.
-
-    Raises:
-        ReobjError: it claims more than PIXELS_MAX pixels: a small file may hold gigabytes.
-    """
-    try:
-        data = np.fromfile(path, np.uint8)
-        if (pixels := claimed_pixels(data.tobytes())) > PIXELS_MAX:
-            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are taken")
-        image = cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):
-        return None
-    return None if image is None else np.asarray(image)
-
-
-def claimed_pixels(data: bytes) -> int:
-    """Read from its header how many pixels an image of IMAGE_SUFFIXES has; 0: not to be told."""
-    width = height = 0
-    with contextlib.suppress(struct.error, IndexError):
-        if data.startswith(b"\x89PNG"):
-            width, height = struct.unpack_from(">II", data, 16)
-        elif data.startswith(b"BM"):
-            width, height = struct.unpack_from("<ii", data, 18)
-        elif data.startswith(b"\xff\xd8"):
-            width, height = _jpeg_size(data)
-        elif data[:4] in (b"II*\0", b"MM\0*"):
-            width, height = _tiff_size(data)
-        elif data[8:15] == b"WEBPVP8":
-            width, height = _webp_size(data)
-    return abs(width * height)
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Return (w, h) from the first start of frame, which follows other segments."""
-    at = 2
-    while data[at] == 0xFF and not (
-        0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in JPEG_OTHER
-    ):
-        at += 2 + struct.unpack_from(">H", data, at + 2)[0]
-    height, width = struct.unpack_from(">HH", data, at + 5)
-    return width, height
-
-
-JPEG_OTHER = (0xC4, 0xC8, 0xCC)  # tables among the markers of frames
-
-
-def _tiff_size(data: bytes) -> tuple[int, int]:
-    """Return (w, h) from the tags 256 and 257 of the first directory."""
-    order = "<" if data[:1] == b"I" else ">"
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    tags = (struct.unpack_from(order + "HHII", data, start + 2 + 12 * i) for i in range(count))
-    sides = {tag: value >> 16 * (kind == 3 and order == ">") for tag, kind, _, value in tags}
-    return sides.get(256, 0), sides.get(257, 0)
-
-
-def _webp_size(data: bytes) -> tuple[int, int]:
-    """Return (w, h): of the canvas, of a lossless or of a lossy picture."""
-    if data[15:16] == b"X":
-        width, height = (int.from_bytes(data[i : i + 3], "little") + 1 for i in (24, 27))
-    elif data[15:16] == b"L":
-        (bits,) = struct.unpack_from("<I", data, 21)
-        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    else:
-        width, height = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
-    return width, height
+    def _check_pixels(self, capture: Any) -> None:
+        """Set the shape of the pixels, and say that it is not square."""
+        wide, high = (round(capture.get(p)) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
+        turned = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
+        wide, high = (high, wide) if turned else (wide, high)
+        if wide > 0 and high > 0 and abs(wide / high - 1) > SQUARE:
+            self.pixel_aspect = wide / high
+            self._warn(f"its pixels are {wide}:{high}, not square, as it says: boxes are in stored "
+                       "pixels, cameras have two focal lengths; where that is wrong, correct its "
+                       "sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:

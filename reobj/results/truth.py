@@ -1,0 +1,358 @@
+"""True boxes with identities, and boxes to be scored, from files; what is assumed of them is said.
+
+Start at `read_truth` and `read_result`. Formats of truth: MOTChallenge rows and what is written in
+their form (CVAT's MOT 1.1, DanceTrack, our rooms), KITTI tracking labels, CVAT for video 1.1,
+COCO-VID.
+"""
+
+from __future__ import annotations
+
+import configparser
+import dataclasses
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from reobj.files import load_json, read_lines, shortened
+from reobj.results.result import Result
+from reobj.sources.cvat import read_cvat
+from reobj.sources.tables import WHOLE_MAX, read_mot_rows
+from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
+
+SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
+UNNAMED = ("", "object")  # names of boxes without a class
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledBoxes:
+    """Boxes of a whole video with identities and classes: truth, or what is to be scored.
+
+    Attributes (N rows in any order):
+        frame: (N,) from 1, as in MOTChallenge files. identity: (N,). xyxy: (N, 4) native pixels.
+        name: (N,) class names; "" matches every class.
+        role: (N,) SCORED, IGNORED or ABSENT; all SCORED in a result.
+    """
+
+    frame: IntArray
+    identity: IntArray
+    xyxy: Array
+    name: npt.NDArray[np.str_]
+    role: IntArray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, keep: Any) -> LabelledBoxes:
+        return LabelledBoxes(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+
+
+def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
+    """Make labelled boxes of MOTChallenge rows (N, 6+); name, role: one for all rows, or (N,)."""
+    n, box = len(rows), rows[:, 2:6]
+    xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
+    whole = rows[:, :2].astype(np.int64)
+    names, roles = np.broadcast_to(np.asarray(name, str), n), np.broadcast_to(role, n)
+    return LabelledBoxes(whole[:, 0], whole[:, 1], xyxy, names, np.asarray(roles, np.int64))
+
+
+def read_truth(
+    path: Path,
+    class_names: Sequence[str],
+    min_visibility: float,
+    said: list[str] | None = None,
+    size: tuple[int, int] = (0, 0),
+) -> LabelledBoxes:
+    """Read true boxes: MOTChallenge rows, KITTI tracking labels, CVAT for video, COCO-VID.
+
+    Args:
+        class_names: by the numbers of files that do not name their classes (from 0).
+        min_visibility: rows that are less visible are IGNORED.
+        said: what was assumed of the file is appended. size: (w, h) of the video, (0, 0): unknown.
+    Raises:
+        ReobjError: the file cannot be read, or an identity has two boxes in a frame.
+    """
+    said = [] if said is None else said
+    if path.suffix.lower() in (".xml", ".zip"):
+        video: Any = SimpleNamespace(size=size, working_size=size, names=[], frame_count=0)
+        found = read_cvat(path, video)
+        if not len(found.identity):
+            raise ReobjError(
+                f"{path}: boxes of images, without identities; expected CVAT for video"
+            )
+        names = np.array(found.class_names, str)[found.class_id]
+        role = np.full(len(names), SCORED)
+        truth = LabelledBoxes(found.frame + 1, found.identity, found.xyxy, names, role)
+        said += found.messages
+    elif path.suffix.lower() == ".json":
+        truth = _read_coco_video(path)
+    elif _is_kitti(path):
+        truth = _read_kitti(path, said)
+    else:
+        truth = _read_mot(path, class_names, min_visibility, said)
+    _check_identities(truth, path)
+    return truth
+
+
+def read_result(out: Path, said: list[str] | None = None) -> LabelledBoxes:
+    """Read boxes, identities and classes of an output folder; or, without classes, of MOT rows.
+
+    Args:
+        said: what was assumed of the file is appended.
+    """
+    said = [] if said is None else said
+    if out.is_dir():
+        result = Result.load(out)
+        tracks, names = result.tracks, np.array([*result.class_names, ""], str)  # -1: unknown
+        role = np.full(len(tracks), SCORED)
+        ids, frame = tracks.track_id, tracks.frame + 1
+        found = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
+    else:
+        found = labelled(_from_one(read_mot_rows(out), out, said))
+    _check_identities(found, out)
+    return found
+
+
+# MOT16, 17 and 20: person on vehicle, static person, distractor, reflection; 20: and vehicle that
+# is not motorised (TrackEval 1.3.0, mot_challenge_2d_box.py)
+MOT_PEDESTRIAN = 1
+MOT_DISTRACTORS = {"MOT16": (2, 7, 8, 12), "MOT17": (2, 7, 8, 12), "MOT20": (2, 6, 7, 8, 12)}
+MOT_CLASSES = 13
+
+
+def _read_mot(
+    path: Path, class_names: Sequence[str], min_visibility: float, said: list[str]
+) -> LabelledBoxes:
+    """Read MOTChallenge rows.
+
+    Column 7 is a flag (0: the row does not count). Column 8 is a class only in files of nine
+    columns, column 9 the visibility then; MOT15 has ten: world coordinates in their place.
+    """
+    rows = _from_one(read_mot_rows(path), path, said)
+    flagged = rows[:, 6] == 0 if rows.shape[1] > 6 else np.zeros(len(rows), bool)
+    sequence = _sequence(path)
+    _check_length(rows, path, sequence)
+    if rows.shape[1] != 9:
+        return labelled(rows, "", np.where(flagged, ABSENT, SCORED))
+    number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
+    hidden = rows[:, 8] < min_visibility
+    labels, stated = path.with_name("labels.txt"), path.with_name("gt_mot_format.json")
+    if labels.exists():
+        said.append(f"classes are lines of {labels.name}, from 1 (CVAT's MOT 1.1)")
+        role = np.where(flagged, ABSENT, hidden * IGNORED)
+        return labelled(rows, _by_line(number, labels, path), role)
+    if stated.exists():
+        return labelled(rows, _names_of(number, stated, class_names), (flagged | hidden) * IGNORED)
+    if benchmark := _benchmark(sequence.get("name", ""), path, number, flagged):
+        said.append(f"classes are {benchmark}'s: pedestrians count, boxes on distractors do not")
+        role = np.where(flagged | (number != MOT_PEDESTRIAN), ABSENT, hidden * IGNORED)
+        role[np.isin(number, MOT_DISTRACTORS[benchmark])] = IGNORED
+        return labelled(rows, "", role)
+    if (number < 0).all() or (sequence and (number == MOT_PEDESTRIAN).all()):
+        said.append("the truth has one class without a name: classes do not count")
+        return labelled(rows, "", np.where(flagged, ABSENT, hidden * IGNORED))
+    said.append("class numbers of the truth are those of the detector (COCO's), from 0")
+    return labelled(rows, _names_of(number, None, class_names), (flagged | hidden) * IGNORED)
+
+
+def _from_one(rows: Array, path: Path, said: list[str]) -> Array:
+    """Return rows whose frames count from 1, whatever the file counts from."""
+    first = rows[:, 0].min(initial=1)
+    if first < 0:
+        raise ReobjError(f"{path}: frame {first:.0f}; expected frames from 1, or from 0")
+    if (rows[:, 4:6] < 0).any():
+        at = int((rows[:, 4:6] < 0).any(1).argmax())
+        where = f"frame {rows[at, 0]:.0f}, identity {rows[at, 1]:.0f}"
+        raise ReobjError(
+            f"{path}, {where}: width or height below 0; expected left,top,width,height"
+        )
+    if first == 0:
+        said.append(f"{path.name} has a frame 0: its frames are taken as 0-based")
+        rows = rows + np.eye(1, rows.shape[1])
+    return rows
+
+
+def _sequence(path: Path) -> dict[str, str]:
+    """Return the facts of the seqinfo.ini beside the gt folder; {} if there is none."""
+    file = path.parent.parent / "seqinfo.ini"
+    if not file.exists():
+        return {}
+    parser = configparser.ConfigParser(interpolation=None)
+    try:
+        parser.read_string("\n".join(read_lines(file)))
+    except configparser.Error as error:
+        raise ReobjError(f"{file}: {error}; expected [Sequence] with name, seqLength") from error
+    return dict(parser["Sequence"]) if parser.has_section("Sequence") else {"name": ""}
+
+
+def _check_length(rows: Array, path: Path, sequence: dict[str, str]) -> None:
+    """Refuse truth of frames beyond the sequence's length, as TrackEval does."""
+    length = sequence.get("seqlength", "")
+    last = rows[:, 0].max(initial=0)
+    if length.isdecimal() and last > int(length):
+        known = f"seqinfo.ini says seqLength={length}"
+        raise ReobjError(f"{path}: frame {last:.0f}, but {known}: truth of another sequence?")
+
+
+def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> str:
+    """Return the MOTChallenge benchmark whose classes a file has, "": none.
+
+    By the name of the sequence, of its folder; else by the rows: all of classes 1 to 13, other than
+    pedestrians only with flag 0.
+    """
+    for text in (name, path.resolve().parent.parent.name):
+        if found := re.match(r"(MOT16|MOT17|MOT20)-\d+", text):
+            return found[1]
+    other = number != MOT_PEDESTRIAN
+    known = ((number >= 1) & (number <= MOT_CLASSES)).all()
+    return "MOT17" if known and other.any() and (flagged == other).all() else ""
+
+
+def _by_line(number: IntArray, labels: Path, path: Path) -> list[str]:
+    """Name classes by the lines of a file, from 1; 0 and less: no class."""
+    lines = [line.strip() for line in read_lines(labels)]
+    if number.max(initial=0) > len(lines):
+        raise ReobjError(f"{path}: class {number.max()}, but {labels} has {len(lines)} lines")
+    return [lines[n - 1] if n > 0 else "" for n in number.tolist()]
+
+
+def _names_of(number: IntArray, stated: Path | None, class_names: Sequence[str]) -> list[str]:
+    """Name classes by a JSON file of ours, {"classes": {number: name}}, or by class_names."""
+    names = {str(i): n for i, n in enumerate(class_names)}
+    if stated is not None:
+        given = load_json(stated)
+        given = given.get("classes") if isinstance(given, dict) else None
+        if isinstance(given, dict):
+            names = {str(k): str(v) for k, v in given.items()}
+    return [names.get(str(n), str(n)) for n in number]
+
+
+KITTI_COLUMNS = (17, 18)  # with a score
+
+
+def _is_kitti(path: Path) -> bool:
+    """Tell whether the first line is of KITTI's tracking labels: the third word is a class."""
+    words = next((line.split() for line in read_lines(path) if line.strip()), [])
+    return len(words) in KITTI_COLUMNS and not re.fullmatch(r"[-+.\deE]+", words[2])
+
+
+def _read_kitti(path: Path, said: list[str]) -> LabelledBoxes:
+    """Read KITTI tracking labels: frame (from 0), id, type, ..., left, top, right, bottom, ..."""
+    lines = [(at, line.split()) for at, line in enumerate(read_lines(path), 1) if line.strip()]
+    try:
+        if bad := [at for at, words in lines if len(words) not in KITTI_COLUMNS]:
+            raise ReobjError(f"{path}, line {bad[0]}: expected 17 columns as in KITTI's labels")
+        table = np.array([[*words[:2], *words[6:10]] for _, words in lines], np.float64)
+    except ReobjError:
+        raise
+    except ValueError as error:
+        raise ReobjError(f"{path}: {error}; expected KITTI's tracking labels") from error
+    names = np.array([words[2] for _, words in lines], str)
+    if not np.isfinite(table).all():
+        raise ReobjError(f"{path}: a number is not finite; expected KITTI's tracking labels")
+    any_of = names == "DontCare"
+    role = np.where(any_of, IGNORED, SCORED)
+    said.append("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's rules of "
+                "distractors, occlusion and height are not applied")  # fmt: skip
+    whole = table[:, :2].astype(np.int64)
+    names = np.where(any_of, "", names)
+    return LabelledBoxes(whole[:, 0] + 1, whole[:, 1], table[:, 2:], names, role)
+
+
+def _read_coco_video(path: Path) -> LabelledBoxes:
+    """Read COCO-VID: images with frame_id (from 0), annotations with instance_id or track_id."""
+    try:
+        data = load_json(path)
+        videos = {image.get("video_id") for image in data["images"]}
+        if len(videos) > 1:
+            raise ReobjError(f"{path}: images of {len(videos)} videos; expected those of one")
+        frame_of = {image["id"]: int(image["frame_id"]) for image in data["images"]}
+        name_of = {kind["id"]: str(kind["name"]) for kind in data["categories"]}
+        rows = [
+            [frame_of[a["image_id"]] + 1, a["instance_id"] if "instance_id" in a else a["track_id"],
+             *a["bbox"]] for a in data["annotations"]
+        ]  # fmt: skip
+        table = np.array(rows, np.float64).reshape(-1, 6)
+        names = [name_of[a["category_id"]] for a in data["annotations"]]
+        crowd = [IGNORED if a.get("iscrowd") or a.get("ignore") else SCORED
+                 for a in data["annotations"]]  # fmt: skip
+    except ReobjError:
+        raise
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        expected = "COCO-VID: images with frame_id, annotations with instance_id and bbox"
+        raise ReobjError(f"{path}: {error!r}; expected {expected}") from error
+    if not np.isfinite(table).all() or (np.abs(table) > WHOLE_MAX).any():
+        raise ReobjError(f"{path}: a number is not finite; expected COCO-VID")
+    return labelled(table, np.array(names, str), np.array(crowd, np.int64))
+
+
+def _check_identities(boxes: LabelledBoxes, path: Path) -> None:
+    """Refuse boxes without identity, and an identity that has two boxes in a frame."""
+    scored = boxes[boxes.role == SCORED]
+    if (scored.identity < 0).any():
+        count, total = (scored.identity < 0).sum(), len(scored)
+        frame = scored.frame[scored.identity < 0].min()
+        why = ": detections, not tracks?" if count == total else ""
+        raise ReobjError(f"{path}: {count} of {total} boxes have no identity (below 0), the first "
+                         f"in frame {frame} (from 1){why}")  # fmt: skip
+    pairs = np.column_stack([scored.frame, scored.identity])
+    unique, count = np.unique(pairs, axis=0, return_counts=True)
+    if (count > 1).any():
+        frame, identity = unique[(count > 1).argmax()]
+        more = (count > 1).sum()
+        raise ReobjError(
+            f"{path}: identity {identity} has {count[(count > 1).argmax()]} boxes in frame {frame} "
+            f"(from 1; {more} such cases); an object is in one place at a time"
+        )
+
+
+def check_counts(truth: LabelledBoxes, path: Path, left_out: str = "") -> None:
+    """Refuse truth of which no row counts.
+
+    Args:
+        left_out: why rows of the file are not among them.
+    """
+    if (truth.role == SCORED).any():
+        return
+    absent, ignored = (truth.role == ABSENT).sum(), (truth.role == IGNORED).sum()
+    why = "no boxes in it"
+    if len(truth):
+        why = (f"of {len(truth)} rows {absent} are marked not to count (column 7 is 0, or another "
+               f"class) and {ignored} to be ignored")  # fmt: skip
+    raise ReobjError(f"{path}: no true box counts: {left_out or why}")
+
+
+def with_common_names(
+    truth: LabelledBoxes, found: LabelledBoxes, said: list[str]
+) -> tuple[LabelledBoxes, LabelledBoxes, bool]:
+    """Bring the class names of truth and result together.
+
+    Names that differ in case, "_" or "-" alone are the same. Where the result has no classes, or
+    none in common with the truth, classes do not count: all found names become "".
+
+    Returns:
+        truth, result, and whether classes count.
+    """
+    ours = sorted(set(found.name.tolist()) - set(UNNAMED))
+    theirs = sorted(set(truth.name[truth.role == SCORED].tolist()) - set(UNNAMED))
+    plain = {_plain(name): name for name in ours}
+    named = {name: plain.get(_plain(name), name) for name in set(truth.name.tolist())}
+    names = np.array([named[name] for name in truth.name.tolist()], str)
+    truth = dataclasses.replace(truth, name=names)
+    if not theirs or not len(found) or {named[name] for name in theirs} & set(ours):
+        return truth, found, True
+    why = "the result has no classes"
+    if ours:
+        why = f"no class in common (truth: {shortened(theirs)}; result: {shortened(ours)})"
+    said.append(f"{why}: boxes match whatever their class")
+    return truth, dataclasses.replace(found, name=np.full(len(found), "")), False
+
+
+def _plain(name: str) -> str:
+    """Return a name without case, "_" and "-"."""
+    return re.sub(r"[\s_-]+", " ", name.strip().casefold())

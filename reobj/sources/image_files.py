@@ -1,0 +1,404 @@
+"""Image files: which of a folder are the frames, in which order, at which times; reading them.
+
+Start at `list_images`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import itertools
+import math
+import re
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from reobj.types import Array, ReobjError
+
+IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
+UNREAD_SUFFIXES = (  # of images that not every OpenCV reads
+    *(".heic", ".heif", ".avif", ".gif", ".jxl", ".jp2", ".exr", ".hdr", ".ppm", ".pgm", ".tga"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw"),  # cameras' own
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageList:
+    """The frames of an image folder.
+
+    Attributes:
+        files: in order. usual: those of the size, upright, that most of them have by their headers.
+        messages: what of the folder is no frame, for the user.
+    """
+
+    files: list[Path]
+    usual: list[Path]
+    messages: list[str]
+
+
+def list_images(source: str) -> ImageList:
+    """List the images of a folder, glob or single file in the order of their names.
+
+    What is no picture by its content is left out: of one channel with more than 8 bits, and of one
+    channel or called a mask, depth or the like beside pictures of the same numbers.
+
+    Returns:
+        no files for what is a video, or is not there.
+    Raises:
+        ReobjError: no images; two kinds of them that cannot be told apart; too many sizes.
+    """
+    path = Path(source)
+    if path.is_file():
+        suffix = path.suffix.lower()
+        if suffix in UNREAD_SUFFIXES and suffix != ".gif":  # which is read as a video
+            raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
+        return _sized(source, [path] if suffix in IMAGE_SUFFIXES else [], {path: header(path)}, [])
+    if not path.is_dir() and not re.search(r"[*?\[]", source):
+        return ImageList([], [], [])
+    found = [p for p in _paths(path) if not p.name.startswith(".")]
+    files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES]
+    others = Counter(p.suffix for p in found if p.suffix.lower() in UNREAD_SUFFIXES)
+    messages = [
+        f"{n} {suffix} files are not read; convert them to .jpg" for suffix, n in others.items()
+    ]
+    if not files:
+        beside = sorted(p.name for p in found if p.is_dir())[:9]
+        more = [f"its folders are {', '.join(beside)}"] if beside and path.is_dir() else []
+        what = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
+        raise ReobjError("; ".join([f"{source}: {what}", *messages, *more]))
+    headers = {p: header(p) for p in files}
+    files, left_out = _pictures(files, headers, source if path.is_dir() else "")
+    return _sized(source, files, headers, messages + left_out)
+
+
+def _paths(path: Path) -> list[Path]:
+    """List a folder, or the matches of a glob in a folder whose own name may look like one."""
+    if path.is_dir():
+        return list(path.iterdir())
+    if path.parent.is_dir():
+        return [path.parent / name for name in glob.glob(path.name, root_dir=path.parent)]
+    return [Path(name) for name in glob.glob(str(path))]
+
+
+def _sized(
+    source: str, files: list[Path], headers: dict[Path, Header | None], messages: list[str]
+) -> ImageList:
+    """Put files in order, and find the size of most."""
+    sizes = Counter(found.size for p in files if (found := headers[p]) is not None)
+    size, most = max(sizes.items(), key=lambda item: (item[1], math.prod(item[0])),
+                     default=((0, 0), 0))  # fmt: skip
+    if 2 * most < sizes.total():
+        raise ReobjError(
+            f"{source}: {sizes.total()} images of {len(sizes)} sizes, at most {most} of the same "
+            f"({size[0]}x{size[1]}); expected one size: give a folder or a glob in quotes of those"
+        )
+    by_name = dict(zip(files, (p.name for p in files), strict=True))
+    order = {name: k for k, name in enumerate(sorted_names(by_name.values()))}
+    files = sorted(files, key=lambda p: (order[p.name], str(p)))
+    usual = [p for p in files if (found := headers[p]) is not None and found.size == size]
+    return ImageList(files, usual, messages)
+
+
+# ---- Which images are frames ---------------------------------------------------------------------
+
+# Words in the names of what lies beside pictures (7-Scenes, ScanNet, 3D Scanner App, NeRFCapture,
+# DAVIS, Replica, Hypersim, Record3D)
+NO_PICTURE = frozenset(
+    "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm segmentation "
+    "semantic semantics label labels instance instances panoptic normal normals thumb thumbs "
+    "thumbnail preview ir infrared flow albedo uncertainty".split()
+)
+A_PICTURE = frozenset("color colour rgb image img frame photo".split())
+SIDE_BY_SIDE = 3  # images of each of two kinds; chosen: with fewer, equal numbers are chance
+
+
+@dataclass(slots=True)
+class _Kind:
+    """Images whose names differ in their numbers only."""
+
+    files: list[Path]
+    words: set[str]
+    numbers: set[tuple[int, ...]]
+    color: bool
+
+    def shares(self, other: _Kind, least: Callable[[int, int], int]) -> bool:
+        """Tell whether more than half of the smaller (min) or larger (max) have equal numbers."""
+        count = least(len(self.numbers), len(other.numbers))
+        return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
+
+    def is_named_picture(self, other: _Kind) -> bool:
+        """Tell whether the names call these pictures by a word that those of others have not."""
+        return bool((self.words - other.words) & A_PICTURE)
+
+
+def _pictures(
+    files: list[Path], headers: dict[Path, Header | None], folder: str
+) -> tuple[list[Path], list[str]]:
+    """Separate pictures from depth maps, masks and the like.
+
+    Args:
+        folder: the source where it is one, "" for a glob: that says which kind is meant.
+    Returns:
+        the pictures, and messages.
+    """
+    messages = []
+    deep = [p for p in files if (h := headers[p]) is not None and h.channels == 1 and h.bits > 8]
+    if len(deep) == len(files):
+        messages.append("images of one channel with more than 8 bits are taken as pictures; are "
+                        "they depth maps? Then give those in colour")  # fmt: skip
+    elif deep:
+        files = [p for p in files if p not in set(deep)]
+        messages.append(_left_out(deep, "one channel with more than 8 bits, as depth maps have"))
+    kinds = _kinds(files, headers)
+    any_color = any(kind.color for kind in kinds)
+    for kind in list(kinds):
+        others = [k for k in kinds if k is not kind]
+        gray = any_color and not kind.color
+        named = bool(kind.words & NO_PICTURE)
+        beside = [k for k in others if kind.shares(k, min)]
+        if gray and (named or any(k.color for k in beside)):
+            messages.append(_left_out(kind.files, "one channel, beside images in colour"))
+            kinds.remove(kind)
+        elif named and any(not k.words & NO_PICTURE for k in beside):
+            messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
+            kinds.remove(kind)
+    for kind in list(kinds) if folder else ():
+        rivals = [k for k in kinds if k is not kind and kind.shares(k, max)]
+        rivals = [k for k in rivals if min(len(k.files), len(kind.files)) >= SIDE_BY_SIDE]
+        if any(k.is_named_picture(kind) and not kind.is_named_picture(k) for k in rivals):
+            messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
+            kinds.remove(kind)
+    for kind, other in itertools.combinations(kinds if folder else (), 2):
+        if kind.shares(other, max) and min(len(kind.files), len(other.files)) >= SIDE_BY_SIDE:
+            names = [min((p.name for p in k.files), key=by_number) for k in (kind, other)]
+            raise ReobjError(
+                f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
+                f"Give a glob in quotes, such as '{Path(folder) / _glob_of(names[0])}'"
+            )
+    return [p for kind in kinds for p in kind.files], messages
+
+
+def _left_out(files: Sequence[Path], why: str) -> str:
+    first = min((p.name for p in files), key=by_number)
+    return f"{len(files)} images are no frames ({why}): {first}" + " ..." * (len(files) > 1)
+
+
+def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_Kind]:
+    """Group images by their names without the numbers; a copy, a(1).jpg, is as its original."""
+    groups: dict[str, list[tuple[Path, str]]] = {}
+    for path in files:
+        stem = re.sub(r"\s*\(\d+\)$", "", path.stem.casefold())
+        groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
+    kinds = []
+    for text, mine in groups.items():
+        numbers = {tuple(map(int, re.findall(r"\d+", stem))) for _, stem in mine}
+        known = [h for path, _ in mine if (h := headers[path]) is not None]
+        color = 2 * sum(h.channels == 1 for h in known) <= len(known)
+        words = set(re.split(r"[^a-z]+", text.rpartition(".")[0]))
+        kinds.append(_Kind([path for path, _ in mine], words, numbers, color))
+    return kinds
+
+
+def _glob_of(name: str) -> str:
+    """Write a glob of all names that differ from one in their numbers."""
+    return re.sub(r"\d+", "*", glob.escape(name))
+
+
+# ---- Order and times of names --------------------------------------------------------------------
+
+
+def by_number(name: str) -> tuple[Any, ...]:
+    """Return a key that sorts names by the numbers in them, image2 before image10.
+
+    Copies come after their original: a.jpg, a(1).jpg. Case does not count.
+    """
+    stem, dot, suffix = name.rpartition(".")
+    stem, suffix = (stem, suffix) if dot else (name, "")
+    parts = re.split(r"(\d+)", stem.casefold())
+    key = [(bool(k % 2), int(part) if k % 2 else part) for k, part in enumerate(parts) if part]
+    return (key, suffix.casefold(), name)
+
+
+def sorted_names(names: Iterable[str]) -> list[str]:
+    """Sort names by the numbers in them, those that are decimal numbers by their value."""
+    names = list(names)
+    if (values := _decimals(names)) is None:
+        return sorted(names, key=by_number)
+    order = sorted(range(len(names)), key=lambda k: (values[k], by_number(names[k])))
+    return [names[k] for k in order]
+
+
+DECIMAL = re.compile(r"(.*?)((?:(?<![^_= ])-)?\d+(?:\.(\d+))?)")  # a minus is no hyphen of a word
+
+
+def _decimals(names: Sequence[str]) -> list[float] | None:
+    """Read the numbers at the end of names that are else equal; None if that is not all of them."""
+    found = [DECIMAL.fullmatch(Path(name).stem.casefold()) for name in names]
+    known = [match for match in found if match is not None]
+    if not known or len(known) < len(names) or len({match[1] for match in known}) > 1:
+        return None
+    parts = [match[3] for match in known if match[3]]
+    # 1.8, 1.9, 1.10 are two counters: decimals of unequal length do not end in 0 (but 10.0)
+    if len(set(map(len, parts))) > 1 and any(len(p) > 1 and p.endswith("0") for p in parts):
+        return None
+    return [float(match[2]) for match in known]
+
+
+# Names that are time stamps (TUM: 1305031102.175304.png)
+STAMPS_PER_S = (1.0, 1e3, 1e6, 1e9)  # s, ms, us, ns
+EPOCH_S = (946684800.0, 4102444800.0)  # 2000 to 2100, in s since 1970
+FRAME_STEPS_S = (1 / 240, 10.0)  # between two images: the fastest phones; photos one by one
+LEAST_STAMP = 1e9  # whole numbers below are counters (chosen: s since 1970 have ten digits)
+
+
+def times_of_names(names: Sequence[str]) -> Array | None:
+    """Read the times of images (F,) in s from names that are time stamps; None if they are none.
+
+    The last number of every name counts if it has a decimal point, or at least ten digits. Its
+    unit, s, ms, us or ns, is the one in which the images have a plausible rate, a plausible date
+    since 1970 first.
+    """
+    words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
+    if not words or not all(words):
+        return None
+    decimals, points = _decimals(names), ["." in word for (word,) in words]
+    numbers = np.array(decimals or [float(word) for (word,) in words])
+    if not (all(points) or (decimals and any(points)) or numbers.min() >= LEAST_STAMP):
+        return None
+    steps = np.diff(numbers)
+    if (steps <= 0).any():
+        return None
+    found = []
+    for per_s in STAMPS_PER_S:
+        step_s = float(np.median(steps)) / per_s if len(steps) else 1 / IMAGE_FPS
+        first_s = float(numbers[0]) / per_s
+        dated = EPOCH_S[0] < first_s < EPOCH_S[1]
+        clock = dated or (first_s < EPOCH_S[0] and len(steps) > 0)  # or since it was switched on
+        if clock and FRAME_STEPS_S[0] <= step_s <= FRAME_STEPS_S[1]:
+            found.append((not dated, abs(math.log(step_s * IMAGE_FPS)), per_s))
+    return numbers / min(found)[2] if found else None
+
+
+# ---- Reading -------------------------------------------------------------------------------------
+
+PIXELS_MAX = 1 << 28  # of an image; chosen: above the 200 megapixels of phones; 800 MB as BGR
+
+
+def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
+    """Read an image file as OpenCV's `flags` say; None if it is no image.
+
+    Raises:
+        ReobjError: it claims more than PIXELS_MAX pixels: a small file may hold gigabytes.
+    """
+    try:
+        data = np.fromfile(path, np.uint8)
+        claimed = header_of(data.tobytes())
+        if claimed is not None and (pixels := math.prod(claimed.size)) > PIXELS_MAX:
+            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are taken")
+        image = cv2.imdecode(data, flags) if len(data) else None
+    except (OSError, cv2.error):
+        return None
+    return None if image is None else np.asarray(image)
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What an image file says of itself: (w, h) in px, upright; channels without alpha; bits each.
+
+    Of palettes, which masks have and photos have not, one channel.
+    """
+
+    size: tuple[int, int]
+    channels: int = 3
+    bits: int = 8
+
+
+HEADER_BYTES = (1 << 12, 1 << 17)  # read at first; chosen: without and with a photo's thumbnail
+
+
+def header(path: Path) -> Header | None:
+    """Read the header of an image file; None if there is none that is known."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        data = b""
+        for count in (*HEADER_BYTES, -1):
+            data += file.read(count)
+            found = header_of(data)
+            if found is not None and min(found.size) > 0:
+                return found
+    return None
+
+
+def header_of(data: bytes) -> Header | None:
+    """Read the header of an image of IMAGE_SUFFIXES; None if it is cut off, or of another kind."""
+    with contextlib.suppress(struct.error, IndexError):
+        if data.startswith(b"\x89PNG"):
+            width, height, bits, kind = struct.unpack_from(">IIBB", data, 16)
+            return Header((width, height), 3 if kind in (2, 6) else 1, bits)
+        if data.startswith(b"BM"):
+            width, height, _, bits = struct.unpack_from("<iiHH", data, 18)
+            return Header((abs(width), abs(height)), 3 if bits > 8 else 1)
+        if data.startswith(b"\xff\xd8"):
+            return _jpeg_header(data)
+        if data[:4] in (b"II*\0", b"MM\0*"):
+            tags = _tiff_tags(data)
+            channels, bits = tags.get(277, 1), tags.get(258, 1)
+            bits = bits if channels == 1 else 8
+            return Header(_upright((tags.get(256, 0), tags.get(257, 0)), tags), channels, bits)
+        if data[8:15] == b"WEBPVP8":
+            return Header(_webp_size(data))
+    return None
+
+
+def _upright(size: tuple[int, int], tags: dict[int, int]) -> tuple[int, int]:
+    """Turn (w, h) as EXIF's orientation, tag 274, says: 5 to 8 are quarter turns."""
+    return size[::-1] if 5 <= tags.get(274, 1) <= 8 else size
+
+
+def _jpeg_header(data: bytes) -> Header:
+    """Read the first start of frame, which follows other segments, EXIF among them."""
+    at, tags = 2, dict[int, int]()
+    while data[at] == 0xFF and not (
+        0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in JPEG_OTHER
+    ):
+        length = struct.unpack_from(">H", data, at + 2)[0]
+        if data[at + 4 : at + 10] == b"Exif\0\0":
+            with contextlib.suppress(struct.error, IndexError):  # not needed for a picture
+                tags = _tiff_tags(data[at + 10 : at + 2 + length])
+        at += 2 + length
+    bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+    return Header(_upright((width, height), tags), channels, bits)
+
+
+JPEG_OTHER = (0xC4, 0xC8, 0xCC)  # tables among the markers of frames
+
+
+def _tiff_tags(data: bytes) -> dict[int, int]:
+    """Read the tags of the first directory that are one number."""
+    order = "<" if data[:1] == b"I" else ">"
+    (start,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, start)
+    tags = [struct.unpack_from(order + "HHII", data, start + 2 + 12 * i) for i in range(count)]
+    return {
+        tag: value >> 16 * (kind == 3 and order == ">") for tag, kind, n, value in tags if n == 1
+    }
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """Return (w, h): of the canvas, of a lossless or of a lossy picture."""
+    if data[15:16] == b"X":
+        width, height = (int.from_bytes(data[i : i + 3], "little") + 1 for i in (24, 27))
+    elif data[15:16] == b"L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        width, height = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
+    return width, height

@@ -1,0 +1,149 @@
+"""Folders of YOLO labels: a text file an image, `class cx cy w h [conf] [id]` or polygons.
+
+All numbers but the class, the confidence and the identity are shares of the image.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from reobj.files import LINES_MAX, read_lines
+from reobj.sources.class_names import YAML_SUFFIXES, load_class_names
+from reobj.sources.image_frames import frames_of_names
+from reobj.sources.masks import NO_RUNS
+from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections
+from reobj.sources.video import Video
+from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, xyxy_from_cxcywh
+
+LABEL_FOLDERS = ("labels", "obj_train_data")  # of datasets: YOLO's, and CVAT's export of YOLO 1.1
+NO_LABELS = ("classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt",
+             "readme.dataset.txt", "readme.roboflow.txt", "requirements.txt")  # fmt: skip
+NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml", "dataset.yml")
+
+
+def label_files(path: Path) -> list[Path]:
+    """List the label files of a folder, or of the folders of labels of a dataset in it."""
+    own = [p for p in path.glob("*.txt") if p.name.lower() not in NO_LABELS]
+    if not own or any((path / name).is_dir() for name in LABEL_FOLDERS):
+        own = [p for p in path.rglob("*.txt") if p.name.lower() not in NO_LABELS]
+        own = [p for p in own if set(LABEL_FOLDERS) & set(p.relative_to(path).parts[:-1])]
+    if not own:
+        raise ReobjError(f"{path}: a folder without label files; expected YOLO's NAME.txt, one an "
+                         "image, in it or in its folder labels/")  # fmt: skip
+    return sorted(own)
+
+
+def names_file(path: Path) -> Path | None:
+    """Find the class names of a folder of labels: in it, or in one of two folders above."""
+    folder = path.resolve()
+    for place in (folder, *folder.parents[:2]):
+        for name in NAME_FILES:
+            if (place / name).is_file():
+                return place / name
+        found = sorted(p for p in place.glob("*") if p.suffix.lower() in YAML_SUFFIXES)
+        for other in found:
+            if any(line.startswith("names") for line in read_lines(other)):
+                return other
+    return None
+
+
+def read_label_folder(
+    path: Path, names: Sequence[str], video: Video, first: str = ""
+) -> RecordedDetections:
+    """Read a folder of YOLO labels.
+
+    NAME.txt belongs to the image of that name; of a video, NAME_N.txt to its N-th frame (from 1, as
+    ultralytics counts, where NAME is that of the video).
+
+    Args:
+        names: class names by number; (): those beside the labels, else COCO's.
+        first: number of the first frame as the user says it, "": found out.
+    """
+    files = label_files(path)
+    messages = [f"a folder of YOLO labels: {len(files)} files"]
+    of_video = re.compile(re.escape(Path(video.source).stem) + r"_\d+")
+    ours = [] if video.names else [f for f in files if of_video.fullmatch(f.stem)]
+    if ours and len(ours) < len(files):
+        messages.append(f"{len(files) - len(ours)} files of other names than the video's left out")
+        files = ours
+    if not names and (beside := names_file(path)) is not None:
+        names = load_class_names(beside)
+        messages.append(f"class names of {beside.name}")
+    elif not names:
+        messages.append("no class names beside it: class numbers are taken as COCO's 80")
+    rows, lines, of_file = list[list[float]](), list[str](), list[int]()
+    for at, file in enumerate(files):
+        for number, line in enumerate(read_lines(file), 1):
+            if cells := line.split():
+                rows.append(_row(cells, f"{file}, line {number}"))
+                lines.append(f"{number} of {file.name}")
+                of_file.append(at)
+        if len(rows) > LINES_MAX:
+            raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
+    box, score, identity = _columns(rows)
+    stems = [str(file.relative_to(path)) for file in files]
+    usual = 1 if ours else None
+    frame, text = frames_of_names(stems, video, str(path), first, usual, not ours)
+    messages += [text] if text else []
+    scaled = xyxy_from_cxcywh(box) * np.tile(np.array(video.size, np.float64), 2)
+    return RecordedDetections(
+        frame[np.array(of_file, np.int64)], scaled, score,
+        np.array([row[0] for row in rows], np.float64).astype(np.int64), [NO_RUNS] * len(rows),
+        tuple(names or COCO_NAMES), video.size, video.working_size, np.array(lines, object), "line",
+        messages, identity,
+    )  # fmt: skip
+
+
+def _row(cells: Sequence[str], where: str) -> list[float]:
+    """Read the numbers of a line, the class first."""
+    try:
+        row = [float(cell) for cell in cells]
+    except ValueError:
+        raise ReobjError(f"{where}: {' '.join(cells)[:60]!r}, expected numbers: class cx cy w h "
+                         "[conf] [id]") from None  # fmt: skip
+    if len(row) < 5 or not np.isfinite(row).all() or row[0] % 1 or not 0 <= row[0] < 1 << 31:
+        raise ReobjError(f"{where}: {' '.join(cells)[:60]!r}, expected class cx cy w h [conf] [id] "
+                         "or class x1 y1 x2 y2 ...")  # fmt: skip
+    places = row[1:5] if len(row) < 8 else row[1 : len(row) - 2]
+    if np.abs(places).max() > NORMALISED_MAX:
+        raise ReobjError(f"{where}: {max(places, key=abs):g} is no share of the image; expected "
+                         "numbers of 0..1, not pixels")  # fmt: skip
+    return row
+
+
+def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
+    """Split rows into boxes (N, 4) cx, cy, w, h, scores (N,) and identities (N,), -1: none.
+
+    Up to seven numbers are a box, with a confidence (at most 1) and an identity (whole), where not
+    every seventh is a share: then they are triangles. More are polygons, with the same at the end.
+    """
+    count = len(rows)
+    box, score, identity = np.zeros((count, 4)), np.ones(count), np.full(count, -1, np.int64)
+    seventh = [row[6] for row in rows if len(row) == 7]
+    triangles = any(value % 1 for value in seventh)
+    for i, row in enumerate(rows):
+        polygon = len(row) > 7 or (len(row) == 7 and triangles)
+        rest = row[5:] if not polygon else _tail(row)
+        if polygon:
+            corners = np.reshape(row[1 : len(row) - len(rest)], (-1, 2))
+            low, high = corners.min(0), corners.max(0)
+            box[i] = *(low + high) / 2, *(high - low)
+        else:
+            box[i] = row[1:5]
+        for value in rest:
+            if value > 1 or (value % 1 == 0 and len(rest) == 2 and value == rest[1]):
+                identity[i] = int(value)
+            else:
+                score[i] = value
+    return box, score, identity
+
+
+def _tail(row: Sequence[float]) -> Sequence[float]:
+    """Return what follows the corners of a polygon: nothing, [conf], [id] or [conf, id]."""
+    if len(row) % 2 == 0:
+        return row[-1:]
+    return row[-2:] if row[-1] > NORMALISED_MAX and row[-1] % 1 == 0 else []

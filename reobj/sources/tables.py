@@ -1,0 +1,542 @@
+"""Detections and tracks in text tables: MOTChallenge, KITTI tracking, CSV with a header.
+
+Start at `read_table` and `read_mot_rows`. Cells are separated by commas, semicolons, tabs or
+spaces; where a comma separates no cells it may be the decimal point.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reobj.files import read_lines, shortened
+from reobj.sources.class_names import check_length
+from reobj.sources.image_files import EPOCH_S
+from reobj.sources.image_frames import frames_of_names, frames_of_numbers
+from reobj.sources.masks import NO_RUNS
+from reobj.sources.recorded import RecordedDetections
+from reobj.sources.video import Video
+from reobj.types import (
+    CLASS_MAX,
+    CLASS_NAME_MAX,
+    COCO_NAMES,
+    COORDINATE_MAX,
+    Array,
+    BoolArray,
+    IntArray,
+    ReobjError,
+    printable,
+    xyxy_from_cxcywh,
+)
+
+MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "extra", "z")
+KITTI_COLUMNS = ("frame", "id", "class", "truncated", "occluded", "alpha", "x1", "y1", "x2", "y2",
+                 "3d h", "3d w", "3d l", "3d x", "3d y", "3d z", "yaw", "score")  # fmt: skip
+ALIASES: dict[str, tuple[str, ...]] = {  # of columns, the first that is there and not empty counts
+    "frame": ("frame", "frame_id", "frame_index", "frame_number", "frame_idx", "frame_no",
+              "frame_num", "frame_nr", "frameid", "framenumber"),
+    "image": ("file_name", "filename", "image_name", "image_path", "image_id", "imageid", "image",
+              "img_name", "img_path", "img", "path", "file"),
+    "time": ("time", "timestamp", "time_s", "timestamp_s", "time_ns", "timestamp_ns", "time_us",
+             "timestamp_us", "time_ms", "timestamp_ms"),
+    "id": ("id", "track_id", "tracker_id", "trackid", "track", "object_id", "obj_id", "object_uid",
+           "instance_id", "instance", "identity"),
+    "x1": ("x1", "x_min", "xmin", "left", "bb_left", "bbox_left", "box_left", "x_left", "xtl",
+           "bbox_x1", "bbox_xmin", "x", "bbox_x", "bb_x"),
+    "y1": ("y1", "y_min", "ymin", "top", "bb_top", "bbox_top", "box_top", "y_top", "ytl",
+           "bbox_y1", "bbox_ymin", "y", "bbox_y", "bb_y"),
+    "x2": ("x2", "x_max", "xmax", "right", "bb_right", "bbox_right", "box_right", "x_right", "xbr",
+           "bbox_x2", "bbox_xmax"),
+    "y2": ("y2", "y_max", "ymax", "bottom", "bb_bottom", "bbox_bottom", "box_bottom", "y_bottom",
+           "ybr", "bbox_y2", "bbox_ymax"),
+    "w": ("w", "width", "bb_width", "bbox_width", "box_width", "bbox_w", "bb_w"),
+    "h": ("h", "height", "bb_height", "bbox_height", "box_height", "bbox_h", "bb_h"),
+    "cx": ("cx", "xc", "x_center", "x_centre", "center_x", "xcenter", "bbox_cx"),
+    "cy": ("cy", "yc", "y_center", "y_centre", "center_y", "ycenter", "bbox_cy"),
+    "score": ("score", "confidence", "conf", "prob", "probability", "detection_score"),
+    "class": ("class_name", "category_name", "class_label", "label", "name", "category", "type",
+              "class", "class_id", "cls", "category_id", "label_id", "coco80_class"),
+}  # fmt: skip
+BOXES = (("x1", "y1", "x2", "y2"), ("x1", "y1", "w", "h"), ("cx", "cy", "w", "h"))
+OPTIONAL = ("id", "score", "class")  # columns without any value count as missing
+WHOLE_MAX = 2.0**53  # of frame and identity; beyond, a float skips whole numbers
+NO_CELLS = ("", "nan", "none", "null", "na")  # what pandas and others write for no value
+
+
+@dataclass(slots=True)
+class Table:
+    """Hold the cells of a table by what their columns mean.
+
+    Attributes:
+        path: of the file. kind: "MOT", "KITTI" or "CSV".
+        cells: N texts by role, a key of ALIASES, or a name of MOT_COLUMNS or KITTI_COLUMNS.
+        line: (N,) where each row stands, in `unit`s. header: names of the columns, [] without.
+        comma: it may be the decimal point. messages: for the user.
+    """
+
+    path: Path
+    kind: str
+    cells: dict[str, list[str]]
+    line: IntArray
+    unit: str = "line"
+    header: tuple[str, ...] = ()
+    comma: bool = False
+    messages: list[str] = field(default_factory=list)
+
+    def where(self, row: int) -> str:
+        """Say where a row stands."""
+        return f"{self.path}, {self.unit} {self.line[row]}"
+
+    def rows(self, keep: BoolArray) -> None:
+        """Keep some of the N rows."""
+        kept = np.flatnonzero(keep)
+        self.cells = {role: [own[i] for i in kept] for role, own in self.cells.items()}
+        self.line = self.line[kept]
+
+    def numbers(self, role: str) -> Array:
+        """Convert a column to finite numbers (N,); an error names the line."""
+        cells = self.cells[role]
+        if self.comma:
+            cells = [cell.replace(",", ".") for cell in cells]
+        with contextlib.suppress(ValueError):
+            values = np.array(cells, np.float64)
+            if np.isfinite(values).all():
+                return values
+        values = np.full(len(cells), np.nan)
+        for i, cell in enumerate(cells):
+            with contextlib.suppress(ValueError):
+                values[i] = float(cell)
+            if not math.isfinite(values[i]):
+                raise ReobjError(f"{self.where(i)}: {self.cells[role][i]!r} is no finite number")
+        return values
+
+    def whole(self, role: str) -> IntArray:
+        """Convert a column to whole numbers (N,)."""
+        values = self.numbers(role)
+        bad = (np.abs(values) > WHOLE_MAX) | (values % 1 != 0)
+        if bad.any():
+            row = int(bad.argmax())
+            text = f"{role} {self.cells[role][row]}, expected a whole number"
+            raise ReobjError(f"{self.where(row)}: {text}")
+        return values.astype(np.int64)
+
+
+# ---- Cells ---------------------------------------------------------------------------------------
+
+
+def _is_number(cell: str) -> bool:
+    with contextlib.suppress(ValueError):
+        float(cell.strip().replace(",", "."))
+        return True
+    return False
+
+
+def _are_numbers(cells: Sequence[str]) -> bool:
+    with contextlib.suppress(ValueError):
+        return np.array(cells, np.float64).ndim == 1
+    return all(map(_is_number, cells))
+
+
+def _separator(line: str) -> str:
+    """Find what separates the cells of a line: of ; tab and comma the one that makes most."""
+    best = max(";\t,", key=line.count)
+    data = line.lstrip()[:1] in tuple("+-.0123456789")
+    if len(line.split()) > line.count(best) + 1 and (data or best not in line):
+        return " "
+    return best
+
+
+def _is_remark(line: str) -> bool:
+    """Tell whether a line begins with # and is no header."""
+    if line[:1] != "#":
+        return False
+    words = set(re.split(r"[^a-z0-9]+", line.lower())) | set(re.split(r"\W+", line.lower()))
+    return not words & {name for role in ("frame", "image", "time") for name in ALIASES[role]}
+
+
+def _rows(path: Path) -> tuple[list[list[str]], list[int], str]:
+    """Split a file into rows of cells, the lines on which they end, and the separator."""
+    lines = read_lines(path)
+    lines = ["\n" if _is_remark(line) else line for line in lines]
+    first = next((line for line in lines if line.strip()), "")
+    separator = _separator(first)
+    if separator == " ":
+        split = [(line.split(), i) for i, line in enumerate(lines, 1)]
+    else:
+        reader = csv.reader(lines, delimiter=separator, strict=True)
+        try:
+            split = [(cells, reader.line_num) for cells in reader]
+        except csv.Error as error:
+            raise ReobjError(f"{path}, line {reader.line_num}: no table ({error})") from error
+    kept = [([cell.strip() for cell in cells], i) for cells, i in split]
+    kept = [(cells, i) for cells, i in kept if any(cells)]
+    if kept and kept[0][0][0] == "#":  # of a header, apart from its first name
+        kept[0][0].pop(0)
+    return [cells for cells, _ in kept], [i for _, i in kept], separator
+
+
+def read_cells(path: Path) -> Table:
+    """Read the cells of a text table, whatever its kind.
+
+    Raises:
+        ReobjError: a row of another length than the first one, or a header that names no box.
+    """
+    rows, lines, separator = _rows(path)
+    first = rows[0] if rows else []
+    table = Table(path, "MOT", {}, np.array(lines, np.int64), comma=separator != ",")
+    if not first:
+        table.cells = {role: [] for role in MOT_COLUMNS}
+        return table
+    columns: Sequence[str] = MOT_COLUMNS
+    expected = "6 to 10 (frame, id, left, top, w, h, score)"
+    count = len(first)
+    if not _is_number(first[0]):
+        table.kind, table.header = "CSV", _header(first)
+        columns, count, rows, lines = table.header, len(table.header), rows[1:], lines[1:]
+        table.line = table.line[1:]
+        expected = str(count)
+    elif count > 1 and not any(cells[-1] for cells in rows):  # each line ends in a separator
+        rows, count = [cells[:-1] for cells in rows], count - 1
+        expected = str(count) if 6 <= count <= len(MOT_COLUMNS) else expected
+    elif len(first) in (17, 18) and not _is_number(first[2]):
+        table.kind, columns, expected = "KITTI", KITTI_COLUMNS, str(count)
+    elif 6 <= count <= len(MOT_COLUMNS):
+        expected = str(count)
+    for cells, line in zip(rows, lines, strict=True):
+        if str(len(cells)) != expected:
+            raise ReobjError(f"{path}, line {line}: {len(cells)} columns, expected {expected}")
+    by_name = {name: [row[i] for row in rows] for i, name in enumerate(columns[:count])}
+    table.cells = _by_role(by_name, path) if table.kind == "CSV" else by_name
+    return table
+
+
+def _header(cells: Sequence[str]) -> tuple[str, ...]:
+    """Read the names of columns: without remarks in brackets and after a semicolon; distinct."""
+    text = re.sub(r"\(.*?\)|\[.*?\]", "", ",".join(cells)).split(";")[0].lower()
+    names = [re.sub(r"[\s.-]+", "_", name.strip()) for name in text.lstrip("# ").split(",")]
+    if "x0" in names and "y0" in names:  # corners counted from 0
+        other = {"x0": "x1", "y0": "y1", "x1": "x2", "y1": "y2"}
+        names = [other.get(name, name) for name in names]
+    return tuple(name if name not in names[:i] else f"column {i}" for i, name in enumerate(names))
+
+
+def _by_role(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str]]:
+    """Find the columns of a CSV by their names."""
+    cells = {}
+    for role, names in ALIASES.items():
+        own = [name for name in names if name in by_name]
+        filled = [name for name in own if not all(map(_is_empty, by_name[name]))]
+        used = filled or (own if role not in OPTIONAL else [])
+        if used:
+            cells[role] = by_name[used[0]]
+    when = any(role in cells for role in ("frame", "image", "time"))
+    if not when or not any(all(role in cells for role in roles) for roles in BOXES):
+        missing = [role for role in ("x1", "y1", "x2", "y2") if role not in cells]
+        missing = ["frame"] * (not when) + missing
+        text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
+        example = "expected one such as frame,x1,y1,x2,y2,score,class"
+        raise ReobjError(f"{path}, line 1: {text}: {example}")
+    return cells
+
+
+def _is_empty(cell: str) -> bool:
+    return cell.lower() in NO_CELLS
+
+
+def table_of_records(path: Path, records: Any) -> Table | None:
+    """Make the table of a JSON list of flat objects, as supervision's JSONSink writes it.
+
+    None: it is something else.
+    """
+    flat = isinstance(records, list) and all(isinstance(record, dict) for record in records)
+    if not flat or not any({"x_min", "xmin", "x1"} & record.keys() for record in records[:1]):
+        return None
+    names = list(dict.fromkeys(name for record in records for name in record))
+    header = _header([name.replace(",", " ") for name in names])
+    texts = [["" if r.get(name) is None else str(r[name]).strip() for r in records]
+             for name in names]  # fmt: skip
+    cells = _by_role(dict(zip(header, texts, strict=True)), path)
+    return Table(path, "CSV", cells, np.arange(len(records)), "entry", header)
+
+
+# ---- What the cells mean -------------------------------------------------------------------------
+
+
+def read_mot_rows(path: Path) -> Array:
+    """Read a MOTChallenge file as numbers.
+
+    Returns:
+        (N, 6 to 10) frame (from 1), id, left, top, w, h[, score[, class or x[, y[, z]]]]; of an
+        empty file (0, 10).
+    Raises:
+        ReobjError: names the line that has another number of columns or is no number.
+    """
+    table = read_cells(path)
+    if table.kind != "MOT":
+        raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
+    rows = np.stack([table.numbers(role) for role in table.cells], 1)  # (N, 6 to 10)
+    table.whole("frame"), table.whole("id")
+    if (far := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
+        row = int(far.argmax())
+        text = f"box {rows[row, 2:6]}, expected at most {COORDINATE_MAX:g} px"
+        raise ReobjError(f"{table.where(row)}: {text}")
+    return rows
+
+
+def read_table(
+    path: Path, names: Sequence[str], video: Video, first: str = ""
+) -> RecordedDetections:
+    """Read the detections of a text table.
+
+    Args:
+        names: class names by number, () where they are not given.
+        first: number of the first frame as the user says it, "": found out.
+    """
+    return recorded_table(read_cells(path), names, video, first)
+
+
+def recorded_table(
+    table: Table, names: Sequence[str], video: Video, first: str = ""
+) -> RecordedDetections:
+    """Make the detections of a table of any kind."""
+    _drop_rows(table)
+    xyxy, count, mot = _boxes(table), len(table.line), table.kind == "MOT"
+    if mot and (table.numbers("id") % 1 != 0).any():
+        raise ReobjError(f"{table.path}: the second column is no identity. If this is no MOT file: "
+                         "CSV needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
+    identity = _identities(table)
+    score = table.numbers("score") if "score" in table.cells else np.ones(count)
+    classes = _mot_classes(table, score, names) if mot else _text_classes(table, names)
+    frame = _frames(table, video, first)
+    found = RecordedDetections(
+        frame, xyxy, score, classes[0], [NO_RUNS] * count, tuple(classes[1]), video.size,
+        video.working_size, table.line, table.unit, table.messages, identity,
+    )  # fmt: skip
+    return _without_ignored(found) if mot else found
+
+
+def _drop_rows(table: Table) -> None:
+    """Leave out, and count, rows that stand for no box or that the format says to ignore."""
+    if table.kind == "KITTI":
+        keep = np.array([name != "DontCare" for name in table.cells["class"]], bool)
+        if not keep.all():
+            table.messages.append(f"{(~keep).sum()} rows DontCare left out")
+            table.rows(keep)
+    roles = [role for role in ("x1", "y1", "x2", "y2", "w", "h", "cx", "cy") if role in table.cells]
+    none = np.ones(len(table.line), bool)
+    for role in roles:
+        rows = np.flatnonzero(none)
+        none[rows] = [_is_empty(table.cells[role][row]) for row in rows]
+    if none.any():
+        first = f"{table.unit} {table.line[none][0]}"
+        table.messages.append(f"{none.sum()} rows without a box left out, the first at {first}")
+        table.rows(~none)
+
+
+def _boxes(table: Table) -> Array:
+    """Return the boxes (N, 4), corners."""
+    roles = next(own for own in BOXES if all(role in table.cells for role in own))
+    box = np.stack([table.numbers(role) for role in roles], 1)
+    if roles[0] == "cx":
+        return xyxy_from_cxcywh(box)
+    return np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]) if roles[2] == "w" else box
+
+
+def _identities(table: Table) -> IntArray:
+    """Return the identities (N,), -1 where a row has none; empty without such a column."""
+    if "id" not in table.cells:
+        return np.empty(0, np.int64)
+    if table.kind == "CSV":
+        table.cells["id"] = ["-1" if _is_empty(cell) else cell for cell in table.cells["id"]]
+    return table.whole("id")
+
+
+USUAL_FIRST = {"MOT": 1, "KITTI": 0, "CSV": 0}  # number of the first frame
+
+
+def _frames(table: Table, video: Video, first: str) -> IntArray:
+    """Return the frames of the source (N,), -1: none."""
+    if "frame" in table.cells and _are_numbers(table.cells["frame"]):
+        usual = USUAL_FIRST[table.kind]
+        if any(name.startswith("bb_") for name in table.header):  # MOTChallenge's own names
+            usual = 1
+        numbers = table.whole("frame")
+        count, where = video.frame_count, str(table.path)
+        frame, text = frames_of_numbers(numbers, count, first, usual, False, where)
+    elif "frame" in table.cells or "image" in table.cells:
+        names = table.cells["frame" if "frame" in table.cells else "image"]
+        frame, text = frames_of_names(names, video, str(table.path), first, 0)
+    else:
+        return _frames_at(seconds(table), video, table.path)
+    table.messages += [text] if text else []
+    return frame
+
+
+def image_names_of(table: Table) -> list[str]:
+    """Return the distinct names of images in a table, [] where it has numbers or times."""
+    if "frame" in table.cells or "image" not in table.cells:
+        return []
+    names = list(dict.fromkeys(table.cells["image"]))
+    return [] if _are_numbers(names) else names
+
+
+def seconds(table: Table) -> Array:
+    """Return the times (N,) of a table in s: in the unit that the column names, or that dates are.
+
+    Numbers that are no date since 1970 in s, ms, us or ns are s.
+    """
+    values = table.numbers("time")
+    named = [name for name in ALIASES["time"] if name in table.header]
+    units = {"ns": 1e9, "us": 1e6, "ms": 1e3}
+    per_s = next((units[name[-2:]] for name in named[:1] if name[-3:-2] == "_"
+                  and name[-2:] in units), 0.0)  # fmt: skip
+    if not per_s and len(values):
+        dated = [u for u in (1.0, 1e3, 1e6, 1e9) if EPOCH_S[0] < values.min() / u < EPOCH_S[1]]
+        per_s = dated[0] if dated else 1.0
+    return values / (per_s or 1.0)
+
+
+def _frames_at(time_s: Array, video: Video, path: Path) -> IntArray:
+    """Find the frames at times (N,) in s, -1 where none is within half a frame interval."""
+    if video.times_s is None:
+        raise ReobjError(f"{path}, line 1: no column frame; time stamps are of use only where the "
+                         "names of the images are time stamps too")  # fmt: skip
+    half = 0.5 * float(np.median(np.diff(video.times_s))) if len(video.times_s) > 1 else 0.0
+    after = np.searchsorted(video.times_s, time_s).clip(max=len(video.times_s) - 1)  # (N,)
+    pair = np.stack([(after - 1).clip(0), after], 1)  # (N, 2)
+    offset = np.abs(video.times_s[pair] - time_s[:, None])
+    nearest = np.take_along_axis(pair, offset.argmin(1)[:, None], 1)[:, 0]
+    return np.where(offset.min(1) <= half, nearest, -1)
+
+
+# ---- Classes -------------------------------------------------------------------------------------
+
+
+def _text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[str]]:
+    """Read a column of class names or of numbers from 0; empty cells and -1 are no class."""
+    cells = table.cells.get("class", [""] * len(table.line))
+    blank = np.array([_is_empty(cell) or cell == "-1" for cell in cells], bool)
+    filled = [cell for cell, none in zip(cells, blank.tolist(), strict=True) if not none]
+    numbers = _whole_numbers(filled)
+    class_id = np.zeros(len(cells), np.int64)
+    if not filled:
+        return class_id, ["object"]
+    known: list[str]
+    if numbers is not None:
+        known = list(names or COCO_NAMES)
+        class_id[~blank] = numbers
+    else:
+        for name in set(filled):
+            if len(name) > CLASS_NAME_MAX:
+                check_length(name, table.where(cells.index(name)))
+        base = list(names) if table.kind == "KITTI" else list(names or COCO_NAMES)
+        new = sorted(set(filled) - set(base))
+        known = [*base, *new]
+        index = {name: i for i, name in reversed(list(enumerate(known)))}
+        class_id[~blank] = [index[cell] for cell in filled]
+        if new and base:
+            table.messages.append(
+                f"{len(new)} class names not in the list: {printable(shortened(new))}"
+            )
+    return _with_unnamed(class_id, blank, known, table)
+
+
+def _whole_numbers(cells: Sequence[str]) -> IntArray | None:
+    """Convert cells such as 56 or 56.0 to numbers from 0 (N,); None if they are names."""
+    if not all(re.fullmatch(r"[0-9]{1,18}(\.0*)?", cell) for cell in cells):
+        return None
+    return np.array([int(cell.partition(".")[0]) for cell in cells], np.int64)
+
+
+def _with_unnamed(
+    class_id: IntArray, blank: BoolArray, names: list[str], table: Table
+) -> tuple[IntArray, list[str]]:
+    """Call rows without a class (N,) `object`, and count them."""
+    if blank.any():
+        class_id = np.where(blank, len(names), class_id)
+        names = [*names, "object"]
+        table.messages.append(f"{blank.sum()} boxes without a class are called object")
+    return class_id, names
+
+
+def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntArray, list[str]]:
+    """Read the class numbers of MOT rows; what the column holds is measured.
+
+    Numbers count from 1 in the order of the names, from 0 where a 0 fits the names; -1 is no
+    class. Boxmot's older results (1, class from 0, score in the last three of nine columns) are
+    recognised: their scores replace `score` in place. Numbers that cannot be of classes are world
+    coordinates (columns 8 to 10 of MOTChallenge's detections).
+    """
+    count = len(score)
+    number = table.numbers("class") if "class" in table.cells else np.full(count, -1.0)
+    none = np.zeros(count, np.int64), ["object"]
+    if not count or (number == -1).all():
+        return none
+    if (odd := (number % 1 != 0) | (number < -1)).any():
+        value = table.cells["class"][int(odd.argmax())]
+        table.messages.append(f"column 8 holds no class numbers ({value}): no classes are read")
+        return none
+    if number.max() > CLASS_MAX:
+        text = f"class number {table.cells['class'][int(number.argmax())]}"
+        raise ReobjError(f"{table.path}: {text}, expected at most {CLASS_MAX}")
+    kind, first = number.astype(np.int64), 1
+    if _is_boxmot(table, score, kind):
+        score[:], first = table.numbers("extra"), 0
+        table.messages.append(
+            "columns 7 to 9 are taken as 1, class from 0, score, as boxmot writes them"
+        )
+    ignored = (kind == 0) & (score == 0)  # VisDrone's ignored regions
+    used = kind[~ignored]
+    if (used == 0).any() and first:
+        first = 0 if not ignored.any() and (not names or used.max() < len(names)) else 1
+        text = "are taken as 0-based, as there is a 0" if not first else "count from 1; 0: no class"
+        table.messages.append(f"class numbers {text}")
+    known = list(names)
+    if (most := int(kind.max(initial=0)) - first) >= len(known):
+        if known:
+            text = f"class numbers up to {kind.max()}, but only {len(known)} class names"
+            table.messages.append(f"{text}: the others are called by their numbers")
+        known += [f"class {i + first}" for i in range(len(known), most + 1)]
+    blank = (kind < first) & ~ignored
+    class_id, known = _with_unnamed((kind - first).clip(0), blank, known, table)
+    return np.where(ignored, IGNORED, class_id), known
+
+
+IGNORED = -2  # class of rows that are left out
+
+
+VISIBLE_ROWS = 20  # chosen: true boxes; among so many one at least is wholly visible
+
+
+def _is_boxmot(table: Table, score: Array, number: IntArray) -> bool:
+    """Tell whether the last column is a score: all scores are 1, and no value of it is 0 or 1.
+
+    In MOTChallenge's ground truth it is the visibility, which is 1 where nothing is in front;
+    identities and classes count from 1 there.
+    """
+    if "extra" not in table.cells or "z" in table.cells or (score != 1).any():
+        return False
+    extra = table.numbers("extra")
+    if not ((extra > 0) & (extra < 1)).all():
+        return False
+    no_truth = (table.numbers("id") < 0).all() or (number == 0).any()
+    as_written = all(re.fullmatch(r"0?\.\d{6}", cell) for cell in table.cells["extra"])  # %.6f
+    return bool(no_truth or as_written or len(extra) >= VISIBLE_ROWS)
+
+
+def _without_ignored(found: RecordedDetections) -> RecordedDetections:
+    """Leave out, and count, the regions that are to be ignored."""
+    ignored = found.class_id == IGNORED
+    if ignored.any():
+        text = f"{ignored.sum()} rows of class 0 and score 0 (ignored regions) left out"
+        found.messages.append(text)
+        found.select(np.flatnonzero(~ignored))
+    return found

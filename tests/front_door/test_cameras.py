@@ -1,0 +1,90 @@
+"""`poses` on small rendered walks in which some pictures cannot be located."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pose_worlds import ate_percent, textured_room
+
+import reobj_track as rt
+from reobj.cameras import load_poses
+
+pytest.importorskip("pycolmap")
+COUNT = 30
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """A walk in even steps with a hand that shakes by 5 of 320 pixels; true poses."""
+    return textured_room(COUNT, 0.12, -0.8, size=(320, 240))
+
+
+def cameras(folder: Path, images, capsys, caplog) -> tuple[rt.Poses, str]:
+    """Write images, run `poses` on them; the poses and everything that was printed."""
+    (folder / "in").mkdir()
+    for k, image in enumerate(images):
+        cv2.imwrite(str(folder / "in" / f"{k:03d}.png"), image)
+    assert rt.main(["poses", str(folder / "in"), "-o", str(folder / "out")]) == 0
+    text = "".join(capsys.readouterr()) + caplog.text
+    found = list((folder / "out" / "cache").glob("poses*.npz"))
+    video = rt.Video(folder / "in")
+    poses = load_poses(found[0]) if found else rt.estimate_poses(video, rt.PosesConfig(), folder)
+    return poses, text
+
+
+def other_scene(k: int) -> np.ndarray:
+    return textured_room(1, 0, seed=7 + k % 2, size=(320, 240))[0][0]
+
+
+SPOILED = {
+    "black": lambda image, k: image * 0,
+    "white": lambda image, k: image * 0 + 255,
+    "blur": lambda image, k: cv2.GaussianBlur(image, (0, 0), 25),
+    "finger": lambda image, k: cv2.circle(image.copy(), (160, 120), 210, (60, 80, 150), -1),
+    "another scene": lambda image, k: other_scene(k),
+}
+
+
+@pytest.mark.parametrize("kind", ["black", "another scene"])
+def test_some_pictures_without_the_scene_cost_no_camera_of_the_others(
+    walk, tmp_path, monkeypatch, capsys, caplog, kind
+):
+    """As with these pictures deleted; they have none, and are named."""
+    monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)  # fewer than pictures: by flow
+    images, truth = walk
+    lost = range(12, 17)
+    images = [SPOILED[kind](im, k) if k in lost else im for k, im in enumerate(images)]
+    poses, text = cameras(tmp_path, images, capsys, caplog)
+    own = ~np.isin(np.arange(COUNT), lost)
+    assert poses.known[own].all() and not poses.known[~own].any() and poses.part_count == 1
+    assert ate_percent(poses.cam_from_world[own], truth[own]) < 1.0
+    assert "cameras: 25 of 30 frames (pycolmap)," in text and "012.png" in text
+
+
+def test_only_gaps_with_a_small_error_are_interpolated(walk, tmp_path, monkeypatch, capsys, caplog):
+    """The shaking hand is off by 2 px in one lost frame, and by 8 px in five; both are said."""
+    monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)
+    images, truth = walk
+    lost = [7, *range(15, 20)]
+    images = [SPOILED["blur"](im, k) if k in lost else im for k, im in enumerate(images)]
+    poses, text = cameras(tmp_path, images, capsys, caplog)
+    assert np.flatnonzero(poses.status == "interpolated").tolist() == [7]
+    assert np.flatnonzero(~poses.known).tolist() == [*range(15, 20)]
+    assert "cameras: 25 of 30 frames (pycolmap), 1 interpolated" in text
+    assert "5 of 30 frames have no camera: frames 15-19" in text
+    assert ate_percent(poses.cam_from_world[poses.known], truth[poses.known]) < 1.5
+
+
+def test_pictures_in_which_nothing_can_be_followed_say_so(tmp_path, capsys, caplog):
+    images = [np.full((240, 320, 3), 255, np.uint8)] * 45
+    _, text = cameras(tmp_path, images, capsys, caplog)
+    assert "cameras: 0 of 45 frames" in text and "no picture shows anything" in text
+
+
+def test_a_turn_on_the_spot_is_refused_with_what_was_measured(tmp_path, capsys, caplog):
+    images = textured_room(8, 0, 4, size=(320, 240))[0]
+    poses, text = cameras(tmp_path, images, capsys, caplog)
+    assert not poses.known.any() and "as a plane or a mere turn gives them" in text

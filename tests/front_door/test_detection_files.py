@@ -1,0 +1,790 @@
+"""Detections and tracks of other tools through the command line: the right boxes and frames.
+
+One truth, a chair that moves through a small video, is written in every format and variant that
+users bring; the tracks that come out are compared with it. What cannot be meant is refused in one
+line that names the cause.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import reobj_track as rt
+
+SIZE, FRAMES = (320, 240), 8
+CHAIR = 56  # of COCO's 80, from 0
+QUICK = ("--embed", "none", "--set", "output.overlay=none", "--set", "output.scene=false")
+
+
+def box(frame: int) -> tuple[int, int, int, int]:
+    """Corners of the chair in a frame."""
+    return 10 + 4 * frame, 20, 50 + 4 * frame, 60
+
+
+def film(path: Path, frames: int = FRAMES) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25, SIZE)
+    for _ in range(frames):
+        writer.write(np.zeros((*SIZE[::-1], 3), np.uint8))
+    writer.release()
+    return path
+
+
+def images(folder: Path, names: Sequence[str]) -> Path:
+    folder.mkdir(parents=True)
+    for name in names:
+        cv2.imwrite(str(folder / name), np.zeros((*SIZE[::-1], 3), np.uint8))
+    return folder
+
+
+@dataclasses.dataclass
+class Tracked:
+    """What a run wrote and said."""
+
+    code: int
+    frames: list[int]  # from 0
+    boxes: list[tuple[float, ...]]
+    classes: list[str]
+    said: str
+
+
+@pytest.fixture
+def tracked(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Tracked]:
+    def run(source: Path, *arguments: Any) -> Tracked:
+        caplog.clear()
+        caplog.set_level(logging.WARNING)
+        out = tmp_path / "out"
+        code = rt.main(["track", str(source), "-o", str(out), *map(str, arguments), *QUICK])
+        said = caplog.text + capsys.readouterr().err
+        if code:
+            assert not (out / "tracks.txt").exists()
+            return Tracked(code, [], [], [], said)
+        rows = np.loadtxt(out / "tracks.txt", delimiter=",", ndmin=2).reshape(-1, 10)
+        classes = json.loads((out / "objects.json").read_text())["objects"]
+        corners = np.hstack([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]])
+        return Tracked(
+            code, (rows[:, 0] - 1).astype(int).tolist(), [tuple(b) for b in corners.tolist()],
+            sorted(entry["class"] for entry in classes), said,
+        )  # fmt: skip
+
+    return run
+
+
+def is_truth(made: Tracked, name: str = "chair", frames: Sequence[int] = range(FRAMES)) -> bool:
+    """Whether the chair is in its place in these frames, and nothing else."""
+    same = np.allclose(made.boxes, [box(f) for f in made.frames], atol=0.05)
+    return made.frames == list(frames) and same and made.classes == [name]
+
+
+# ---- One truth in every format -------------------------------------------------------------------
+
+
+def lines(row: Callable[[int, tuple[int, int, int, int]], str], header: str = "") -> str:
+    return header + "".join(row(f, box(f)) + "\n" for f in range(FRAMES))
+
+
+def mot(separator: str = ",", tail: str = "1,57", first: int = 1, identity: int = 1) -> str:
+    def row(f: int, b: tuple[int, int, int, int]) -> str:
+        cells = [f + first, identity, b[0], b[1], b[2] - b[0], b[3] - b[1], *tail.split(",")]
+        return separator.join(map(str, cells))
+
+    return lines(row)
+
+
+def csv(header: str, cells: str) -> str:
+    """CSV with cells such as "{f},{x1}"."""
+    return lines(
+        lambda f, b: cells.format(
+            f=f, n=f + 1, x1=b[0], y1=b[1], x2=b[2], y2=b[3], w=b[2] - b[0], h=b[3] - b[1],
+            cx=(b[0] + b[2]) / 2, cy=(b[1] + b[3]) / 2,
+        ),
+        header + "\n",
+    )  # fmt: skip
+
+
+def kitti(score: str = "") -> str:
+    row = "{f} 1 chair 0 0 -1.5 {x1}.00 {y1}.00 {x2}.00 {y2}.00 1 1 1 1 1 5 0.1" + score
+    ignored = "3 -1 DontCare -1 -1 -10 1 1 9 9 -1 -1 -1 -1000 -1000 -1000 -10" + score
+    return csv("", row).lstrip() + ignored + "\n"
+
+
+def coco_box(frame: int) -> list[int]:
+    x, y, x2, y2 = box(frame)
+    return [x, y, x2 - x, y2 - y]
+
+
+def sink() -> str:
+    """What supervision's JSONSink writes: numbers as text too, empty where there is none."""
+    keys = ("x_min", "y_min", "x_max", "y_max")
+    rows = [
+        dict(zip(keys, box(f), strict=True))
+        | {"class_id": 0, "confidence": ".9", "tracker_id": "", "class_name": "chair",
+           "frame_index": f} for f in range(FRAMES)
+    ]  # fmt: skip
+    return json.dumps(rows)
+
+
+CSV_ROW = "{f},{x1},{y1},{x2},{y2},.9,chair"
+TABLES = {
+    "mot": mot(),
+    "mot with spaces": mot(" "),
+    "mot with tabs": mot("\t"),
+    "mot with semicolons": mot(";"),
+    "mot with decimal commas": mot(";", "0,9").replace("0;9", "0,9").replace(";20;", ";20,0;"),
+    "mot with floats as numpy writes them": mot(tail="9.0e-01,57.0"),
+    "mot with CRLF and a byte order mark": "\ufeff" + mot().replace("\n", "\r\n"),
+    "mot from 0": mot(first=0),
+    "mot in columns": mot("   ").replace("1 ", " 1 "),
+    "mot after a remark": "# made by some tool, 1 line\n" + mot(),
+    "mot with a comma at the end": mot().replace("\n", ",\n"),
+    "a header of words": csv("# frame x1 y1 x2 y2 score class", "{f} {x1} {y1} {x2} {y2} .9 chair"),
+    "boxmot: 1, class from 0, score": mot(tail=f"1,{CHAIR},0.873000"),
+    "boxmot's detections, no identity": mot(tail=f"1,{CHAIR},.87", identity=-1),
+    "csv": csv("frame,x1,y1,x2,y2,score,class", CSV_ROW),
+    "csv in capitals": csv("Frame,X1,Y1,X2,Y2,Score,Class", CSV_ROW),
+    "csv of a spreadsheet": csv("frame;x1;y1;x2;y2;score;class",
+                                "{f};{x1},0;{y1},0;{x2},0;{y2},0;0,9;chair"),
+    "pandas' index": csv(",frame,x1,y1,x2,y2,score,class", "{n}," + CSV_ROW),
+    "pandas' floats": csv("frame,x1,y1,x2,y2,score,class", "{f}.0,{x1}.0,{y1},{x2},{y2},.9,56.0"),
+    "supervision's sink": csv(
+        "x_min,y_min,x_max,y_max,class_id,confidence,tracker_id,class_name,frame_index",
+        "{x1},{y1},{x2},{y2},0,.9,,chair,{f}"),
+    "xmin, prob, label": csv("frame_id,xmin,ymin,xmax,ymax,prob,label", CSV_ROW),
+    "left to bottom": csv("frame_number,left,top,right,bottom,conf,category", CSV_ROW),
+    "numbers from 1": csv("frame,x1,y1,x2,y2,score,class", CSV_ROW.replace("{f}", "{n}")),
+    "mot's own header": csv("frame,id,bb_left,bb_top,bb_width,bb_height,conf,class,x,y,z",
+                            "{n},1,{x1},{y1},{w},{h},.9,chair,-1,-1,-1"),
+    "centres": csv("frame,cx,cy,w,h,score,class", "{f},{cx},{cy},{w},{h},.9,chair"),
+    "corners from 0": csv("frame,x0,y0,x1,y1,score,class", CSV_ROW),
+    "image sizes beside corners": csv("filename,width,height,class,xmin,ymin,xmax,ymax",
+                                      "f_{f}.jpg,320,240,chair,{x1},{y1},{x2},{y2}"),
+    "frames without boxes": csv("frame,x1,y1,x2,y2,score,class", CSV_ROW) + "3,,,,,,\n",
+    "kitti": kitti(),
+    "kitti with scores": kitti(" 0.9"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", TABLES)
+def test_tables(tmp_path: Path, tracked: Callable[..., Tracked], what: str) -> None:
+    path = tmp_path / ("det.csv" if what.startswith("csv") else "det.txt")
+    path.write_text(TABLES[what], newline="")
+    (tmp_path / "coco.txt").write_text("\n".join(rt.COCO_NAMES))
+    names = ("--set", f"detect.class_names={tmp_path / 'coco.txt'}")
+    named = (
+        what[:3] in ("mot", "box") and "commas" not in what and "own" not in what
+    ) or "floats" in what
+    made = tracked(film(tmp_path / "v.avi"), "--detections", path, *(names if named else ()))
+    assert is_truth(made, "object" if "commas" in what else "chair"), made
+
+
+JSONS: dict[str, Callable[[], Any]] = {
+    "ultralytics' predictions, names": lambda: [
+        {"image_id": f"frame_{f:05d}", "file_name": f"frame_{f:05d}.png", "category_id": 62,
+         "bbox": coco_box(f), "score": 0.9} for f in range(FRAMES)],
+    "string ids alone": lambda: [
+        {"image_id": f"frame_{f:05d}", "category_id": 62, "bbox": coco_box(f), "score": 0.9}
+        for f in range(FRAMES)],
+    "numbers in the names": lambda: [
+        {"image_id": f, "category_id": 62, "bbox": coco_box(f), "score": 0.9}
+        for f in range(FRAMES)],
+    "dataset with folders of Windows": lambda: {
+        "images": [{"id": 90 + f, "file_name": f"im\\frame_{f:05d}.png", "width": 320,
+                    "height": 240} for f in range(FRAMES)],
+        "categories": [{"id": 3, "name": "chair"}],
+        "annotations": [{"image_id": 90 + f, "category_id": 3, "bbox": coco_box(f)}
+                        for f in range(FRAMES)]},
+    "dataset of images of twice the size": lambda: {
+        "images": [{"id": f, "file_name": f"frame_{f:05d}.png", "width": 640, "height": 480}
+                   for f in range(FRAMES)],
+        "categories": [{"id": 3, "name": "chair"}],
+        "annotations": [{"image_id": f, "category_id": 3, "bbox": [2 * v for v in coco_box(f)]}
+                        for f in range(FRAMES)]},
+    "supervision's sink": lambda: json.loads(sink()),
+    "oa-slam": lambda: [
+        {"file_name": f"rgb/frame_{f:05d}.png", "detections": [
+            {"category_id": CHAIR, "detection_score": 0.9, "bbox": list(box(f))}]}
+        for f in range(FRAMES)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", JSONS)
+@pytest.mark.parametrize("begin", [0, 1])
+def test_json(tmp_path: Path, tracked: Callable[..., Tracked], what: str, begin: int) -> None:
+    """Of images whose names count from 0 or from 1; ids are those of the names."""
+    data = json.dumps(JSONS[what]())
+    if begin:  # every name, and the ids that are numbers of names, one later
+        for f in reversed(range(FRAMES)):
+            data = data.replace(f"frame_{f:05d}", f"frame_{f + 1:05d}")
+        if what == "numbers in the names":
+            entries = json.loads(data)
+            data = json.dumps([entry | {"image_id": entry["image_id"] + 1} for entry in entries])
+    (tmp_path / "pred").mkdir()
+    (tmp_path / "pred" / "predictions.json").write_text(data)
+    names = [f"frame_{f + begin:05d}.png" for f in range(FRAMES)]
+    source = images(tmp_path / "images", names)
+    made = tracked(source, "--detections", tmp_path / "pred" / "predictions.json")
+    assert is_truth(made), made
+    assert ("scaled" in made.said) == ("size" in what)
+
+
+def test_ids_from_0_of_images_whose_names_count_from_1(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """There is no image 0: the ids are positions."""
+    (tmp_path / "res.json").write_text(json.dumps(JSONS["numbers in the names"]()))
+    source = images(tmp_path / "images", [f"frame_{f + 1:05d}.png" for f in range(FRAMES)])
+    assert is_truth(tracked(source, "--detections", tmp_path / "res.json"))
+
+
+def test_numbers_of_other_videos_are_not_taken(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """CVAT's names of a video's frames: the number is the frame; of every 3rd, from 0 or from 1."""
+    source = film(tmp_path / "v.avi", 16)
+    for begin in (0, 1):
+        data = {
+            "images": [{"id": i, "file_name": f"frame_{begin + 3 * i:06d}.PNG"} for i in range(5)],
+            "categories": [{"id": 1, "name": "chair"}],
+            "annotations": [{"image_id": i, "category_id": 1, "bbox": coco_box(3 * i),
+                             "attributes": {"track_id": 0}} for i in range(5)],
+        }  # fmt: skip
+        (tmp_path / "instances.json").write_text(json.dumps(data))
+        for option in ("--detections", "--tracks"):
+            made = tracked(source, option, tmp_path / "instances.json", "--overwrite")
+            assert is_truth(made, frames=range(0, 15, 3)), (option, begin, made)
+
+
+def test_numbers_that_count_from_0_or_from_1_are_asked_for(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """Frames 3 to 6 of a longer video: nothing shows what they count from."""
+    source = film(tmp_path / "v.avi", 12)
+    (tmp_path / "labels").mkdir()
+    for f in range(3, 7):
+        (tmp_path / "labels" / f"other_{f}.txt").write_text(yolo(f))
+    made = tracked(source, "--detections", tmp_path / "labels")
+    assert made.code == 2 and "from 0, or from 1" in made.said
+    made = tracked(source, "--detections", tmp_path / "labels", "--set", "detect.first_frame=0")
+    assert is_truth(made, frames=range(3, 7)), made
+
+
+# ---- YOLO labels ---------------------------------------------------------------------------------
+
+
+def yolo(frame: int, kind: int = CHAIR, tail: str = "") -> str:
+    x, y, x2, y2 = box(frame)
+    shares = ((x + x2) / 640, (y + y2) / 480, (x2 - x) / 320, (y2 - y) / 240)
+    return f"{kind} " + " ".join(f"{v:.6f}" for v in shares) + f"{tail}\n"
+
+
+def polygon(frame: int, tail: str = "") -> str:
+    x, y, x2, y2 = box(frame)
+    corners = ((x, y), (x2, y), (x2, y2), ((x + x2) / 2, y2), (x, y2))
+    return "0 " + " ".join(f"{a / 320:.6f} {b / 240:.6f}" for a, b in corners) + f"{tail}\n"
+
+
+def yolo_folder(folder: Path, row: Callable[[int], str], name: str, begin: int) -> Path:
+    folder.mkdir(parents=True)
+    for f in range(FRAMES):
+        (folder / name.format(f + begin)).write_text(row(f))
+    return folder
+
+
+NAMES = {
+    "classes.txt": "chair\nlamp\n",
+    "data.yaml": "path: ../room\ntrain: images\nnames: [chair, 'desk lamp'] # two\nnc: 2\n",
+    "dataset.yaml": "nc: 2\nnames:\n  0: chair\n  1: lamp\nkpt: 3\n",
+    "my.yml": "names:\n- chair\n- \"lamp\"\n",
+    "obj.names": "chair\nlamp\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("names", NAMES)
+def test_yolo_dataset_with_its_names(
+    tmp_path: Path, tracked: Callable[..., Tracked], names: str
+) -> None:
+    """Images and labels of the same names, as datasets have them."""
+    stem = "room-{:03d}"
+    source = images(tmp_path / "set/images/val", [stem.format(f) + ".jpg" for f in range(FRAMES)])
+    yolo_folder(tmp_path / "set/labels/val", lambda f: yolo(f, 0), stem + ".txt", 0)
+    (tmp_path / "set" / names).write_text(NAMES[names])
+    (tmp_path / "set/train.txt").write_text("images/val/room-000.jpg\n")
+    folder = "set" if names != "my.yml" else "set/labels/val"
+    made = tracked(source, "--detections", tmp_path / folder)
+    assert is_truth(made), made
+    assert f"{FRAMES} files" in made.said and names in made.said
+
+
+@pytest.mark.parametrize(
+    ("row", "option"),
+    [
+        (lambda f: yolo(f, 0), "--detections"),
+        (lambda f: yolo(f, 0, " 0.9"), "--detections"),
+        (lambda f: yolo(f, 0, " 0.9 1"), "--tracks"),
+        (lambda f: yolo(f, 0, " 7"), "--tracks"),  # no save_conf
+        (polygon, "--detections"),
+        (lambda f: polygon(f, " 0.9"), "--detections"),
+        (lambda f: polygon(f, " 0.9 12"), "--tracks"),
+        (lambda f: polygon(f, " 12"), "--tracks"),
+    ],
+)
+def test_yolo_labels_of_a_video(
+    tmp_path: Path, tracked: Callable[..., Tracked], row: Callable[[int], str], option: str
+) -> None:
+    """Ultralytics' NAME_N.txt counts from 1."""
+    labels = yolo_folder(tmp_path / "predict/labels", row, "v_{}.txt", 1)
+    (labels.parent / "classes.txt").write_text("chair\nlamp\n")
+    made = tracked(film(tmp_path / "v.avi"), option, labels)
+    assert is_truth(made), made
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("56 100 80 40 40\n", "is no share of the image"),
+        ("56 .5 .5 .2\n", "expected class cx cy w h"),
+        ("chair .5 .5 .2 .2\n", "expected numbers"),
+        ("56 .5 .5 .2 nan\n", "expected class cx cy w h"),
+        ("99 .5 .5 .2 .2\n", "class 99, but there are only 80 class names"),
+    ],
+)
+def test_label_files_that_cannot_be_meant(
+    tmp_path: Path, tracked: Callable[..., Tracked], text: str, expected: str
+) -> None:
+    labels = yolo_folder(tmp_path / "labels", lambda f: text, "v_{}.txt", 1)
+    made = tracked(film(tmp_path / "v.avi"), "--detections", labels)
+    assert made.code == 2 and expected in made.said and "v_1.txt" in made.said
+    (tmp_path / "empty").mkdir()
+    made = tracked(tmp_path / "v.avi", "--detections", tmp_path / "empty")
+    assert made.code == 2 and "without label files" in made.said
+
+
+def test_labels_of_several_videos_in_one_folder(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    labels = yolo_folder(tmp_path / "labels", yolo, "v_{}.txt", 1)
+    for f in range(4):
+        (labels / f"other_{f + 1}.txt").write_text("1 .5 .5 .2 .2\n")
+    made = tracked(film(tmp_path / "v.avi"), "--detections", labels)
+    assert is_truth(made) and "4 files of other names than the video's left out" in made.said
+
+
+def test_labels_from_roboflow(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    """Its names have the original one before a hash, whose digits are no frame number."""
+    source = images(tmp_path / "im", [f"room{f}.png" for f in range(FRAMES)])
+    folder = tmp_path / "train/labels"
+    folder.mkdir(parents=True)
+    for f in range(FRAMES):
+        (folder / f"room{f}_png.rf.ab{90 - f}cd{7 * f}.txt").write_text(yolo(f))
+    assert is_truth(tracked(source, "--detections", tmp_path / "train"))
+
+
+# ---- What is left out is counted -----------------------------------------------------------------
+
+
+def test_no_box_of_a_file_is_left_out_by_itself(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """150 boxes a frame; a limit that the user sets is said."""
+    rows = [f"{f + 1},{k + 1},{2 * k},{10 + k % 3 * 60},9,40,.9\n" for f in range(4)
+            for k in range(150)]  # fmt: skip
+    (tmp_path / "det.txt").write_text("".join(rows))
+    source = film(tmp_path / "v.avi", 4)
+    found = rt.read_detections(tmp_path / "det.txt", rt.Video(source))
+    assert len(found) == 600 and found.messages == []
+    made = tracked(source, "--detections", tmp_path / "det.txt", "--set",
+                   "detect.max_detections=40")  # fmt: skip
+    assert "440 boxes beyond the best 40 of a frame left out" in made.said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (mot(tail=".9,57") + "2,-1,9,9,9,9,.05,57\n", "1 of 9 boxes have a score below 0.1"),
+        (mot(tail="87.5,57"), "are taken as percent"),
+        (mot(tail=".9,57") + "2,1,200,100,40,40,.9,-1\n", "1 boxes without a class are called"),
+        (mot(tail=".9,57") + "2,1,200,100,40,40,0,0\n", "ignored regions"),
+        (mot(tail=".9,1.25"), "column 8 holds no class numbers"),
+        (mot(tail=".9,57") + "99,1,200,100,40,40,.9,57\n", "1 boxes of frames that the video has"),
+        (kitti(), "1 rows DontCare left out"),
+        (TABLES["frames without boxes"], "1 rows without a box left out"),
+        (TABLES["numbers from 1"], "are taken as counted from 1"),
+    ],
+)
+def test_what_is_left_out_or_guessed_is_said_once(
+    tmp_path: Path, tracked: Callable[..., Tracked], text: str, said: str
+) -> None:
+    (tmp_path / "det.txt").write_text(text)
+    made = tracked(film(tmp_path / "v.avi"), "--detections", tmp_path / "det.txt")
+    assert made.code == 0 and made.said.count(said) == 1, made.said
+
+
+@pytest.mark.parametrize(
+    ("name", "per_s"),
+    [("timestamp", 1), ("time_ns", 1e9), ("timestamp", 1e9), ("Timestamp [ms]", 1e3),
+     ("timestamp_us", 1e6)],
+)  # fmt: skip
+def test_times_in_every_unit(
+    tmp_path: Path, tracked: Callable[..., Tracked], name: str, per_s: float
+) -> None:
+    """Of images named by times since 1970: in the unit of the column, or that of the date."""
+    start = 1341847980
+    source = images(tmp_path / "im", [f"{start + f / 25:.6f}.png" for f in range(FRAMES)])
+    row = "{f},{x1},{y1},{x2},{y2},.9,chair"
+    text = csv(f"{name},x1,y1,x2,y2,score,class", row).splitlines(keepends=True)
+    times = [
+        f"{round((start + f / 25) * per_s, 6 if per_s == 1 else 0):.6f}" for f in range(FRAMES)
+    ]
+    rows = [t + line[line.index(",") :] for t, line in zip(times, text[1:], strict=True)]
+    (tmp_path / "det.csv").write_text(text[0] + "".join(rows))
+    made = tracked(source, "--detections", tmp_path / "det.csv")
+    assert is_truth(made), made
+
+
+@pytest.mark.parametrize(("count", "names"), [(57, {"chair", "object"}), (58, {"couch", "person"})])
+def test_a_class_0_counts_from_0_where_that_fits_the_names(
+    tmp_path: Path, count: int, names: set[str]
+) -> None:
+    """57 names and a class 57: they count from 1, and 0 is no class."""
+    (tmp_path / "names.txt").write_text("\n".join(rt.COCO_NAMES[:count]))
+    (tmp_path / "det.txt").write_text(mot(tail=".9,57") + "2,1,200,100,40,40,.9,0\n")
+    config = rt.DetectConfig(class_names=str(tmp_path / "names.txt"))
+    video = rt.Video(film(tmp_path / "v.avi"))
+    found = rt.read_detections(tmp_path / "det.txt", video, config)
+    assert {found.class_names[c] for c in found.class_id} == names
+    assert len(found) == 9 and "class numbers" in found.messages[0]
+
+
+def test_csv_from_1_that_does_not_show_it(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    """Frames 1 to 7 of 8: read as documented, from 0, and said; the other reading on request."""
+    text = "".join(TABLES["csv"].splitlines(keepends=True)[:1] + TABLES["csv"].splitlines(True)[2:])
+    (tmp_path / "det.csv").write_text(text)
+    source = film(tmp_path / "v.avi")
+    made = tracked(source, "--detections", tmp_path / "det.csv")
+    assert is_truth(made, frames=range(1, 8)) and "detect.first_frame=1" in made.said
+    made = tracked(source, "--detections", tmp_path / "det.csv", "--set", "detect.first_frame=1")
+    assert made.frames == list(range(7)) and made.boxes[0] == box(1)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (csv("frame,x1,y1,x2,y2", "{f},.1,.2,.3,.4"), "normalised to 0..1?"),
+        (csv("frame,x1,y1,x2,y2", "{f},200,100,40,40"), "all fit it as x, y, w, h"),
+        (csv("frame,x,y,w,h", "{f},200,100,310,220"), "if w and h are the corner x2, y2"),
+        (csv("frame,x1,y1,x2,y2,class", "{f},1,2,30,40," + "b" * 131000),
+         "det.csv, line 2: a class name of 131000 characters, at most 200"),
+        (csv("frame,x1,y1,x2,y2,score", "{f},{x1},{y1},nan,{y2},.9"), "'nan' is no finite"),
+        (csv("filename,x1,y1,x2,y2", "a/img.jpg,1,2,30,40"), "mean no frame of the video"),
+    ],
+)  # fmt: skip
+def test_tables_that_cannot_be_meant(
+    tmp_path: Path, tracked: Callable[..., Tracked], text: str, expected: str
+) -> None:
+    (tmp_path / "det.csv").write_text(text)
+    made = tracked(film(tmp_path / "v.avi"), "--detections", tmp_path / "det.csv")
+    assert made.code == 2 and expected in made.said and made.said.count("\n") <= 1, made.said
+
+
+def test_boxes_of_frames_that_were_not_turned_upright(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    """Boxes of 320 x 240 on an upright video of 240 x 320, in a table and in COCO."""
+    folder = tmp_path / "upright"
+    folder.mkdir()
+    for f in range(FRAMES):
+        cv2.imwrite(str(folder / f"{f}.png"), np.zeros((320, 240, 3), np.uint8))
+    rows = [f"{f + 1},-1,{x},50,60,80,.9\n" for f in range(FRAMES) for x in (20, 120, 260)]
+    (tmp_path / "det.txt").write_text("".join(rows))
+    made = tracked(folder, "--detections", tmp_path / "det.txt")
+    assert made.code == 2 and "all fit the frame turned by 90 deg, (320, 240)" in made.said
+    data = {
+        "images": [{"id": 0, "file_name": "0.png", "width": 320, "height": 240}],
+        "categories": [{"id": 1, "name": "chair"}],
+        "annotations": [{"image_id": 0, "category_id": 1, "bbox": [1, 2, 30, 40]}],
+    }
+    (tmp_path / "coco.json").write_text(json.dumps(data))
+    made = tracked(folder, "--detections", tmp_path / "coco.json")
+    assert made.code == 2 and "not turned upright?" in made.said
+    (tmp_path / "det.txt").write_text("1,-1,200,50,60,80,.9\n1,-1,20,250,60,69,.9\n")
+    assert tracked(folder, "--detections", tmp_path / "det.txt").code == 0  # over the edge only
+
+
+# ---- COCO: types, datasets beside it -------------------------------------------------------------
+
+
+def dataset(**changes: Any) -> dict[str, Any]:
+    names = [f"{f}.png" for f in range(FRAMES)]
+    return {
+        "images": [{"id": f, "file_name": name} for f, name in enumerate(names)],
+        "categories": [{"id": 1, "name": "chair"}],
+        "annotations": [{"image_id": f, "category_id": 1, "bbox": coco_box(f), "track_id": 4}
+                        for f in range(FRAMES)],
+    } | changes  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"images": 5}, "images is 5"),
+        ({"images": {"a": 1}}, "images is {'a': 1}"),
+        ({"images": [{"id": 0, "file_name": "0.png"}, 7]}, "images[1]: 7"),
+        ({"images": [{"id": 0, "file_name": 7}]}, "images[0]: {'id': 0, 'file_name': 7}"),
+        ({"images": [{"id": [0], "file_name": "0.png"}]}, "images[0]: "),
+        ({"images": [{"id": 0, "width": "wide"}]}, "images[0]: "),
+        ({"categories": ["chair"]}, "categories[0]: 'chair'"),
+        ({"categories": [{"id": 1, "name": "c" * 300}]}, "a class name of 300 characters"),
+        ({"annotations": [7]}, "entry 0: 7, expected an object"),
+        ({"annotations": [{"image_id": 0, "category_id": 1, "bbox": "1234"}]}, "a bbox of 4"),
+        ({"annotations": [{"image_id": [0], "category_id": 1, "bbox": [1, 2, 3, 4]}]}, "two ids"),
+        ({"annotations": [{"image_id": 0, "category_id": 1, "bbox": [1, 2, 30, 40],
+                           "segmentation": "x"}]}, "segmentation cannot be read"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("option", ["--detections", "--tracks"])
+def test_coco_of_wrong_types(
+    tmp_path: Path, tracked: Callable[..., Tracked], changes: dict[str, Any], expected: str,
+    option: str, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Beside a video, and in a run without images."""
+    path = tmp_path / "d.json"
+    path.write_text(json.dumps(dataset(**changes)))
+    made = tracked(images(tmp_path / "im", ["0.png", "1.png"]), option, path)
+    assert made.code == 2 and expected in made.said and "d.json" in made.said, made.said
+    (tmp_path / "poses.txt").write_text("".join(f"{i} 0 0 {i} 0 0 0 1\n" for i in range(4)))
+    camera = ("--camera", "PINHOLE 320 240 300 300 160 120")
+    code = rt.main(["run", "-o", str(tmp_path / "out2"), option, str(path), "--poses",
+                    str(tmp_path / "poses.txt"), *camera])  # fmt: skip
+    assert code == 2 and expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("size", [5, [[1, 2], [3, 4]], [640.0, np.inf], [320 + 1j, 240], [0, 5]])
+def test_npz_whose_image_size_is_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], size: Any
+) -> None:
+    rt.write_detections_npz(tmp_path / "d.npz", [], ["chair"], SIZE)
+    np.savez(tmp_path / "d.npz", **(dict(np.load(tmp_path / "d.npz")) | {"image_size": size}))
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    code = rt.main(["run", "-o", str(tmp_path / "out"), "--detections", str(tmp_path / "d.npz"),
+                    "--poses", str(tmp_path / "poses.txt")])  # fmt: skip
+    said = capsys.readouterr().err
+    assert code == 2 and "image_size" in said and said.count("\n") == 1
+
+
+def test_two_datasets_beside_a_result_file(tmp_path: Path, tracked: Callable[..., Tracked]) -> None:
+    """The one whose ids fit; two that fit and differ are refused; two that agree are not."""
+    source = images(tmp_path / "im", [f"{f}.png" for f in range(FRAMES)])
+    rows = [{"image_id": f, "category_id": 1, "bbox": coco_box(f), "score": 0.9}
+            for f in range(FRAMES)]  # fmt: skip
+    (tmp_path / "res").mkdir()
+    (tmp_path / "res/results.json").write_text(json.dumps(rows))
+    other = dataset(images=[{"id": 70 + f, "file_name": f"{f}.png"} for f in range(FRAMES)])
+    (tmp_path / "res/zzz.json").write_text(json.dumps(other))
+    (tmp_path / "res/instances.json").write_text(json.dumps(dataset()))
+    command = (source, "--detections", tmp_path / "res/results.json", "--overwrite")
+    assert is_truth(tracked(*command))
+    other = dataset(categories=[{"id": 9, "name": "sofa"}])  # the images fit, the classes do not
+    for others in (dataset(), other):
+        (tmp_path / "res/zzz.json").write_text(json.dumps(others))
+        assert is_truth(tracked(*command))
+    other = dataset(categories=[{"id": 1, "name": "sofa"}])
+    (tmp_path / "res/zzz.json").write_text(json.dumps(other))
+    with pytest.raises(rt.ReobjError, match=r"instances\.json and zzz\.json beside it both"):
+        rt.read_detections(tmp_path / "res/results.json", rt.Video(source))
+
+
+# ---- CVAT and identities -------------------------------------------------------------------------
+
+
+def cvat(shape: Callable[[int], str], meta: str = "") -> str:
+    shapes = "".join(shape(f) for f in range(FRAMES))
+    tracks = f'<track id="0" label="chair">{shapes}</track>'
+    return f"<annotations>{meta}{tracks}</annotations>"
+
+
+def cvat_box(f: int, extra: str = "") -> str:
+    x, y, x2, y2 = box(f)
+    return f'<box frame="{f}" outside="0" xtl="{x}" ytl="{y}" xbr="{x2}" ybr="{y2}" {extra}/>'
+
+
+def cvat_points(tag: str) -> Callable[[int], str]:
+    def shape(f: int) -> str:
+        x, y, x2, y2 = box(f)
+        return f'<{tag} frame="{f}" outside="0" points="{x},{y + 9};{x + 9},{y};{x2},{y2}"/>'
+
+    return shape
+
+
+def cvat_ellipse(f: int) -> str:
+    return f'<ellipse frame="{f}" outside="0" cx="{30 + 4 * f}" cy="40" rx="20" ry="20"/>'
+
+
+def cvat_turned(f: int) -> str:
+    """A square of side 40 / sqrt(2) that is turned by 45 deg."""
+    x, y, half = 30 + 4 * f, 40, 20 / np.sqrt(2)
+    return (f'<box frame="{f}" outside="0" xtl="{x - half}" ytl="{y - half}" xbr="{x + half}" '
+            f'ybr="{y + half}" rotation="45.00"/>')  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        (cvat_box, ""),
+        (cvat_points("polygon"), "8 polygons taken as their bounding boxes"),
+        (cvat_points("polyline"), "8 polylines taken as"),
+        (cvat_points("points"), "8 points taken as"),
+        (cvat_ellipse, "8 ellipses taken as"),
+        (cvat_turned, "8 turned boxes taken as"),
+    ],
+)
+def test_shapes_of_cvat(
+    tmp_path: Path, tracked: Callable[..., Tracked], shape: Callable[[int], str], said: str
+) -> None:
+    with zipfile.ZipFile(tmp_path / "task.zip", "w") as packed:
+        packed.writestr("annotations.xml", cvat(shape))
+    made = tracked(film(tmp_path / "v.avi"), "--tracks", tmp_path / "task.zip")
+    assert is_truth(made) and said in made.said and ("taken as" in made.said) == bool(said)
+
+
+def test_cvat_of_images_and_of_another_size(
+    tmp_path: Path, tracked: Callable[..., Tracked]
+) -> None:
+    label = 'label="chair"'
+    shapes = "".join(
+        f'<image id="{f}" name="frame_{f:06d}">{cvat_box(f, label)}</image>' for f in range(FRAMES)
+    )
+    (tmp_path / "images.xml").write_text(f"<annotations>{shapes}</annotations>")
+    source = film(tmp_path / "v.avi")
+    assert is_truth(tracked(source, "--detections", tmp_path / "images.xml"))
+    size = "<original_size><width>240</width><height>320</height></original_size>"
+    (tmp_path / "t.xml").write_text(cvat(cvat_box, f"<meta><task>{size}</task></meta>"))
+    with pytest.raises(rt.ReobjError, match="made for images of 240x320, but the video is 320x240"):
+        rt.read_tracks(tmp_path / "t.xml", rt.Video(source))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        kitti(),
+        csv("x_min,y_min,x_max,y_max,class_id,confidence,tracker_id,class_name,frame_index",
+            "{x1},{y1},{x2},{y2},0,.9,1,chair,{f}"),
+        csv("frame,track_id,left,top,right,bottom,label", "{f},0,{x1},{y1},{x2},{y2},chair"),
+        csv("frame,trackid,x1,y1,x2,y2,label", "{f},4,{x1},{y1},{x2},{y2},chair")
+        + "2,-1,200,100,240,130,lamp\n",
+    ],
+)  # fmt: skip
+def test_identities_of_tables(tmp_path: Path, tracked: Callable[..., Tracked], text: str) -> None:
+    (tmp_path / "t.txt").write_text(text)
+    made = tracked(film(tmp_path / "v.avi"), "--tracks", tmp_path / "t.txt")
+    assert is_truth(made), made
+    assert ("1 is added" in made.said) == (",0,10,20," in text)
+    assert ("1 of 9 boxes without an identity left out" in made.said) == ("lamp" in text)
+
+
+def test_classes_are_lent_where_boxes_show_the_same(tmp_path: Path) -> None:
+    """Identities without classes: by the overlap of all frames; none where nothing overlaps."""
+    source = film(tmp_path / "v.avi")
+    (tmp_path / "det.csv").write_text(TABLES["csv"])
+    out = tmp_path / "out"
+    assert rt.main(["track", str(source), "-o", str(out), "--detections",
+                    str(tmp_path / "det.csv"), *QUICK]) == 0  # fmt: skip
+    far = "".join(f"{f + 1},2,200,150,60,50\n" for f in range(FRAMES))
+    off = mot().replace(",57", "").splitlines()
+    off[3] = "4,1,60,20,40,40,1"  # one box was drawn beside the old one
+    (tmp_path / "ids.txt").write_text(
+        "\n".join(f"{row}".rsplit(",", 1)[0] for row in off) + "\n" + far
+    )
+    assert rt.main(["objects", str(out), "--tracks", str(tmp_path / "ids.txt")]) == 0
+    objects = json.loads((out / "objects.json").read_text())
+    assert [(o["id"], o["class"]) for o in objects["objects"]] == [(1, "chair"), (2, "object")]
+    assert any("8 are `object`" in text for text in objects["warnings"])
+
+
+# ---- Class names ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("path: ../datasets/room\ntrain: images/train\nnames:\n  0: chair\n  1: table\n",
+         ("chair", "table")),
+        ("names: [chair, \"dining table\", 'tv''s stand']\n",
+         ("chair", "dining table", "tv's stand")),
+        ("names: {0: chair, 2: table}\n", ("chair", "class 1", "table")),
+        ("names: [\n  chair,\n  table,\n]\n", ("chair", "table")),
+        ("nc: 2\nnames:\n- chair # the first\n- table\nval: x\n", ("chair", "table")),
+        ("train: images\n", "no `names:` in it"),
+        ("names:\n", "lists no names"),
+        ("names: chair\n", "expected [a, b]"),
+        ("names:\n  99999: chair\n", "class number '99999'"),
+    ],
+)  # fmt: skip
+def test_class_names_of_a_yaml_file(
+    tmp_path: Path, text: str, expected: tuple[str, ...] | str
+) -> None:
+    (tmp_path / "data.yaml").write_text(text)
+    (tmp_path / "det.txt").write_text(mot(tail=".9,1"))
+    config = rt.DetectConfig(class_names=str(tmp_path / "data.yaml"))
+    video = rt.Video(film(tmp_path / "v.avi"))
+    try:
+        found: Any = rt.read_detections(tmp_path / "det.txt", video, config).class_names
+    except rt.ReobjError as error:
+        found = str(error)
+    assert found == expected or (isinstance(expected, str) and expected in found), found
+
+
+# ---- Detectors whose labels are text -------------------------------------------------------------
+
+
+class Boxes:
+    def __init__(self, xyxy: Any) -> None:
+        self.xyxy, self.conf, self.cls = np.array([xyxy], float), np.array([0.9]), np.array([0])
+
+
+class Results:
+    """As of ultralytics: a model with classes of its own."""
+
+    def __init__(self, xyxy: Any) -> None:
+        self.orig_shape, self.names, self.boxes = (240, 320), {0: "red mug"}, Boxes(xyxy)
+
+
+class Supervision:
+    def __init__(self, xyxy: Any) -> None:
+        self.xyxy, self.confidence = np.array([xyxy], float), np.array([0.9])
+        self.class_id, self.mask = np.array([0]), None
+        self.data = {"class_name": np.array(["red mug"])}
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda b: {"boxes": [b], "scores": [0.9], "labels": ["red mug"]},
+        lambda b: [{"boxes": np.array([b]), "scores": [0.9], "labels": [0],
+                    "text_labels": ["red mug"]}],
+        Results,
+        lambda b: [Results(b)],
+        Supervision,
+    ],
+)  # fmt: skip
+def test_labels_that_are_text(tmp_path: Path, made: Callable[[Any], Any]) -> None:
+    """Open vocabulary: the label is the class, whatever number it has in the detector."""
+    frames = iter([*range(FRAMES)] * 2)
+    config = rt.Config(embed=rt.EmbedConfig(model="none"))
+    config = dataclasses.replace(
+        config, output=dataclasses.replace(config.output, overlay="none", scene=False)
+    )
+    result = rt.run(film(tmp_path / "v.avi"), tmp_path / "out", config,
+                    detections=lambda image: made(box(next(frames))), in_3d=False)  # fmt: skip
+    assert [o.class_name for o in result.objects] == ["red mug"]
+    assert result.tracks.frame.tolist() == list(range(FRAMES))

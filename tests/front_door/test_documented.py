@@ -1,0 +1,520 @@
+"""Every command and every piece of Python in README and docs/ is run, or named here with a reason.
+
+The blocks of `sh` and `python` in the tutorials are run by tests/test_docs.py. All other commands
+are here: as they are written, in a folder where the files that they name lie ready, and with some
+words more (`more`) that make them quick. A command that is new in the docs fails until it is here.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import truth as scores
+from test_readers import as_3d_scanner_app, as_polycam, as_record3d
+
+import reobj_track as rt
+from front_door.room import (
+    CAMERA,
+    FEW,
+    ROOM,
+    ROOT,
+    assert_right,
+    cli,
+    info,
+    true_boxes,
+    true_cameras,
+    true_centres,
+    true_objects,
+)
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROGRAMS = r"(?:[A-Z_]+=\S+ )?(?:python |reobj-track |pip |mkdocs |git clone|curl |wget )"
+
+
+def page_name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def commands_of(path: Path) -> list[str]:
+    """Commands in blocks that are indented or fenced (not `sh`), and in code within lines."""
+    text = path.read_text().replace("\\\n", " ")
+    text = re.sub(r"^```(sh|python|py)\n.*?^```$", "", text, flags=re.M | re.S)
+    blocks = re.findall(rf"^(?:    )?({PROGRAMS}.*)$", text, re.M)
+    inline = re.findall(rf"`({PROGRAMS}[^`]*)`", text)
+    return [" ".join(re.sub(r"\s{2,}#.*", "", c).split()) for c in blocks + inline]
+
+
+DOCUMENTED = {c: page_name(p) for p in reversed(PAGES) for c in reversed(commands_of(p))}
+
+# ---- Not run here, and why ----
+
+ELSEWHERE = {
+    "pip install -r requirements.txt && python reobj_track.py run examples/room/room.mp4 "
+    "--detections examples/room/detections.npz -o out": "test_commands.py, .ci/run",
+    'pip install -e ".[dev]" && python -m pytest': ".ci/run",
+    'pip install -e ".[docs]" && mkdocs serve': ".ci/run builds the site",
+    "pip install -r requirements.txt": ".ci/run",
+    "pip install torch matplotlib onnx": ".ci/run installs them with the extras",
+    "pip install 'reobj-track[video]'": "an extra of pyproject.toml, checked below",
+    "pip install 'reobj-track[viewer]'": "an extra of pyproject.toml, checked below",
+    "python reobj_track.py --options": "test_commands.py",
+    "python reobj_track.py models": "test_commands.py",
+    "python reobj_track.py objects out --solver lfd": "test_commands.py, with all solvers",
+    "python reobj_track.py eval out --gt gt.txt": "below; twice in the docs",
+}  # fmt: skip
+LONG = {  # scripts that take long, or data that is not here: their words are compared with --help
+    "appearance.md": ("rank_k", "train_embedding", "train_head", "benchmark"),
+    "poses.md": ("pose_accuracy", "pose_breaks"),
+    "quadrics.md": ("synthetic_quadrics", "tuw_demo", "scale_table"),
+    "tracking.md": ("benchmark", "compare_deepsort", "real_rooms"),
+}
+
+
+def long_script(command: str) -> str | None:
+    """The example that a command calls, if it is one of those that take long."""
+    found = re.search(r"python examples/(\w+)\.py", command)
+    every = {name for names in LONG.values() for name in names}
+    return found[1] if found and found[1] in every else None
+
+
+# ---- The files that a reader has lying there ----
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder of a reader, in a checkout."""
+    for path in (*ROOT.glob("*.*"), ROOT / "examples", ROOT / "reobj"):
+        (tmp_path / path.name).symlink_to(path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def recording(desk: Path) -> None:
+    """A video, recorded boxes, cameras and the truth."""
+    (desk / "phone.mp4").symlink_to(ROOM / "room.mp4")
+    (desk / "det.npz").symlink_to(ROOM / "detections.npz")
+    with np.load(ROOM / "detections.npz") as file:
+        kept = {k: file[k] for k in ("frame", "xyxy", "score", "class_id", "class_names")}
+    names = [str(n) for n in kept["class_names"]]
+    number = {name: i + 1 for i, name in enumerate(names)}
+    boxes = [
+        {"image_id": int(f), "category_id": number[names[c]], "score": float(s),
+         "bbox": [float(b[0]), float(b[1]), float(b[2] - b[0]), float(b[3] - b[1])]}
+        for f, b, s, c in zip(kept["frame"], kept["xyxy"], kept["score"], kept["class_id"],
+                              strict=True)
+    ]  # fmt: skip
+    images = [
+        {"id": i, "file_name": f"{i:06d}.jpg", "width": 640, "height": 480} for i in range(240)
+    ]
+    categories = [{"id": i, "name": name} for name, i in number.items()]
+    (desk / "det.json").write_text(json.dumps(boxes))
+    (desk / "instances.json").write_text(json.dumps({"images": images, "categories": categories}))
+    (desk / "poses.txt").symlink_to(ROOM / "poses.txt")
+    (desk / "gt.txt").symlink_to(ROOM / "gt_mot.txt")
+    (desk / "gt_objects.json").symlink_to(ROOM / "gt_objects.json")
+
+
+def colmap_model(desk: Path) -> None:
+    """The true cameras of all frames as COLMAP's text model, named as ffmpeg does it, from 0."""
+    recording(desk)
+    folder = desk / "colmap_model" / "sparse" / "0"
+    folder.mkdir(parents=True)
+    shutil.copy(ROOM / "camera.txt", folder / "cameras.txt")
+    lines = []
+    for i, pose in enumerate(true_cameras(range(240))):
+        w, x, y, z = quadrics_quaternion(pose[:, :3])
+        at = " ".join(repr(float(v)) for v in (w, x, y, z, *pose[:, 3]))
+        lines.append(f"{i + 1} {at} 1 {i:06d}.jpg\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    (folder / "points3D.txt").write_text("")
+
+
+def quadrics_quaternion(turn: np.ndarray) -> np.ndarray:
+    """w, x, y, z."""
+    from scipy.spatial.transform import Rotation
+
+    return np.roll(Rotation.from_matrix(turn).as_quat(), 1)
+
+
+def output(desk: Path) -> None:
+    """An output folder of the whole clip, with cameras of its own; edits for it."""
+    recording(desk)
+    rows = np.loadtxt(desk / "out" / "tracks.txt", delimiter=",")
+    frame, number, left, top, width, height = rows[0, :6].tolist()
+    box = [left, top, left + width, top + height]
+    renamed = {"id": int(number), "frame": int(frame) - 1, "box": box}
+    edits = [{"do": "rename", "object": renamed, "class": "armchair"}]
+    data = {"format": "reobj-edits", "version": 1, "edits": edits}
+    (desk / "edits.json").write_text(json.dumps(data))
+
+
+SIX = range(0, 60, 10)  # frames of the clip that are the pictures of an app's export
+
+
+def pictures(folder: Path, names: str) -> None:
+    """Six frames of the clip as images, boxes for them beside the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, frame in enumerate(rt.Video(ROOM / "room.mp4", rt.InputConfig(every=10, stop=60))):
+        cv2.imwrite(str(folder / names.format(i)), frame.image)
+    with np.load(ROOM / "detections.npz") as file:
+        rows = np.isin(file["frame"], list(SIX))
+        lines = ["frame,x1,y1,x2,y2,score,class"]
+        for f, b, s, c in zip(*(file[k][rows] for k in ("frame", "xyxy", "score", "class_id")),
+                              strict=True):  # fmt: skip
+            box = ",".join(map(str, b.tolist()))
+            lines.append(f"{f // 10},{box},{s},{file['class_names'][c]}")
+    Path("six.csv").write_text("\n".join(lines) + "\n")
+
+
+def record3d(desk: Path) -> None:
+    pictures(desk / "recording" / "rgbd", "{}.jpg")
+    as_record3d(desk / "recording", true_cameras(SIX))
+
+
+def polycam(desk: Path) -> None:
+    pictures(desk / "export" / "keyframes" / "corrected_images", "{:04d}.jpg")
+    (desk / "export").mkdir(exist_ok=True)
+    shutil.rmtree(desk / "export/keyframes/corrected_cameras", ignore_errors=True)
+    aside = desk / "aside"
+    aside.mkdir()
+    as_polycam(aside, true_cameras(SIX))
+    shutil.move(aside / "keyframes/corrected_cameras", desk / "export/keyframes")
+
+
+def scanner_app(desk: Path) -> None:
+    pictures(desk / "export", "frame_{:05d}.jpg")
+    as_3d_scanner_app(desk / "export", true_cameras(SIX))
+
+
+def mine(desk: Path) -> None:
+    """A detector of one's own, with its class names."""
+    recording(desk)
+    (desk / "mine.onnx").symlink_to(small_detector())
+    (desk / "names.txt").write_text("\n".join(rt.COCO_NAMES) + "\n")
+
+
+def small_detector() -> Path:
+    try:
+        return Path(rt.model_path("fast", offline=True))
+    except rt.ReobjError as error:
+        pytest.skip(f"no weights here: {error}")
+
+
+# ---- What must come out ----
+
+SUPPLIED = f"--poses poses.txt --camera {CAMERA}"
+SHORT = " ".join(map(str, FEW))
+PLAIN = "--set output.overlay=none --set output.scene=0"
+
+
+def right(desk: Path) -> None:
+    assert_right(desk / "out")
+
+
+def right_identities(desk: Path) -> None:
+    assert_right(desk / "out", share=0, idf1=0.94)
+
+
+def right_without_images(desk: Path) -> None:
+    assert_right(desk / "out", idf1=0.94, warning="no images")
+
+
+def detected(desk: Path) -> None:
+    """A small detector finds half of the rendered furniture."""
+    found = scores.Output.read(desk / "out")
+    score = scores.score_2d(true_boxes().of_frames(range(0, 120, 6)), found)
+    assert score.idf1 > 0.45 and score.found >= 0.4 * score.true, score
+
+
+def scaled(desk: Path) -> None:
+    """The scale follows the chairs, whose heights come out 2 to 10 % too small."""
+    scale = info(desk / "out")["world"]["scale"]
+    ours = scores.Output.read(desk / "out").centres
+    points = np.array([ours[f] for f in range(240)])
+    goal, *_ = scores.similarity(points, true_centres())
+    height = np.mean([o["size_m"][2] for o in true_objects() if o["class"] == "chair"])
+    assert scale["source"] == "known_size"
+    assert abs(np.log(scale["metres_per_unit"] / goal * height / 0.82)) < 0.08
+
+
+def evaluated(desk: Path) -> None:
+    found = json.loads((desk / "out/eval.json").read_text())
+    assert found["tracks"]["all"]["IDF1"] > 0.97
+
+
+def evaluated_in_3d(desk: Path) -> None:
+    found = json.loads((desk / "out/eval.json").read_text())
+    assert set(found["tracks"]) - {"all"} == {"chair", "cup"}
+    assert found["tracks"]["all"]["IDF1"] > 0.97 and found["objects"]["found"] >= 9
+
+
+def exported(desk: Path) -> None:
+    data = json.loads((desk / "out/coco_vid.json").read_text())
+    assert len(data["annotations"]) == len((desk / "out/tracks.txt").read_text().splitlines())
+
+
+def located(desk: Path) -> None:
+    """Own cameras are right up to a similarity."""
+    rows = np.loadtxt(desk / "out/poses.txt")
+    true = true_centres()[np.round(rows[:, 0] * 12).astype(int)]
+    scale, turn, shift = scores.similarity(rows[:, 1:4], true)
+    error = np.linalg.norm(scale * rows[:, 1:4] @ turn.T + shift - true, axis=1)
+    assert len(rows) >= 20 and np.median(error) < 0.01 * np.linalg.norm(np.ptp(true, axis=0))
+
+
+def posed(desk: Path) -> None:
+    """Every picture has its own camera, and the objects their identities."""
+    rows = np.loadtxt(desk / "out/poses.txt")
+    np.testing.assert_allclose(rows[:, 1:4], true_centres()[list(SIX)], atol=1e-5)
+    truth = true_boxes().of_frames(SIX)
+    frame = truth.frame // 10
+    found = scores.Output.read(desk / "out")
+    moved = scores.Truth(frame, truth.identity, truth.xyxy, truth.clear, truth.kinds)
+    assert scores.score_2d(moved, found).idf1 > 0.8
+    assert info(desk / "out")["world"]["units"] == "m"
+
+
+def renamed(desk: Path) -> None:
+    classes = [o["class"] for o in info(desk / "out")["objects"]]
+    assert classes.count("armchair") == 1
+
+
+def drawn(desk: Path) -> None:
+    assert cv2.imread(str(desk / "gallery.jpg")) is not None
+
+
+def no_weights(_: Path) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How a documented command is run.
+
+    Attributes:
+        desk: makes the files that it names. check: what came out. more: words that make it quick.
+        swap: for words that stand for something. folder: name of the copy of the example's output
+            folder that it needs. code: exit code; says: what it then prints.
+    """
+
+    desk: Callable[[Path], None]
+    check: Callable[[Path], None]
+    more: str = ""
+    swap: dict[str, str] = field(default_factory=dict)
+    folder: str = ""
+    code: int = 0
+    says: str = ""
+
+
+TOOL = "python reobj_track.py "
+NAMED = {"VIDEO": "phone.mp4", "OUT": "out"}
+FIRST = f"--every 4 --stop 80 {PLAIN}"
+SHOWN = {
+    TOOL + "run phone.mp4 -o out": Shown(
+        recording, no_weights, "--offline", code=2, says="--detector fast"
+    ),
+    TOOL + "run phone.mp4 -o out --detector fast": Shown(
+        recording, detected, f"--every 6 --stop 120 {SUPPLIED}"
+    ),
+    TOOL + "run phone.mp4 -o out --detections det.json": Shown(
+        recording, right, f"{SHORT} {SUPPLIED}"
+    ),
+    TOOL + "run phone.mp4 -o out --poses colmap_model/": Shown(
+        colmap_model, right, f"--detections det.npz {SHORT} --metric"
+    ),
+    TOOL + "track phone.mp4 -o out": Shown(
+        recording, right_identities, f"--detections det.npz {SHORT}"
+    ),
+    TOOL + "objects out --known-size chair=0.82m": Shown(output, scaled, PLAIN, folder="out"),
+    TOOL + "eval out --gt gt.txt": Shown(output, evaluated, folder="out"),
+    TOOL + "export out --to coco-vid": Shown(output, exported, folder="out"),
+    TOOL + "poses VIDEO -o OUT": Shown(recording, located, FIRST.split(" --set")[0], NAMED),
+    TOOL + "poses VIDEO -o OUT --camera fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]": Shown(
+        recording, located, "--every 3 --stop 60",
+        NAMED | {"fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]": CAMERA},
+    ),
+    TOOL + "run VIDEO -o OUT --poses PATH": Shown(
+        recording, right, f"--detections det.npz {SHORT} --camera {CAMERA}",
+        NAMED | {"PATH": "poses.txt"},
+    ),
+    TOOL + 'run -o OUT --detections FILE --poses FILE --camera "MODEL WIDTH HEIGHT PARAMS"': Shown(
+        recording, right_without_images, SHORT,
+        {"OUT": "out", "--detections FILE": "--detections det.npz",
+         "--poses FILE": "--poses poses.txt",
+         "MODEL WIDTH HEIGHT PARAMS": "PINHOLE 640 480 " + CAMERA.replace(",", " ")},
+    ),
+    TOOL + "objects OUT --edits edits.json": Shown(output, renamed, PLAIN, NAMED, "out"),
+    TOOL + "objects out --edits edits.json": Shown(output, renamed, PLAIN, folder="out"),
+    TOOL + "eval OUT --gt gt.txt [--gt-objects gt_objects.json] [--classes chair,cup]": Shown(
+        output, evaluated_in_3d, "", {"[": "", "]": "", "OUT": "out"}, "out"
+    ),
+    TOOL + "run recording/rgbd --poses recording/metadata -o out": Shown(
+        record3d, posed, f"--detections six.csv {PLAIN}"
+    ),
+    TOOL + "run export/keyframes/corrected_images --poses export -o out": Shown(
+        polycam, posed, f"--detections six.csv {PLAIN}"
+    ),
+    TOOL + 'run "export/frame_*.jpg" --poses export -o out': Shown(
+        scanner_app, posed, f"--detections six.csv {PLAIN}"
+    ),
+    TOOL + "run phone.mp4 -o out --detector mine.onnx --set detect.class_names=names.txt": Shown(
+        mine, detected, f"--every 6 --stop 120 {SUPPLIED}"
+    ),
+    "python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
+        output, drawn, "", {"OUT...": "out", "gt.txt...": "gt.txt"}, "out"
+    ),
+    "python examples/live_ar.py -o OUT": Shown(recording, no_weights, "--frames 20", NAMED),
+}  # fmt: skip
+del ELSEWHERE["python reobj_track.py eval out --gt gt.txt"]
+
+
+def test_every_command_in_the_docs_is_run_or_has_a_reason() -> None:
+    """A command that is new, and an entry whose command has gone."""
+    known = {*ELSEWHERE, *SHOWN}
+    unknown = {c: p for c, p in DOCUMENTED.items() if c not in known and not long_script(c)}
+    assert unknown == {}, "run them in SHOWN, or name them in ELSEWHERE or LONG"
+    assert known - set(DOCUMENTED) == set()
+    called = {(Path(p).name, s) for c, p in all_documented() if (s := long_script(c))}
+    assert called >= {(page, s) for page, names in LONG.items() for s in names}
+
+
+def all_documented() -> list[tuple[str, str]]:
+    return [(c, page_name(p)) for p in PAGES for c in commands_of(p)]
+
+
+SCRIPTS = [p.stem for p in sorted((ROOT / "examples").glob("*.py")) if "__main__" in p.read_text()]
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_example_says_how_it_is_used(script: str) -> None:
+    """And knows the flags that the docs call it with."""
+    words = [sys.executable, ROOT / "examples" / f"{script}.py", "--help"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if "needs PyTorch" in done.stderr and find_spec("torch") is None:
+        pytest.skip("PyTorch is not installed")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("usage:") and f"{script}.py" in done.stdout
+    listed = set(re.findall(r"--[\w-]+", done.stdout))
+    for command, page in all_documented():
+        if long_script(command) == script:
+            flags = set(re.findall(r"(?<=\s)\[?(--[\w-]+)", command))
+            assert flags <= listed, f"{page}: {command}"
+
+
+def test_extras_that_the_docs_name_exist() -> None:
+    text = "\n".join(p.read_text() for p in PAGES)
+    extras = set(re.findall(r"(?:reobj-track|\")\.?\[([\w,]+)\]", text))
+    section = (ROOT / "pyproject.toml").read_text().split("[project.optional-dependencies]")[1]
+    known = set(re.findall(r"^(\w+) = \[", section.split("\n[")[0], re.M))
+    assert extras and {e for names in extras for e in names.split(",")} <= known
+
+
+@pytest.mark.parametrize("command", SHOWN)
+def test_documented_command(
+    command: str,
+    desk: Path,
+    request: pytest.FixtureRequest,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    shown = SHOWN[command]
+    if "--detector fast" in command:
+        small_detector()
+    if shown.code:
+        monkeypatch.setenv("REOBJ_MODELS", str(desk / "nowhere"))
+        monkeypatch.setenv("XDG_CACHE_HOME", str(desk / "nowhere"))
+    if shown.folder:
+        shutil.copytree(request.getfixturevalue("example"), desk / shown.folder)
+    shown.desk(desk)
+    words = command
+    for old, new in shown.swap.items():
+        words = words.replace(old, new)
+    python, script, *args = shlex.split(f"{words} {shown.more}")
+    assert python == "python"
+    if script == "reobj_track.py":
+        assert cli(*args) == shown.code
+    else:
+        subprocess.run([sys.executable, script, *args], check=True, capture_output=True)
+    said = capsys.readouterr()
+    if shown.says:
+        assert shown.says in said.err and len(said.err.strip().splitlines()) == 1
+    shown.check(desk)
+
+
+# ---- Python outside the tutorials ----
+
+QUICK = rt.Config(
+    input=rt.InputConfig(every=3, stop=120),
+    poses=rt.PosesConfig(mode="poses.txt", camera=CAMERA),
+    output=rt.OutputConfig(overlay="none", scene=False),
+)
+
+
+def python_of(page: str) -> list[str]:
+    """Fenced Python, and indented Python that begins with an import."""
+    text = (ROOT / page).read_text()
+    fenced = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
+    indented = re.findall(r"(?:^    import .*\n)(?:^    .*\n)+", text, re.M)
+    return fenced + [re.sub(r"^    ", "", block, flags=re.M) for block in indented]
+
+
+def test_python_is_where_it_is_known_to_be() -> None:
+    pages = {page_name(p) for p in PAGES if p.parent.name != "tutorials"}
+    assert {p for p in pages if python_of(p)} == {"README.md", "docs/quadrics.md"}
+    assert [len(python_of(p)) for p in ("README.md", "docs/quadrics.md")] == [1, 1]
+
+
+def test_python_in_readme(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording(desk)
+    (code,) = python_of("README.md")
+    for old, new in (
+        ('rt.track("phone.mp4", detector)', 'rt.track(rt.Video("phone.mp4", FEW), detector)'),
+        ('rt.run("phone.mp4", "out")', 'rt.run("phone.mp4", "out", QUICK, detections="det.npz")'),
+    ):
+        assert old in code
+        code = code.replace(old, new)
+    scope: dict[str, Any] = {"FEW": QUICK.input, "QUICK": QUICK, "detector": "det.npz"}
+    exec(compile(code, "README.md", "exec"), scope)
+    assert_right(desk / "out")
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(line.split()[0].isdigit() for line in lines) >= 40 + 22
+    assert len(scope["result"].objects) == len(info(desk / "out")["objects"])
+
+
+def test_python_in_quadrics(desk: Path) -> None:
+    """A chair and a cup of the clip from true boxes, where nothing hides them, and true cameras."""
+    (code,) = python_of("docs/quadrics.md")
+    truth, frames = true_boxes(min_visible=0.95), range(0, 240, 2)
+    views = {o["id"]: (truth.clear & (truth.identity == o["id"])).sum() for o in true_objects()}
+    chosen = [
+        max((o for o in true_objects() if o["class"] == c), key=lambda o: int(views[o["id"]]))
+        for c in ("chair", "cup")
+    ]
+    boxes = np.full((len(frames), 2, 4), np.nan)
+    for k, o in enumerate(chosen):
+        rows = truth.clear & (truth.identity == o["id"]) & np.isin(truth.frame, list(frames))
+        boxes[truth.frame[rows] // 2, k] = truth.xyxy[rows]
+    fx, fy, cx, cy = map(float, CAMERA.split(","))
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    scope: dict[str, Any] = {
+        "boxes_xyxy": boxes, "img_from_world": K @ true_cameras(frames), "width": 640,
+        "height": 480,
+    }  # fmt: skip
+    exec(compile(code, "quadrics.md", "exec"), scope)
+    fits = scope["fits"]
+    goal = np.array([o["center"] for o in chosen])
+    assert np.linalg.norm(fits.ellipsoids.center_in_world - goal, axis=1).max() < 0.06
+    assert list(fits.status) == ["ok", "ok"]

@@ -1,0 +1,326 @@
+"""`eval`: scores what TrackEval scores, refuses what it refuses, and says what it assumes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import reobj_track as rt
+
+ROWS = np.array(
+    [(f, o, 30 + f * 20 % 1200, 40 + o * 120, 60, 100) for f in range(1, 31) for o in range(1, 6)],
+    float,
+)
+NAMES = {1: "chair", 2: "cup", 3: "chair", 4: "tv", 5: "potted plant"}
+COCO = {name: rt.COCO_NAMES.index(name) for name in NAMES.values()}
+
+
+def write(path: Path, rows: np.ndarray, tail: str = "", sep: str = ",") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = (sep.join(f"{x:.10g}" for x in row) for row in rows)
+    path.write_text("".join(f"{line}{sep if tail else ''}{tail}\n" for line in lines))
+    return path
+
+
+def score(out: Path, gt: Path, *more: str) -> tuple[dict[str, float], list[str]]:
+    found = rt.evaluate(out, gt, **({"classes": list(more)} if more else {}))
+    return found["tracks"]["all"], found["messages"]
+
+
+def refused(capsys: pytest.CaptureFixture[str], out: Path, gt: Path) -> str:
+    """The one line that the command line prints instead of a table."""
+    assert rt.main(["eval", str(out), "--gt", str(gt)]) == 2
+    text = capsys.readouterr()
+    assert text.out == "" and len(text.err.splitlines()) == 1
+    return text.err
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    return write(tmp_path / "res.txt", ROWS, "0.9,-1,-1,-1")
+
+
+def test_identities_twice_in_a_frame_are_refused(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = ROWS.copy()
+    rows[rows[:, 1] == 2, 1] = 1
+    gt, other = write(tmp_path / "gt.txt", ROWS, "1"), write(tmp_path / "two.txt", rows, "1")
+    for out, truth in ((result, other), (other, gt)):
+        text = refused(capsys, out, truth)
+        assert "two.txt: identity 1 has 2 boxes in frame 1 (from 1; 30 such cases)" in text
+    rows = ROWS.copy()
+    rows[rows[:, 1] == 2, 1], marked = 1, np.where(rows[:, 1] == 2, 0, 1)
+    unmarked = write(tmp_path / "gt0.txt", np.c_[rows, marked])  # what does not count is no rival
+    assert score(write(tmp_path / "x.txt", ROWS[ROWS[:, 1] != 2]), unmarked)[0]["HOTA"] == 1
+
+
+def test_boxes_without_identity_are_refused(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = ROWS.copy()
+    rows[:, 1] = -1
+    gt = write(tmp_path / "gt.txt", ROWS, "1")
+    text = refused(capsys, write(tmp_path / "det.txt", rows, "0.9,-1,-1,-1"), gt)
+    assert "det.txt: 150 of 150 boxes have no identity" in text and "detections, not tracks" in text
+    rows[:-1, 1] = ROWS[:-1, 1]
+    assert "1 of 150 boxes" in refused(capsys, write(tmp_path / "one.txt", rows), gt)
+
+
+def test_frames_from_0_are_taken_as_such_and_said(result: Path, tmp_path: Path) -> None:
+    rows = ROWS - np.eye(1, 6)
+    zero = write(tmp_path / "zero.txt", rows, "1")
+    for out, gt in ((result, zero), (zero, write(tmp_path / "gt.txt", ROWS, "1")), (zero, zero)):
+        found, said = score(out, gt)
+        assert found["HOTA"] == found["IDF1"] == found["MOTA"] == 1
+        assert "zero.txt has a frame 0: its frames are taken as 0-based" in said
+    assert score(result, write(tmp_path / "gt.txt", ROWS, "1"))[1] == []
+
+
+@pytest.mark.parametrize(
+    ("tail", "keep", "why"),
+    [
+        ("1", 0, "no boxes in it"),
+        ("0", 150, "of 150 rows 150 are marked not to count (column 7 is 0"),
+        ("0,-1,-1,-1", 150, "of 150 rows 150 are marked not to count"),
+    ],
+)
+def test_truth_of_which_nothing_counts(
+    result: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    tail: str,
+    keep: int,
+    why: str,
+) -> None:
+    gt = write(tmp_path / "gt.txt", ROWS[:keep], tail)
+    for out in (result, write(tmp_path / "none.txt", ROWS[:0])):
+        text = refused(capsys, out, gt)
+        assert f"{gt}: no true box counts: {why}" in text
+
+
+def test_a_result_without_a_box_is_worth_nothing(tmp_path: Path) -> None:
+    gt = write(tmp_path / "gt.txt", ROWS, "1")
+    found, _ = score(write(tmp_path / "none.txt", ROWS[:0]), gt)
+    assert found["HOTA"] == found["IDF1"] == found["MOTA"] == 0 and found["gt_objects"] == 5
+
+
+@pytest.mark.parametrize(
+    ("rows", "what"),
+    [
+        (ROWS - 2 * np.eye(1, 6), "frame -1; expected frames from 1, or from 0"),
+        (ROWS * [1, 1, 1, 1, -1, 1], "frame 1, identity 1: width or height below 0"),
+    ],
+)
+def test_rows_that_cannot_be_meant(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rows: np.ndarray, what: str
+) -> None:
+    bad, gt = write(tmp_path / "bad.txt", rows), write(tmp_path / "gt.txt", ROWS, "1")
+    assert f"bad.txt{', ' if 'identity' in what else ': '}{what}" in refused(capsys, bad, gt)
+    assert "bad.txt" in refused(capsys, result, bad)
+
+
+def test_large_identities_and_boxes_without_area(tmp_path: Path) -> None:
+    """Identities beyond 2^31 are identities; a box without area matches nothing."""
+    gt, rows = write(tmp_path / "gt.txt", ROWS, "1"), ROWS.copy()
+    rows[:, 1] += 2**52
+    large = write(tmp_path / "large.txt", rows)
+    large.write_text("\n".join(",".join(f"{x:.0f}" for x in row) for row in rows))
+    assert score(large, gt)[0]["HOTA"] == 1
+    rows = ROWS.copy()
+    rows[rows[:, 0] == 3, 4:] = 0
+    found, _ = score(write(tmp_path / "flat.txt", rows), gt)
+    assert found["recall"] == found["precision"] == pytest.approx(29 / 30)
+
+
+def test_columns_parted_by_spaces(result: Path, tmp_path: Path) -> None:
+    gt = write(tmp_path / "gt.txt", ROWS, "1 -1 -1 -1", " ")
+    assert score(result, gt)[0]["HOTA"] == 1
+    spaces = write(tmp_path / "res2.txt", ROWS, "0.9", "  ")
+    assert score(spaces, gt)[0]["HOTA"] == 1
+
+
+# ---- Classes ----
+
+
+def folder(out: Path, names: tuple[str, ...] | None = None) -> Path:
+    """An output folder with these boxes, of these class names or of NAMES."""
+    classes = names or rt.COCO_NAMES
+    ids, n = ROWS[:, 1].astype(int), len(ROWS)
+    kind = np.array([0 if names else COCO[NAMES[i]] for i in ids])
+    xyxy = np.c_[ROWS[:, 2:4], ROWS[:, 2:4] + ROWS[:, 4:]]
+    frame = ROWS[:, 0].astype(int) - 1
+    tracks = rt.Tracks(frame, ids, ids, xyxy, np.full(n, 0.9), kind, np.zeros(n, int))
+    own = [rt.Object(i, names[0] if names else NAMES[i], 0.9, "tracked", "") for i in NAMES]
+    from reobj.results.result import VideoInfo
+
+    rt.Result(tracks, tuple(classes), VideoInfo("v", 1300, 800, 30.0), own).save(out)
+    return out
+
+
+def nine(path: Path, number: dict[str, int], flag: int = 1) -> Path:
+    kinds = [number[NAMES[int(i)]] for i in ROWS[:, 1]]
+    ones = np.ones(len(ROWS))
+    return write(path, np.c_[ROWS, flag * ones, kinds, 0.8 * ones])
+
+
+def test_labels_of_cvat_name_the_classes(tmp_path: Path) -> None:
+    """From 1 by the lines of gt/labels.txt; seqinfo.ini of no MOT sequence changes nothing."""
+    out, labels = folder(tmp_path / "out"), ["Potted_Plant", "chair", "cup", "TV"]
+    line = {n: 1 + labels.index({"potted plant": labels[0], "tv": "TV"}.get(n, n)) for n in COCO}
+    ours = rt.evaluate(out, nine(tmp_path / "ours/gt.txt", COCO))
+    for name in ("cvat", "cvat_seq"):
+        gt = nine(tmp_path / name / "gt/gt.txt", line)
+        (gt.parent / "labels.txt").write_text("\n".join(labels) + "\n")
+        if name == "cvat_seq":
+            (gt.parent.parent / "seqinfo.ini").write_text("[Sequence]\nname=room\nseqLength=30\n")
+        found = rt.evaluate(out, gt)
+        assert found["tracks"] == ours["tracks"]
+        assert sorted(found["tracks"]) == ["all", "chair", "cup", "potted plant", "tv"]
+        assert all(s["HOTA"] == 1 for s in found["tracks"].values())
+        assert found["messages"] == ["classes are lines of labels.txt, from 1 (CVAT's MOT 1.1)"]
+    (gt.parent / "labels.txt").write_text("chair\n")
+    with pytest.raises(rt.ReobjError, match=r"class 4, but .*labels.txt has 1 lines"):
+        rt.evaluate(out, gt)
+
+
+def mot_files(tmp_path: Path, name: str, seqinfo: bool = True) -> tuple[Path, Path]:
+    """A person, a static person (7), a vehicle without motor (6), a car (3); all are found."""
+    kinds = {1: 1, 2: 7, 3: 6, 4: 3}
+    rows = ROWS[ROWS[:, 1] < 5]
+    kind = np.array([kinds[int(i)] for i in rows[:, 1]])
+    gt = write(tmp_path / name / "gt/gt.txt", np.c_[rows, kind == 1, kind, np.ones(len(rows))])
+    if seqinfo:
+        text = f"[Sequence]\nname={name}\nseqLength=30\n"
+        (gt.parent.parent / "seqinfo.ini").write_text(text)
+    return write(tmp_path / "pr.txt", rows, "0.9,-1,-1,-1"), gt
+
+
+@pytest.mark.parametrize(
+    ("name", "benchmark", "precision"),
+    [
+        ("MOT16-02", "MOT16", 1 / 3),
+        ("MOT17-02-FRCNN", "MOT17", 1 / 3),
+        ("MOT20-01", "MOT20", 1 / 2),  # class 6 is a distractor there
+        ("park", "MOT17", 1 / 3),  # by its rows
+    ],
+)
+@pytest.mark.parametrize("seqinfo", [True, False])
+def test_distractors_of_mot(
+    tmp_path: Path, name: str, benchmark: str, precision: float, seqinfo: bool
+) -> None:
+    found, said = score(*mot_files(tmp_path, name, seqinfo))
+    assert found["precision"] == pytest.approx(precision) and found["gt_objects"] == 1
+    assert said == [f"classes are {benchmark}'s: pedestrians count, boxes on distractors do not"]
+
+
+def test_one_class_without_a_name_is_any_class(tmp_path: Path) -> None:
+    """DanceTrack and SportsMOT: nine columns, class 1 throughout, and a seqinfo.ini."""
+    out = folder(tmp_path / "out", ("person",))
+    gt = nine(tmp_path / "dancetrack0001/gt/gt.txt", dict.fromkeys(COCO, 1))
+    (gt.parent.parent / "seqinfo.ini").write_text("[Sequence]\nname=dancetrack0001\n")
+    found = rt.evaluate(out, gt)
+    assert found["tracks"]["all"]["HOTA"] == 1 and list(found["tracks"]) == ["all"]
+    assert "one class without a name" in found["messages"][0]
+
+
+def test_frames_beyond_the_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = mot_files(tmp_path, "MOT17-02")
+    (tmp_path / "MOT17-02/seqinfo.ini").write_text("[Sequence]\nname=MOT17-02\nseqLength=20\n")
+    assert "frame 30, but seqinfo.ini says seqLength=20" in refused(capsys, *files)
+
+
+@pytest.mark.parametrize("names", [("object",), ("Ball", "x")])
+def test_a_result_without_these_classes_is_scored_without(
+    tmp_path: Path, names: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, gt = folder(tmp_path / "out", names), nine(tmp_path / "gt.txt", COCO)
+    found = rt.evaluate(out, gt)
+    assert list(found["tracks"]) == ["all"] and found["tracks"]["all"]["HOTA"] == 1
+    assert "boxes match whatever their class" in found["messages"][-1]
+    assert rt.evaluate(out / "tracks.txt", gt)["tracks"] == found["tracks"]
+    assert score(out, gt, "chair")[0]["HOTA"] == 1  # boxes on other classes are no errors
+    assert rt.main(["eval", str(out), "--gt", str(gt)]) == 0
+    assert "\nnote: " in capsys.readouterr().out
+    kept = json.loads((out / "eval.json").read_text())
+    assert kept["messages"] == found["messages"]
+
+
+def test_no_row_of_a_class_counts(tmp_path: Path) -> None:
+    out, gt = folder(tmp_path / "out"), nine(tmp_path / "gt.txt", COCO)
+    assert score(out, gt, "chair")[0]["gt_objects"] == 2
+    rows = [line for line in gt.read_text().splitlines() if f",{COCO['cup']},0.8" not in line]
+    gt.write_text("\n".join(rows))
+    with pytest.raises(rt.ReobjError, match=r"no true box counts: none is of cup"):
+        score(out, gt, "cup")
+
+
+# ---- Other formats of truth ----
+
+
+def kitti(path: Path, extra: str = "") -> Path:
+    lines = [
+        f"{f - 1:.0f} {i:.0f} {NAMES[int(i)].replace(' ', '_')} 0 0 -1.5 {x} {y} {x + w} {y + h} "
+        "1 1 1 0 0 9 0"
+        for f, i, x, y, w, h in ROWS.tolist()
+    ]
+    path.write_text("\n".join([*lines, extra]) + "\n")
+    return path
+
+
+def test_kitti_labels(tmp_path: Path) -> None:
+    """From frame 0; what lies on DontCare is no error."""
+    out = folder(tmp_path / "out")
+    found = rt.evaluate(out, kitti(tmp_path / "0000.txt"))
+    assert all(s["HOTA"] == 1 for s in found["tracks"].values()) and len(found["tracks"]) == 5
+    assert found["messages"][0].startswith("KITTI's labels: frames from 0")
+    text = kitti(tmp_path / "0001.txt").read_text()
+    anywhere = [line.split() for line in text.splitlines() if " 2 cup " in line]
+    for words in anywhere:
+        words[1:3] = "-1", "DontCare"
+    others = [line for line in text.splitlines() if " 2 cup " not in line]
+    ignored = tmp_path / "0002.txt"
+    ignored.write_text("\n".join([*others, *map(" ".join, anywhere)]))
+    assert score(out, ignored)[0]["precision"] == 1
+    ignored.write_text("\n".join(others))
+    assert score(out, ignored)[0]["precision"] == 0.8
+    with pytest.raises(rt.ReobjError, match="line 151: expected 17 columns"):
+        rt.evaluate(out, kitti(tmp_path / "0003.txt", "1 2 chair"))
+
+
+def test_coco_video(tmp_path: Path) -> None:
+    out, frames = folder(tmp_path / "out"), range(30)
+    images = [{"id": 100 + f, "frame_id": f, "video_id": 1} for f in frames]
+    kinds = [{"id": k, "name": n} for n, k in COCO.items()]
+    notes = [
+        {"id": k, "image_id": 99 + int(f), "category_id": COCO[NAMES[int(i)]], "instance_id": i,
+         "bbox": [x, y, w, h]} for k, (f, i, x, y, w, h) in enumerate(ROWS.tolist())
+    ]  # fmt: skip
+    data = {"images": images, "categories": kinds, "annotations": notes}
+    path = tmp_path / "vid.json"
+    path.write_text(json.dumps(data))
+    assert all(s["HOTA"] == 1 for s in rt.evaluate(out, path)["tracks"].values())
+    images[3]["video_id"] = 2
+    path.write_text(json.dumps(data))
+    with pytest.raises(rt.ReobjError, match="images of 2 videos"):
+        rt.evaluate(out, path)
+    path.write_text(json.dumps({"images": [{"id": 1}]}))
+    with pytest.raises(rt.ReobjError, match="expected COCO-VID: images with frame_id"):
+        rt.evaluate(out, path)
+
+
+def test_cvat_for_video(tmp_path: Path) -> None:
+    out = folder(tmp_path / "out")
+    text = "<annotations>"
+    for i, name in NAMES.items():
+        text += f'<track id="{i - 1}" label="{name}">'
+        for f, _, x, y, w, h in ROWS[ROWS[:, 1] == i].tolist():
+            text += (f'<box frame="{f - 1:.0f}" xtl="{x}" ytl="{y}" xbr="{x + w}" ybr="{y + h}" '
+                     'outside="0" occluded="0" keyframe="1"/>')  # fmt: skip
+        text += "</track>"
+    (tmp_path / "cvat.xml").write_text(text + "</annotations>")
+    found = rt.evaluate(out, tmp_path / "cvat.xml")["tracks"]
+    assert len(found) == 5 and all(s["HOTA"] == 1 for s in found.values())

@@ -1,0 +1,445 @@
+"""Supplied poses as a user brings them: which frame each belongs to, what is refused, and why."""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import quadrics
+import reobj_track as rt
+from reobj.cameras import import_pycolmap, invert_rigid, write_colmap
+
+sys.path.append(str(Path(__file__).resolve().parent.parent))
+from pose_worlds import look_at
+
+FRAMES, SIZE = 30, (320, 240)
+CAMERA = rt.Camera("PINHOLE", *SIZE, (290.0, 290.0, 160.0, 120.0))
+LINE = "PINHOLE 320 240 290 290 160 120"
+CENTRES = np.array([[-0.6, 0, 0.41], [0.6, 0.3, 0.41], [0.1, 0.9, 0.41], [-0.1, -0.8, 0.41]])
+SOLIDS = quadrics.Ellipsoids(
+    CENTRES, np.tile([0.25, 0.3, 0.41], (4, 1)), np.eye(3)[None].repeat(4, 0)
+)
+
+
+def path_of(count: int = FRAMES) -> np.ndarray:
+    """cam_from_world (F, 3, 4) of a hand-held walk around the origin, z up."""
+    angle = np.radians(np.linspace(-60, 60, count))
+    at, rng = np.arange(count), np.random.default_rng(1)
+    radius, height = 3.4 + 0.3 * np.sin(at / 3), 1.6 + 0.3 * np.sin(at / 2)
+    eye = np.stack([radius * np.sin(angle), -radius * np.cos(angle), height], 1)
+    target = np.array([0, 0, 0.4]) + rng.normal(0, 0.05, (count, 3))
+    return np.array([look_at(e, t) for e, t in zip(eye, target, strict=True)])
+
+
+@cache
+def images() -> tuple[np.ndarray, ...]:
+    """Pictures of a textured floor along the path."""
+    rng = np.random.default_rng(0)
+    scales = [rng.normal(0, 1, (side, side)).astype(np.float32) for side in (20, 60, 180, 540)]
+    floor = sum(cv2.resize(noise, (1600, 1600), interpolation=cv2.INTER_CUBIC) for noise in scales)
+    floor = cv2.normalize(floor, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    world_from_texel = np.array([[0.005, 0, -4], [0, 0.005, -4], [0, 0, 1]])  # 8 x 8 m
+    pictures = []
+    for pose in path_of():
+        homography = CAMERA.K @ pose[:, [0, 1, 3]] @ world_from_texel
+        gray = cv2.warpPerspective(floor, homography, SIZE, flags=cv2.INTER_AREA)
+        pictures.append(np.repeat(gray[:, :, None], 3, 2))
+    return tuple(pictures)
+
+
+def film(folder: Path, blank: bool = False) -> Path:
+    path = folder / "v.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
+    for image in images():
+        video.write(np.full_like(image, 90) if blank else image)
+    video.release()
+    return path
+
+
+def folder_of(folder: Path, name: str = "{:04d}.jpg", first: int = 0, blank: bool = True) -> Path:
+    (folder / "images").mkdir()
+    for i, image in enumerate(images()):
+        picture = np.full_like(image, 90) if blank else image
+        cv2.imwrite(str(folder / "images" / name.format(i + first)), picture)
+    return folder / "images"
+
+
+def as_poses(cams: np.ndarray) -> rt.Poses:
+    at = np.arange(len(cams))
+    return rt.Poses(CAMERA, at, at / 30, cams, np.full(len(cams), "supplied"), "user")
+
+
+def model(folder: Path, frames: list[int], names: list[str], camera: str = "") -> Path:
+    """COLMAP text model of some frames under the names given."""
+    write_colmap(folder, as_poses(path_of()[frames]), names)
+    if camera:
+        (folder / "cameras.txt").write_text(camera)
+    return folder
+
+
+def transforms(path: Path, frames: list[int], names: list[str]) -> Path:
+    world_from_gl = np.tile(np.eye(4), (len(frames), 1, 1))
+    world_from_gl[:, :3] = invert_rigid(path_of()[frames])
+    world_from_gl = world_from_gl @ np.diag([1.0, -1, -1, 1])
+    rows = [
+        {"file_path": name, "transform_matrix": pose.tolist()}
+        for name, pose in zip(names, world_from_gl, strict=True)
+    ]
+    path.write_text(json.dumps({"fl_x": 290, "cx": 160, "cy": 120, "w": 320, "h": 240,
+                                "frames": rows}))  # fmt: skip
+    return path
+
+
+def quaternions(frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    world_from_cam = invert_rigid(path_of()[frames])
+    return world_from_cam[:, :, 3], Rotation.from_matrix(world_from_cam[:, :, :3]).as_quat()
+
+
+def tum(path: Path, stamps: list[str], frames: list[int], head: str = "", sep: str = " ") -> Path:
+    place, xyzw = quaternions(frames)
+    rows = [
+        sep.join([stamp, *map(repr, [*p.tolist(), *q.tolist()])])
+        for stamp, p, q in zip(stamps, place, xyzw, strict=True)
+    ]
+    path.write_text(head + "\n".join(rows) + "\n")
+    return path
+
+
+def detections(folder: Path) -> Path:
+    """Boxes of four chairs in all frames, .3 px off."""
+    boxes = quadrics.solid_boxes(SOLIDS, "box", CAMERA.K @ path_of())  # (F, 4, 4)
+    boxes = boxes + np.random.default_rng(2).normal(0, 0.3, boxes.shape)
+    rows = [
+        f"{f},{','.join(f'{v:.2f}' for v in boxes[f, k])},.9,chair"
+        for f, k in np.ndindex(*boxes.shape[:2])
+    ]
+    path = folder / "d.csv"
+    path.write_text("frame,x1,y1,x2,y2,score,class\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def assert_right(poses: rt.Poses, frames: list[int]) -> None:
+    """The frames that have a pose are these, and it is theirs."""
+    assert poses.frame[poses.known].tolist() == frames
+    np.testing.assert_allclose(poses.cam_from_world[poses.known], path_of()[frames], atol=1e-6)
+
+
+def run(folder: Path, source: Path | None, poses: Path, *more: str) -> int:
+    words = ["run", *([str(source)] if source else []), "-o", str(folder / "out"), "--detections",
+             str(detections(folder)), "--poses", str(poses), "--embed", "none",
+             "--set", "output.overlay=none", "--set", "output.scene=false",
+             "--set", "poses.size_px=160"]  # fmt: skip
+    return rt.main([*words, *more])
+
+
+def assert_chairs_in_place(out: Path, atol: float = 0.02) -> None:
+    objects = json.loads((out / "objects.json").read_text())["objects"]
+    found = np.array([o["center"] for o in objects if o["center"]])
+    assert len(found) == 4
+    assert np.linalg.norm(found[:, None] - CENTRES, axis=2).min(0).max() < atol
+
+
+ALL = list(range(FRAMES))
+KEPT = {
+    "all": ALL,
+    "first missing": ALL[1:],
+    "last missing": ALL[:-1],
+    "both missing": ALL[1:-1],
+    "one in the middle missing": [i for i in ALL if i != 11],
+}
+
+
+# ---- Numbers in names ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("kept", KEPT)
+def test_numbers_of_a_video_count_from_0_or_1_as_the_images_show(
+    tmp_path: Path, kept: str, first: int
+) -> None:
+    frames = KEPT[kept]
+    path = model(tmp_path / "m", frames, [f"{i + first:05d}.png" for i in frames])
+    poses = rt.read_poses(path, rt.Video(film(tmp_path)))
+    assert_right(poses, frames)
+    assert f"counted from {first}" in poses.messages[-1]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("every", [2, 3, 4])
+def test_every_kth_frame_numbered_anew(tmp_path: Path, every: int, first: int) -> None:
+    frames = ALL[::every]
+    names = [f"frame_{i + first:05d}.png" for i in range(len(frames))]
+    poses = rt.read_poses(model(tmp_path / "m", frames, names), rt.Video(film(tmp_path)))
+    assert_right(poses, frames)
+    assert f"one frame in {every}" in poses.messages[-1]
+
+
+def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
+    source = folder_of(tmp_path, blank=False)
+    names = [f"images/frame_{i + 1:05d}.png" for i in ALL[:-1]]
+    poses = rt.read_poses(transforms(tmp_path / "t.json", ALL[:-1], names), rt.Video(source))
+    assert_right(poses, ALL[:-1])
+
+
+@pytest.mark.parametrize(("first", "stop"), [(1, 0), (0, 24)])
+def test_boxes_decide_where_images_show_nothing(tmp_path: Path, first: int, stop: int) -> None:
+    """Also of a part of the video: the numbers are those of the source."""
+    source, frames = film(tmp_path, blank=True), ALL[:-1] if first else ALL[1:]
+    path = model(tmp_path / "m", frames, [f"{i + first:05d}.jpg" for i in frames])
+    assert run(tmp_path, source, path, "--stop", str(stop)) == 0
+    assert_chairs_in_place(tmp_path / "out")
+    warnings = json.loads((tmp_path / "out" / "objects.json").read_text())["warnings"]
+    assert any(f"counted from {first} (it fits the boxes" in text for text in warnings)
+
+
+def test_without_evidence_both_readings_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = film(tmp_path, blank=True)
+    path = model(tmp_path / "m", ALL[1:-1], [f"{i:05d}.jpg" for i in ALL[1:-1]])
+    words = ["poses", str(source), "-o", str(tmp_path / "out"), "--poses", str(path),
+             "--set", "poses.size_px=160"]  # fmt: skip
+    assert rt.main(words) == 2
+    error = capsys.readouterr().err
+    assert "counted from 0" in error and "counted from 1" in error
+    assert "--set poses.frames_by=number0" in error
+    assert not (tmp_path / "out" / "poses.txt").exists()
+    for first in (0, 1):
+        poses = rt.read_poses(path, rt.Video(source), frames_by=f"number{first}")
+        assert poses.frame[poses.known][0] == 1 - first
+    assert rt.main([*words, "--set", "poses.frames_by=time"]) == 2
+    assert "can be read by number0, number1" in capsys.readouterr().err
+
+
+def test_equal_file_names_in_two_folders_of_a_model(tmp_path: Path) -> None:
+    source = folder_of(tmp_path).rename(tmp_path / "left")
+    frames = [*ALL[::-1], *ALL]
+    names = [f"right/{i:04d}.jpg" for i in ALL] + [f"left/{i:04d}.jpg" for i in ALL]
+    path = model(tmp_path / "m", frames, names)
+    assert_right(rt.read_poses(path, rt.Video(source)), ALL)
+    with pytest.raises(rt.ReobjError, match="several images in different folders"):
+        rt.read_poses(path, rt.Video(source.rename(tmp_path / "other")))
+    with pytest.raises(rt.ReobjError, match="have the same number"):
+        rt.read_poses(path, rt.Video(film(tmp_path)))
+
+
+# ---- Time stamps ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stamps", "said"),
+    [
+        ([str(5 + i) for i in ALL], "order"),  # whole seconds, as many as images
+        ([str(i) for i in ALL], "whole numbers"),
+        ([str(1700000000 + i) for i in ALL], "order"),
+        ([f"{i / 10:.4f}" for i in ALL], "order"),
+    ],
+)
+def test_as_many_rows_as_images_without_times(tmp_path: Path, stamps: list[str], said: str) -> None:
+    """Images without time stamps have no times: none is assumed."""
+    path = tum(tmp_path / "t.txt", stamps, ALL)
+    poses = rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE)
+    assert_right(poses, ALL)
+    assert said in poses.messages[-1]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("kept", ["all", "last missing", "one in the middle missing"])
+def test_frame_numbers_in_place_of_times(tmp_path: Path, first: int, kept: str) -> None:
+    frames = KEPT[kept]
+    path = tum(tmp_path / "t.txt", [f"{i + first}.0" for i in frames], frames)
+    assert_right(rt.read_poses(path, rt.Video(film(tmp_path)), camera=LINE), frames)
+
+
+@pytest.mark.parametrize("per_s", [1e3, 1e6, 1e9])
+def test_stamps_in_ms_us_and_ns(tmp_path: Path, per_s: float) -> None:
+    """Of a video, since its start; and of images named in ns, as dates."""
+    frames = ALL[::4]
+    path = tum(tmp_path / "t.txt", [f"{round(i / 30 * per_s)}" for i in frames], frames)
+    poses = rt.read_poses(path, rt.Video(film(tmp_path)), camera=LINE)
+    assert_right(poses, frames)
+    start = 1_700_000_000_000_000_000
+    source = tmp_path / "ns"
+    source.mkdir()
+    for i, image in enumerate(images()):
+        cv2.imwrite(str(source / f"{start + 50_000_000 * i}.png"), image)
+    dates = [f"{(start + 50_000_000 * i) // round(1e9 / per_s)}.000000" for i in frames]
+    poses = rt.read_poses(tum(tmp_path / "d.txt", dates, frames), rt.Video(source), camera=LINE)
+    assert_right(poses, frames)
+    assert any("taken for" in text for text in poses.messages)
+
+
+# ---- Order of quaternions ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("head", [True, False])
+@pytest.mark.parametrize("clock", ["ns", "s"])
+def test_csv_with_w_first(tmp_path: Path, head: bool, clock: str) -> None:
+    """EuRoC's ns need no header; without one and in s the boxes decide."""
+    place, xyzw = quaternions(ALL)
+    names = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n"
+    rows = [
+        ",".join(map(str, [stamp, *p, *q[[3, 0, 1, 2]]]))
+        for stamp, p, q in zip(
+            [1_700_000_000_000_000_000 + 50_000_000 * i if clock == "ns" else i / 20 for i in ALL],
+            place, xyzw, strict=True,
+        )
+    ]  # fmt: skip
+    path = tmp_path / "gt.csv"
+    path.write_text(names * head + "\n".join(rows) + "\n")
+    assert run(tmp_path, None, path, "--camera", LINE) == 0
+    assert_chairs_in_place(tmp_path / "out")
+
+
+def test_a_body_is_said_to_be_taken_for_the_camera(tmp_path: Path) -> None:
+    path = tmp_path / "gt.csv"
+    place, xyzw = quaternions(ALL)
+    rows = np.column_stack([1.7e18 + 5e7 * np.arange(FRAMES), place, xyzw[:, [3, 0, 1, 2]]])
+    np.savetxt(path, rows, "%.9f", delimiter=",", header="timestamp [ns], p_RS_R_x [m], ...")
+    poses = rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE)
+    assert_right(poses, ALL)
+    assert any("body taken for camera" in text for text in poses.messages)
+
+
+# ---- Models and cameras --------------------------------------------------------------------------
+
+
+def test_the_larger_model_or_the_named_one(tmp_path: Path) -> None:
+    source = rt.Video(folder_of(tmp_path))
+    names = [f"{i:04d}.jpg" for i in ALL]
+    small = model(tmp_path / "w" / "sparse" / "0", ALL[:6], names[:6])
+    large = model(tmp_path / "w" / "sparse" / "1", ALL[4:], names[4:])
+    poses = rt.read_poses(tmp_path / "w", source)
+    assert_right(poses, ALL[4:])
+    assert any("sparse/0 (6)" in text and "sparse/1 taken" in text for text in poses.messages)
+    assert_right(rt.read_poses(small, source), ALL[:6])
+    below = large / "sparse" / "0"
+    below.mkdir(parents=True)
+    import_pycolmap().Reconstruction(str(small)).write_binary(str(below))
+    assert_right(rt.read_poses(large, source), ALL[4:])  # named, though a binary one is below it
+    model(tmp_path / "w" / "sparse" / "2", ALL[:26], names[:26])
+    with pytest.raises(rt.ReobjError, match=r"sparse/1 and .*sparse/2 are models of 26 images"):
+        rt.read_poses(tmp_path / "w", source)
+
+
+def test_a_folder_says_what_it_was_taken_for(tmp_path: Path) -> None:
+    names = [f"{i:04d}.jpg" for i in ALL]
+    transforms(tmp_path / "transforms.json", ALL, names)
+    model(tmp_path / "sparse" / "0", ALL, names)
+    poses = rt.read_poses(tmp_path, rt.Video(folder_of(tmp_path)))
+    assert any("read as transforms; --pose-format chooses" in text for text in poses.messages)
+    assert "read as transforms; frames found by file names" in poses.messages[-1]
+
+
+def with_cameras(folder: Path, cameras: list[str], of_image: list[int]) -> Path:
+    path = model(folder, ALL, [f"{i:04d}.jpg" for i in ALL])
+    lines = [line for line in (path / "images.txt").read_text().splitlines() if line]
+    rows = [line.split() for line in lines]
+    for row, camera in zip(rows, of_image, strict=True):
+        row[8] = str(camera)
+    other = ["999", *rows[0][1:8], "99", "cam1/9999.jpg"]
+    (path / "images.txt").write_text("\n\n".join(" ".join(row) for row in [*rows, other]) + "\n\n")
+    text = "".join(f"{i} {camera}\n" for i, camera in enumerate(cameras, 1))
+    (path / "cameras.txt").write_text(text + "99 OPENCV 1000 700 900 900 500 350 0 0 0 0\n")
+    return path
+
+
+def test_only_cameras_of_images_that_are_frames_count(tmp_path: Path) -> None:
+    source = rt.Video(folder_of(tmp_path))
+    path = with_cameras(tmp_path / "m", [LINE], [1] * FRAMES)
+    assert_right(rt.read_poses(path, source), ALL)
+    each = [f"PINHOLE 320 240 {290 + 0.1 * (i % 5)} {290 + 0.1 * (i % 5)} 160 120" for i in ALL]
+    path = with_cameras(tmp_path / "each", each, [i + 1 for i in ALL])
+    assert rt.read_poses(path, source).camera.params[0] == pytest.approx(290.2)
+    path = with_cameras(tmp_path / "two", [LINE, LINE.replace("290", "400")], [1, 2] * 15)
+    with pytest.raises(rt.ReobjError, match=r"several different cameras .*290-400.*--camera"):
+        rt.read_poses(path, source)
+    assert rt.read_poses(path, source, camera=LINE).camera == CAMERA
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "1e300"])
+@pytest.mark.parametrize("binary", [True, False])
+def test_points_that_are_not_finite_are_refused(
+    tmp_path: Path, number: str, binary: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = model(tmp_path / "m", ALL, [f"{i:04d}.jpg" for i in ALL])
+    x = "5" if binary else number
+    (path / "points3D.txt").write_text(f"3 0 0 1 9 9 9 0\n7 {x} 0 1 9 9 9 0\n")
+    if binary:
+        pycolmap = import_pycolmap()
+        whole = pycolmap.Reconstruction(str(path))
+        whole.points3D[7].xyz = [float(number), 0, 1]
+        path = tmp_path / "binary"
+        path.mkdir()
+        whole.write_binary(str(path))
+    assert run(tmp_path, None, path) == 2
+    assert "point 7 is" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "objects.json").exists()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(
+    "camera",
+    [
+        "OPENCV 320 240 290 290 160 120 0 0 2 0",
+        "OPENCV 320 240 290 290 160 120 1e20 0 0 0",
+        "OPENCV 320 240 290 290 160 120 0 0 0 1e5",
+        "SIMPLE_RADIAL 320 240 290 160 120 -10",
+        "SIMPLE_RADIAL 320 240 290 160 120 -1000",
+        "SIMPLE_RADIAL 320 240 290 160 120 1e5",
+    ],
+)
+@pytest.mark.parametrize("in_model", [True, False])
+def test_a_lens_that_leaves_no_pixel_is_refused(
+    tmp_path: Path, camera: str, in_model: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [f"{i:04d}.jpg" for i in ALL]
+    path = model(tmp_path / "m", ALL, names, f"1 {camera}\n" if in_model else "")
+    assert run(tmp_path, None, path, *([] if in_model else ["--camera", camera])) == 2
+    error = capsys.readouterr().err
+    assert "its distortion leaves" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "camera"),
+    [
+        ("image_width: 320\nimage_height: 240\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+         "  data: [290, 0, 160,\n    0, 290, 120, 0, 0, 1]\ndistortion_model: plumb_bob\n"
+         "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, 0.02, 0.001, 0.002, 0]\n",
+         rt.Camera("OPENCV", *SIZE, (290, 290, 160, 120, 0.1, 0.02, 0.001, 0.002))),
+        ("%YAML:1.0\n---\nimage_width: 320\nimage_height: 240\n"
+         "Camera_Matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+         "   data: [ 2.9e+02, 0., 160., 0., 290., 120., 0., 0., 1. ]\n", CAMERA),
+        ("cam0:\n  camera_model: pinhole\n  distortion_coeffs: [0.1, 0.02, 0.003, 0.004]\n"
+         "  distortion_model: equidistant\n  intrinsics: [290, 290, 160, 120]\n"
+         "  resolution: [320, 240]\n  rostopic: /cam0/image_raw\n",
+         rt.Camera("OPENCV_FISHEYE", *SIZE, (290, 290, 160, 120, 0.1, 0.02, 0.003, 0.004))),
+        ("%YAML:1.0\nCamera.type: \"PinHole\"\nCamera.fx: 290.0\nCamera.fy: 290.0\n"
+         "Camera.cx: 160.0\nCamera.cy: 120.0\nCamera.k1: 0.1\nCamera.width: 320\n"
+         "Camera.height: 240\n",
+         rt.Camera("OPENCV", *SIZE, (290, 290, 160, 120, 0.1, 0, 0, 0))),
+    ],
+)  # fmt: skip
+def test_yaml_of_cameras(tmp_path: Path, text: str, camera: rt.Camera) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    rows = tum(tmp_path / "t.txt", [str(i) for i in ALL], ALL)
+    found = rt.read_poses(rows, rt.Video(folder_of(tmp_path)), camera=str(path))
+    assert found.camera == camera
+
+
+@pytest.mark.parametrize("numbers", [12, 16])
+def test_rows_of_matrices_are_poses(tmp_path: Path, numbers: int) -> None:
+    """KITTI's, and Replica's and our poses_c2w.txt."""
+    rows = np.tile(np.eye(4), (FRAMES, 1, 1))
+    rows[:, :3] = invert_rigid(path_of())
+    path = tmp_path / "poses_c2w.txt"
+    np.savetxt(path, rows.reshape(FRAMES, 16)[:, :numbers])
+    assert_right(rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE), ALL)

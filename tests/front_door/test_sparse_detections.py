@@ -1,0 +1,281 @@
+"""A detector that was not run on every frame: frames nobody looked at are no misses."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from simulated import unlinked, walk
+
+import reobj_track as rt
+from reobj.identity.gaps import fill_gaps
+from reobj.parts import link_and_fit
+from reobj.sources.detectors import DetectionCache, as_source
+from reobj.sources.looked import frames_looked_at
+
+TABLE, CHAIR = 60, 56
+FRAMES = 60
+
+
+def scene(frame: int) -> list[list[float]]:
+    """A table, and from frame 10 on a chair beside it."""
+    table = [300 + 0.2 * frame, 200, 500 + 0.2 * frame, 350, 0.8, TABLE]
+    chair = [40 + 0.2 * frame, 100, 110 + 0.2 * frame, 220, 0.8, CHAIR]
+    return [table, chair] if frame >= 10 else [table]
+
+
+def irregular(count: int = 300) -> set[int]:
+    return set(np.flatnonzero(np.random.default_rng(1).random(count) < 0.3).tolist())
+
+
+WHEN = {f"every {n}": set(range(0, 300, n)) for n in (2, 3, 4, 5, 8, 10)}
+WHEN |= {"late start": set(range(7, 300, 5)), "irregular": irregular()}
+
+
+@pytest.mark.parametrize("name", WHEN)
+@pytest.mark.parametrize("unseen", [None, []])
+def test_a_newcomer_has_an_identity_from_its_third_detection_on(name: str, unseen: object) -> None:
+    """Also where frames that nobody looked at come as frames without a detection."""
+    tracker, chair = rt.Tracker(), []
+    for frame in range(300):
+        looked = frame in WHEN[name]
+        found = tracker.update(scene(frame) if looked else unseen)
+        if looked and frame >= 10:
+            chair.append(dict(zip(found.class_id.tolist(), found.track_id.tolist(), strict=True)))
+        if not looked:
+            assert len(found) == 0 and len(tracker.latest) == 0
+    assert [ids.get(CHAIR) for ids in chair[2:]] == [2] * (len(chair) - 2)
+    assert {ids[TABLE] for ids in chair} == {1}
+
+
+def test_an_object_that_is_looked_for_and_missed_still_leaves() -> None:
+    """Frames of `coast_frames` and of the tentative limit are frames looked at."""
+    tracker = rt.Tracker(rt.TrackerConfig(coast_frames=4))
+    for frame in range(30):
+        tracker.update(scene(frame) if frame % 3 == 0 else None)
+    for _ in range(50):
+        tracker.update(None)
+    assert len(tracker.state.identity) == 2 and not tracker.looked
+    assert tracker.predicted().track_id.tolist() == [1, 2]
+    for k in range(5):
+        assert len(tracker.state.identity) == 2, k
+        tracker.update([], looked=True)
+    assert len(tracker.state.identity) == 0
+
+
+def test_frames_without_a_box_are_looked_at_in_a_dense_video() -> None:
+    """A tentative track of one detection ends after two empty frames, as before."""
+    tracker = rt.Tracker()
+    for frame in range(20):
+        tracker.update(scene(frame))
+    tracker.update([*scene(20), [600, 10, 630, 60, 0.8, CHAIR]])
+    assert len(tracker.state.identity) == 3
+    for _ in range(3):
+        tracker.update([])
+    assert tracker.state.identity.tolist() == [0, 1] and tracker.looked
+
+
+def test_a_saved_tracker_goes_on_as_the_other_does(tmp_path: Path) -> None:
+    def feed(tracker: rt.Tracker, frames: range) -> list[list[float]]:
+        steps = [tracker.update(scene(f) if f % 4 == 0 else []) for f in frames]
+        return [step.to_array().tolist() for step in steps]
+
+    tracker = rt.Tracker()
+    feed(tracker, range(13))  # the chair is tentative
+    tracker.save(tmp_path / "state.npz")
+    again = rt.Tracker.load(tmp_path / "state.npz")
+    assert feed(again, range(13, 60)) == feed(tracker, range(13, 60))
+    assert again.frame_number == 59 and again.state.identity.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("frames", "boxes", "looked"),
+    [
+        (range(60), 3, None),  # dense
+        ([f for f in range(60) if f % 7], 3, None),  # some are empty
+        ([*range(10), *range(50, 60)], 3, None),  # a wall for most of the time
+        (range(0, 60, 3), 1, range(0, 60, 3)),
+        ([0, 6, 9, 21, 24, 30, 51], 1, range(0, 60, 3)),  # nothing found in many of them
+        (range(7, 50, 5), 2, range(2, 60, 5)),
+        ([0, 1, 10, 11, 30], 3, None),  # as many alone as not
+        ([3, 4, 9, 12, 20, 22, 31, 40, 47, 51], 3, [3, 4, 9, 12, 20, 22, 31, 40, 47, 51]),
+        ([3, 4, 9, 12, 20, 22, 31, 40, 47, 51], 1, None),  # one thing that is rarely found
+        ([5, 40], 3, None),  # two frames are no interval
+        ([], 1, None),
+    ],
+)
+def test_the_frames_looked_at_are_inferred(frames: object, boxes: int, looked: object) -> None:
+    found = frames_looked_at(np.repeat(np.array(frames, np.int64), boxes), 60)
+    assert (None if found is None else found.tolist()) == (looked and list(looked))
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sparse") / "images"
+    folder.mkdir()
+    for frame in range(FRAMES):
+        image = np.full((480, 640, 3), 90, np.uint8)
+        for x1, y1, x2, y2, *_ in scene(frame):
+            cv2.rectangle(image, (int(x1), int(y1)), (int(x2), int(y2)), (200, 60, 20), -1)
+        cv2.imwrite(str(folder / f"{frame:04d}.png"), image)
+    return folder
+
+
+def mot(path: Path, frames: range, truth: bool = False) -> Path:
+    lines = [
+        f"{frame + 1},{k if truth else -1},{x1},{y1},{x2 - x1},{y2 - y1},{1 if truth else score}"
+        for frame in frames
+        for k, (x1, y1, x2, y2, score, _) in enumerate(scene(frame), 1)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def track(images: Path, boxes: Path, out: Path, *more: str) -> list[str]:
+    """Run `track` on the command line; returns the warnings that it keeps."""
+    off = ("--set", "output.overlay=none", "--set", "output.scene=false", "--embed", "none")
+    args = ("track", images, "--detections", boxes, "-o", out, *off, *more)
+    assert rt.main([str(a) for a in args]) == 0
+    return list(json.loads((out / "objects.json").read_text())["warnings"])
+
+
+@pytest.mark.parametrize("n", [3, 10])
+def test_track_names_both_and_fills_the_frames_between(
+    images: Path, tmp_path: Path, n: int
+) -> None:
+    warnings = track(images, mot(tmp_path / "det.txt", range(0, FRAMES, n)), tmp_path / "out")
+    (said,) = warnings
+    assert f"1 frame in {n} (0, {n}, {2 * n}, " in said and "not looked at" in said
+    rows = np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")
+    last = (FRAMES - 1) // n * n + 1  # from 1
+    first = -(-10 // n) * n + 1
+    assert rows[rows[:, 1] == 1, 0].tolist() == list(range(1, last + 1))
+    assert rows[rows[:, 1] == 2, 0].tolist() == list(range(first, last + 1))
+    assert ((rows[:, 6] > 0) == ((rows[:, 0] - 1) % n == 0)).all()  # filled: score 0
+    gt = mot(tmp_path / "gt.txt", range(FRAMES), truth=True)
+    whole = rt.evaluate(tmp_path / "out", gt)
+    assert whole["tracks"]["all"]["HOTA"] == 1 and whole["tracks"]["all"]["IDF1"] == 1
+    assert "the detector was not run on" in whole["messages"][-1]
+    assert rt.evaluate(tmp_path / "out/tracks.txt", gt) == whole
+    dense = track(images, mot(tmp_path / "all.txt", range(FRAMES)), tmp_path / "dense")
+    assert dense == []
+
+
+def test_lists_of_images_say_which_were_looked_at(images: Path, tmp_path: Path) -> None:
+    """COCO's `images` and npz's `done`: also frames without a box, whatever their intervals."""
+    seen, clip = [0, 1, 7, 30, 31, 50], rt.Video(images)
+    names = [{"id": f + 7, "file_name": f"{f:04d}.png"} for f in seen]
+    kinds = [{"id": k, "name": rt.COCO_NAMES[k]} for k in (TABLE, CHAIR)]
+    entries = [
+        {"id": 2 * f + k, "image_id": f + 7, "category_id": int(c), "score": s,
+         "bbox": [x1, y1, x2 - x1, y2 - y1]}
+        for f in (0, 30, 31) for k, (x1, y1, x2, y2, s, c) in enumerate(scene(f))
+    ]  # fmt: skip
+    data = {"images": names, "categories": kinds, "annotations": entries}
+    (tmp_path / "coco.json").write_text(json.dumps(data))
+    boxes = [(f, rt.Detections.from_array(scene(f) if f in (0, 30, 31) else [])) for f in seen]
+    rt.write_detections_npz(tmp_path / "d.npz", boxes, rt.COCO_NAMES, (640, 480))
+    for name in ("coco.json", "d.npz"):
+        found = rt.read_detections(tmp_path / name, clip)
+        assert found.looked is not None and found.looked.tolist() == seen
+        assert sum("lists 6 frames only (0, 1, 7, 30, 31, ...)" in m for m in found.messages) == 1
+        source = rt.open_detections(clip, rt.DetectConfig(), tmp_path / name)
+        answers = [source.look(frame) for frame in clip]
+        assert [f for f, a in enumerate(answers) if a is not None] == seen
+        assert [len(a) for a in answers if a is not None] == [1, 0, 0, 2, 2, 0]
+
+
+def test_a_function_that_returns_none_did_not_look(images: Path, tmp_path: Path) -> None:
+    calls = list[int]()
+
+    def detector(image: np.ndarray) -> object:
+        calls.append(len(calls))
+        return scene(calls[-1]) if calls[-1] % 4 == 0 else None
+
+    online = [tracks.track_id.tolist() for _, tracks in rt.track(images, detector, rt.Tracker())]
+    assert online[20] == [1, 2] and online[21] == [] and len(calls) == FRAMES
+    calls.clear()
+    config = rt.Config(
+        embed=rt.EmbedConfig(model="none"), output=rt.OutputConfig(overlay="none", scene=False)
+    )
+    poses = rt.PosesConfig(mode="none")
+    config = rt.Config(embed=config.embed, output=config.output, poses=poses)
+    result = rt.run(images, tmp_path / "out", config, detections=detector)
+    assert len(calls) == FRAMES and [o.class_name for o in result.objects] == [
+        "dining table",
+        "chair",
+    ]
+    assert result.looked is not None and result.looked.tolist() == list(range(0, FRAMES, 4))
+    nothing = rt.run(images, tmp_path / "none", config, detections=lambda image: None)
+    assert "run on no frame (it gave None each time)" in nothing.warnings[-1]
+
+
+def test_a_cache_knows_the_frames_that_nobody_looked_at(images: Path, tmp_path: Path) -> None:
+    """Of a function that is asked for all frames before the cameras are known."""
+    calls = list[int]()
+    made = as_source(lambda image: calls.append(0))  # returns None
+    source = dataclasses.replace(made, cache=DetectionCache(tmp_path / "cache", (640, 480)))
+    frame = next(iter(rt.Video(images)))
+    assert source.look(frame) is None and source.look(frame) is None and len(calls) == 1
+    assert len(source(frame)) == 0
+
+
+def test_tracks_are_embedded_again_by_frames_looked_at() -> None:
+    tracker, seen = rt.Tracker(rt.TrackerConfig(embed_every=2)), list[int]()
+    for frame in range(13):
+        looked = frame % 4 == 0
+        boxes, vectors = (scene(0), [[1.0, 0.0]]) if looked else (None, None)
+        tracker.update(boxes, embeddings=vectors)
+        seen.append(int(tracker.state.embedded[0]))
+    assert seen[::4] == [0, 0, 8, 8]
+
+
+def test_why_nothing_was_tracked_or_is_left(images: Path, tmp_path: Path) -> None:
+    det = mot(tmp_path / "det.txt", range(0, FRAMES, 3))
+    more = ("--set", "tracker.new_score=.9")
+    (_, said) = track(images, det, tmp_path / "a", *more)
+    assert said.endswith("detections are below tracker.new_score=0.9") and "36" in said
+    lines = track(images, det, tmp_path / "b", "--set", "detect.min_score=.9")
+    assert any("none of 36 boxes is left: those of score 0.9 or more" in line for line in lines)
+    assert not any("another detector" in line for line in lines)
+
+
+def moving(frames: list[int], step: float = 100.0) -> rt.Tracks:
+    """A box of 40 px that moves by `step` a frame."""
+    n = np.array(frames)
+    xyxy = np.stack([n * step, 0 * n, n * step + 40, 0 * n + 40], 1)
+    one = np.ones(len(n), np.int64)
+    return rt.Tracks(n, one, one, xyxy, 0.9 * one, 0 * one, 0 * one)
+
+
+def test_gaps_between_frames_looked_at_are_filled_whatever_the_motion() -> None:
+    tracks, size = moving([0, 2, 4, 6, 8, 10]), (2000, 480)
+    looked = np.arange(0, 11, 2)
+    filled = fill_gaps(tracks, size, 5, looked, every=1)
+    assert filled.frame.tolist() == list(range(11))
+    middle = filled.xyxy[filled.frame == 5][0]
+    assert abs(middle[0] - 500) < 20
+    missed = fill_gaps(tracks, size, 5, np.arange(11), every=1)  # looked at and missed: too far
+    assert len(missed) == len(tracks)
+    assert fill_gaps(tracks, size, 5, looked, every=2).frame.tolist() == looked.tolist()
+    one = tracks[tracks.frame != 4]  # missed in frame 4, which was looked at
+    assert fill_gaps(one, size, 5, looked, every=1).frame.tolist() == [0, 1, 2, 6, 7, 8, 9, 10]
+
+
+def test_solids_are_not_missed_in_frames_that_nobody_looked_at() -> None:
+    """The confidence of chairs whose boxes are those of every fourth frame."""
+    sure = []
+    for looked in (np.arange(0, 40, 4), None):
+        given = unlinked(walk())
+        keep = given.tracks.frame % 4 == 0
+        given.tracks = given.tracks[keep]
+        given.tracks.score[:] = 0.35
+        given.looked = looked
+        link_and_fit(given, rt.ObjectsConfig())
+        sure.append([o.confidence or 0.0 for o in given.objects])
+    assert len(sure[0]) == 3
+    assert min(sure[0]) > max(sure[1] or [0.0]) + 0.1
