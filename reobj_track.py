@@ -1195,8 +1195,8 @@ def _finish(
     result.edits = result.edits or kept_edits(workspace.out)
     with Progress("objects"):
         link_and_fit(result, config.objects)
-    gap, every = 0 if result.identities_given else config.output.fill_gaps, video.config.every
-    filled = fill(result, video.size, gap, every)  # by our own solids, whatever solver is asked for
+    gap = 0 if result.identities_given else config.output.fill_gaps
+    filled = fill(result, video.size, gap)  # by our own solids, whatever solver is asked for
     solve_again(result, config.objects)
     result.tracks, result.out = filled, workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in

@@ -240,6 +240,7 @@ class Poses:
             a world and a scale of its own: nothing is known of how two of them lie to each other.
             A frame without a pose counts to the part of the nearest frame that has one.
         messages: what the user should know (spans without poses and what helps).
+        reading: how supplied poses were read: format, and the rule that found their frames.
     """
 
     camera: Camera
@@ -255,6 +256,7 @@ class Poses:
     visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
     part: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     messages: tuple[str, ...] = ()
+    reading: str = ""
 
     def __post_init__(self) -> None:
         if len(self.part) != len(self.frame):
@@ -267,9 +269,10 @@ class Poses:
 
     @property
     def cameras_text(self) -> str:
-        """Say how many frames have a camera, and how many of these are interpolated."""
+        """Say how many frames have a camera, where from, and how many are interpolated."""
         known, between = int(self.known.sum()), int((self.known & ~self.measured).sum())
-        text = f"cameras: {known} of {len(self.frame)} frames ({self.source})"
+        origin = f"{self.source}: {self.reading}" if self.reading else self.source
+        text = f"cameras: {known} of {len(self.frame)} frames ({origin})"
         return f"{text}, {between} interpolated" if between else text
 
     @property
@@ -319,6 +322,7 @@ def save_poses(path: Path, poses: Poses, **more: Any) -> None:
         "metric": poses.metric,
         "up": None if poses.up_in_world is None else poses.up_in_world.tolist(),
         "messages": poses.messages,
+        "reading": poses.reading,
     }
     save_npz(path, {k: getattr(poses, k) for k in _POSE_ARRAYS}, **facts)
 
@@ -335,6 +339,7 @@ def load_poses(path: Path) -> Poses:
         metric=facts["metric"],
         up_in_world=up,
         messages=tuple(facts["messages"]),
+        reading=facts.get("reading", ""),
         **arrays,
     )
 

@@ -318,6 +318,7 @@ def describe_world(
         parts,
         first.floor,
         first.floor_reason,
+        poses.reading,
     )
 
 

@@ -349,18 +349,22 @@ def _part_with_most_boxes(
     return np.asarray(votes.argmax(1), np.int64)
 
 
-def fill(result: Result, image_size: tuple[int, int], max_gap: int, every: int) -> Tracks:
+def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
     """Fill gaps between detections of an identity: by its solid where it has one.
 
     Args:
-        image_size: (w, h). max_gap: as of `fill_gaps`. every: frames from one read to the next.
+        image_size: (w, h). max_gap: as of `fill_gaps`.
+    Returns:
+        the tracks; frames that the detector was not run on are not filled.
     """
     tracks = result.tracks
     for part in result.parts() if max_gap else ():
         if part.poses is not None and (own := part.located):
             identity, support = np.array([o.id for o in own]), [str(o.support) for o in own]
             tracks = fill_by_place(tracks, part.poses, identity, part.ellipsoids(), support)
-    return fill_gaps(tracks, image_size, max_gap, result.looked, every)
+    if result.looked is not None:
+        tracks = tracks[np.isin(tracks.frame, result.looked)]
+    return fill_gaps(tracks, image_size, max_gap, result.looked)
 
 
 OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are by object

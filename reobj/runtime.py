@@ -66,9 +66,6 @@ def quiet_opencv() -> Iterator[None]:
         log.setLogLevel(before)
 
 
-# OpenCV's pool of threads is not there in a forked process, but is waited for. It must be ended
-# before the fork: in the child every change of the number waits too. The next call that needs
-# threads starts them again, in parent and child.
 _threads_before: list[int] = []
 
 
@@ -81,7 +78,14 @@ def _allow_threads() -> None:
     cv2.setNumThreads(_threads_before.pop())
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(
-        before=_end_threads, after_in_parent=_allow_threads, after_in_child=_allow_threads
-    )
+@functools.cache
+def guard_forks() -> None:
+    """End OpenCV's threads before this process is forked; they start again when needed.
+
+    The pool of threads does not exist in the forked process, and OpenCV waits for it there, also
+    when the number of threads is changed: it must end before the fork.
+    """
+    if hasattr(os, "register_at_fork"):  # not on Windows
+        os.register_at_fork(
+            before=_end_threads, after_in_parent=_allow_threads, after_in_child=_allow_threads
+        )

@@ -553,10 +553,13 @@ def as_frame(image: Any, masks: BoolArray | None = None) -> Image:
     return np.ascontiguousarray(image)
 
 
-def frame_step(table: Tracks) -> int:
-    """Return the frames from one that was read to the next: more than 1 with `--every`."""
-    frames = np.unique(table.frame)
-    return int(np.diff(frames).min()) if len(frames) > 1 else 1
+def frame_step(frame: IntArray) -> int:
+    """Return the frames from one that was read to the next: more than 1 with `--every`.
+
+    frame: (N,) numbers of frames that were read.
+    """
+    frames = np.unique(frame)
+    return int(np.gcd.reduce(np.diff(frames))) if len(frames) > 1 else 1
 
 
 def looks(table: Tracks, looked: IntArray | None) -> tuple[IntArray, int]:
@@ -569,7 +572,7 @@ def looks(table: Tracks, looked: IntArray | None) -> tuple[IntArray, int]:
         next.
     """
     if looked is None:
-        return table.frame, frame_step(table)
+        return table.frame, frame_step(table.frame)
     return np.searchsorted(looked, table.frame), 1
 
 

@@ -672,7 +672,7 @@ def test_stamps_of_another_clock_may_be_one_a_frame_of_the_source(
         return
     poses = read(path, video, camera=CAMERA)
     np.testing.assert_allclose(poses.cam_from_world, cams[[1, 3, 5]], atol=1e-9)
-    assert "order, one row for each frame of the source" in poses.messages[-1]
+    assert "order, one row for each frame of the source" in poses.reading
 
 
 def test_lost_scannet_frames_have_no_pose(tmp_path):

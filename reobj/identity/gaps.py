@@ -23,47 +23,40 @@ from reobj.types import (
     xyxy_from_cxcywh,
 )
 
-# Overlap of the boxes at both ends, of gaps in which it was missed; less: it moved too far to say
-# where it was. Between two frames looked at in turn it is filled anyway: examples/room with boxes
-# of every 3rd frame IDF1 .88 instead of .74 (every 10th: .63 and .41)
-MIN_END_IOU = 0.3
+MIN_END_IOU = 0.3  # overlap of the boxes at both ends; less: it moved too far to say where it was
 WINDOW = 10  # frames on either side that the smoother reads; with 40 boxes move by 1.3 px at most
 # over the box's mean side, as in the tracker (DeepSORT: 1/20, 1/160, 1/20, 1/16)
 STD_POSITION, STD_VELOCITY, STD_MEASURE, STD_START = 0.05, 1 / 80, 0.05, 0.2
 
 
 def fill_gaps(
-    tracks: Tracks,
-    image_size: tuple[int, int],
-    max_gap: int,
-    looked: IntArray | None = None,
-    every: int = 0,
+    tracks: Tracks, image_size: tuple[int, int], max_gap: int, looked: IntArray | None = None
 ) -> Tracks:
-    """Fill gaps between two detections of an identity with at most `max_gap` frames looked at.
+    """Fill gaps of at most `max_gap` frames between two detections of an identity.
 
     Args:
         tracks: of a video, in frames that were all read. image_size: (w, h) that boxes stay in.
-        looked: frames that the detector was run on; None: all that were read. The others are
-            filled too; `every` frames lie from one that was read to the next.
+        looked: frames that the detector was run on, the only ones that count and are filled;
+            None: all that were read.
     Returns:
         the tracks with rows of score 0 and detection index -1 in the gaps, ordered by frame.
     """
     parts = [tracks]
-    step = frame_step(tracks) if looked is None else every
+    step = frame_step(tracks.frame if looked is None else looked)
     number, unit = looks(tracks, looked)
     for identity in np.unique(tracks.track_id):
         own = tracks.track_id == identity
         rows = tracks[own]
-        missing = np.diff(rows.frame) // step - 1  # (n - 1,) frames after each row
+        between = np.diff(rows.frame) // step - 1  # (n - 1,) frames after each row
         missed = np.diff(number[own]) // unit - 1  # of them looked at
-        for i in np.flatnonzero((missing > 0) & (missed <= max_gap)):
-            overlap = box_iou(rows.xyxy[i : i + 1], rows.xyxy[i + 1 : i + 2])[0, 0]
-            if missed[i] and overlap < MIN_END_IOU:
+        for i in np.flatnonzero((missed > 0) & (missed <= max_gap)):
+            if box_iou(rows.xyxy[i : i + 1], rows.xyxy[i + 1 : i + 2])[0, 0] < MIN_END_IOU:
                 continue
-            window = np.abs(rows.frame - rows.frame[i]) <= (WINDOW + missing[i]) * step
+            window = np.abs(rows.frame - rows.frame[i]) <= (WINDOW + between[i]) * step
             at = (rows.frame[window] - rows.frame[window][0]) // step
             box = smooth_boxes(at, rows.xyxy[window])  # (F, 4) of every frame of the window
-            frame = rows.frame[i] + step * np.arange(1, missing[i] + 1)
+            frame = rows.frame[i] + step * np.arange(1, between[i] + 1)
+            frame = frame if looked is None else np.intersect1d(frame, looked)
             filled = box[(frame - rows.frame[window][0]) // step]
             filled = filled.clip(0, np.tile(image_size, 2))
             one = np.ones(len(frame), np.int64)

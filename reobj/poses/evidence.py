@@ -12,7 +12,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -41,11 +40,12 @@ class PoseReading:
     kind: str = ""
     measured: str = ""
 
-    def with_message(self, path: Path) -> Poses:
-        """Return the poses, with what the file was taken for and how its frames were found."""
-        text = f"{path}: read as {self.kind}; frames found by {self.rule}"
+    @property
+    def described_poses(self) -> Poses:
+        """The poses, with what the file was taken for and how its frames were found."""
+        text = f"{self.kind}, frames by {self.rule}"
         text += f" ({self.measured})" if self.measured else ""
-        return dataclasses.replace(self.poses, messages=(*self.poses.messages, text))
+        return dataclasses.replace(self.poses, reading=text)
 
 
 # Residuals of one reading and another: (n,) each, of what both explain, or of what each does

@@ -155,7 +155,7 @@ def _by_image_numbers(
     for key, rule, offset in ways:
         frame = np.array([frame_of.get(n + offset, -1) for n in number.tolist()], np.int64)
         found.append(_reading(key, rule, np.where(known, frame, -1), source))
-    if found[0].outside:  # not all of them are numbers of images
+    if found[0].outside and not np.isin(images, number[known]).all():  # some of both fit none
         for first in (0, 1):
             rule = f"{noun} as places in the order of the images, counted from {first}"
             found.append(

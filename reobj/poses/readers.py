@@ -69,7 +69,7 @@ def the_reading(found: list[PoseReading], path: Path) -> Poses:
             f"images nor tracks show which is right: {what}; choose with --set "
             f"poses.frames_by={found[0].key}"
         )
-    return found[0].with_message(path)
+    return found[0].described_poses
 
 
 def pose_readings(

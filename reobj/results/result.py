@@ -178,6 +178,7 @@ class World:
 
     Attributes:
         units: "m", "arbitrary", or None without cameras. source: of the poses.
+        reading: format of supplied poses, and the rule that found their frames.
         registered_frames, interpolated_frames: with a pose, between two; frames: in all parts.
         up_in_world: (3,) unit vector against gravity; up_source: where it comes from.
         scale: metres per unit, its relative sigma and source; None without a fit.
@@ -198,6 +199,7 @@ class World:
     parts: tuple[Part, ...] = ()
     floor: Floor | None = None
     floor_reason: str = ""
+    reading: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the `world` of objects.json."""

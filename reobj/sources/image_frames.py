@@ -147,6 +147,8 @@ def frames_of_names(
     if text and not first:
         return frame[row], text
     frame, text = frames_of_numbers(number, video.frame_count, first, usual, listed, where)
+    if video.frame_count and (number.min(), number.max()) == (0, video.frame_count - 1):
+        return frame[row], ""  # from the first frame to the last: there is no other reading
     said = "the number in a name is the frame's"
     return frame[row], f"{said}: {text}" if text else f"{said}, from {usual}"
 

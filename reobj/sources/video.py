@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from reobj.files import shortened
-from reobj.runtime import check_versions, quiet_opencv
+from reobj.runtime import check_versions, guard_forks, quiet_opencv
 from reobj.sources.container_files import holds_pictures_only, missing_bytes, settled_times
 from reobj.sources.image_files import (
     FRAME_STEPS_S,
@@ -114,6 +114,7 @@ class Video:
 
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
         check_versions()
+        guard_forks()
         self._address, self.config = str(source), config or InputConfig()
         self.source = without_secrets(self._address)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:

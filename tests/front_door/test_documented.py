@@ -73,7 +73,7 @@ ELSEWHERE = {
     "python reobj_track.py --options": "test_commands.py",
     "python reobj_track.py models": "test_commands.py",
     "python reobj_track.py objects out --solver lfd": "test_commands.py, with all solvers",
-    "python reobj_track.py eval out --gt gt.txt": "below; twice in the docs",
+    "python reobj_track.py objects out --edits edits.json": "below, of OUT",
 }  # fmt: skip
 LONG = {  # scripts that take long, or data that is not here: their words are compared with --help
     "appearance.md": ("rank_k", "train_embedding", "train_head", "benchmark"),
@@ -292,12 +292,8 @@ def renamed(desk: Path) -> None:
     assert classes.count("armchair") == 1
 
 
-def drawn(desk: Path) -> None:
-    assert cv2.imread(str(desk / "gallery.jpg")) is not None
-
-
-def no_weights(_: Path) -> None:
-    pass
+def nothing(_: Path) -> None:
+    """The exit code says it all; the example has no errors to draw."""
 
 
 @dataclass(frozen=True)
@@ -321,10 +317,10 @@ class Shown:
 
 TOOL = "python reobj_track.py "
 NAMED = {"VIDEO": "phone.mp4", "OUT": "out"}
-FIRST = f"--every 4 --stop 80 {PLAIN}"
+FIRST = "--every 4 --stop 80"
 SHOWN = {
     TOOL + "run phone.mp4 -o out": Shown(
-        recording, no_weights, "--offline", code=2, says="--detector fast"
+        recording, nothing, "--offline", code=2, says="--detector fast"
     ),
     TOOL + "run phone.mp4 -o out --detector fast": Shown(
         recording, detected, f"--every 6 --stop 120 {SUPPLIED}"
@@ -341,7 +337,7 @@ SHOWN = {
     TOOL + "objects out --known-size chair=0.82m": Shown(output, scaled, PLAIN, folder="out"),
     TOOL + "eval out --gt gt.txt": Shown(output, evaluated, folder="out"),
     TOOL + "export out --to coco-vid": Shown(output, exported, folder="out"),
-    TOOL + "poses VIDEO -o OUT": Shown(recording, located, FIRST.split(" --set")[0], NAMED),
+    TOOL + "poses VIDEO -o OUT": Shown(recording, located, FIRST, NAMED),
     TOOL + "poses VIDEO -o OUT --camera fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]": Shown(
         recording, located, "--every 3 --stop 60",
         NAMED | {"fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]": CAMERA},
@@ -357,7 +353,6 @@ SHOWN = {
          "MODEL WIDTH HEIGHT PARAMS": "PINHOLE 640 480 " + CAMERA.replace(",", " ")},
     ),
     TOOL + "objects OUT --edits edits.json": Shown(output, renamed, PLAIN, NAMED, "out"),
-    TOOL + "objects out --edits edits.json": Shown(output, renamed, PLAIN, folder="out"),
     TOOL + "eval OUT --gt gt.txt [--gt-objects gt_objects.json] [--classes chair,cup]": Shown(
         output, evaluated_in_3d, "", {"[": "", "]": "", "OUT": "out"}, "out"
     ),
@@ -374,11 +369,10 @@ SHOWN = {
         mine, detected, f"--every 6 --stop 120 {SUPPLIED}"
     ),
     "python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
-        output, drawn, "", {"OUT...": "out", "gt.txt...": "gt.txt"}, "out"
+        output, nothing, "", {"OUT...": "out", "gt.txt...": "gt.txt"}, "out"
     ),
-    "python examples/live_ar.py -o OUT": Shown(recording, no_weights, "--frames 20", NAMED),
+    "python examples/live_ar.py -o OUT": Shown(recording, nothing, "--frames 20", NAMED),
 }  # fmt: skip
-del ELSEWHERE["python reobj_track.py eval out --gt gt.txt"]
 
 
 def test_every_command_in_the_docs_is_run_or_has_a_reason() -> None:

@@ -168,7 +168,7 @@ def test_numbers_of_a_video_count_from_0_or_1_as_the_images_show(
     path = model(tmp_path / "m", frames, [f"{i + first:05d}.png" for i in frames])
     poses = rt.read_poses(path, rt.Video(film(tmp_path)))
     assert_right(poses, frames)
-    assert f"counted from {first}" in poses.messages[-1]
+    assert f"counted from {first}" in poses.reading
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -178,7 +178,7 @@ def test_every_kth_frame_numbered_anew(tmp_path: Path, every: int, first: int) -
     names = [f"frame_{i + first:05d}.png" for i in range(len(frames))]
     poses = rt.read_poses(model(tmp_path / "m", frames, names), rt.Video(film(tmp_path)))
     assert_right(poses, frames)
-    assert f"one frame in {every}" in poses.messages[-1]
+    assert f"one frame in {every}" in poses.reading
 
 
 def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
@@ -195,8 +195,8 @@ def test_boxes_decide_where_images_show_nothing(tmp_path: Path, first: int, stop
     path = model(tmp_path / "m", frames, [f"{i + first:05d}.jpg" for i in frames])
     assert run(tmp_path, source, path, "--stop", str(stop)) == 0
     assert_chairs_in_place(tmp_path / "out")
-    warnings = json.loads((tmp_path / "out" / "objects.json").read_text())["warnings"]
-    assert any(f"counted from {first} (it fits the boxes" in text for text in warnings)
+    world = json.loads((tmp_path / "out" / "objects.json").read_text())["world"]
+    assert f"counted from {first} (it fits the boxes" in world["reading"]
 
 
 def test_without_evidence_both_readings_are_named(
@@ -247,7 +247,7 @@ def test_as_many_rows_as_images_without_times(tmp_path: Path, stamps: list[str],
     path = tum(tmp_path / "t.txt", stamps, ALL)
     poses = rt.read_poses(path, rt.Video(folder_of(tmp_path)), camera=LINE)
     assert_right(poses, ALL)
-    assert said in poses.messages[-1]
+    assert said in poses.reading
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -335,7 +335,7 @@ def test_a_folder_says_what_it_was_taken_for(tmp_path: Path) -> None:
     model(tmp_path / "sparse" / "0", ALL, names)
     poses = rt.read_poses(tmp_path, rt.Video(folder_of(tmp_path)))
     assert any("read as transforms; --pose-format chooses" in text for text in poses.messages)
-    assert "read as transforms; frames found by file names" in poses.messages[-1]
+    assert poses.reading == "transforms, frames by file names"
 
 
 def with_cameras(folder: Path, cameras: list[str], of_image: list[int]) -> Path:

@@ -1,0 +1,133 @@
+"""benchmarks/: floors fail where a figure is worse, and changes of the core are real changes."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+import mutate
+import numpy as np
+import pytest
+import recordings
+import truth as scores
+
+FIGURES = {
+    "exit": 0, "seconds": 20.0, "mb": 400, "idf1": 0.9, "found": 20, "true": 21, "false": 2,
+    "solids": 18, "solids_true": 20, "cm": 3.0, "cameras": 100, "frames": 100, "off": 0.2,
+    "warnings": 0,
+}  # fmt: skip
+WORSE = {
+    "exit": 1, "idf1": 0.86, "found": 17, "false": 5, "solids": 15, "cm": 6.0, "cameras": 90,
+    "off": 0.5, "mb": 700,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", WORSE)
+def test_a_worse_figure_misses_its_floor(key: str) -> None:
+    floors = recordings.floors_of(FIGURES)
+    assert recordings.missed(FIGURES, floors) == []
+    (text,) = recordings.missed(FIGURES | {key: WORSE[key]}, floors)
+    assert key in text or "exit code 1" in text
+
+
+def test_no_figure_and_no_floors_are_faults() -> None:
+    floors = recordings.floors_of(FIGURES)
+    without = {k: v for k, v in FIGURES.items() if k != "off"}
+    assert len(recordings.missed(without, floors)) == 1
+    assert len(recordings.missed(FIGURES, None)) == 1
+
+
+def test_every_command_has_a_name_of_its_own() -> None:
+    names = [case.name for case in recordings.CASES]
+    assert len(set(names)) == len(names)
+    if recordings.FLOORS.exists():
+        assert set(json.loads(recordings.FLOORS.read_text())) == set(names)
+
+
+def output(rows: list[list[float]], names: dict[int, str]) -> scores.Output:
+    objects = [{"id": i, "class": name} for i, name in names.items()]
+    return scores.Output({}, np.array(rows, float).reshape(-1, 6), objects, {})
+
+
+def test_identities_and_lists_by_hand(tmp_path: Path) -> None:
+    """Ten frames of a chair and a cup; the chair breaks in two, a bottle is seen on the cup."""
+    path = tmp_path / "gt.txt"
+    true = [f"{f + 1},{i},{50 * i},0,20,20,1,{i},1" for f in range(10) for i in (1, 2)]
+    path.write_text("\n".join(true))
+    truth = scores.read_mot_truth(path, {1: "chair", 2: "cup"})
+    chair = [[f, 5 if f < 7 else 6, 51, 0, 71, 20] for f in range(10)]
+    found = scores.score_2d(truth, output(chair, {5: "chair", 6: "chair"}))
+    assert found == scores.Found(2 * 7 / 30, 1, 2, 1)
+    bottle = [[f, 7, 100, 0, 120, 20] for f in range(10)]
+    found = scores.score_2d(truth, output(bottle, {7: "bottle"}))
+    assert found == scores.Found(0, 0, 2, 1)
+    moved = [[f, 5, 60, 0, 80, 20] for f in range(10)]  # IoU 1 / 3
+    assert scores.score_2d(truth, output(moved, {5: "chair"})).found == 0
+    assert scores.score_2d(truth, output([], {})) == scores.Found(0, 0, 2, 0)
+
+
+def test_areas_and_what_need_not_be_found(tmp_path: Path) -> None:
+    path = tmp_path / "gt.txt"
+    rows = [f"{f + 1},{i},{100 * i},0,40,40,1,-1,1" for f in range(4) for i in (1, 2, 3)]
+    path.write_text("\n".join(rows))
+    kinds = [
+        {"id": 1, "class": "chair", "also_ok": ["couch"], "recall": True},
+        {"id": 2, "class": "cup", "also_ok": [], "recall": False},
+        {"id": 3, "class": "ignore", "also_ok": [], "ignore_classes": ["book"]},
+    ]
+    (tmp_path / "objects.json").write_text(json.dumps(kinds))
+    truth = scores.read_mot_truth(path, {}, tmp_path / "objects.json")
+    rows_of = {1: [100, 0, 140, 40], 2: [200, 0, 240, 40], 3: [310, 10, 330, 30]}
+    found = [[f, i, *box] for f in range(4) for i, box in rows_of.items()]
+    good = scores.score_2d(truth, output(found, {1: "couch", 2: "cup", 3: "book"}))
+    assert good == scores.Found(1, 1, 1, 0)
+    tv = scores.score_2d(truth, output(found, {1: "couch", 2: "cup", 3: "tv"}))
+    assert tv == scores.Found(2 * 8 / (8 + 12), 1, 1, 1)
+
+
+def test_cameras_and_solids_by_hand() -> None:
+    rng = np.random.default_rng(0)
+    true = rng.normal(size=(9, 3))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    ours = dict(enumerate((true - 3) @ turn * 0.5))  # true = 2 turn ours + 3
+    objects = [
+        {"id": 1, "class": "chair", "center": turn.T @ [-1.0, -1, -1.25], "size": [0.2, 0.1, 0.4],
+         "quat_wxyz": [1, 0, 0, 0]},
+    ]  # fmt: skip
+    output = scores.Output({}, np.empty((0, 6)), objects, ours)
+    cameras = scores.score_cameras(output, dict(enumerate(true)), own=True)
+    assert cameras is not None and cameras.median == pytest.approx(0, abs=1e-9)
+    chair = {"class": "chair", "center": [1, 1, 0.4], "size_m": [0.2, 0.4, 0.8],
+             "world_from_obj": np.eye(3)}  # fmt: skip
+    solids = scores.score_solids([chair], output, cameras.truth_from_ours)
+    assert (solids.found, solids.true) == (1, 1)
+    assert solids.centre_m == pytest.approx(0.1) and solids.size == pytest.approx(0, abs=1e-9)
+    far = chair | {"center": [2, 1, 0.4]}
+    assert scores.score_solids([far], output, cameras.truth_from_ours).found == 0
+    late = scores.score_cameras(output, {k + 1: v for k, v in enumerate(true)}, own=True)
+    assert late is not None and late.median > 0.3
+
+
+def test_changes_are_real_and_can_be_compiled(tmp_path: Path) -> None:
+    code = '''"""Doc."""
+
+
+def f(x: int = 2) -> float | None:
+    """Doc."""
+    if x < 3 and not x == 1:
+        raise ValueError(f"{x + 1}")
+    for i in range(x):
+        x += i * 2
+    return -x / 2.0 if x in (1, 2) else None
+'''
+    (tmp_path / "m.py").write_text(code)
+    found = mutate.mutants_of(tmp_path, "m.py", set(range(1, 99)), random.Random(0))
+    befores = {m.before for m in found}
+    assert {"x < 3", "not x == 1", "i * 2", "-x / 2.0", "x in (1, 2)", "2.0", "3"} <= befores
+    assert not any("Doc" in b or "x + 1" in b for b in befores)
+    source = code.encode()
+    for m in found:
+        new = source[: m.begin] + m.text.encode() + source[m.end :]
+        assert new != source
+        compile(new, "m.py", "exec")
