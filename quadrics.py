@@ -1567,6 +1567,10 @@ VIEW_OUTLIER = 6.0  # mean squared residual of a view (chi2 .9999, 4 dof, is 23.
 EDGE_OUTLIER = 5.0  # sigma, a single edge farther off is dropped (occlusion)
 HIDDEN_CAP = 7.4  # most that a hidden edge costs: -2 log(.2 hidden / 20 sigma / .4)
 OUTLIER_CAP = 12.0  # most that any other edge costs, for .02 wrong
+UPPER, LOWER = 1, 3  # edges of a box
+# Of objects that stand on the floor, the share whose lower part something nearer occludes in all
+# views: that of `HIDDEN` among the votes for the scale
+OCCLUDED_BELOW = 0.25
 # (9, 9) information that keeps unobservable rotations finite; .9 rad: a uniform angle in +-90 deg
 ROTATION_CAP: Array = np.diag([0.0] * 6 + [0.9**-2] * 3)
 
@@ -1768,18 +1772,30 @@ def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data) -> Array:
 
     -2 log p = (v + n) log(1 + S / v) + priors of size, tilt, floor + log det(H)
     - log det(information of the size prior) - 2 log_odds, S the truncated squares.
+    What stands on a known floor may be occluded in its lower part in all views at once: with
+    probability OCCLUDED_BELOW edges that end inside it in views that end above the floor are free.
     """
     used = data.edges.used[fit.obj]
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     pull = _prior_terms(fit.state, prob).cost
     noise = _least(fit.noise, fit.obj)  # the level that the best support reaches
-    square = (value / noise[:, None, None]) ** 2
+    standard = value / noise[:, None, None]  # (B, V, E)
     cap = np.where(value > 0, HIDDEN_CAP, OUTLIER_CAP)
-    total = (np.minimum(square, cap) * used / data.edges.share[fit.obj]).sum((1, 2))
-    misfit = (NOISE_PRIOR_DOF + _count(used, data, fit.obj)) * np.log1p(total / NOISE_PRIOR_DOF)
+    cost = np.minimum(standard**2, cap) * used / data.edges.share[fit.obj]
+    dof = NOISE_PRIOR_DOF + _count(used, data, fit.obj)
+    misfit = dof * np.log1p(cost.sum((1, 2)) / NOISE_PRIOR_DOF)
+    stands = np.isfinite(spec.floor_sigma[fit.hyp])
+    above = stands[:, None] & (standard[..., LOWER] > EDGE_OUTLIER)  # (B, V)
+    free = above[..., None] & (value > 0)
+    free[..., UPPER] = False
+    occluded = dof * np.log1p(np.where(free, 0.0, cost).sum((1, 2)) / NOISE_PRIOR_DOF)
+    either = np.logaddexp(
+        np.log1p(-OCCLUDED_BELOW) - 0.5 * misfit, np.log(OCCLUDED_BELOW) - 0.5 * occluded
+    )
+    fits_boxes = np.where(stands, either, -0.5 * misfit)
     determinant = np.linalg.slogdet(fit.hessian + ROTATION_CAP)[1]
     determinant -= np.linalg.slogdet(prob.size_info)[1]
-    return np.asarray(-0.5 * (misfit + pull + determinant) + spec.log_odds[fit.hyp])
+    return np.asarray(fits_boxes - 0.5 * (pull + determinant) + spec.log_odds[fit.hyp])
 
 
 def _safe_inverse(hessian: Array) -> Array:
