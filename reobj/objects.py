@@ -132,28 +132,26 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
 KNOWN_SIZE_M = (0.001, 1000.0)  # chosen: objects of a room or a street are neither
 
 
-def _plain(name: str) -> str:
-    """Normalise a category as `quadrics` does: "Potted_Plant" and "potted plant" are the same."""
-    return re.sub(r"[\s_\-]+", " ", name.strip().lower())
-
-
 def check_known_size(config: ObjectsConfig, class_names: Sequence[str]) -> None:
     """Refuse sizes of categories that no object can have; a misspelt one would set nothing."""
-    known = {_plain(name) for name in class_names}
-    for name in map(str, parse_known_size(config.known_size)):
-        if known and _plain(name) not in known:
+    names = list(map(str, parse_known_size(config.known_size)))
+    priors = size_priors(config)
+    known = set(priors.canonical(class_names))
+    for name, plain in zip(names, priors.canonical(names), strict=True):
+        if known and plain not in known:
             close = did_you_mean(name, class_names) or f"; there are {shortened(class_names)}"
             raise ReobjError(f"--known-size {name}: no such class{close}")
 
 
 def unused_sizes(config: ObjectsConfig, objects: Sequence[Object]) -> list[str]:
     """Warn of sizes of categories that no object with a solid has: they set nothing."""
-    seen = {_plain(o.class_name) for o in objects if o.located}
-    names = map(str, parse_known_size(config.known_size))
+    priors = size_priors(config)
+    seen = set(priors.canonical([o.class_name for o in objects if o.located]))
+    names = list(map(str, parse_known_size(config.known_size)))
     return [
         f"--known-size {name}: no {name} with a solid was found, so this sets no scale"
-        for name in names
-        if _plain(name) not in seen
+        for name, plain in zip(names, priors.canonical(names), strict=True)
+        if plain not in seen
     ]
 
 

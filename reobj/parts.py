@@ -69,24 +69,29 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> None:
     fit_in: list[Fit | None] = [None] * max(len(parts), 1)
     priors = quadrics.load_priors(config.priors or None)
     if any(p.known.sum() >= config.min_views for p in parts):
-        for k, own in enumerate(parts):  # a direction given as up is one of the largest part
-            options = dataclasses.replace(config, up="") if k else config
-            fit_in[k] = fitter(options, own, result.class_names)
+        for k, own in enumerate(parts):
+            fit_in[k] = fitter(_options(config, k), own, result.class_names)
     linked = _Linked(result.tracks, located=[None] * len(fit_in))
     if not result.identities_given:
         linked = _link_parts(result, parts, fit_in, priors, config)
     if result.edits is not None:
-        linked = _edited(linked, result, result.edits)
+        linked = _edited(linked, result, result.edits, priors)
+        fit_in = [
+            None if fit is None else fitter(_options(config, k), parts[k], result.class_names)
+            for k, fit in enumerate(fit_in)
+        ]
     tracks = linked.tracks
+    category = tracks.class_id if linked.category is None else linked.category  # (N,)
     part = np.zeros(len(tracks), np.int64) if poses is None else poses.part_of(tracks.frame)  # (N,)
     fits: list[quadrics.ObjectFits | None] = [None] * len(fit_in)
     identity, row_of = np.unique(tracks.track_id, return_inverse=True)
     part_of_object = _part_with_most_boxes(tracks, row_of, len(identity), part, poses, config)
     result.objects = []
     for k, fit in enumerate(fit_in):
-        rows, views = tracks[part_of_object[row_of] == k], None
+        own_rows, views = part_of_object[row_of] == k, None
+        rows = tracks[own_rows]
         if len(rows) and fit is not None:
-            classes = object_classes(rows)
+            classes = object_classes(dataclasses.replace(rows, class_id=category[own_rows]))
             group = np.searchsorted(list(classes), rows.track_id)
             views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
             located = linked.located[k]
@@ -132,6 +137,7 @@ class _Linked:
     confidence: dict[int, float] = field(default_factory=dict)
     located: list[Located | None] = field(default_factory=list)
     solid_of: dict[int, int] = field(default_factory=dict)
+    category: IntArray | None = None  # (N,) class whose size prior counts; None: that of the row
 
     def rows_now(self, before: IntArray) -> IntArray:
         """Return where rows of the table before linking are now, -1: deleted."""
@@ -142,8 +148,17 @@ class _Linked:
         return np.asarray(now[before], np.int64)
 
 
-def _edited(linked: _Linked, result: Result, edits: Edits) -> _Linked:
-    """Correct identities and classes by hand; an object that the user names is surely there."""
+def _options(config: ObjectsConfig, part: int) -> ObjectsConfig:
+    """Return the options of a part: a direction given as up is one of the largest, part 0."""
+    return dataclasses.replace(config, up="") if part else config
+
+
+def _edited(linked: _Linked, result: Result, edits: Edits, priors: quadrics.Priors) -> _Linked:
+    """Correct identities and classes by hand; an object that the user names is surely there.
+
+    A new name that the priors know is a new category. Any other is a label: the size prior stays
+    that of the class which the detector gave.
+    """
     before = linked.tracks
     try:
         made = apply_edits(before, result.class_names, edits)
@@ -164,7 +179,10 @@ def _edited(linked: _Linked, result: Result, edits: Edits) -> _Linked:
     source = np.arange(len(before)) if linked.source is None else linked.source
     rows = (made.tracks[made.keep], source[made.keep])
     solid_of = {i: solid for i, solid in linked.solid_of.items() if origin.get(i) == {i}}
-    return _Linked(*rows, linked.events, confidence, linked.located, solid_of)
+    names = [name_of(made.class_names, c) for c in range(len(made.class_names))]
+    known = np.append(priors.index(names) >= 0, False)[made.tracks.class_id]  # (N,)
+    category = np.where(known, made.tracks.class_id, before.class_id)[made.keep]
+    return _Linked(*rows, linked.events, confidence, linked.located, solid_of, category)
 
 
 def _link_parts(

@@ -158,7 +158,7 @@ def test_priors_support_and_up_are_obeyed(tmp_path: Path) -> None:
     small = json.loads(own.read_text().replace('"chair"', '"armchair of a doll"'))
     (tmp_path / "priors.json").write_text(json.dumps(small))
     few = tracks[tracks.frame < 3]  # hardly any parallax: the prior decides the depth
-    sizes = [fitted(few, poses, options(priors=p)).objects[0].size_rel_sigma.max()
+    sizes = [fitted(few, poses, options(priors=p, support="box")).objects[0].size_rel_sigma.max()
              for p in ("", str(tmp_path / "priors.json"))]  # fmt: skip
     assert sizes[1] > 1.2 * sizes[0]  # an unknown category says less of the size
 

@@ -1,0 +1,138 @@
+"""Size priors of categories as a user meets them: a wrong one must not beat the boxes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_quadrics as syn
+from simulated import tracks_of, unlinked, walk
+
+import quadrics as q
+from reobj.objects import ObjectsConfig, check_known_size, unused_sizes
+from reobj.parts import link_and_fit
+from reobj.results.edits import read_edits
+
+UP = (0.0, 0.0, 1.0)
+PRIORS = q.load_priors()
+
+
+def scene(
+    category: str, scale: float, views: int, arc: float, on_side: bool = False, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, q.Ellipsoids]:
+    """Boxes (V, 4, 1 noise %) of four boxes `scale` times the usual size, cameras, truth."""
+    rng = np.random.default_rng(seed)
+    half = np.tile(0.5 * scale * np.exp(PRIORS.log_mean[PRIORS.index([category])]), (4, 1))
+    turn = syn.random_yaw(4, rng)
+    if on_side:
+        turn = turn @ np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    truth = q.Ellipsoids(np.zeros((4, 3)), half, turn)
+    cams = syn.arc_cameras(views, arc, rng)
+    cams[:, :, 3] *= 6.4 * half.max() / 2.5  # as far away as the object is large
+    boxes = syn.noisy(q.solid_boxes(truth, "box", cams), 0.01, rng)
+    return boxes, cams, truth
+
+
+def overlap(fits: q.ObjectFits, truth: q.Ellipsoids) -> float:
+    return float(syn.box_overlap(fits.ellipsoids, truth).mean())
+
+
+@pytest.mark.parametrize("scale", [0.4, 0.63, 1.0, 1.6, 2.5])
+@pytest.mark.parametrize("on_side", [False, True])
+@pytest.mark.parametrize("category", ["chair", "couch", "book"])
+def test_a_wrong_size_does_not_beat_the_boxes(category: str, on_side: bool, scale: float) -> None:
+    for views, arc in ((8, 90.0), (20, 180.0)):
+        boxes, cams, truth = scene(category, scale, views, arc, on_side)
+        with_it = q.fit_objects(boxes, cams, syn.IMAGE, [category] * 4, PRIORS, up=UP)
+        without = q.fit_objects(boxes, cams, syn.IMAGE, up=UP)
+        assert overlap(with_it, truth) > overlap(without, truth) - 0.03
+        if scale == 2.5 and views == 20 and category == "chair" and not on_side:
+            assert overlap(with_it, truth) > 0.9
+            assert all("category overruled: size is 2.5 times the usual" in r
+                       for r in with_it.reason)  # fmt: skip
+        if scale == 1.0 and not on_side:
+            assert not any("overruled" in reason for reason in with_it.reason)
+
+
+def test_the_right_category_helps_where_views_are_few() -> None:
+    gain = []
+    for seed in range(6):
+        boxes, cams, truth = scene("chair", 1.0, 3, 15.0, seed=seed)
+        with_it = q.fit_objects(boxes, cams, syn.IMAGE, ["chair"] * 4, PRIORS, up=UP)
+        gain.append(overlap(with_it, truth) - overlap(q.fit_objects(boxes, cams, syn.IMAGE, up=UP),
+                                                      truth))  # fmt: skip
+    assert np.mean(gain) > 0.03
+
+
+def test_one_wrong_name_does_not_spoil_the_scale() -> None:
+    boxes, cams, _, names = syn.furnished_room(np.random.default_rng(3))
+    boxes, names = boxes[:, :8], names[:8]
+    right = q.fit_objects(boxes, cams, syn.IMAGE, names, PRIORS, up=UP, metric=False)
+    names[4] = "cup"  # a refrigerator
+    wrong = q.fit_objects(boxes, cams, syn.IMAGE, names, PRIORS, up=UP, metric=False)
+    assert abs(np.log(wrong.scale.value / right.scale.value)) < wrong.scale.rel_sigma < 0.25
+
+
+def test_millimetres_stay_far_from_the_origin() -> None:
+    boxes, cams, _ = scene("chair", 1.0, 12, 120.0)
+    shift = np.array([4.0e5, 5.4e6, 120.0])
+    away = cams.copy()
+    away[:, :, 3] -= cams[:, :, :3] @ shift
+    near, far = (
+        q.fit_objects(boxes, c, syn.IMAGE, ["chair"] * 4, PRIORS, up=UP) for c in (cams, away)
+    )
+    moved = far.ellipsoids.center_in_world - shift - near.ellipsoids.center_in_world
+    assert np.abs(moved).max() < 1e-3
+    assert np.abs(far.size - near.size).max() < 1e-3
+
+
+def test_boxes_that_are_not_finite_are_left_out() -> None:
+    boxes, cams, truth = scene("chair", 1.0, 12, 120.0)
+    boxes[3], boxes[5, :, 2] = np.nan, np.inf
+    fits = q.fit_objects(boxes, cams, syn.IMAGE, ["chair"] * 4, PRIORS, up=UP)
+    assert not fits.inlier[[3, 5]].any() and overlap(fits, truth) > 0.9
+
+
+def test_synonyms_are_one_category() -> None:
+    config = ObjectsConfig(known_size="sofa=80cm")
+    check_known_size(config, ["chair", "couch"])  # raises where there is none
+    with pytest.raises(ValueError, match="no such class"):
+        check_known_size(config, ["chair", "cup"])
+    assert unused_sizes(config, []) != []
+    words = ["Sofa", "fridge", "table", "phone", "plant", "television", "toaster"]
+    usual = ["couch", "refrigerator", "dining table", "cell phone", "potted plant", "tv", "toaster"]
+    assert PRIORS.canonical(words) == usual
+    table = json.loads(Path(q.__file__).with_name("priors.json").read_text())
+    assert set(table["aliases"].values()) <= set(PRIORS.names)
+
+
+def test_known_size_takes_synonyms() -> None:
+    boxes, cams, _ = scene("couch", 1.0, 12, 120.0)
+    known = {"sofa": ("h", 2.0)}
+    fits = q.fit_objects(boxes, cams, syn.IMAGE, ["couch"] * 4, PRIORS, up=UP, known_size=known)
+    assert fits.scale.source == "known_size"
+
+
+@pytest.mark.parametrize(("label", "same"), [("my favourite seat", True), ("cup", False)])
+def test_a_label_that_no_prior_knows_keeps_the_category(
+    tmp_path: Path, label: str, same: bool
+) -> None:
+    """Three frames hardly show a size: it is that of the category."""
+    poses = walk()
+    tracks = tracks_of(poses)
+    tracks = tracks[tracks.frame < 3]
+    box = tracks.xyxy[tracks.track_id == 2][0].tolist()
+    entry = {"do": "rename", "object": {"id": 2, "frame": 0, "box": box}, "class": label}
+    path = tmp_path / "e.json"
+    path.write_text(json.dumps({"format": "reobj-edits", "version": 1, "edits": [entry]}))
+    sizes = []
+    for edits in (None, read_edits(path)):
+        result = unlinked(poses, tracks)
+        result.edits = edits
+        link_and_fit(result, ObjectsConfig(link=False))
+        found = {o.id: o for o in result.objects}[2]
+        sizes.append(np.array(found.size))
+    assert found.class_name == label
+    assert np.allclose(*sizes) == same
