@@ -21,7 +21,7 @@ LEAST_VERSIONS = {
     "scipy": "1.13.1",
     "onnxruntime": "1.19.2",
     "pycolmap": "4.2.1",
-    "filterpy": "1.4.5",
+    "filterpy": "2.0.0",
 }
 
 

@@ -156,7 +156,7 @@ def test_frame_rates_are_kept(tmp_path: Path, encoder: str, fps: float) -> None:
         last_s = found.get(cv2.CAP_PROP_POS_MSEC) / 1000
     assert last_s == pytest.approx((4 / every - 1) * every / fps, rel=rel)
     if encoder == "vp8":
-        assert b"DURATIOND\x87\x9300:00:%012.9f" % (4 / fps) in film.path.read_bytes()
+        assert b"00:00:%012.9f" % (4 / fps) in film.path.read_bytes()  # FFmpeg's tag DURATION
 
 
 @pytest.mark.parametrize("size", [(321, 241), (1601, 901), (3840, 2160), (64, 48)])

@@ -68,7 +68,7 @@ class FilmWriter:
         """Open a film of frames that are shrunk from (w, h) `size`; the suffix is replaced."""
         av = import_av()
         self.path = path.with_suffix(".webm" if av is None else ".mp4")
-        self.part = self.path.with_name(f".part-{self.path.name}")
+        self.part = self.path.with_name(f".part-{self.path.name}").absolute()  # 12:30/ is a folder
         shrink = min(1.0, (VP8_SIZE_PX if av is None else H264_SIZE_PX) / max(size))
         self.every = 1 if av else max(math.ceil(fps / VP8_FPS - 1e-3), 1)  # 30.0001 fps is 30
         self.repeat = math.ceil(LEAST_FPS / fps)

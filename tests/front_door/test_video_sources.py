@@ -266,9 +266,9 @@ def test_a_video_of_the_time_of_day_through_the_command_line(
     write_video(tmp_path / "x.mp4", EVEN[:9]).rename(tmp_path / "12:30.mp4")
     (tmp_path / "d.txt").write_text("".join(f"{i + 1},-1,5,6,20,20,0.9\n" for i in range(9)))
     monkeypatch.chdir(tmp_path)
-    args = ["--detections", "d.txt", "--embed", "none", "-o", "out 12:31"]
+    args = ["--detections", "d.txt", "--embed", "none", "-o", "12:31"]
     assert rt.main(["track", "12:30.mp4", *args]) == 0
-    assert list(tmp_path.glob("out 12:31/overlay.*"))
+    assert list(tmp_path.glob("12:31/overlay.*"))
 
 
 # ---- Image folders -------------------------------------------------------------------------------
