@@ -89,6 +89,7 @@ class FitConfig:
             fewer are faster and more often let the wrong one win.
         start_iterations: Optimisation steps of each candidate on those views.
         iterations: Most optimisation steps on all views; a fit that has converged stops earlier.
+        wrong_class: Probability that an object's category is wrong; 0: no category is overruled.
     """
 
     edge_noise_px: float = 1.0
@@ -99,6 +100,7 @@ class FitConfig:
     start_views: int = 8
     start_iterations: int = 7
     iterations: int = 40
+    wrong_class: float = 0.05  # (measured: .03 to .25 give nearly the same)
 
 
 # ---- Ellipsoids and dual quadrics -----------------------------------------------------------
@@ -1302,9 +1304,6 @@ STANDING_REL = 0.012  # sigma of a standing thing's lower side, over its height 
 UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean
 UNKNOWN_SIZE_LOG = 0.9  # log, standard deviation of the common size
 UNKNOWN_ASPECT_LOG = 0.6  # log, standard deviation of each axis about the common size
-# Share of objects of a wrong category. Of single detections .15 are (`CLASS_KEPT` of the
-# association); an object has the category of most of its detections (.03 to .25 are alike).
-WRONG_CLASS = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -1384,17 +1383,18 @@ def _cosines(center: Array, point: Array) -> Array:
 
 def _prior_spec(
     names: Sequence[str | None], priors: Priors | None, codes: IntArray, points: Array,
-    world: _World,
+    wrong_class: float, world: _World,
 ) -> _Spec:  # fmt: skip
     """Look up size, shape and uprightness of every object, in world units; list hypotheses."""
     rows = np.full(len(names), -1) if priors is None else priors.index(names)
     # without a scale the sizes of all are open: only `_scale_from_priors` doubts the categories
-    doubted = (rows >= 0) & (world.scale_sigma < UNKNOWN_SCALE_LOG)
+    doubted = (rows >= 0) & (wrong_class > 0) & (world.scale_sigma < UNKNOWN_SCALE_LOG)
     obj = np.concatenate([np.arange(len(names)), np.flatnonzero(doubted)])
     rows = np.concatenate([rows, np.full(len(obj) - len(rows), -1)])
     n, known = len(obj), rows >= 0
-    log_odds = np.where(known, np.log1p(-WRONG_CLASS), 0.0)
-    log_odds[len(names) :] = np.log(WRONG_CLASS / len(SUPPORTS))
+    log_odds = np.where(known, np.log1p(-wrong_class), 0.0)
+    if wrong_class > 0:
+        log_odds[len(names) :] = np.log(wrong_class / len(SUPPORTS))
     codes, points = codes[obj], points[obj]
     mean = np.tile(np.log(UNKNOWN_SIZE_M), (n, 1))  # (O, 3)
     cov = np.tile(UNKNOWN_ASPECT_LOG**2 * np.eye(3) + UNKNOWN_SIZE_LOG**2, (n, 1, 1))  # (O, 3, 3)
@@ -2278,19 +2278,20 @@ def fit_objects(
     seen = (boxes[:, live], one_sided[:, live], usable[:, live], quality[:, live])
     data = _gather_data(*seen, cams, cfg)
     names = [None if categories is None else categories[int(k)] for k in live]
-    known_of = (names, priors, codes[live], on_them[live])
+    known_of = (names, priors, codes[live], on_them[live], cfg.wrong_class)
     fit, spec, world = _solve_passes(data, known_of, sizes, world, cfg)
     return _report((fit, spec, data), boxes, one_sided, usable, cams, live, world, cfg)
 
 
 def _solve_passes(
-    data: _Data, known: tuple[Sequence[str | None], Priors | None, IntArray, Array],
+    data: _Data, known: tuple[Sequence[str | None], Priors | None, IntArray, Array, float],
     sizes: list[tuple[int, int, float]], world: _World, cfg: FitConfig,
 ) -> tuple[_Fit, _Spec, _World]:  # fmt: skip
     """Fit once; if that tells the scale, fit again with it.
 
     Args:
-        known: categories, priors, supports and points of the objects.
+        known: categories, priors, supports and points of the objects, and how often a category
+            is wrong.
     """
     spec = _prior_spec(*known, world)
     fit = _fit_all(data, spec, cfg)

@@ -81,6 +81,7 @@ def fitter(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> F
             up=scene.up if up is None else up, support=support, score=views.score,
             hidden=views.hidden, metric=poses.metric if scene.scale is None else scene.scale,
             known_size=known, floor=scene.floor, points=views.points,
+            config=quadrics.FitConfig(wrong_class=0) if scene.trusts_classes else None,
         )  # fmt: skip
         known_up = up is not None or scene.up is None
         return fits if known_up else dataclasses.replace(fits, up_source="floor")

@@ -43,11 +43,14 @@ class Scene(NamedTuple):
     Attributes:
         floor: that things may stand on. up: (3,) unit, against gravity, where the user gives none.
         scale: metres per unit; None: the poses are metric, or the categories tell.
+        trusts_classes: no category is overruled: while it is open which boxes are of an object,
+            a part of it, or what two share, must not be explained as something else.
     """
 
     floor: quadrics.Floor | None = None
     up: Array | None = None
     scale: quadrics.Scale | None = None
+    trusts_classes: bool = False
 
 
 NOTHING_KNOWN = Scene()

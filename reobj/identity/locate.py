@@ -24,7 +24,7 @@ from reobj.identity.occlusion import edges_above_floor, seen_through
 from reobj.identity.proposals import propose, propose_along_rays
 from reobj.poses.floor import floor_of
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
-from reobj.views import NOTHING_KNOWN, Fit, Scene, Views, gather_views
+from reobj.views import Fit, Scene, Views, gather_views
 
 # Log odds that an object is there: constant, by the log odds of its best scores, by the share of
 # the frames that should show it and do, by how much is seen behind it through its middle
@@ -100,7 +100,7 @@ def locate(
         )
     views = gather_views(tracked, seen, fragment, count, 0.0)
     classes = class_shares(tracked, fragment, count).argmax(1)
-    fits = fit(views, classes.tolist(), NOTHING_KNOWN)
+    fits = fit(views, classes.tolist(), Scene(trusts_classes=True))
     kinds = Categories(priors, names, fits.scale)
     floor = floor_under(poses, fits)
     usual, stands = kinds.usual_size(classes), kinds.on_floor(classes)
@@ -108,7 +108,7 @@ def locate(
     more = _from_untracked(table, seen, kinds, fits.up, floor)
     proposed = Solids.concatenate([proposed, more])
     detected = _detected(table, poses, views)
-    scene = Scene(floor, scale=None if poses.metric else fits.scale)
+    scene = Scene(floor, None, None if poses.metric else fits.scale, trusts_classes=True)
     refit = _refit(detected, views, kinds, scene, fit)
     found = Associator(detected, refit, kinds.size_log_odds).run(proposed, floor is not None)
     solid[own] = found.owner
