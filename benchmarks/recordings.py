@@ -83,9 +83,9 @@ class Case:
         return f"{self.recording} {boxes} {'supplied' if self.poses else 'own'}"
 
 
-def kitchen(boxes: str, poses: str, every: int) -> Case:
+def kitchen(boxes: str, poses: str, every: int, stop: int = 0) -> Case:
     """Return a case of hololens_kitchen."""
-    return Case("hololens_kitchen", "hololens_kitchen/images", boxes, poses, every)
+    return Case("hololens_kitchen", "hololens_kitchen/images", boxes, poses, every, stop)
 
 
 def red(boxes: str, poses: str, every: int) -> Case:
@@ -95,10 +95,10 @@ def red(boxes: str, poses: str, every: int) -> Case:
 
 C2W = "poses_c2w.txt"
 CASES = [
-    Case("room", "", FAST),
+    Case("room", "", FAST, every=2),
     kitchen(YOLO, C2W, 1),
-    kitchen(FAST, C2W, 3),
-    kitchen(YOLO, "", 2),
+    kitchen(FAST, C2W, 4),
+    kitchen(YOLO, "", 1, 120),
     red(YOLO, C2W, 2),
     red(FAST, C2W, 5),
     red(YOLO, "", 5),
@@ -142,6 +142,8 @@ def command(case: Case, data: Path, work: Path) -> list[str]:
     folder = home(case, data)
     source = data / case.source if case.source else folder / "room.mp4"
     words = ["run", str(source), "-o", str(work / "out"), "--every", str(case.every)]
+    if case.stop:
+        words += ["--stop", str(case.stop)]
     if case.boxes == FAST:
         words += ["--detector", "fast"]
     elif case.boxes == MOT:

@@ -383,7 +383,7 @@ def test_ply_holds_the_solids(room: Path, tmp_path: Path) -> None:
     for o in result.located:
         part = parts[object_color(o.id)[::-1]]
         volume = share[o.support] * o.half_axes.prod()
-        assert part.volume == pytest.approx(volume, rel=0.02)
+        assert part.volume == pytest.approx(volume, rel=0.03)  # a polyhedron inside the surface
         np.testing.assert_allclose(part.bounds.mean(0), o.center, atol=1e-4)
         w, x, y, z = o.quat_wxyz
         own = (part.vertices - o.center) @ Rotation.from_quat([x, y, z, w]).as_matrix()
