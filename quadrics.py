@@ -1298,7 +1298,7 @@ START_CENTER = 0.1  # box sizes, sigma of a box's centre as the centre's image
 POINT_REL = 0.08  # sigma of a point, over the half width that is usual for the category
 POINT_ELSEWHERE = 0.1  # odds of a point of something else, over one on the thing
 POINTS_WORTH = 20.0  # all points of a thing together: neighbours err alike
-ELSEWHERE_M = 1.0  # m, spread over the floor of the lower sides of things that need not stand on it
+ELSEWHERE_M = 1.0  # m, spread of the height of objects that need not stand on the floor
 STANDING_REL = 0.012  # sigma of a standing thing's lower side, over its height (chosen: carpets)
 # Size of an unknown category: the spread of the 110 indoor categories of priors.json.
 UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean

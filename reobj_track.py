@@ -1010,10 +1010,13 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    told, always = CamerasOfFrames(poses, video.scale), True if source.always_looks else None
+    cameras = CamerasOfFrames(poses, video.scale)
+    looked = True if source.always_looks else None
     ahead = tracker.config.camera_motion and video.has_images and not video.is_live
     for frame in tracker._camera_motion.ahead(video) if ahead else video:
-        tracks = tracker.update(source.look(frame), frame.image, looked=always, **told(frame.index))
+        tracks = tracker.update(
+            source.look(frame), frame.image, looked=looked, **cameras(frame.index)
+        )
         yield frame, dataclasses.replace(tracks, frame=np.full(len(tracks), frame.index))
 
 

@@ -235,7 +235,7 @@ def try_mutant(root: Path, mutant: Mutant, tests: Sequence[str], limit_s: float)
 
 
 def affordable(tests: Sequence[str], seconds_of: dict[str, float], budget_s: float) -> list[str]:
-    """Return the first of the tests, up to so many seconds in all, and one at least."""
+    """Return the first tests whose sum of seconds stays below a limit, at least one."""
     found: list[str] = []
     for test in tests:
         budget_s -= seconds_of[test]

@@ -338,7 +338,7 @@ def evaluate(
     does not count; nor do boxes in the latter.
 
     Args:
-        out: folder; or MOT rows. The tracks.txt in an output folder stands for the folder.
+        out: folder; or MOT rows. The tracks.txt in an output folder means the folder.
         gt: MOTChallenge gt.txt, KITTI tracking labels, CVAT for video, COCO-VID.
         solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam a line. classes: only
             these. min_visibility: truth that is less visible is ignored.

@@ -61,7 +61,7 @@ class FilmWriter:
     Attributes:
         path: of the file, with the suffix of its format. part: of what is written of it.
         size: (w, h) of the frames, even: codecs want that. count: frames so far.
-        every: one frame of so many is in the film. repeat: it is so many pictures there.
+        every: every n-th frame is in the film. repeat: number of pictures of each.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:

@@ -11,7 +11,7 @@ from reobj.cameras import Poses, invert_rigid
 from reobj.results.result import Result
 from reobj.types import Array
 
-FAR = 100  # extents: float32 has 24 bits, 2 ** -24 of so many extents is 6e-6 of one
+FAR = 100  # extents: float32 has 24 bits, 2 ** -24 of 100 extents is 6e-6 of one
 
 
 def far_origin(poses: Poses | None, places: Array | None = None) -> Array:

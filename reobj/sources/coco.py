@@ -183,7 +183,7 @@ def _read_coco(
     video: Video,
     first: str,
 ) -> RecordedDetections:
-    """Read COCO entries, whose ids are those of a dataset, or speak for themselves."""
+    """Read COCO entries, whose ids are those of a dataset, or names and numbers of images."""
     for at, entry in enumerate(entries):
         found = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
         if not _is_id(found["image_id"]) or not _is_id(found["category_id"]):

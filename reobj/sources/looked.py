@@ -51,8 +51,8 @@ class Intervals:
     def irregular(self) -> bool:
         """True where frames without a box were not looked at, though there is no regular interval.
 
-        Most frames with a box are not followed by another, and so many boxes in a frame leave few
-        frames without any by chance: fewer than half of the frames were looked at.
+        Most frames with a box are not followed by another, and the number of boxes in a frame
+        leaves few frames without any by chance: fewer than half of the frames were looked at.
         """
         if self.count < 2 or self.step > 1 or 2 * self.apart <= self.count - 1:
             return False

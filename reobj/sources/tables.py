@@ -513,7 +513,7 @@ def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntA
 IGNORED = -2  # class of rows that are left out
 
 
-VISIBLE_ROWS = 20  # chosen: true boxes; among so many one at least is wholly visible
+VISIBLE_ROWS = 20  # chosen: of this many true boxes at least one is wholly visible
 
 
 def _is_boxmot(table: Table, score: Array, number: IntArray) -> bool:
