@@ -1226,9 +1226,9 @@ def _size_prior(state: _State, prob: _Problem) -> tuple[Array, Array, Array]:
     pull = (prob.size_info @ error[..., None])[..., 0]
     own = (error > 0) / prob.size_var  # (B, 3)
     wall = SIZE_WALL**2
-    over = np.maximum(own * error**2 - wall, 0.0)  # (B, 3) sigma^2
-    steep = 2.0 * SIZE_WALL_RISE / wall * over  # (B, 3)
-    cost = (error * pull).sum(1) + SIZE_WALL_RISE / wall * (over**2).sum(1)
+    over = np.maximum((own * error**2).sum(1) - wall, 0.0)  # (B,) sigma^2
+    steep = (2.0 * SIZE_WALL_RISE / wall * over)[:, None]  # (B, 1)
+    cost = (error * pull).sum(1) + SIZE_WALL_RISE / wall * over**2
     extra = (steep * own)[:, None] * np.eye(3)  # (B, 3, 3)
     return cost, pull + steep * own * error, prob.size_info + extra
 
@@ -1605,7 +1605,8 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
     info = np.linalg.inv(spec.size_cov)[hyp] + round_[:, None, None] * tie
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
-    var = np.maximum(np.einsum("oii->oi", spec.size_cov), SIZE_WALL_LOG**2)[hyp]
+    var = np.maximum(np.einsum("oii->oi", spec.size_cov), SIZE_WALL_LOG**2)
+    var = np.where(spec.kind[:, None] < 0, 3.0 * var, var)[hyp]  # the axes share what is unknown
     return _Problem(
         AXIS_GROUPS[code], mean + shift[:, None], info, var, up, tilt,
         np.eye(3)[axis], floor, spec.floor_sigma[hyp] ** -2.0, spec.points[hyp],
@@ -2139,8 +2140,7 @@ def _status(
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     error = fit.state.log_half - prob.size_mean
     far = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))  # (B,) sigma
-    var = np.maximum(np.einsum("oii->oi", spec.size_cov), SIZE_WALL_LOG**2)[fit.hyp]
-    grown = np.sqrt(((error > 0) / var * error**2).sum(1))  # (B,) same, growth alone
+    grown = np.sqrt(((error > 0) / prob.size_var * error**2).sum(1))  # (B,) same, growth alone
     overruled = _overruled(fit, spec)
     status, reason = [], []
     for b, wrong in enumerate(_rejection_reasons(fit, post, seen, grown)):

@@ -109,7 +109,7 @@ def test_behind_a_hidden_edge_the_fit_goes_on(edge: int) -> None:
     true = 2 * chair_solids().half_axes[:, 2]
     assert (cut.size[:, 2] < 0.8 * true).all()
     np.testing.assert_allclose(whole.size[:, 2], true, rtol=0.15)
-    assert (whole.cov[:, 5, 5] > 2 * cut.cov[:, 5, 5]).all()  # and it is said
+    assert (whole.cov[:, 5, 5] > 1.5 * cut.cov[:, 5, 5]).all()  # and it is said
 
 
 def seen_along(distance: float, beside: float = 0.0, count: int = 40) -> np.ndarray:
