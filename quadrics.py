@@ -1876,6 +1876,9 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
         fit.good = used & (np.abs(standard) <= EDGE_OUTLIER) & fit.views[..., None]
         _refit(fit, data, spec, cfg, "huber")
     fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data)
+    sigma = np.sqrt(_safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]])  # (B, 3)
+    # only a size that the boxes tell overrules a category
+    fit.evidence[(fit.hyp != fit.obj) & (sigma > LOOSE_LOG).any(1)] = -np.inf
     order = np.lexsort((-fit.evidence, fit.obj))
     return fit[order[_group_starts(fit.obj[order])]]
 
