@@ -95,15 +95,15 @@ def red(boxes: str, poses: str, every: int) -> Case:
 
 C2W = "poses_c2w.txt"
 CASES = [
-    Case("room", "", FAST, every=2),
-    kitchen(YOLO, C2W, 1),
+    Case("room", "", FAST, every=3),
+    kitchen(YOLO, C2W, 2),
     kitchen(FAST, C2W, 4),
     kitchen(YOLO, "", 1, 120),
-    red(YOLO, C2W, 2),
+    red(YOLO, C2W, 3),
     red(FAST, C2W, 5),
     red(YOLO, "", 5),
-    Case("office_loop", "office_loop/images", FAST),
-    Case("office_loop", "office_loop/images", YOLO),
+    Case("office_loop", "office_loop/images", FAST, stop=120),
+    Case("office_loop", "office_loop/images", YOLO, stop=120),
     Case("bonsai_mip360", "bonsai_mip360/images", FAST, every=6),
     Case("livingroom13", "livingroom13/images", FAST),
     Case("livingroom13", "livingroom13/images", YOLO),

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from front_door.room import CAMERA, FEW, ROOM
 from simulated import SIZE, finished, fitted, tracks_of, unlinked, walk
 
 import reobj_track as rt
@@ -18,14 +19,11 @@ try:
 except ImportError:  # test_properties.py is skipped then
     pass
 else:  # the same cases each time, within a minute; `--hypothesis-profile long` tries new ones
-    settings.register_profile("ci", max_examples=40, deadline=None, derandomize=True, database=None)
+    settings.register_profile("ci", max_examples=25, deadline=None, derandomize=True, database=None)
     settings.register_profile("long", max_examples=2000, deadline=None, database=None)
     settings.load_profile("ci")
 
 os.environ["REOBJ_RAISE"] = "1"  # a fault of the program in a picture fails the test
-ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
-CAMERA = "492.756788421,492.756788421,320,240"  # of examples/room/camera.txt
-FEW = ("--every", 3, "--stop", 120)  # frames of the example room that are enough for files
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -57,15 +56,27 @@ def scannet(folder: Path) -> None:
         np.savetxt(scene / f"pose/{i}.txt", pose)
 
 
+AR_FRAMES = 96
+
+
 def arkit(folder: Path) -> None:
     """A recording, boxes for it, and the log of an app: world_from_camera in OpenGL axes."""
-    shutil.copy(ROOM / "room.mp4", folder / "recording.mp4")
-    shutil.copy(ROOM / "detections.npz", folder / "recording.npz")
+    film = cv2.VideoWriter(
+        str(folder / "recording.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 12, (640, 480)
+    )
+    for frame in rt.Video(ROOM / "room.mp4", rt.InputConfig(stop=AR_FRAMES)):
+        film.write(frame.image)
+    film.release()
+    with np.load(ROOM / "detections.npz") as file:
+        rows = file["frame"] < AR_FRAMES
+        given = {k: file[k][rows] for k in ("frame", "xyxy", "score", "class_id")}
+        whole = {k: file[k] for k in ("image_size", "class_names")}
+        np.savez(folder / "recording.npz", **whole, **given)
     K = np.array([[FOCAL, 0, CENTRE[0] - 0.5], [0, FOCAL, CENTRE[1] - 0.5], [0, 0, 1]])
     lines = [
         json.dumps({"t": i / 12, "transform": (pose @ np.diag([1, -1, -1, 1])).T.ravel().tolist(),
                     "intrinsics": K.T.ravel().tolist()})
-        for i, pose in enumerate(true_poses())
+        for i, pose in enumerate(true_poses()[:AR_FRAMES])
     ]  # fmt: skip
     (folder / "arkit.jsonl").write_text("\n".join(lines) + "\n")
 
@@ -92,7 +103,7 @@ def check_scannet(folder: Path) -> None:
 
 def check_ar(folder: Path) -> None:
     """The poses came through the phone's axes: the camera's own path is the true one."""
-    rows, true = np.loadtxt(folder / "poses.txt"), true_poses()
+    rows, true = np.loadtxt(folder / "poses.txt"), true_poses()[:AR_FRAMES]
     np.testing.assert_allclose(rows[:, 1:4], true[:, :3, 3], atol=1e-6)
     again = np.loadtxt(folder / "out/poses.txt")
     np.testing.assert_allclose(again[:, 1:4], true[::3, :3, 3], atol=1e-6)

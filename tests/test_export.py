@@ -17,7 +17,7 @@ from xml.etree import ElementTree as ET
 import cv2
 import numpy as np
 import pytest
-from conftest import CAMERA, FEW, ROOM
+from front_door.room import CAMERA, FEW, ROOM
 from scipy.spatial.transform import Rotation
 from simulated import fitted, tracks_of, walk
 
@@ -213,7 +213,8 @@ def test_corrected_mot_keeps_the_classes(room: Path, tmp_path: Path) -> None:
     # Some are at a limit: boxes in the file are rounded, and a first fit and not the association
     # tells which edges are hidden, and which points are on what.
     changed = [x for x in status if x[0] != x[1]]
-    assert len(changed) <= 3 and all(set(x) == {"ok", "prior_dominated"} for x in changed)
+    assert len(changed) <= len(before) // 5
+    assert all(set(x) == {"ok", "prior_dominated"} for x in changed)
 
 
 BAD_TRACKS = {

@@ -519,8 +519,8 @@ def test_the_child_ends_with_its_parent(tmp_path, monkeypatch, ending, platform)
 
 
 def test_a_damaged_job_file_begins_anew(walk, tmp_path, caplog):
-    first = run(tmp_path, walk[0])
-    (tmp_path / "mapping/job.json").write_text('{"camera"')
-    again = run(tmp_path, walk[0])
-    assert first[0] == again[0] == [] and again[1] is not None
+    shutil.copytree(walk[2], tmp_path / "out")
+    (tmp_path / "out/mapping/job.json").write_text('{"camera"')
+    again = run(tmp_path / "out", walk[0])
+    assert again[0] == [] and again[1] is not None
     assert "job.json" in caplog.text and "computed again" in caplog.text

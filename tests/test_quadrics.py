@@ -994,8 +994,8 @@ def test_wrong_shapes_say_what_is_expected(arguments, message: str) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_random_input_never_raises_and_never_lies() -> None:
-    counts = syn.fuzz(2500, np.random.default_rng(18))
-    assert counts["objects"] >= 2500 and counts["bad"] == 0
+    counts = syn.fuzz(1000, np.random.default_rng(18))
+    assert counts["objects"] >= 1000 and counts["bad"] == 0
     assert min(counts["rejected"], counts["prior_dominated"]) > 100
 
 

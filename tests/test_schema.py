@@ -100,7 +100,7 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return data
 
 
-NASTY = [None, "x", -1, 0, 1.5, 10**30, True, [], {}, [1], [1, 2, 3], {"a": 1}, 1e300, [[]]]
+NASTY = [None, "x", -1, 1.5, True, [], {"a": 1}, [1, 2, 3], [[]]]
 
 
 def test_faults_are_those_that_jsonschema_finds(example: Any) -> None:

@@ -24,7 +24,8 @@ import reobj_track as rt
 ROOT = Path(__file__).resolve().parent.parent.parent
 ROOM = ROOT / "examples" / "room"
 CAMERA = "492.756788421,492.756788421,320,240"  # of examples/room/camera.txt
-FEW = ("--every", 3, "--stop", 120)  # frames of the clip that are enough for most
+SMALL = ("--set", "poses.size_px=320")  # images that points and own cameras are made of: quick
+FEW = ("--every", 3, "--stop", 120, *SMALL)  # frames of the clip that are enough for most
 DETECTIONS = ("--detections", ROOM / "detections.npz")
 POSES = ("--poses", ROOM / "poses.txt", "--camera", CAMERA)
 

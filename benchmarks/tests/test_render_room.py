@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import render_room as rr
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 SMALL = rr.RoomConfig(seed=3, width=320, height=240, frames=40, texels_per_m=60, light_rays=1)

@@ -17,7 +17,7 @@ import reid_scenes as rs
 import reobj_track as rt
 from reobj.identity.reid import SimilarityCalibration
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 RNG = np.random.default_rng(0)
 
