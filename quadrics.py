@@ -2027,15 +2027,28 @@ def _known_sizes(
     return out
 
 
-def _scale_from_known(fit: _Fit, sizes: list[tuple[int, int, float]]) -> tuple[float, float] | None:
-    """Estimate log metres per unit and its sigma from sizes that the user knows."""
+def _scale_from_known(
+    fit: _Fit, sizes: list[tuple[int, int, float]], cfg: FitConfig
+) -> tuple[float, float] | None:
+    """Estimate log metres per unit and its sigma from sizes that the user knows.
+
+    The boxes of all objects have an error in common, as in `_report`: a detector that draws them
+    tight does so everywhere.
+    """
     if not sizes:
         return None
     row, axis, metres = (np.array(column) for column in zip(*sizes, strict=True))
+    axis = UPRIGHT_ORDERS[np.where(fit.code[row] == CYLINDER, 2, fit.axis[row]), axis]
     cov = _safe_inverse(fit.hessian + ROTATION_CAP)
     vote = np.log(metres) - fit.state.log_half[row, axis] - np.log(2.0)
     info = 1.0 / (cov[row, 3 + axis, 3 + axis] + 1e-6)
-    return _weighted_median(vote, info), float(np.sqrt(1.0 / info.sum()))
+    common = 2.0 * (cfg.edge_noise_rel * np.median(fit.noise[row])) ** 2  # of opposite edges
+    common *= cfg.correlation_deg > 0
+    return _weighted_median(vote, info), float(np.sqrt(1.0 / info.sum() + common))
+
+
+# Axes of a solid by its vertical one, which comes last
+UPRIGHT_ORDERS: IntArray = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 
 
 def _parallax(fit: _Fit, data: _Data) -> Array:
@@ -2054,7 +2067,7 @@ def _vertical_axis_last(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntAr
     Returns:
         solids, their covariance (B, 9, 9), and order (B, 3): the prior's axis behind each new one.
     """
-    order = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])[np.where(fit.code == CYLINDER, 2, fit.axis)]
+    order = UPRIGHT_ORDERS[np.where(fit.code == CYLINDER, 2, fit.axis)]
     row = np.arange(len(fit.obj))[:, None]
     half = np.exp(fit.state.log_half)[row, order]
     rot = np.take_along_axis(fit.state.rot, order[:, None, :], 2)
@@ -2300,7 +2313,7 @@ def _solve_passes(
     fit = _fit_all(data, spec, cfg)
     if world.scale_source != "none":
         return fit, spec, world
-    found, source = _scale_from_known(fit, sizes), "known_size"
+    found, source = _scale_from_known(fit, sizes, cfg), "known_size"
     if found is None:
         metric = _prior_spec(*known, world._replace(scale_sigma=0.0))
         found, source = _scale_from_priors(fit, data, metric), "priors"

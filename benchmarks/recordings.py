@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Run the command line on every recording with images, and hold the figures against floors.
 
-    python benchmarks/recordings.py DATA [-o OUT] [--only NAME...] [--jobs 2] [--write-floors]
+    python benchmarks/recordings.py DATA [-o OUT] [--only NAME...] [--long] [--jobs 2] [--write-floors]
 
 Every row is one command, as a user types it, in a process of its own: with the small detector
 (--detector fast, weights in REOBJ_MODELS) and with recorded boxes, with the tool's own cameras and
@@ -98,10 +98,8 @@ CASES = [
     Case("room", "", FAST, every=3),
     kitchen(YOLO, C2W, 2),
     kitchen(FAST, C2W, 4),
-    kitchen(YOLO, "", 1, 120),
     red(YOLO, C2W, 3),
     red(FAST, C2W, 5),
-    red(YOLO, "", 5),
     Case("office_loop", "office_loop/images", FAST, stop=120),
     Case("office_loop", "office_loop/images", YOLO, stop=120),
     Case("bonsai_mip360", "bonsai_mip360/images", FAST, every=6),
@@ -121,6 +119,8 @@ CASES = [
     Case("TUD-Campus", "mot/TUD-Campus/img1", MOT),
     Case("PETS-S3-MF1", "mot/PETS-S3-MF1/img1", MOT),
 ]
+# with --long only: a minute each
+LONG = [kitchen(YOLO, "", 1, 120), red(YOLO, "", 5)]
 CAMERAS = {  # where the file of poses has none
     "cubeslam_cabinet": "535.4,539.2,320.1,247.6",
     "tum_fr3": "535.4,539.2,320.1,247.6",
@@ -399,11 +399,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("data", type=Path, help="folder of the recordings")
     add("-o", "--out", type=Path, help="keep the output folders here (default: nowhere)")
     add("--only", nargs="+", default=[], metavar="NAME", help="beginnings of names")
+    add("--long", action="store_true", help="also what CI leaves out, as it takes a minute each")
     add("--jobs", type=int, default=2, help="commands at once")
     add("--write-floors", action="store_true", help="the floors anew, of the cases that are run")
     args = parser.parse_args(argv)
     floors = json.loads(FLOORS.read_text()) if FLOORS.exists() else {}
-    cases = [c for c in CASES if not args.only or c.name.startswith(tuple(args.only))]
+    every = CASES + LONG if args.long else CASES
+    cases = [c for c in every if not args.only or c.name.startswith(tuple(args.only))]
     order = sorted(cases, key=lambda c: -floors.get(c.name, {}).get("seconds", math.inf))
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(args.jobs) as pool:
         out = (args.out or Path(temporary)).resolve()

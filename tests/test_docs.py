@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -160,7 +161,7 @@ def test_every_tutorial_is_executed() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_tutorial(page: str, tmp_path: Path) -> None:
+def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a reader does: in a checkout, one block after the other."""
     need(page)
     prepare, check = PAGES[page]
@@ -168,7 +169,14 @@ def test_tutorial(page: str, tmp_path: Path) -> None:
         (tmp_path / path.name).symlink_to(path)
     prepare(tmp_path)
     env = os.environ | {"STEPS": "3", "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    monkeypatch.chdir(tmp_path)
     for kind, text in blocks(TUTORIALS / f"{page}.md"):
+        commands = [shlex.split(line, comments=True) for line in text.splitlines()]
+        ours = all(c[:2] == ["python", "reobj_track.py"] for c in commands)
+        if kind == "sh" and ours and "$(" not in text:
+            for command in commands:  # in this process: quicker
+                assert rt.main(command[2:]) == 0, command
+            continue
         shell = ["bash", "-euo", "pipefail", "-c"] if kind == "sh" else [sys.executable, "-c"]
         done = subprocess.run([*shell, text], cwd=tmp_path, env=env, capture_output=True, text=True)
         said = done.stdout[-2000:] + done.stderr[-3000:]

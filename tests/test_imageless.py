@@ -279,19 +279,3 @@ def test_tracks_need_no_images_either(tmp_path: Path) -> None:
 
 
 # ---- Real recordings -----------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="no real recordings: set REOBJ_SHARED")
-def test_tums_office_has_boxes_and_motion_capture_only(tmp_path: Path) -> None:
-    """100 frames of fr3/office, whose images are not at hand."""
-    data = SHARED / "data" / "tum_fr3_office"
-    config = rt.Config(
-        input=rt.InputConfig(start=300, stop=400),
-        poses=rt.PosesConfig(mode=str(data / "groundtruth.txt"),
-                             camera=str(data / "intrinsics.json")),
-    )  # fmt: skip
-    result = rt.run(None, tmp_path / "out", config, detections=data / "detections_yolo.csv")
-    assert result.poses.known.sum() == 100 and result.poses.metric
-    assert result.poses.time_s[0] == pytest.approx(1341847990.8, abs=0.5)
-    # A detector that reports nothing below .4: what is in a third of the frames is doubtful there.
-    assert sum(o.located for o in result.objects) >= 4

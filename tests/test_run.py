@@ -830,7 +830,7 @@ def test_a_camera_line_of_colmap_is_taken_as_it_is(tmp_path: Path) -> None:
     args[args.index("--camera") + 1] = "1 PINHOLE 320 240 300 300 160 120"
     assert cli(*args) == 0
     assert rt.Result.load(tmp_path / "out").poses.camera.K[0, 0] == 300
-    room = ("poses", ROOT / "examples/room/room.mp4", "-o", tmp_path / "room", "--stop", 20)
+    room = ("poses", ROOT / "examples/room/room.mp4", "-o", tmp_path / "room", "--stop", 10)
     assert cli(*room, "--poses", ROOT / "examples/room/poses.txt", "--camera", line) == 0
     camera = (tmp_path / "room/sparse/cameras.txt").read_text()
     assert "PINHOLE 640 480 492.7567" in camera

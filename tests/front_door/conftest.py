@@ -1,4 +1,7 @@
-"""The result of README's first command, made once for all tests and all workers."""
+"""The result of README's first command, made once for all tests and all workers.
+
+Where REOBJ_EXAMPLE names an output folder of that command, as in .ci/run, it is taken.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ from reobj.files import locked
 @pytest.fixture(scope="session")
 def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output folder of README's first command. Copy it before you change it."""
+    if given := os.environ.get("REOBJ_EXAMPLE"):
+        return Path(given)
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "example"
     folder.mkdir(exist_ok=True)

@@ -39,7 +39,7 @@ def test_no_figure_and_no_floors_are_faults() -> None:
 
 
 def test_every_command_has_a_name_of_its_own() -> None:
-    names = [case.name for case in recordings.CASES]
+    names = [case.name for case in recordings.CASES + recordings.LONG]
     assert len(set(names)) == len(names)
     if recordings.FLOORS.exists():
         assert set(json.loads(recordings.FLOORS.read_text())) == set(names)

@@ -39,29 +39,20 @@ def other_scene(k: int) -> np.ndarray:
     return textured_room(1, 0, seed=7 + k % 2, size=(320, 240))[0][0]
 
 
-SPOILED = {
-    "black": lambda image, k: image * 0,
-    "white": lambda image, k: image * 0 + 255,
-    "blur": lambda image, k: cv2.GaussianBlur(image, (0, 0), 25),
-    "finger": lambda image, k: cv2.circle(image.copy(), (160, 120), 210, (60, 80, 150), -1),
-    "another scene": lambda image, k: other_scene(k),
-}
-
-
-@pytest.mark.parametrize("kind", ["black", "another scene"])
 def test_some_pictures_without_the_scene_cost_no_camera_of_the_others(
-    walk, tmp_path, monkeypatch, capsys, caplog, kind
+    walk, tmp_path, monkeypatch, capsys, caplog
 ):
-    """As with these pictures deleted; they have none, and are named."""
+    """Black ones and some of another scene: as with them deleted; they have none, and are named."""
     monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)  # fewer than pictures: by flow
     images, truth = walk
-    lost = range(12, 17)
-    images = [SPOILED[kind](im, k) if k in lost else im for k, im in enumerate(images)]
+    lost = [*range(5, 10), *range(18, 23)]
+    images = [other_scene(k) if k in lost else im for k, im in enumerate(images)]
+    images[5:10] = [image * 0 for image in images[5:10]]
     poses, text = cameras(tmp_path, images, capsys, caplog)
     own = ~np.isin(np.arange(COUNT), lost)
     assert poses.known[own].all() and not poses.known[~own].any() and poses.part_count == 1
     assert ate_percent(poses.cam_from_world[own], truth[own]) < 1.0
-    assert "cameras: 25 of 30 frames (pycolmap)," in text and "012.png" in text
+    assert "cameras: 20 of 30 frames (pycolmap)," in text and "018.png" in text
 
 
 def test_only_gaps_with_a_small_error_are_interpolated(walk, tmp_path, monkeypatch, capsys, caplog):
@@ -69,7 +60,7 @@ def test_only_gaps_with_a_small_error_are_interpolated(walk, tmp_path, monkeypat
     monkeypatch.setattr("reobj.poses.estimate.MIN_KEYFRAMES", 12)
     images, truth = walk
     lost = [7, *range(15, 20)]
-    images = [SPOILED["blur"](im, k) if k in lost else im for k, im in enumerate(images)]
+    images = [cv2.GaussianBlur(im, (0, 0), 25) if k in lost else im for k, im in enumerate(images)]
     poses, text = cameras(tmp_path, images, capsys, caplog)
     assert np.flatnonzero(poses.status == "interpolated").tolist() == [7]
     assert np.flatnonzero(~poses.known).tolist() == [*range(15, 20)]

@@ -250,7 +250,8 @@ def scaled(desk: Path) -> None:
     goal, *_ = scores.similarity(points, true_centres())
     height = np.mean([o["size_m"][2] for o in true_objects() if o["class"] == "chair"])
     assert scale["source"] == "known_size"
-    assert abs(np.log(scale["metres_per_unit"] / goal * height / 0.82)) < 0.08
+    error = abs(np.log(scale["metres_per_unit"] / goal * height / 0.82))
+    assert error < min(0.08, 3 * scale["rel_sigma"]) and scale["rel_sigma"] < 0.06
 
 
 def evaluated(desk: Path) -> None:
