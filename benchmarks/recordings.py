@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Run the command line on every recording with images, and hold the figures against floors.
 
-    python benchmarks/recordings.py DATA [-o OUT] [--only NAME...] [--long] [--jobs 2] [--write-floors]
+    python benchmarks/recordings.py DATA [-o OUT] [--only NAME...] [--long] [--jobs 2]
+        [--write-floors]
 
 Every row is one command, as a user types it, in a process of its own: with the small detector
 (--detector fast, weights in REOBJ_MODELS) and with recorded boxes, with the tool's own cameras and
