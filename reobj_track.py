@@ -58,7 +58,7 @@ import numpy.typing as npt
 import quadrics
 from reobj import __version__
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.commands import SecretFormatter, make_parser, say, short_help, with_streams
+from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
 from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
 from reobj.identity.assignment import Pairs, ambiguous_pairs, assign, touching
 from reobj.identity.camera_motion import CameraMotion
@@ -1331,7 +1331,7 @@ def _main(words: Sequence[str]) -> int:
         level = logging.DEBUG if args.debug else logging.INFO if args.verbose else logging.WARNING
         logging.addLevelName(logging.WARNING, "warning")
         handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(SecretFormatter("%(levelname)s: %(message)s"))
+        handler.setFormatter(SafeFormatter("%(levelname)s: %(message)s"))
         logging.basicConfig(level=level, handlers=[handler], force=True)
         return int(args.func(args))
     except KeyboardInterrupt:

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 from reobj import __version__
 from reobj.files import did_you_mean, wrapped
 from reobj.options import add_flags, list_options
-from reobj.types import ReobjError, one_line, without_secrets
+from reobj.types import ReobjError, one_line, printable, without_secrets
 
 Command = Callable[[argparse.Namespace], int]
 SHELLS = ("bash", "zsh")  # shtab's script for tcsh knows no flags of commands
@@ -52,12 +52,12 @@ class Parser(argparse.ArgumentParser):
         return [word for word in words if word.startswith(start)]
 
 
-class SecretFormatter(logging.Formatter):
-    """Write log lines without the secrets of URLs."""
+class SafeFormatter(logging.Formatter):
+    """Write log lines without the secrets of URLs, and control characters of names escaped."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
-        return without_secrets(super().format(record))
+        """Return the line, or lines."""
+        return "\n".join(map(printable, without_secrets(super().format(record)).split("\n")))
 
 
 def with_streams(program: Callable[[], int]) -> int:

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from simulated import SIZE, fitted, tracks_of, unlinked, walk
 
 import reobj_track as rt
+from front_door.room import ROOM, cli
 from reobj.results import film, overlay, scene
 from reobj.results.export import EXPORTS
 from reobj.results.result import VideoInfo
@@ -584,3 +585,16 @@ def test_films_of_tiny_pictures(
             writer.write(np.full((*writer.size[::-1], 3), 99, np.uint8))
         writer.close(True)
         assert writer.path.exists()
+
+
+def test_names_in_warnings_cannot_steer_a_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "\x1b[31mred"
+    folder.mkdir()
+    (folder / "det.txt").write_text("")
+    given = ("--detections", folder / "det.txt", "--poses", ROOM / "poses.txt")
+    size = "PINHOLE 640 480 492 492 320 240"
+    assert cli("run", "-o", tmp_path / "out", *given, "--camera", size) == 0
+    said = capsys.readouterr().err
+    assert "\\x1b[31mred" in said and "\x1b" not in said
