@@ -417,6 +417,13 @@ def test_a_gap_is_a_fragment() -> None:
     found = boxes(*((f, i, 60 * i) for f in range(6) for i in (1, 2) if (i, f) != (1, 3)))
     mine = score_tracks(truth, found)
     assert mine["Frag"] == 1 and mine["IDSW"] == 0
+    one = score_tracks(truth, found[found.identity == 2])
+    assert one["Frag"] == 0  # an object that is never found has none
+
+
+def test_the_map_of_identities_names_those_that_none_is_found_for() -> None:
+    truth = boxes((0, 1, 0), (0, 2, 60), (1, 1, 0))
+    assert identity_map(truth, boxes((0, 7, 0))) == {1: 7, 2: None}
 
 
 def test_a_return_is_kept_if_any_visit_before_had_its_identity() -> None:

@@ -252,6 +252,19 @@ def test_edges_are_drawn_in_place_if_wanted() -> None:
     assert (drawn(frames, {1}, wanted=False) == 127).all()
 
 
+def test_edges_are_bent_by_the_lens() -> None:
+    """The middle of a long edge is where the lens has it, not between its ends."""
+    lens = rt.Camera("OPENCV", 200, 120, (300.0, 300.0, 100.0, 60.0, -0.9, 0.0, 0.0, 0.0))
+    half, place = np.array([[1.2, 0.7, 0.2]]), np.array([[0, 0, 4.0]])
+    frames = wireframes(quadrics.Ellipsoids(place, half, np.eye(3)[None]), ["box"])
+    image = drawn(frames, {1}, camera=lens)
+    ends = image_points(lens, np.array([[-1.2, 0.7, 3.8], [1.2, 0.7, 3.8]]))
+    x, y = np.round(image_points(lens, np.array([[0, 0.7, 3.8]]))[0] - 0.5).astype(int)
+    assert y > ends[:, 1].max() + 3
+    assert (image[y, x] == object_color(1)).all()
+    assert (image[int(ends[0, 1]), x] != object_color(1)).any()
+
+
 def test_nearer_solids_are_drawn_over_farther_ones() -> None:
     places, half = np.array([[0, 0, 3.0], [0, 0, 6.0]]), np.full((2, 3), 0.3)
     for order in ([0, 1], [1, 0]):

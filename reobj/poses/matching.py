@@ -279,7 +279,7 @@ def is_whole(stamps: Array) -> bool:
 LONE_FRAME_S = 1 / 60  # half a frame interval where there is only one frame (chosen: 30 Hz)
 STAMP_TOLERANCE_S = 0.02  # between a frame and its pose (default of TUM's associate.py)
 SAME_TIME_S = 5e-4  # times in files and containers are rounded to a ms
-STAMP_STEP_S = 0.1  # between poses, up to which one between them is interpolated (chosen: 10 Hz)
+STAMP_STEP_S = 0.11  # between poses, up to which one between them is interpolated: 10 Hz, jitter
 
 
 def _by_stamps(stamps_s: Array, source: Source, own: bool) -> list[Reading]:

@@ -1,0 +1,94 @@
+"""Which frame a supplied pose belongs to: numbers, times, what lies between two times."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from reobj.cameras import invert_rigid
+from reobj.poses.matching import (
+    Reading,
+    Source,
+    _by_image_numbers,
+    _by_stamps,
+    interpolated,
+    rows_by_time,
+)
+
+
+def source(frame: list[int], time_s: list[float], count: int, timed: bool = True) -> Source:
+    return Source(np.array(frame), np.array(time_s), count, timed=timed)
+
+
+def rows_of(found: list[Reading]) -> dict[str, tuple[list[int], int]]:
+    return {reading.key: (reading.row.tolist(), reading.outside) for reading in found}
+
+
+def test_poses_between_two_times_are_interpolated() -> None:
+    """A steady turn about z and a steady move: a quarter of the way is a quarter of both."""
+    angle = np.array([0.0, 0.4, 0.8, 1.2])
+    world_from_cam = np.concatenate(
+        [
+            Rotation.from_rotvec(np.outer(angle, [0, 0, 1])).as_matrix(),
+            np.outer(angle, [10.0, 20.0, -30.0])[:, :, None],
+        ],
+        2,
+    )
+    stamps = np.array([5.0, 5.1, 5.2, 5.4])  # the last step is too long
+    times = np.array([5.025, 5.1, 5.1004, 5.15, 5.3, 4.9, 5.5]) + 1.3e9
+    stamps += 1.3e9  # of Unix: a tenth of a second is no exact number
+    found, at = interpolated(invert_rigid(world_from_cam), stamps, times)
+    assert np.flatnonzero(at).tolist() == [0, 3]
+    back = invert_rigid(found)
+    np.testing.assert_allclose(back[:, :, 3], np.outer([0.1, 0.6], [10, 20, -30]), atol=1e-4)
+    turn = Rotation.from_matrix(back[:, :, :3]).as_rotvec()
+    np.testing.assert_allclose(turn, np.outer([0.1, 0.6], [0, 0, 1]), atol=1e-5)
+
+
+def test_a_pose_that_is_not_known_interpolates_nothing() -> None:
+    poses = np.tile(np.eye(3, 4), (3, 1, 1))
+    poses[1, 0, 3] = np.nan
+    _, at = interpolated(poses, np.array([0.0, 0.1, 0.2]), np.array([0.05, 0.15]))
+    assert not at.any()
+
+
+@pytest.mark.parametrize(
+    ("stamps", "rows"),
+    [
+        ([0.0, 0.1, 0.2], [0, 1, 2]),
+        ([0.018, 0.119, 0.219], [0, 1, 2]),  # within 20 ms
+        ([0.022, 0.122, 0.222], [-1, -1, -1]),
+        ([0.1], [-1, 0, -1]),
+        ([0.19, 0.205], [-1, -1, 1]),  # the nearest
+    ],
+)
+def test_times_are_matched_within_20_ms(stamps: list[float], rows: list[int]) -> None:
+    found = rows_by_time(np.array(stamps), np.arange(3), np.array([0.0, 0.1, 0.2]))
+    assert found.tolist() == rows
+
+
+def test_of_fast_frames_a_time_matches_within_half_a_frame() -> None:
+    """Every third frame of 100 a second: a neighbour that was not read is another frame."""
+    frame = np.array([0, 3, 6])
+    assert rows_by_time(np.array([0.004, 0.036, 0.06]), frame, frame / 100).tolist() == [0, -1, 2]
+
+
+def test_numbers_beside_images_that_count_from_elsewhere() -> None:
+    seen = source([0, 1, 2], [0, 0.1, 0.2], 3)
+    from_1 = _by_image_numbers(np.array([1, 2, 3]), np.array([0, 1, 2]), seen, "numbers")
+    assert rows_of(from_1)["number1"] == ([0, 1, 2], 0)
+    assert rows_of(from_1)["number"] == ([-1, 0, 1], 1)
+    from_0 = _by_image_numbers(np.array([0, 1, 2]), np.array([1, 2, 3]), seen, "numbers")
+    assert rows_of(from_0)["number0"] == ([0, 1, 2], 0)
+    assert rows_of(from_0)["number"] == ([1, 2, -1], 1)
+    same = _by_image_numbers(np.array([1, 2, 3]), np.array([1, 2, 3]), seen, "numbers")
+    assert set(rows_of(same)) <= {"number", "order"} and rows_of(same)["number"] == ([0, 1, 2], 0)
+
+
+def test_times_outside_the_source_are_counted() -> None:
+    """Half a frame before the first and after the last is inside."""
+    seen = source([0, 1, 2], [0, 0.1, 0.2], 4)  # the fourth frame, at .3, is not read
+    stamps = np.array([-0.06, -0.04, 0.0, 0.3, 0.34, 0.36, 0.5])
+    (found,) = _by_stamps(stamps, seen, own=True)
+    assert found.key == "time" and found.outside == 3 and found.row.tolist() == [2, -1, -1]
