@@ -1074,14 +1074,15 @@ def run(
             names = tuple(found.class_names)
         check_known_size(config.objects, names)
         model = None
+        started = time.monotonic()
         if readings:
             shown = boxes if tracks else _tracklets(boxes)
             poses = settled_poses(readings, shown, video, config.poses, workspace)
         elif in_3d and not video.is_live:
             moving = np.isin([*names, ""], config.objects.moving_classes)[boxes.class_id]
             rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
-            started = time.monotonic()
             poses, model = reconstruct_cached(video, config.poses, workspace, rows)
+        if poses is not None:
             seconds["poses"] = time.monotonic() - started
         if not tracks:
             result = _track_video(video, workspace, config, found, poses, seconds, viewer)
