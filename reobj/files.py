@@ -269,11 +269,14 @@ def load_json(path: Path) -> Any:
     if (size := sum(text.count(sign) * each for sign, each in JSON_BYTES.items())) > JSON_MAX:
         taken = f"would take {size >> 20} MB of memory, at most {JSON_MAX >> 20} MB are taken"
         raise ReobjError(f"{path}: {taken}; cut it into pieces")
+    if found := re.search(r"\d{309}", text):
+        line = text.count("\n", 0, found.start()) + 1
+        raise ReobjError(f"{path}, line {line}: a number of more than 308 digits")
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
-    except (RecursionError, ValueError) as error:  # nested too deep; a number of 4,300 digits
+    except (RecursionError, ValueError) as error:  # nested too deep
         raise ReobjError(f"{path}: no JSON that can be meant ({error})") from error
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import difflib
 import json
 import math
+import re
 import textwrap
 import tomllib
 from collections.abc import Iterable
@@ -104,6 +105,7 @@ def read_config(config: C, path: str | Path) -> C:
     for key, value in table.items():
         inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else None
         for name, own in (inner if inner is not None else {key: value}).items():
+            own = _with_bytes(own) if isinstance(own, str) else own
             config = with_option(config, name, own, f"{path}: ")
     return config
 
@@ -126,15 +128,23 @@ def write_config(config: Any, path: str | Path) -> None:
         sections = section
     head = "# Options of reobj_track that differ from the defaults; --options lists all.\n"
     with atomic(Path(path)) as part:
-        text = head + "\n".join(lines) + "\n" * bool(lines)
-        part.write_text(text, encoding="utf-8", errors="surrogateescape")  # paths are bytes
+        part.write_text(head + "\n".join(lines) + "\n" * bool(lines), encoding="utf-8")
 
 
 def _toml(value: str | float) -> str:
-    """Write a value: a text as JSON has it, but DEL escaped too; numbers as Python has them."""
+    """Write a value: a text as JSON has it, but DEL escaped too; numbers as Python has them.
+
+    Paths are bytes: one that is no UTF-8 stands as \\udc80 to \\udcff, as Python names it.
+    """
     if isinstance(value, str):
+        value = re.sub("[\udc80-\udcff]", lambda byte: f"\\udc{ord(byte[0]) & 255:02x}", value)
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return str(value).lower()
+
+
+def _with_bytes(text: str) -> str:
+    """Put the bytes that `_toml` names back into a text."""
+    return re.sub(r"\\udc([89a-f][0-9a-f])", lambda byte: chr(0xDC00 + int(byte[1], 16)), text)
 
 
 # ---- Flags ----

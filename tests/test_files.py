@@ -159,7 +159,7 @@ def test_json_takes_no_more_than_was_reckoned(tmp_path: Path, item: str) -> None
     assert len(data) > 1000 and taken < 1.3 * reckoned
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000, "9" * 5000])
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000])
 def test_json_that_no_one_writes(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(rt.ReobjError, match=r"a\.json: no JSON that can be meant"):

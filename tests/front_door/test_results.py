@@ -484,7 +484,7 @@ def test_paths_that_are_no_utf8(tmp_path: Path) -> None:
     folder = tmp_path / os.fsdecode(b"\xff")
     assert rt.main(written_walk(folder, np.zeros(3))) == 0
     out = folder / "out"
-    assert b"\xff/poses.txt" in (out / "config.toml").read_bytes()
+    assert r"\\udcff/poses.txt" in (out / "config.toml").read_text()
     assert rt.main(["objects", str(out)]) == 0
     again = ["run", "-o", str(folder / "again"), "--detections", str(folder / "d.csv")]
     assert rt.main([*again, "--config", str(out / "config.toml")]) == 0
@@ -598,3 +598,28 @@ def test_names_in_warnings_cannot_steer_a_terminal(
     assert cli("run", "-o", tmp_path / "out", *given, "--camera", size) == 0
     said = capsys.readouterr().err
     assert "\\x1b[31mred" in said and "\x1b" not in said
+
+
+@pytest.mark.parametrize("key", ["fl_x", "transform_matrix"])
+def test_a_number_that_no_float_holds_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str
+) -> None:
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
+    data: dict[str, Any] = {
+        "fl_x": 500,
+        "cx": 320,
+        "cy": 240,
+        "w": 640,
+        "h": 480,
+        "frames": [frame],
+    }
+    if key == "fl_x":
+        data["fl_x"] = 10**400
+    else:
+        frame["transform_matrix"][0][3] = 10**400
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    (tmp_path / "det.txt").write_text("1,-1,10,10,50,50,0.9,-1,-1,-1\n")
+    given = ("--detections", tmp_path / "det.txt", "--poses", tmp_path / "transforms.json")
+    assert cli("run", "-o", tmp_path / "out", *given) == 2
+    said = capsys.readouterr().err
+    assert "transforms.json, line 1: a number of more than 308 digits" in said
