@@ -171,7 +171,8 @@ def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     env = os.environ | {"STEPS": "3", "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     monkeypatch.chdir(tmp_path)
     for kind, text in blocks(TUTORIALS / f"{page}.md"):
-        commands = [shlex.split(line, comments=True) for line in text.splitlines()]
+        lines = text.replace("\\\n", " ").splitlines()
+        commands = [shlex.split(line, comments=True) for line in lines]
         ours = all(c[:2] == ["python", "reobj_track.py"] for c in commands)
         if kind == "sh" and ours and "$(" not in text:
             for command in commands:  # in this process: quicker
