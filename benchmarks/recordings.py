@@ -96,7 +96,6 @@ def red(boxes: str, poses: str, every: int) -> Case:
 
 C2W = "poses_c2w.txt"
 CASES = [
-    Case("room", "", FAST, every=3),
     kitchen(YOLO, C2W, 2),
     kitchen(FAST, C2W, 4),
     red(YOLO, C2W, 3),
@@ -121,7 +120,7 @@ CASES = [
     Case("PETS-S3-MF1", "mot/PETS-S3-MF1/img1", MOT),
 ]
 # with --long only: a minute each
-LONG = [kitchen(YOLO, "", 1, 120), red(YOLO, "", 5)]
+LONG = [Case("room", "", FAST, every=3), kitchen(YOLO, "", 1, 120), red(YOLO, "", 5)]
 CAMERAS = {  # where the file of poses has none
     "cubeslam_cabinet": "535.4,539.2,320.1,247.6",
     "tum_fr3": "535.4,539.2,320.1,247.6",
