@@ -96,10 +96,10 @@ def red(boxes: str, poses: str, every: int) -> Case:
 
 C2W = "poses_c2w.txt"
 CASES = [
-    kitchen(YOLO, C2W, 2),
-    kitchen(FAST, C2W, 4),
-    red(YOLO, C2W, 3),
-    red(FAST, C2W, 5),
+    kitchen(YOLO, C2W, 3),
+    kitchen(FAST, C2W, 6),
+    red(YOLO, C2W, 5),
+    red(FAST, C2W, 8),
     Case("office_loop", "office_loop/images", FAST, stop=120),
     Case("office_loop", "office_loop/images", YOLO, stop=120),
     Case("bonsai_mip360", "bonsai_mip360/images", FAST, every=6),
