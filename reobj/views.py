@@ -179,7 +179,9 @@ def points_on(views: Views, poses: Poses, solids: quadrics.Ellipsoids) -> Array:
     seen = sparse.csr_array(shown.T.astype(np.int64)) @ of_view  # (G, P) views that observe it
     group, point = views_inside.nonzero()
     count = views_inside.data
-    mostly = (count >= POINT_VIEWS) & (count >= INSIDE_SHARE * seen[group, point])
+    # of an array, scipy before 1.14 makes a sparse one of these
+    every = np.asarray(sparse.csr_matrix(seen)[group, point]).ravel()
+    mostly = (count >= POINT_VIEWS) & (count >= INSIDE_SHARE * every)
     group, point = group[mostly], point[mostly]
     at = np.einsum(
         "ki,kij->kj",
