@@ -2033,7 +2033,7 @@ def _scale_from_known(
     """Estimate log metres per unit and its sigma from sizes that the user knows.
 
     The boxes of all objects have an error in common, as in `_report`: a detector that draws them
-    tight does so everywhere.
+    tight does so for every object.
     """
     if not sizes:
         return None
