@@ -229,18 +229,6 @@ def test_where_it_broke_it_is_done_again_with_more_keyframes(walk, tmp_path, mon
     assert "broke between frames 22 and 23" in poses.messages[0]
 
 
-def test_a_mirrored_half_is_a_part_of_its_own(tmp_path):
-    """A mirror image shows the same textures but no place of the same world."""
-    images, truth = textured_room(24, 0.2, -1.5, size=(320, 240))
-    images[12:] = [np.ascontiguousarray(image[:, ::-1]) for image in images[12:]]
-    poses = rt.estimate_poses(FakeVideo(images), config(), tmp_path)
-    assert poses.part_count == 2 and "broke between frames 11 and 12" in poses.messages[0]
-    first = poses.part[:12]
-    assert (first == first[0]).all() and (poses.part[12:] == 1 - first[0]).all()
-    own = np.arange(24) < 12
-    assert ate_percent(poses.cam_from_world[own], truth[own]) < 2
-
-
 # ---- EXIF ----------------------------------------------------------------------------------------
 
 

@@ -32,3 +32,11 @@ def test_names_are_matched(given: list[str], frames: list[int], rule: str) -> No
 def test_a_name_in_two_unknown_folders_is_refused() -> None:
     with pytest.raises(ReobjError, match=r"0001.jpg is the name of several images"):
         frames_by_name(["a/0001.jpg", "b/0001.jpg"], IMAGES)
+
+
+@pytest.mark.parametrize("top", ["", "walk/"])
+def test_folders_are_compared_up_to_the_first(top: str) -> None:
+    """Only the outermost folder differs."""
+    names = [f"{top}left/images/1.jpg", f"{top}right/images/1.jpg"]
+    found, rule = frames_by_name(names[::-1], ["left/images/1.jpg", "right/images/1.jpg"])
+    assert found.tolist() == [1, 0] and rule == "file names with 2 folders"

@@ -12,6 +12,7 @@ from reobj.poses.matching import (
     Source,
     _by_image_numbers,
     _by_stamps,
+    _reading,
     interpolated,
     rows_by_time,
 )
@@ -92,3 +93,9 @@ def test_times_outside_the_source_are_counted() -> None:
     stamps = np.array([-0.06, -0.04, 0.0, 0.3, 0.34, 0.36, 0.5])
     (found,) = _by_stamps(stamps, seen, own=True)
     assert found.key == "time" and found.outside == 3 and found.row.tolist() == [2, -1, -1]
+
+
+def test_numbers_after_the_last_frame_are_counted() -> None:
+    seen = source([0, 1, 2], [0, 0.1, 0.2], 3)
+    found = _reading("number", "numbers", np.array([-1, 0, 2, 3, 4]), seen)
+    assert found.row.tolist() == [1, -1, 2] and found.outside == 3

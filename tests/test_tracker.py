@@ -1222,6 +1222,26 @@ def test_without_appearance_the_place_names_an_object() -> None:
     assert tracker.latest.tracklet_id.tolist() == [3, 4]
 
 
+@pytest.mark.parametrize(("shift", "look", "found"), [(0, 1, 1), (0.3, 1, 3), (0.3, 0, 1)])
+def test_half_a_place_does_not_outweigh_another_look(shift: float, look: int, found: int) -> None:
+    """After a blind time: what lies where an object was is that object, what overlaps half of its
+    box and looks different is new."""
+    views = unit(np.random.default_rng(35), 3)
+    tracker = rt.Tracker(rt.TrackerConfig(coast_frames=5))
+    for pose in PAST:
+        boxes = balls_seen(pose)[0]
+        tracker.update(boxes, embeddings=views[[0, 2]], cam_from_world=pose, camera=CAMERA)
+    for _ in range(10):
+        tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
+    x0, y0, x1, y1 = boxes.xyxy[0]
+    moved = rows((x0 + shift * (x1 - x0), y0 + shift * (y1 - y0), x1, y1))
+    for _ in range(4):
+        tracks = tracker.update(
+            moved, embeddings=views[[0 if look == 0 else 1]], cam_from_world=PAST[-1], camera=CAMERA
+        )
+    assert tracks.track_id.tolist() == [found]
+
+
 # ---- The whole state ----
 
 
