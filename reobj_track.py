@@ -43,11 +43,11 @@ import dataclasses
 import json
 import logging
 import math
-import re
 import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -123,6 +123,7 @@ from reobj.sources.looked import Intervals
 from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
+from reobj.state import restore_state, state_arrays
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -458,45 +459,6 @@ class TrackerState:
     reid_calibration: SimilarityCalibration = field(default_factory=SimilarityCalibration)
     match_calibration: SimilarityCalibration = field(default_factory=SimilarityCalibration)
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
-
-
-def saved_fields(owner: Any) -> Sequence[str]:
-    """Return the names of the attributes that are the state of a dataclass or of another class."""
-    if dataclasses.is_dataclass(owner):
-        return [one.name for one in dataclasses.fields(owner)]
-    return getattr(owner, "ARRAYS", ())
-
-
-def state_arrays(value: Any, name: str) -> dict[str, Any]:
-    """Flatten a state to arrays by dotted names; None is left out."""
-    if value is None:
-        return {}
-    if isinstance(value, list):
-        items = {f"{name}.{k}": item for k, item in enumerate(value)}
-    else:
-        items = {f"{name}.{key}": getattr(value, key) for key in saved_fields(value)}
-    if not items:
-        return {name: value}
-    return {key: x for path, item in items.items() for key, x in state_arrays(item, path).items()}
-
-
-def restore_state(value: Any, name: str, arrays: dict[str, Any]) -> Any:
-    """Fill a fresh state from `state_arrays`; returns it, or the array that takes its place.
-
-    Raises:
-        KeyError: an array is missing.
-    """
-    if isinstance(value, list):
-        prefix = re.compile(re.escape(name) + r"\.(\d+)\.")
-        count = len({found[1] for key in arrays if (found := prefix.match(key))})
-        return [restore_state(type(value[0])(), f"{name}.{k}", arrays) for k in range(count)]
-    if keys := saved_fields(value):
-        for key in keys:
-            setattr(value, key, restore_state(getattr(value, key), f"{name}.{key}", arrays))
-        return value
-    if value is None:
-        return arrays.get(name)
-    return int(arrays[name]) if isinstance(value, int) else arrays[name]
 
 
 class Tracker:
@@ -1169,43 +1131,31 @@ def run(
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
-    boxes_file = tracks or detections
-    video = open_video(source, config.input, config.poses, boxes_file, config.detect)
+    video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
     with Workspace(out, overwrite) as workspace:
         workspace.bind(video, overwrite)
+        job = _Job(video, workspace, config)
         viewer = Viewer(VideoInfo.of(video)) if show else None
-        seconds: dict[str, float] = {}
         in_3d = in_3d and config.poses.mode != "none"
-        readings, poses = supplied_poses(video, config.poses) if in_3d else [], None
+        readings = supplied_poses(video, config.poses) if in_3d else []
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
-            boxes, names = result.tracks, result.class_names
+            check_known_size(config.objects, result.class_names)
+            boxes, class_names = result.tracks, result.class_names
         else:
-            on = (config.threads, config.offline, config.device)
-            found = open_detections(video, config.detect, detections, *on)
-            found, boxes = keep_detections(found, video, workspace), Tracks.empty()
-            if in_3d and not video.is_live:
-                started = time.monotonic()
-                found, boxes = detect_all(found, video, workspace)
-                seconds["detect"] = time.monotonic() - started
-            names = tuple(found.class_names)
-        check_known_size(config.objects, names)
-        model = None
-        started = time.monotonic()
+            detected, boxes = _detect(job, detections, in_3d)
+            class_names = tuple(detected.class_names)
+            check_known_size(config.objects, class_names)
+        poses, models = None, []
         if readings:
-            shown = boxes if tracks else _tracklets(boxes)
-            poses = settled_poses(readings, shown, video, config.poses, workspace)
+            poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
         elif in_3d and not video.is_live:
-            moving = np.isin([*names, ""], config.objects.moving_classes)[boxes.class_id]
-            rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
-            poses, model = reconstruct_cached(video, config.poses, workspace, rows)
-        if poses is not None:
-            seconds["poses"] = time.monotonic() - started
+            poses, models = _own_cameras(job, boxes, class_names)
         if not tracks:
-            result = _track_video(video, workspace, config, found, poses, seconds, viewer)
-        workspace.save_last(result, poses, model or [])
-        result.poses, result.seconds = poses, seconds
-        result = _finish(result, video, workspace, config)
+            result = _track_video(job, detected, poses, viewer)
+        workspace.save_last(result, poses, models)
+        result.poses, result.seconds = poses, job.seconds
+        result = _finish(job, result)
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
             viewer.close()
@@ -1236,7 +1186,39 @@ def refit(
             result = _given_tracks(tracks, video, config.detect, result)
             workspace.save_last(result, poses, workspace.last_models())
             result.poses = poses
-        return _finish(result, video, workspace, config)
+        return _finish(_Job(video, workspace, config), result)
+
+
+def _last_config(out: str | Path) -> Config:
+    """Read the options of the last run in an output folder; the defaults if it has none."""
+    path = Path(out) / CONFIG_FILE
+    return read_config(Config(), path) if path.is_file() else Config()
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What every stage of `run` reads: the video, the output folder, the options.
+
+    Attributes:
+        seconds: that each stage took, added by the stage.
+    """
+
+    video: Video
+    workspace: Workspace
+    config: Config
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def runtime(self) -> tuple[int, bool, str]:
+        """Return threads, offline and device, as networks are opened with."""
+        return self.config.threads, self.config.offline, self.config.device
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Note the seconds of a stage that ends without an exception."""
+        started = time.monotonic()
+        yield
+        self.seconds[stage] = time.monotonic() - started
 
 
 def _check_objects(config: ObjectsConfig) -> None:
@@ -1249,34 +1231,60 @@ def _check_objects(config: ObjectsConfig) -> None:
     parse_known_size(config.known_size)
 
 
-def _last_config(out: str | Path) -> Config:
-    """Read the options of the last run in an output folder; the defaults if it has none."""
-    path = Path(out) / CONFIG_FILE
-    return read_config(Config(), path) if path.is_file() else Config()
+def _detect(
+    job: _Job, detections: str | Path | Callable[[Image], Any] | None, in_3d: bool
+) -> tuple[DetectionSource, Tracks]:
+    """Open the detections; where cameras are wanted, detect in all frames of a recorded video.
+
+    Returns:
+        the source, and its boxes: cameras are estimated without moving objects, and checked with
+        boxes; empty where the frames are read one by one.
+    """
+    opened = open_detections(job.video, job.config.detect, detections, *job.runtime)
+    source = keep_detections(opened, job.video, job.workspace)
+    if not in_3d or job.video.is_live:
+        return source, Tracks.empty()
+    with job.timed("detect"):
+        return detect_all(source, job.video, job.workspace)
+
+
+def _supplied_cameras(job: _Job, readings: Sequence[Any], boxes: Tracks) -> Poses:
+    """Choose between the readings of the user's poses, by the images and boxes."""
+    with job.timed("poses"):
+        return settled_poses(readings, boxes, job.video, job.config.poses, job.workspace)
+
+
+def _own_cameras(
+    job: _Job, boxes: Tracks, class_names: Sequence[str]
+) -> tuple[Poses, Sequence[Path]]:
+    """Reconstruct the cameras from the images; moving objects hold no features.
+
+    Returns:
+        poses, and the folders of the COLMAP models.
+    """
+    with job.timed("poses"):
+        moving = np.isin([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
+        rows = boxes[moving & (boxes.score >= job.config.tracker.high_score)]
+        return reconstruct_cached(job.video, job.config.poses, job.workspace, rows)
 
 
 def _track_video(
-    video: Video,
-    workspace: Workspace,
-    config: Config,
-    source: DetectionSource,
-    poses: Poses | None,
-    seconds: dict[str, float],
-    viewer: Viewer | None = None,
+    job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | None = None
 ) -> Result:
     """Track all frames, or take the tracks from the cache; a live source is never cached."""
+    video, config = job.video, job.config
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
-    path = workspace.path("tracks", *detections_key(source, video), *setup)
+    path = job.workspace.path("tracks", *detections_key(source, video), *setup)
     if source.key and not video.is_live and (known := load_cached(path, Result.load_tracked)):
         return known
-    started, on = time.monotonic(), (config.threads, config.offline, config.device)
-    tracker = Tracker(config.tracker, make_embedder(config.embed.model, config.embed.head, *on))
-    steps = track(video, source, tracker, poses=poses)
-    if viewer is not None:
-        steps = viewer.follow(steps, source.class_names, video, poses)
-    result = collect_tracks(steps, tracker, video, source)
-    seconds["track"] = time.monotonic() - started
+    with job.timed("track"):
+        embedder = make_embedder(config.embed.model, config.embed.head, *job.runtime)
+        tracker = Tracker(config.tracker, embedder)
+        steps = track(video, source, tracker, poses=poses)
+        if viewer is not None:
+            steps = viewer.follow(steps, source.class_names, video, poses)
+        result = collect_tracks(steps, tracker, video, source)
     result.save_tracked(path)
     return result
 
@@ -1302,50 +1310,60 @@ def _given_tracks(
     )
 
 
-def _finish(
-    result: Result,
-    video: Video,
-    workspace: Workspace,
-    config: Config,
-) -> Result:
-    """Link tracklets, fit one solid an object, and write all files of the output folder.
-
-    The pictures come last: the results are written whatever becomes of them.
-    """
-    started, poses = time.monotonic(), result.poses
-    result.edits = result.edits or kept_edits(workspace.out)
-    with Progress("objects"):
-        link_and_fit(result, config.objects)
-    gap = 0 if result.identities_given else config.output.fill_gaps
-    filled = fill(result, video.size, gap)  # by our own solids, whatever solver is asked for
-    solve_again(result, config.objects)
-    result.tracks, result.out = filled, workspace.out
-    detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
-    result.embedding_row = detected[result.embedding_row]
-    result.seconds["objects"] = time.monotonic() - started
-    result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
-    scores = (config.tracker.high_score, config.objects.moving_classes, config.tracker.new_score)
-    result.warnings += implausible(result, *scores)
-    result.warnings += unused_sizes(config.objects, result.objects)
-    started = time.monotonic()
-    shown, models = config.output, workspace.last_models()
-
-    def more(folder: Path) -> None:
-        write_config(config, folder / CONFIG_FILE)
-        if models is not None:
-            copy_models(models, folder)
-            write_supplied_model(poses, video, folder)
-
-    stale = (MODEL,) if models is not None or poses is None else ()
-    result.save(workspace.out, shown.doubtful, more, stale)
-    options = (shown.overlay, shown.scene, shown.doubtful)
-    if faults := write_pictures(result, workspace.out, video, *options):
-        result.warnings += faults
-        result.write_objects(workspace.out / "objects.json")
-    result.seconds["write"] = time.monotonic() - started
+def _finish(job: _Job, result: Result) -> Result:
+    """Link tracklets, fit one shape an object, and write all files of the output folder."""
+    with job.timed("objects"):
+        _fit_objects(job, result)
+    result.seconds |= job.seconds
+    result.warnings += _warnings(job.config, result)
+    with job.timed("write"):
+        _write(job, result)
+    result.seconds |= job.seconds
     for warning in result.warnings:
         log.warning(warning)
     return result
+
+
+def _fit_objects(job: _Job, result: Result) -> None:
+    """Link and fit; then fill gaps of the tracks by our own shapes, whatever solver is chosen."""
+    config = job.config
+    result.edits = result.edits or kept_edits(job.workspace.out)
+    with Progress("objects"):
+        link_and_fit(result, config.objects)
+    gap = 0 if result.identities_given else config.output.fill_gaps
+    filled = fill(result, job.video.size, gap)
+    solve_again(result, config.objects)
+    result.tracks, result.out = filled, job.workspace.out
+    detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
+    result.embedding_row = detected[result.embedding_row]
+
+
+def _warnings(config: Config, result: Result) -> list[str]:
+    """Collect what the user should know of the cameras, the objects and the options."""
+    poses = result.poses
+    of_cameras = [] if poses is None else [*poses.messages, *parts_message(poses)]
+    tracker, moving = config.tracker, config.objects.moving_classes
+    of_objects = implausible(result, tracker.high_score, moving, tracker.new_score)
+    return [*of_cameras, *of_objects, *unused_sizes(config.objects, result.objects)]
+
+
+def _write(job: _Job, result: Result) -> None:
+    """Write all files; pictures last, so that the results are there whatever becomes of them."""
+    workspace, output = job.workspace, job.config.output
+    models = workspace.last_models()
+
+    def write_more(folder: Path) -> None:
+        write_config(job.config, folder / CONFIG_FILE)
+        if models is not None:
+            copy_models(models, folder)
+            write_supplied_model(result.poses, job.video, folder)
+
+    stale = (MODEL,) if models is not None or result.poses is None else ()
+    result.save(workspace.out, output.doubtful, write_more, stale)
+    shown = (output.overlay, output.scene, output.doubtful)
+    if faults := write_pictures(result, workspace.out, job.video, *shown):
+        result.warnings += faults
+        result.write_objects(workspace.out / "objects.json")
 
 
 # ---- Command line ------------------------------------------------------------------------------
