@@ -1,6 +1,4 @@
-"""The public names, the ways to call the tracker from Python, their types, and the examples in
-docstrings.
-"""
+"""The public names, the ways to call the tracker from Python, and the examples in docstrings."""
 
 from __future__ import annotations
 
@@ -8,7 +6,6 @@ import doctest
 import importlib
 import importlib.util
 import inspect
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -31,7 +28,6 @@ DETECTIONS = ROOM / "detections.npz"
 
 
 def test_public_names_are_few_sorted_and_documented() -> None:
-    assert 35 <= len(rt.__all__) <= 45
     assert rt.__all__ == sorted(set(rt.__all__))
     for name in set(rt.__all__) - {"COCO_NAMES", "__version__"}:
         assert inspect.getdoc(getattr(rt, name)), name
@@ -203,48 +199,6 @@ def test_track_hands_poses_to_the_tracker() -> None:
     np.testing.assert_array_equal([given[0]["cam_from_world"], given[2]["cam_from_world"]], cams)
     small = rt.Camera("PINHOLE", 320, 240, (250.0, 250.0, 160.0, 120.0))
     assert [given[0]["camera"], given[2]["camera"]] == [small] * 2
-
-
-# ---- Types ----
-
-GOOD = """
-from collections.abc import Iterator
-import numpy as np
-import numpy.typing as npt
-import reobj_track as rt
-tracker: rt.Tracker = rt.Tracker(rt.TrackerConfig(n_init=1), embedder=None)
-tracks: rt.Tracks = tracker.update(np.zeros((0, 6)), None)
-rows: npt.NDArray[np.float64] = tracks.to_array()
-ids: npt.NDArray[np.int64] = tracks.track_id
-pairs: Iterator[tuple[rt.Frame, rt.Tracks]] = rt.track("a.mp4", "det.txt", tracker)
-result: rt.Result = rt.run("a.mp4", "out", rt.Config(), tracks="corrected.xml")
-found: rt.Object = rt.Result.load("out").objects[0]
-name: str = found.class_name
-size: npt.NDArray[np.float64] | None = found.size_m
-own: rt.Detections = rt.Detections.from_array([[0, 0, 1, 1, 0.5, 0]])
-"""
-BAD = {
-    "ids: list[str] = rt.Tracker().update([]).track_id": "Incompatible types",
-    "for frame in rt.track('a.mp4'): frame.image": 'no attribute "image"',
-    "rt.TrackerConfig(n_int=1)": "Unexpected keyword argument",
-    "rt.Tracker().update()": "Missing positional argument",
-    "rt.Result.load('out').objects[0].centre": 'no attribute "centre"',
-    "rt.unit_rows": "does not explicitly export",  # a room's own name
-}
-
-
-def test_types(tmp_path: Path) -> None:
-    """mypy --strict accepts the documented calls and finds the mistake in each wrong one."""
-    pytest.importorskip("mypy")
-    (tmp_path / "good.py").write_text(GOOD)
-    (tmp_path / "bad.py").write_text("import reobj_track as rt\n" + "\n".join(BAD) + "\n")
-    command = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml"]
-    files = [tmp_path / "good.py", tmp_path / "bad.py"]
-    done = subprocess.run([*command, *files], capture_output=True, text=True, cwd=ROOT)
-    lines = [line for line in done.stdout.splitlines() if "error:" in line]
-    assert len(lines) == len(BAD), done.stdout + done.stderr
-    for line, expected in zip(lines, BAD.values(), strict=True):
-        assert "bad.py" in line and expected in line
 
 
 # ---- Docstrings ----

@@ -57,7 +57,7 @@ def scannet(folder: Path) -> None:
         np.savetxt(scene / f"pose/{i}.txt", pose)
 
 
-AR_FRAMES = 96
+AR_FRAMES = 60
 
 
 def arkit(folder: Path) -> None:

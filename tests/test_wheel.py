@@ -50,6 +50,32 @@ SAID = (
 )
 
 
+GOOD = """
+from collections.abc import Iterator
+import numpy as np
+import numpy.typing as npt
+import reobj_track as rt
+tracker: rt.Tracker = rt.Tracker(rt.TrackerConfig(n_init=1), embedder=None)
+tracks: rt.Tracks = tracker.update(np.zeros((0, 6)), None)
+rows: npt.NDArray[np.float64] = tracks.to_array()
+ids: npt.NDArray[np.int64] = tracks.track_id
+pairs: Iterator[tuple[rt.Frame, rt.Tracks]] = rt.track("a.mp4", "det.txt", tracker)
+result: rt.Result = rt.run("a.mp4", "out", rt.Config(), tracks="corrected.xml")
+found: rt.Object = rt.Result.load("out").objects[0]
+name: str = found.class_name
+size: npt.NDArray[np.float64] | None = found.size_m
+own: rt.Detections = rt.Detections.from_array([[0, 0, 1, 1, 0.5, 0]])
+"""
+BAD = {
+    "ids: list[str] = rt.Tracker().update([]).track_id": "Incompatible types",
+    "for frame in rt.track('a.mp4'): frame.image": 'no attribute "image"',
+    "rt.TrackerConfig(n_int=1)": "Unexpected keyword argument",
+    "rt.Tracker().update()": "Missing positional argument",
+    "rt.Result.load('out').objects[0].centre": 'no attribute "centre"',
+    "rt.unit_rows": "does not explicitly export",  # a name of its own module
+}
+
+
 def call(*command: str | Path, cwd: Path) -> str:
     """Run a command away from the source tree, with no weights but those of the wheel."""
     nowhere = str(cwd / "empty")
@@ -117,11 +143,20 @@ def test_the_wheel_is_what_is_used_and_holds_what_the_repository_does(
 
 
 def test_a_users_program_sees_the_types(installed: Path, tmp_path: Path) -> None:
+    """Types of results; the documented calls are accepted, and each mistake is found."""
     pytest.importorskip("mypy", reason="the types cannot be checked without mypy")
     (tmp_path / "program.py").write_text(PROGRAM)
+    (tmp_path / "good.py").write_text(GOOD)
+    (tmp_path / "wrong.py").write_text("import reobj_track as rt\n" + "\n".join(BAD) + "\n")
     python = program(installed, "python")
     mypy = (sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary")
-    said = call(*mypy, "--python-executable", python, "program.py", cwd=tmp_path).splitlines()
-    assert len(said) == len(SAID), said
-    for line, expected in zip(said, SAID, strict=True):
+    said = call(
+        *mypy, "--python-executable", python, "program.py", "good.py", "wrong.py", cwd=tmp_path
+    ).splitlines()
+    assert len(said) == len(SAID) + len(BAD), said
+    wrong = [line for line in said if line.startswith("wrong.py")]
+    for line, expected in zip(wrong, BAD.values(), strict=True):
+        assert expected in line
+    right = [line for line in said if line not in wrong]
+    for line, expected in zip(right, SAID, strict=True):
         assert re.fullmatch(rf"program\.py:{expected}", line), line
