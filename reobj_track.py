@@ -47,6 +47,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,7 @@ from reobj.sources.looked import Intervals
 from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
+from reobj.state import restore_state, state_arrays
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -365,7 +367,7 @@ class TrackState:
 
 # ---- Tracker -----------------------------------------------------------------------------------
 
-STATE_VERSION = 7  # of the files of Tracker.save
+STATE_VERSION = 8  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (docs/tracking.md).
@@ -393,6 +395,72 @@ OUT_OF_VIEW = -1e6  # px, where tracks wait whose place is not in view
 PLACE_IN_VIEW = 0.5  # share of a projected box in the image from which a detection is expected
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameContext:
+    """One frame as `Tracker.update` got it: made once, passed to every step, never changed.
+
+    Attributes:
+        number: of the call, from 0. looked_at: whether the detector was run on this frame.
+        box: (D, 4) cx, cy, w, h of the detections. lazy: their embeddings, computed on request.
+        cam_from_world: (3, 4), None: no pose. img_from_world: (3, 4), None without pose or camera.
+        points: (N, 3) in world that this frame sees; None: none given.
+    """
+
+    number: int
+    looked_at: bool
+    image: Image | None
+    detections: Detections
+    box: Array
+    lazy: LazyEmbeddings
+    cam_from_world: Array | None
+    camera: Camera | None
+    points: Array | None
+
+    @property
+    def img_from_world(self) -> Array | None:
+        """Return K @ cam_from_world (3, 4)."""
+        if self.cam_from_world is None or self.camera is None:
+            return None
+        return np.asarray(self.camera.K @ self.cam_from_world)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Return width and height of the camera's image, px."""
+        return (0, 0) if self.camera is None else (self.camera.width, self.camera.height)
+
+
+@dataclass(slots=True)
+class TrackerState:
+    """All that changes from frame to frame: what `Tracker.save` writes is these fields.
+
+    Attributes:
+        frame_number: of the latest frame, -1 before the first.
+        looks: frames on which the detector was run, less one.
+        intervals: between frames with detections.
+        last_pose: (3, 4) cam_from_world of the frame before the latest, None: no pose.
+        component: of the trajectory, in whose world the latest frame lies.
+        maps: ellipsoids of the identities in the world of each component.
+        tracks: the live tracks. last_seen: (I,) frame of each identity's last detection.
+        identity_class: (I,) class of each identity.
+        reid_calibration: of views some time apart; match_calibration: of a track and a detection.
+    """
+
+    tracks: TrackState
+    last_seen: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    identity_class: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    frame_number: int = -1
+    looks: int = -1
+    next_tracklet: int = 1
+    component: int = 0
+    last_pose: Array | None = None
+    intervals: Intervals = field(default_factory=Intervals)
+    maps: list[EllipsoidMap] = field(default_factory=lambda: [EllipsoidMap()])
+    gallery: Gallery = field(default_factory=Gallery)
+    reid_calibration: SimilarityCalibration = field(default_factory=SimilarityCalibration)
+    match_calibration: SimilarityCalibration = field(default_factory=SimilarityCalibration)
+    camera_motion: CameraMotion = field(default_factory=CameraMotion)
+
+
 class Tracker:
     """Give every detection of a video the identity of its physical object.
 
@@ -401,8 +469,6 @@ class Tracker:
     another object. An object that was away is recognised by
     appearance, whatever its place in the image, unless two identities fit about equally well: then
     it gets a new identity (the linker of `run` decides later, with 3D evidence).
-
-    (More than 20 methods: each is a named step of `update`, and all share the state of the tracks.)
 
     Args:
         config: thresholds; the defaults serve video of static scenes from 5 to 60 frames a second.
@@ -424,27 +490,10 @@ class Tracker:
     def reset(self) -> None:
         """Forget everything: the next video starts with identity 1."""
         none = np.empty(0, np.int64)
-        self.frame_number = -1
-        self.looked = False  # whether the detector was run on the latest frame
-        self._looks = -1  # frames that it was run on, but for the first
-        self._intervals = Intervals()  # of the frames with detections
-        self.state = TrackState.spawn(np.empty((0, 4)), none, 0, self.config)
-        self.gallery = Gallery()
-        self.reid_calibration = SimilarityCalibration()  # of views some time apart
-        self.match_calibration = SimilarityCalibration()  # of a track and a detection
-        self.part = 0  # of the cameras' path, in whose world the latest frame lies
-        self.maps = [EllipsoidMap()]  # places of the identities in the world of each part
-        self.last_seen = none  # (I,) frame of each identity's last detection
-        self.identity_class = none  # (I,)
-        self._next_tracklet = 1
-        self._camera_motion = CameraMotion()
-        self._last_pose: Array | None = None  # of the frame before the latest
-        self._pose: Array | None = None  # (3, 4) cam_from_world of the latest frame
-        self._view: Array | None = None  # (3, 4) img_from_world of the latest frame
-        self._image_size = (0, 0)
-        self._latest: Tracks | None = None
-        self.detections = Detections.empty()
-        self._lazy: LazyEmbeddings | None = None  # of the latest frame
+        tracks = TrackState.spawn(np.empty((0, 4)), none, 0, self.config)
+        self.state = TrackerState(tracks)
+        self._frame: FrameContext | None = None  # the latest
+        self._latest = Tracks.empty()
 
     def update(
         self,
@@ -479,44 +528,57 @@ class Tracker:
         Raises:
             ReobjError: something that cannot be meant; the tracker stays as it was.
         """
+        state = self.state
         run = detections is not None and looked is not False
         detections = as_detections(detections) if run else Detections.empty()
-        frame = None if frame is None else as_frame(frame, detections.masks)
-        given = as_embeddings(embeddings, len(detections), self.state.embedding.shape[1])
+        image = None if frame is None else as_frame(frame, detections.masks)
+        given = as_embeddings(embeddings, len(detections), state.tracks.embedding.shape[1])
         pose = checked_pose(cam_from_world, camera, points, part)
-        self.frame_number += 1
+        state.frame_number += 1
         if len(detections):
-            self._intervals.add(self.frame_number, len(detections))
+            state.intervals.add(state.frame_number, len(detections))
         elif run and looked is None:
-            run = self._intervals.looked_at(self.frame_number)
-        self.looked, self._looks = run, self._looks + run
+            run = state.intervals.looked_at(state.frame_number)
+        state.looks += run
         weight = self.config.foreground_weight
-        lazy = LazyEmbeddings(given, self.embedder, frame, detections, weight)
-        self._enter(part)
-        self._predict(frame, pose, camera)
-        if not run:
-            self._lazy, self._latest, self.detections = None, Tracks.empty(), detections
-            return self._latest
+        lazy = LazyEmbeddings(given, self.embedder, image, detections, weight)
         box = cxcywh_from_xyxy(detections.xyxy)
-        track_of = self._associate(detections, box, lazy)  # (D,) row of the track's state, or -1
-        self._update_states(detections, box, track_of)
-        track_of = self._spawn(detections, box, track_of)
-        if points is not None and self._pose is not None and camera is not None:
-            self._note_spans(detections, track_of, points, self._pose, camera.K)
-        self._embed(detections, track_of, lazy)
-        track_of = self._confirm(track_of)
-        self._lazy, self._latest = lazy, self._report(detections, track_of)
-        self.detections = detections
+        context = FrameContext(
+            state.frame_number, run, image, detections, box, lazy, pose, camera, points
+        )
+        self._enter(part)
+        self._predict(context)
+        self._frame = context
+        self._latest = self._track(context) if run else Tracks.empty()
+        return self._latest[self._latest.track_id > 0]
+
+    def _track(self, frame: FrameContext) -> Tracks:
+        """Match, start, embed, confirm and end tracks; returns those of this frame."""
+        track_of = self._associate(frame)  # (D,) row of the tracks' state, or -1
+        self._update_states(frame, track_of)
+        track_of = self._spawn(frame, track_of)
+        self._note_spans(frame, track_of)
+        self._embed(frame, track_of)
+        track_of = self._confirm(frame, track_of)
+        tracks = self._report(frame, track_of)
         self._retire()
-        confirmed = self._latest[self._latest.track_id > 0]
-        if self._view is not None:
-            self._add_views(confirmed, self._view)
-        return confirmed
+        self._add_views(frame, tracks[tracks.track_id > 0])
+        return tracks
 
     @property
     def latest(self) -> Tracks:
         """Tracks of the latest frame with the tentative ones too, of track_id 0."""
-        return Tracks.empty() if self._latest is None else self._latest
+        return self._latest
+
+    @property
+    def looked(self) -> bool:
+        """Whether the detector was run on the latest frame."""
+        return self._frame is not None and self._frame.looked_at
+
+    @property
+    def detections(self) -> Detections:
+        """Detections of the latest frame."""
+        return Detections.empty() if self._frame is None else self._frame.detections
 
     def predicted(self, frames: int = 5) -> Tracks:
         """Return the boxes predicted in the latest frame for identities not detected in it.
@@ -529,17 +591,17 @@ class Tracker:
         Returns:
             Tracks of score 0 and detection_index -1, as filled gaps are.
         """
-        state = self.state
-        absent = (state.missed > 0) | (not self.looked)
-        t = np.flatnonzero((state.identity >= 0) & absent & (state.missed <= frames))
-        t = t[state.mean[t, 0, 0] > OUT_OF_VIEW / 2]
-        box, none = xyxy_from_cxcywh(state.mean[t, :, 0]), np.full(len(t), -1)
-        ids = (np.full(len(t), self.frame_number), state.identity[t] + 1, state.tracklet[t])
-        return Tracks(*ids, box, np.zeros(len(t)), state.votes[t].argmax(1), none)
+        tracks = self.state.tracks
+        absent = (tracks.missed > 0) | (not self.looked)
+        t = np.flatnonzero((tracks.identity >= 0) & absent & (tracks.missed <= frames))
+        t = t[tracks.mean[t, 0, 0] > OUT_OF_VIEW / 2]
+        box, none = xyxy_from_cxcywh(tracks.mean[t, :, 0]), np.full(len(t), -1)
+        ids = (np.full(len(t), self.state.frame_number), tracks.identity[t] + 1, tracks.tracklet[t])
+        return Tracks(*ids, box, np.zeros(len(t)), tracks.votes[t].argmax(1), none)
 
     def latest_embeddings(self) -> tuple[IntArray, Floats]:
         """Return which detections of the latest frame were embedded (n,), and their rows (n, E)."""
-        lazy = self._lazy
+        lazy = None if self._frame is None else self._frame.lazy
         if lazy is None or lazy.rows is None:
             return np.empty(0, np.int64), np.empty((0, 0), np.float32)
         return np.flatnonzero(lazy.done), lazy.rows[lazy.done]
@@ -547,41 +609,45 @@ class Tracker:
     @property
     def places(self) -> EllipsoidMap:
         """Places of the identities in the world of the latest frame."""
-        return self.maps[self.part]
+        return self.state.maps[self.state.component]
 
-    def _enter(self, part: int) -> None:
-        """Go on in the world of another part of the path, in which no track has a place yet."""
-        if part != self.part:
-            self.part, self._last_pose, self.state.ends[:] = part, None, np.nan
-            self.maps += [EllipsoidMap() for _ in range(part + 1 - len(self.maps))]
+    def _enter(self, component: int) -> None:
+        """Enter the world of another component of the trajectory; no track has a position there."""
+        state = self.state
+        if component != state.component:
+            state.component = component
+            state.last_pose = None
+            state.tracks.ends[:] = np.nan
+            state.maps += [EllipsoidMap() for _ in range(component + 1 - len(state.maps))]
 
-    def _predict(self, frame: Image | None, pose: Array | None, camera: Camera | None) -> None:
+    def _predict(self, frame: FrameContext) -> None:
         """Predict all tracks, then move them by the camera's own motion.
 
         That is what the image shows, or without an image the known rotation; with a pose, tracks
         whose place in 3D is known go where that is seen.
         """
-        state = self.state
-        state.mean, state.cov = kalman_predict(state.mean, state.cov, self.config)
-        size = state.mean[:, 2:, 0]
+        state, tracks = self.state, self.state.tracks
+        tracks.mean, tracks.cov = kalman_predict(tracks.mean, tracks.cov, self.config)
+        size = tracks.mean[:, 2:, 0]
         np.maximum(size, 1.0, out=size)  # stays positive
-        state.reach[:] = 0
-        self._view, self._pose, before = None, pose, state.mean[..., 0].copy()
-        if frame is not None and self.config.camera_motion:
-            motion = self._camera_motion(frame)
-            state.mean, state.cov = warp_states(state.mean, state.cov, motion)
-            state.mean[:, :2, 0] += self._camera_motion.parallax(before[:, :2])
+        tracks.reach[:] = 0
+        before = tracks.mean[..., 0].copy()
+        pose, camera = frame.cam_from_world, frame.camera
+        if frame.image is not None and self.config.camera_motion:
+            motion = state.camera_motion(frame.image)
+            tracks.mean, tracks.cov = warp_states(tracks.mean, tracks.cov, motion)
+            tracks.mean[:, :2, 0] += state.camera_motion.parallax(before[:, :2])
             if pose is None:
-                self._last_pose = None  # the tracks are no longer where it saw them
-        elif pose is not None and camera is not None and self._last_pose is not None:
-            rotation = pose[:, :3] @ self._last_pose[:, :3].T
+                state.last_pose = None  # the tracks are no longer where it saw them
+        elif pose is not None and camera is not None and state.last_pose is not None:
+            rotation = pose[:, :3] @ state.last_pose[:, :3].T
             turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for what is far
-            state.mean, state.cov = warp_states(state.mean, state.cov, turn)
-        in_view = np.ones(len(state.mean), bool)
+            tracks.mean, tracks.cov = warp_states(tracks.mean, tracks.cov, turn)
+        in_view = np.ones(len(tracks.mean), bool)
         if pose is not None and camera is not None:
             in_view = self._follow_places(pose, camera, before)
-        if self.looked:
-            state.missed += in_view | (state.missed == 0)
+        if frame.looked_at:
+            tracks.missed += in_view | (tracks.missed == 0)
 
     def _follow_places(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
         """Move tracks of known place as the image of their ellipsoid or of their span does.
@@ -591,58 +657,63 @@ class Tracker:
         Returns:
             (T,) True where a detection is to be expected.
         """
-        state, K = self.state, camera.K
-        self._image_size = size = (camera.width, camera.height)
-        self._view = view = K @ cam_from_world  # (3, 4)
-        last, self._last_pose = self._last_pose, cam_from_world
-        known = rows_of(self.places.known, state.identity, False)
+        tracks, K = self.state.tracks, camera.K
+        size = (camera.width, camera.height)
+        view = K @ cam_from_world  # (3, 4)
+        last, self.state.last_pose = self.state.last_pose, cam_from_world
+        known = rows_of(self.places.known, tracks.identity, False)
         inside = np.isfinite(self.places.project(view, size, PLACE_IN_VIEW)[:, 0])  # (I,)
-        in_view = ~known | rows_of(inside, state.identity, False)
-        tracked = (state.identity, state.ends, state.size, K, size)
+        in_view = ~known | rows_of(inside, tracks.identity, False)
+        tracked = (tracks.identity, tracks.ends, tracks.size, K, size)
         now, reach = self.places.tracks_seen(cam_from_world, *tracked)
-        located = known | np.isfinite(state.ends[:, 0, 0])
+        located = known | np.isfinite(tracks.ends[:, 0, 0])
         followed = np.zeros(len(known), bool)
         if last is not None:
             before, reach_before = self.places.tracks_seen(last, *tracked)
-            followed = (state.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
+            followed = (tracks.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
             shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
             moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
-            state.mean[followed, :, 0] = moved[followed]  # (T, 4)
-            state.reach[followed] = np.abs(reach - reach_before)[followed]
-        lost = located & (state.missed > 0)
+            tracks.mean[followed, :, 0] = moved[followed]  # (T, 4)
+            tracks.reach[followed] = np.abs(reach - reach_before)[followed]
+        lost = located & (tracks.missed > 0)
         shown = (in_view & np.isfinite(now[:, 0]))[:, None]
         where = np.where(shown, now, [OUT_OF_VIEW, OUT_OF_VIEW, 1, 1])  # matches nothing
-        again = TrackState.spawn(where[lost], state.tracklet[lost], 0, self.config)
-        state.mean[lost], state.cov[lost] = again.mean, again.cov
-        state.reach[lost] = np.abs(reach[lost])
-        state.cov[:, :2, 0] += state.reach**2
+        again = TrackState.spawn(where[lost], tracks.tracklet[lost], 0, self.config)
+        tracks.mean[lost], tracks.cov[lost] = again.mean, again.cov
+        tracks.reach[lost] = np.abs(reach[lost])
+        tracks.cov[:, :2, 0] += tracks.reach**2
         return np.asarray(in_view, bool)
 
-    def _note_spans(
-        self, detections: Detections, track_of: IntArray, points: Array, pose: Array, K: Array
-    ) -> None:
+    def _note_spans(self, frame: FrameContext, track_of: IntArray) -> None:
         """Note where the tracks seen now are, by the points in their boxes.
 
         Identities with an ellipsoid do without.
         """
-        state = self.state
+        pose, camera, points = frame.cam_from_world, frame.camera, frame.points
+        if points is None or pose is None or camera is None:
+            return
+        tracks = self.state.tracks
         rows = np.flatnonzero(track_of >= 0)
-        rows = rows[~rows_of(self.places.known, state.identity[track_of[rows]], False)]
-        spans = spans_of_boxes(detections.xyxy[rows], points, pose, K)
-        state.ends[track_of[rows]], state.size[track_of[rows]] = spans
+        rows = rows[~rows_of(self.places.known, tracks.identity[track_of[rows]], False)]
+        ends, size = spans_of_boxes(frame.detections.xyxy[rows], points, pose, camera.K)
+        tracks.ends[track_of[rows]] = ends
+        tracks.size[track_of[rows]] = size
 
-    def _add_views(self, confirmed: Tracks, view: Array) -> None:
+    def _add_views(self, frame: FrameContext, confirmed: Tracks) -> None:
         """Keep the boxes of this frame as views of their objects, and fit places now and then.
 
         At once where at least half of them are due, which is where the camera takes wide steps.
         """
+        view = frame.img_from_world
+        if view is None:
+            return
         identity = confirmed.track_id - 1
-        self.places.add(self.frame_number, identity, confirmed.xyxy, view)
+        self.places.add(frame.number, identity, confirmed.xyxy, view)
         due = self.places.due
-        if self._looks % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
-            self.places.refit(self._image_size)
+        if self.state.looks % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
+            self.places.refit(frame.image_size)
 
-    def _associate(self, detections: Detections, box: Array, lazy: LazyEmbeddings) -> IntArray:
+    def _associate(self, frame: FrameContext) -> IntArray:
         """Match detections to tracks: high scores by motion, then the rest by overlap.
 
         Both times an ambiguous match (a rival costs little more) and a weak one (the detection may
@@ -651,17 +722,21 @@ class Tracker:
         Returns:
             (D,) row of the track's state, or -1.
         """
-        config, state = self.config, self.state
-        pairs = self._gate(detections, box, lazy.available)
+        config, tracks = self.config, self.state.tracks
+        detections, lazy = frame.detections, frame.lazy
+        pairs = self._gate(frame)
         t, d = pairs.track, pairs.detection
-        score, priority = detections.score[d], self._priority_cost()[t]
+        score = detections.score[d]
+        priority = self._priority_cost()[t]
         first = score >= config.high_score  # (M,), as all below
-        weak = (pairs.cost + priority > WEAK_MATCH_COST) & (state.embedded[t] >= 0)
+        weak = (pairs.cost + priority > WEAK_MATCH_COST) & (tracks.embedded[t] >= 0)
         ambiguous, rivals = ambiguous_pairs(pairs, first)
         agree = ambiguous | weak
         matched, refused = self._match(pairs, pairs.cost, priority, first, agree, rivals, lazy)
-        track_of, free = np.full(len(detections), -1), np.ones(len(state.mean), bool)
-        track_of[d[matched]], free[t[matched]] = t[matched], False
+        track_of = np.full(len(detections), -1)
+        track_of[d[matched]] = t[matched]
+        free = np.ones(len(tracks.mean), bool)
+        free[t[matched]] = False
         low = free[t] & (track_of[d] < 0) & (score >= config.low_score)
         second = low & ~refused & (pairs.iou >= LOW_IOU)
         if second.any():
@@ -670,36 +745,39 @@ class Tracker:
             track_of[d[matched]] = t[matched]
         return track_of
 
-    def _gate(self, detections: Detections, box: Array, has_appearance: bool) -> Pairs:
+    def _gate(self, frame: FrameContext) -> Pairs:
         """Compare tracks and detections by motion: which may belong together, and at what cost."""
-        state = self.state
-        track, reach = state.mean[..., 0].T, state.reach.T  # (4, T) cx, cy, w, h; (2, T)
-        variance = center_variance(state.mean, state.cov).T  # (2, T)
+        tracks, detections = self.state.tracks, frame.detections
+        track, reach = tracks.mean[..., 0].T, tracks.reach.T  # (4, T) cx, cy, w, h; (2, T)
+        variance = center_variance(tracks.mean, tracks.cov).T  # (2, T)
         gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
         t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
-        track, seen, reach = track.take(t, 1), box.T.take(d, 1), reach.take(t, 1)  # (4, M) ...
+        track, seen, reach = track.take(t, 1), frame.box.T.take(d, 1), reach.take(t, 1)  # (4, M)
         iou, share = overlap_within_reach(track, reach, seen)
         distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1)) / GATE_CHI2
         overlap = iou * share
-        same_class = state.votes.argmax(1)[t] == detections.class_id[d]
+        same_class = tracks.votes.argmax(1)[t] == detections.class_id[d]
         cost = (1 - DISTANCE_WEIGHT) * (1 - overlap)
         cost += DISTANCE_WEIGHT * np.minimum(distance, 1) + CLASS_COST * ~same_class
         good = ((distance < 1) | (iou > GATE_IOU)) & (same_class | (overlap > LOW_IOU))
-        if not has_appearance:
+        if not frame.lazy.available:
             growth = np.log(track[2:] / np.maximum(seen[2:], 1e-3))  # (2, M)
             good &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(0) & (iou >= MOTION_ONLY_IOU)
         return Pairs(*(x[good] for x in (t, d, cost, iou, share, same_class)))
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
-        age = np.minimum(np.maximum((self.state.missed - 1) / AGE_FRAMES, 0), 1)
-        return np.asarray(AGE_COST * age + UNCONFIRMED_COST * (self.state.identity < 0))
+        tracks = self.state.tracks
+        age = np.minimum(np.maximum((tracks.missed - 1) / AGE_FRAMES, 0), 1)
+        return np.asarray(AGE_COST * age + UNCONFIRMED_COST * (tracks.identity < 0))
 
     def _match(
         self, pairs: Pairs, cost: Array, priority: Array | float, possible: BoolArray,
         must_agree: BoolArray, rivals: BoolArray, lazy: LazyEmbeddings,
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
         """Assign at least cost; compare the appearance where it must agree; assign again.
+
+        Ends, as every round compares at least one detection that was not compared before.
 
         Args:
             cost, possible: (M,). priority: added to the cost. must_agree: (M,) pairs whose
@@ -709,14 +787,16 @@ class Tracker:
         """
         t, d = pairs.track, pairs.detection
         refused = np.zeros(len(cost), bool)
-        compared = np.full(len(lazy.done), not (lazy.available and self.state.embedding.shape[1]))
+        tracks = self.state.tracks
+        compared = np.full(len(lazy.done), not (lazy.available and tracks.embedding.shape[1]))
         while True:
             good = np.flatnonzero(possible & ~refused & (cost < MAX_COST))
             matched = good[assign(t[good], d[good], (cost + priority)[good])]
             ask = matched[must_agree[matched] & ~compared[d[matched]]]
             if not len(ask):
                 return matched, refused
-            asked_by, asked = np.zeros(len(self.state.mean), bool), np.zeros_like(compared)
+            asked_by = np.zeros(len(tracks.mean), bool)
+            asked = np.zeros_like(compared)
             asked_by[t[ask]] = True
             asked[d[ask]] = asked[d[rivals & must_agree & asked_by[t]]] = True
             asked &= ~compared
@@ -734,143 +814,153 @@ class Tracker:
         Returns:
             cost (M,), and pairs (M,) that boxes and appearance together speak against.
         """
-        rows, some = np.flatnonzero(asked), np.flatnonzero(asked[pairs.detection])
-        cosines = part_cosines(self.state.embedding, lazy.get(rows), lazy.foreground_width)
-        t, column = pairs.track[some], np.searchsorted(rows, pairs.detection[some])
-        known = self.state.embedded[t] >= 0
-        logit = self.match_calibration.logit(*(part[t, column] for part in cosines))
-        unlike, weight = 1 / (1 + np.exp(np.where(known, logit, 0))), self.config.appearance_weight
-        against, cost = np.zeros(len(cost), bool), cost.copy()
+        rows = np.flatnonzero(asked)
+        some = np.flatnonzero(asked[pairs.detection])
+        tracks = self.state.tracks
+        cosines = part_cosines(tracks.embedding, lazy.get(rows), lazy.foreground_width)
+        t = pairs.track[some]
+        column = np.searchsorted(rows, pairs.detection[some])
+        known = tracks.embedded[t] >= 0
+        logit = self.state.match_calibration.logit(*(part[t, column] for part in cosines))
+        unlike = 1 / (1 + np.exp(np.where(known, logit, 0)))
+        weight = self.config.appearance_weight
+        against = np.zeros(len(cost), bool)
+        cost = cost.copy()
         cost[some] = (1 - weight) * cost[some] + weight * unlike
         overlap = pairs.iou[some] - CLASS_COST * ~pairs.same_class[some]
         evidence = pairs.share[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
         against[some] = known & (logit + evidence < 0)
         return cost, against
 
-    def _update_states(self, detections: Detections, box: Array, track_of: IntArray) -> None:
+    def _update_states(self, frame: FrameContext, track_of: IntArray) -> None:
         """Correct the matched tracks; boxes of low score are less certain."""
         rows = np.flatnonzero(track_of >= 0)
-        t, state = track_of[rows], self.state
-        mean, score = state.mean[t], detections.score[rows]
+        t, tracks = track_of[rows], self.state.tracks
+        mean, score = tracks.mean[t], frame.detections.score[rows]
         growth = (np.maximum(1 - score, 0.05) / 0.2) ** SCORE_NOISE  # (n,) 1 at .8
         noise = STD_MEASURE * _noise_scale(mean) * growth[:, None]
-        state.mean[t], state.cov[t] = kalman_update(mean, state.cov[t], box[rows], noise)
-        self._count(detections, rows, t)
+        tracks.mean[t], tracks.cov[t] = kalman_update(mean, tracks.cov[t], frame.box[rows], noise)
+        self._count(frame.detections, rows, t)
 
     def _count(self, detections: Detections, rows: IntArray, t: IntArray) -> None:
         """Count a detection for each of the tracks t, with its vote for a class."""
-        state = self.state
-        state.missed[t] = 0
+        tracks = self.state.tracks
+        tracks.missed[t] = 0
         classes = detections.class_id[rows]
-        state.votes = widen(state.votes, np.empty((0, classes.max(initial=0) + 1)))
-        state.votes[t, classes] += detections.score[rows]
+        tracks.votes = widen(tracks.votes, np.empty((0, classes.max(initial=0) + 1)))
+        tracks.votes[t, classes] += detections.score[rows]
 
-    def _spawn(self, detections: Detections, box: Array, track_of: IntArray) -> IntArray:
+    def _spawn(self, frame: FrameContext, track_of: IntArray) -> IntArray:
         """Start a tentative track at every unmatched detection of sufficient score."""
+        state, detections = self.state, frame.detections
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
         if not len(rows):
             return track_of
-        ids = self._next_tracklet + np.arange(len(rows))
-        self._next_tracklet += len(rows)
-        track_of[rows] = len(self.state.mean) + np.arange(len(rows))
-        spawned = TrackState.spawn(box[rows], ids, self.frame_number, self.config)
-        self.state = self.state.append(spawned)
+        ids = state.next_tracklet + np.arange(len(rows))
+        state.next_tracklet += len(rows)
+        track_of[rows] = len(state.tracks.mean) + np.arange(len(rows))
+        spawned = TrackState.spawn(frame.box[rows], ids, frame.number, self.config)
+        state.tracks = state.tracks.append(spawned)
         self._count(detections, rows, track_of[rows])
         return track_of
 
-    def _embed(self, detections: Detections, track_of: IntArray, lazy: LazyEmbeddings) -> None:
+    def _embed(self, frame: FrameContext, track_of: IntArray) -> None:
         """Embed tracks before their confirmation and now and then, and learn what is similar.
 
         Embeddings that ambiguous matches asked for calibrate, but do not enter a track's mean:
         their box may be half of a neighbour.
         """
+        lazy = frame.lazy
         if not lazy.available:
             return
-        state = self.state
+        tracks = self.state.tracks
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
-        soon = (state.identity[t] < 0) & (state.evidence[t] >= self.config.n_init - 1)
-        due = soon | (self._looks % max(1, self.config.embed_every) == 0)  # all in one pass
-        self._calibrate_matches(detections, track_of, rows[lazy.done[rows] | due], lazy)
+        soon = (tracks.identity[t] < 0) & (tracks.evidence[t] >= self.config.n_init - 1)
+        due = soon | (self.state.looks % max(1, self.config.embed_every) == 0)  # all in one pass
+        self._calibrate_matches(frame, track_of, rows[lazy.done[rows] | due])
         rows = rows[due]
         t = track_of[rows]
         if not len(rows):
             return
         embedding = lazy.get(rows)  # (n, E)
-        self.gallery.foreground_width = lazy.foreground_width
-        state.embedding = widen(state.embedding, embedding)
-        known = state.embedded[t] >= 0
+        self.state.gallery.foreground_width = lazy.foreground_width
+        tracks.embedding = widen(tracks.embedding, embedding)
+        known = tracks.embedded[t] >= 0
         keep = np.where(known, EMBEDDING_MOMENTUM, 0.0)[:, None]
-        state.embedding[t] = unit_rows(keep * state.embedding[t] + (1 - keep) * embedding)
-        state.embedded[t] = self.frame_number
-        old = np.flatnonzero(state.identity[t] >= 0)  # those with an identity
+        tracks.embedding[t] = unit_rows(keep * tracks.embedding[t] + (1 - keep) * embedding)
+        tracks.embedded[t] = frame.number
+        old = np.flatnonzero(tracks.identity[t] >= 0)  # those with an identity
         if len(old):
-            self._add_to_gallery(embedding[old], t[old], detections.class_id[rows[old]])
+            class_id = frame.detections.class_id[rows[old]]
+            self._add_to_gallery(frame, embedding[old], t[old], class_id)
 
-    def _calibrate_matches(
-        self, detections: Detections, track_of: IntArray, rows: IntArray, lazy: LazyEmbeddings
-    ) -> None:
+    def _calibrate_matches(self, frame: FrameContext, track_of: IntArray, rows: IntArray) -> None:
         """Show the calibration of matches every track with its own and the others' detections."""
-        state = self.state
-        rows = rows[(state.embedded[track_of[rows]] >= 0) & (state.identity[track_of[rows]] >= 0)]
+        tracks, lazy = self.state.tracks, frame.lazy
+        rows = rows[(tracks.embedded[track_of[rows]] >= 0) & (tracks.identity[track_of[rows]] >= 0)]
         if len(rows):
-            own = state.embedding[track_of[rows]]
+            own = tracks.embedding[track_of[rows]]
             parts = part_cosines(own, lazy.get(rows), lazy.foreground_width)  # (n, n) each
-            self.match_calibration.add_frame(*parts, detections.class_id[rows])
+            self.state.match_calibration.add_frame(*parts, frame.detections.class_id[rows])
 
-    def _add_to_gallery(self, embedding: Floats, t: IntArray, class_id: IntArray) -> None:
+    def _add_to_gallery(
+        self, frame: FrameContext, embedding: Floats, t: IntArray, class_id: IntArray
+    ) -> None:
         """Add embeddings (n, E) of tracks t to the gallery, and calibrate with its first views."""
-        identity, gallery = self.state.identity[t], self.gallery
+        state = self.state
+        identity, gallery = state.tracks.identity[t], state.gallery
         if len(gallery.count):
-            gallery.reserve(len(self.last_seen), embedding.shape[1])
+            gallery.reserve(len(state.last_seen), embedding.shape[1])
             first = gallery.rows[identity, 0] * (gallery.count[identity, None] > 1)
             parts = part_cosines(embedding, first, gallery.foreground_width)
-            self.reid_calibration.add_frame(*parts, class_id)
-        gallery.add(identity, embedding, self._viewing_rays(t))
+            state.reid_calibration.add_frame(*parts, class_id)
+        gallery.add(identity, embedding, self._viewing_rays(frame, t))
 
-    def _viewing_rays(self, t: IntArray) -> Array:
-        """Return unit vectors (n, 3) in which tracks are seen in the world of part 0, else NaN."""
-        if self._view is None or self.part:
+    def _viewing_rays(self, frame: FrameContext, t: IntArray) -> Array:
+        """Return viewing directions (n, 3) of tracks in the world of component 0, else NaN."""
+        view = frame.img_from_world
+        if view is None or self.state.component:
             return np.full((len(t), 3), np.nan)
-        return viewing_rays(xyxy_from_cxcywh(self.state.mean[t, :, 0]), self._view)
+        return viewing_rays(xyxy_from_cxcywh(self.state.tracks.mean[t, :, 0]), view)
 
-    def _confirm(self, track_of: IntArray) -> IntArray:
+    def _confirm(self, frame: FrameContext, track_of: IntArray) -> IntArray:
         """Give tracks that were seen often enough an identity: a known one, or a new one.
 
         A return has an appearance to show for it and needs one detection less. Where nothing is
         known yet, one detection is enough (as in SORT's first frames).
         """
-        state = self.state
-        needed = self.config.n_init if len(self.last_seen) else 1
-        young = (state.identity < 0) & (state.missed == 0)
-        ready = np.flatnonzero(young & (state.evidence >= min(needed, self.config.n_init - 1)))
-        seen_now = (state.identity >= 0) & (state.missed == 0)
-        self.last_seen[state.identity[seen_now]] = self.frame_number
+        state, tracks = self.state, self.state.tracks
+        needed = self.config.n_init if len(state.last_seen) else 1
+        young = (tracks.identity < 0) & (tracks.missed == 0)
+        ready = np.flatnonzero(young & (tracks.evidence >= min(needed, self.config.n_init - 1)))
+        seen_now = (tracks.identity >= 0) & (tracks.missed == 0)
+        state.last_seen[tracks.identity[seen_now]] = frame.number
         if not len(ready):
             return track_of
-        returning = self._recognise(ready)  # (n,) identity or -1
-        sure = (returning >= 0) | (state.evidence[ready] >= needed)
+        returning = self._recognise(frame, ready)  # (n,) identity or -1
+        sure = (returning >= 0) | (tracks.evidence[ready] >= needed)
         ready, returning = ready[sure], returning[sure]
         fresh, back = ready[returning < 0], ready[returning >= 0]
-        ids = len(self.last_seen) + np.arange(len(fresh))
-        self.last_seen = np.append(self.last_seen, np.zeros(len(fresh), np.int64))
-        self.identity_class = np.append(self.identity_class, state.votes[fresh].argmax(1))
-        came_back = np.zeros(len(self.last_seen) + 1, bool)  # the last one: of no identity
+        ids = len(state.last_seen) + np.arange(len(fresh))
+        state.last_seen = np.append(state.last_seen, np.zeros(len(fresh), np.int64))
+        state.identity_class = np.append(state.identity_class, tracks.votes[fresh].argmax(1))
+        came_back = np.zeros(len(state.last_seen) + 1, bool)  # the last one: of no identity
         came_back[returning[returning >= 0]] = True
-        stale = came_back[state.identity]  # their tracks that still coast
-        state.identity[back], state.identity[fresh] = returning[returning >= 0], ids
-        self.last_seen[state.identity[ready]] = self.frame_number
-        seen = ready[state.embedded[ready] >= 0]
+        stale = came_back[tracks.identity]  # their tracks that still coast
+        tracks.identity[back], tracks.identity[fresh] = returning[returning >= 0], ids
+        state.last_seen[tracks.identity[ready]] = frame.number
+        seen = ready[tracks.embedded[ready] >= 0]
         if len(seen):
-            rays = self._viewing_rays(seen)
-            self.gallery.add(state.identity[seen], state.embedding[seen], rays)
+            rays = self._viewing_rays(frame, seen)
+            state.gallery.add(tracks.identity[seen], tracks.embedding[seen], rays)
         if not stale.any():
             return track_of
         renumber = np.append(np.where(stale, -1, np.cumsum(~stale) - 1), -1)
-        self.state = state.select(~stale)
+        state.tracks = tracks.select(~stale)
         return np.asarray(renumber[track_of], np.int64)
 
-    def _recognise(self, ready: IntArray) -> IntArray:
+    def _recognise(self, frame: FrameContext, ready: IntArray) -> IntArray:
         """Recognise known identities in tracks about to be confirmed, (n,) identity or -1.
 
         Appearance and place, where known, must make it probable, also in view of the other
@@ -879,23 +969,23 @@ class Tracker:
         An identity that was seen while the newcomer was already in view is another object, and so
         is one whose place in 3D is not here. Things that move have no place: no ellipsoid fits.
         """
-        state = self.state
+        state, tracks = self.state, self.state.tracks
         result = np.full(len(ready), -1, np.int64)
-        identity = np.flatnonzero(self.last_seen < state.first[ready].max(initial=0))  # (I,)
+        identity = np.flatnonzero(state.last_seen < tracks.first[ready].max(initial=0))  # (I,)
         if not len(identity) or not self.config.remember:
             return result
-        box = state.mean[ready, :, 0]
-        iou, share = self.places.overlap(box, identity, self._view, self._image_size)
+        box = tracks.mean[ready, :, 0]
+        iou, share = self.places.overlap(box, identity, frame.img_from_world, frame.image_size)
         at_known_place = iou * share > LOW_IOU
-        rays = self._viewing_rays(ready)
-        logit = self.reid_calibration.logit(
-            *self.gallery.parts(state.embedding[ready], identity, rays)
+        rays = self._viewing_rays(frame, ready)
+        logit = state.reid_calibration.logit(
+            *state.gallery.parts(tracks.embedding[ready], identity, rays)
         )
         logit[at_known_place & np.isinf(logit)] = 0  # no appearance: the place decides
         logit += np.where(at_known_place, share * (IOU_ODDS * iou - NO_OVERLAP_ODDS), 0)
-        logit -= JUMP_ODDS * self._far_from_own_track(ready, identity)
-        possible = self.last_seen[identity] < state.first[ready][:, None]
-        possible &= self.identity_class[identity] == state.votes[ready].argmax(1)[:, None]
+        logit -= JUMP_ODDS * self._far_from_own_track(frame, ready, identity)
+        possible = state.last_seen[identity] < tracks.first[ready][:, None]
+        possible &= state.identity_class[identity] == tracks.votes[ready].argmax(1)[:, None]
         logit[~possible | (iou == 0)] = -np.inf
         probability = match_probability(logit)
         good = probability >= self.config.return_probability
@@ -904,45 +994,53 @@ class Tracker:
         result[row[taken]] = identity[column[taken]]
         return result
 
-    def _far_from_own_track(self, ready: IntArray, identity: IntArray) -> BoolArray:
+    def _far_from_own_track(
+        self, frame: FrameContext, ready: IntArray, identity: IntArray
+    ) -> BoolArray:
         """Mark (n, I) where the identity's own track still coasts, far from the newcomer.
 
         Only of identities without a place in 3D: that tells more.
         """
-        state = self.state
-        row = np.full(len(self.last_seen), -1)
-        coasting = np.flatnonzero((state.identity >= 0) & (state.missed > 0))
-        row[state.identity[coasting]] = coasting
+        tracks = self.state.tracks
+        row = np.full(len(self.state.last_seen), -1)
+        coasting = np.flatnonzero((tracks.identity >= 0) & (tracks.missed > 0))
+        row[tracks.identity[coasting]] = coasting
         row = row[identity]  # (I,)
-        center, variance = state.mean[:, :2, 0].T, center_variance(state.mean, state.cov).T
+        center, variance = tracks.mean[:, :2, 0].T, center_variance(tracks.mean, tracks.cov).T
         away = center[:, ready, None] - center[:, None, row]  # (2, n, I)
         far = squared_mahalanobis(away, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
-        placed = rows_of(self.places.known, identity, False) & (self._view is not None)
+        placed = rows_of(self.places.known, identity, False) & (frame.img_from_world is not None)
         return np.asarray(far & (row >= 0) & ~placed, bool)
 
-    def _report(self, detections: Detections, track_of: IntArray) -> Tracks:
+    def _report(self, frame: FrameContext, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""
+        tracks, detections = self.state.tracks, frame.detections
         rows = np.flatnonzero(track_of >= 0)
-        t, frame = track_of[rows], np.full(len(rows), self.frame_number)
-        ids = (self.state.identity[t] + 1, self.state.tracklet[t])
-        xyxy, score, class_id = detections.xyxy, detections.score, detections.class_id
-        return Tracks(frame, *ids, xyxy[rows], score[rows], class_id[rows], rows)
+        t = track_of[rows]
+        return Tracks(
+            frame=np.full(len(rows), frame.number),
+            track_id=tracks.identity[t] + 1,
+            tracklet_id=tracks.tracklet[t],
+            xyxy=detections.xyxy[rows],
+            score=detections.score[rows],
+            class_id=detections.class_id[rows],
+            detection_index=rows,
+        )
 
     def _retire(self) -> None:
         """Drop tracks that coasted too long; their identities stay in the gallery."""
-        state, config = self.state, self.config
-        tentative = np.minimum(state.evidence, config.n_init)
-        stays = state.missed <= np.where(state.identity < 0, tentative, config.coast_frames)
+        tracks, config = self.state.tracks, self.config
+        tentative = np.minimum(tracks.evidence, config.n_init)
+        stays = tracks.missed <= np.where(tracks.identity < 0, tentative, config.coast_frames)
         if not stays.all():
-            self.state = state.select(stays)
+            self.state.tracks = tracks.select(stays)
 
     def save(self, path: str | Path) -> None:
         """Write the whole state, without the embedder, as an .npz file.
 
         What `load` reads goes on exactly as this tracker does.
         """
-        saved = {key: getattr(owner, name) for key, (owner, name) in self._saved().items()}
-        arrays = {key: value for key, value in saved.items() if value is not None}
+        arrays = state_arrays(self.state, "state")
         save_npz(Path(path), arrays, version=STATE_VERSION, config=dataclasses.asdict(self.config))
 
     @classmethod
@@ -953,32 +1051,13 @@ class Tracker:
             if facts["version"] != STATE_VERSION:
                 raise ValueError(f"version {facts['version']}, this is {STATE_VERSION}")
             tracker = cls(TrackerConfig(**facts["config"]), embedder)
-            tracker.maps = [EllipsoidMap() for name in arrays if name.endswith(".dual_q")]
-            for key, (owner, name) in tracker._saved().items():
-                old = getattr(owner, name)
-                if old is not None or key in arrays:
-                    setattr(owner, name, int(arrays[key]) if isinstance(old, int) else arrays[key])
+            restore_state(tracker.state, "state", arrays)
         except (KeyError, TypeError, ValueError) as error:
             raise ReobjError(
                 f"{path}: not the state of a tracker of this version ({error}); "
                 "expected a file written by Tracker.save"
             ) from error
         return tracker
-
-    def _saved(self) -> dict[str, tuple[Any, str]]:
-        """List all that changes from frame to frame: owner and attribute, by its name in files."""
-        own = "frame_number _looks last_seen identity_class _next_tracklet _last_pose part"
-        parts: dict[str, tuple[Any, Sequence[str]]] = {
-            "tracker": (self, own.split()),
-            "state": (self.state, [f.name for f in dataclasses.fields(TrackState)]),
-            "gallery": (self.gallery, Gallery.ARRAYS),
-            **{f"places{k or ''}": (m, EllipsoidMap.ARRAYS) for k, m in enumerate(self.maps)},
-            "reid_calibration": (self.reid_calibration, SimilarityCalibration.ARRAYS),
-            "match_calibration": (self.match_calibration, SimilarityCalibration.ARRAYS),
-            "camera_motion": (self._camera_motion, CameraMotion.ARRAYS),
-            "intervals": (self._intervals, [f.name for f in dataclasses.fields(Intervals)]),
-        }
-        return {f"{part}.{n}": (owner, n) for part, (owner, names) in parts.items() for n in names}
 
 
 # ---- The loop ----------------------------------------------------------------------------------
@@ -1013,7 +1092,7 @@ def track(
     cameras = CamerasOfFrames(poses, video.scale)
     looked = True if source.always_looks else None
     ahead = tracker.config.camera_motion and video.has_images and not video.is_live
-    for frame in tracker._camera_motion.ahead(video) if ahead else video:
+    for frame in tracker.state.camera_motion.ahead(video) if ahead else video:
         tracks = tracker.update(
             source.look(frame), frame.image, looked=looked, **cameras(frame.index)
         )
@@ -1052,43 +1131,31 @@ def run(
     if config.threads:
         cv2.setNumThreads(config.threads)
     _check_objects(config.objects)
-    boxes_file = tracks or detections
-    video = open_video(source, config.input, config.poses, boxes_file, config.detect)
+    video = open_video(source, config.input, config.poses, tracks or detections, config.detect)
     with Workspace(out, overwrite) as workspace:
         workspace.bind(video, overwrite)
+        job = _Job(video, workspace, config)
         viewer = Viewer(VideoInfo.of(video)) if show else None
-        seconds: dict[str, float] = {}
         in_3d = in_3d and config.poses.mode != "none"
-        readings, poses = supplied_poses(video, config.poses) if in_3d else [], None
+        readings = supplied_poses(video, config.poses) if in_3d else []
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
-            boxes, names = result.tracks, result.class_names
+            check_known_size(config.objects, result.class_names)
+            boxes, class_names = result.tracks, result.class_names
         else:
-            on = (config.threads, config.offline, config.device)
-            found = open_detections(video, config.detect, detections, *on)
-            found, boxes = keep_detections(found, video, workspace), Tracks.empty()
-            if in_3d and not video.is_live:
-                started = time.monotonic()
-                found, boxes = detect_all(found, video, workspace)
-                seconds["detect"] = time.monotonic() - started
-            names = tuple(found.class_names)
-        check_known_size(config.objects, names)
-        model = None
-        started = time.monotonic()
+            detected, boxes = _detect(job, detections, in_3d)
+            class_names = tuple(detected.class_names)
+            check_known_size(config.objects, class_names)
+        poses, models = None, []
         if readings:
-            shown = boxes if tracks else _tracklets(boxes)
-            poses = settled_poses(readings, shown, video, config.poses, workspace)
+            poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
         elif in_3d and not video.is_live:
-            moving = np.isin([*names, ""], config.objects.moving_classes)[boxes.class_id]
-            rows = boxes[moving & (boxes.score >= config.tracker.high_score)]
-            poses, model = reconstruct_cached(video, config.poses, workspace, rows)
-        if poses is not None:
-            seconds["poses"] = time.monotonic() - started
+            poses, models = _own_cameras(job, boxes, class_names)
         if not tracks:
-            result = _track_video(video, workspace, config, found, poses, seconds, viewer)
-        workspace.save_last(result, poses, model or [])
-        result.poses, result.seconds = poses, seconds
-        result = _finish(result, video, workspace, config)
+            result = _track_video(job, detected, poses, viewer)
+        workspace.save_last(result, poses, models)
+        result.poses, result.seconds = poses, job.seconds
+        result = _finish(job, result)
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
             viewer.close()
@@ -1119,7 +1186,39 @@ def refit(
             result = _given_tracks(tracks, video, config.detect, result)
             workspace.save_last(result, poses, workspace.last_models())
             result.poses = poses
-        return _finish(result, video, workspace, config)
+        return _finish(_Job(video, workspace, config), result)
+
+
+def _last_config(out: str | Path) -> Config:
+    """Read the options of the last run in an output folder; the defaults if it has none."""
+    path = Path(out) / CONFIG_FILE
+    return read_config(Config(), path) if path.is_file() else Config()
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What every stage of `run` reads: the video, the output folder, the options.
+
+    Attributes:
+        seconds: that each stage took, added by the stage.
+    """
+
+    video: Video
+    workspace: Workspace
+    config: Config
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def runtime(self) -> tuple[int, bool, str]:
+        """Return threads, offline and device, as networks are opened with."""
+        return self.config.threads, self.config.offline, self.config.device
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Note the seconds of a stage that ends without an exception."""
+        started = time.monotonic()
+        yield
+        self.seconds[stage] = time.monotonic() - started
 
 
 def _check_objects(config: ObjectsConfig) -> None:
@@ -1132,34 +1231,60 @@ def _check_objects(config: ObjectsConfig) -> None:
     parse_known_size(config.known_size)
 
 
-def _last_config(out: str | Path) -> Config:
-    """Read the options of the last run in an output folder; the defaults if it has none."""
-    path = Path(out) / CONFIG_FILE
-    return read_config(Config(), path) if path.is_file() else Config()
+def _detect(
+    job: _Job, detections: str | Path | Callable[[Image], Any] | None, in_3d: bool
+) -> tuple[DetectionSource, Tracks]:
+    """Open the detections; where cameras are wanted, detect in all frames of a recorded video.
+
+    Returns:
+        the source, and its boxes: cameras are estimated without moving objects, and checked with
+        boxes; empty where the frames are read one by one.
+    """
+    opened = open_detections(job.video, job.config.detect, detections, *job.runtime)
+    source = keep_detections(opened, job.video, job.workspace)
+    if not in_3d or job.video.is_live:
+        return source, Tracks.empty()
+    with job.timed("detect"):
+        return detect_all(source, job.video, job.workspace)
+
+
+def _supplied_cameras(job: _Job, readings: Sequence[Any], boxes: Tracks) -> Poses:
+    """Choose between the readings of the user's poses, by the images and boxes."""
+    with job.timed("poses"):
+        return settled_poses(readings, boxes, job.video, job.config.poses, job.workspace)
+
+
+def _own_cameras(
+    job: _Job, boxes: Tracks, class_names: Sequence[str]
+) -> tuple[Poses, Sequence[Path]]:
+    """Reconstruct the cameras from the images; moving objects hold no features.
+
+    Returns:
+        poses, and the folders of the COLMAP models.
+    """
+    with job.timed("poses"):
+        moving = np.isin([*class_names, ""], job.config.objects.moving_classes)[boxes.class_id]
+        rows = boxes[moving & (boxes.score >= job.config.tracker.high_score)]
+        return reconstruct_cached(job.video, job.config.poses, job.workspace, rows)
 
 
 def _track_video(
-    video: Video,
-    workspace: Workspace,
-    config: Config,
-    source: DetectionSource,
-    poses: Poses | None,
-    seconds: dict[str, float],
-    viewer: Viewer | None = None,
+    job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | None = None
 ) -> Result:
     """Track all frames, or take the tracks from the cache; a live source is never cached."""
+    video, config = job.video, job.config
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
-    path = workspace.path("tracks", *detections_key(source, video), *setup)
+    path = job.workspace.path("tracks", *detections_key(source, video), *setup)
     if source.key and not video.is_live and (known := load_cached(path, Result.load_tracked)):
         return known
-    started, on = time.monotonic(), (config.threads, config.offline, config.device)
-    tracker = Tracker(config.tracker, make_embedder(config.embed.model, config.embed.head, *on))
-    steps = track(video, source, tracker, poses=poses)
-    if viewer is not None:
-        steps = viewer.follow(steps, source.class_names, video, poses)
-    result = collect_tracks(steps, tracker, video, source)
-    seconds["track"] = time.monotonic() - started
+    with job.timed("track"):
+        embedder = make_embedder(config.embed.model, config.embed.head, *job.runtime)
+        tracker = Tracker(config.tracker, embedder)
+        steps = track(video, source, tracker, poses=poses)
+        if viewer is not None:
+            steps = viewer.follow(steps, source.class_names, video, poses)
+        result = collect_tracks(steps, tracker, video, source)
     result.save_tracked(path)
     return result
 
@@ -1185,50 +1310,60 @@ def _given_tracks(
     )
 
 
-def _finish(
-    result: Result,
-    video: Video,
-    workspace: Workspace,
-    config: Config,
-) -> Result:
-    """Link tracklets, fit one solid an object, and write all files of the output folder.
-
-    The pictures come last: the results are written whatever becomes of them.
-    """
-    started, poses = time.monotonic(), result.poses
-    result.edits = result.edits or kept_edits(workspace.out)
-    with Progress("objects"):
-        link_and_fit(result, config.objects)
-    gap = 0 if result.identities_given else config.output.fill_gaps
-    filled = fill(result, video.size, gap)  # by our own solids, whatever solver is asked for
-    solve_again(result, config.objects)
-    result.tracks, result.out = filled, workspace.out
-    detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
-    result.embedding_row = detected[result.embedding_row]
-    result.seconds["objects"] = time.monotonic() - started
-    result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
-    scores = (config.tracker.high_score, config.objects.moving_classes, config.tracker.new_score)
-    result.warnings += implausible(result, *scores)
-    result.warnings += unused_sizes(config.objects, result.objects)
-    started = time.monotonic()
-    shown, models = config.output, workspace.last_models()
-
-    def more(folder: Path) -> None:
-        write_config(config, folder / CONFIG_FILE)
-        if models is not None:
-            copy_models(models, folder)
-            write_supplied_model(poses, video, folder)
-
-    stale = (MODEL,) if models is not None or poses is None else ()
-    result.save(workspace.out, shown.doubtful, more, stale)
-    options = (shown.overlay, shown.scene, shown.doubtful)
-    if faults := write_pictures(result, workspace.out, video, *options):
-        result.warnings += faults
-        result.write_objects(workspace.out / "objects.json")
-    result.seconds["write"] = time.monotonic() - started
+def _finish(job: _Job, result: Result) -> Result:
+    """Link tracklets, fit one shape an object, and write all files of the output folder."""
+    with job.timed("objects"):
+        _fit_objects(job, result)
+    result.seconds |= job.seconds
+    result.warnings += _warnings(job.config, result)
+    with job.timed("write"):
+        _write(job, result)
+    result.seconds |= job.seconds
     for warning in result.warnings:
         log.warning(warning)
     return result
+
+
+def _fit_objects(job: _Job, result: Result) -> None:
+    """Link and fit; then fill gaps of the tracks by our own shapes, whatever solver is chosen."""
+    config = job.config
+    result.edits = result.edits or kept_edits(job.workspace.out)
+    with Progress("objects"):
+        link_and_fit(result, config.objects)
+    gap = 0 if result.identities_given else config.output.fill_gaps
+    filled = fill(result, job.video.size, gap)
+    solve_again(result, config.objects)
+    result.tracks, result.out = filled, job.workspace.out
+    detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
+    result.embedding_row = detected[result.embedding_row]
+
+
+def _warnings(config: Config, result: Result) -> list[str]:
+    """Collect what the user should know of the cameras, the objects and the options."""
+    poses = result.poses
+    of_cameras = [] if poses is None else [*poses.messages, *parts_message(poses)]
+    tracker, moving = config.tracker, config.objects.moving_classes
+    of_objects = implausible(result, tracker.high_score, moving, tracker.new_score)
+    return [*of_cameras, *of_objects, *unused_sizes(config.objects, result.objects)]
+
+
+def _write(job: _Job, result: Result) -> None:
+    """Write all files; pictures last, so that the results are there whatever becomes of them."""
+    workspace, output = job.workspace, job.config.output
+    models = workspace.last_models()
+
+    def write_more(folder: Path) -> None:
+        write_config(job.config, folder / CONFIG_FILE)
+        if models is not None:
+            copy_models(models, folder)
+            write_supplied_model(result.poses, job.video, folder)
+
+    stale = (MODEL,) if models is not None or result.poses is None else ()
+    result.save(workspace.out, output.doubtful, write_more, stale)
+    shown = (output.overlay, output.scene, output.doubtful)
+    if faults := write_pictures(result, workspace.out, job.video, *shown):
+        result.warnings += faults
+        result.write_objects(workspace.out / "objects.json")
 
 
 # ---- Command line ------------------------------------------------------------------------------

@@ -71,7 +71,7 @@ def facts(tracker: rt.Tracker, seconds: list[tuple[float, float]]) -> str:
     ms = 1e3 * np.array(seconds)  # (F, 2)
     (track, track95), (both, both95) = (np.percentile(x, (50, 95)) for x in (ms[:, 1], ms.sum(1)))
     return (
-        f"{len(tracker.last_seen)} objects, {tracker.places.known.sum()} of known place; "
+        f"{len(tracker.state.last_seen)} objects, {tracker.places.known.sum()} of known place; "
         f"tracker {track:.1f} ms (95 %: {track95:.1f}), with detector {both:.1f} ({both95:.1f})"
     )
 
@@ -80,13 +80,13 @@ def objects_of(
     tracker: rt.Tracker, names: tuple[str, ...]
 ) -> tuple[quadrics.Ellipsoids, list[dict[str, Any]]]:
     """Ellipsoids of the objects of known place, and one entry each for the JSON file."""
-    known = np.flatnonzero(tracker.places.known[: len(tracker.last_seen)])
+    known = np.flatnonzero(tracker.places.known[: len(tracker.state.last_seen)])
     solids, _ = quadrics.Ellipsoids.from_dual_quadrics(tracker.places.dual_q[known])
     entries = [
         {
             "id": int(i) + 1,
-            "category": names[tracker.identity_class[i]],
-            "last_frame": int(tracker.last_seen[i]),
+            "category": names[tracker.state.identity_class[i]],
+            "last_frame": int(tracker.state.last_seen[i]),
             "views": int((tracker.places.frame[i] >= 0).sum()),
             "center_in_world": solids.center_in_world[k].round(4).tolist(),
             "half_axes": solids.half_axes[k].round(4).tolist(),

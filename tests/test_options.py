@@ -613,7 +613,7 @@ def _(lab: Lab) -> None:
     for value in (4, 9):
         tracker = lab.tracker(value)
         track(tracker, *[rows(BOX)] * 4)
-        alive = [len(track(tracker, NOTHING)) or len(tracker.state.mean) for _ in range(12)]
+        alive = [len(track(tracker, NOTHING)) or len(tracker.state.tracks.mean) for _ in range(12)]
         assert alive == [1] * value + [0] * (12 - value)
 
 
@@ -629,7 +629,7 @@ def _(lab: Lab) -> None:
 def spread(tracker: rt.Tracker) -> np.ndarray:
     """Variances of position and velocity after a second without a detection."""
     track(tracker, *[rows(BOX)] * 4, *[NOTHING] * 25)
-    return np.asarray(tracker.state.cov[0, 0])
+    return np.asarray(tracker.state.tracks.cov[0, 0])
 
 
 @shows("tracker.std_position")
@@ -672,7 +672,7 @@ def _(lab: Lab) -> None:
         asked = []
 
         def embedder(frame: Any, detections: Any, index: np.ndarray) -> rt.Embeddings:
-            asked.append(tracker.frame_number)  # noqa: B023
+            asked.append(tracker.state.frame_number)  # noqa: B023
             return rt.Embeddings(np.eye(1, 8), np.empty((1, 0)))
 
         tracker = rt.Tracker(lab.config(value).tracker, embedder)  # type: ignore[arg-type]
@@ -699,7 +699,7 @@ def _(lab: Lab) -> None:
         tracker = lab.tracker(value)
         track(tracker, *[rows(BOX)] * 4, frame=image)
         track(tracker, NOTHING, frame=np.roll(image, 40, 1))
-        assert tracker.state.mean[0, 0, 0] == pytest.approx(150 + shift, abs=2)
+        assert tracker.state.tracks.mean[0, 0, 0] == pytest.approx(150 + shift, abs=2)
 
 
 # ---- poses ----

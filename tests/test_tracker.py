@@ -115,7 +115,7 @@ def test_what_overlaps_passes_the_gate_though_its_centre_lies_outside() -> None:
     whole, end = [100, 100, 300, 300, 0.9, 0], [256, 100, 301, 300, 0.9, 0]
     for _ in range(20):
         tracker.update([whole], embeddings=appearance)
-    state = rt.kalman_predict(tracker.state.mean, tracker.state.cov, tracker.config)
+    state = rt.kalman_predict(tracker.state.tracks.mean, tracker.state.tracks.cov, tracker.config)
     assert 9.21 * rt.center_variance(*state)[0, 0] < (256 - 200) ** 2  # px, to its nearest edge
     assert tracker.update([end], embeddings=appearance).tracklet_id.tolist() == [1]
 
@@ -167,7 +167,7 @@ def test_a_doubtful_box_moves_a_track_less() -> None:
         for _ in range(5):
             tracker.update(rows((100, 100, 150, 150)))
         tracker.update(rows((110, 100, 160, 150), score=score))
-        at[score] = tracker.state.mean[0, 0, 0]
+        at[score] = tracker.state.tracks.mean[0, 0, 0]
     assert 125 < at[0.6] < at[0.95] - 0.3 < 135
 
 
@@ -202,7 +202,7 @@ def test_tracks_move_with_the_parallax_of_a_deep_scene() -> None:
     bands = zip(np.split(image, 4), (4, 22, 10, 16), strict=True)
     moved = np.concatenate([np.roll(band, shift, 1) for band, shift in bands])
     tracker.update(rt.Detections.empty(), moved)
-    np.testing.assert_allclose(tracker.state.mean[0, :2, 0], [336, 440], atol=1.5)
+    np.testing.assert_allclose(tracker.state.tracks.mean[0, :2, 0], [336, 440], atol=1.5)
 
 
 def test_known_pose_replaces_the_image_motion() -> None:
@@ -441,7 +441,7 @@ def test_embeddings_stay_with_their_boxes() -> None:
     boxes = [(400, 0, 450, 50, 0.05), (0, 0, 50, 50), (400, 200, 450, 250, 0.05), (100, 0, 150, 50)]
     tracks = tracker.update(rows(*boxes), embeddings=mixed)
     assert tracks.detection_index.tolist() == [1, 3]
-    np.testing.assert_allclose(tracker.state.embedding, views, atol=1e-6)
+    np.testing.assert_allclose(tracker.state.tracks.embedding, views, atol=1e-6)
 
 
 K640 = rt.Camera("PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0))
@@ -500,7 +500,7 @@ def test_what_cannot_be_meant_leaves_the_tracker_as_it_was(
 def test_a_pose_with_nan_is_none() -> None:
     tracker = rt.Tracker()
     tracker.update([], cam_from_world=np.full((3, 4), np.nan), camera=K640)
-    assert tracker._pose is None
+    assert tracker.state.last_pose is None
 
 
 def test_frames_of_one_pixel_are_frames() -> None:
@@ -534,7 +534,7 @@ def test_state_does_not_grow_with_time() -> None:
     for frame in range(1500):
         tracker.update(rows(*boxes), embeddings=views + 0.3 * unit(rng, 5))
         if frame in (100, 1499):
-            sizes.append((tracker.gallery.rows.nbytes, len(tracker.state.mean)))
+            sizes.append((tracker.state.gallery.rows.nbytes, len(tracker.state.tracks.mean)))
     assert sizes[0] == sizes[1]
 
 
@@ -862,7 +862,7 @@ class Counted:
 
     def __call__(self, frame: Any, detections: rt.Detections, rows: np.ndarray) -> rt.Embeddings:
         assert self.tracker is not None
-        self.asked.append((self.tracker.frame_number, rows.tolist()))
+        self.asked.append((self.tracker.state.frame_number, rows.tolist()))
         own = np.eye(1, 8).repeat(len(rows), 0)
         return rt.Embeddings(own, own)
 
@@ -938,7 +938,7 @@ def test_tracks_are_given_up_one_by_one() -> None:
     both = rows((100, 100, 150, 150), (300, 100, 350, 150))
     for found in [both] * 4 + [both[:1]] + [both[:0]] * 6:
         tracker.update(found)
-        counts.append(len(tracker.state.mean))
+        counts.append(len(tracker.state.tracks.mean))
     assert counts == [2] * 9 + [1, 0]
 
 
@@ -1030,7 +1030,7 @@ def test_a_return_ends_the_track_that_still_coasts() -> None:
     gone(tracker, views[:1], frames=5)
     for _ in range(4):
         tracks = tracker.update(rows(new), embeddings=views[:1])
-    assert tracks.track_id.tolist() == [1] and tracker.state.identity.tolist() == [0]
+    assert tracks.track_id.tolist() == [1] and tracker.state.tracks.identity.tolist() == [0]
     for _ in range(4):
         tracks = tracker.update(rows(new, old), embeddings=views)
     assert tracks.track_id.tolist() == [1, 2]
@@ -1074,12 +1074,12 @@ def test_tracks_grow_as_their_places_come_near() -> None:
     for i in range(6):
         pose = pose_at(0.5)
         pose[2, 3] = -1.4 * (i % 2)
-        before = tracker.state.mean[:, 2, 0].copy()
+        before = tracker.state.tracks.mean[:, 2, 0].copy()
         found, _ = balls_seen(pose)
         tracks = tracker.update(found, cam_from_world=pose, camera=CAMERA)
         assert tracks.track_id.tolist() == [1, 2]
         width = found.xyxy[:, 2] - found.xyxy[:, 0]
-        assert (np.abs(np.log(tracker.state.mean[:, 2, 0] / width)) < 0.15).all()
+        assert (np.abs(np.log(tracker.state.tracks.mean[:, 2, 0] / width)) < 0.15).all()
         assert i < 2 or (np.abs(np.log(before / width)) > 0.3).all()
 
 
@@ -1100,7 +1100,7 @@ def test_in_view_a_missed_track_of_known_place_is_given_up() -> None:
     counts = []
     for _ in range(7):
         tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
-        counts.append(len(tracker.state.mean))
+        counts.append(len(tracker.state.tracks.mean))
     assert counts == [2] * 5 + [0] * 2
 
 
@@ -1170,7 +1170,7 @@ def test_embedding_of_a_track_is_a_running_mean() -> None:
     for view in (first, second):
         tracker.update(rows((0, 0, 50, 50)), embeddings=view[None])
     expected = (0.8 * first + 0.2 * second) / np.hypot(0.8, 0.2)
-    np.testing.assert_allclose(tracker.state.embedding[0], expected, atol=1e-6)
+    np.testing.assert_allclose(tracker.state.tracks.embedding[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("weight", [0.5, 0.9])
@@ -1193,7 +1193,7 @@ def test_side_by_side_objects_of_a_class_calibrate(kind: int, pairs: int) -> Non
     counts = []
     for _ in range(3):
         tracker.update(both, embeddings=views)
-        different, same = tracker.match_calibration.moments[:, 0, 0]
+        different, same = tracker.state.match_calibration.moments[:, 0, 0]
         counts.append((different - 10, same - 10))  # beyond the prior's
     assert counts == [(0, 0), (pairs, 2), (2 * pairs, 4)]
 
@@ -1217,7 +1217,7 @@ def test_without_appearance_the_place_names_an_object() -> None:
     walk(tracker, PAST)
     for _ in range(10):
         tracker.update(rt.Detections.empty(), cam_from_world=PAST[-1], camera=CAMERA)
-    assert len(tracker.state.mean) == 0
+    assert len(tracker.state.tracks.mean) == 0
     assert walk(tracker, [PAST[-1]] * 4)[-1] == {0: 1, 1: 2}
     assert tracker.latest.tracklet_id.tolist() == [3, 4]
 
@@ -1245,16 +1245,23 @@ def test_half_a_place_does_not_outweigh_another_look(shift: float, look: int, fo
 # ---- The whole state ----
 
 
-def everything(tracker: rt.Tracker) -> dict[str, np.ndarray]:
-    """All that a tracker knows and shows."""
-    parts: dict[str, Any] = {
-        name: getattr(tracker, name) for name in ("frame_number", "last_seen", "identity_class")
-    }
-    for part in ("state", "gallery", "places", "reid_calibration", "match_calibration"):
-        owner = getattr(tracker, part)
-        names = getattr(owner, "ARRAYS", getattr(owner, "__slots__", ()))
-        parts |= {f"{part}.{name}": getattr(owner, name) for name in names}
-    return {name: np.asarray(value) for name, value in parts.items()}
+NOT_SAVED = ("state.camera_motion.residual_flow", "state.camera_motion._ahead")  # of two frames
+
+
+def everything(owner: Any, name: str = "state") -> dict[str, np.ndarray]:
+    """All attributes of a tracker's state and of what it holds, by their path."""
+    if isinstance(owner, list):
+        items = dict(enumerate(owner))
+    else:
+        names = getattr(owner, "__slots__", None) or getattr(owner, "__dict__", {})
+        items = {key: getattr(owner, key) for key in names}
+    if not items or isinstance(owner, np.ndarray):
+        return {name: np.asarray(owner)}
+    found: dict[str, np.ndarray] = {}
+    for key, value in items.items():
+        if f"{name}.{key}" not in NOT_SAVED:
+            found |= everything(value, f"{name}.{key}")
+    return found
 
 
 def filled() -> rt.Tracker:
@@ -1272,14 +1279,14 @@ def test_everything_is_saved(tmp_path: Path) -> None:
     tracker = filled()
     tracker.save(tmp_path / "state.npz")
     loaded = rt.Tracker.load(tmp_path / "state.npz")
-    mine, theirs = everything(tracker), everything(loaded)
-    assert len(mine) > 20 and mine.keys() == theirs.keys()
+    mine, theirs = everything(tracker.state), everything(loaded.state)
+    assert len(mine) > 40 and mine.keys() == theirs.keys()
     for name, value in mine.items():
         np.testing.assert_array_equal(value, theirs[name], err_msg=name)
     for pose in AWAY[10:20]:  # without an image the turn since the last pose counts
         for one in (tracker, loaded):
             one.update(rt.Detections.empty(), cam_from_world=pose, camera=CAMERA)
-        np.testing.assert_array_equal(tracker.state.mean, loaded.state.mean)
+        np.testing.assert_array_equal(tracker.state.tracks.mean, loaded.state.tracks.mean)
 
 
 def test_the_first_turn_after_loading_counts(tmp_path: Path) -> None:
@@ -1290,14 +1297,16 @@ def test_the_first_turn_after_loading_counts(tmp_path: Path) -> None:
     tracker.save(tmp_path / "state.npz")
     loaded = rt.Tracker.load(tmp_path / "state.npz")
     loaded.update(rt.Detections.empty(), cam_from_world=pose_at(0, 10.0), camera=CAMERA)
-    assert loaded.state.mean[0, 0, 0] == pytest.approx(320 - 500 * np.tan(np.radians(10)), abs=2)
+    assert loaded.state.tracks.mean[0, 0, 0] == pytest.approx(
+        320 - 500 * np.tan(np.radians(10)), abs=2
+    )
 
 
 def test_reset_forgets_everything() -> None:
     tracker = filled()
-    assert tracker.places.known.any() and tracker.gallery.count.any()
+    assert tracker.places.known.any() and tracker.state.gallery.count.any()
     tracker.reset()
-    mine, fresh = everything(tracker), everything(rt.Tracker())
+    mine, fresh = everything(tracker.state), everything(rt.Tracker().state)
     for name, value in fresh.items():
         np.testing.assert_array_equal(mine[name], value, err_msg=name)
     assert len(tracker.latest) == 0 and tracker.latest_embeddings()[0].tolist() == []

@@ -128,7 +128,7 @@ def collect_tracks(
     result.untracked = _untracked(tracks, frames, detected, video.scale)
     if not all(looked):
         result.looked = np.array(frames, np.int64)[np.array(looked, bool)]
-    result.keep_embeddings(frames, embedded, tracker.gallery.foreground_width)
+    result.keep_embeddings(frames, embedded, tracker.state.gallery.foreground_width)
     result.warnings += [*source.messages, *video.messages]
     if video.is_live:
         result.warnings += [

@@ -59,12 +59,12 @@ def test_an_object_that_is_looked_for_and_missed_still_leaves() -> None:
         tracker.update(scene(frame) if frame % 3 == 0 else None)
     for _ in range(50):
         tracker.update(None)
-    assert len(tracker.state.identity) == 2 and not tracker.looked
+    assert len(tracker.state.tracks.identity) == 2 and not tracker.looked
     assert tracker.predicted().track_id.tolist() == [1, 2]
     for k in range(5):
-        assert len(tracker.state.identity) == 2, k
+        assert len(tracker.state.tracks.identity) == 2, k
         tracker.update([], looked=True)
-    assert len(tracker.state.identity) == 0
+    assert len(tracker.state.tracks.identity) == 0
 
 
 def test_frames_without_a_box_are_looked_at_in_a_dense_video() -> None:
@@ -73,10 +73,10 @@ def test_frames_without_a_box_are_looked_at_in_a_dense_video() -> None:
     for frame in range(20):
         tracker.update(scene(frame))
     tracker.update([*scene(20), [600, 10, 630, 60, 0.8, CHAIR]])
-    assert len(tracker.state.identity) == 3
+    assert len(tracker.state.tracks.identity) == 3
     for _ in range(3):
         tracker.update([])
-    assert tracker.state.identity.tolist() == [0, 1] and tracker.looked
+    assert tracker.state.tracks.identity.tolist() == [0, 1] and tracker.looked
 
 
 def test_a_saved_tracker_goes_on_as_the_other_does(tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ def test_tracks_are_embedded_again_by_frames_looked_at() -> None:
         looked = frame % 4 == 0
         boxes, vectors = (scene(0), [[1.0, 0.0]]) if looked else (None, None)
         tracker.update(boxes, embeddings=vectors)
-        seen.append(int(tracker.state.embedded[0]))
+        seen.append(int(tracker.state.tracks.embedded[0]))
     assert seen[::4] == [0, 0, 8, 8]
 
 
