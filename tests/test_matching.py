@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import invert_rigid
-from reobj.poses.matching import (
+from reobj.poses.supplied.frame_assignment import (
     Reading,
     Source,
     _by_image_numbers,

@@ -14,7 +14,8 @@ import numpy as np
 from reobj.frame_lookup import frames_by_name
 from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import stated_camera
-from reobj.poses.matching import (
+from reobj.poses.pose_file import PoseFile
+from reobj.poses.supplied.frame_assignment import (
     UNITS,
     Source,
     by_numbers,
@@ -22,8 +23,7 @@ from reobj.poses.matching import (
     numbers_of_times,
     unit_of_stamps,
 )
-from reobj.poses.pose_file import PoseFile
-from reobj.poses.readers import read_pose_file
+from reobj.poses.supplied.readers import read_pose_file
 from reobj.sources.detection_files import (
     DetectConfig,
     image_names,

@@ -16,11 +16,11 @@ import numpy as np
 
 from reobj.cameras import WORLD_MAX, Camera, Poses, usable
 from reobj.files import load_json, spans
-from reobj.poses import pose_formats as formats
-from reobj.poses.colmap_model import find_models, read_colmap
-from reobj.poses.evidence import PoseReading, by_images
 from reobj.poses.intrinsics import CAMERA_FORMS, fitted_camera, parse_camera
-from reobj.poses.matching import (
+from reobj.poses.pose_file import PoseFile, one_camera
+from reobj.poses.supplied import pose_formats as formats
+from reobj.poses.supplied.colmap_model import find_models, read_colmap
+from reobj.poses.supplied.frame_assignment import (
     UNITS,
     Reading,
     Source,
@@ -29,7 +29,7 @@ from reobj.poses.matching import (
     source_of,
     unit_of_stamps,
 )
-from reobj.poses.pose_file import PoseFile, one_camera
+from reobj.poses.supplied.interpretation import PoseReading, by_images
 from reobj.types import Array, IntArray, ReobjError
 
 
