@@ -14,7 +14,6 @@ import numpy as np
 from reobj.frame_lookup import frames_by_name
 from reobj.poses.estimate import PosesConfig
 from reobj.poses.intrinsics import stated_camera
-from reobj.poses.pose_file import PoseFile
 from reobj.poses.supplied.frame_assignment import (
     UNITS,
     Source,
@@ -23,6 +22,7 @@ from reobj.poses.supplied.frame_assignment import (
     numbers_of_times,
     unit_of_stamps,
 )
+from reobj.poses.supplied.pose_formats import PoseFile
 from reobj.poses.supplied.readers import read_pose_file
 from reobj.sources.detection_files import (
     DetectConfig,

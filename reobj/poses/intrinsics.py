@@ -16,7 +16,6 @@ import numpy as np
 
 from reobj.cameras import Camera, camera_parameters, checked_camera
 from reobj.files import load_json, read_text
-from reobj.poses.simple_yaml import read_yaml
 from reobj.types import COORDINATE_MAX, ReobjError
 
 NUMBERS = "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]"  # OpenCV's order
@@ -334,3 +333,56 @@ def _sized(size: tuple[int, int] | None) -> tuple[int, int]:
     if size is None:
         raise ReobjError("no image size; expected MODEL WIDTH HEIGHT PARAMS, or JSON with w and h")
     return size
+
+
+# ---- YAML ----------------------------------------------------------------------------------------
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read nested mappings with values that are words, numbers or lists of them.
+
+    Indentation nests; `[1, 2]` may go on over lines; lines `- 1` and `- [1, 2]` are lists. Tags,
+    comments and document marks are skipped.
+
+    Raises:
+        ReobjError: a line is none of these.
+    """
+    text = re.sub(r"(^|\s)#.*", r"\1", read_text(path, CAMERA_MAX), flags=re.MULTILINE)
+    text = re.sub(r"\[[^\[\]]*\]", lambda m: " ".join(m[0].split()), text)  # lists to one line
+    whole: dict[str, Any] = {}
+    stack: list[tuple[int, Any]] = [(-1, whole)]  # indentation and content of what is open
+    key, key_indent = "", -1
+    for line in text.splitlines():
+        if not line.strip() or line.startswith(("%", "---", "...")):
+            continue
+        indent, word = len(line) - len(line.lstrip()), line.strip()
+        item = word.startswith("- ")
+        while not item and stack[-1][0] >= indent and len(stack) > 1:
+            stack.pop()
+        parent = stack[-1][1]
+        if item:
+            rows = parent.get(key) if isinstance(parent.get(key), list) else []
+            parent[key] = [*rows, _value(word[2:])]
+            continue
+        if key and indent > key_indent and parent.get(key, "") is None:
+            parent[key] = {}
+            stack.append((key_indent, parent[key]))
+            parent = parent[key]
+        name, colon, value = word.partition(":")
+        if not colon:
+            raise ReobjError(f"{path}: {word[:60]!r} is not understood; expected `key: value`")
+        key, key_indent = name.strip(" \"'"), indent
+        value = re.sub(r"^!\S+", "", value.strip()).strip()
+        parent[key] = _value(value) if value else None
+    return whole
+
+
+def _value(text: str) -> Any:
+    """Convert a word, a number or a list of them."""
+    text = text.strip()
+    if text.startswith("["):
+        return [_value(part) for part in text.strip("[]").split(",") if part.strip()]
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip("\"'")

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from reobj.cameras import WORLD_MAX, Camera, import_pycolmap, read_sparse_model
 from reobj.poses.intrinsics import colmap_camera
-from reobj.poses.pose_file import (
+from reobj.poses.supplied.pose_formats import (
     PoseFile,
     checked_rigid,
     from_quaternions,

@@ -17,7 +17,6 @@ import numpy as np
 from reobj.cameras import WORLD_MAX, Camera, Poses, usable
 from reobj.files import load_json, spans
 from reobj.poses.intrinsics import CAMERA_FORMS, fitted_camera, parse_camera
-from reobj.poses.pose_file import PoseFile, one_camera
 from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.colmap_model import find_models, read_colmap
 from reobj.poses.supplied.frame_assignment import (
@@ -30,6 +29,7 @@ from reobj.poses.supplied.frame_assignment import (
     unit_of_stamps,
 )
 from reobj.poses.supplied.interpretation import PoseReading, by_images
+from reobj.poses.supplied.pose_formats import PoseFile, one_camera
 from reobj.types import Array, IntArray, ReobjError
 
 
