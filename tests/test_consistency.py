@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reobj.poses.arrays import read_arrays
-from reobj.poses.consistency import (
+from reobj.poses.bundle import read_arrays
+from reobj.poses.verification import (
     MIN_BRIDGE,
     MIN_FOCAL_PAIRS,
     MatchedPairs,

@@ -21,11 +21,11 @@ from test_consistency import fundamental
 import reobj_track as rt
 from reobj.cameras import read_sparse_model
 from reobj.files import Progress, locked
-from reobj.poses import child as child_room
+from reobj.poses import child_job as child_room
 from reobj.poses import mapping
-from reobj.poses.consistency import MatchedPairs
 from reobj.poses.mapping import FOCAL_GUESS, mapping_child, reconstruct
 from reobj.poses.soundness import Part
+from reobj.poses.verification import MatchedPairs
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -456,7 +456,7 @@ def test_objects_as_landmarks_never_worsen_the_points(walk, noise_px, used):
 SLEEPER = """
 import sys, time
 from pathlib import Path
-from reobj.poses.child import Child, serve
+from reobj.poses.child_job import Child, serve
 def job(folder):
     Path(sys.argv[1]).with_name("pid").write_text(str(__import__("os").getpid()))
     time.sleep(60)
@@ -466,7 +466,7 @@ if __name__ == "__main__":
 PARENT = """
 from pathlib import Path
 from reobj.files import Progress
-from reobj.poses.child import Child
+from reobj.poses.child_job import Child
 with Child("sleeper", Path("work/mapping"), Path("work/log")) as child:
     child.run(Progress)
 """

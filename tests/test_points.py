@@ -11,9 +11,9 @@ from pose_worlds import FakeVideo, motion, supplied, textured_room
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import Progress
-from reobj.poses import points as room
-from reobj.poses.child import Child
-from reobj.poses.points import choose_keyframes, choose_pairs, path_steps, triangulate
+from reobj.poses import sfm as room
+from reobj.poses.child_job import Child
+from reobj.poses.sfm import choose_keyframes, choose_pairs, path_steps, triangulate
 
 pytest.importorskip("pycolmap")
 SIZE = (320, 240)

@@ -9,7 +9,7 @@ from test_consistency import Scene
 
 from reobj.poses import adjustment
 from reobj.poses.adjustment import _bundle_adjust, adjusted
-from reobj.poses.arrays import read_arrays
+from reobj.poses.bundle import read_arrays
 from reobj.poses.mapping import _only, _Search
 from reobj.poses.soundness import MIN_JOINT, Part, confirmed
 from reobj.poses.uncertainty import relative_sigmas

@@ -7,7 +7,7 @@ import pytest
 from test_consistency import CAMERA, Scene
 
 from reobj.poses import zoom
-from reobj.poses.arrays import read_arrays
+from reobj.poses.bundle import read_arrays
 from reobj.poses.zoom import constant_focal
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.arrays import FOCAL_RANGE, ModelArrays, read_arrays
+from reobj.poses.bundle import FOCAL_RANGE, ModelArrays, read_arrays
 from reobj.poses.uncertainty import relative_sigmas
 
 

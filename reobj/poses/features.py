@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.child import send_progress
+from reobj.poses.child_job import send_progress
 from reobj.types import Array, BoolArray, Floats, Image
 
 

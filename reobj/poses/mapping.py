@@ -26,8 +26,10 @@ import numpy as np
 from reobj.cameras import Camera, import_pycolmap
 from reobj.files import Progress, atomic, load_cached, load_json, spans, writing
 from reobj.poses.adjustment import SAME_FOCAL, Adjusted, adjusted, refine
-from reobj.poses.child import Child, send_progress, serve
-from reobj.poses.consistency import (
+from reobj.poses.child_job import Child, send_progress, serve
+from reobj.poses.features import choose_pairs, extract_features, match_pairs
+from reobj.poses.soundness import MIN_PART_IMAGES, SURE_CENTRE_SIGMA, Part, confirmed, measured
+from reobj.poses.verification import (
     MIN_MATCHES,
     MatchedPairs,
     consistent_groups,
@@ -35,8 +37,6 @@ from reobj.poses.consistency import (
     focal_from_pairs,
     read_pairs,
 )
-from reobj.poses.features import choose_pairs, extract_features, match_pairs
-from reobj.poses.soundness import MIN_PART_IMAGES, SURE_CENTRE_SIGMA, Part, confirmed, measured
 from reobj.poses.zoom import MIN_ZOOM, constant_focal
 from reobj.types import Array, Image, IntArray
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from reobj.poses.arrays import FOCAL_RANGE, ModelArrays
+from reobj.poses.bundle import FOCAL_RANGE, ModelArrays
 from reobj.types import IntArray
 
 MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)

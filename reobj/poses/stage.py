@@ -14,7 +14,7 @@ from reobj.files import load_cached, load_npz, part_path
 from reobj.poses.depth import add_depth
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.intrinsics import camera_line, parse_camera
-from reobj.poses.points import triangulate
+from reobj.poses.sfm import triangulate
 from reobj.poses.supplied.interpretation import PoseReading, by_images, by_tracks, check_poses
 from reobj.poses.supplied.readers import pose_readings, the_reading
 from reobj.results.workspace import Workspace

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from reobj.poses.arrays import ModelArrays
+from reobj.poses.bundle import ModelArrays
 from reobj.types import Array, IntArray
 
 CAUCHY_SIGMAS = 2.0  # residual from where an observation counts less, in sigmas (chosen)

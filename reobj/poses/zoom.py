@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from reobj.poses.arrays import MIN_RAY_SPREAD, ModelArrays
+from reobj.poses.bundle import MIN_RAY_SPREAD, ModelArrays
 from reobj.types import Array, IntArray
 
 WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends those further off)

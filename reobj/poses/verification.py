@@ -20,7 +20,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.arrays import MIN_RAY_SPREAD, ModelArrays
+from reobj.poses.bundle import MIN_RAY_SPREAD, ModelArrays
 from reobj.types import Array, BoolArray, IntArray
 
 

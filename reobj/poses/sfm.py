@@ -19,7 +19,7 @@ import numpy as np
 
 from reobj.cameras import Camera, Poses, import_pycolmap, invert_rigid, write_colmap
 from reobj.files import Progress, load_npz, save_npz, writing
-from reobj.poses.child import Child, serve
+from reobj.poses.child_job import Child, serve
 from reobj.poses.features import extract_features, match_pairs
 from reobj.sources.video import shrunk
 from reobj.types import Array, Image, IntArray
@@ -70,7 +70,7 @@ def triangulate(
         "pairs": choose_pairs(steps[rows]).tolist(),
         "seed": seed,
     }
-    with Child("reobj.poses.points", folder, work_dir / "points.log") as child, writing(folder):
+    with Child("reobj.poses.sfm", folder, work_dir / "points.log") as child, writing(folder):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         np.save(folder / "keyframes.npy", np.stack([images[row] for row in rows]))
