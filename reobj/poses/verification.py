@@ -1,134 +1,67 @@
-"""Check a reconstruction against its own evidence, and take apart what does not hold together.
+"""Verify reconstructed models without ground truth: consistency, soundness, constant focal length.
 
-A mapper can join two worlds by a few wrong matches, or register a frame metres from where it was:
-the reprojection error shows neither. What shows it is how many points tie two groups of images
-together, and whether the model explains the matches of pictures that follow each other. Needs no
-truth and no threshold of one recording.
+The reprojection error shows none of the errors: wrong models had the smallest. A mapper can join
+two scenes by a few wrong matches, register a frame metres from its true position, or shift images
+of another focal length towards the scene. Three checks find this:
+
+1. consistency: a model is split where few points connect two groups of images, or where it does
+   not explain the matches of consecutive images;
+2. soundness: parallax, triangulation angles, the covariance of the camera centres, and a second
+   mapper where that is large;
+3. zoom: the focal length of each image, by points triangulated from its neighbours on one side.
+
+No threshold is fitted to one recording.
 """
 
 from __future__ import annotations
 
-import contextlib
+import enum
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.bundle import MIN_RAY_SPREAD, ModelArrays
+from reobj.poses.bundle import FOCAL_RANGE, MIN_RAY_SPREAD, ModelArrays
+from reobj.poses.features import MIN_MATCHES, MatchedPairs
 from reobj.types import Array, BoolArray, IntArray
 
-
-@dataclass(frozen=True, slots=True)
-class MatchedPairs:
-    """The verified matches of a database.
-
-    Attributes:
-        image_ids: (P, 2) of each pair, the lower first. inliers: of each pair the matching
-            keypoints (n, 2). keypoints: (N, 2) pixels by image id.
-        fundamental: (P, 3, 3), NaN where the pair has none (planar, or a mere turn).
-    """
-
-    image_ids: IntArray
-    inliers: list[IntArray]
-    keypoints: dict[int, Array]
-    fundamental: Array
-
-    @property
-    def enough(self) -> BoolArray:
-        """Mark the pairs (P,) with as many verified matches as register an image."""
-        return np.array([len(found) >= MIN_MATCHES for found in self.inliers], bool)
-
-    def only(self, ids: Sequence[int]) -> MatchedPairs:
-        """Return the pairs of some images."""
-        rows = np.flatnonzero(np.isin(self.image_ids, ids).all(1))
-        inliers, xy = [self.inliers[row] for row in rows], {i: self.keypoints[i] for i in ids}
-        return MatchedPairs(self.image_ids[rows], inliers, xy, self.fundamental[rows])
-
-
-def read_pairs(database: Path) -> MatchedPairs:
-    """Read keypoints and verified matches."""
-    pc = import_pycolmap()
-    general = {int(pc.TwoViewGeometryConfiguration.UNCALIBRATED),
-               int(pc.TwoViewGeometryConfiguration.CALIBRATED)}  # fmt: skip
-    with contextlib.closing(pc.Database.open(str(database))) as db:
-        pair_ids, geometries = db.read_two_view_geometries()
-        keypoints = {
-            image.image_id: np.asarray(db.read_keypoints(image.image_id), np.float64)[:, :2]
-            for image in db.read_all_images()
-        }
-    none = np.full((3, 3), np.nan)
-    fundamental = [
-        g.F if int(g.config) in general and g.F is not None else none for g in geometries
-    ]
-    return MatchedPairs(
-        np.array([pc.pair_id_to_image_pair(p) for p in pair_ids], np.int64).reshape(-1, 2),
-        [np.asarray(g.inlier_matches, np.int64) for g in geometries],
-        keypoints,
-        np.array(fundamental).reshape(-1, 3, 3),
-    )
-
-
-FOCAL_STEPS = np.geomspace(0.4, 2.0, 161)  # tried, over the longer side (28-103 deg; 1 % apart)
-MIN_FOCAL_PAIRS = 10  # pairs whose epipolar geometry is believed together (chosen)
-MIN_FOCAL_MATCHES = 30  # of such a pair (COLMAP's relpose_min_num_inliers)
-
-
-def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None:
-    """Estimate the focal length that makes essential matrices of the fundamental ones.
-
-    E = K' F K has two equal singular values for the right K. Of each trial the median over pairs of
-    1 - s2 / s1 counts, so that half of the pairs may be wrong; no start value, no local minimum.
-
-    Returns:
-        focal length over the longer side; None with too few pairs.
-    Ref: Mendonca and Cipolla, CVPR 1999.
-    """
-    enough = np.array([len(m) >= MIN_FOCAL_MATCHES for m in pairs.inliers], bool)
-    F = pairs.fundamental[enough & np.isfinite(pairs.fundamental[:, 0, 0])]  # (P, 3, 3)
-    if len(F) < MIN_FOCAL_PAIRS:
-        return None
-    K = np.zeros((len(FOCAL_STEPS), 3, 3))
-    K[:, 0, 0] = K[:, 1, 1] = FOCAL_STEPS * max(size)
-    K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = size[0] / 2, size[1] / 2, 1
-    E = np.swapaxes(K, 1, 2)[:, None] @ F[None] @ K[:, None]  # (S, P, 3, 3)
-    s = np.linalg.svd(E, compute_uv=False)
-    cost = np.median(1 - s[..., 1] / s[..., 0], 1)  # (S,)
-    best = int(cost.argmin())
-    inside = 0 < best < len(cost) - 1
-    return float(FOCAL_STEPS[best]) if inside else None
+# ---- Consistency ---------------------------------------------------------------------------------
 
 
 EXPLAINED_PX = 4.0  # largest distance from the epipolar line (COLMAP's filter_max_reproj_error)
-MIN_MATCHES = 30  # verified matches that say something (COLMAP registers from 30 on)
-MAX_NEIGHBOUR = 4  # keyframes apart, at most, that are looked at (chosen)
-MIN_TIED = 0.1  # share of them that are one point of the model (measured: right .38-.98, wrong 0)
-MIN_BRIDGE = 30  # points that tie two groups of images (COLMAP registers one image from 30 on)
-MIN_GROUP = 3  # images; fewer that hang on few points are left to be located by PnP
-WEAKEST_CUTS = 3  # whose missing points are counted (chosen: time)
+MAX_NEIGHBOUR = 4  # keyframes apart, at most, whose matches are checked (chosen)
+# Fraction of the matches that must be one point of the model (measured: right .38-.98, wrong 0)
+MIN_TIED = 0.1
+MIN_BRIDGE = 30  # points that connect two groups (COLMAP registers one image from 30 on)
+MIN_GROUP = 3  # images; fewer with a weak connection are left to be located by PnP
+WEAKEST_CUTS = 3  # whose re-observed points are counted (chosen: time)
 BORDER_IMAGES = 10  # of each side of a cut, those that share the most points (chosen: time)
-NEAR_VIEW_DEG = 30.0  # turn of a view up to which a point is found again (SIFT: Lowe 2004, fig. 9)
-NEAR_VIEW_SCALE = 2.0  # change of distance up to which it is (an octave; chosen)
-MIN_SEEN = 0.03  # share of such points that must be found again (measured: right .065-.5, wrong
-# 0-.007), and how many at least: what only views farther apart share is matched by chance
-MIN_FOUND = 10  # (measured: right 31 and more; the last 30 frames of the example mirrored 0)
+NEAR_VIEW_DEG = 30.0  # change of view that SIFT bridges (Lowe 2004, fig. 9)
+NEAR_VIEW_SCALE = 2.0  # change of distance that it bridges (an octave; chosen)
+# Fraction of the points that near views must observe again, and least number: what only farther
+# views share is matched by chance. Measured: right .065-.5, wrong 0-.007; right 31 and more, the
+# last 30 frames of the example mirrored 0.
+MIN_REOBSERVED = 0.03
+MIN_REOBSERVED_COUNT = 10
 
 
 def consistent_groups(arrays: ModelArrays, pairs: MatchedPairs) -> list[IntArray]:
-    """Split the images of a model into groups that hold together.
+    """Split the images of a model into consistent groups.
 
     Args:
         arrays: ids of its images ascend in time. pairs: verified matches of its database.
     Returns:
-        ids of the images of each group, the largest group first; images that hang on by too little
+        ids of the images of each group, the largest group first; images with too weak a connection
         are in none.
     """
-    explained, groups = count_explained(arrays, pairs), []
+    explained = count_explained(arrays, pairs)
+    groups = list[IntArray]()
     todo = _runs_of_tied_neighbours(arrays, pairs, explained)
     while todo:
         rows = todo.pop()
@@ -154,11 +87,12 @@ def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
     xy = np.concatenate([np.empty((0, 2)), *(pairs.keypoints[i] for i in ids)])
     ideal = np.reshape(arrays.camera.cam_from_img(xy), (-1, 2))
     a, b = np.searchsorted(arrays.ids, pairs.image_ids[inside]).T  # (p,)
-    rotation, shift = arrays.cam_from_world[:, :, :3], arrays.cam_from_world[:, :, 3]
+    rotation = arrays.cam_from_world[:, :, :3]
+    shift = arrays.cam_from_world[:, :, 3]
     turn = rotation[b] @ np.swapaxes(rotation[a], 1, 2)  # (p, 3, 3)
     x, y, z = (shift[b] - np.einsum("pij,pj->pi", turn, shift[a])).T
-    none = np.zeros(len(x))
-    cross = np.moveaxis(np.array([[none, -z, y], [z, none, -x], [-y, x, none]]), 2, 0)
+    zero = np.zeros(len(x))
+    cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), 2, 0)
     E = cross @ turn
     count = np.zeros(len(pairs.inliers), np.int64)
     for k, row in enumerate(inside.tolist()):
@@ -167,7 +101,8 @@ def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
             np.insert(ideal[first[image[k]] + match[:, side]], 2, 1, 1)  # (n, 3)
             for side, image in enumerate((a, b))
         )
-        line_b, line_a = one @ E[k].T, other @ E[k]
+        line_b = one @ E[k].T
+        line_a = other @ E[k]
         slope = (line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)
         distance = np.abs((other * line_b).sum(1)) / np.sqrt(slope + 1e-18) * arrays.focal
         count[row] = (distance < EXPLAINED_PX).sum()
@@ -177,12 +112,12 @@ def count_explained(arrays: ModelArrays, pairs: MatchedPairs) -> IntArray:
 def _runs_of_tied_neighbours(
     arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray
 ) -> list[IntArray]:
-    """Split rows of images where the model does not hold the matches of neighbours in time.
+    """Split rows of images where matches of neighbours in time are not triangulated in the model.
 
-    Images that follow each other show one place (others may be alike by chance), so the model must
-    have their verified matches (`_ties`). It does not where the camera was put at a twin of its
-    place, at another scale, or nowhere. An image that is tied to neither of its neighbours is left
-    out; it splits the rest unless the images before and after it are tied to each other.
+    Consecutive images show the same scene (others may only look alike), so their verified matches
+    must be points of the model (`_ties`). They are not where an image was registered at a
+    look-alike position, at another scale, or not at all. An image that is tied to neither neighbour
+    is left out; it splits the rest unless the images before and after it are tied to each other.
 
     Returns:
         rows (n,) of each run, ascending.
@@ -205,47 +140,51 @@ def _runs_of_tied_neighbours(
 def _ties(
     arrays: ModelArrays, pairs: MatchedPairs, explained: IntArray, every: list[int]
 ) -> dict[tuple[int, int], bool]:
-    """Tell of each pair of images with enough verified matches whether the model has them.
+    """Check for each pair of images with enough matches that they are triangulated in the model.
 
-    A good share must be one point of the model, two observations each; and an essential matrix of
-    their own must not explain many more of them than the model's does.
+    A fraction MIN_TIED of the matches must be one point of the model; and an essential matrix of
+    the pair alone must not explain many more of them than the model does.
 
     Args:
-        every: ids in the order of time; pairs with up to 3 images between them are looked at.
+        every: ids in the order of time; pairs with up to 3 images between them are checked.
     """
-    at = {number: k for k, number in enumerate(every)}
-    point_of, ties = {}, {}
+    order = {number: k for k, number in enumerate(every)}
+    point_of = {}
+    ties = {}
     for row, image_id in enumerate(arrays.ids.tolist()):
         point_of[image_id] = np.full(len(pairs.keypoints[image_id]), -1)
         mine = arrays.image == row
         point_of[image_id][arrays.keypoint[mine]] = arrays.point[mine]
     for row, (a, b) in enumerate(pairs.image_ids.tolist()):
         matches = pairs.inliers[row]
-        if len(matches) < MIN_MATCHES or at[b] - at[a] > MAX_NEIGHBOUR:
+        if len(matches) < MIN_MATCHES or order[b] - order[a] > MAX_NEIGHBOUR:
             continue
         ties[a, b] = False
         if a in point_of and b in point_of:
-            one, other = point_of[a][matches[:, 0]], point_of[b][matches[:, 1]]
-            shared = np.mean((one == other) & (one >= 0))
-            against = _contradicted(arrays, pairs, row, int(explained[row]))
-            ties[a, b] = bool(shared >= MIN_TIED and not against)
+            one = point_of[a][matches[:, 0]]
+            other = point_of[b][matches[:, 1]]
+            tied = np.mean((one == other) & (one >= 0))
+            contradicted = _contradicted(arrays, pairs, row, int(explained[row]))
+            ties[a, b] = bool(tied >= MIN_TIED and not contradicted)
     return ties
 
 
 def _contradicted(arrays: ModelArrays, pairs: MatchedPairs, row: int, explained: int) -> bool:
-    """Tell whether two images' own essential matrix explains many more matches than the model."""
-    matches, (a, b) = pairs.inliers[row], pairs.image_ids[row].tolist()
+    """True if an essential matrix of two images explains many more matches than the model."""
+    matches = pairs.inliers[row]
+    a, b = pairs.image_ids[row].tolist()
     if len(matches) - explained < MIN_MATCHES:
         return False
-    camera, ransac = arrays.camera, {"max_error": EXPLAINED_PX, "random_seed": 0}
+    camera = arrays.camera
+    ransac = {"max_error": EXPLAINED_PX, "random_seed": 0}
     xy = pairs.keypoints[a][matches[:, 0]], pairs.keypoints[b][matches[:, 1]]
-    own = import_pycolmap().estimate_essential_matrix(*xy, camera, camera, ransac)
-    return bool(own is not None and own["num_inliers"] - explained >= MIN_MATCHES)
+    estimate = import_pycolmap().estimate_essential_matrix(*xy, camera, camera, ransac)
+    return bool(estimate is not None and estimate["num_inliers"] - explained >= MIN_MATCHES)
 
 
-def _shared_points(seen: Any) -> Array:
+def _shared_points(covisibility: Any) -> Array:
     """Count the points (R, R) that two images share, 0 on the diagonal."""
-    shared = np.asarray((seen @ seen.T).todense(), np.float64)
+    shared = np.asarray((covisibility @ covisibility.T).todense(), np.float64)
     np.fill_diagonal(shared, 0)
     return shared
 
@@ -253,22 +192,21 @@ def _shared_points(seen: Any) -> Array:
 def _weak_cut(
     arrays: ModelArrays, rows: IntArray, pairs: MatchedPairs, explained: IntArray
 ) -> BoolArray | None:
-    """Find two groups of images that too little ties together.
+    """Find a cut of the images into two groups whose connection is too weak.
 
-    Candidates are the cuts of the spanning tree of most shared points. A point ties two groups,
-    and their scales, if one of them sees it from directions that tell its depth, and the other sees
-    it too. Too few are few points, or few of those that should be found again: near views of a
-    place that share nothing are two places, and what far views share is chance. Points without two
-    images that have as many matches are few too: chance matches of a symmetric thing add up over
-    images.
+    Candidates are the cuts of the spanning tree of most shared points. A point connects two groups,
+    including their relative scale, if one group triangulates it and the other observes it. A cut is
+    weak if it has too few such points, or if no pair of images across it has as many matches: false
+    matches on symmetric objects add up over images. It is also weak if nearby views across it
+    re-observe too few points: what only distant views share is matched by chance.
 
     Args:
         explained: (P,) matches of each pair.
     Returns:
-        (n,) True on one side of `rows`, None if all holds together.
+        (n,) True on one side of `rows`, None if there is no weak cut.
     """
-    seen = arrays.seen()[rows]
-    shared = _shared_points(seen)
+    covisibility = arrays.covisibility()[rows]
+    shared = _shared_points(covisibility)
     tree = minimum_spanning_tree(sparse.csr_matrix(np.where(shared > 0, 1 / (shared + 1), 0)))
     order, parent = breadth_first_order(tree, 0, directed=False)
     if len(order) < len(rows):  # not even connected
@@ -287,8 +225,8 @@ def _weak_cut(
     smaller = np.minimum(cuts.sum(1), (~cuts).sum(1))
     groups = np.flatnonzero(smaller >= MIN_GROUP)
     for cut in groups[np.argsort(bridge[groups], kind="stable")[:WEAKEST_CUTS]]:
-        expected, found = _found_again(arrays, rows, np.asarray(cuts[cut]))
-        if found < max(MIN_SEEN * expected, MIN_FOUND):
+        expected, reobserved = _count_reobserved(arrays, rows, np.asarray(cuts[cut]))
+        if reobserved < max(MIN_REOBSERVED * expected, MIN_REOBSERVED_COUNT):
             return np.asarray(cuts[cut])
     return None
 
@@ -297,22 +235,22 @@ CUTS_AT_ONCE = 50  # whose bridges are counted together (chosen: memory)
 
 
 def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
-    """Count the points (C,) that tie the two sides of each cut (C, R) of `rows`.
+    """Count the points (C,) that connect the two sides of each cut (C, R) of `rows`.
 
-    The depth of a point is told by n rays whose directions u spread: n - |sum of u|^2 / n, which is
-    1 - cos(angle) for two.
+    One side must triangulate the point, by `MIN_RAY_SPREAD`, and the other observe it.
     """
-    centre, seen = arrays.centre[rows], arrays.seen()[rows].tocsc()
-    at = seen.tocoo()
-    ray = arrays.xyz[at.col] - centre[at.row]  # (m, 3)
+    centre = arrays.centre[rows]
+    covisibility = arrays.covisibility()[rows].tocsc()
+    entries = covisibility.tocoo()
+    ray = arrays.xyz[entries.col] - centre[entries.row]  # (m, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    rays = [sparse.csc_matrix((u, (at.row, at.col)), seen.shape) for u in ray.T]
+    rays = [sparse.csc_matrix((u, (entries.row, entries.col)), covisibility.shape) for u in ray.T]
     count = np.zeros(len(cuts), np.int64)
     for start in range(0, len(cuts), CUTS_AT_ONCE):
         chunk = cuts[start : start + CUTS_AT_ONCE].astype(float)
         sides = []
         for side in (chunk, 1 - chunk):
-            n = np.asarray(side @ seen)  # (c, N)
+            n = np.asarray(side @ covisibility)  # (c, N)
             length2 = sum(np.asarray(side @ u) ** 2 for u in rays)
             sides.append((n > 0, n - length2 / np.maximum(n, 1) >= MIN_RAY_SPREAD))
         (one, one_deep), (two, two_deep) = sides
@@ -320,42 +258,449 @@ def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
     return count
 
 
-def _found_again(arrays: ModelArrays, rows: IntArray, side: BoolArray) -> tuple[int, int]:
-    """Count the observations that the images of one side should have of the other side's points.
+def _count_reobserved(arrays: ModelArrays, rows: IntArray, side: BoolArray) -> tuple[int, int]:
+    """Count the observations that each side of a cut should have of the other side's points.
 
-    Expected is a point that two images of its side see, in an image of the other side that it lies
-    in, from a direction and a distance near those of one of the two.
+    Expected is a point that two images of its side see, in an image of the other side that it
+    projects into, from a direction and a distance near those of one of the two.
 
     Args:
         side: (R,) of `rows`.
     Returns:
-        how many are expected, and how many of these were made; of both directions together.
+        how many are expected, and how many of these were made; sums of both directions.
     """
-    pose, centre, camera = arrays.cam_from_world[rows], arrays.centre[rows], arrays.camera
-    every, size = arrays.seen()[rows], (camera.width, camera.height)
+    pose = arrays.cam_from_world[rows]
+    centre = arrays.centre[rows]
+    camera = arrays.camera
+    covisibility = arrays.covisibility()[rows]
+    size = (camera.width, camera.height)
     img_from_cam = np.array(camera.calibration_matrix())
-    expected = found = 0
+    expected = reobserved = 0
     for own in (side, ~side):
-        seen = every[own]
+        seen = covisibility[own]
         points = np.flatnonzero(np.asarray(seen.sum(0)).ravel() >= 2)  # (n,)
-        xyz, seen = arrays.xyz[points], seen[:, points].tocoo()
-        there = every[~own][:, points].tocsr()
+        xyz = arrays.xyz[points]
+        seen = seen[:, points].tocoo()
+        there = covisibility[~own][:, points].tocsr()
         border = np.argsort(-np.asarray(there.sum(1)).ravel(), kind="stable")[:BORDER_IMAGES]
-        ray = centre[own][seen.row] - xyz[seen.col]  # (m, 3) from the point to a camera that has it
+        ray = centre[own][seen.row] - xyz[seen.col]  # (m, 3) from a point to a camera that sees it
         length = np.linalg.norm(ray, axis=1)
         for image in border:
             there_from_world = pose[~own][image]
-            at = xyz @ there_from_world[:, :3].T + there_from_world[:, 3]  # (n, 3)
-            at = at @ img_from_cam.T
-            inside = at[:, 2] > 0
-            xy = at[:, :2] / np.where(inside, at[:, 2], 1)[:, None]
+            projected = xyz @ there_from_world[:, :3].T + there_from_world[:, 3]  # (n, 3)
+            projected = projected @ img_from_cam.T
+            inside = projected[:, 2] > 0
+            xy = projected[:, :2] / np.where(inside, projected[:, 2], 1)[:, None]
             inside &= ((xy > 0) & (xy < size)).all(1)
-            here = centre[~own][image] - xyz  # (n, 3)
-            away = np.linalg.norm(here, axis=1)[seen.col]
-            cosine = (ray * here[seen.col]).sum(1) / (length * away)
-            alike = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
-            alike &= np.abs(np.log(length / away)) < np.log(NEAR_VIEW_SCALE)
-            inside &= np.bincount(seen.col[alike], minlength=len(points)) > 0
+            other_ray = centre[~own][image] - xyz  # (n, 3)
+            other_length = np.linalg.norm(other_ray, axis=1)[seen.col]
+            cosine = (ray * other_ray[seen.col]).sum(1) / (length * other_length)
+            is_near = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
+            is_near &= np.abs(np.log(length / other_length)) < np.log(NEAR_VIEW_SCALE)
+            inside &= np.bincount(seen.col[is_near], minlength=len(points)) > 0
             expected += int(inside.sum())
-            found += int(inside[there[image].indices].sum())
-    return expected, found
+            reobserved += int(inside[there[image].indices].sum())
+    return expected, reobserved
+
+
+# ---- Soundness -----------------------------------------------------------------------------------
+
+
+class FocalSource(enum.Enum):
+    """How a focal length is known."""
+
+    GIVEN = enum.auto()  # by the user
+    MATCHES = enum.auto()  # estimated from the epipolar geometry of the matches
+    MODEL = enum.auto()  # calibrated by the bundle adjustment of the model
+    GUESS = enum.auto()  # EXIF, or a usual one
+
+
+@dataclass(frozen=True, slots=True)
+class SigmaLimits:
+    """Largest centre_sigma of a component, by how its focal length is known.
+
+    Attributes:
+        accepted: of components of the incremental mapper that need no second mapper to agree.
+        confirmed: of components that a second mapper can confirm.
+    """
+
+    accepted: float
+    confirmed: float
+
+
+# Up to here all centres of a component are certain. Above, it may be one of many nearly equal
+# solutions, and another mapper must find the same (measured: right models of 40 keyframes and more
+# .0001 to .0025, wrong ones of short stretches from .0011 on).
+SURE_CENTRE_SIGMA = 0.001
+# A focal length that does not come from the model is evidence of its own: it saves the second
+# mapper at .0012 (chosen: time). Without it a second mapper proves nothing above .004: where the
+# camera zoomed, both came to the same wrong scale (measured: one of .0045).
+SIGMA_LIMITS = {
+    FocalSource.GIVEN: SigmaLimits(accepted=0.0012, confirmed=np.inf),
+    FocalSource.MATCHES: SigmaLimits(accepted=0.0012, confirmed=np.inf),
+    FocalSource.MODEL: SigmaLimits(accepted=SURE_CENTRE_SIGMA, confirmed=0.004),
+    FocalSource.GUESS: SigmaLimits(accepted=SURE_CENTRE_SIGMA, confirmed=0.004),
+}
+MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
+MIN_POINTS = 100  # refuse a model with fewer (chosen)
+MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
+MIN_TRI_ANGLE_DEG = 1.5  # median; refuse a model with less (chosen; COLMAP's points: 1.5)
+MIN_REGISTERED = 0.5  # fraction of the keyframes that makes a model worth keeping ...
+MIN_COMPONENT_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
+# Two mappers agree if no centre differs by more, over the extent, and no camera by more in
+# orientation: half of what the benchmark of broken trajectories calls wrong
+SAME_CENTRE = 0.05
+SAME_TURN_DEG = 5.0
+SAME_IMAGES = 0.75  # fraction of the component that the other mapper must have (chosen)
+MIN_SAME = 3  # images of a piece of it; fewer have arbitrary poses (chosen)
+# Points that each of two pieces triangulates and that prove how they are joined: they fix rotation,
+# shift and scale (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
+MIN_JOINT = 100
+
+
+SIDEWAYS = "move the camera sideways around the objects (turning on the spot gives no depth)"
+LENS = "give measured intrinsics (--camera); pixels must be square"
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """A consistent model of one component of the trajectory, and the measures of its soundness."""
+
+    model: Any
+    arrays: ModelArrays
+    focal_source: FocalSource
+    tri_angle_deg: float  # median over points of the widest angle between two rays
+    registered: float  # fraction of the keyframes
+    parallax_px: float  # that rotations of the camera alone cannot explain
+    centre_sigma: float  # largest of a camera centre, over the extent of the trajectory
+    explained: int  # verified matches
+    problem: str  # "" if it is sound
+    kept: IntArray  # ids of the images with certain poses
+    advice: str = ""  # for the user, where the cause is established
+
+    @property
+    def focal(self) -> float:
+        """Focal length over the longer side."""
+        return self.arrays.focal_over_size
+
+
+def measured(
+    model: Any,
+    arrays: ModelArrays,
+    centre_sigma: float,
+    *,
+    count: int,
+    explained: int,
+    focal_source: FocalSource,
+) -> Component:
+    """Measure an adjusted model of some of `count` keyframes and name its first problem.
+
+    Args:
+        arrays: of the model. explained: verified matches that it explains.
+    """
+    images = len(arrays.ids)
+    points = len(arrays.xyz)
+    seen = np.median(np.bincount(arrays.image, minlength=max(images, 1)))
+    angle_deg = _median_tri_angle_deg(arrays)
+    parallax_px = _parallax_px(arrays)
+    focal = arrays.focal_over_size
+    # at a wrong focal length a translation along a wall looks like a rotation
+    calibrated = focal_source is FocalSource.MODEL
+    advice = SIDEWAYS if calibrated else ""
+    no_depth = "so depth cannot be estimated"
+    if not calibrated:
+        no_depth = f"if the focal length is {focal:.2f} x the longer side"
+    checks = (
+        (images < min(MIN_REGISTERED * count, MIN_COMPONENT_IMAGES),
+         f"only {images} of {count} keyframes connect", ""),
+        (points < MIN_POINTS, f"only {points} points could be triangulated", ""),
+        (seen < MIN_POINTS_PER_IMAGE,
+         f"half of the keyframes see {seen:.0f} points or fewer", ""),
+        (parallax_px < MIN_PARALLAX_PX,
+         f"the camera only rotates (to {parallax_px:.1f} px), {no_depth}", advice),
+        (angle_deg < MIN_TRI_ANGLE_DEG,
+         f"half of the points are seen from directions within {angle_deg:.1f} deg", advice),
+        (arrays.camera.has_bogus_params(*FOCAL_RANGE, 1.0),
+         f"the estimated focal length is {focal:.2f} x the longer side", LENS),
+    )  # fmt: skip
+    problem, advice = next(((text, advice) for bad, text, advice in checks if bad), ("", ""))
+    return Component(
+        model, arrays, focal_source, angle_deg, images / count, parallax_px, centre_sigma,
+        explained, problem, arrays.ids, advice,
+    )  # fmt: skip
+
+
+def confirmed(
+    components: list[Component], others: list[Component], focal_source: FocalSource
+) -> list[Component]:
+    """Reject components of uncertain cameras unless a second mapper reproduces them.
+
+    Images whose poses differ, or which it lacks, are not kept.
+
+    Args:
+        focal_source: of the focal length before mapping.
+    """
+    checked = list[Component]()
+    for component in components:
+        if not component.problem and component.centre_sigma > SURE_CENTRE_SIGMA:
+            can_confirm = component.centre_sigma <= SIGMA_LIMITS[focal_source].confirmed
+            rows = _reproduced_by(
+                component.arrays, [other.arrays for other in others if can_confirm]
+            )
+            component = replace(component, kept=component.arrays.ids[rows])
+            if len(rows) < SAME_IMAGES * len(component.arrays.ids):
+                problem = (
+                    "the camera positions are uncertain, and no second mapper confirms them "
+                    f"(largest sigma {100 * component.centre_sigma:.2g} % of the trajectory, "
+                    f"parallax {component.parallax_px:.0f} px, rays meet at "
+                    f"{component.tri_angle_deg:.1f} deg)"
+                )
+                component = replace(component, problem=problem)
+        checked.append(component)
+    return sorted(checked, key=lambda c: (bool(c.problem), -c.registered))
+
+
+def _reproduced_by(one: ModelArrays, others: Sequence[ModelArrays]) -> IntArray:
+    """Return the images (rows of one) with the same poses in another mapper's models.
+
+    Those may be pieces. A piece only proves the relative poses of its own cameras. What joins it to
+    the others are points that both triangulate: of two scenes that look alike there are few, and
+    none where a single image, or a pair without a third, connects two scales.
+    """
+    pieces = sorted((_same(one, other) for other in others), key=len, reverse=True)
+    rows = pieces[0] if pieces else np.empty(0, np.int64)
+    todo = pieces[1:]
+    while joined := [
+        piece
+        for piece in todo
+        if (one.triangulated_by(rows) & one.triangulated_by(piece)).sum() >= MIN_JOINT
+    ]:
+        rows = np.union1d(rows, joined[0])
+        todo = [piece for piece in todo if piece is not joined[0]]
+    return np.sort(rows)
+
+
+def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
+    """Return the images that another model has, rows (n,) of one; none unless all poses agree.
+
+    One is aligned to the other by the mean of the relative orientations, then scale and shift.
+    """
+    ids = np.intersect1d(one.ids, other.ids)
+    if len(ids) < MIN_SAME:
+        return np.empty(0, np.int64)
+    rows = np.searchsorted(one.ids, ids)
+    other_rows = np.searchsorted(other.ids, ids)
+    a = one.cam_from_world[rows][:, :, :3]
+    b = other.cam_from_world[other_rows][:, :, :3]
+    relative = Rotation.from_matrix(np.swapaxes(b, 1, 2) @ a)
+    mean = relative.mean()
+    turn_deg = np.degrees((mean.inv() * relative).magnitude())
+    start = one.centre[rows]
+    end = other.centre[other_rows]
+    moved = mean.apply(start - start.mean(0))
+    end = end - end.mean(0)
+    moved *= (moved * end).sum() / max((moved**2).sum(), 1e-12)
+    offset = np.linalg.norm(moved - end, axis=1).max() / np.linalg.norm(np.ptp(end, axis=0))
+    return rows[: len(ids) if offset <= SAME_CENTRE and turn_deg.max() <= SAME_TURN_DEG else 0]
+
+
+ANGLE_SAMPLE = 2000  # points of which the median angle is taken, at least (chosen: time)
+
+
+def _median_tri_angle_deg(arrays: ModelArrays) -> float:
+    """Return the median over points of the widest angle between two rays."""
+    if not len(arrays.xyz):
+        return 0.0
+    step = max(1, len(arrays.xyz) // ANGLE_SAMPLE)
+    sample = np.flatnonzero(arrays.point % step == 0)
+    sample = sample[np.argsort(arrays.point[sample], kind="stable")]
+    ray = arrays.xyz[arrays.point[sample]] - arrays.centre[arrays.image[sample]]  # (m, 3)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    starts = np.flatnonzero(np.diff(arrays.point[sample], prepend=-1))
+    cosine = [(u @ u.T).min() for u in np.split(ray, starts[1:])]  # of each point
+    return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
+
+
+MIN_SHARED = 15  # points of a pair of images whose parallax counts (chosen)
+
+
+def _parallax_px(arrays: ModelArrays) -> float:
+    """Return the parallax that rotations of the camera cannot explain, px.
+
+    Of each pair of images the rays of the shared points are aligned by a rotation; the median
+    residual is the pair's parallax. Returned is the 95th percentile over pairs. A camera that only
+    rotated looks sound otherwise: a wrong focal length produces triangulation angles.
+    """
+    unit = np.insert(arrays.ideal, 2, 1, 1)  # (M, 3)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    ends = np.searchsorted(arrays.image, np.arange(len(arrays.ids) + 1))
+    residuals = []
+    for a, b in itertools.combinations(range(len(arrays.ids)), 2):
+        if (b - a) & (b - a - 1) == 0:  # 1, 2, 4, 8 ... keyframes apart
+            p, q = (arrays.point[ends[i] : ends[i + 1]] for i in (a, b))
+            both, one, other = np.intersect1d(p, q, return_indices=True)
+            if len(both) >= MIN_SHARED:
+                u = unit[ends[a] + one]  # (n, 3)
+                v = unit[ends[b] + other]
+                turned = Rotation.align_vectors(v, u)[0].apply(u)
+                residuals.append(np.median(np.linalg.norm(turned - v, axis=1)))
+    return float(np.percentile(residuals, 95)) * arrays.focal if residuals else 0.0
+
+
+# ---- Zoom ----------------------------------------------------------------------------------------
+
+
+WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends those further off)
+MIN_RESECTED_POINTS = 20  # of these seen in an image (chosen; two determine focal length and pose)
+# Log of the focal length's change that is a zoom (measured, mean of both sides: zoomed by 1.25 to
+# 1.5 .15-.30, right models below .03; one side alone .34-.39, right models up to .12)
+MIN_ZOOM = 0.12
+MIN_ZOOM_ONE_SIDE = 0.24
+MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
+RESECTED_IMAGES = 2  # on each side of a gap (chosen)
+UNMEASURED = 10.0  # log of a change that cannot be measured: its sides count as different cameras
+RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
+
+
+def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int, int, float]]]:
+    """Find the images that were not taken at the most frequent focal length.
+
+    A mapper assumes one focal length: it shifts images of a zoomed stretch towards the scene.
+
+    Args:
+        models: ids of images ascend in time.
+    Returns:
+        ids of the images of other focal lengths, or of one that cannot be compared; of each change
+        the ids of the images before and after it and the ratio of their focal lengths.
+    """
+    changes = sorted(change for arrays in models for change in _changes(arrays))
+    changes = [c for c in changes if not any(_is_side_effect(c, other) for other in changes)]
+    ids = np.array(sorted({int(i) for arrays in models for i in arrays.ids}), np.int64)
+    starts = np.searchsorted(ids, [after for _, after, _ in changes])
+    log = np.zeros(len(ids))
+    for k, (start, (_, _, ratio)) in enumerate(zip(starts, changes, strict=True)):
+        is_measured = not k or start - starts[k - 1] >= WINDOW  # else each bends the other's images
+        log[start:] += np.log(ratio) if is_measured else UNMEASURED
+    same = np.abs(log[:, None] - log) < MIN_ZOOM  # (R, R)
+    return ids[~same[same.sum(1).argmax()]] if len(ids) else ids, changes
+
+
+def _is_side_effect(one: tuple[int, int, float], other: tuple[int, int, float]) -> bool:
+    """True if an adjacent larger zoom in the same direction explains this one.
+
+    Images next to a zoom are bent by it.
+    """
+    adjacent = one is not other and (one[0] == other[1] or one[1] == other[0])
+    log = np.log(one[2])
+    other_log = np.log(other[2])
+    return bool(adjacent and log * other_log > 0 and abs(log) < abs(other_log))
+
+
+def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
+    """List the changes of the focal length between consecutive images.
+
+    The images next to each gap are resected from points of the other side. Where only one side can
+    be measured, a larger change is required: the noise of its depths biases it.
+    """
+    count = len(arrays.ids)
+    changes = list[tuple[int, int, float]]()
+    ray = np.insert(arrays.ideal, 2, 1, 1)[:, None] @ arrays.cam_from_world[arrays.image][:, :, :3]
+    ray = ray[:, 0] / np.linalg.norm(ray[:, 0], axis=1, keepdims=True)  # (M, 3) in world
+    across = np.eye(3) - ray[:, :, None] * ray[:, None]  # (M, 3, 3)
+    start = (across @ arrays.centre[arrays.image][:, :, None])[:, :, 0]
+    terms = np.hstack([across.reshape(-1, 9), start, ray, np.ones((len(ray), 1))])  # (M, 16)
+    for k in range(1, count):
+        before = range(max(0, k - WINDOW), k)
+        after = range(k, min(k + WINDOW, count))
+        sides = list[list[list[float]]]()
+        for side, resected, sign in (
+            (before, after[:RESECTED_IMAGES], 1),
+            (after, before[-RESECTED_IMAGES:], -1),
+        ):
+            points = _triangulate(arrays, terms, side)
+            values = np.array([_log_focal(arrays, image, points) for image in resected])
+            values = values * [sign, 1]
+            sides.append(values[np.isfinite(values[:, 0])].tolist())
+        if any(sides):
+            log, sigma = np.median(list(itertools.chain(*sides)), axis=0)
+            least = MIN_ZOOM if all(sides) else MIN_ZOOM_ONE_SIDE
+            if abs(log) > max(least, MIN_SIGMAS * sigma):
+                ids = int(arrays.ids[k - 1]), int(arrays.ids[k])
+                changes.append((*ids, float(np.exp(log))))
+    return changes
+
+
+def _triangulate(arrays: ModelArrays, terms: Array, side: range) -> Array:
+    """Triangulate points from some consecutive images: the nearest to all their rays.
+
+    Args:
+        terms: (M, 16) of each observation with unit ray u from centre c, in world: I - u u' (9),
+            (I - u u') c, u, 1.
+    Returns:
+        (N, 3) points, NaN where the rays do not determine the depth.
+    """
+    first, last = np.searchsorted(arrays.image, (side.start, side.stop))
+    points, row = np.unique(arrays.point[first:last], return_inverse=True)
+    entries = (np.ones(len(row)), (row, np.arange(len(row))))
+    sums = sparse.csr_matrix(entries, (len(points), len(row))) @ terms[first:last]
+    n = sums[:, 15]
+    good = n - (sums[:, 12:15] ** 2).sum(1) / np.maximum(n, 1) >= MIN_RAY_SPREAD
+    xyz = np.full((len(arrays.xyz), 3), np.nan)
+    A = sums[good, :9].reshape(-1, 3, 3)
+    b = sums[good, 9:12, None]
+    xyz[points[good]] = np.linalg.solve(A, b)[:, :, 0]
+    return xyz
+
+
+def _log_focal(arrays: ModelArrays, image: int, points: Array) -> tuple[float, float]:
+    """Estimate an image's focal length from points (N, 3), NaN where there are none.
+
+    Returns:
+        log of its ratio to that of the model, and its sigma; NaN with too few points.
+    """
+    first, last = np.searchsorted(arrays.image, (image, image + 1))
+    pose = arrays.cam_from_world[image]
+    ideal = arrays.ideal[first:last]
+    xyz_in_cam = points[arrays.point[first:last]] @ pose[:, :3].T + pose[:, 3]
+    in_front = xyz_in_cam[:, 2] > 0  # no NaN
+    if in_front.sum() < MIN_RESECTED_POINTS:
+        return np.nan, np.nan
+    return _resect(xyz_in_cam[in_front], ideal[in_front] * arrays.focal, arrays.focal)
+
+
+def _resect(xyz_in_cam: Array, xy: Array, focal: float) -> tuple[float, float]:
+    """Fit a small motion and the focal length of a camera to points, with a Cauchy loss of 1 px.
+
+    Args:
+        xyz_in_cam: (n, 3) points, nearly in the camera's frame. xy: (n, 2) pixels from the centre.
+    Returns:
+        log of the focal length over `focal`, and its sigma; NaN if the fit fails.
+    """
+    turn = np.eye(3)
+    shift = np.zeros(3)
+    log = 0.0
+    for _ in range(RESECTION_STEPS):
+        moved = xyz_in_cam @ turn.T + shift
+        if (moved[:, 2] <= 0).any():
+            return np.nan, np.nan
+        f = focal * np.exp(log)
+        zero = np.zeros(len(moved))
+        inverse = 1 / moved[:, 2]
+        x = moved[:, 0] * inverse
+        y = moved[:, 1] * inverse
+        residual = xy - f * np.column_stack([x, y])  # (n, 2)
+        weight = 1 / (1 + (residual**2).sum(1))
+        J = f * np.array([  # (2, 7, n) by rotation, translation and log focal length
+            [-x * y, 1 + x * x, -y, inverse, zero, -x * inverse, x],
+            [-1 - y * y, x * y, x, zero, inverse, -y * inverse, y],
+        ])  # fmt: skip
+        normal = np.einsum("ain,ajn,n->ij", J, J, weight)
+        if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e14:
+            return np.nan, np.nan
+        step = np.linalg.solve(normal, np.einsum("ain,na,n->i", J, residual, weight))
+        rotation = Rotation.from_rotvec(step[:3]).as_matrix()
+        turn = rotation @ turn
+        shift = rotation @ shift + step[3:6]
+        log = float(np.clip(log + step[6], -1, 1))
+    variance = np.average((residual**2).sum(1), weights=weight) / 2
+    return log, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
