@@ -1,8 +1,8 @@
-"""Poses made elsewhere: which format a file or folder has, and which frame each pose belongs to.
+"""Read the poses of a video's frames from files of other tools.
 
-Each format has a reader that turns its conventions into cam_from_world, OpenCV axes, COLMAP pixels
-(`pose_formats`, `colmap_model`); `pose_readings` then finds the frames. Whether the conventions
-were those that the file claims is judged later, by `checks`.
+The reader of each format converts its conventions to cam_from_world, OpenCV axes, COLMAP pixels
+(`pose_formats`, `colmap_model`); poses are then assigned to frames (`frame_assignment`). Whether
+the file follows its conventions is checked later, against the tracks (`interpretation`).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from reobj.poses.supplied import pose_formats as formats
 from reobj.poses.supplied.colmap_model import find_models, read_colmap
 from reobj.poses.supplied.frame_assignment import (
     UNITS,
-    Reading,
-    Source,
+    FrameAssignment,
+    SourceFrames,
+    assignments,
     interpolated,
-    readings,
     source_of,
     unit_of_stamps,
 )
@@ -46,30 +46,30 @@ def read_poses(
     Args:
         path: file or folder. video: the frames they belong to.
         fmt: auto (recognised), or a format of READERS.
-        camera: intrinsics in place of the file's, as `--camera` takes them.
-        metric: the poses are in metres, also where the format does not say so.
-        frames_by: which pose belongs to which frame, where the file leaves it open: `number0`,
-            `number1`, `time`, ... as the error of a tie names them.
+        camera: intrinsics in place of the file's, in the forms of `--camera`.
+        metric: the poses are in metres, whatever the format.
+        frames_by: the assignment to frames, where the file is ambiguous: `number0`, `number1`,
+            `time`, ... as listed in the error.
     Returns:
-        poses of the frames that the file knows, NaN for the others (counted in `messages`).
+        poses of all frames, NaN where the file has none (counted in `messages`).
     Raises:
         ReobjError: damaged, unknown, not rigid, without intrinsics, of another video, or with
             several readings between which the images do not decide.
     """
-    found = pose_readings(path, video, fmt, camera, metric, frames_by)
-    return the_reading(by_images(found, video), Path(path))
+    readings = pose_readings(path, video, fmt, camera, metric, frames_by)
+    return the_reading(by_images(readings, video), Path(path))
 
 
-def the_reading(found: list[PoseReading], path: Path) -> Poses:
-    """Return the poses of the only reading; refuse several that were not decided between."""
-    if len(found) > 1:
-        what = "; or ".join(f"{reading.key} ({reading.rule})" for reading in found)
+def the_reading(readings: list[PoseReading], path: Path) -> Poses:
+    """Return the poses of the only reading; refuse several."""
+    if len(readings) > 1:
+        choices = "; or ".join(f"{reading.key} ({reading.rule})" for reading in readings)
         raise ReobjError(
-            f"{path}: the frames of its poses can be found in {len(found)} ways, and neither "
-            f"images nor tracks show which is right: {what}; choose with --set "
-            f"poses.frames_by={found[0].key}"
+            f"{path}: its poses can be assigned to frames in {len(readings)} ways, and neither "
+            f"images nor tracks show which is right: {choices}; choose with --set "
+            f"poses.frames_by={readings[0].key}"
         )
-    return found[0].described_poses
+    return readings[0].described_poses
 
 
 def pose_readings(
@@ -80,80 +80,92 @@ def pose_readings(
     metric: bool = False,
     frames_by: str = "",
 ) -> list[PoseReading]:
-    """Read poses as `read_poses` does, in all the ways that the file leaves open, one at least."""
-    path, size = Path(path), (int(video.size[0]), int(video.size[1]))
-    given = read_pose_file(path, fmt, size)
+    """Read poses as `read_poses` does; all readings that the file allows, at least one."""
+    path = Path(path)
+    size = (int(video.size[0]), int(video.size[1]))
+    pose_file = read_pose_file(path, fmt, size)
     stated = parse_camera(camera, size)
-    if stated is None and not any(given.cameras):
+    if stated is None and not any(pose_file.cameras):
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     times = [(frame.index, frame.time_s) for frame in video]
     if not times:
-        raise ReobjError("the video has no frame that can be read: poses belong to nothing")
-    frame, time_s = np.array([n for n, _ in times], np.int64), np.array([t for _, t in times])
+        raise ReobjError("no readable frame in the video, so no pose can be matched")
+    frame = np.array([n for n, _ in times], np.int64)
+    time_s = np.array([t for _, t in times])
     source = source_of(video, frame, time_s)
-    stamps_s, messages = _in_seconds(given, path, source)
-    count = len(given.cam_from_world)
-    found = readings(count, given.names, stamps_s, source, str(path), given.own)
-    if not found:
-        what = _compared(given, stamps_s, source)
-        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({what})")
-    rows = np.unique(np.concatenate([reading.row for reading in found]))
-    intrinsics = _intrinsics(given, rows[rows >= 0], size, path) if stated is None else stated
+    stamps_s, messages = _in_seconds(pose_file, path, source)
+    count = len(pose_file.cam_from_world)
+    candidates = assignments(count, pose_file.names, stamps_s, source, str(path), pose_file.is_ours)
+    if not candidates:
+        compared = _compared(pose_file, stamps_s, source)
+        raise ReobjError(f"{path}: none of its {count} poses belongs to a frame ({compared})")
+    rows = np.unique(np.concatenate([candidate.row for candidate in candidates]))
+    intrinsics = stated
+    if intrinsics is None:
+        intrinsics = _intrinsics(pose_file, rows[rows >= 0], size, path)
     if not usable(intrinsics):
         raise ReobjError(f"{path}: {intrinsics}: expected finite numbers, focal lengths above 0")
-    orders = {"": given.cam_from_world}
-    if given.w_first is not None:
-        orders = {"w_last": given.cam_from_world, "w_first": given.w_first}
-    result = []
-    for reading, (order, cam_from_world) in itertools.product(found, orders.items()):
-        poses, lost = _of_frames(cam_from_world, stamps_s, reading, source, path)
-        status = np.where(np.isfinite(poses).all((1, 2)), "supplied", "none")
-        whole = Poses(
-            intrinsics, frame, time_s, poses, status, "user",
-            metric=given.metric or metric, up_in_world=given.up_in_world, points=given.points,
-            colors=given.colors, visibility=_in_frames(given.visibility, reading.row),
-            messages=(*given.messages, *messages, *lost),
+    orders = {"": pose_file.cam_from_world}
+    if pose_file.w_first is not None:
+        orders = {"w_last": pose_file.cam_from_world, "w_first": pose_file.w_first}
+    readings = []
+    for candidate, (order, by_order) in itertools.product(candidates, orders.items()):
+        cam_from_world, lost = _of_frames(by_order, stamps_s, candidate, source, path)
+        status = np.where(np.isfinite(cam_from_world).all((1, 2)), "supplied", "none")
+        poses = Poses(
+            intrinsics, frame, time_s, cam_from_world, status, "user",
+            metric=pose_file.metric or metric, up_in_world=pose_file.up_in_world,
+            points=pose_file.points, colors=pose_file.colors,
+            visibility=_in_frames(pose_file.visibility, candidate.row),
+            messages=(*pose_file.messages, *messages, *lost),
         )  # fmt: skip
-        key = f"{reading.key}.{order}".rstrip(".")
-        rule = f"{reading.rule}, quaternions {order}".removesuffix(", quaternions ")
-        result.append(PoseReading(key, rule, whole, given.kind))
-    keys = ", ".join(reading.key for reading in result)
-    if frames_by and not (result := [r for r in result if r.key == frames_by]):
+        key = f"{candidate.key}.{order}".rstrip(".")
+        rule = f"{candidate.rule}, quaternions {order}".removesuffix(", quaternions ")
+        readings.append(PoseReading(key, rule, poses, pose_file.kind))
+    keys = ", ".join(reading.key for reading in readings)
+    if frames_by and not (readings := [r for r in readings if r.key == frames_by]):
         raise ReobjError(f"--set poses.frames_by={frames_by}: {path} can be read by {keys}")
-    return result
+    return readings
 
 
 def _in_seconds(
-    given: PoseFile, path: Path, source: Source
+    pose_file: PoseFile, path: Path, source: SourceFrames
 ) -> tuple[Array | None, tuple[str, ...]]:
-    """Convert the stamps (N,) of a file into seconds; which unit was found, if the file is mute."""
-    if given.stamps is None:
+    """Convert the stamps (N,) of a file to seconds; report the unit if it was inferred."""
+    if pose_file.stamps is None:
         return None, ()
-    unit, per_s = given.unit, dict(UNITS).get(given.unit, 1.0)
-    if not unit:
-        end_s = float(source.time_s[-1]) if source.timed else 0.0
-        unit, per_s = unit_of_stamps(given.stamps, end_s)
-    said = unit != "s" and not given.unit
-    return given.stamps / per_s, (f"{path}: time stamps taken for {unit}",) * said
+    if pose_file.unit:
+        return pose_file.stamps / dict(UNITS)[pose_file.unit], ()
+    end_s = float(source.time_s[-1]) if source.timed else 0.0
+    unit, per_s = unit_of_stamps(pose_file.stamps, end_s)
+    messages = () if unit == "s" else (f"{path}: time stamps taken for {unit}",)
+    return pose_file.stamps / per_s, messages
 
 
-def _intrinsics(given: PoseFile, rows: IntArray, size: tuple[int, int], path: Path) -> Camera:
+def _intrinsics(pose_file: PoseFile, rows: IntArray, size: tuple[int, int], path: Path) -> Camera:
     """Return the one camera of the poses in these rows, for frames of (w, h) `size`."""
-    each = len(given.cameras) == len(given.cam_from_world)
-    camera = one_camera([given.cameras[row] for row in rows] if each else given.cameras, path)
+    cameras = pose_file.cameras
+    if len(cameras) == len(pose_file.cam_from_world):
+        cameras = tuple(cameras[row] for row in rows)
+    camera = one_camera(cameras, path)
     if camera is None:
         raise ReobjError(f"{path}: no intrinsics; add --camera {CAMERA_FORMS}")
     return fitted_camera(camera, size, str(path))
 
 
 def _of_frames(
-    cam_from_world: Array, stamps_s: Array | None, reading: Reading, source: Source, path: Path
+    cam_from_world: Array,
+    stamps_s: Array | None,
+    assignment: FrameAssignment,
+    source: SourceFrames,
+    path: Path,
 ) -> tuple[Array, list[str]]:
-    """Return the poses (F, 3, 4) of the frames by one reading, and which frames have none."""
-    row, known = reading.row, reading.row >= 0
+    """Return the poses (F, 3, 4) of the frames by one assignment, and report frames without one."""
+    row = assignment.row
+    known = row >= 0
     poses = np.full((len(row), 3, 4), np.nan)
     poses[known] = cam_from_world[row[known]]
-    if reading.key == "time" and stamps_s is not None and len(stamps_s) > 1:
+    if assignment.key == "time" and stamps_s is not None and len(stamps_s) > 1:
         exact, use = interpolated(cam_from_world, stamps_s, source.time_s)
         poses[use & known] = exact[row[use] >= 0]
     known = np.isfinite(poses).all((1, 2))
@@ -166,24 +178,27 @@ def _of_frames(
     return poses, [f"{path}: poses for {known.sum()} of {len(row)} frames, none for {lost}"]
 
 
-def _compared(given: PoseFile, stamps_s: Array | None, source: Source) -> str:
-    """Say what was compared in vain."""
-    if given.names:
+def _compared(pose_file: PoseFile, stamps_s: Array | None, source: SourceFrames) -> str:
+    """Describe what was compared without a match, for a message."""
+    if pose_file.names:
         first = source.images[int(source.frame[0])] if source.images else int(source.frame[0])
-        return f"images {given.names[0]!r} ..., frames {first!r} ..."
+        return f"images {pose_file.names[0]!r} ..., frames {first!r} ..."
     if stamps_s is None:
         return "in order"
     start, end = source.time_s[[0, -1]]
-    said = f"frames {start:.3f}-{end:.3f} s" if source.timed else "the images have no times"
-    return f"{stamps_s[0]:.3f}-{stamps_s[-1]:.3f} s, {said}; another clock: one for each frame"
+    frames = f"frames {start:.3f}-{end:.3f} s" if source.timed else "the images have no times"
+    return (
+        f"{stamps_s[0]:.3f}-{stamps_s[-1]:.3f} s, {frames}; stamps of another clock need one row "
+        "for each frame"
+    )
 
 
 def _in_frames(visibility: IntArray, row: IntArray) -> IntArray:
-    """Replace rows of poses (M, 2) by those of the frames that have them; others fall out."""
+    """Replace rows of poses (M, 2) by those of their frames; poses without a frame are dropped."""
     frame_of = np.full(int(max(row.max(initial=-1), visibility[:, 0].max(initial=-1))) + 1, -1)
     frame_of[row[row >= 0]] = np.flatnonzero(row >= 0)
-    at = frame_of[visibility[:, 0]]
-    return np.column_stack([at, visibility[:, 1]])[at >= 0]
+    frame = frame_of[visibility[:, 0]]
+    return np.column_stack([frame, visibility[:, 1]])[frame >= 0]
 
 
 # ---- Formats -------------------------------------------------------------------------------------
@@ -205,7 +220,7 @@ READERS: dict[str, Callable[[Path, tuple[int, int]], PoseFile]] = {
     "splatting": formats.read_splatting,
     "rows": formats.read_rows,  # a table: tum, euroc or matrices, by its columns
 }
-# Files of a folder by which a format is recognised, the first that is there
+# Files of a folder by which a format is recognised, in the order of preference
 FILES = {
     "transforms": "transforms.json",
     "stray": "odometry.csv",
@@ -218,31 +233,31 @@ TABLES = ("poses.txt", "groundtruth.txt", "traj.txt", "poses_c2w.txt")  # TUM; R
 
 
 def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
-    """Read a file or folder of poses in one of the formats of READERS, or the one recognised.
+    """Read a file or folder of poses in a format of READERS, or recognise it.
 
     Args:
         size: (w, h) of the images, for formats that do not state it.
     """
     if not path.exists():
         raise ReobjError(f"{path}: no such file; --poses takes auto, none, or a file of poses")
-    kinds = _formats_of(path) if fmt == "auto" else {fmt: path}
-    name, own = next(iter(kinds.items()))
+    formats_of = _recognise(path) if fmt == "auto" else {fmt: path}
+    name, file = next(iter(formats_of.items()))
     reader = READERS.get(name)
     if reader is None:
-        raise ReobjError(f"--pose-format {fmt}: unknown; known are auto, {', '.join(READERS)}")
-    given = reader(own, size)
-    if len(kinds) > 1:
-        others = ", ".join(sorted(set(kinds) - {name}))
-        note = f"{path}: read as {name}; --pose-format chooses what else is there: {others}"
-        given = given.with_messages(note)
-    return given
+        raise ReobjError(f"--pose-format {fmt}: unknown; expected auto, {', '.join(READERS)}")
+    pose_file = reader(file, size)
+    if len(formats_of) > 1:
+        others = ", ".join(sorted(set(formats_of) - {name}))
+        note = f"{path}: read as {name}; it also has {others}: choose with --pose-format"
+        pose_file = pose_file.with_messages(note)
+    return pose_file
 
 
-def _formats_of(path: Path) -> dict[str, Path]:
-    """Recognise the formats in a folder from the names in it, or that of a file; at least one.
+def _recognise(path: Path) -> dict[str, Path]:
+    """Recognise the formats in a folder by its file names, or that of a file; at least one.
 
     Returns:
-        what each reader is to be given, the likeliest first.
+        the path for the reader of each format, the likeliest first.
     """
     if not path.is_dir():
         return {_format_of_file(path): path}
@@ -264,7 +279,7 @@ def _formats_of(path: Path) -> dict[str, Path]:
 
 
 def _format_of_file(path: Path) -> str:
-    """Recognise a format from a file's name, of JSON from its keys too."""
+    """Recognise the format of a file by its name; of JSON also by its keys."""
     suffixes = {".r3d": "record3d", ".traj": "arkitscenes", ".npy": "llff"}
     if path.name.startswith("images.") or path.suffix == ".bin":
         return "colmap"
@@ -278,11 +293,11 @@ def _format_of_file(path: Path) -> str:
             return "splatting"
         if isinstance(content, dict) and "poses" in content:
             return "record3d"
-        some = next(iter(content.values()), None) if isinstance(content, dict) else None
+        first = next(iter(content.values()), None) if isinstance(content, dict) else None
         if (
-            isinstance(some, dict)
+            isinstance(first, dict)
             and "frames" not in content
-            and {"pose", "aligned_pose"} & set(some)
+            and {"pose", "aligned_pose"} & set(first)
         ):
             return "scannetpp"
         return "transforms"
