@@ -69,7 +69,7 @@ class PoseFile:
 
 
 def lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield file and line number (for messages) and the words of each line; comments are skipped."""
+    """Yield location (for messages) and words of each line of a text file, without comments."""
     for number, text in enumerate(read_lines(path), 1):
         if not text.lstrip().startswith("#"):
             yield f"{path}, line {number}", text.split()
@@ -310,7 +310,7 @@ OWN_HEADER = "(world_from_cam, seconds, units: "  # of `cameras.write_tum`
 
 
 def _by_time(stamps: Array, path: Path) -> tuple[IntArray, tuple[str, ...]]:
-    """Return the rows (n,) by ascending stamp, without repeated stamps, and a message about these."""
+    """Return the rows (n,) by ascending stamp, without repeated ones, and a message about these."""
     kept = np.unique(stamps, return_index=True)[1]
     repeated = len(stamps) - len(kept)
     if not repeated:
@@ -368,7 +368,7 @@ def read_matrices(path: Path, size: tuple[int, int]) -> PoseFile:
 
 
 def matrix_rows(path: Path) -> tuple[Array, list[str]]:
-    """Read rows of 12 or 16 numbers as matrices (N, 4, 4), not finite where lost, with locations."""
+    """Read rows of 12 or 16 numbers: matrices (N, 4, 4), not finite where lost, and locations."""
     rows, where = read_table(path, (12, 16), "12 or 16 numbers a row", finite=False)
     whole = np.tile(np.eye(4), (len(rows), 1, 1))
     whole.reshape(-1, 16)[:, : rows.shape[1]] = rows
