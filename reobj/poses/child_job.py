@@ -27,7 +27,8 @@ from reobj.types import Image, ReobjError
 # ---- The files of a job --------------------------------------------------------------------------
 
 
-JOB, KEYFRAMES = "job.json", "keyframes.npy"
+JOB = "job.json"
+KEYFRAMES = "keyframes.npy"
 
 
 def write_job(folder: Path, job: dict[str, Any], images: Sequence[Image]) -> None:
@@ -120,7 +121,8 @@ class Child:
                 break
             if len(words) != 4 or words[0] != "reobj:":
                 continue
-            stage, done, total = words[1], int(words[2]), int(words[3])
+            stage = words[1]
+            done, total = map(int, words[2:])
             if line is None or line.stage != stage:
                 if line is not None:
                     line.close()

@@ -230,7 +230,7 @@ def fill_gaps(
     status = status.copy()
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     for k in np.flatnonzero(np.diff(known) > 1).tolist():
-        a, b = int(known[k]), int(known[k + 1])
+        a, b = known[k : k + 2].tolist()
         if frame[b] - frame[a] - 1 > max_gap or any(a < row < b for row in unmapped):
             continue
         camera = model.cameras[0]

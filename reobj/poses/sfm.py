@@ -332,7 +332,9 @@ def _triangulate_job(folder: Path, job: dict[str, Any], images: Any) -> None:
     out = str(folder / "sparse")
     model = pc.triangulate_points(model, str(database), str(folder), out, options=options)
     row_of = {number: row for row, number in enumerate(ids)}
-    points, colors, visibility = [], [], []
+    points = []
+    colors = []
+    visibility = []
     for number, (_, point) in enumerate(sorted(model.points3D.items())):
         points.append(point.xyz)
         colors.append(_color(model, point, images, row_of))

@@ -161,7 +161,9 @@ def _read_colmap_text(folder: Path) -> PoseFile:
     each image, where pycolmap takes every other image for observations.
     """
     cameras = _colmap_text_cameras(folder / "cameras.txt")
-    names, used, where = [], [], []
+    names = []
+    used = []
+    where = []
     rows: list[list[float]] = []
     row_of: dict[str, int] = {}
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"

@@ -416,7 +416,8 @@ def source_of(video: Any, frame: IntArray, time_s: Array) -> SourceFrames:
     """Describe a `Video` whose frames (F,) were read at times (F,) in s."""
     paths = [str(Path(file).absolute()) for file in getattr(video, "files", ())]
     images = tuple(paths or video.names)
-    config, count = getattr(video, "config", None), int(video.frame_count)
+    config = getattr(video, "config", None)
+    count = int(video.frame_count)
     if not images and (config is None or (not config.stop and config.every == 1)):
         count = int(frame[-1]) + 1  # what was decoded, not what the container claims
     return SourceFrames(

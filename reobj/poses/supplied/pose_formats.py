@@ -329,7 +329,8 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     columns = _named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
     world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
     kept, messages = _by_time(rows[:, 0], path)
-    camera, sensor = None, _sensor_of(path)
+    camera = None
+    sensor = _sensor_of(path)
     if sensor is None:
         messages += (
             f"{path}: poses of the body, and no sensor.yaml with the camera's T_BS beside it: body "
@@ -490,7 +491,8 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     files = sorted(f for f in folder.glob("*.txt") if re.search(r"(\d|\.pose)$", f.stem))
     if not files:
         raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
-    where, expected = [str(file) for file in files], "4 rows of 4 numbers"
+    where = [str(file) for file in files]
+    expected = "4 rows of 4 numbers"
     tables = [read_table(file, (4,), expected, finite=False)[0] for file in files]
     raise_where([len(table) != 4 for table in tables], where, f"expected {expected}")
     world_from_cam = checked_rigid(np.array(tables), where)
@@ -526,7 +528,8 @@ def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
         raise ReobjError(f"{path}: no frame_*.json, nor keyframes/cameras/*.json in it")
     data = [json_object(file) for file in files]
     where = [str(file) for file in files]
-    matrices, cameras = [], []
+    matrices = []
+    cameras = []
     for file, entry in zip(where, data, strict=True):
         try:
             rows = entry.get("cameraPoseARFrame") or [
@@ -557,7 +560,9 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     if not isinstance(frames, list) or not frames:
         raise ReobjError(f"{path}: no `frames`; expected nerfstudio's or ngp's transforms.json")
     where = [f"{path}, frames[{i}]" for i in range(len(frames))]
-    matrices, names, cameras = list[Array](), list[str](), list[Camera | None]()
+    matrices = list[Array]()
+    names = list[str]()
+    cameras = list[Camera | None]()
     for key, frame in zip(where, frames, strict=True):
         try:
             matrices.append(np.array(frame["transform_matrix"], np.float64).reshape(4, 4))
@@ -593,7 +598,8 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
     data = json_object(path)
     names = tuple(data)
     where = [f"{path}, {name}" for name in data]
-    matrices, cameras = [], []
+    matrices = []
+    cameras = []
     for name, key in zip(names, where, strict=True):
         try:
             matrix = data[name].get("aligned_pose", data[name].get("pose"))
@@ -645,7 +651,10 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     path = path / "cameras.json" if path.is_dir() else path
     data = load_json(path)
-    matrices, names, cameras, where = [], list[str](), list[Camera | None](), list[str]()
+    matrices = list[Array]()
+    names = list[str]()
+    cameras = list[Camera | None]()
+    where = list[str]()
     for i, entry in enumerate(data if isinstance(data, list) else []):
         where.append(f"{path}, entry {i}")
         try:
