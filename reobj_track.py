@@ -91,7 +91,6 @@ from reobj.options import config_from_args, read_config, write_config
 from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
-from reobj.poses.readers import read_poses
 from reobj.poses.stage import (
     poses_key,
     reconstruct_cached,
@@ -99,6 +98,7 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
+from reobj.poses.supplied.readers import read_poses
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export

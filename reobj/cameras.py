@@ -426,7 +426,7 @@ def triangulate_rays(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, 
 
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])  # axes of a camera: OpenGL has y up and z backward
-NO_SCALE = "units: arbitrary"  # in the head of our TUM files, for `reobj.poses.readers`
+NO_SCALE = "units: arbitrary"  # in the head of our TUM files, for `reobj.poses.supplied.readers`
 
 
 def write_tum(path: Path, poses: Poses) -> None:

@@ -8,7 +8,7 @@ from pose_worlds import FOCAL, SIZE, motion, supplied
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import invert_rigid
-from reobj.poses.checks import check_poses
+from reobj.poses.supplied.interpretation import check_poses
 
 
 def box_tracks(cams, noise_px, seed, objects=12):

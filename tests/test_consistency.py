@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reobj.poses.arrays import read_arrays
-from reobj.poses.consistency import (
-    MIN_BRIDGE,
-    MIN_FOCAL_PAIRS,
-    MatchedPairs,
-    consistent_groups,
-    count_explained,
-    focal_from_pairs,
-)
+from reobj.poses.bundle import read_arrays
+from reobj.poses.features import MIN_FOCAL_PAIRS, MatchedPairs, focal_from_pairs
+from reobj.poses.verification import MIN_BRIDGE, consistent_groups, count_explained
 
 pycolmap = pytest.importorskip("pycolmap")
 

@@ -151,7 +151,7 @@ def test_maps_of_another_camera_are_placed_by_its_file(tmp_path, walk):
     (folder / "intrinsics.json").write_text(json.dumps(own))  # the way between them left out
     assert np.median(on_walls(add(metric(walk), folder).points)) > 0.02
     (folder / "intrinsics.json").unlink()
-    with pytest.raises(rt.ReobjError, match="put the depth camera's intrinsics there"):
+    with pytest.raises(rt.ReobjError, match="add the depth camera's intrinsics there"):
         add(metric(walk), folder)
     beside = {"fx": 1, "depth": own, "T_color_from_depth": [0.3, -0.1, 0.05]}
     (tmp_path / "intrinsics.json").write_text(json.dumps(beside))
@@ -351,7 +351,7 @@ def other_matrix(folder):
     [
         (None, "d", "no such folder"), (empty, "d:much", "no such folder"),
         (empty, "d:0", "no such folder"), (empty, "d", "no .png in it"),
-        (strange, "d", "no depth map"), (color_image, "d", "no depth map"),
+        (strange, "d", "not a depth map"), (color_image, "d", "not a depth map"),
         (other_names, "d", "none of its 1 depth maps"), (other_sizes, "d", "32x24 pixels"),
         (other_json, "d", "expected fx, fy"), (lacking_json, "d", "intrinsics.json: expected fx"),
         (other_matrix, "d", "3x3 or 4x4"),

@@ -13,7 +13,7 @@ from pose_worlds import FakeVideo, ate_percent, blank, textured_room
 
 import reobj_track as rt
 from reobj.poses.estimate import rows_around_breaks
-from reobj.poses.mapping import Mapped
+from reobj.poses.sfm import Mapped
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -110,7 +110,7 @@ def reconstructed(walk, monkeypatch):
 def test_the_seed_reaches_pnp(reconstructed, tmp_path, monkeypatch):
     seeds = []
 
-    def note(model, key_rows, left_out, video, seed, line):
+    def note(model, key_rows, unmapped, video, seed, line):
         seeds.append(seed)
         count = len(video.frames)
         return np.full((count, 3, 4), np.nan), np.full(count, "none")
@@ -137,7 +137,7 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
     assert bool(found.messages) != filled
     if not filled:
         assert "2 of 30 frames have no camera: frames 11-12 (2: 011.jpg, 012" in found.messages[0]
-        assert "show too few points" in found.messages[0] and "lie at" not in found.messages[0]
+        assert "show too few points" in found.messages[0] and "are next to" not in found.messages[0]
 
 
 # ---- Failures ------------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ def test_gaps_are_filled_up_to_max_gap(reconstructed, tmp_path, monkeypatch, max
     "images, message",
     [
         (textured_room(1, 0)[0], "only 1 different view"),
-        ([np.zeros((240, 320, 3), np.uint8)] * 45, "no picture shows anything"),  # black
+        ([np.zeros((240, 320, 3), np.uint8)] * 45, "no image has texture"),  # black
         (textured_room(1, 0)[0] * 45, "only 2 different views"),  # still
     ],
 )

@@ -214,10 +214,10 @@ def test_the_size_is_that_of_the_detections_where_they_say_it(tmp_path: Path) ->
 @pytest.mark.parametrize(
     "detections, poses, camera, message",
     [
-        (None, "tum", LINE, "no video: name one, or give"),
-        (lambda image: [], "tum", LINE, "no video: name one, or give"),
-        ("csv", "auto", LINE, "no video: name one, or give"),
-        ("csv", "none", LINE, "no video: name one, or give"),
+        (None, "tum", LINE, "no video: name one, or use"),
+        (lambda image: [], "tum", LINE, "no video: name one, or use"),
+        ("csv", "auto", LINE, "no video: name one, or use"),
+        ("csv", "none", LINE, "no video: name one, or use"),
         ("csv", "tum", "300,300,160,120", "no image size"),
         ("csv", "tum", "", "groundtruth.txt: no image size"),
         ("no.csv", "tum", LINE, "no.csv: no such file of detections"),
@@ -244,8 +244,8 @@ def test_what_is_not_possible_is_said_in_one_line(
     ("video", "options", "message"),
     [
         (False, {"depth": "maps"}, "--depth maps: .*name the video"),
-        (True, {"mode": "none", "depth": "maps"}, "--poses none has none"),
-        (True, {"mode": "none", "metric": True}, "--poses none has none"),
+        (True, {"mode": "none", "depth": "maps"}, "--poses is none"),
+        (True, {"mode": "none", "metric": True}, "--poses is none"),
     ],
 )
 def test_options_of_cameras_or_images_that_are_not_there_are_refused(

@@ -21,17 +21,17 @@ from test_consistency import fundamental
 import reobj_track as rt
 from reobj.cameras import read_sparse_model
 from reobj.files import Progress, locked
-from reobj.poses import child as child_room
-from reobj.poses import mapping
-from reobj.poses.consistency import MatchedPairs
-from reobj.poses.mapping import FOCAL_GUESS, mapping_child, reconstruct
-from reobj.poses.soundness import Part
+from reobj.poses import child_job, mapping, sfm
+from reobj.poses.features import MatchedPairs
+from reobj.poses.mapping import FOCAL_GUESS, Focal, MapperSearch
+from reobj.poses.sfm import mapping_child, reconstruct
+from reobj.poses.verification import Component, FocalSource
 
 pycolmap = pytest.importorskip("pycolmap")
 
 
-def parts_of(folder, images, boxes=None, size=None, camera=None, guess=FOCAL_GUESS, **changes):
-    """Reconstruct; messages, and the models of all parts."""
+def models_of(folder, images, boxes=None, size=None, camera=None, guess=FOCAL_GUESS, **changes):
+    """Reconstruct; messages, and the models of all components."""
     ids = changes.pop("ids", range(1, len(images) + 1))
     options = {"seed": 0, "progress": Progress} | changes
     with mapping_child(folder) as child:
@@ -56,7 +56,7 @@ def parts_of(folder, images, boxes=None, size=None, camera=None, guess=FOCAL_GUE
 
 def run(*args, **options):
     """Reconstruct; messages, and the largest model or None."""
-    messages, models = parts_of(*args, **options)
+    messages, models = models_of(*args, **options)
     return messages, models[0] if models else None
 
 
@@ -116,61 +116,66 @@ def arc(count, half_rad):
     return cams
 
 
+GUESS, MATCHES = Focal(0.8, FocalSource.GUESS), Focal(0.8, FocalSource.MATCHES)
+
+
 @pytest.fixture
 def search(monkeypatch):
-    """A search among 30 keyframes whose mappers' parts are set by the test: `search.made`."""
+    """A search among 30 keyframes whose mappers' components are set by the test: `search.made`."""
     pairs = MatchedPairs(
         np.array([[1, 2]]), [np.zeros((1000, 2))], dict.fromkeys(range(1, 31)), np.ones((1, 3, 3))
     )
     frames = {i: 10 * i for i in range(1, 31)}
-    search = mapping._Search(Path("database.db"), frames, pairs, False, 0)
+    search = MapperSearch(Path("database.db"), frames, pairs, GUESS, 0.8, 0)
     search.made, search.ran = [], []
 
-    def parts(mapper, held):
-        search.ran.append((mapper, held))
+    def components(mapper, keep_intrinsics):
+        search.ran.append((mapper, keep_intrinsics))
         return search.made
 
     monkeypatch.setattr(mapping, "_set_focal", lambda *_: None)
     monkeypatch.setattr(mapping, "constant_focal", lambda _: (np.empty(0), []))
-    monkeypatch.setattr(search, "_parts", parts)
-    monkeypatch.setattr(search, "_one_camera", lambda sound: [part.model for part in sound])
+    monkeypatch.setattr(search, "_components", components)
+    monkeypatch.setattr(mapping, "models_of_one_camera", lambda sound: [c.model for c in sound])
     return search
 
 
-def part(first=1, last=30, calibrated=True, sigma=0.0005, problem="", focal=0.8):
+def component(first=1, last=30, calibrated=True, sigma=0.0005, problem="", focal=0.8):
     camera = SimpleNamespace(width=640, height=480)
     arrays = SimpleNamespace(ids=np.arange(first, last + 1), focal_over_size=focal, camera=camera)
-    share = (last - first + 1) / 30
-    return Part("model", arrays, calibrated, 2.4, share, 20.0, sigma, 1000, problem, arrays.ids)
+    source = FocalSource.MODEL if calibrated else FocalSource.GUESS
+    measures = 2.4, (last - first + 1) / 30, 20.0, sigma, 1000
+    return Component("model", arrays, source, *measures, problem, arrays.ids)
 
 
-def test_a_focal_length_that_nothing_tells_is_kept_and_said(search):
-    """No mapper's model determines it: the guess is held, and the user is told."""
-    search.made = [part(calibrated=False)]
-    _, (message,) = search.run(None, 0.8)
-    assert message.startswith("the images of frames 10-300 do not tell the focal length")
-    assert "taken as 0.8 x" in message and "--camera" in message
+def test_a_focal_length_that_nothing_determines_is_kept_and_reported(search):
+    """No mapper's model determines it: the guess is kept, and the user is warned."""
+    search.made = [component(calibrated=False)]
+    _, (message,) = search.run()
+    assert message.startswith("frames 10-300 do not determine the focal length")
+    assert "assumed to be 0.8 x" in message and "--camera" in message
     assert search.ran == [("incremental", False), ("incremental", True)]
 
 
-def test_a_part_that_is_refused_is_said_and_why(search, monkeypatch):
-    monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
-    search.made = [part(1, 15), part(16, 27, problem="the camera hardly moved"), part(28, 30)]
-    models, messages = search.run(0.8, 0.8)
+def test_a_component_that_is_refused_is_reported_with_the_reason(search, monkeypatch):
+    monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
+    still = component(16, 27, problem="the camera hardly moved")
+    search.made = [component(1, 15), still, component(28, 30)]
+    search.focal = MATCHES
+    models, messages = search.run()
     assert models == ["model"] * 2 and search.ran == [("incremental", True), ("global", True)]
-    assert messages == [
-        "a part of the video (frames 160-270) has no poses: the camera hardly moved"
-    ]
+    assert messages == ["frames 160-270 have no poses: the camera hardly moved"]
 
 
 def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
     """Of hololens_kitchen the incremental mapper found pieces, the global one all of it."""
-    made = {"incremental": [part(1, 15), part(16, 30, sigma=0.003)], "global": [part()]}
-    monkeypatch.setattr(search, "_parts", lambda mapper, held: made[mapper])
-    matches = sum(p.explained for p in made["global"])
+    pieces = [component(1, 15), component(16, 30, sigma=0.003)]
+    made = {"incremental": pieces, "global": [component()]}
+    monkeypatch.setattr(search, "_components", lambda mapper, keep_intrinsics: made[mapper])
+    matches = sum(c.explained for c in made["global"])
     search.pairs = replace(search.pairs, inliers=[np.zeros((matches, 2), np.int64)])
-    search.told = 0.8
-    best, messages = search._best(0.8)
+    search.focal = MATCHES
+    best, messages = search._best()
     assert best is made["global"] and messages == []
 
 
@@ -180,35 +185,38 @@ def test_a_whole_global_model_needs_no_other_to_confirm_it(search, monkeypatch):
 def test_weaker_geometry_needs_the_matches_or_another_mapper(
     search, monkeypatch, focal, sigma, count
 ):
-    """They tell the focal length without any model."""
-    monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
-    search.made = [part(sigma=sigma, focal=focal)]
-    search.run(0.8, 0.8)
+    """The matches determine the focal length without any model."""
+    monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
+    search.made = [component(sigma=sigma, focal=focal)]
+    search.focal = MATCHES
+    search.run()
     assert len(search.ran) == count
 
 
 def test_the_second_mapper_is_not_believed_for_the_focal_length_that_it_was_held_to(
     search, monkeypatch
 ):
-    """The first differed from what the matches tell: one of the two is wrong."""
-    made = {"incremental": [part(sigma=0.0011, focal=0.9)], "global": [part(sigma=0.00102)]}
+    """The first differed from that of the matches: one of the two is wrong."""
+    first, second = component(sigma=0.0011, focal=0.9), component(sigma=0.00102)
+    made = {"incremental": [first], "global": [second]}
     asked = []
-    monkeypatch.setattr(search, "_parts", lambda mapper, held: made[mapper])
-    monkeypatch.setattr(mapping, "confirmed", lambda parts, *_: asked.append(parts) or parts)
-    search.told = 0.8
-    search._best(0.8)
+    monkeypatch.setattr(search, "_components", lambda mapper, keep_intrinsics: made[mapper])
+    monkeypatch.setattr(mapping, "confirmed", lambda made, *_: asked.append(made) or made)
+    search.focal = MATCHES
+    search._best()
     assert asked == [made["incremental"], made["global"]]
 
 
-def test_a_zoom_in_a_part_that_is_refused_anyway_takes_no_images(search, monkeypatch):
-    """Its points have too little parallax to tell; where nothing else holds it is looked at."""
+def test_a_zoom_in_a_component_that_is_refused_anyway_takes_no_images(search, monkeypatch):
+    """Its points have too little parallax; it is checked where no other component is sound."""
     asked = []
-    monkeypatch.setattr(mapping, "confirmed", lambda parts, others, told: parts)
+    monkeypatch.setattr(mapping, "confirmed", lambda components, others, source: components)
     monkeypatch.setattr(mapping, "constant_focal", lambda a: (asked.append(a) or np.empty(0), []))
-    good, bad = part(1, 15), part(16, 30, problem="the camera hardly moved")
+    good, bad = component(1, 15), component(16, 30, problem="the camera hardly moved")
+    search.focal = MATCHES
     for made in ([good, bad], [bad]):
         search.made = made
-        search.run(0.8, 0.8)
+        search.run()
     assert asked == [[good.arrays], [bad.arrays]]
 
 
@@ -216,38 +224,42 @@ def test_a_focal_length_that_keeps_changing_is_refused(search, monkeypatch):
     found = iter([[1], [2], [3], [4]])
     changes = [(4, 5, 1.3)]
     monkeypatch.setattr(mapping, "constant_focal", lambda _: (np.array(next(found)), changes))
-    search.made = [part()]
-    models, (message,) = search.run(0.8, 0.8)
+    search.made = [component()]
+    search.focal = MATCHES
+    models, (message,) = search.run()
     assert models == [] and "the focal length keeps changing" in message
     assert len(search.ran) == mapping.MAX_ROUNDS
 
 
-def test_of_a_zoom_the_images_left_tell_the_focal_length(search, monkeypatch):
-    """Matches of pictures of two focal lengths tell one between them."""
+def test_of_a_zoom_the_images_left_determine_the_focal_length(search, monkeypatch):
+    """Matches of images of two focal lengths give one between them."""
     ids = np.column_stack([np.arange(1, 21), np.arange(2, 22)])[np.arange(40) % 20]
     matches = [np.zeros((50, 2), np.int64)] * 40
     keypoints = dict.fromkeys(range(1, 31))
     search.pairs = MatchedPairs(ids, matches, keypoints, fundamental(1.1, 40))
     found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
     monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
-    search.made = [part(1, 21)]
-    search.run(0.9, 0.8)
-    assert search.told == pytest.approx(1.1, rel=0.02)
+    search.made = [component(1, 21)]
+    search.focal = Focal(0.9, FocalSource.MATCHES)
+    search.run()
+    assert search.focal.value == pytest.approx(1.1, rel=0.02)
+    assert search.focal.source is FocalSource.MATCHES
 
 
 @pytest.mark.parametrize(
-    "focal, told, kept", [(0.8, True, True), (1.1, True, False), (0.8, False, False)]
+    "focal, calibrated, kept", [(0.8, True, True), (1.1, True, False), (0.8, False, False)]
 )
-def test_of_two_focal_lengths_the_given_camera_tells_which_is_right(
-    search, monkeypatch, focal, told, kept
+def test_of_two_focal_lengths_that_of_the_given_camera_is_right(
+    search, monkeypatch, focal, calibrated, kept
 ):
-    """The pictures of a zoom are left out; those that stay may be the zoomed ones."""
+    """The images of a zoom are left out; those that stay may be the zoomed ones."""
     found = iter([(np.array([22, 23]), [(21, 22, 1.4)]), (np.empty(0), [])])
-    freed = SimpleNamespace(arrays=SimpleNamespace(focal_over_size=focal), calibrated=told)
+    arrays = SimpleNamespace(focal_over_size=focal)
+    freed = SimpleNamespace(arrays=arrays, calibrated=calibrated)
     monkeypatch.setattr(mapping, "constant_focal", lambda _: next(found))
     monkeypatch.setattr(mapping, "adjusted", lambda model, calibrate: freed)
-    search.fixed, search.made = True, [part(1, 21)]
-    models, messages = search.run(None, 0.8)
+    search.focal, search.made = Focal(0.8, FocalSource.GIVEN), [component(1, 21)]
+    models, messages = search.run()
     assert (len(models) == 1) == kept
     what = "between frames 210 and 220" if kept else "another focal length than that of the given"
     assert what in messages[0]
@@ -289,13 +301,13 @@ def test_features_lie_where_the_dots_are(tmp_path):
 
 # ---- Refusals ------------------------------------------------------------------------------------
 
-TURNED = "turn of the camera explains|make a first model|keyframes connect"
+TURNED = "camera only rotates|initialises a model|keyframes connect"
 # images, words of the message
 REFUSED = {
     "two images": (lambda: textured_room(2, 0.5)[0], "only 2 different views"),
     "noise": (
         lambda: list(np.random.default_rng(0).integers(0, 255, (6, 240, 320, 3), np.uint8)),
-        "no two keyframes|keyframes connect",
+        "no pair of keyframes|keyframes connect",
     ),
     "turn with little motion": (
         lambda: textured_room(8, 0.005, 4, size=(320, 240))[0],
@@ -346,22 +358,22 @@ def test_the_users_pythonpath_reaches_the_child(walk, tmp_path, monkeypatch):
 
 def test_packages_are_imported_while_the_child_maps(tmp_path, monkeypatch):
     """Not before: until then the child needs all cores. What is not installed is passed over."""
-    told, imported = [], []
-    monkeypatch.setattr(mapping, "LATER", ("one", "two"))
+    stages, imported = [], []
+    monkeypatch.setattr(sfm, "LATER", ("one", "two"))
 
     def import_module(name):
-        imported.append((name, list(told)))
+        imported.append((name, list(stages)))
         raise ImportError(name)
 
     def run(progress):
         for stage in ("features", "match", "mapping", "mapping"):
-            told.append(stage)
+            stages.append(stage)
             progress(stage, 5).close()
         return "stopped"
 
-    monkeypatch.setattr(mapping.importlib, "import_module", import_module)
-    monkeypatch.setattr(child_room.Child, "run", lambda _, progress: run(progress))
-    messages, _ = parts_of(tmp_path, [np.zeros((48, 64, 3), np.uint8)] * 3)
+    monkeypatch.setattr(sfm.importlib, "import_module", import_module)
+    monkeypatch.setattr(child_job.Child, "run", lambda _, progress: run(progress))
+    messages, _ = models_of(tmp_path, [np.zeros((48, 64, 3), np.uint8)] * 3)
     assert "stopped" in messages[0]
     assert [name for name, _ in imported] == ["one", "two"]
     assert imported[0][1][:3] == ["features", "match", "mapping"]
@@ -416,11 +428,11 @@ def test_with_more_keyframes_only_what_is_new_is_done(walk, tmp_path):
     assert totals[-3:-1] == [("features", 8), ("match", 28)]
 
 
-def test_two_rooms_come_as_two_parts(tmp_path):
-    """The larger part is the first; one camera, the better one, took both."""
+def test_two_rooms_come_as_two_components(tmp_path):
+    """The larger one is the first; one camera, the better one, took both."""
     one, truth = textured_room(12, 0.45, -3, size=(320, 240))
     other, _ = textured_room(10, 0.45, -3, seed=5, size=(320, 240))
-    messages, models = parts_of(tmp_path, other + one)
+    messages, models = models_of(tmp_path, other + one)
     assert messages == [] and [len(model.names) for model in models] == [12, 10]
     first, second = models
     assert set(second.names) == {f"{i:03d}.jpg" for i in range(10)}
@@ -456,7 +468,7 @@ def test_objects_as_landmarks_never_worsen_the_points(walk, noise_px, used):
 SLEEPER = """
 import sys, time
 from pathlib import Path
-from reobj.poses.child import Child, serve
+from reobj.poses.child_job import Child, serve
 def job(folder):
     Path(sys.argv[1]).with_name("pid").write_text(str(__import__("os").getpid()))
     time.sleep(60)
@@ -466,7 +478,7 @@ if __name__ == "__main__":
 PARENT = """
 from pathlib import Path
 from reobj.files import Progress
-from reobj.poses.child import Child
+from reobj.poses.child_job import Child
 with Child("sleeper", Path("work/mapping"), Path("work/log")) as child:
     child.run(Progress)
 """
@@ -485,9 +497,11 @@ def test_the_child_ends_with_its_parent(tmp_path, monkeypatch, ending, platform)
     while not noted.exists() or not noted.read_text():
         assert time.monotonic() < deadline and parent.poll() is None
         time.sleep(0.01)
-    monkeypatch.setattr(child_room, "LEFT_OVER_S", 0.1)
-    with pytest.raises(rt.ReobjError, match=r"work: a reconstruction still runs in this folder"):
-        child_room.Child("sleeper", tmp_path / "work/mapping", tmp_path / "work/log2")
+    monkeypatch.setattr(child_job, "LEFT_OVER_S", 0.1)
+    with pytest.raises(
+        rt.ReobjError, match=r"work: a reconstruction is still running in this folder"
+    ):
+        child_job.Child("sleeper", tmp_path / "work/mapping", tmp_path / "work/log2")
     parent.send_signal(ending)
     parent.wait()
     with locked(tmp_path / "work/mapping.lock", 10.0):  # held as long as the child lives

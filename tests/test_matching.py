@@ -7,23 +7,23 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import invert_rigid
-from reobj.poses.matching import (
-    Reading,
-    Source,
+from reobj.poses.supplied.frame_assignment import (
+    FrameAssignment,
+    SourceFrames,
+    _assignment,
     _by_image_numbers,
     _by_stamps,
-    _reading,
     interpolated,
     rows_by_time,
 )
 
 
-def source(frame: list[int], time_s: list[float], count: int, timed: bool = True) -> Source:
-    return Source(np.array(frame), np.array(time_s), count, timed=timed)
+def source(frame: list[int], time_s: list[float], count: int, timed: bool = True) -> SourceFrames:
+    return SourceFrames(np.array(frame), np.array(time_s), count, timed=timed)
 
 
-def rows_of(found: list[Reading]) -> dict[str, tuple[list[int], int]]:
-    return {reading.key: (reading.row.tolist(), reading.outside) for reading in found}
+def rows_of(found: list[FrameAssignment]) -> dict[str, tuple[list[int], int]]:
+    return {a.key: (a.row.tolist(), a.outside) for a in found}
 
 
 def test_poses_between_two_times_are_interpolated() -> None:
@@ -91,11 +91,11 @@ def test_times_outside_the_source_are_counted() -> None:
     """Half a frame before the first and after the last is inside."""
     seen = source([0, 1, 2], [0, 0.1, 0.2], 4)  # the fourth frame, at .3, is not read
     stamps = np.array([-0.06, -0.04, 0.0, 0.3, 0.34, 0.36, 0.5])
-    (found,) = _by_stamps(stamps, seen, own=True)
+    (found,) = _by_stamps(stamps, seen, is_ours=True)
     assert found.key == "time" and found.outside == 3 and found.row.tolist() == [2, -1, -1]
 
 
 def test_numbers_after_the_last_frame_are_counted() -> None:
     seen = source([0, 1, 2], [0, 0.1, 0.2], 3)
-    found = _reading("number", "numbers", np.array([-1, 0, 2, 3, 4]), seen)
+    found = _assignment("number", "numbers", np.array([-1, 0, 2, 3, 4]), seen)
     assert found.row.tolist() == [1, -1, 2] and found.outside == 3

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 import reobj.objects
 import reobj.poses.estimate as estimate
-import reobj.poses.mapping as mapping
+import reobj.poses.sfm as sfm
 import reobj.poses.stage as stage
 import reobj.results.scene as scene
 import reobj.sources.detectors as detectors
@@ -805,14 +805,14 @@ def reconstructed(lab: Lab, value: Any) -> rt.Poses:
     video = rt.Video(folder if folder.exists() else images(folder, 9))
     keys = np.array([0, 4, 8])
 
-    def made(*args: Any, **known: Any) -> mapping.Mapped:
+    def made(*args: Any, **known: Any) -> sfm.Mapped:
         bound = signature.bind(*args, **known).arguments
         seeds.append(bound["seed"])
         found = rt.Poses(CAMERA, keys, keys / 30, arc(9)[keys], np.full(3, "keyframe"), "user")
         work = Path(bound["work_dir"])
         (work / "mapping").mkdir(parents=True, exist_ok=True)
         write_colmap(work / "sparse", found, [video.names[k] for k in keys])
-        return mapping.Mapped([work / "sparse"], [])
+        return sfm.Mapped([work / "sparse"], [])
 
     signature, seeds = inspect.signature(estimate.reconstruct), []
     lab.patch.setattr(estimate, "reconstruct", made)

@@ -11,9 +11,11 @@ from pose_worlds import FakeVideo, motion, supplied, textured_room
 import reobj_track as rt
 from reobj.cameras import invert_rigid
 from reobj.files import Progress
-from reobj.poses import points as room
-from reobj.poses.child import Child
-from reobj.poses.points import choose_keyframes, choose_pairs, path_steps, triangulate
+from reobj.poses import sfm
+from reobj.poses.child_job import Child
+from reobj.poses.features import choose_posed_pairs
+from reobj.poses.keyframes import choose_posed_keyframes, path_steps, sharpest_images
+from reobj.poses.sfm import triangulate
 
 pytest.importorskip("pycolmap")
 SIZE = (320, 240)
@@ -82,18 +84,20 @@ def test_poses_that_do_not_explain_the_images_give_a_message(corner, tmp_path, m
     turned = dataclasses.replace(given, cam_from_world=wrong)
     poses = run(video, turned, tmp_path)
     assert len(poses.points) == 0 and len(poses.messages) == 1
-    assert "matched features of 9 images meet in 3D" in poses.messages[0]
+    assert "matched features of 9 images triangulate" in poses.messages[0]
     np.testing.assert_array_equal(poses.cam_from_world, turned.cam_from_world)
 
 
 def test_a_stretch_of_poses_that_is_off_is_named(corner, tmp_path):
-    """Frames 12 and 14 lie 40 m below their place; between the two all is as it should be."""
+    """Frames 12 and 14 lie 40 m too low; between the two all is right."""
     _, given, video, _, _ = corner
     cams = given.cam_from_world.copy()
     cams[6:8, 1, 3] += 40
     poses = run(video, dataclasses.replace(given, cam_from_world=cams), tmp_path)
     (message,) = poses.messages
-    assert message.startswith("the supplied poses tear between frames 10 and 12, 14 and 16: what")
+    assert message.startswith(
+        "the supplied poses are inconsistent between frames 10 and 12, 14 and 16: "
+    )
     assert len(poses.points) > 100
 
 
@@ -115,7 +119,7 @@ def test_a_child_that_stops_is_a_message(corner, tmp_path, monkeypatch):
     def stop(module, folder, log_path):
         return Child("reobj.poses.nothing", folder, log_path)
 
-    monkeypatch.setattr(room, "Child", stop)
+    monkeypatch.setattr(sfm, "Child", stop)
     (message,) = run(video, given, tmp_path).messages
     assert "the triangulation stopped (exit code 1), see" in message
     assert "nothing" in (tmp_path / "points.log").read_text()
@@ -139,52 +143,51 @@ def test_progress_comes_from_the_child(corner, tmp_path):
 @pytest.mark.parametrize("kind", ["orbit", "walk", "pan", "forward"])
 def test_keyframes_are_evenly_spread_whatever_the_unit(kind):
     cams = motion(kind, 600)
-    rows = choose_keyframes(path_steps(supplied(cams)))
+    rows = choose_posed_keyframes(path_steps(supplied(cams)))
     assert 40 <= len(rows) <= 150 and rows[0] == 0 and (np.diff(rows) > 0).all()
     assert np.diff(rows).max() < 0.15 * 600
     cams[:, :, 3] *= 1e-3
-    np.testing.assert_array_equal(choose_keyframes(path_steps(supplied(cams))), rows)
+    np.testing.assert_array_equal(choose_posed_keyframes(path_steps(supplied(cams))), rows)
 
 
 def test_few_frames_are_all_keyframes_and_those_without_a_pose_none():
     cams = motion("orbit", 13)
     cams[5] = np.nan
-    rows = choose_keyframes(path_steps(supplied(cams)))
+    rows = choose_posed_keyframes(path_steps(supplied(cams)))
     assert rows.tolist() == [i for i in range(13) if i != 5]
-    assert choose_keyframes(np.full((4, 6), np.nan)).tolist() == []
+    assert choose_posed_keyframes(np.full((4, 6), np.nan)).tolist() == []
 
 
 def test_a_long_way_takes_wider_steps():
     cams = np.concatenate([motion("orbit", 400), motion("orbit", 400)[::-1]] * 4)
-    assert 60 < len(choose_keyframes(path_steps(supplied(cams)))) <= 150
+    assert 60 < len(choose_posed_keyframes(path_steps(supplied(cams)))) <= 150
 
 
-def test_pairs_are_neighbours_and_returns_to_a_place():
+def test_pairs_are_neighbours_and_loop_closures():
     cams = np.concatenate([motion("walk", 20), motion("walk", 20)[::-1]])
-    pairs = set(map(tuple, choose_pairs(path_steps(supplied(cams))).tolist()))
+    pairs = set(map(tuple, choose_posed_pairs(path_steps(supplied(cams))).tolist()))
     assert all(a < b for a, b in pairs)
     assert {(i, i + 1) for i in range(39)} <= pairs
     assert {(i, 39 - i) for i in range(15)} <= pairs  # the way back
     assert len(pairs) < 40 * 7
 
 
-def test_places_that_cannot_see_the_same_are_no_pair():
-    """Back to back at one place."""
+def test_opposite_views_are_no_pair():
+    """Back to back at one position."""
     turned = motion("orbit", 12)
     turned[6:, [0, 2]] *= -1
-    pairs = choose_pairs(path_steps(supplied(turned)))
+    pairs = choose_posed_pairs(path_steps(supplied(turned)))
     far = pairs[(pairs[:, 1] - pairs[:, 0] > 4)]
     assert ((far[:, 0] < 6) == (far[:, 1] < 6)).all()
 
 
-def test_the_sharpest_image_near_a_keyframe_stands_for_it(monkeypatch):
+def test_the_sharpest_image_near_a_keyframe_replaces_it():
     noise = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
     images = [np.full_like(noise, 99)] * 40
     images[11] = images[20] = images[33] = noise
     given = supplied(motion("walk", 40), CAMERA)
     given.cam_from_world[20] = np.nan  # sharp, but without a pose
-    found = room._sharp_images(
-        given, FakeVideo(images), np.array([10, 20 + 2, 34]), 160, Progress("k")
-    )
+    keys = np.array([10, 20 + 2, 34])
+    found = sharpest_images(given, FakeVideo(images), keys, 160, Progress("k"))
     assert sorted(found)[0] == 11 and 33 in found and 20 not in found
     assert all(image.shape == (120, 160, 3) for image in found.values())

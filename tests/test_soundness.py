@@ -1,4 +1,4 @@
-"""What tells a sound model: the covariance of its cameras, and two mappers that agree."""
+"""What makes a model sound: the covariance of its cameras, and two mappers that agree."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_consistency import Scene
 
-from reobj.poses import adjustment
-from reobj.poses.adjustment import _bundle_adjust, adjusted
-from reobj.poses.arrays import read_arrays
-from reobj.poses.mapping import _only, _Search
-from reobj.poses.soundness import MIN_JOINT, Part, confirmed
-from reobj.poses.uncertainty import relative_sigmas
+from reobj.poses import bundle
+from reobj.poses.bundle import adjusted, read_arrays, refine, relative_sigmas, submodel
+from reobj.poses.mapping import models_of_one_camera
+from reobj.poses.verification import MIN_JOINT, Component, FocalSource, confirmed
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -27,17 +25,17 @@ def noisy(scene, noise_px, seed):
     scene.xy = clean + np.random.default_rng(seed).normal(0, noise_px, clean.shape)
     model = scene.model()
     scene.xy = clean
-    _bundle_adjust(model, False, False)
+    refine(model)
     return model
 
 
 def test_the_sigma_of_centres_is_what_repeated_noise_shows():
     """80 adjustments with fresh noise, each brought to the truth by a similarity."""
     scene, truth = Scene(count=6, points=150), None
-    off, told = [], []
+    off, estimated = [], []
     for seed in range(80):
         model = noisy(scene, 0.5, seed)
-        told.append(relative_sigmas(read_arrays(model), False)[0])
+        estimated.append(relative_sigmas(read_arrays(model), False)[0])
         found = centres_of(model)
         truth = centres_of(scene.model()) if truth is None else truth
         a, b = found - found.mean(0), truth - truth.mean(0)
@@ -46,7 +44,7 @@ def test_the_sigma_of_centres_is_what_repeated_noise_shows():
         off.append(a * (a * b).sum() / (a**2).sum() - b)
     extent = np.linalg.norm(np.ptp(truth, axis=0))
     shown = np.sqrt((np.array(off) ** 2).sum(2).mean(0)).max() / extent
-    assert np.median(told) == pytest.approx(shown, rel=0.3)
+    assert np.median(estimated) == pytest.approx(shown, rel=0.3)
 
 
 def test_less_parallax_and_a_free_focal_length_are_less_sure():
@@ -69,7 +67,7 @@ def test_what_nothing_determines_is_infinite():
 
 
 @pytest.mark.parametrize("turns", [True, False])
-def test_a_focal_length_is_taken_if_the_views_tell_it(turns):
+def test_a_focal_length_is_taken_if_the_views_determine_it(turns):
     """Of a walk with a shake of the hand; a dolly's depths may be stretched with any."""
     scene = Scene(count=8, points=400)
     if not turns:
@@ -88,8 +86,8 @@ def test_a_focal_length_is_taken_if_the_views_tell_it(turns):
     assert found.centre_sigma < np.inf
 
 
-@pytest.mark.parametrize("focal, told", [(505.0, True), (430.0, False)])
-def test_a_focal_length_that_depends_on_the_principal_point_is_not_told(monkeypatch, focal, told):
+@pytest.mark.parametrize("focal, good", [(505.0, True), (430.0, False)])
+def test_a_focal_length_that_depends_on_the_principal_point_is_refused(monkeypatch, focal, good):
     """The principal point drifts off when it is freed: in a wrong minimum to make up for one."""
     model, freed = noisy(Scene(count=16, points=400), 0.3, 0), []
 
@@ -99,15 +97,15 @@ def test_a_focal_length_that_depends_on_the_principal_point_is_not_told(monkeypa
             params = [500.0, 370, 240, 0, 0] if free_centre else [focal, 320, 240, 0, 0]
             model.camera(1).params = params
 
-    monkeypatch.setattr(adjustment, "_bundle_adjust", set_intrinsics)
+    monkeypatch.setattr(bundle, "_bundle_adjust", set_intrinsics)
     found = adjusted(model, True)
-    assert found.calibrated == told
-    assert found.arrays.focal == (focal if told else 500)
-    assert freed == [(True, True), (True, False), (False, False)][: 2 + (not told)]
+    assert found.calibrated == good
+    assert found.arrays.focal == (focal if good else 500)
+    assert freed == [(True, True), (True, False), (False, False)][: 2 + (not good)]
 
 
-def test_two_cameras_in_one_place_tear_no_model():
-    """Their distance, which the noise alone tells, is no measure of the others'."""
+def test_two_cameras_at_one_position_break_no_model():
+    """Their distance, which is noise alone, does not fix the scale."""
     scene = Scene(count=8, points=400)
     rotation = scene.truth[:, :, :3]
     centre = -np.einsum("nji,nj->ni", rotation, scene.truth[:, :, 3])
@@ -117,15 +115,15 @@ def test_two_cameras_in_one_place_tear_no_model():
     scene.seen = np.array([scene.project(pose)[1] for pose in scene.truth])
     scene.xy = scene.xy + np.random.default_rng(0).normal(0, 0.5, scene.xy.shape)
     model = scene.model()
-    model.camera(1).focal_length *= 1.02  # the camera of a larger part
-    _bundle_adjust(model, False, False)
+    model.camera(1).focal_length *= 1.02  # the camera of a larger component
+    refine(model)
     step = np.linalg.norm(np.diff(centres_of(model), axis=0), axis=1)
     true = np.linalg.norm(np.diff(centre, axis=0), axis=1)
     assert step[3:] / step[3] == pytest.approx(true[3:] / true[3], rel=0.05)
     assert step[:2].max() < 0.05 * step[3:].min()
 
 
-def test_points_at_a_centre_tell_nothing():
+def test_points_at_a_camera_centre_have_no_weight():
     """Chance matches are triangulated there; their derivatives would be infinite."""
     scene = Scene(count=6, points=300)
     sigma, _ = relative_sigmas(read_arrays(noisy(scene, 0.5, 0)), True)
@@ -137,9 +135,10 @@ def test_points_at_a_centre_tell_nothing():
 # ---- Two mappers ---------------------------------------------------------------------------------
 
 
-def part(model, sigma, problem=""):
+def component(model, sigma, problem=""):
     arrays = read_arrays(model)
-    return Part(model, arrays, True, 10.0, 1.0, 20.0, sigma, 1000, problem, arrays.ids)
+    measures = 10.0, 1.0, 20.0, sigma, 1000
+    return Component(model, arrays, FocalSource.MODEL, *measures, problem, arrays.ids)
 
 
 def moved(step_m=0.0, turn_deg=0.0, count=12):
@@ -167,8 +166,9 @@ def moved(step_m=0.0, turn_deg=0.0, count=12):
     ],
 )
 def test_weak_geometry_needs_the_same_from_another_mapper(other, sure):
-    weak = part(Scene().model(), 0.002)
-    (found,) = confirmed([weak], [part(moved(**other), 0.002)], True)
+    weak = component(Scene().model(), 0.002)
+    second = component(moved(**other), 0.002)
+    (found,) = confirmed([weak], [second], FocalSource.MATCHES)
     assert (not found.problem) == sure and ("parallax" in found.problem) != sure
 
 
@@ -176,11 +176,11 @@ def piece(first, last):
     """Some images of the scene in a world and scale of their own."""
     model = moved()
     model.transform(pycolmap.Sim3d(1 + 0.1 * first, pycolmap.Rotation3d(), [first, 0, 0]))
-    return part(_only(model, set(range(first, last))), 0.002)
+    return component(submodel(model, set(range(first, last))), 0.002)
 
 
 @pytest.mark.parametrize(
-    "ends, joint, sure",
+    "ends, count, sure",
     [
         ([(1, 7), (7, 13)], None, True),  # two pieces, by all that both sides see
         ([(7, 13), (1, 4), (4, 7)], None, True),  # in any order
@@ -188,50 +188,54 @@ def piece(first, last):
         ([(1, 7), (7, 13)], MIN_JOINT - 1, False),
         ([(1, 7), (8, 13)], None, True),  # without an image
         ([(1, 5), (9, 13)], None, False),  # without a third of them
-        ([(1, 9), (9, 11)], None, False),  # a pair lies as it likes
+        ([(1, 9), (9, 11)], None, False),  # the scale of a pair is arbitrary
     ],
 )
-def test_pieces_of_another_mapper_count_where_points_prove_how_they_are_joined(ends, joint, sure):
+def test_pieces_of_another_mapper_count_where_points_prove_how_they_are_joined(ends, count, sure):
     scene = Scene()
-    if joint is not None:  # other points that both sides see are two
+    if count is not None:  # other points that both sides see are two
         arrays, seen = read_arrays(scene.model()), scene.seen
-        told = arrays.told_by(np.arange(6)) & arrays.told_by(np.arange(6, 12))
-        ids = np.flatnonzero(seen.sum(0) >= 2)[told]  # as the model has them
+        joint = arrays.triangulated_by(np.arange(6)) & arrays.triangulated_by(np.arange(6, 12))
+        ids = np.flatnonzero(seen.sum(0) >= 2)[joint]  # as the model has them
         both = np.flatnonzero(seen[:6].any(0) & seen[6:].any(0))
-        scene.untie(6, int(np.flatnonzero(both == ids[joint])[0]))
-    weak = part(scene.model(), 0.002)
-    (found,) = confirmed([weak], [piece(*end) for end in ends], True)
+        scene.untie(6, int(np.flatnonzero(both == ids[count])[0]))
+    weak = component(scene.model(), 0.002)
+    (found,) = confirmed([weak], [piece(*end) for end in ends], FocalSource.MATCHES)
     assert (not found.problem) == sure
     if sure:  # only what both have stays
-        assert set(found.held) == {i for end in ends for i in range(*end)}
+        assert set(found.kept) == {i for end in ends for i in range(*end)}
 
 
 def test_images_that_the_other_mapper_lacks_are_left_out():
-    weak = part(Scene().model(), 0.002)
-    (found,) = confirmed([weak], [piece(1, 11)], True)
-    (model,) = _Search._one_camera(None, [found])
+    weak = component(Scene().model(), 0.002)
+    (found,) = confirmed([weak], [piece(1, 11)], FocalSource.MATCHES)
+    (model,) = models_of_one_camera([found])
     assert not found.problem and sorted(model.reg_image_ids()) == list(range(1, 11))
-    (model,) = _Search._one_camera(None, [weak])
+    (model,) = models_of_one_camera([weak])
     assert len(model.reg_image_ids()) == 12
 
 
-def test_points_are_told_by_images_whose_rays_spread():
+def test_points_are_triangulated_by_images_whose_rays_spread():
     scene = Scene(count=4, points=50)
     scene.seen[:] = True
-    scene.poses[1] = scene.poses[0]  # from one place
+    scene.poses[1] = scene.poses[0]  # from one position
     scene.seen[3, 10:] = False
-    told = read_arrays(scene.model()).told_by
-    assert [told(np.array(rows)).sum() for rows in ([0], [0, 1], [0, 2], [2, 3])] == [0, 0, 50, 10]
+    mark = read_arrays(scene.model()).triangulated_by
+    assert [mark(np.array(rows)).sum() for rows in ([0], [0, 1], [0, 2], [2, 3])] == [0, 0, 50, 10]
 
 
-def test_two_mappers_prove_less_where_nothing_told_the_focal_length():
-    other = part(moved(), 0.002)
-    for sigma, told, sure in ((0.005, True, True), (0.005, False, False), (0.003, False, True)):
-        (found,) = confirmed([part(Scene().model(), sigma)], [other], told)
+def test_two_mappers_prove_less_where_the_focal_length_was_a_guess():
+    other = component(moved(), 0.002)
+    matches, guess = FocalSource.MATCHES, FocalSource.GUESS
+    for sigma, source, sure in (
+        (0.005, matches, True), (0.005, guess, False), (0.003, guess, True)
+    ):  # fmt: skip
+        (found,) = confirmed([component(Scene().model(), sigma)], [other], source)
         assert (not found.problem) == sure
 
 
 def test_strong_geometry_needs_nobody_and_a_problem_stays():
-    strong, bad = part(Scene().model(), 0.0005), part(Scene().model(), 0.0005, "too few points")
-    first, second = confirmed([bad, strong], [], True)
+    strong = component(Scene().model(), 0.0005)
+    bad = component(Scene().model(), 0.0005, "too few points")
+    first, second = confirmed([bad, strong], [], FocalSource.MATCHES)
     assert first is strong and second is bad

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from test_consistency import CAMERA, Scene
 
-from reobj.poses import zoom
-from reobj.poses.arrays import read_arrays
-from reobj.poses.zoom import constant_focal
+from reobj.poses import verification
+from reobj.poses.bundle import read_arrays
+from reobj.poses.verification import constant_focal
 
 
 def zoomed_scene(zoomed, ratio, seed=0, noise_px=0.3):
@@ -43,18 +43,18 @@ def test_images_of_another_focal_length_are_found(ratio):
 
 @pytest.mark.parametrize("log, sigma, found", [(0.3, 0.03, 1), (0.2, 0.01, 0), (0.3, 0.07, 0)])
 def test_one_side_alone_must_be_clearer(monkeypatch, log, sigma, found):
-    """Seen from those before it, one image has another focal length; those behind tell nothing."""
+    """By the images before it, one image has another focal length; those after it measure none."""
     views = views_of(range(0), 1.0)
 
-    def told(arrays, image, side):
+    def log_focal(arrays, image, side):
         if side.start > image:
             return np.nan, np.nan
         return (log, sigma) if image == 13 else (0.0, 0.003)
 
-    monkeypatch.setattr(zoom, "TOLD_BY", 1)
-    monkeypatch.setattr(zoom, "_triangulate", lambda arrays, terms, side: side)
-    monkeypatch.setattr(zoom, "_log_focal", told)
-    assert [(a, b) for a, b, _ in zoom._changes(views)] == [(13, 14)] * found
+    monkeypatch.setattr(verification, "RESECTED_IMAGES", 1)
+    monkeypatch.setattr(verification, "_triangulate", lambda arrays, terms, side: side)
+    monkeypatch.setattr(verification, "_log_focal", log_focal)
+    assert [(a, b) for a, b, _ in verification._changes(views)] == [(13, 14)] * found
 
 
 def test_the_focal_length_of_most_images_is_kept():
@@ -63,27 +63,27 @@ def test_the_focal_length_of_most_images_is_kept():
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.04])
-def test_one_focal_length_is_left_in_peace(ratio):
+def test_one_focal_length_is_no_zoom(ratio):
     """Also where the lens breathes by a few per cent as it focuses."""
     others, changes = constant_focal([views_of(range(7, 13), ratio, noise_px=1.0)])
     assert len(others) == 0 and changes == []
 
 
-def test_a_short_zoom_parts_its_two_sides(monkeypatch):
-    """Between two changes near each other no image tells its focal length without the other."""
+def test_a_short_zoom_separates_its_two_sides(monkeypatch):
+    """Between two changes near each other no focal length is measured without the other side."""
     views = views_of(range(7, 13), 1.3)
     assert constant_focal([views])[0].tolist() == list(range(8, 21))  # the first of equal sides
-    monkeypatch.setattr(zoom, "WINDOW", 6)  # now both sides of it are measured alone
+    monkeypatch.setattr(verification, "WINDOW", 6)  # now both sides of it are measured alone
     assert constant_focal([views])[0].tolist() == list(range(8, 14))
 
 
-def test_models_apart_are_looked_at_each():
+def test_models_are_checked_one_by_one():
     one, other = views_of(range(0), 1.0), views_of(range(7, 13), 1.3)
     assert constant_focal([one])[1] == [] and len(constant_focal([one, other])[1]) == 2
     assert constant_focal([])[0].tolist() == []
 
 
-def test_too_few_points_tell_nothing():
+def test_too_few_points_show_no_zoom():
     scene = zoomed_scene(range(7, 13), 1.3)
     scene.seen[:, 30:] = False
     assert constant_focal([read_arrays(scene.model())])[1] == []

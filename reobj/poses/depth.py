@@ -1,7 +1,7 @@
-"""Points and metric scale from depth maps beside the frames: 16-bit PNG, as many sensors write it.
+"""Points and metric scale from depth maps of the frames: 16-bit PNG, as many sensors write it.
 
-`add_depth` does all: finds the maps of the frames, makes poses of unknown scale metric, and adds
-points with their visibility. Frames without a map are left alone.
+Start at `add_depth`: it finds the maps of the frames, makes poses of unknown scale metric, and adds
+points with their visibility. Frames without a map are unchanged.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError
 from reobj.views import VisiblePoints
 
-UNITS_PER_M = 1000.0  # of a depth map's numbers: mm (ScanNet, 7-Scenes, Record3D; TUM has 5000)
+UNITS_PER_M = 1000.0  # of a depth map's values: mm (ScanNet, 7-Scenes, Record3D; TUM has 5000)
 INVALID = (0, 65535)  # no depth; 65535: 7-Scenes
-PIXELS = 320  # wider maps are read at every 2nd, 3rd ... pixel (chosen: time)
+MAX_SIDE_PX = 320  # larger maps are read at every 2nd, 3rd ... pixel (chosen: time)
 
 
 @dataclass(frozen=True, slots=True)
 class DepthMaps:
-    """Depth maps of some frames, one camera for all.
+    """Depth maps of some frames, all of one camera.
 
     Attributes:
-        files: by row of the poses. units_per_m: of their numbers.
+        files: by row of the poses. units_per_m: of their values.
         camera: of the maps. depth_from_color: (3, 4) rigid, metres.
     """
 
@@ -44,7 +44,7 @@ class DepthMaps:
     depth_from_color: Array
 
     def read(self, row: int) -> tuple[Floats, Array]:
-        """Read a map, thinned to PIXELS and without distortion.
+        """Read a map, subsampled to MAX_SIDE_PX and without distortion.
 
         Returns:
             depth (h, w) in m, 0 where there is none, and K (3, 3) of its pixels.
@@ -52,60 +52,63 @@ class DepthMaps:
         image = _read_map(self.files[row])
         size = (self.camera.width, self.camera.height)
         if image.shape[::-1] != size:
-            raise ReobjError(f"{self.files[row]}: {image.shape[1]}x{image.shape[0]} pixels; "
-                             f"expected {size[0]}x{size[1]} as the others")  # fmt: skip
-        step, K = -(-max(size) // PIXELS), self.camera.K
+            raise ReobjError(
+                f"{self.files[row]}: {image.shape[1]}x{image.shape[0]} pixels; expected "
+                f"{size[0]}x{size[1]} as the other maps"
+            )
+        step = -(-max(size) // MAX_SIDE_PX)
+        K = self.camera.K
         x, y = np.meshgrid(np.arange(0, size[0], step), np.arange(0, size[1], step))
-        at = np.stack([x, y], -1)  # (h, w, 2)
+        xy = np.stack([x, y], -1)  # (h, w, 2)
         if self.camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
-            # what a pinhole camera would see there lies elsewhere in the image
-            ray = np.concatenate([at + 0.5, np.ones_like(x)[..., None]], -1) @ np.linalg.inv(K).T
-            found = self.camera.to_pycolmap().img_from_cam(ray.reshape(-1, 3))
-            at = np.floor(np.reshape(found, at.shape)).astype(int)
-        inside: BoolArray = np.all((at >= 0) & (at < size), axis=-1)
-        at = np.where(inside[..., None], at, 0)
-        depth = np.where(inside, image[at[..., 1], at[..., 0]], 0).astype(np.float32)
+            # pixels of an ideal pinhole camera lie elsewhere in the distorted image
+            ray = np.concatenate([xy + 0.5, np.ones_like(x)[..., None]], -1) @ np.linalg.inv(K).T
+            distorted = self.camera.to_pycolmap().img_from_cam(ray.reshape(-1, 3))
+            xy = np.floor(np.reshape(distorted, xy.shape)).astype(int)
+        inside: BoolArray = np.all((xy >= 0) & (xy < size), axis=-1)
+        xy = np.where(inside[..., None], xy, 0)
+        depth = np.where(inside, image[xy[..., 1], xy[..., 0]], 0).astype(np.float32)
         depth[np.isin(depth, INVALID)] = 0
-        # a pixel x of the thinned map has its centre at step x + .5 of the whole one
-        small = np.array(
+        # a pixel x of the subsampled map has its centre at step x + .5 of the whole one
+        small_from_full = np.array(
             [[1 / step, 0, 0.5 - 0.5 / step], [0, 1 / step, 0.5 - 0.5 / step], [0, 0, 1]]
         )
-        return depth / np.float32(self.units_per_m), small @ K
+        return depth / np.float32(self.units_per_m), small_from_full @ K
 
 
 def _read_map(path: Path) -> Any:
     """Read a depth map as it is stored, (h, w) uint16."""
     image = read_image(path, cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.uint16:
-        raise ReobjError(f"{path}: no depth map; expected a 16-bit PNG with one channel")
+        raise ReobjError(f"{path}: not a depth map; expected a 16-bit PNG with one channel")
     return image
 
 
-# ---- Which maps, and their camera ----------------------------------------------------------------
+# ---- The maps and their camera -------------------------------------------------------------------
 
 
 def find_depth_maps(text: str, poses: Poses, names: Sequence[str]) -> DepthMaps:
     """Find the depth maps of the frames.
 
     Args:
-        text: folder, or FOLDER:UNITS with the numbers' units per metre (TUM: 5000; default: mm).
+        text: folder, or FOLDER:UNITS with units per metre (TUM: 5000; default: mm).
         names: (F,) of the frames' images, or () for those of a video.
     Raises:
         ReobjError: no folder, no maps in it, none of a frame, or intrinsics that do not fit.
     """
     folder, units = _folder_and_units(text)
-    found = sorted(folder.glob("*.png"))
-    if not found:
-        raise ReobjError(f"{folder}: no .png in it; --depth wants a folder of 16-bit depth maps")
-    row_of = _rows_of_maps([path.stem for path in found], poses.frame, names)
-    files = {row: path for path, row in zip(found, row_of, strict=True) if row >= 0}
+    paths = sorted(folder.glob("*.png"))
+    if not paths:
+        raise ReobjError(f"{folder}: no .png in it; --depth needs a folder of 16-bit depth maps")
+    rows = _rows_of_maps([path.stem for path in paths], poses.frame, names)
+    files = {row: path for path, row in zip(paths, rows, strict=True) if row >= 0}
     if not files:
         first = names[0] if names else f"frame {poses.frame[0]}"
         raise ReobjError(
-            f"{folder}: none of its {len(found)} depth maps belongs to a frame ({found[0].name!r}, "
+            f"{folder}: none of its {len(paths)} depth maps belongs to a frame ({paths[0].name!r}, "
             f"{first!r} ...); expected the same names, or frame numbers"
         )
-    height, width = _read_map(found[0]).shape
+    height, width = _read_map(paths[0]).shape
     camera, color_from_depth = _depth_camera(folder, (width, height), poses.camera)
     return DepthMaps(files, units, camera, invert_rigid(color_from_depth))
 
@@ -113,20 +116,19 @@ def find_depth_maps(text: str, poses: Poses, names: Sequence[str]) -> DepthMaps:
 def _folder_and_units(text: str) -> tuple[Path, float]:
     """Split FOLDER:UNITS."""
     head, colon, tail = text.rpartition(":")
-    if Path(text).is_dir() or not colon:
-        folder, units = Path(text), UNITS_PER_M
-    else:
-        try:
-            folder, units = Path(head), float(tail)
-        except ValueError:
-            folder, units = Path(text), UNITS_PER_M
+    folder = Path(text)
+    units = UNITS_PER_M
+    if colon and not folder.is_dir():
+        with contextlib.suppress(ValueError):
+            units = float(tail)
+            folder = Path(head)
     if not folder.is_dir() or not 0 < units < np.inf:
         expected = "FOLDER, or FOLDER:UNITS with units per metre (1000: mm; TUM: 5000)"
         raise ReobjError(f"--depth {text}: no such folder; expected {expected}")
     return folder, units
 
 
-STAMP = re.compile(r"\d+\.\d+")  # a time in s as a name (TUM)
+STAMP = re.compile(r"\d+\.\d+")  # a time in s as a file name (TUM)
 MAX_STAMP_S = 0.02  # between an image and its depth map (TUM's own tool: .02)
 
 
@@ -136,29 +138,36 @@ def _rows_of_maps(stems: Sequence[str], frame: IntArray, names: Sequence[str]) -
     Returns:
         the row of each map's frame, -1: none.
     """
-    own = [_core(Path(name).stem) for name in names]
-    row_of = {name: row for row, name in enumerate(own)}
+    images = [_core(Path(name).stem) for name in names]
+    row_of = {name: row for row, name in enumerate(images)}
     rows = [row_of.get(_core(stem), -1) for stem in stems]
     if max(rows) >= 0:
         return rows
-    if own and all(STAMP.fullmatch(name) for name in (*own, *stems)):
-        at, time_s = np.array(own, np.float64), np.array(stems, np.float64)
-        nearest = np.abs(at - time_s[:, None]).argmin(1)  # (N,)
-        close = np.abs(at[nearest] - time_s) <= MAX_STAMP_S
-        return [int(row) for row in np.where(close, nearest, -1)]
-    given = [int(found[-1]) if (found := re.findall(r"\d+", n)) else -1 for n in own]
-    numbers = dict(zip(given if own else frame.tolist(), range(len(frame)), strict=True))
-    numbers.pop(-1, None)
-    return [numbers.get(int(n[-1]), -1) if (n := re.findall(r"\d+", s)) else -1 for s in stems]
+    if images and all(STAMP.fullmatch(name) for name in (*images, *stems)):
+        image_s = np.array(images, np.float64)
+        map_s = np.array(stems, np.float64)
+        nearest = np.abs(image_s - map_s[:, None]).argmin(1)  # (N,)
+        is_close = np.abs(image_s[nearest] - map_s) <= MAX_STAMP_S
+        return [int(row) for row in np.where(is_close, nearest, -1)]
+    numbers = [_last_number(name) for name in images] if images else frame.tolist()
+    row_of_number = dict(zip(numbers, range(len(frame)), strict=True))
+    row_of_number.pop(-1, None)
+    return [row_of_number.get(_last_number(stem), -1) for stem in stems]
+
+
+def _last_number(text: str) -> int:
+    """Return the last number in a text, -1 if there is none."""
+    digits = re.findall(r"\d+", text)
+    return int(digits[-1]) if digits else -1
 
 
 def _core(stem: str) -> str:
-    """Take the word for the kind of image out of a name such as frame-000020.depth."""
+    """Remove the word for the kind of image from a name such as frame-000020.depth."""
     return re.sub(r"[._-]?(depth|color|colour|rgb)[._-]?", "", stem, flags=re.IGNORECASE)
 
 
 def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[Camera, Array]:
-    """Find the intrinsics of the maps: in a file of theirs, else those of the colour images.
+    """Find the intrinsics of the maps: in a file beside them, else those of the colour images.
 
     Returns:
         camera, and color_from_depth (3, 4).
@@ -170,16 +179,16 @@ def _depth_camera(folder: Path, size: tuple[int, int], color: Camera) -> tuple[C
             return Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)), same
     for path in (folder / "intrinsics.json", folder.parent / "intrinsics.json"):
         content = load_json(path) if path.exists() else {}
-        own = content.get("depth") if isinstance(content, dict) else None
+        depth = content.get("depth") if isinstance(content, dict) else None
         if path.parent == folder and path.exists():
-            own = own or content
-        if own is not None:
-            return _camera_of(path, content, own, size)
+            depth = depth or content
+        if depth is not None:
+            return _camera_of(path, content, depth, size)
     if abs(color.width * size[1] - color.height * size[0]) > max(color.width, color.height, *size):
         raise ReobjError(
             f"{folder}: depth maps of {size[0]}x{size[1]}, frames of {color.width}x{color.height}: "
-            "of other shape; put the depth camera's intrinsics there: intrinsics.json with fx, fy, "
-            "cx, cy"
+            "another aspect ratio; add the depth camera's intrinsics there: intrinsics.json with "
+            "fx, fy, cx, cy"
         )
     return color.resized(size), same
 
@@ -193,18 +202,19 @@ def _matrix(path: Path) -> Array:
     raise ReobjError(f"{path}: expected a 3x3 or 4x4 matrix of intrinsics")
 
 
-def _camera_of(path: Path, content: Any, own: Any, size: tuple[int, int]) -> tuple[Camera, Array]:
-    """Read an intrinsics.json: fx, fy, cx, cy of maps w x h, and T_color_from_depth if known."""
+def _camera_of(path: Path, content: Any, depth: Any, size: tuple[int, int]) -> tuple[Camera, Array]:
+    """Read an intrinsics.json: fx, fy, cx, cy of maps w x h, and T_color_from_depth if given."""
     color_from_depth = np.eye(3, 4)
     try:
-        fx, fy, cx, cy = (float(own[key]) for key in ("fx", "fy", "cx", "cy"))
-        camera = Camera("PINHOLE", int(own.get("w", size[0])), int(own.get("h", size[1])),
-                        (fx, fy, cx, cy))  # fmt: skip
-        given = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
-        if given.shape == (3,):
-            color_from_depth[:, 3] = given
+        width = int(depth.get("w", size[0]))
+        height = int(depth.get("h", size[1]))
+        fx, fy, cx, cy = (float(depth[key]) for key in ("fx", "fy", "cx", "cy"))
+        camera = Camera("PINHOLE", width, height, (fx, fy, cx, cy))
+        transform = np.array(content.get("T_color_from_depth", [0, 0, 0]), np.float64)
+        if transform.shape == (3,):
+            color_from_depth[:, 3] = transform
         else:
-            color_from_depth[:] = given.reshape(-1, 4)[:3]
+            color_from_depth[:] = transform.reshape(-1, 4)[:3]
         return camera.resized(size), color_from_depth
     except (AttributeError, KeyError, TypeError, ValueError):
         expected = "fx, fy, cx, cy of the depth maps, T_color_from_depth: 3 or 3x4 numbers in m"
@@ -220,7 +230,7 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
     Args:
         text: FOLDER or FOLDER:UNITS. video: of the poses; its images give the points' colours.
     Returns:
-        the poses with more points; as they were, with a message, where the scale cannot be told.
+        the poses with more points; unchanged, with a message, where the scale is not observable.
     """
     names = [video.name(int(frame)) for frame in poses.frame] if video.names else ()
     maps = find_depth_maps(text, poses, names)
@@ -233,41 +243,44 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
 
 
 MAX_MAPS = 60  # maps that are read, evenly spread (chosen: time)
-MIN_MAPS = 3  # with a ratio, to tell a scale from (chosen)
+MIN_MAPS = 3  # with a ratio, to estimate a scale (chosen)
 MIN_RATIOS = 10  # points of a map that give its ratio (chosen)
-# Relative sigma that the scatter does not show: of the depth camera itself (Khoshelham and Elberink
-# 2012: ~1 %), of its place and the colour camera's focal length (chosen: redkitchen, 1 to 3 %).
+# Systematic relative sigma: of the depth camera itself (Khoshelham and Elberink 2012: ~1 %), of its
+# extrinsics and the colour camera's focal length (chosen: redkitchen, 1 to 3 %).
 SENSOR_SIGMA = 0.02
-RUNS = 8  # of the path, whose scatter tells the sigma (chosen)
-MAX_SCALE_SPREAD = 0.2  # relative, between maps: then depth and cameras contradict (chosen)
+RUNS = 8  # of the trajectory, whose scatter gives the sigma (chosen)
+MAX_SCALE_SPREAD = 0.2  # relative, between maps; more is a contradiction of the poses (chosen)
 
 
 def depth_scale(poses: Poses, maps: DepthMaps) -> tuple[Array, Array, int] | str:
-    """Measure metres per unit of each part: depth of the maps over that of the sparse points.
+    """Estimate metres per unit of each component: depth of the maps over that of sparse points.
 
     Returns:
-        scale and relative sigma of each part, and the number of maps; or a message why not.
+        scale and relative sigma of each component, and the number of maps; or a message why not.
     """
-    visible, scales, sigmas, used = VisiblePoints(poses), [], [], 0
-    for part in range(poses.part_count):
-        rows = [r for r in _spread_rows(poses, maps) if poses.part[r] == part]
-        found = [_log_ratio(poses, maps, visible, row) for row in rows]
-        logs = np.array([log for log in found if log is not None])
-        where = "" if poses.part_count == 1 else f" of part {part}"
+    visible = VisiblePoints(poses)
+    scales = []
+    sigmas = []
+    used = 0
+    for component in range(poses.part_count):
+        rows = [r for r in _spread_rows(poses, maps) if poses.part[r] == component]
+        ratios = [_log_ratio(poses, maps, visible, row) for row in rows]
+        logs = np.array([log for log in ratios if log is not None])
+        where = "" if poses.part_count == 1 else f" of component {component}"
         if len(logs) < MIN_MAPS:
             return (
-                f"--depth: the scale{where} stays unknown, and no points come from depth: "
+                f"--depth: the scale{where} stays unknown, and no points are added from depth: "
                 f"{len(logs)} of {len(rows)} maps show enough sparse points, {MIN_MAPS} are needed"
             )
         spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
         if spread > MAX_SCALE_SPREAD:
             return (
-                f"--depth: the ratio of depth to the cameras' world{where} varies by "
-                f"{100 * spread:.0f} % between maps: one of them is wrong; the scale stays unknown"
+                f"--depth: the ratio of depth to the poses{where} varies by {100 * spread:.0f} % "
+                "between maps: depth or poses are wrong; the scale stays unknown"
             )
         used += len(logs)
         scales.append(float(np.exp(np.median(logs))))
-        # neighbouring maps err alike: runs of them count as one measurement each
+        # errors of neighbouring maps are correlated: runs of them count as one measurement each
         runs = np.array([np.median(run) for run in np.array_split(logs, min(RUNS, len(logs)))])
         sigma = float(runs.std(ddof=1)) / np.sqrt(len(runs))
         sigmas.append(float(np.hypot(sigma, SENSOR_SIGMA)))
@@ -277,8 +290,8 @@ def depth_scale(poses: Poses, maps: DepthMaps) -> tuple[Array, Array, int] | str
 def _spread_rows(poses: Poses, maps: DepthMaps) -> list[int]:
     """Choose at most MAX_MAPS rows with a pose and a map, evenly spread."""
     rows = [row for row in sorted(maps.files) if poses.known[row]]
-    at = np.linspace(0, len(rows) - 1, min(len(rows), MAX_MAPS)).round().astype(int)
-    return [rows[i] for i in at]
+    chosen = np.linspace(0, len(rows) - 1, min(len(rows), MAX_MAPS)).round().astype(int)
+    return [rows[i] for i in chosen]
 
 
 def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) -> float | None:
@@ -288,8 +301,10 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
         return None
     depth, K = maps.read(row)
     in_color = points @ poses.cam_from_world[row, :, :3].T + poses.cam_from_world[row, :, 3]
-    rotation, shift, log_scale = maps.depth_from_color[:, :3], maps.depth_from_color[:, 3], 0.0
-    for offset in (0 * shift, shift, shift):  # the way between the cameras needs the scale
+    rotation = maps.depth_from_color[:, :3]
+    shift = maps.depth_from_color[:, 3]
+    log_scale = 0.0
+    for offset in (0 * shift, shift, shift):  # the shift between the cameras needs the scale
         in_depth = np.exp(log_scale) * in_color @ rotation.T + offset
         measured = _look_up(depth, K, in_depth)
         good = (measured > 0) & (in_depth[:, 2] > 0)
@@ -310,31 +325,32 @@ def _look_up(depth: Floats, K: Array, in_depth: Array) -> Array:
 
 
 def _scaled(poses: Poses, scale: Array, sigma: Array, used: int) -> Poses:
-    """Scale the parts of a world to metres."""
-    cams, points = poses.cam_from_world.copy(), poses.points.copy()
-    cams[:, :, 3] *= scale[poses.part][:, None]
-    part_of_point = np.zeros(len(points), np.int64)
-    part_of_point[poses.visibility[:, 1]] = poses.part[poses.visibility[:, 0]]
-    points *= scale[part_of_point][:, None]
+    """Scale the components of the trajectory to metres."""
+    cam_from_world = poses.cam_from_world.copy()
+    points = poses.points.copy()
+    cam_from_world[:, :, 3] *= scale[poses.part][:, None]
+    component = np.zeros(len(points), np.int64)
+    component[poses.visibility[:, 1]] = poses.part[poses.visibility[:, 0]]
+    points *= scale[component][:, None]
     figures = ", ".join(f"{s:.4g} m +- {100 * e:.1f} %" for s, e in zip(scale, sigma, strict=True))
     message = f"metric by {used} depth maps: one unit of the reconstruction was {figures}"
     return dataclasses.replace(
         poses,
-        cam_from_world=cams,
+        cam_from_world=cam_from_world,
         points=points,
         metric=True,
         messages=(*poses.messages, message),
     )
 
 
-GRID = 80  # pixels across a map that become points (chosen)
+MAP_POINTS = 80  # across a map (chosen)
 MAX_STEP = 0.05  # of depth between neighbouring pixels, relative: beyond is an edge (chosen)
 MAX_POINTS = 20000  # kept after thinning (chosen: as a reconstruction has)
-VOXEL_M = 0.02  # one point in each, larger voxels where these are too many (chosen)
-AGREE = 0.04  # relative difference of depths that are the same (chosen: noise and pose errors) ...
+VOXEL_M = 0.02  # side for one point each; larger where these are too many (chosen)
+AGREE = 0.04  # relative difference of equal depths (chosen: noise and pose errors) ...
 AGREE_M = 0.03  # ... and at least
-# Share of the looks of other maps at a point that go through it, beyond which maps and poses are
-# not of each other. Measured: redkitchen .14; its depths made 20 % shorter or longer .36, .40.
+# Fraction of the views of points in other maps that see through the point; beyond it maps and poses
+# contradict. Measured: redkitchen .14; its depths made 20 % shorter or longer .36, .40.
 MAX_CONTRADICTED = 0.3
 
 
@@ -342,47 +358,49 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
     """Add thinned points of the maps, observed in the frames whose depth agrees."""
     rows = _spread_rows(poses, maps)
     if not rows:
-        text = "--depth: no frame with a depth map has a pose: no points from depth"
-        return dataclasses.replace(poses, messages=(*poses.messages, text))
-    read = {row: maps.read(row) for row in rows}
+        return _with_message(poses, "no frame with a depth map has a pose")
+    depth_maps = {row: maps.read(row) for row in rows}
     depth_from_world = {
         row: _compose(maps.depth_from_color, poses.cam_from_world[row]) for row in rows
     }
-    found, depths, source = [], [], []
+    map_points = []
+    map_depths = []
+    map_rows = []
     for row in rows:
-        in_depth = _grid_points(*read[row])
+        in_depth = _grid_points(*depth_maps[row])
         world_from_depth = invert_rigid(depth_from_world[row])
-        found.append(in_depth @ world_from_depth[:, :3].T + world_from_depth[:, 3])
-        depths.append(in_depth[:, 2])
-        source.append(np.full(len(in_depth), row))
-    points, depth, origin = (np.concatenate(x) for x in (found, depths, source))
-    kept = _thin(points, depth, poses.part[origin])
-    points, origin = points[kept], origin[kept]
-    seen, through = [], np.zeros(len(points), np.int64)
+        map_points.append(in_depth @ world_from_depth[:, :3].T + world_from_depth[:, 3])
+        map_depths.append(in_depth[:, 2])
+        map_rows.append(np.full(len(in_depth), row))
+    points = np.concatenate(map_points)
+    origin = np.concatenate(map_rows)
+    kept = _thin(points, np.concatenate(map_depths), poses.part[origin])
+    points = points[kept]
+    origin = origin[kept]
+    observations = []
+    seen_through = np.zeros(len(points), np.int64)
     for row in rows:
         same = np.flatnonzero(poses.part[origin] == poses.part[row])
         pose = depth_from_world[row]
         in_depth = points[same] @ pose[:, :3].T + pose[:, 3]
-        measured = _look_up(*read[row], in_depth)
+        measured = _look_up(*depth_maps[row], in_depth)
         limit = np.maximum(AGREE * in_depth[:, 2], AGREE_M)
         agrees = (measured > 0) & (np.abs(measured - in_depth[:, 2]) <= limit)
-        seen.append(np.column_stack([np.full(agrees.sum(), row), same[agrees]]))
-        through[same[measured > in_depth[:, 2] + limit]] += 1
-    visibility = np.concatenate(seen)
+        observations.append(np.column_stack([np.full(agrees.sum(), row), same[agrees]]))
+        seen_through[same[measured > in_depth[:, 2] + limit]] += 1
+    visibility = np.concatenate(observations)
     views = np.bincount(visibility[:, 1], minlength=len(points))
-    again, against = int((views - 1).clip(0).sum()), int(through.sum())
-    if against > MAX_CONTRADICTED * (again + against):
-        text = (
-            f"--depth: no points from depth: in {against} of {against + again} looks another map "
-            "sees through a point; are units, intrinsics and poses those of these maps?"
+    confirmed = int((views - 1).clip(0).sum())
+    contradicted = int(seen_through.sum())
+    if contradicted > MAX_CONTRADICTED * (confirmed + contradicted):
+        return _with_message(
+            poses,
+            f"in {contradicted} of {contradicted + confirmed} views another map sees through a "
+            "point; are units, intrinsics and poses those of these maps?",
         )
-        return dataclasses.replace(poses, messages=(*poses.messages, text))
-    good = (views > through) & (views > 0)  # else it moved, or is a stray pixel
+    good = (views > seen_through) & (views > 0)  # else it moved, or is a stray pixel
     if not good.any():
-        text = (
-            f"--depth: no points from depth: {len(rows)} maps show no surface; are they of depth?"
-        )
-        return dataclasses.replace(poses, messages=(*poses.messages, text))
+        return _with_message(poses, f"{len(rows)} maps show no surface; are they depth maps?")
     visibility = visibility[good[visibility[:, 1]]]
     visibility[:, 1] = np.cumsum(good)[visibility[:, 1]] - 1 + len(poses.points)
     colors = _colors(points[good], origin[good], poses, video)
@@ -394,6 +412,11 @@ def _with_points(poses: Poses, maps: DepthMaps, video: Any) -> Poses:
     )
 
 
+def _with_message(poses: Poses, reason: str) -> Poses:
+    text = f"--depth: no points from depth: {reason}"
+    return dataclasses.replace(poses, messages=(*poses.messages, text))
+
+
 def _compose(c_from_b: Array, b_from_a: Array) -> Array:
     """Chain rigid transforms (3, 4)."""
     return np.column_stack(
@@ -403,7 +426,7 @@ def _compose(c_from_b: Array, b_from_a: Array) -> Array:
 
 def _grid_points(depth: Floats, K: Array) -> Array:
     """Return points (N, 3) of a coarse grid of a map, in its camera; none at edges."""
-    step = max(1, max(depth.shape) // GRID)
+    step = max(1, max(depth.shape) // MAP_POINTS)
     low, high = (f(depth, np.ones((3, 3), np.uint8)) for f in (cv2.erode, cv2.dilate))
     smooth = (low > 0) & (high - low <= 2 * MAX_STEP * depth)
     chosen = np.zeros(depth.shape, bool)
@@ -413,14 +436,16 @@ def _grid_points(depth: Floats, K: Array) -> Array:
     return np.asarray(rays * depth[y, x][:, None], np.float64)
 
 
-def _thin(points: Array, depth: Array, part: IntArray) -> IntArray:
-    """Choose one point a voxel, that measured from nearest by; at most MAX_POINTS rows."""
-    order, size = np.argsort(depth, kind="stable"), VOXEL_M
-    low, part = points.min(0, initial=0), part[order]
+def _thin(points: Array, depth: Array, component: IntArray) -> IntArray:
+    """Choose one point per voxel, that with the least depth; at most MAX_POINTS rows."""
+    order = np.argsort(depth, kind="stable")
+    size = VOXEL_M
+    low = points.min(0, initial=0)
+    component = component[order]
     while True:
         cell = np.floor((points[order] - low) / size).astype(np.int64)  # (N, 3)
         count = cell.max(0, initial=0) + 1
-        key = ((part * count[0] + cell[:, 0]) * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
+        key = ((component * count[0] + cell[:, 0]) * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
         first = np.unique(key, return_index=True)[1]
         if len(first) <= MAX_POINTS:
             return np.sort(order[first])
@@ -436,10 +461,11 @@ def _colors(points: Array, origin: IntArray, poses: Poses, video: Any) -> npt.ND
         if row is None or frame.image is None:
             continue
         chosen = np.flatnonzero(origin == row)
-        pose, (height, width) = poses.cam_from_world[row], frame.image.shape[:2]
+        pose = poses.cam_from_world[row]
+        height, width = frame.image.shape[:2]
         scale = np.array([width / poses.camera.width, height / poses.camera.height])
         xyw = (points[chosen] @ pose[:, :3].T + pose[:, 3]) @ poses.camera.K.T
-        xy = xyw[:, :2] / np.maximum(xyw[:, 2:], 1e-9) * scale  # the lens matters little here
+        xy = xyw[:, :2] / np.maximum(xyw[:, 2:], 1e-9) * scale  # distortion hardly matters here
         x, y = xy.astype(int).clip(0, (width - 1, height - 1)).T
         colors[chosen] = frame.image[y, x, ::-1]
     return colors

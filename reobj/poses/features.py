@@ -1,7 +1,7 @@
-"""Features and matches of keyframes, in a pycolmap database.
+"""Features and matches of keyframes in a pycolmap database, and the focal length from matches.
 
-RootSIFT by OpenCV, pairs in sequence and by retrieval, matching and verification by pycolmap. What
-was done before is not done again, so that keyframes can be added.
+RootSIFT by OpenCV; pairs in sequence and by retrieval, or by supplied poses; verification by
+pycolmap. Results in the database are kept, so that keyframes can be added.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +20,21 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.child import send_progress
-from reobj.types import Array, BoolArray, Floats, Image
+from reobj.poses.child_job import send_progress
+from reobj.types import Array, BoolArray, Floats, Image, IntArray
 
 
 def extract_features(
     database: Path, images: Any, ids: Sequence[int], boxes: Sequence[Array], camera: Any
 ) -> None:
-    """Write keyframes and their RootSIFT features into a database, those that it does not have.
+    """Write keyframes and their RootSIFT features into a database that does not have them yet.
 
     Args:
         images: (K, h, w, 3) BGR. ids: of each, above 0. boxes: (M, 4) xyxy of each, pixels of the
             images: no features there. camera: `pycolmap.Camera` with id 1, of all images.
     """
-    pc, threads = import_pycolmap(), cv2.getNumThreads()
+    pc = import_pycolmap()
+    threads = cv2.getNumThreads()
     with contextlib.closing(pc.Database.open(str(database))) as db, ThreadPoolExecutor(2) as pool:
         if not db.exists_camera(1):
             db.write_camera(camera, use_camera_id=True)
@@ -41,8 +43,8 @@ def extract_features(
             db.write_rig(rig, use_rig_id=True)
         todo = [k for k, number in enumerate(ids) if not db.exists_descriptors(number)]
         cv2.setNumThreads(1)
-        found = pool.map(lambda k: _root_sift(images[k], np.array(boxes[k])), todo)
-        for done, (k, (xy, descriptors)) in enumerate(zip(todo, found, strict=True), 1):
+        features = pool.map(lambda k: _root_sift(images[k], np.array(boxes[k])), todo)
+        for done, (k, (xy, descriptors)) in enumerate(zip(todo, features, strict=True), 1):
             if not db.exists_image(ids[k]):
                 image = pc.Image(name=f"{ids[k]:06d}", camera_id=1, image_id=ids[k])
                 db.write_image(image, use_image_id=True)
@@ -59,8 +61,8 @@ def extract_features(
 
 SIFT_FEATURES = 1200  # a keyframe, the strongest (chosen: 2000 and 4096 were slower and no better)
 SIFT_CONTRAST = 0.02  # contrast threshold (chosen; OpenCV's default: .04)
-SIFT_CONTRAST_LOW = 0.007  # the same for plain walls, where that finds too few (chosen)
-SIFT_FEW = 500  # features that are too few (chosen)
+SIFT_CONTRAST_LOW = 0.007  # for plain walls, where that finds fewer than SIFT_FEW (chosen)
+SIFT_FEW = 500  # (chosen)
 
 
 def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]:
@@ -78,22 +80,23 @@ def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image
         mask[math.floor(y1) : math.ceil(y2), math.floor(x1) : math.ceil(x2)] = 0
     for contrast in (SIFT_CONTRAST, SIFT_CONTRAST_LOW):
         sift: Any = cv2.SIFT.create(nfeatures=SIFT_FEATURES, contrastThreshold=contrast)
-        keypoints, found = sift.detectAndCompute(gray, mask)
+        keypoints, descriptors = sift.detectAndCompute(gray, mask)
         if len(keypoints) >= SIFT_FEW:
             break
-    if found is None or not len(keypoints):
+    if descriptors is None or not len(keypoints):
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
     # OpenCV has the centre of the first pixel at (0, 0), COLMAP at (.5, .5)
     xy = np.array([k.pt for k in keypoints], np.float32) + np.float32(0.5)  # (N, 2)
-    root = np.sqrt(found / np.maximum(found.sum(1, keepdims=True), 1e-9)) * 512
+    root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)) * 512
     return xy, np.minimum(root, 255).astype(np.uint8)
 
 
 MAX_EXHAUSTIVE = 30  # keyframes of which all pairs are matched (chosen: 435 pairs)
-OFFSETS = [1 << k for k in range(12)]  # of more, pairs so far apart (COLMAP: quadratic overlap)
+OFFSETS = [1 << k for k in range(12)]  # between paired keyframes (COLMAP: quadratic overlap)
 MATCH_CHUNK = 100  # pairs between two lines of progress (chosen)
 MAX_RATIO = 0.8  # of the angles to the best and the second best (Lowe, IJCV 2004; COLMAP)
 MAX_ANGLE = 0.7  # between matching descriptors, radians (COLMAP)
+MIN_MATCHES = 30  # verified matches of a pair that count as evidence (COLMAP registers from 30 on)
 
 
 def choose_pairs(database: Path, ids: Sequence[int], seed: int) -> list[tuple[int, int]]:
@@ -105,30 +108,33 @@ def choose_pairs(database: Path, ids: Sequence[int], seed: int) -> list[tuple[in
     if (count := len(ids)) <= MAX_EXHAUSTIVE:
         return list(itertools.combinations(ids, 2))
     with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
-        found = [np.asarray(db.read_descriptors(number).data) for number in ids]
+        descriptors = [np.asarray(db.read_descriptors(number).data) for number in ids]
     pairs = {(i, i + offset) for offset in OFFSETS for i in range(count - offset)}
-    pairs |= set(_pairs_from_retrieval(found, seed))
+    pairs |= set(_pairs_from_retrieval(descriptors, seed))
     return [(ids[i], ids[j]) for i, j in sorted(pairs)]
 
 
 def match_pairs(database: Path, pairs: Sequence[tuple[int, int]], seed: int) -> None:
-    """Match pairs of images and verify them by two-view geometry; those that are done are skipped.
+    """Match pairs of images and verify them by two-view geometry; verified pairs are skipped.
 
     Args:
         pairs: ids of images in the database.
     """
-    pc, listed = import_pycolmap(), database.parent / "pairs.txt"
+    pc = import_pycolmap()
+    listed = database.parent / "pairs.txt"
     verification = pc.TwoViewGeometryOptions()
     ransac = verification.ransac
     ransac.random_seed = seed  # else two runs differ
     # COLMAP: 100 and 3; the same inliers in less time (measured)
-    ransac.min_num_trials, ransac.dyn_num_trials_multiplier = 30, 1.0
+    ransac.min_num_trials = 30
+    ransac.dyn_num_trials_multiplier = 1.0
     with contextlib.closing(pc.Database.open(str(database))) as db:
         todo = [pair for pair in pairs if not db.exists_two_view_geometry(*pair)]
         unit = {}
         for number in sorted({number for pair in todo for number in pair}):
-            rows = np.asarray(db.read_descriptors(number).data).astype(np.float32)
-            unit[number] = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+            descriptors = np.asarray(db.read_descriptors(number).data).astype(np.float32)
+            norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
+            unit[number] = descriptors / np.maximum(norm, 1e-9)
     with ThreadPoolExecutor(2) as pool:
         for start in range(0, len(todo), MATCH_CHUNK):
             chunk = todo[start : start + MATCH_CHUNK]
@@ -143,20 +149,23 @@ def match_pairs(database: Path, pairs: Sequence[tuple[int, int]], seed: int) -> 
 
 
 def _matches(a: Floats, b: Floats) -> npt.NDArray[np.uint32]:
-    """Match unit descriptors (N, 128) and (M, 128): the best of each other, by the ratio test.
+    """Match unit descriptors (N, 128) and (M, 128): mutual nearest neighbours, with ratio test.
 
     Returns:
         (n, 2) rows of a and of b.
     """
     if min(len(a), len(b)) < 2:
         return np.empty((0, 2), np.uint32)
-    cosine, rows = a @ b.T, np.arange(len(a))  # (N, M)
+    cosine = a @ b.T  # (N, M)
+    rows = np.arange(len(a))
     best = cosine.argmax(1)
     top = cosine[rows, best]
     cosine[rows, best] = -1
     good = _distinct(top, cosine.max(1))
     cosine[rows, best] = top
-    rows, best, top = rows[good], best[good], top[good]
+    rows = rows[good]
+    best = best[good]
+    top = top[good]
     rivals = cosine[:, best]  # (N, n)
     rivals[rows, np.arange(len(rows))] = -1
     mutual = _distinct(top, rivals.max(0, initial=-1))
@@ -169,8 +178,8 @@ def _distinct(top: Floats, second: Floats) -> BoolArray:
     return np.asarray((angle < MAX_RATIO * rival) & (angle < MAX_ANGLE), bool)
 
 
-RETRIEVED_PAIRS = 6  # most similar keyframes matched with each, to close loops (chosen)
-VISUAL_WORDS = 64  # of a VLAD vector (its paper: 16-256)
+RETRIEVED_PAIRS = 6  # with the most similar keyframes, to close loops (chosen)
+VISUAL_WORDS = 64  # of a VLAD vector (the paper: 16-256)
 WORD_SAMPLE = 6000  # descriptors clustered into words, at least (chosen: time)
 
 
@@ -190,13 +199,126 @@ def _pairs_from_retrieval(descriptors: list[Image], seed: int) -> list[tuple[int
     start = cv2.KMEANS_PP_CENTERS
     words = cv2.kmeans(sample, VISUAL_WORDS, np.empty(0), stop, 1, start)[2]  # (W, 128)
     vlad = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sums of residuals
-    for sums, found in zip(vlad, descriptors, strict=True):
+    for sums, rows in zip(vlad, descriptors, strict=True):
         # argmin |d - w|^2 = argmax d'w - |w|^2 / 2
-        nearest = (found @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
-        np.add.at(sums, nearest, found - words[nearest])
+        nearest = (rows @ words.T - 0.5 * (words**2).sum(1)).argmax(1)  # (n,)
+        np.add.at(sums, nearest, rows - words[nearest])
     vlad /= np.maximum(np.linalg.norm(vlad, axis=2, keepdims=True), 1e-9)
     flat = vlad.reshape(len(vlad), -1)
-    similarity, at = flat @ flat.T, np.arange(len(flat))  # (K, K)
-    similarity[np.abs(at[:, None] - at) <= 2] = -np.inf  # matched already
+    similarity = flat @ flat.T  # (K, K)
+    order = np.arange(len(flat))
+    similarity[np.abs(order[:, None] - order) <= 2] = -np.inf  # matched already
     best = np.argsort(-similarity, axis=1, kind="stable")[:, :RETRIEVED_PAIRS]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
+
+
+POSED_OFFSETS = (1, 2, 4)  # between paired keyframes of supplied poses (chosen)
+NEAR_PAIRS = 4  # with the nearest other keyframes by pose, to close loops (chosen)
+MAX_PAIR_STEPS = 8.0  # largest distance of such a pair, in keyframe steps (chosen)
+
+
+def choose_posed_pairs(steps: Array) -> IntArray:
+    """Choose the pairs of K keyframes with supplied poses to match: neighbours in time and in pose.
+
+    Args:
+        steps: (K, 6) of `keyframes.path_steps`.
+    Returns:
+        (P, 2) rows of the keyframes, the lower one first.
+    """
+    count = len(steps)
+    pairs = {(i, i + offset) for offset in POSED_OFFSETS for i in range(count - offset)}
+    distance = np.linalg.norm(steps[:, None] - steps, axis=2)  # (K, K)
+    rows = np.arange(count)
+    distance[np.abs(rows[:, None] - rows) <= max(POSED_OFFSETS)] = np.inf
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEAR_PAIRS]  # (K, near)
+    for i, j in zip(
+        np.repeat(rows, nearest.shape[1]).tolist(), nearest.ravel().tolist(), strict=True
+    ):
+        if distance[i, j] <= MAX_PAIR_STEPS:
+            pairs.add((min(i, j), max(i, j)))
+    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+
+
+# ---- Verified matches and their focal length -----------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class MatchedPairs:
+    """Verified matches of the image pairs in a database.
+
+    Attributes:
+        image_ids: (P, 2) of each pair, the lower first. inliers: of each pair the matching
+            keypoints (n, 2). keypoints: (N, 2) pixels by image id.
+        fundamental: (P, 3, 3), NaN where the pair has none (planar, or a pure rotation).
+    """
+
+    image_ids: IntArray
+    inliers: list[IntArray]
+    keypoints: dict[int, Array]
+    fundamental: Array
+
+    @property
+    def enough(self) -> BoolArray:
+        """Mark the pairs (P,) with as many verified matches as register an image."""
+        return np.array([len(found) >= MIN_MATCHES for found in self.inliers], bool)
+
+    def only(self, ids: Sequence[int]) -> MatchedPairs:
+        """Return the pairs of some images."""
+        rows = np.flatnonzero(np.isin(self.image_ids, ids).all(1))
+        inliers = [self.inliers[row] for row in rows]
+        keypoints = {i: self.keypoints[i] for i in ids}
+        return MatchedPairs(self.image_ids[rows], inliers, keypoints, self.fundamental[rows])
+
+
+def read_pairs(database: Path) -> MatchedPairs:
+    """Read keypoints and verified matches."""
+    pc = import_pycolmap()
+    general = {int(pc.TwoViewGeometryConfiguration.UNCALIBRATED),
+               int(pc.TwoViewGeometryConfiguration.CALIBRATED)}  # fmt: skip
+    with contextlib.closing(pc.Database.open(str(database))) as db:
+        pair_ids, geometries = db.read_two_view_geometries()
+        keypoints = {
+            image.image_id: np.asarray(db.read_keypoints(image.image_id), np.float64)[:, :2]
+            for image in db.read_all_images()
+        }
+    unknown = np.full((3, 3), np.nan)
+    fundamental = [
+        g.F if int(g.config) in general and g.F is not None else unknown for g in geometries
+    ]
+    return MatchedPairs(
+        np.array([pc.pair_id_to_image_pair(p) for p in pair_ids], np.int64).reshape(-1, 2),
+        [np.asarray(g.inlier_matches, np.int64) for g in geometries],
+        keypoints,
+        np.array(fundamental).reshape(-1, 3, 3),
+    )
+
+
+FOCAL_STEPS = np.geomspace(0.4, 2.0, 161)  # tried, over the longer side (28-103 deg; 1 % apart)
+MIN_FOCAL_PAIRS = 10  # pairs whose epipolar geometry is trusted together (chosen)
+
+
+def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None:
+    """Estimate the focal length that turns fundamental matrices into essential ones.
+
+    E = K' F K has two equal singular values for the true K. The cost of each focal length on a grid
+    is the median over pairs of 1 - s2 / s1: half of the pairs may be wrong, and there is no start
+    value and no local minimum.
+
+    Returns:
+        focal length over the longer side; None with too few pairs.
+    Ref: Mendonca and Cipolla, CVPR 1999.
+    """
+    F = pairs.fundamental[pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])]  # (P, 3, 3)
+    if len(F) < MIN_FOCAL_PAIRS:
+        return None
+    K = np.zeros((len(FOCAL_STEPS), 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = FOCAL_STEPS * max(size)
+    K[:, 0, 2] = size[0] / 2
+    K[:, 1, 2] = size[1] / 2
+    K[:, 2, 2] = 1
+    E = np.swapaxes(K, 1, 2)[:, None] @ F[None] @ K[:, None]  # (S, P, 3, 3)
+    s = np.linalg.svd(E, compute_uv=False)
+    cost = np.median(1 - s[..., 1] / s[..., 0], 1)  # (S,)
+    best = int(cost.argmin())
+    is_inside = 0 < best < len(cost) - 1
+    return float(FOCAL_STEPS[best]) if is_inside else None

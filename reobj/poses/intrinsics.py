@@ -1,6 +1,6 @@
-"""Intrinsics from outside: what --camera says, COLMAP's camera lines, JSON files of many tools.
+"""Read intrinsics: the value of --camera, COLMAP's camera lines, JSON and YAML of many tools.
 
-Start at `parse_camera`. What a camera does is the business of `cameras`.
+Start at `parse_camera`.
 """
 
 from __future__ import annotations
@@ -16,26 +16,24 @@ import numpy as np
 
 from reobj.cameras import Camera, camera_parameters, checked_camera
 from reobj.files import load_json, read_text
-from reobj.poses.simple_yaml import read_yaml
 from reobj.types import COORDINATE_MAX, ReobjError
 
 NUMBERS = "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]"  # OpenCV's order
-CAMERA_FORMS = f"{NUMBERS}; MODEL WIDTH HEIGHT PARAMS as COLMAP has it; or a file"
+CAMERA_FORMS = f"{NUMBERS}; MODEL WIDTH HEIGHT PARAMS of COLMAP; or a file"
 
 
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
-    """Parse what --camera says: numbers, a camera as COLMAP writes it, or a file.
+    """Parse the value of --camera: numbers, a camera line of COLMAP, or a file.
 
     Args:
         text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]`, pixels; `[ID] MODEL WIDTH HEIGHT PARAMS`;
-            or a file that holds one of these (a cameras.txt of one camera), a matrix K of 3x3 or
-            4x4, JSON (`camera_from_json`), YAML (`camera_from_yaml`), or ARKitScenes' .pincam.
-        size: (w, h) of the frames, and of a camera that does not state its own.
+            or a file with one of these (a cameras.txt of one camera), a 3x3 or 4x4 matrix K, JSON
+            (`camera_from_json`), YAML (`camera_from_yaml`), or ARKitScenes' .pincam.
+        size: (w, h) of the frames, and of a camera without a size.
     Returns:
-        the camera of the frames: one of another size but the same shape is resized; None of an
-        empty text.
+        the camera, resized to the frames if the aspect ratio is the same; None of an empty text.
     Raises:
-        ReobjError: anything else, or a camera that does not belong to such frames.
+        ReobjError: anything else, or a camera that does not fit the frames.
 
     >>> parse_camera("500,500,320,240", (640, 480)).model
     'PINHOLE'
@@ -48,14 +46,14 @@ CAMERA_MAX = 1 << 20  # characters of a file; chosen: a thousand times what a ca
 
 
 def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
-    """Parse as `parse_camera` does, without a look at the frames: the camera at its own size.
+    """Parse as `parse_camera` does, but return the camera at its own size, unchecked.
 
     Args:
-        size: of a camera that does not state its own; None: refuse it.
+        size: of a camera without a size; None: refuse it.
     """
     if not text.strip():
         return None
-    is_file = os.path.isfile(text)  # of any text, however long
+    is_file = os.path.isfile(text)  # does not raise for long texts
     try:
         content = read_text(Path(text), CAMERA_MAX) if is_file else text
         if is_file and content.lstrip()[:1] in ("{", "["):
@@ -72,63 +70,66 @@ def stated_camera(text: str, size: tuple[int, int] | None) -> Camera | None:
     except ReobjError as error:
         raise ReobjError(f"--camera {text:.200}: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, AttributeError):
-        what = "not understood" if is_file else "no such file, and no camera"
-        raise ReobjError(f"--camera {text:.200}: {what}; expected {CAMERA_FORMS}") from None
+        fault = "not a camera file" if is_file else "neither a file nor a camera"
+        raise ReobjError(f"--camera {text:.200}: {fault}; expected {CAMERA_FORMS}") from None
     return camera
 
 
 def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
-    """Return the camera of images resized to (w, h) `size`; refuse one of another shape."""
-    width, height = camera.width, camera.height
+    """Return the camera resized to (w, h) `size`; refuse one of another aspect ratio."""
+    width = camera.width
+    height = camera.height
     try:
-        camera_parameters(camera.model)  # a panorama has no K
+        camera_parameters(camera.model)  # refuses panoramas, which have no K
     except ReobjError as error:
         raise ReobjError(f"{where}: {error}") from None
     if abs(width * size[1] - height * size[0]) > max(width, height, *size):  # more than rounding
         raise ReobjError(
             f"{where}: a camera of {width}x{height} images, but the frames are {size[0]}x{size[1]};"
-            " expected the same shape (rotated or cropped video?)"
+            " expected the same aspect ratio (rotated or cropped video?)"
         )
     camera = checked_camera(camera.resized(size), where)
     least = MIN_PINHOLE if camera.model in BROWN_LENSES else MIN_FISHEYE
-    if (share := pinhole_share(camera)) < least:
+    if (ratio := pinhole_ratio(camera)) < least:
         raise ReobjError(
-            f"{where}: {camera_line(camera)}: its distortion leaves {100 * share:.0f} % of the "
-            "image's pixels; expected a lens that such images can be of (is the order of the terms "
-            "another one?)"
+            f"{where}: {camera_line(camera)}: its distortion is invertible for only "
+            f"{100 * ratio:.0f} % of the pixels; check the order of the distortion terms"
         )
     return camera
 
 
 BROWN_LENSES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-MIN_PINHOLE = 0.4  # share of the pixels of such a lens (chosen: usual ones keep .7 and more)
-MIN_FISHEYE = 0.1  # of others (chosen: fisheyes of 180 deg keep .4)
-GRID = 16  # pixels a side that are tried (chosen)
+MIN_PINHOLE = 0.4  # `pinhole_ratio` of such a lens (chosen: usual ones have .7 and more)
+MIN_FISHEYE = 0.1  # of others (chosen: fisheyes of 180 deg have .4)
+TRIED_PX = 16  # pixels along each side (chosen)
 MAX_STRETCH = 3.0  # of a radius by distortion (chosen: beyond what a pinhole image can show)
 
 
-def pinhole_share(camera: Camera) -> float:
-    """Return the share of a camera's pixels that a pinhole image of the same focal length has too.
+def pinhole_ratio(camera: Camera) -> float:
+    """Return the fraction of a camera's pixels whose distortion is plausible.
 
-    The distortion must not fold the image on the way from its centre to them, nor move them to
-    more than MAX_STRETCH times their radius, or a share of it as small.
+    The distortion must be monotonic along the radius from the image centre to the pixel, and change
+    the radius by a factor of at most MAX_STRETCH.
     """
-    x, y = ((np.arange(GRID) + 0.5) / GRID * side for side in (camera.width, camera.height))
+    x, y = ((np.arange(TRIED_PX) + 0.5) / TRIED_PX * side for side in (camera.width, camera.height))
     pixel = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     centre = camera.K[:2, 2]
     ideal = camera.undistort(pixel) - centre
-    radius, own = np.linalg.norm(pixel - centre, axis=1), np.linalg.norm(ideal, axis=1)
-    good = np.isfinite(own) & (own < MAX_STRETCH * radius) & (radius < MAX_STRETCH * own)
+    radius = np.linalg.norm(pixel - centre, axis=1)
+    ideal_radius = np.linalg.norm(ideal, axis=1)
+    good = np.isfinite(ideal_radius)
+    good &= (ideal_radius < MAX_STRETCH * radius) & (radius < MAX_STRETCH * ideal_radius)
     ray = np.linalg.solve(camera.K[:2, :2], ideal[good].T).T  # (n, 2)
-    steps = np.linspace(0, 1, GRID)[:, None, None] * ray  # (GRID, n, 2)
+    steps = np.linspace(0, 1, TRIED_PX)[:, None, None] * ray  # (TRIED_PX, n, 2)
     rays = np.concatenate([steps, np.ones((*steps.shape[:2], 1))], 2).reshape(-1, 3)
-    seen = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64).reshape(steps.shape)
-    outwards = np.diff(np.linalg.norm(seen - centre, axis=2), axis=0) > 0
-    return float(outwards.all(0).sum()) / len(pixel)
+    distorted = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64)
+    distorted = distorted.reshape(steps.shape)
+    is_outwards = np.diff(np.linalg.norm(distorted - centre, axis=2), axis=0) > 0
+    return float(is_outwards.all(0).sum()) / len(pixel)
 
 
 def camera_line(camera: Camera) -> str:
-    """Write a camera as COLMAP does: MODEL WIDTH HEIGHT PARAMS, with all digits."""
+    """Format a camera as COLMAP does: MODEL WIDTH HEIGHT PARAMS, with all digits."""
     return " ".join(map(str, (camera.model, camera.width, camera.height, *camera.params)))
 
 
@@ -158,32 +159,38 @@ def _is_number(word: str) -> bool:
 
 
 def colmap_camera(words: Sequence[str]) -> Camera:
-    """Make a camera of the words MODEL WIDTH HEIGHT PARAMS of a line of COLMAP's cameras.txt.
+    """Make a camera from the words MODEL WIDTH HEIGHT PARAMS of a line of COLMAP's cameras.txt.
 
     Raises:
-        ReobjError: no model of the installed pycolmap, or other parameters than it has.
-        ValueError: a word is no number.
+        ReobjError: not a model of the installed pycolmap, or not its parameters.
+        ValueError: a word is not a number.
     """
     model, width, height, *params = words
     camera = Camera(model, int(width), int(height), tuple(map(float, params)))
     if not np.isfinite(camera.params).all() or min(camera.width, camera.height) < 1:
         raise ReobjError(f"{' '.join(words)!r}: a number is not finite, or the size not positive")
-    camera.to_pycolmap()  # refuses what is no camera
+    camera.to_pycolmap()  # refuses unknown models
     return camera
 
 
 def brown_camera(
     size: tuple[int, int] | None, fx: float, fy: float, cx: float, cy: float, *distortion: float
 ) -> Camera:
-    """Make a camera of OpenCV's numbers, in the simplest of COLMAP's models that holds them.
+    """Make a camera from OpenCV's numbers, in the simplest sufficient model of COLMAP.
 
     Args:
-        size: (w, h) px. distortion: k1, k2, p1, p2, k3, k4, k5, k6, from the end on left out where
-            they are 0: Brown's, and from k4 on OpenCV's rational one.
+        size: (w, h) px. distortion: k1, k2, p1, p2, k3, k4, k5, k6 (Brown's model, with k4 to k6
+            OpenCV's rational one); trailing zeros may be left out.
     """
     terms = [*distortion, *[0.0] * (8 - len(distortion))]
-    model, count = ("OPENCV", 4) if any(terms) else ("PINHOLE", 0)
-    model, count = ("FULL_OPENCV", 8) if any(terms[4:]) else (model, count)
+    model = "PINHOLE"
+    count = 0
+    if any(terms):
+        model = "OPENCV"
+        count = 4
+    if any(terms[4:]):
+        model = "FULL_OPENCV"
+        count = 8
     params = (fx, fy, cx, cy, *terms[:count])
     if not np.isfinite(params).all() or min(fx, fy) <= 0:
         raise ReobjError("a number is not finite, or a focal length not positive")
@@ -216,14 +223,14 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE", "EQUIDISTANT", "KANNALA_BRANDT4")
 
 
 def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
-    """Make a camera of the keys that tools write into JSON files.
+    """Make a camera from the keys of JSON files of various tools.
 
     Args:
         data: focal length `fx`, `fy` (`fl_x`, or `camera_angle_x` in radians) and centre `cx`,
             `cy`, or a matrix `K`, `camera_matrix`, `intrinsic_matrix`; distortion by name (`k1`,
             ...) or as a list in OpenCV's order; `w`, `h` or `width`, `height`; `model` or
-            `camera_model`, with COLMAP's `params` or the names of its parameters. All this may
-            stand in an object `camera` or `intrinsics`.
+            `camera_model`, with COLMAP's `params` or the names of its parameters. All of these may
+            be in an object `camera` or `intrinsics`.
         size: (w, h) where the data have none.
     Returns:
         the camera at the size of the data; None without a focal length.
@@ -250,31 +257,31 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
 
 
 def camera_from_yaml(data: dict[str, Any], size: tuple[int, int] | None) -> Camera | None:
-    """Make a camera of the YAML of OpenCV, ROS, Kalibr (`cam0`), EuRoC or ORB-SLAM (`Camera.fx`).
+    """Make a camera from YAML of OpenCV, ROS, Kalibr (`cam0`), EuRoC or ORB-SLAM (`Camera.fx`).
 
     Args:
         data: as `read_yaml` returns it. size: (w, h) where the data have none.
     Returns:
         the camera at the size of the data; None without a focal length.
     Raises:
-        ReobjError: several cameras, or a lens that is none of ours.
+        ReobjError: several cameras, or an unknown lens model.
     """
-    kalibr = [name for name, own in data.items() if _is_object(own) and "intrinsics" in own]
+    kalibr = [name for name, entry in data.items() if _is_object(entry) and "intrinsics" in entry]
     if len(kalibr) > 1:
         raise ReobjError(f"cameras {', '.join(kalibr)}; expected one: leave the others out")
     data = data[kalibr[0]] if kalibr else data
-    known = {re.sub(r"^Camera1?\.", "", key): data[key] for key in data}
-    plain = {key.replace("_", "").lower(): own for key, own in known.items()}
+    keys = {re.sub(r"^Camera1?\.", "", key): data[key] for key in data}
+    normalised = {key.replace("_", "").lower(): value for key, value in keys.items()}
     for key in ("camera_matrix", "distortion_coefficients"):  # Camera_Matrix, cameraMatrix
-        if (word := key.replace("_", "")) in plain:
-            known[key] = plain[word]
-    if "distortion_coeffs" in known:
-        known["distortion_coefficients"] = known["distortion_coeffs"]
-    if len(known.get("resolution", ())) == 2:
-        known["width"], known["height"] = known.pop("resolution")
-    if isinstance(known.get("intrinsics"), list):
-        known |= dict(zip(("fx", "fy", "cx", "cy"), known.pop("intrinsics"), strict=True))
-    return camera_from_json(known, size)
+        if (word := key.replace("_", "")) in normalised:
+            keys[key] = normalised[word]
+    if "distortion_coeffs" in keys:
+        keys["distortion_coefficients"] = keys["distortion_coeffs"]
+    if len(keys.get("resolution", ())) == 2:
+        keys["width"], keys["height"] = keys.pop("resolution")
+    if isinstance(keys.get("intrinsics"), list):
+        keys |= dict(zip(("fx", "fy", "cx", "cy"), keys.pop("intrinsics"), strict=True))
+    return camera_from_json(keys, size)
 
 
 def image_side(value: Any) -> int:
@@ -292,7 +299,7 @@ def _is_object(value: Any) -> bool:
 def _pinhole_of_json(
     data: dict[str, Any], size: tuple[int, int] | None
 ) -> tuple[float, float, float, float] | None:
-    """Return fx, fy, cx, cy of an object's own keys or its matrix; None without focal length."""
+    """Return fx, fy, cx, cy from the keys or the matrix of an object; None without focal length."""
     for key in MATRICES:
         matrix = data[key].get("data") if _is_object(data.get(key)) else data.get(key)
         if matrix is not None:
@@ -309,7 +316,7 @@ def _pinhole_of_json(
 
 
 def _terms(data: dict[str, Any], names: Sequence[str]) -> list[float]:
-    """Return the distortion, in the order of its names, 0 where it is not given."""
+    """Return the distortion in the order of its names, 0 where it is not given."""
     given: Any = next((data[key] for key in DISTORTIONS if key in data), [])
     values = np.ravel(given["data"] if _is_object(given) else given).tolist()
     if len(values) > len(names) and any(values[len(names) :]):
@@ -321,16 +328,73 @@ def _terms(data: dict[str, Any], names: Sequence[str]) -> list[float]:
 def _camera_of_names(
     model: str, data: dict[str, Any], pinhole: Sequence[float], size: tuple[int, int]
 ) -> Camera:
-    """Make a camera of any other of COLMAP's models, its parameters found by their names."""
-    known = data | dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True)) | {"f": pinhole[0]}
+    """Make a camera of another of COLMAP's models from parameters with its names."""
+    values = data | dict(zip(("fx", "fy", "cx", "cy"), pinhole, strict=True)) | {"f": pinhole[0]}
     names = camera_parameters(model)
-    missing = [name for name in names if name not in known]
+    missing = [name for name in names if name not in values]
     if missing:
         raise ReobjError(f"no {', '.join(missing)} of a {model} camera")
-    return Camera(model, *size, tuple(float(known[name]) for name in names))
+    return Camera(model, *size, tuple(float(values[name]) for name in names))
 
 
 def _sized(size: tuple[int, int] | None) -> tuple[int, int]:
     if size is None:
         raise ReobjError("no image size; expected MODEL WIDTH HEIGHT PARAMS, or JSON with w and h")
     return size
+
+
+# ---- YAML ----------------------------------------------------------------------------------------
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read the subset of YAML in camera files: nested mappings of words, numbers and lists.
+
+    Enough for OpenCV's FileStorage, ROS's camera_info, Kalibr's camchain, EuRoC's sensor.yaml.
+    Indentation nests; `[1, 2]` may span lines; lines `- 1` and `- [1, 2]` are lists. Tags, comments
+    and document marks are skipped.
+
+    Raises:
+        ReobjError: a line is none of these.
+    """
+    text = re.sub(r"(^|\s)#.*", r"\1", read_text(path, CAMERA_MAX), flags=re.MULTILINE)
+    text = re.sub(r"\[[^\[\]]*\]", lambda m: " ".join(m[0].split()), text)  # lists to one line
+    root: dict[str, Any] = {}
+    stack: list[tuple[int, Any]] = [(-1, root)]  # indentation and content of open mappings
+    key = ""
+    key_indent = -1
+    for line in text.splitlines():
+        if not line.strip() or line.startswith(("%", "---", "...")):
+            continue
+        indent = len(line) - len(line.lstrip())
+        word = line.strip()
+        is_item = word.startswith("- ")
+        while not is_item and stack[-1][0] >= indent and len(stack) > 1:
+            stack.pop()
+        parent = stack[-1][1]
+        if is_item:
+            rows = parent.get(key) if isinstance(parent.get(key), list) else []
+            parent[key] = [*rows, _value(word[2:])]
+            continue
+        if key and indent > key_indent and parent.get(key, "") is None:
+            parent[key] = {}
+            stack.append((key_indent, parent[key]))
+            parent = parent[key]
+        name, colon, value = word.partition(":")
+        if not colon:
+            raise ReobjError(f"{path}: cannot parse {word[:60]!r}; expected `key: value`")
+        key = name.strip(" \"'")
+        key_indent = indent
+        value = re.sub(r"^!\S+", "", value.strip()).strip()
+        parent[key] = _value(value) if value else None
+    return root
+
+
+def _value(text: str) -> Any:
+    """Convert a word, a number or a list of them."""
+    text = text.strip()
+    if text.startswith("["):
+        return [_value(part) for part in text.strip("[]").split(",") if part.strip()]
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip("\"'")

@@ -1,8 +1,6 @@
-"""Keyframes of a video by optical flow, and the points that are followed from frame to frame.
+"""Keyframes of a video: by optical flow, or along supplied poses.
 
-A keyframe is taken where the picture has moved far enough from the last one that a reconstruction
-learns from it. `follow_points` (Lucas-Kanade) is shared with `localize`. Nothing here knows of
-cameras in 3D.
+`follow_points` (Lucas-Kanade) is shared with `localize`.
 """
 
 from __future__ import annotations
@@ -15,9 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from reobj.cameras import Poses, invert_rigid
 from reobj.files import Progress
 from reobj.sources.video import shrunk
-from reobj.types import Array, BoolArray, Image
+from reobj.types import Array, BoolArray, Image, IntArray
 
 CACHE_MB = 1000.0  # of gray images kept in memory: 3200 of 640x480 (chosen)
 
@@ -39,12 +38,12 @@ class ResizedFrame:
 
     @property
     def has_texture(self) -> bool:
-        """False for a picture in which nothing can be followed, such as a black one."""
+        """False for an image without points to track, such as a black one."""
         return len(_corners(self.gray)) >= MIN_CORNERS
 
 
 def _square(image: Image, aspect: float) -> Image:
-    """Widen an image, or heighten it, so that pixels of this width over height become square."""
+    """Stretch an image so that pixels of this aspect ratio (width over height) become square."""
     if aspect == 1:
         return image
     height, width = image.shape[:2]
@@ -60,7 +59,9 @@ class ResizedVideo:
     """
 
     def __init__(self, video: Any, size_px: int, cache_mb: float = CACHE_MB) -> None:
-        self.video, self.size_px, self.cache_mb = video, size_px, cache_mb
+        self.video = video
+        self.size_px = size_px
+        self.cache_mb = cache_mb
         self.aspect = float(getattr(video, "pixel_aspect", 1.0))
         self.frames: list[int] = []
         self.times_s: list[float] = []
@@ -74,7 +75,7 @@ class ResizedVideo:
             yield ResizedFrame(row, frame.index, frame.time_s, bgr, gray)
 
     def first_pass(self, line: Progress) -> Iterator[ResizedFrame]:
-        """Iterate, and keep numbers, times and (as far as they fit) the gray images."""
+        """Iterate, and keep numbers, times and (if they fit) the gray images."""
         for frame in self:
             self.frames.append(frame.frame)
             self.times_s.append(frame.time_s)
@@ -86,7 +87,7 @@ class ResizedVideo:
         line.close()
 
     def grays(self) -> Iterator[Image]:
-        """Iterate over the gray images once more: from memory, or reading the video again."""
+        """Iterate over the gray images again: from memory, or by reading the video again."""
         kept = self.used_mb <= self.cache_mb
         return iter(self.cache) if kept else (frame.gray for frame in self)
 
@@ -98,17 +99,18 @@ KLT_ERROR_PX = 1.0  # largest forward-backward error (Kalal et al., ICPR 2010; c
 def follow_points(
     old: Image, new: Image, xy: Array, and_back: bool = True
 ) -> tuple[Array, BoolArray]:
-    """Follow points into the next image by Lucas-Kanade.
+    """Track points into the next image by Lucas-Kanade.
 
     Args:
         old, new: (h, w) gray. xy: (N, 2) in `old`, OpenCV pixels (centre of the first: 0, 0).
-        and_back: keep only points that come back to where they started.
+        and_back: require a small forward-backward error.
     Returns:
-        xy: (N, 2) in `new`. kept: (N,) True for points that were followed.
+        xy: (N, 2) in `new`. kept: (N,) True for points that were tracked.
     """
     if not len(xy):
         return xy, np.zeros(0, bool)
-    start, window = xy.astype(np.float32).reshape(-1, 1, 2), (KLT_WINDOW_PX,) * 2
+    start = xy.astype(np.float32).reshape(-1, 1, 2)
+    window = (KLT_WINDOW_PX,) * 2
     flow: Any = cv2.calcOpticalFlowPyrLK
     ahead, found, _ = flow(old, new, start, None, winSize=window)
     kept = found[:, 0] > 0
@@ -119,49 +121,52 @@ def follow_points(
     return ahead[:, 0].astype(np.float64), kept
 
 
-CORNERS = 150  # followed from a keyframe (chosen: 300 were slower and no better)
+CORNERS = 150  # tracked from a keyframe (chosen: 300 were slower and no better)
 CORNER_QUALITY = 0.01  # of the best corner's (OpenCV's usual value)
 CORNER_SPACING = 1 / 80  # between two corners, over the longer side (chosen)
 MIN_CORNERS = 20  # with fewer an image counts as textureless (chosen)
 
 
 def _corners(gray: Image) -> Array:
-    """Find the corners (N, 2) of an image that can be followed."""
+    """Find the corners (N, 2) of an image that can be tracked."""
     spacing = max(gray.shape) * CORNER_SPACING
     found = cv2.goodFeaturesToTrack(gray, CORNERS, CORNER_QUALITY, spacing)
     return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
 
 class _KeyframeFlow:
-    """Optical flow since a keyframe: its corners, followed from frame to frame."""
+    """Optical flow since a keyframe: its corners, tracked from frame to frame."""
 
     def __init__(self, key: ResizedFrame) -> None:
-        self.row, self.gray = key.row, key.gray
-        self.start = self.at = _corners(key.gray)  # (N, 2) there and in the last frame
+        self.row = key.row
+        self.gray = key.gray
+        self.start = self.corners = _corners(key.gray)  # (N, 2) in the keyframe, the last frame
         self.count = max(len(self.start), 1)
 
     def update(self, frame: ResizedFrame) -> tuple[float, float] | None:
-        """Follow the corners into the next frame.
+        """Track the corners into the next frame.
 
         Returns:
-            the median flow since the keyframe over the image's width, and the share of the corners
-            that is left. None for a frame without texture: the next one is compared with the last
-            that had some.
+            the median flow since the keyframe over the image's width, and the fraction of the
+            corners that is left. None for a frame without texture: the next one is compared with
+            the last that had some.
         """
-        ahead, kept = follow_points(self.gray, frame.gray, self.at)
+        ahead, kept = follow_points(self.gray, frame.gray, self.corners)
         if kept.sum() < MIN_CORNERS_LEFT * self.count and not frame.has_texture:
             return None
-        self.start, self.at, self.gray = self.start[kept], ahead[kept], frame.gray
-        flow = np.linalg.norm(self.at - self.start, axis=1)
-        share = len(flow) / self.count
-        return float(np.median(flow)) / frame.gray.shape[1] if kept.any() else 0.0, share
+        self.start = self.start[kept]
+        self.corners = ahead[kept]
+        self.gray = frame.gray
+        flow = np.linalg.norm(self.corners - self.start, axis=1)
+        left = len(flow) / self.count
+        return float(np.median(flow)) / frame.gray.shape[1] if kept.any() else 0.0, left
 
 
 MAX_FLOW = 0.12  # median flow that makes a keyframe, over the width (chosen)
 MIN_FLOW = 0.015  # flow that counts as motion, over the width (chosen: 10 px of 640)
-MIN_CORNERS_LEFT = 0.55  # share of the corners below which a new keyframe is due (chosen)
+MIN_CORNERS_LEFT = 0.55  # fraction of the corners below which a keyframe is added (chosen)
 MAX_INTERVAL = 60  # frames after which any motion makes a keyframe (chosen: 2 s)
-SHARP_WINDOW = 0.7  # share of the flow threshold from which on frames compete in sharpness (chosen)
+SHARP_WINDOW = 0.7  # of the flow threshold: frames beyond compete in sharpness (chosen)
 
 
 def pick_keyframes(
@@ -170,24 +175,31 @@ def pick_keyframes(
     """Choose keyframes by optical flow, the sharpest near the threshold, with the first and last.
 
     When there are more than `max_keyframes`, every second one is dropped and the thresholds double:
-    one pass, bounded memory, the same choice every time. A picture without texture (black, white)
-    is none: the reconstruction can do nothing with it, and it hides no motion.
+    one pass, bounded memory, reproducible. An image without texture (black, white) is no keyframe:
+    nothing in it can be matched.
 
     Args:
         max_flow: median flow since the last keyframe, over the width, that makes the next one.
     """
     keys: list[ResizedFrame] = []
-    replay: deque[ResizedFrame] = deque()  # frames after a chosen one that were followed already
+    replay: deque[ResizedFrame] = deque()  # frames after a keyframe that were read already
     window: list[ResizedFrame] = []  # frames near the threshold
-    stream, last, track, wider, flow = iter(frames), None, None, 1, 0.0
+    stream = iter(frames)
+    last: ResizedFrame | None = None
+    track: _KeyframeFlow | None = None
+    wider = 1
+    flow = 0.0
     while (frame := replay.popleft() if replay else next(stream, None)) is not None:
         if track is None:
             if frame.has_texture:
-                keys, track, last = [frame], _KeyframeFlow(frame), frame
+                keys = [frame]
+                track = _KeyframeFlow(frame)
+                last = frame
             continue
         if (update := track.update(frame)) is None:
             continue
-        last, (flow, left) = frame, update
+        last = frame
+        flow, left = update
         if flow >= SHARP_WINDOW * wider * max_flow:
             window.append(frame)
         late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
@@ -196,9 +208,91 @@ def pick_keyframes(
             replay.extendleft(f for f in reversed(window) if f.row > best.row)
             keys.append(best)
             if len(keys) > max_keyframes:
-                keys, wider = keys[::2], 2 * wider
-            window, track = [], _KeyframeFlow(best)
+                keys = keys[::2]
+                wider *= 2
+            window = []
+            track = _KeyframeFlow(best)
     moved = flow > MIN_FLOW or len(keys) == 1
     if last is None or last.row == keys[-1].row or not moved:
         return keys
     return [*keys[: max(max_keyframes - 1, 1)], last]
+
+
+# ---- Keyframes of supplied poses -----------------------------------------------------------------
+
+
+MAX_POSED_KEYFRAMES = 150  # of supplied poses (chosen: time)
+MIN_KEYFRAMES = 40  # with fewer the steps between them are halved (chosen)
+TURN_STEP_DEG = 8.0  # rotation between keyframes (chosen: an eighth of a usual field of view)
+SPREAD_STEP = 1 / 8  # translation between them, over the rms spread of the path: an orbit's 7 deg
+
+
+def path_steps(poses: Poses) -> Array:
+    """Express poses as coordinates (F, 6) in which keyframes are 1 apart; NaN: no pose.
+
+    The first three are the viewing direction over TURN_STEP_DEG, the others the camera's centre
+    over SPREAD_STEP of the path's rms spread: distances are relative, whatever the scale.
+    """
+    world_from_cam = invert_rigid(poses.cam_from_world)  # (F, 3, 4)
+    centre = world_from_cam[:, :, 3]
+    spread = np.sqrt(np.nanvar(centre, axis=0).sum()) if poses.known.any() else 0.0
+    # for small angles the distance on the unit sphere is the angle
+    turn = world_from_cam[:, :, 2] / np.radians(TURN_STEP_DEG)
+    return np.column_stack([turn, centre / max(SPREAD_STEP * spread, 1e-12)])
+
+
+def choose_posed_keyframes(steps: Array) -> IntArray:
+    """Choose keyframes along supplied poses: each one step (or a multiple of it) from the last.
+
+    Args:
+        steps: (F, 6) of `path_steps`.
+    Returns:
+        rows, ascending; MIN_KEYFRAMES to MAX_POSED_KEYFRAMES of them, or all frames if fewer.
+    """
+    rows = np.flatnonzero(np.isfinite(steps).all(1))
+    length = 1.0
+    chosen = _rows_apart(steps, rows, length)
+    while len(chosen) < min(MIN_KEYFRAMES, len(rows)) and length > 1e-6:
+        length /= 2
+        chosen = _rows_apart(steps, rows, length)
+    while len(chosen) > MAX_POSED_KEYFRAMES:
+        length *= 1.1
+        chosen = _rows_apart(steps, rows, length)
+    return chosen
+
+
+def _rows_apart(steps: Array, rows: IntArray, length: float) -> IntArray:
+    """Choose rows at least `length` from the last one chosen."""
+    chosen = rows[:1].tolist()
+    for row in rows[1:].tolist():
+        if np.linalg.norm(steps[row] - steps[chosen[-1]]) >= length:
+            chosen.append(row)
+    return np.array(chosen, np.int64)
+
+
+def sharpest_images(
+    poses: Poses, video: Any, keys: IntArray, size_px: int, line: Progress
+) -> dict[int, Image]:
+    """Read the sharpest image near each keyframe, within a quarter of the way to its neighbours.
+
+    Returns:
+        image by row of the poses, shrunk; none where there are no images.
+    """
+    nearest: dict[int, int] = {}  # keyframe of each row that may replace it
+    for before, key, after in zip([-1, *keys], keys, [*keys[1:], len(poses.frame)], strict=False):
+        for row in range(key - (key - before) // 4, key + (after - key) // 4 + 1):
+            if poses.known[row]:
+                nearest[row] = int(key)
+    row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
+    best: dict[int, tuple[float, int, Image]] = {}
+    for frame in video if len(keys) else ():
+        line.step()
+        key = nearest.get(row_of.get(frame.index, -1), -1)
+        if key < 0 or frame.image is None:
+            continue
+        image = shrunk(frame.image, size_px)
+        sharpness = float(cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.CV_32F).var())
+        if key not in best or sharpness > best[key][0]:
+            best[key] = (sharpness, row_of[frame.index], image)
+    line.close()
+    return {row: image for _, row, image in best.values()}

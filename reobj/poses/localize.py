@@ -1,6 +1,6 @@
-"""Poses of the frames between the keyframes: 3D points followed from both sides, PnP, gaps.
+"""Locate the frames between the mapped keyframes: PnP on tracked 3D points, interpolated gaps.
 
-Needs a reconstruction of the keyframes (`mapping`); changes nothing in it.
+The reconstruction of the keyframes is not changed.
 """
 
 from __future__ import annotations
@@ -25,63 +25,70 @@ from reobj.types import Array, BoolArray, Image, IntArray
 def locate_between(
     model: SparseModel,
     key_rows: IntArray,
-    left_out: IntArray,
+    unmapped: IntArray,
     video: ResizedVideo,
     seed: int,
     line: Progress,
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Locate every frame by PnP from points followed from the keyframes before and after it.
+    """Locate every frame by PnP on points tracked from the keyframes before and after it.
 
-    Points are not followed to or past a keyframe that the model does not hold: what mapping took
-    out, with better matches, PnP must not put back.
+    Points are not tracked to or past a keyframe that is not in the model: mapping rejected it with
+    better matches than PnP has.
 
     Args:
         model: of the keyframes, native pixels. key_rows: (R,) row of each of its images in the
-            video, ascending. left_out: (L,) rows of the other keyframes, ascending.
+            video, ascending. unmapped: (L,) rows of the other keyframes, ascending.
     Returns:
-        cam_from_world: (F, 3, 4), NaN where PnP was refused or the camera jumped. status: (F,) as
-        in `Poses`.
+        cam_from_world: (F, 3, 4), NaN where PnP failed or the camera jumped. status: (F,) as in
+        `Poses`.
     """
-    count, camera = len(video.frames), model.cameras[0]
-    cam_from_world, status = np.full((count, 3, 4), np.nan), np.full(count, "none", "<U12")
-    cam_from_world[key_rows], status[key_rows] = model.cam_from_world, "keyframe"
-    reached = beside_held(np.union1d(key_rows, left_out), key_rows, count)
+    count = len(video.frames)
+    camera = model.cameras[0]
+    cam_from_world = np.full((count, 3, 4), np.nan)
+    status = np.full(count, "none", "<U12")
+    cam_from_world[key_rows] = model.cam_from_world
+    status[key_rows] = "keyframe"
+    tried = beside_mapped(np.union1d(key_rows, unmapped), key_rows, count)
 
     def locate(segment: tuple[int, int, list[tuple[int, Image]]]) -> int:
         before, after, run = segment
         images = [gray for _, gray in run]
-        ahead = _follow_model_points(model, before, images)
-        back = _follow_model_points(model, after, images[::-1])[::-1]
+        ahead = _track_model_points(model, before, images)
+        back = _track_model_points(model, after, images[::-1])[::-1]
         for (row, gray), (seen_a, xy_a), (seen_b, xy_b) in zip(run, ahead, back, strict=True):
-            if reached[row] and status[row] == "none":
-                points, xy = model.points[np.r_[seen_a, seen_b]], np.r_[xy_a, xy_b]
-                found = absolute_pose(xy, points, camera, gray.shape[1], seed)
-                if found is not None:
-                    cam_from_world[row], status[row] = found, "pnp"
+            if tried[row] and status[row] == "none":
+                points = model.points[np.r_[seen_a, seen_b]]
+                pose = absolute_pose(np.r_[xy_a, xy_b], points, camera, gray.shape[1], seed)
+                if pose is not None:
+                    cam_from_world[row] = pose
+                    status[row] = "pnp"
         return len(run) - 1
 
-    segments, threads = _segments(key_rows, video.grays()), cv2.getNumThreads()
+    segments = _segments(key_rows, video.grays())
+    threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    with ThreadPoolExecutor(2) as pool:  # segments share nothing; OpenCV's own threads gain less
+    with ThreadPoolExecutor(2) as pool:  # segments are independent; OpenCV's own threads gain less
         while batch := list(itertools.islice(segments, 2)):
             for done in pool.map(locate, batch):
                 line.step(done)
     cv2.setNumThreads(threads)
     line.close()
     jump = _detours(cam_from_world) & (status == "pnp")
-    cam_from_world[jump], status[jump] = np.nan, "none"
+    cam_from_world[jump] = np.nan
+    status[jump] = "none"
     return cam_from_world, status
 
 
-def beside_held(keys: IntArray, held: IntArray, count: int) -> BoolArray:
-    """Mark the frames (F,) whose keyframe before or after them is held by a model, or is they.
+def beside_mapped(keys: IntArray, mapped: IntArray, count: int) -> BoolArray:
+    """Mark the frames (F,) that are a mapped keyframe, or next to one before or after them.
 
     Args:
-        keys: (K,) rows of all keyframes, ascending. held: of those that a model has. count: F.
+        keys: (K,) rows of all keyframes, ascending. mapped: of those in a model. count: F.
     """
-    rows, has = np.arange(count), np.isin(keys, held)
-    has = np.concatenate([[False], has, [False]])  # -1 and K: no keyframe
-    before, after = has[np.searchsorted(keys, rows, "right")], has[np.searchsorted(keys, rows) + 1]
+    rows = np.arange(count)
+    is_mapped = np.concatenate([[False], np.isin(keys, mapped), [False]])  # -1 and K: no keyframe
+    before = is_mapped[np.searchsorted(keys, rows, "right")]
+    after = is_mapped[np.searchsorted(keys, rows) + 1]
     return np.asarray(before | after, bool)
 
 
@@ -91,31 +98,33 @@ MAX_RUN = 1000  # frames held in memory between two keyframes (chosen: .3 GB of 
 def _segments(
     key_rows: IntArray, grays: Iterator[Image]
 ) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
-    """Cut the video at the registered keyframes.
+    """Cut the video at the mapped keyframes.
 
     Yields:
         the image of the model before and after (-1: none), and (row, gray image) of both and of all
-        frames between them. Of a stretch longer than MAX_RUN the middle is left out.
+        frames between them. The middle of a segment longer than MAX_RUN is left out.
     """
     image_of = {int(row): image for image, row in enumerate(key_rows)}
-    before, run = -1, deque[tuple[int, Image]](maxlen=MAX_RUN)
+    before = -1
+    run = deque[tuple[int, Image]](maxlen=MAX_RUN)
     for row, gray in enumerate(grays):
         run.append((row, gray))
         image = image_of.get(row, -1)
         if image >= 0 or (before >= 0 and len(run) == MAX_RUN):
             yield before, image, list(run)
-            before, run = image, deque([(row, gray)], maxlen=MAX_RUN)
+            before = image
+            run = deque([(row, gray)], maxlen=MAX_RUN)
     if before >= 0:
         yield before, -1, list(run)
 
 
-PNP_POINTS = 200  # followed from each keyframe, those with the longest tracks first (chosen)
+PNP_POINTS = 200  # tracked from each keyframe, those with the longest tracks first (chosen)
 
 
-def _follow_model_points(
+def _track_model_points(
     model: SparseModel, image: int, grays: list[Image]
 ) -> list[tuple[IntArray, Array]]:
-    """Follow the 3D points that an image of the model sees (-1: none) through gray images.
+    """Track the 3D points that an image of the model observes (-1: none) through gray images.
 
     Returns:
         per gray image, the first being the keyframe itself: rows (n,) of `model.points` and their
@@ -126,17 +135,19 @@ def _follow_model_points(
     seen = seen[longest[:PNP_POINTS]]
     scale = np.array(grays[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
     # COLMAP has the centre of the first pixel at (.5, .5), OpenCV at (0, 0)
-    points, xy = model.obs_point[seen], model.obs_xy[seen] * scale - 0.5
-    followed = [(points, model.obs_xy[seen])]
+    points = model.obs_point[seen]
+    xy = model.obs_xy[seen] * scale - 0.5
+    tracked = [(points, model.obs_xy[seen])]
     for old, new in itertools.pairwise(grays):
-        ahead, kept = follow_points(old, new, xy, and_back=False)  # RANSAC takes out the rest
-        points, xy = points[kept], ahead[kept]
-        followed.append((points, (xy + 0.5) / scale))
-    return followed
+        ahead, kept = follow_points(old, new, xy, and_back=False)  # RANSAC rejects outliers
+        points = points[kept]
+        xy = ahead[kept]
+        tracked.append((points, (xy + 0.5) / scale))
+    return tracked
 
 
 PNP_MIN_INLIERS = 15  # of an accepted pose (chosen; COLMAP registers images from 30 on)
-PNP_MIN_RATIO = 0.5  # of inliers among the followed points (chosen; COLMAP: .25 of raw matches)
+PNP_MIN_RATIO = 0.5  # of inliers among the tracked points (chosen; COLMAP: .25 of raw matches)
 PNP_ERROR_PX = 4.0  # of an inlier, pixels of the resized image (chosen; COLMAP: 12)
 
 
@@ -147,7 +158,7 @@ def absolute_pose(
 
     Args:
         xy: (n, 2) native pixels, COLMAP's. points: (n, 3) in world. resized_width: pixels of the
-            image in which the points were found; the error allowed is counted in its pixels.
+            image in which the points were tracked; PNP_ERROR_PX is in its pixels.
     Returns:
         cam_from_world (3, 4); None with too few inliers or an inlier behind the camera.
     """
@@ -155,24 +166,24 @@ def absolute_pose(
         return None
     error_px = PNP_ERROR_PX * camera.width / resized_width
     ransac = {"max_error": error_px, "confidence": 0.999, "random_seed": seed}
-    found = import_pycolmap().estimate_and_refine_absolute_pose(
+    estimate = import_pycolmap().estimate_and_refine_absolute_pose(
         xy, points, camera.to_pycolmap(), estimation_options={"ransac": ransac}
     )
-    if found is None or found["num_inliers"] < max(PNP_MIN_INLIERS, PNP_MIN_RATIO * len(xy)):
+    if estimate is None or estimate["num_inliers"] < max(PNP_MIN_INLIERS, PNP_MIN_RATIO * len(xy)):
         return None
-    pose: Array = found["cam_from_world"].matrix()
-    depth = points[found["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
+    pose: Array = estimate["cam_from_world"].matrix()
+    depth = points[estimate["inlier_mask"]] @ pose[2, :3] + pose[2, 3]
     return pose if np.isfinite(pose).all() and (depth > 0).all() else None
 
 
-MAX_DETOUR_STEPS = 5.0  # of a PnP pose, in usual steps of the camera (chosen)
+MAX_DETOUR_STEPS = 5.0  # of a PnP pose (chosen)
 
 
 def _detours(cam_from_world: Array) -> BoolArray:
     """Mark frames (F,) whose centre is far from both neighbours, while these are near each other.
 
-    The detour over a centre, compared with the way past it, counts in steps: the distance of the
-    neighbours or the median step of the path, whichever is longer.
+    The unit of the detour is the distance of the neighbours or the median step of the trajectory,
+    whichever is longer.
     """
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     detour = np.zeros(len(cam_from_world), bool)
@@ -185,9 +196,9 @@ def _detours(cam_from_world: Array) -> BoolArray:
     return detour
 
 
-INTERPOLATED_PX = PNP_ERROR_PX  # an interpolated pose may be off by what a located one may
+INTERPOLATED_PX = PNP_ERROR_PX  # the error allowed of an interpolated pose is that of PnP
 SHIFT_POINTS = 200  # whose shift in the image is measured, at least (chosen: time)
-NEAR_SPANS = 2.0  # times the gap's length, before and after it, in which the error is measured
+NEAR_GAPS = 2.0  # gap lengths, before and after it, in which the error is measured (chosen)
 
 
 def fill_gaps(
@@ -199,31 +210,34 @@ def fill_gaps(
     status: npt.NDArray[np.str_],
     max_gap: int,
     shrink: float,
-    left_out: Sequence[int] | IntArray = (),
+    unmapped: Sequence[int] | IntArray = (),
 ) -> tuple[Array, npt.NDArray[np.str_]]:
-    """Interpolate the poses of at most `max_gap` lost frames in a row where that can be right.
+    """Interpolate the poses of at most `max_gap` consecutive lost frames where the error is small.
 
-    That is where the error (`_interpolation_px`) is below `INTERPOLATED_PX`; never beyond the ends,
-    nor past a row of `left_out`, a keyframe that mapping took out. The rotation is interpolated by
-    slerp and the camera's centre along a line.
+    It must be below `INTERPOLATED_PX` (`_interpolation_px`). There is no extrapolation, and no
+    interpolation past a row of `unmapped`, a keyframe that mapping rejected. The rotation is
+    interpolated by slerp and the camera's centre linearly.
 
     Args:
         model: whose points the frames see. key_rows: (R,) row of each of its images, ascending.
-        frame: (F,) source numbers: frames that were not read count too. time_s: (F,).
+        frame: (F,) numbers in the source: frames that were not read count too. time_s: (F,).
         cam_from_world: (F, 3, 4), NaN where lost. status: (F,) as in `Poses`.
-        shrink: side of the resized image, in whose pixels errors are counted, over the native one.
+        shrink: side of the resized image over the native one; errors are in resized pixels.
     Returns:
         copies of cam_from_world and status, the latter "interpolated" where filled.
     """
-    filled, status = cam_from_world.copy(), status.copy()
+    filled = cam_from_world.copy()
+    status = status.copy()
     known = np.flatnonzero(np.isfinite(cam_from_world).all((1, 2)))
     for k in np.flatnonzero(np.diff(known) > 1).tolist():
-        a, b = int(known[k]), int(known[k + 1])
-        if frame[b] - frame[a] - 1 > max_gap or any(a < row < b for row in left_out):
+        a, b = known[k : k + 2].tolist()
+        if frame[b] - frame[a] - 1 > max_gap or any(a < row < b for row in unmapped):
             continue
-        camera, points = model.cameras[0], _points_around(model, key_rows, a, b)
+        camera = model.cameras[0]
+        points = _points_around(model, key_rows, a, b)
         size = shrink * np.array([camera.width, camera.height])
-        sides, focal = (known[: k + 1], known[k + 1 :]), float(shrink * camera.K[0, 0])
+        sides = known[: k + 1], known[k + 1 :]
+        focal = float(shrink * camera.K[0, 0])
         error = _interpolation_px(sides, time_s, cam_from_world, points, focal, size)
         if error <= INTERPOLATED_PX:
             inner = np.arange(a + 1, b, dtype=np.int64)
@@ -233,22 +247,22 @@ def fill_gaps(
 
 
 def _interpolated(ends: Array, times_s: Array, wanted_s: Array) -> Array:
-    """Interpolate between two poses (2, 3, 4) at times (n,): slerp, and a line of the centre.
+    """Interpolate between two poses (2, 3, 4) at times (n,): slerp, and linearly in the centre.
 
-    The translation of cam_from_world on a line would bend the path.
+    Linear in the translation of cam_from_world would bend the trajectory.
     """
     world_from_cam = invert_rigid(ends)
     turn = Slerp(times_s, Rotation.from_matrix(world_from_cam[:, :, :3]))(wanted_s).as_matrix()
-    share = ((wanted_s - times_s[0]) / (times_s[1] - times_s[0]))[:, None]
-    centre = world_from_cam[0, :, 3] + share * (world_from_cam[1] - world_from_cam[0])[:, 3]
+    fraction = ((wanted_s - times_s[0]) / (times_s[1] - times_s[0]))[:, None]
+    centre = world_from_cam[0, :, 3] + fraction * (world_from_cam[1] - world_from_cam[0])[:, 3]
     return invert_rigid(np.concatenate([turn, centre[:, :, None]], 2))
 
 
 def _points_around(model: SparseModel, key_rows: IntArray, a: int, b: int) -> Array:
-    """Return the points (n, 3) that the keyframes around the rows a to b see."""
-    reach = round(NEAR_SPANS * (b - a))
-    first = int(np.searchsorted(key_rows, a - reach, "right")) - 1  # one before that, one after
-    images = np.arange(max(first, 0), int(np.searchsorted(key_rows, b + reach)) + 1)
+    """Return the points (n, 3) that the keyframes around the rows a to b observe."""
+    margin = round(NEAR_GAPS * (b - a))
+    first = int(np.searchsorted(key_rows, a - margin, "right")) - 1  # one before that, one after
+    images = np.arange(max(first, 0), int(np.searchsorted(key_rows, b + margin)) + 1)
     seen = np.unique(model.obs_point[np.isin(model.obs_image, images)])
     return model.points[seen[:: max(1, len(seen) // SHIFT_POINTS)]]
 
@@ -261,13 +275,12 @@ def _interpolation_px(
     focal: float,
     size: Array,
 ) -> float:
-    """Estimate the error that interpolation over a gap makes, as a shift of points in the image.
+    """Estimate the error of interpolation over a gap, as a shift of points in the image.
 
-    It is the largest of: the errors that it makes at located frames near the gap, on each side of
-    it, where as long a time is left out; and the distance between the line and the cubic Hermite
-    path, which leaves and reaches the gap with the velocities measured at its ends. The second is
-    large where the camera moves otherwise in the gap than beside it, the first where it shakes, and
-    between photos.
+    It is the largest of: the errors at located frames on each side of the gap, where as long a gap
+    is left out; and the distance between linear interpolation and a cubic Hermite curve with the
+    velocities measured at the ends of the gap. The first is large where the camera shakes, and
+    between photos; the second where its velocity changes across the gap.
 
     Args:
         sides: located rows before and after the gap, ascending. points: (N, 3). focal, size: px.
@@ -275,27 +288,30 @@ def _interpolation_px(
         pixels; infinite where too few frames are located beside the gap.
     """
     before, after = sides
-    start_s, end_s = time_s[before[-1]], time_s[after[0]]
-    span, worst = float(end_s - start_s), 0.0
+    start_s = time_s[before[-1]]
+    end_s = time_s[after[0]]
+    gap_s = float(end_s - start_s)
+    worst = 0.0
     if min(len(before), len(after)) < 2:
         return np.inf
     for side, edge_s in ((before, start_s), (after, end_s)):
-        near = side[np.abs(time_s[side] - edge_s) <= NEAR_SPANS * span * (1 + 1e-6)]
-        until = np.searchsorted(time_s[near], time_s[near] + span * (1 - 1e-6))
+        near = side[np.abs(time_s[side] - edge_s) <= NEAR_GAPS * gap_s * (1 + 1e-6)]
+        until = np.searchsorted(time_s[near], time_s[near] + gap_s * (1 - 1e-6))
         errors = []
         for i, j in enumerate(until.tolist()):
             if j < len(near) and j > i + 1:
-                ends, inner = near[[i, j]], near[i + 1 : j]
-                guess = _interpolated(cam_from_world[ends], time_s[ends], time_s[inner])
-                errors.append(_shift_px(guess, cam_from_world[inner], points, focal, size))
+                ends = near[[i, j]]
+                inner = near[i + 1 : j]
+                line = _interpolated(cam_from_world[ends], time_s[ends], time_s[inner])
+                errors.append(_shift_px(line, cam_from_world[inner], points, focal, size))
         if not errors:
             return np.inf
         worst = max(worst, *errors)
-    at = np.array([before[-2], before[-1], after[0], after[1]])
-    ends = at[[1, 2]]
+    four = np.array([before[-2], before[-1], after[0], after[1]])
+    ends = four[[1, 2]]
     inner_s = np.linspace(start_s, end_s, 9)[1:-1]
     line = _interpolated(cam_from_world[ends], time_s[ends], inner_s)
-    curve = _hermite(cam_from_world[at], time_s[at], inner_s)
+    curve = _hermite(cam_from_world[four], time_s[four], inner_s)
     return max(worst, _shift_px(line, curve, points, focal, size))
 
 
@@ -309,16 +325,16 @@ def _hermite(poses: Array, times_s: Array, wanted_s: Array) -> Array:
     turn = Rotation.from_matrix(world_from_cam[:, :, :3])
     path = np.hstack([(turn[1].inv() * turn).as_rotvec(), world_from_cam[:, :, 3]])  # (4, 6)
     speed = np.diff(path, axis=0) / np.diff(times_s)[:, None]  # (3, 6)
-    at = CubicHermiteSpline(times_s[1:3], path[1:3], speed[[0, 2]])(wanted_s)  # (n, 6)
-    turned = (turn[1] * Rotation.from_rotvec(at[:, :3])).as_matrix()
-    return invert_rigid(np.concatenate([turned, at[:, 3:, None]], 2))
+    curve = CubicHermiteSpline(times_s[1:3], path[1:3], speed[[0, 2]])(wanted_s)  # (n, 6)
+    turned = (turn[1] * Rotation.from_rotvec(curve[:, :3])).as_matrix()
+    return invert_rigid(np.concatenate([turned, curve[:, 3:, None]], 2))
 
 
 def _shift_px(one: Array, other: Array, points: Array, focal: float, size: Array) -> float:
-    """Return the largest shift of the image between two poses each (n, 3, 4).
+    """Return the largest shift of the image over n pairs of poses (n, 3, 4).
 
-    The shift of a pair is the median over the points that the second pose has in its image; it is
-    infinite where that is none.
+    The shift of a pair is the median over the points that project into the image of the second
+    pose; it is infinite where there are none.
     """
     (x1, z1), (x2, z2) = (
         (focal * found[..., :2] / found[..., 2:], found[..., 2])

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, invert_rigid
 from reobj.files import load_json, read_lines
-from reobj.poses.pose_formats import matrix_rows
+from reobj.poses.supplied.pose_formats import matrix_rows
 from reobj.results.result import Object, Result
 from reobj.types import Array, IntArray, ReobjError, log
 

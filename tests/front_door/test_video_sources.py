@@ -17,8 +17,8 @@ import pytest
 import reobj_track as rt
 from reobj import runtime
 from reobj.cameras import Camera
-from reobj.poses import mapping
 from reobj.poses.keyframes import ResizedVideo
+from reobj.poses.sfm import rescale
 from reobj.sources.container_files import settled_times
 from reobj.sources.image_files import sorted_names, times_of_names
 from reobj.types import Array, Image
@@ -236,10 +236,10 @@ def test_a_camera_of_square_pixels_becomes_one_of_others(model: str) -> None:
     made = Camera(model, 640, 480, params).to_pycolmap()
     rays = np.array([[0, 0, 1], [0.3, 0.2, 1], [-0.4, 0.1, 1]])
     before: Array = made.img_from_cam(rays)
-    mapping._rescale(made, (480, 480))
+    rescale(made, (480, 480))
     np.testing.assert_allclose(made.img_from_cam(rays), before * [0.75, 1], atol=1e-9)
     same = Camera(model, 640, 480, params).to_pycolmap()
-    mapping._rescale(same, (320, 240))
+    rescale(same, (320, 240))
     assert same.model.name == model
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from reobj.cameras import WORLD_MAX, Camera, import_pycolmap, read_sparse_model
 from reobj.poses.intrinsics import colmap_camera
-from reobj.poses.pose_file import (
+from reobj.poses.supplied.pose_formats import (
     PoseFile,
     checked_rigid,
     from_quaternions,
@@ -25,24 +25,24 @@ from reobj.poses.pose_file import (
 )
 from reobj.types import Array, BoolArray, IntArray, ReobjError
 
-MODELS = ("images.bin", "images.txt")  # the first is preferred
-PLACES = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))  # in a folder
+MODELS = ("images.bin", "images.txt")  # in the order of preference
+FOLDERS = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))  # the same
 
 
 def find_models(path: Path) -> list[Path]:
-    """List the files of images of the COLMAP models that a path means: its own, or those below it.
+    """List the image files of the COLMAP models at a path or below it.
 
-    Of a folder without a model these are `sparse/N` and `sparse`, else `N`, else `colmap/sparse/N`.
+    Below a folder without a model: `sparse/N` and `sparse`, else `N`, else `colmap/sparse/N`.
     """
     if path.is_file():
         named = path if path.name in MODELS else path.parent / MODELS[0]
         return [named] if named.is_file() else _model_in(path.parent)
-    own = _model_in(path)
-    for places in PLACES if not own else ():
-        folders = [folder for place in places for folder in sorted(path.glob(place))]
+    models = _model_in(path)
+    for patterns in FOLDERS if not models else ():
+        folders = [folder for pattern in patterns for folder in sorted(path.glob(pattern))]
         folders = [f for f in folders if f.name.isdecimal() or f.name == "sparse"]
-        own = own or [model for folder in folders for model in _model_in(folder)]
-    return own
+        models = models or [model for folder in folders for model in _model_in(folder)]
+    return models
 
 
 def _model_in(folder: Path) -> list[Path]:
@@ -52,7 +52,7 @@ def _model_in(folder: Path) -> list[Path]:
 def read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read a COLMAP model, binary (preferred) or text, with or without rigs; scale unknown.
 
-    Of several models in a folder the one with most images.
+    Of several models in a folder the one with the most images is read.
     """
     models = find_models(path)
     if not models:
@@ -62,13 +62,16 @@ def read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:
         )
     found = [_read_model(model) for model in models]
     count = np.array([len(one.names) for one in found])
-    chosen, named = int(count.argmax()), [str(model.parent) for model in models]
-    largest = [name for name, n in zip(named, count.tolist(), strict=True) if n == count.max()]
+    chosen = int(count.argmax())
+    names = [str(model.parent) for model in models]
+    largest = [name for name, n in zip(names, count.tolist(), strict=True) if n == count.max()]
     if len(largest) > 1:
-        what = f"{' and '.join(largest)} are models of {count.max()} images each"
-        raise ReobjError(f"{path}: {what}; name one of them with --poses")
-    others = [f"{n} ({c})" for n, c in zip(named, count.tolist(), strict=True) if c < count.max()]
-    note = f"{named[chosen]} taken, the model with most images ({count.max()}), not "
+        raise ReobjError(
+            f"{path}: {' and '.join(largest)} are models of {count.max()} images each; name one of "
+            "them with --poses"
+        )
+    others = [f"{n} ({c})" for n, c in zip(names, count.tolist(), strict=True) if c < count.max()]
+    note = f"{names[chosen]} taken, the model with most images ({count.max()}), not "
     messages = (f"{path}: {note}{', '.join(others)}",) if others else ()
     form = "binary" if models[chosen].suffix == ".bin" else "text"
     folder = models[chosen].parent
@@ -105,23 +108,23 @@ def _read_model(images: Path) -> PoseFile:
 
 
 def _far(points: Array) -> BoolArray:
-    """Find points (P, 3) that are not finite, or beyond WORLD_MAX."""
+    """Mark points (P, 3) that are not finite, or beyond WORLD_MAX."""
     return np.asarray(~(np.abs(points) < WORLD_MAX).all(1), bool)
 
 
 def _check_points(points: Array, ids: Sequence[int], path: Path) -> None:
-    """Refuse points (P, 3) that no scene has; ids: of each, for the message."""
+    """Refuse points (P, 3) that are not finite or too far away; ids: of each, for the message."""
     far = _far(points)
     if far.any():
         point = points[far][0]
-        what = "is not finite"
+        fault = "is not finite"
         if np.isfinite(point).all():
-            what = f"is more than {WORLD_MAX:g} units away from the origin"
-        raise ReobjError(f"{path}: point {ids[int(np.argmax(far))]} {what}; remove it")
+            fault = f"is more than {WORLD_MAX:g} units away from the origin"
+        raise ReobjError(f"{path}: point {ids[int(np.argmax(far))]} {fault}; remove it")
 
 
-# Records of COLMAP's binary files: bytes before a name, or before the number of what follows; the
-# format of that number; bytes of each that follows
+# Records of COLMAP's binary files: bytes before a name, or before the number of entries; the format
+# of that number; bytes of an entry
 RECORDS = {
     "cameras.bin": (24, "", 0),
     "images.bin": (64, "<Q", 24),  # with a name
@@ -132,32 +135,35 @@ RECORDS = {
 
 
 def _check_counts(folder: Path) -> None:
-    """Refuse a binary model that claims more than it holds: pycolmap takes memory for the claim."""
+    """Refuse a binary model that claims more than it contains: pycolmap allocates for the claim."""
     for name, (head, number, size) in RECORDS.items():
         if not (folder / name).exists():
             continue
         data = (folder / name).read_bytes()
-        (count,), at = struct.unpack_from("<Q", data), 8
-        if at + count * head > len(data):
+        (count,) = struct.unpack_from("<Q", data)
+        offset = 8
+        if offset + count * head > len(data):
             raise ValueError(f"{name} claims {count} records in {len(data)} bytes")
         for _ in range(count if number else 0):
-            at += head
+            offset += head
             if name == "images.bin":
-                at = data.index(b"\0", at) + 1
-            (n,) = struct.unpack_from(number, data, at)
-            at += struct.calcsize(number) + n * size
-            if at > len(data):
+                offset = data.index(b"\0", offset) + 1
+            (n,) = struct.unpack_from(number, data, offset)
+            offset += struct.calcsize(number) + n * size
+            if offset > len(data):
                 raise ValueError(f"{name} claims {n} entries in {len(data)} bytes")
 
 
 def _read_colmap_text(folder: Path) -> PoseFile:
-    """Read a COLMAP text model, also one of poses alone.
+    """Read a COLMAP text model, also one without points or observations.
 
-    Many tools leave out points3D.txt, or the line of observations after each image: pycolmap
-    refuses the first, and with the second takes every other image for observations.
+    Many tools leave out points3D.txt, which pycolmap refuses, or the line of observations after
+    each image, where pycolmap takes every other image for observations.
     """
     cameras = _colmap_text_cameras(folder / "cameras.txt")
-    names, used, where = [], [], []
+    names = []
+    used = []
+    where = []
     rows: list[list[float]] = []
     row_of: dict[str, int] = {}
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
@@ -182,8 +188,7 @@ def _read_colmap_text(folder: Path) -> PoseFile:
     quaternion_wxyz, translation = np.split(np.array(rows), [4], axis=1)  # (N, 4), (N, 3)
     poses = from_quaternions(np.roll(quaternion_wxyz, -1, 1), translation, where)
     xyz, colors, seen = _colmap_text_points(folder / "points3D.txt", row_of)
-    known = tuple(used)
-    return PoseFile(poses, known, tuple(names), points=xyz, colors=colors, visibility=seen)
+    return PoseFile(poses, tuple(used), tuple(names), points=xyz, colors=colors, visibility=seen)
 
 
 def _colmap_text_cameras(path: Path) -> dict[str, Camera]:
@@ -211,7 +216,8 @@ def _colmap_text_points(
         points (P, 3), their colours (P, 3), and (M, 2) rows of images and of points they observed.
     """
     rows: list[list[float]] = []
-    tracks, expected = [], "POINT3D_ID X Y Z R G B ERROR TRACK[]"
+    tracks = list[list[int]]()
+    expected = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
     for at, words in lines(path) if path.exists() else ():
         if words and len(words) < 8:
             raise ReobjError(f"{at}: expected {expected}")
@@ -222,7 +228,7 @@ def _colmap_text_points(
             tracks.append([row_of[i] for i in words[8::2] if i in row_of])
     table = np.array(rows).reshape(-1, 7)
     order = np.argsort(table[:, 0], kind="stable")
-    seen = [(image, point) for point, at in enumerate(order) for image in tracks[at]]
+    seen = [(image, point) for point, row in enumerate(order) for image in tracks[row]]
     table = table[order]
     _check_points(table[:, 1:4], table[:, 0].astype(np.int64).tolist(), path)
     colors = table[:, 4:].clip(0, 255).astype(np.uint8)

@@ -1,28 +1,61 @@
-"""Steps of COLMAP in a child process: aborts and log stay there, its progress is shown here."""
+"""Jobs of COLMAP in a child process: its aborts and its log stay there, progress is shown here.
+
+A job is a folder with `job.json` and the keyframes; the child leaves its results in the folder.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
-from reobj.files import LockedError, Progress, locked
-from reobj.types import ReobjError
+import numpy as np
+import numpy.typing as npt
+
+from reobj.files import LockedError, Progress, atomic, locked, writing
+from reobj.types import Image, ReobjError
+
+# ---- The files of a job --------------------------------------------------------------------------
+
+
+JOB = "job.json"
+KEYFRAMES = "keyframes.npy"
+
+
+def write_job(folder: Path, job: dict[str, Any], images: Sequence[Image]) -> None:
+    """Write a job and its keyframes (K, h, w, 3) BGR into a folder, which is made."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(folder / KEYFRAMES, np.stack(images))
+    with atomic(folder / JOB) as part:
+        part.write_text(json.dumps(job))
+
+
+def read_job(folder: Path) -> tuple[dict[str, Any], npt.NDArray[np.uint8]]:
+    """Read a job and its keyframes (K, h, w, 3) BGR, mapped into memory."""
+    job = json.loads((folder / JOB).read_text())
+    images = np.load(folder / KEYFRAMES, mmap_mode="r")
+    return job, images.view(np.ndarray)  # indexing a memmap itself is slow
+
+
+# ---- The process ---------------------------------------------------------------------------------
 
 
 class Child:
-    """A fresh interpreter that imports a module and does the job of a folder whenever it is told.
+    """A worker process that imports a module and does the job of a folder on request.
 
-    It starts at once, so that its imports take no time later. A context: it ends with it, and is
-    killed by an exception. Where this process is killed it ends too, and no other child works in
-    the folder before it has.
+    It starts at once, so that its imports take no time later. As a context manager it ends with the
+    block, and is killed by an exception. It also ends when this process is killed, and no other
+    child works in the folder before it has ended.
 
     Args:
         module: its main part calls `serve`. log_path: receives the child's stderr; its folder is
@@ -37,8 +70,10 @@ class Child:
             with locked(_lock_of(folder), LEFT_OVER_S):
                 pass
         except LockedError:
-            why = "a reconstruction still runs in this folder"
-            raise ReobjError(f"{folder.parent}: {why}; wait for it, or end it") from None
+            raise ReobjError(
+                f"{folder.parent}: a reconstruction is still running in this folder; wait for it, "
+                "or end it"
+            ) from None
         log_path.parent.mkdir(parents=True, exist_ok=True)
         # -P: not the modules of the working directory; the package's own folder comes first
         command = [sys.executable, "-P", "-m", module, str(folder)]
@@ -60,23 +95,23 @@ class Child:
         self,
         kind: type[BaseException] | None,
         error: BaseException | None,
-        at: TracebackType | None,
+        traceback: TracebackType | None,
     ) -> None:
         if kind is not None:
             self.process.kill()
         with contextlib.suppress(BrokenPipeError):
-            self.process.__exit__(kind, error, at)  # closes its pipes, waits
+            self.process.__exit__(kind, error, traceback)  # closes its pipes, waits
 
     def run(self, progress: Callable[[str, int], Progress]) -> str:
-        """Have the job done and show its progress.
+        """Request the job and show its progress.
 
         Args:
             progress: makes the line of a stage from its name and total.
         Returns:
-            "" if it ended well, else why the child stopped and where its log is.
+            "" if it succeeded, else why the child stopped and where its log is.
         """
         assert self.process.stdin is not None and self.process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):  # what it printed last, and why, is read below
+        with contextlib.suppress(BrokenPipeError):  # why it ended is reported below
             self.process.stdin.write(b"go\n")
             self.process.stdin.flush()
         line: Progress | None = None
@@ -86,7 +121,8 @@ class Child:
                 break
             if len(words) != 4 or words[0] != "reobj:":
                 continue
-            stage, done, total = words[1], int(words[2]), int(words[3])
+            stage = words[1]
+            done, total = map(int, words[2:])
             if line is None or line.stage != stage:
                 if line is not None:
                     line.close()
@@ -94,8 +130,8 @@ class Child:
             line.step(done - line.done)
         else:
             code = self.process.wait()
-            why = f"signal {-code}" if code < 0 else f"exit code {code}"
-            return f"stopped ({why}), see {self.log_path}"
+            reason = f"signal {-code}" if code < 0 else f"exit code {code}"
+            return f"stopped ({reason}), see {self.log_path}"
         if line is not None:
             line.close()
         return ""
@@ -103,34 +139,35 @@ class Child:
 
 DONE = "reobj: done"
 PR_SET_PDEATHSIG = 1  # of Linux' sys/prctl.h
-LEFT_OVER_S = 60.0  # for the child of a killed run to end; chosen: it does at once (watched)
+LEFT_OVER_S = 60.0  # for the child of a killed run to end; chosen: it ends at once (observed)
 
 
 def _lock_of(folder: Path) -> Path:
-    """Name the file that a child holds the lock of: beside its folder, which may be removed."""
+    """Return the lock file that a child holds: beside its folder, which may be removed."""
     return folder.with_name(f"{folder.name}.lock")
 
 
 def serve(job: Callable[[Path], None]) -> None:
-    """Do the job of the folder of the command line for each line of stdin (in the child).
+    """Do the job of the folder on the command line for each line of stdin (in the child).
 
     The process ends as soon as stdin does, also in the middle of a job: its parent is gone.
     """
     if sys.platform == "linux":  # at once, also in long calls of COLMAP that hold the interpreter
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    folder, told = Path(sys.argv[1]), threading.Semaphore(0)
+    folder = Path(sys.argv[1])
+    requests = threading.Semaphore(0)
     with locked(_lock_of(folder), LEFT_OVER_S):
-        threading.Thread(target=_watch_parent, args=(told,), daemon=True).start()
-        while told.acquire():
+        threading.Thread(target=_watch_parent, args=(requests,), daemon=True).start()
+        while requests.acquire():
             job(folder)
             print(DONE, flush=True)
 
 
-def _watch_parent(told: threading.Semaphore) -> None:
-    """Count the lines of stdin; end this process at their end, whatever it does."""
-    while data := os.read(0, 1):  # not sys.stdin, whose lock would hang the end of the process
+def _watch_parent(requests: threading.Semaphore) -> None:
+    """Count the lines of stdin; end this process at their end, even during a job."""
+    while data := os.read(0, 1):  # not sys.stdin, whose lock would block the end of the process
         if data == b"\n":
-            told.release()
+            requests.release()
     os._exit(0)
 
 

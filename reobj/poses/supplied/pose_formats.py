@@ -1,7 +1,6 @@
-"""Files of poses of single tools and datasets: one small reader a format.
+"""Pose files of other tools and datasets: one small reader per format, listed in `readers.READERS`.
 
-The table READERS in `readers` lists them. All turn their conventions into cam_from_world, OpenCV
-axes, COLMAP pixels.
+All convert their conventions to cam_from_world, OpenCV axes, COLMAP pixels.
 """
 
 from __future__ import annotations
@@ -10,28 +9,230 @@ import dataclasses
 import json
 import re
 import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from reobj.cameras import CV_FROM_GL, NO_SCALE, Camera, invert_rigid
+from reobj.cameras import CV_FROM_GL, NO_SCALE, WORLD_MAX, Camera, invert_rigid
 from reobj.files import TEXT_MAX, check_unpacked, load_json, read_lines
-from reobj.poses.intrinsics import brown_camera, camera_from_json, camera_from_yaml, image_side
-from reobj.poses.pose_file import (
-    PoseFile,
-    checked_rigid,
-    from_quaternions,
-    json_object,
-    numbers,
-    raise_where,
-    read_table,
+from reobj.poses.intrinsics import (
+    brown_camera,
+    camera_from_json,
+    camera_from_yaml,
+    image_side,
+    read_yaml,
 )
-from reobj.poses.simple_yaml import read_yaml
 from reobj.types import Array, IntArray, ReobjError
 
-Y_UP, Z_UP = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
+# ---- Result of a reader, and checks of all readers -----------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFile:
+    """Content of a pose file: N poses in the order of the file, by time where they have one.
+
+    Attributes:
+        cam_from_world: (N, 3, 4), NaN where the file marks a missing pose.
+        cameras: of each pose (N,), or one of all (1,), or () where the file has none.
+        names, stamps: image names or times, by which poses are assigned to frames.
+        unit: of the stamps: s, ms, us, ns, or "" if the format does not specify it.
+        is_ours: this tool wrote the stamps, for the same video.
+        visibility: (M, 2) row of the pose that observed a point, and row of the point.
+        w_first: (N, 3, 4), or None: the poses if the quaternions have w first, where the file does
+            not specify the order; `cam_from_world` assumes w last.
+        kind: name of the format. messages: what was assumed or left out.
+    """
+
+    cam_from_world: Array
+    cameras: tuple[Camera | None, ...] = ()
+    names: tuple[str, ...] = ()
+    stamps: Array | None = None
+    unit: str = ""
+    is_ours: bool = False
+    metric: bool = False
+    up_in_world: Array | None = None
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    colors: npt.NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 3), np.uint8))
+    visibility: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    w_first: Array | None = None
+    kind: str = ""
+    messages: tuple[str, ...] = ()
+
+    def with_messages(self, *messages: str) -> PoseFile:
+        """Return a copy with more messages."""
+        return dataclasses.replace(self, messages=(*self.messages, *messages))
+
+
+def lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield location (for messages) and words of each line of a text file, without comments."""
+    for number, text in enumerate(read_lines(path), 1):
+        if not text.lstrip().startswith("#"):
+            yield f"{path}, line {number}", text.split()
+
+
+def numbers(words: Sequence[str], where: str, expected: str, finite: bool = True) -> list[float]:
+    """Convert the words of a line; `where` and `expected` are for messages."""
+    try:
+        row = [float(word) for word in words]
+    except ValueError:
+        text = " ".join(words)[:60]
+        raise ReobjError(
+            f"{where}: {text!r} is not a row of numbers; expected {expected}"
+        ) from None
+    if finite and not np.isfinite(row).all():
+        raise ReobjError(f"{where}: a number is not finite; leave out rows of frames without pose")
+    return row
+
+
+def read_table(
+    path: Path,
+    columns: tuple[int, ...],
+    expected: str,
+    finite: bool = True,
+    header: bool = False,
+) -> tuple[Array, list[str]]:
+    """Read a table of numbers.
+
+    Args:
+        columns: numbers of columns that are allowed. expected: for messages. finite: refuse inf and
+            nan. header: the first line may name the columns.
+    Returns:
+        rows: (N, C), C in `columns`. where: file and line of each.
+    """
+    rows: list[list[float]] = []
+    where = []
+    for at, words in lines(path):
+        if not words:
+            continue
+        words = " ".join(words).replace(",", " ").split()
+        if header and not rows and not is_number(words[0]):
+            header = False
+            continue
+        row = numbers(words, at, expected, finite)
+        if len(row) not in columns or (rows and len(row) != len(rows[0])):
+            raise ReobjError(f"{at}: {len(row)} numbers; expected {expected}")
+        rows.append(row)
+        where.append(at)
+    if not rows:
+        raise ReobjError(f"{path}: no poses in it; expected {expected}")
+    return np.array(rows), where
+
+
+def is_number(word: str) -> bool:
+    """True if a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object."""
+    content = load_json(path)
+    if not isinstance(content, dict):
+        raise ReobjError(f"{path}: expected an object with `frames` (nerfstudio) or `poses`")
+    return content
+
+
+POSE_TOLERANCE = 0.005  # of entries of rotations and quaternions (7-Scenes: off by 1e-3)
+
+
+def checked_rigid(matrix: Array, where: Sequence[str]) -> Array:
+    """Check rigid transforms and orthonormalise their rotations.
+
+    Args:
+        matrix: (N, 4, 4), not finite where there is no pose. where: of each, for messages.
+    Returns:
+        (N, 3, 4), NaN where there is no pose.
+    """
+    lost = ~np.asarray(np.isfinite(matrix).all((1, 2)), bool)
+    matrix = np.where(lost[:, None, None], np.eye(4), matrix)
+    last_row = np.abs(matrix[:, 3] - [0, 0, 0, 1])  # (N, 4)
+    raise_where(
+        last_row.max(1) > POSE_TOLERANCE,
+        where,
+        "the last row is not 0 0 0 1; expected row-major 4x4 (transpose column-major ones)",
+    )
+    check_positions(matrix[:, :3, 3], where)
+    rotation = matrix[:, :3, :3].clip(-2, 2)  # the squares of 1e300 are too large
+    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))  # (N, 3, 3)
+    raise_where(
+        error.max((1, 2)) > POSE_TOLERANCE,
+        where,
+        "the 3x3 block is not a rotation (rows not of length 1 and perpendicular); expected a "
+        "row-major rigid pose without scale",
+    )
+    raise_where(
+        np.linalg.det(rotation) < 0,
+        where,
+        "the rotation is mirrored (determinant -1); flip two axes, not one",
+    )
+    u, _, vt = np.linalg.svd(rotation)
+    exact = np.concatenate([u @ vt, matrix[:, :3, 3:]], 2)
+    return np.where(lost[:, None, None], np.nan, exact)
+
+
+def check_positions(translation: Array, where: Sequence[str]) -> None:
+    """Refuse translations (N, 3) beyond WORLD_MAX."""
+    far = (np.abs(translation) >= WORLD_MAX).any(1)
+    raise_where(far, where, f"more than {WORLD_MAX:g} units away from the origin")
+
+
+def raise_where(bad: Any, where: Sequence[str], problem: str) -> None:
+    """Raise the problem with the location of the first bad (N,) input, if any."""
+    if np.any(bad):
+        raise ReobjError(f"{where[int(np.argmax(bad))]}: {problem}")
+
+
+def from_quaternions(xyzw: Array, translation: Array, where: Sequence[str]) -> Array:
+    """Make rigid transforms (N, 3, 4) of unit quaternions (N, 4) and translations (N, 3)."""
+    finite = np.isfinite(np.column_stack([xyzw, translation])).all(1)
+    raise_where(~finite, where, "a number is not finite")
+    check_positions(translation, where)
+    norm = np.linalg.norm(xyzw.clip(-2, 2), axis=1)
+    raise_where(
+        np.abs(norm - 1) > POSE_TOLERANCE,
+        where,
+        "the quaternion is not of length 1; expected the columns of the format in its order",
+    )
+    return np.concatenate([Rotation.from_quat(xyzw).as_matrix(), translation[:, :, None]], 2)
+
+
+MAX_FOCAL_SPREAD = 0.02  # relative, over the images of one camera: autofocus (chosen)
+
+
+def one_camera(cameras: Sequence[Camera | None], path: Path) -> Camera | None:
+    """Return the single camera of images: the median of slightly different focal lengths.
+
+    Raises:
+        ReobjError: they differ by more than MAX_FOCAL_SPREAD, or in model or size.
+    """
+    found = sorted((c for c in cameras if c is not None), key=lambda c: c.params[0])
+    if not found:
+        return None
+    kinds = sorted({f"{c.model} {c.width}x{c.height}" for c in found})
+    least = found[0].params[0]
+    most = found[-1].params[0]
+    spread = (most - least) / max(abs(least), 1e-9)
+    if len(kinds) > 1 or spread > MAX_FOCAL_SPREAD:
+        cameras_text = f"focal lengths {least:.4g}-{most:.4g}"
+        if len(kinds) > 1:
+            cameras_text = ", ".join(kinds[:3])
+        raise ReobjError(
+            f"{path}: several different cameras took the frames ({cameras_text}); expected one: "
+            "give its intrinsics with --camera, or reconstruct with a single camera"
+        )
+    return found[len(found) // 2]
+
+
+Y_UP = np.array([0, 1.0, 0])
+Z_UP = np.array([0, 0, 1.0])
 
 
 # ---- Tables: TUM, ORB-SLAM3, EuRoC, rows of matrices ---------------------------------------------
@@ -58,11 +259,11 @@ def read_rows(path: Path, size: tuple[int, int]) -> PoseFile:
     return found
 
 
-LEAST_NS = 1e15  # stamps from here on are ns: in us this is 2001, in ms it is 33,000 years away
+LEAST_NS = 1e15  # larger stamps are ns: in us this is the year 2001, in ms 33,658
 
 
 def _table(path: Path, columns: tuple[int, ...], expected: str) -> tuple[Array, list[str], str]:
-    """Read a table of numbers with commas or spaces; its comments and names of columns come too."""
+    """Read a table of numbers with commas or spaces, and its header: comments, column names."""
     rows, where = read_table(path, columns, expected, header=True)
     first = int(where[0].rpartition(" ")[2])  # line of the first row
     return rows, where, "".join(read_lines(path)[: first - 1])
@@ -76,31 +277,31 @@ def _named_columns(header: str, count: int) -> list[int] | None:
     """
     for line in header.lower().splitlines()[::-1]:
         words = re.sub(r"\[.*?\]|\(.*?\)", "", line).replace(",", " ").lstrip("# ").split()
-        place: dict[str, int] = {}
+        column_of: dict[str, int] = {}
         for i, word in enumerate(words):
             found = re.fullmatch(
                 r"(q|rot|orient|p|t|pos|trans|)[a-z]*?[._]?(?:rs_)?(?:r_)?([xyzw])", word
             )
             if found:
                 turn = "q" if found[1] in ("q", "rot", "orient") else ""
-                place.setdefault(turn + found[2], i)
+                column_of.setdefault(turn + found[2], i)
         wanted = ("x", "y", "z", "qx", "qy", "qz", "qw")
-        if len(words) == count and all(name in place for name in wanted):
-            return [place[name] for name in wanted]
+        if len(words) == count and all(name in column_of for name in wanted):
+            return [column_of[name] for name in wanted]
     return None
 
 
 def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read TUM rows: time, world_from_cam, w last; metres unless our own header says arbitrary.
 
-    Names of columns, in the header, are believed.
+    Column names in the header override this order.
     """
     rows, where, header = _table(path, (8,), "TUM rows: t tx ty tz qx qy qz qw")
     columns = _named_columns(header, 8) or list(range(1, 8))
     world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
     kept, messages = _by_time(rows[:, 0], path)
     return PoseFile(
-        invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], own=OWN_HEADER in header,
+        invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], is_ours=OWN_HEADER in header,
         metric=not re.search(f"#.*{NO_SCALE}", header), kind="TUM rows", messages=messages,
     )  # fmt: skip
 
@@ -109,27 +310,32 @@ OWN_HEADER = "(world_from_cam, seconds, units: "  # of `cameras.write_tum`
 
 
 def _by_time(stamps: Array, path: Path) -> tuple[IntArray, tuple[str, ...]]:
-    """Return the rows (n,) by ascending stamp, of equal ones the first, and what to say of it."""
+    """Return the rows (n,) by ascending stamp, without repeated ones, and a message about these."""
     kept = np.unique(stamps, return_index=True)[1]
-    again = len(stamps) - len(kept)
-    return kept, (f"{path}: {again} rows repeat a time stamp and are left out",) * bool(again)
+    repeated = len(stamps) - len(kept)
+    if not repeated:
+        return kept, ()
+    return kept, (f"{path}: {repeated} rows repeat a time stamp and are left out",)
 
 
 def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read EuRoC's CSV of 8 or 17 columns: ns, world_from_body, quaternion w first; metres.
 
-    `T_BS` of the camera's sensor.yaml, beside it or in cam0 beside its folder, leads from camera to
-    body; without one the body is taken for the camera, and this is said.
+    `T_BS` in the camera's sensor.yaml, beside it or in cam0 beside its folder, is body_from_cam;
+    without one the body is taken for the camera, with a message.
     """
     path = path / "data.csv" if path.is_dir() else path
     rows, where, header = _table(path, (8, 17), "EuRoC rows: ns, x, y, z, qw, qx, qy, qz[, 9 more]")
     columns = _named_columns(header, rows.shape[1]) or [1, 2, 3, 5, 6, 7, 4]
     world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
     kept, messages = _by_time(rows[:, 0], path)
-    camera, sensor = None, _sensor_of(path)
+    camera = None
+    sensor = _sensor_of(path)
     if sensor is None:
-        what = "no sensor.yaml with the camera's T_BS beside it: body taken for camera"
-        messages += (f"{path}: poses of the body, and {what}",)
+        messages += (
+            f"{path}: poses of the body, and no sensor.yaml with the camera's T_BS beside it: body "
+            "taken for camera",
+        )
     else:
         data = read_yaml(sensor)
         try:
@@ -138,8 +344,8 @@ def read_euroc(path: Path, size: tuple[int, int]) -> PoseFile:
             raise ReobjError(f"{sensor}: expected T_BS with data of 16 numbers") from None
         body_from_cam = checked_rigid(matrix, [f"{sensor}, T_BS"])[0]
         turn = world_from_cam[:, :, :3]
-        place = turn @ body_from_cam[:, 3:] + world_from_cam[:, :, 3:]
-        world_from_cam = np.concatenate([turn @ body_from_cam[:, :3], place], 2)
+        centre = turn @ body_from_cam[:, 3:] + world_from_cam[:, :, 3:]
+        world_from_cam = np.concatenate([turn @ body_from_cam[:, :3], centre], 2)
         camera = camera_from_yaml(data, size)
     return PoseFile(
         invert_rigid(world_from_cam)[kept], () if camera is None else (camera,),
@@ -163,7 +369,7 @@ def read_matrices(path: Path, size: tuple[int, int]) -> PoseFile:
 
 
 def matrix_rows(path: Path) -> tuple[Array, list[str]]:
-    """Read rows of 12 or 16 numbers as matrices (N, 4, 4), not finite where lost; where each is."""
+    """Read rows of 12 or 16 numbers: matrices (N, 4, 4), not finite where lost, and locations."""
     rows, where = read_table(path, (12, 16), "12 or 16 numbers a row", finite=False)
     whole = np.tile(np.eye(4), (len(rows), 1, 1))
     whole.reshape(-1, 16)[:, : rows.shape[1]] = rows
@@ -200,23 +406,24 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
     OpenCV axes, quaternion x first, a row for each frame of rgb.mp4, numbered from 0.
     """
     path = path / "odometry.csv" if path.is_dir() else path
-    head, *lines = [line for line in read_lines(path) if line.strip()]
+    head, *records = [line for line in read_lines(path) if line.strip()]
     columns = [word.strip().lower() for word in head.split(",")]
     wanted = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
     if missing := [name for name in wanted if name not in columns]:
         raise ReobjError(f"{path}: no column {', '.join(missing)}; expected {', '.join(wanted)}")
-    at = [columns.index(name) for name in wanted]
-    where = [f"{path}, line {i}" for i in range(2, len(lines) + 2)]
+    indices = [columns.index(name) for name in wanted]
+    where = [f"{path}, line {i}" for i in range(2, len(records) + 2)]
     table = []
-    for text, place in zip(lines, where, strict=True):
+    for text, line in zip(records, where, strict=True):
         words = text.split(",")
-        if len(words) <= max(at):
-            raise ReobjError(f"{place}: {len(words)} columns; expected {len(columns)}")
-        table.append(numbers([words[i] for i in at], place, ", ".join(wanted)))
+        if len(words) <= max(indices):
+            raise ReobjError(f"{line}: {len(words)} columns; expected {len(columns)}")
+        table.append(numbers([words[i] for i in indices], line, ", ".join(wanted)))
     rows = np.array(table).reshape(-1, 8)
     world_from_cam = from_quaternions(rows[:, 4:], rows[:, 1:4], where)
     names = tuple(f"{number:06d}" for number in rows[:, 0].astype(int).tolist())
-    matrix, cameras = path.with_name("camera_matrix.csv"), list[Camera]()
+    matrix = path.with_name("camera_matrix.csv")
+    cameras = list[Camera]()
     if matrix.is_file():
         K = read_table(matrix, (3,), "3 rows of 3 numbers")[0]
         raise_where([K.shape != (3, 3)], [str(matrix)], "expected 3 rows of 3 numbers")
@@ -228,12 +435,12 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
 
 
 def _size_of(K: Array, size: tuple[int, int], native: tuple[int, int]) -> tuple[int, int]:
-    """Return the size of the images that a matrix K is of: that of the frames, or the native one.
+    """Return the size of the images of a matrix K: that of the frames, or the native one.
 
     The principal point is near the middle of the right one.
     """
-    off = [np.abs(2 * K[:2, 2] / some - 1).max() for some in (size, native)]
-    return size if off[0] <= off[1] else native
+    offset = [np.abs(2 * K[:2, 2] / some - 1).max() for some in (size, native)]
+    return size if offset[0] <= offset[1] else native
 
 
 PHONE = (1920, 1440)  # pixels of ARKit's video, in landscape
@@ -242,7 +449,7 @@ PHONE = (1920, 1440)  # pixels of ARKit's video, in landscape
 def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read Record3D's metadata: `poses` qx qy qz qw tx ty tz, world_from_cam, OpenGL axes, y up.
 
-    The file `metadata`, the folder that has one, or an .r3d, which is a zip of that folder.
+    The file `metadata`, its folder, or an .r3d, which is a zip of the folder.
     """
     path = path / "metadata" if path.is_dir() else path
     data = _metadata_of_r3d(path) if path.suffix.lower() == ".r3d" else json_object(path)
@@ -268,9 +475,9 @@ def _metadata_of_r3d(path: Path) -> dict[str, Any]:
             check_unpacked(file.getinfo(name).file_size, TEXT_MAX)
             data = json.loads(file.read(name))
     except (zipfile.BadZipFile, StopIteration, OSError, ValueError, RecursionError) as error:
-        raise ReobjError(f"{path}: no .r3d of Record3D: no JSON `metadata` in it") from error
+        raise ReobjError(f"{path}: not an .r3d of Record3D: no JSON `metadata` in it") from error
     if not isinstance(data, dict):
-        raise ReobjError(f"{path}: `metadata` is no JSON object")
+        raise ReobjError(f"{path}: `metadata` is not a JSON object")
     return data
 
 
@@ -284,7 +491,8 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
     files = sorted(f for f in folder.glob("*.txt") if re.search(r"(\d|\.pose)$", f.stem))
     if not files:
         raise ReobjError(f"{folder}: no <frame number>.txt in it; expected a ScanNet pose folder")
-    where, expected = [str(file) for file in files], "4 rows of 4 numbers"
+    where = [str(file) for file in files]
+    expected = "4 rows of 4 numbers"
     tables = [read_table(file, (4,), expected, finite=False)[0] for file in files]
     raise_where([len(table) != 4 for table in tables], where, f"expected {expected}")
     world_from_cam = checked_rigid(np.array(tables), where)
@@ -294,15 +502,16 @@ def read_scannet(path: Path, size: tuple[int, int]) -> PoseFile:
         K, where_K = read_table(intrinsic, (3, 4), "a 3x3 or 4x4 matrix")
         raise_where([len(K) != K.shape[1]], where_K, f"{len(K)} rows, expected 3x3 or 4x4")
         camera = Camera("PINHOLE", *size, (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
-    up = np.array([0, 0, 1.0]) if folder.name == "pose" else None
+    up = Z_UP if folder.name == "pose" else None
     names = tuple(file.stem for file in files)
     kind = "ScanNet poses" if folder.name == "pose" else "7-Scenes poses"
-    poses, cameras = invert_rigid(world_from_cam), () if camera is None else (camera,)
+    poses = invert_rigid(world_from_cam)
+    cameras = () if camera is None else (camera,)
     return PoseFile(poses, cameras, names, metric=True, up_in_world=up, kind=kind)
 
 
 def arkit_files(path: Path) -> list[Path]:
-    """List the files of cameras, one an image, of a raw export of an app that uses ARKit."""
+    """List the camera files, one per image, of a raw export of an app that uses ARKit."""
     polycam = [path / "keyframes" / name for name in ("corrected_cameras", "cameras")]
     found = [sorted(path.glob("frame_*.json")), *(sorted(p.glob("*.json")) for p in polycam)]
     return next((files for files in found if files), [])
@@ -319,27 +528,30 @@ def read_arkit(path: Path, size: tuple[int, int]) -> PoseFile:
         raise ReobjError(f"{path}: no frame_*.json, nor keyframes/cameras/*.json in it")
     data = [json_object(file) for file in files]
     where = [str(file) for file in files]
-    matrices, cameras = [], []
-    for at, d in zip(where, data, strict=True):
+    matrices = []
+    cameras = []
+    for file, entry in zip(where, data, strict=True):
         try:
-            rows = d.get("cameraPoseARFrame") or [
-                d[f"t_{i}{j}"] for i in range(3) for j in range(4)
+            rows = entry.get("cameraPoseARFrame") or [
+                entry[f"t_{i}{j}"] for i in range(3) for j in range(4)
             ]
             matrices.append(np.array([*rows, 0, 0, 0, 1][:16], np.float64).reshape(4, 4))
-            cameras.append(camera_from_json(d, size))
+            cameras.append(camera_from_json(entry, size))
         except (KeyError, TypeError, ValueError):
-            what = "4x4 cameraPoseARFrame or t_00 to t_23, and intrinsics"
-            raise ReobjError(f"{at}: no camera; expected numbers {what}") from None
+            raise ReobjError(
+                f"{file}: no camera; expected numbers 4x4 cameraPoseARFrame or t_00 to t_23, and "
+                "intrinsics"
+            ) from None
     poses = CV_FROM_GL @ invert_rigid(checked_rigid(np.array(matrices), where))
-    names, up = tuple(file.stem for file in files), np.array([0, 1.0, 0])
+    names = tuple(path.stem for path in files)
     kind = "raw ARKit export"
-    return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=up, kind=kind)
+    return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=Y_UP, kind=kind)
 
 
 def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read nerfstudio's or instant-ngp's transforms.json: world_from_cam, OpenGL axes; no scale.
 
-    nerfstudio turned the world by `applied_transform` A; this is undone:
+    nerfstudio transformed the world by `applied_transform` A; this is undone:
     world_from_cv = inv(A) world_from_gl diag(1, -1, -1, 1).
     """
     path = path / "transforms.json" if path.is_dir() else path
@@ -348,17 +560,19 @@ def read_transforms(path: Path, size: tuple[int, int]) -> PoseFile:
     if not isinstance(frames, list) or not frames:
         raise ReobjError(f"{path}: no `frames`; expected nerfstudio's or ngp's transforms.json")
     where = [f"{path}, frames[{i}]" for i in range(len(frames))]
-    matrices, names, cameras = list[Array](), list[str](), list[Camera | None]()
-    for at, f in zip(where, frames, strict=True):
+    matrices = list[Array]()
+    names = list[str]()
+    cameras = list[Camera | None]()
+    for key, frame in zip(where, frames, strict=True):
         try:
-            matrices.append(np.array(f["transform_matrix"], np.float64).reshape(4, 4))
-            names.append(str(f["file_path"]))
-            cameras.append(camera_from_json({**data, **f}, size))
+            matrices.append(np.array(frame["transform_matrix"], np.float64).reshape(4, 4))
+            names.append(str(frame["file_path"]))
+            cameras.append(camera_from_json({**data, **frame}, size))
         except ReobjError as error:
-            raise ReobjError(f"{at}: {error}") from None
+            raise ReobjError(f"{key}: {error}") from None
         except (KeyError, TypeError, ValueError, IndexError):
-            what = "expected a 4x4 transform_matrix, file_path, and intrinsics that are numbers"
-            raise ReobjError(f"{at}: {what}") from None
+            expected = "a 4x4 transform_matrix, file_path, and intrinsics that are numbers"
+            raise ReobjError(f"{key}: expected {expected}") from None
     applied = np.eye(4)
     try:
         applied[:3] = np.array(data.get("applied_transform", applied), np.float64)[:3]
@@ -382,9 +596,11 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     path = path / "pose_intrinsic_imu.json" if path.is_dir() else path
     data = json_object(path)
-    names, where = tuple(data), [f"{path}, {name}" for name in data]
-    matrices, cameras = [], []
-    for name, at in zip(names, where, strict=True):
+    names = tuple(data)
+    where = [f"{path}, {name}" for name in data]
+    matrices = []
+    cameras = []
+    for name, key in zip(names, where, strict=True):
         try:
             matrix = data[name].get("aligned_pose", data[name].get("pose"))
             matrices.append(np.array(matrix, np.float64).reshape(4, 4))
@@ -392,11 +608,11 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
             cameras.append(brown_camera(_size_of(K, size, PHONE), *K[[0, 1, 0, 1], [0, 1, 2, 2]]))
         except (KeyError, TypeError, ValueError, AttributeError):
             expected = "4x4 aligned_pose or pose, and 3x3 intrinsic"
-            raise ReobjError(f"{at}: expected {expected}, numbers") from None
+            raise ReobjError(f"{key}: expected {expected}, numbers") from None
     raise_where([not names], [str(path)], "no frames in it")
     poses = invert_rigid(checked_rigid(np.array(matrices), where))
-    aligned = all("aligned_pose" in data[name] for name in names)
-    up = Z_UP if aligned else None
+    is_aligned = all("aligned_pose" in data[name] for name in names)
+    up = Z_UP if is_aligned else None
     kind = "ScanNet++ iPhone poses"
     return PoseFile(poses, tuple(cameras), names, metric=True, up_in_world=up, kind=kind)
 
@@ -404,13 +620,13 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
 def read_llff(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read LLFF's poses_bounds.npy: (N, 17), 3x5 [R | t | h, w, f] and two depths; no scale.
 
-    world_from_cam with the axes down, right, backwards. One row an image, by name.
+    world_from_cam with the axes down, right, backwards. One row per image, by name.
     """
     path = path / "poses_bounds.npy" if path.is_dir() else path
     try:
         rows = np.load(path, allow_pickle=False)
     except (OSError, ValueError) as error:
-        raise ReobjError(f"{path}: no .npy file of numbers ({error})") from None
+        raise ReobjError(f"{path}: not a .npy file of numbers ({error})") from None
     if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind not in "fiu":
         raise ReobjError(f"{path}: an array of shape {rows.shape}; expected (N, 17), LLFF's")
     table = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
@@ -435,13 +651,18 @@ def read_splatting(path: Path, size: tuple[int, int]) -> PoseFile:
     """
     path = path / "cameras.json" if path.is_dir() else path
     data = load_json(path)
-    matrices, names, cameras, where = [], list[str](), list[Camera | None](), list[str]()
+    matrices = list[Array]()
+    names = list[str]()
+    cameras = list[Camera | None]()
+    where = list[str]()
     for i, entry in enumerate(data if isinstance(data, list) else []):
         where.append(f"{path}, entry {i}")
         try:
             matrix = np.eye(4)
-            matrix[:3, :3], matrix[:3, 3] = entry["rotation"], entry["position"]
-            width, height = image_side(entry["width"]), image_side(entry["height"])
+            matrix[:3, :3] = entry["rotation"]
+            matrix[:3, 3] = entry["position"]
+            width = image_side(entry["width"])
+            height = image_side(entry["height"])
             focal = float(entry["fx"]), float(entry["fy"])
             names.append(str(entry["img_name"]))
         except (KeyError, TypeError, ValueError):

@@ -1,0 +1,1 @@
+"""Camera poses made by other tools: readers, frame assignment, choice between readings."""
