@@ -57,28 +57,19 @@ import numpy.typing as npt
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
-from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
-from reobj.identity.assignment import Pairs, ambiguous_pairs, assign, touching
-from reobj.identity.camera_motion import CameraMotion
-from reobj.identity.crops import CropEmbedder, make_embedder
-from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
-from reobj.identity.places import (
-    CamerasOfFrames,
-    EllipsoidMap,
-    overlap_within_reach,
-    rows_of,
-    spans_of_boxes,
-)  # fmt: skip
-from reobj.identity.reid import (
+from reobj.appearance.crops import CropEmbedder, make_embedder
+from reobj.appearance.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
+from reobj.appearance.reid import (
     Gallery,
     SimilarityCalibration,
     match_probability,
     part_cosines,
 )  # fmt: skip
-from reobj.identity.sampling import SamplingLayout
-from reobj.objects import (
+from reobj.appearance.sampling import SamplingLayout
+from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
+from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
+from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
+from reobj.objects.description import (
     ObjectsConfig,
     check_known_size,
     parse_known_size,
@@ -86,8 +77,9 @@ from reobj.objects import (
     size_priors,
     unused_sizes,
 )
+from reobj.objects.fit import fill, link_and_fit, parts_message
+from reobj.objects.published import solve_again
 from reobj.options import config_from_args, read_config, write_config
-from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
@@ -115,13 +107,21 @@ from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
 from reobj.schema import validate_objects
-from reobj.solvers import solve_again
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.looked import Intervals
 from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
+from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
+from reobj.tracking.camera_motion import CameraMotion
+from reobj.tracking.ellipsoid_map import (
+    CamerasOfFrames,
+    EllipsoidMap,
+    overlap_within_reach,
+    rows_of,
+    spans_of_boxes,
+)  # fmt: skip
 from reobj.types import (
     COCO_NAMES,
     Array,

@@ -35,7 +35,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 CORE = (
-    "reobj_track.py", "quadrics.py", "reobj/frame_lookup.py", "reobj/identity/*.py",
+    "reobj_track.py", "quadrics.py", "reobj/frame_lookup.py", "reobj/appearance/*.py",
+    "reobj/objects/*.py", "reobj/tracking/*.py",
     "reobj/poses/matching.py", "reobj/poses/readers.py", "reobj/poses/pose_*.py",
     "reobj/poses/colmap_model.py", "reobj/poses/evidence.py", "reobj/results/overlay.py",
     "reobj/results/evaluation.py", "reobj/sources/*.py",

@@ -62,12 +62,12 @@ from synthetic_quadrics import table, write_table
 
 import quadrics
 import reobj_track as rt
-from reobj.objects import DOUBTFUL
-from reobj.parts import link_and_fit
+from reobj.objects.description import DOUBTFUL
+from reobj.objects.fit import link_and_fit
+from reobj.objects.observations import Views
 from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
 from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
-from reobj.views import Views
 
 ROOM = Path(__file__).resolve().parent / "room"
 YOLO, FEMTO, RECORDED = "detections_yolov8s.csv", "detections_femto.csv", "detections.npz"
@@ -150,7 +150,7 @@ def untracked(rows: rt.Tracks) -> BoolArray:
 
 
 # What can be left out, by name: values and functions that take the place of others meanwhile.
-EVIDENCE, ASSOCIATION = "reobj.identity.evidence", "reobj.identity.association"
+EVIDENCE, ASSOCIATION = "reobj.objects.likelihood", "reobj.objects.association"
 WITHOUT: dict[str, dict[str, Any]] = {
     "hidden edges": {f"{EVIDENCE}.HIDDEN": 0.0},
     "hidden edges in the fit": {
@@ -158,23 +158,26 @@ WITHOUT: dict[str, dict[str, Any]] = {
         "quadrics.HUBER_HIDDEN": quadrics.HUBER,
         "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
     },
-    "edges behind nearer things": {"reobj.identity.occlusion._behind_nearer": all_visible},
-    "edges above the floor": {"reobj.identity.occlusion.ABOVE": np.inf},
+    "edges behind nearer things": {"reobj.objects.occlusion._behind_nearer": all_visible},
+    "edges above the floor": {"reobj.objects.occlusion.ABOVE": np.inf},
     "widening": {f"{ASSOCIATION}.WIDENED": 0},
     "limit of a box": {f"{EVIDENCE}.MAX_BOX_LOG_ODDS": 8.0},
     "classes": {f"{EVIDENCE}.CLASS_KEPT": 0.0},
-    "sizes": {"reobj.identity.locate.SIZE_SIGMAS": 0.0},
+    "sizes": {"reobj.objects.component.SIZE_SIGMAS": 0.0},
     "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
     "tracklets": {f"{ASSOCIATION}.KEPT_TRACKLET": 0.0},
-    "untracked detections": {"reobj.identity.locate._doubles": untracked},
+    "untracked detections": {"reobj.objects.component._doubles": untracked},
     "clear detections in refits": {f"{ASSOCIATION}.CLEARLY": -1e3},
     "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
     "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
-    "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
-    "floor": {"reobj.identity.locate.floor_under": nothing, "reobj.parts.floor_under": nothing},
-    "proposals of untracked": {"reobj.identity.locate.PROPOSING_SCORE": np.inf},
-    "points in the fit": {"reobj.parts.points_on": nothing},
-    "seen through": {"reobj.identity.locate.seen_through": never_seen_through},
+    "distances along rays": {"reobj.objects.hypotheses.DISTANCES": np.empty(0)},
+    "floor": {
+        "reobj.objects.component.floor_under": nothing,
+        "reobj.objects.fit.floor_under": nothing,
+    },
+    "proposals of untracked": {"reobj.objects.component.PROPOSING_SCORE": np.inf},
+    "points in the fit": {"reobj.objects.fit.points_on": nothing},
+    "seen through": {"reobj.objects.component.seen_through": never_seen_through},
 }
 
 

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
-from reobj.objects import MIN_SCORE, describe_objects, describe_world, fitter
-from reobj.parts import link_and_fit
+from reobj.objects.description import MIN_SCORE, describe_objects, describe_world, fitter
+from reobj.objects.fit import link_and_fit
+from reobj.objects.observations import gather_views
 from reobj.results.result import VideoInfo
 from reobj.types import object_classes
-from reobj.views import gather_views
 
 SIZE = (640, 480)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))

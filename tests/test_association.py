@@ -11,22 +11,23 @@ from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity import association, evidence
-from reobj.identity import locate as locating
-from reobj.identity.association import Association, Associator
-from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
-from reobj.identity.gaps import fill_by_place
-from reobj.identity.locate import (
+from reobj.objects import association
+from reobj.objects import component as locating
+from reobj.objects import likelihood as evidence
+from reobj.objects.association import Association, Associator
+from reobj.objects.component import (
     USUAL_SHARE,
     Categories,
     confidence,
     locate,
     log_best_odds,
 )
-from reobj.identity.proposals import propose
-from reobj.objects import fitter
+from reobj.objects.description import fitter
+from reobj.objects.hypotheses import propose
+from reobj.objects.likelihood import EXPECTED, Detected, Solids, gather_evidence
+from reobj.objects.observations import Scene, Views, gather_views
+from reobj.tracking.interpolation import fill_by_place
 from reobj.types import class_shares
-from reobj.views import Scene, Views, gather_views
 
 
 def chairs() -> Solids:
@@ -550,7 +551,7 @@ def test_where_no_frame_should_show_a_thing_the_share_is_the_usual_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Every view cuts a large table: that it is never missed does not speak against it."""
-    monkeypatch.setattr("reobj.identity.evidence.EXPECTED", 2.0)
+    monkeypatch.setattr("reobj.objects.likelihood.EXPECTED", 2.0)
     poses, priors = walk(), quadrics.load_priors()
     table = table_of(poses)
     found = locate(table, NAMES, poses, fitter(rt.ObjectsConfig(), poses, NAMES), priors)

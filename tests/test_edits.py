@@ -14,9 +14,9 @@ from simulated import SIZE, tracks_of, unlinked, walk, with_columns
 
 import quadrics
 import reobj_track as rt
-from reobj import parts
-from reobj.identity.occlusion import hidden_edges
-from reobj.parts import link_and_fit
+from reobj.objects import fit as fitting
+from reobj.objects.fit import link_and_fit
+from reobj.objects.occlusion import hidden_edges
 from reobj.results.edits import EDITS, apply_edits, kept_edits, read_edits
 from reobj.results.workspace import Workspace
 
@@ -310,7 +310,7 @@ def test_solids_of_merged_objects_hide_nothing(
         asked.append(ellipsoids)
         return hidden_edges(views, ellipsoids, on_floor)
 
-    monkeypatch.setattr(parts, "hidden_edges", noted)
+    monkeypatch.setattr(fitting, "hidden_edges", noted)
     plain = unlinked(poses, tracks)
     link_and_fit(plain, rt.ObjectsConfig())
     assert np.isfinite(asked[-1].half_axes).all() and len(asked[-1]) == 3  # all known to begin with

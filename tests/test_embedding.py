@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.identity.embedding import (
+from reobj.appearance.embedding import (
     Backbone,
     LazyEmbeddings,
     as_embeddings,

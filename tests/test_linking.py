@@ -10,9 +10,9 @@ from simulated import looking_at
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.linking import FRAGMENT_GAP, cut_at_gaps, link
-from reobj.identity.locate import locate
-from reobj.objects import fitter
+from reobj.objects.component import locate
+from reobj.objects.description import fitter
+from reobj.tracking.linking import FRAGMENT_GAP, cut_at_gaps, link
 
 SIZE = (640, 480)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))

@@ -12,10 +12,16 @@ from scipy.spatial.transform import Rotation
 from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
-import reobj.objects
+import reobj.objects.description
 import reobj_track as rt
-from reobj.objects import describe_objects, describe_world, fitter, parse_known_size, parse_up
-from reobj.views import Views, gather_views
+from reobj.objects.description import (
+    describe_objects,
+    describe_world,
+    fitter,
+    parse_known_size,
+    parse_up,
+)
+from reobj.objects.observations import Views, gather_views
 
 
 def options(**changes: object) -> rt.ObjectsConfig:
@@ -337,10 +343,10 @@ def test_what_is_less_likely_there_than_not_is_doubtful(sure: float, status: str
     """It keeps its solid, but it is neither located nor counted; without a solid it says why."""
     poses = walk(40)
     result = fitted(tracks_of(poses), poses, options())
-    found = reobj.objects._with_confidence(result.objects[0], sure)
+    found = reobj.objects.description._with_confidence(result.objects[0], sure)
     assert (found.status, found.located) == (status, status == "ok")
     assert found.center is not None and found.confidence == sure
     none = dataclasses.replace(result.objects[0], status="rejected", reason="too few", center=None)
-    found = reobj.objects._with_confidence(none, sure)
+    found = reobj.objects.description._with_confidence(none, sure)
     assert found.status == ("rejected" if status == "ok" else "doubtful")
     assert "too few" in found.reason

@@ -10,9 +10,9 @@ from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.occlusion import hidden_edges, seen_through
-from reobj.objects import fitter
-from reobj.views import Views, gather_views
+from reobj.objects.description import fitter
+from reobj.objects.observations import Views, gather_views
+from reobj.objects.occlusion import hidden_edges, seen_through
 
 LEFT, UPPER, RIGHT, LOWER = range(4)
 ELSEWHERE = np.array([False, False])  # neither stands on the floor

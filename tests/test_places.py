@@ -9,7 +9,7 @@ from simulated import SIZE, chair_solids, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.places import (
+from reobj.tracking.ellipsoid_map import (
     EllipsoidMap,
     VisiblePoints,
     overlap_within_reach,

@@ -11,8 +11,8 @@ import synthetic_quadrics as syn
 from simulated import tracks_of, unlinked, walk
 
 import quadrics as q
-from reobj.objects import ObjectsConfig, check_known_size, unused_sizes
-from reobj.parts import link_and_fit
+from reobj.objects.description import ObjectsConfig, check_known_size, unused_sizes
+from reobj.objects.fit import link_and_fit
 from reobj.results.edits import read_edits
 
 UP = (0.0, 0.0, 1.0)

@@ -12,10 +12,10 @@ import pytest
 from simulated import unlinked, walk
 
 import reobj_track as rt
-from reobj.identity.gaps import fill_gaps
-from reobj.parts import link_and_fit
+from reobj.objects.fit import link_and_fit
 from reobj.sources.detectors import DetectionCache, as_source
 from reobj.sources.looked import frames_looked_at
+from reobj.tracking.interpolation import fill_gaps
 
 TABLE, CHAIR = 60, 56
 FRAMES = 60

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from reobj.appearance.reid import SimilarityCalibration, paired_cosine
 from reobj.cameras import Poses, angle_deg, place_of, undistort_boxes, viewing_rays
-from reobj.identity.reid import SimilarityCalibration, paired_cosine
 from reobj.types import (
     Array,
     BoolArray,

@@ -12,10 +12,10 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, triangulate_rays
-from reobj.objects import MIN_SCORE, OURS, ObjectsConfig, describe_objects, name_of
+from reobj.objects.description import MIN_SCORE, OURS, ObjectsConfig, describe_objects, name_of
+from reobj.objects.observations import Views, gather_views
 from reobj.results.result import Object, Result
 from reobj.types import Array, BoolArray, object_classes
-from reobj.views import Views, gather_views
 
 NO_SCALE = quadrics.Scale(1.0, 0.0, "none")
 # views, their cameras, categories -> ellipsoids of the G groups (NaN: none), why others have none

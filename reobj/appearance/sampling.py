@@ -1,7 +1,7 @@
 """Where a feature map is sampled for the foreground and the background of detections.
 
 `sample_parts` places the samples of both parts on the map, `pool_cells` averages them to cells. No
-network here: the map comes from `reobj.identity.embedding`.
+network here: the map comes from `reobj.appearance.embedding`.
 
 Axes: D detections of a frame, M foregrounds, N backgrounds, K cells of S samples each, L = K * S.
 """

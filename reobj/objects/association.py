@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from reobj.identity.evidence import MIN_LOG_ODDS, Detected, Evidence, Solids, gather_evidence
+from reobj.objects.likelihood import MIN_LOG_ODDS, Detected, Evidence, Solids, gather_evidence
 from reobj.types import Array, BoolArray, IntArray
 
 # Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).

@@ -18,11 +18,11 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
 from reobj.files import did_you_mean, load_json, numbers, rounded, shortened
-from reobj.identity.evidence import CLASS_KEPT
+from reobj.objects.likelihood import CLASS_KEPT
+from reobj.objects.observations import NOTHING_KNOWN, Fit, Scene, Views
 from reobj.poses.floor import floor_of
 from reobj.results.result import Object, Part, World, significant
 from reobj.types import Array, LinkEvent, ReobjError, Tracks, object_classes, option, rows_by
-from reobj.views import NOTHING_KNOWN, Fit, Scene, Views
 
 OURS, PUBLISHED = "solids", ("lfd", "sfmo", "psfmo")  # solvers
 

@@ -1,8 +1,8 @@
 """Appearance of detections: foreground and background embeddings from one feature map a frame.
 
 `Embedder` computes them, `LazyEmbeddings` only for the detections that are asked for. Where the map
-is sampled is of `reobj.identity.sampling`, the same from two crops of every object, as in the
-paper, of `reobj.identity.crops`, and who is whom of `reobj.identity.reid`.
+is sampled is of `reobj.appearance.sampling`, the same from two crops of every object, as in the
+paper, of `reobj.appearance.crops`, and who is whom of `reobj.appearance.reid`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reobj.identity.sampling import SamplingLayout, occupancy_map, pool_cells, sample_parts
+from reobj.appearance.sampling import SamplingLayout, occupancy_map, pool_cells, sample_parts
 from reobj.sources.video import resized
 from reobj.sources.weights import (
     IMAGENET_MEAN,

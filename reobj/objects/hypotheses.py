@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 import quadrics
-from reobj.identity.evidence import NO_SOLIDS, Solids
+from reobj.objects.likelihood import NO_SOLIDS, Solids
+from reobj.objects.observations import Views
 from reobj.types import Array, BoolArray, IntArray
-from reobj.views import Views
 
 # Distances that are tried, over that at which a box shows a thing of the usual size of its class:
 # nearer where a part is hidden (chosen; a step of a fifth is less than a chair's depth at 3 m)

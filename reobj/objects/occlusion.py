@@ -12,8 +12,8 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, invert_rigid, place_of
+from reobj.objects.observations import Views, VisiblePoints
 from reobj.types import Array, BoolArray, IntArray
-from reobj.views import Views, VisiblePoints
 
 EDGE_POINTS = (np.arange(8) + 0.5) / 8  # along an edge (chosen)
 # Sizes of the box outside its edge, where something nearer must be, and inside, where it must not

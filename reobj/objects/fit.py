@@ -17,9 +17,7 @@ import numpy as np
 import quadrics
 from reobj.cameras import Poses, place_of
 from reobj.files import shortened
-from reobj.identity.gaps import fill_by_place, fill_gaps
-from reobj.identity.linking import FRAGMENT_GAP, link
-from reobj.identity.locate import (
+from reobj.objects.component import (
     Located,
     confidence,
     floor_under,
@@ -27,8 +25,7 @@ from reobj.identity.locate import (
     log_best_odds,
     on_floor,
 )
-from reobj.identity.occlusion import hidden_edges
-from reobj.objects import (
+from reobj.objects.description import (
     MIN_SCORE,
     ObjectsConfig,
     describe_objects,
@@ -36,8 +33,12 @@ from reobj.objects import (
     fitter,
     name_of,
 )
+from reobj.objects.observations import NOTHING_KNOWN, Fit, Scene, gather_views, points_on
+from reobj.objects.occlusion import hidden_edges
 from reobj.results.edits import Edits, apply_edits
 from reobj.results.result import Result
+from reobj.tracking.interpolation import fill_by_place, fill_gaps
+from reobj.tracking.linking import FRAGMENT_GAP, link
 from reobj.types import (
     BoolArray,
     Embeddings,
@@ -49,7 +50,6 @@ from reobj.types import (
     object_classes,
     rows_by,
 )
-from reobj.views import NOTHING_KNOWN, Fit, Scene, gather_views, points_on
 
 
 def link_and_fit(result: Result, config: ObjectsConfig) -> None:

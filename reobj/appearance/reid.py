@@ -1,8 +1,7 @@
-"""Re-identification: what identities looked like, and what a similarity means.
+"""Re-identification by appearance: a gallery of each identity, and calibrated similarities.
 
 `Gallery` keeps a few views of every identity, `SimilarityCalibration` turns cosines into log odds,
-and `match_probability` sets these against rivals. Where identities are is of
-`reobj.identity.places`; which detection takes which identity the tracker and the linker decide.
+and `match_probability` compares these with the best rival.
 
 Axes: I identities, K views of an identity in the gallery, E width of an embedding.
 """

@@ -1,7 +1,7 @@
 """Appearance in the style of re-OBJ: embeddings from two masked crops of every object.
 
-`CropEmbedder` has the interface of `Embedder` (`reobj.identity.embedding`), which needs one pass a
-frame instead of two crops an object; `make_embedder` makes whichever a configuration names.
+`CropEmbedder` has the interface of `Embedder` (`reobj.appearance.embedding`), which needs one pass
+per frame instead of two crops per object. `make_embedder` builds the one that a config names.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from reobj.identity.embedding import Embedder, trained_head
-from reobj.identity.sampling import (
+from reobj.appearance.embedding import Embedder, trained_head
+from reobj.appearance.sampling import (
     SamplingLayout,
     inside_object,
     occupancy_map,

@@ -1,7 +1,7 @@
 """Objects of a part of the path by their place: the association, from tables and back.
 
 `locate` takes all detections, those in tracklets and those in none, and says which are of one
-solid. What moves, and what no solid explains, is left to appearance (`reobj.identity.linking`).
+solid. What moves, and what no solid explains, is left to appearance (`reobj.tracking.linking`).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Poses, undistort_boxes
-from reobj.identity.association import Association, Associator, Refit
-from reobj.identity.evidence import NO_SOLIDS, Detected, Solids, logit
-from reobj.identity.linking import cut_at_gaps
-from reobj.identity.occlusion import edges_above_floor, seen_through
-from reobj.identity.proposals import propose, propose_along_rays
+from reobj.objects.association import Association, Associator, Refit
+from reobj.objects.hypotheses import propose, propose_along_rays
+from reobj.objects.likelihood import NO_SOLIDS, Detected, Solids, logit
+from reobj.objects.observations import Fit, Scene, Views, gather_views
+from reobj.objects.occlusion import edges_above_floor, seen_through
 from reobj.poses.floor import floor_of
+from reobj.tracking.linking import cut_at_gaps
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
-from reobj.views import Fit, Scene, Views, gather_views
 
 # Log odds that an object is there: constant, by the log odds of its best scores, by the share of
 # the frames that should show it and do, by how much is seen behind it through its middle
