@@ -114,13 +114,14 @@ from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
 from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
+from reobj.tracking.box_noise import STD_MEASURE, STD_POSITION, STD_START, STD_VELOCITY
 from reobj.tracking.camera_motion import CameraMotion
 from reobj.tracking.ellipsoid_map import (
-    CamerasOfFrames,
+    CameraInputs,
     EllipsoidMap,
-    overlap_within_reach,
+    iou_within_uncertainty,
     rows_of,
-    spans_of_boxes,
+    depth_intervals,
 )  # fmt: skip
 from reobj.types import (
     COCO_NAMES,
@@ -178,10 +179,10 @@ class TrackerConfig:
     )
     remember: bool = option(True, "recognise objects that return, however long they were away")
     std_position: float = option(
-        0.05, "process noise of a position, over the box size; more for jerky cameras"
+        STD_POSITION, "process noise of a position, over the box size; more for jerky cameras"
     )
     std_velocity: float = option(
-        1 / 80, "process noise of a velocity, over the box size; more for jerky cameras"
+        STD_VELOCITY, "process noise of a velocity, over the box size; more for jerky cameras"
     )
     appearance_weight: float = option(0.7, "share of appearance in the cost of ambiguous matches")
     foreground_weight: float = option(
@@ -233,11 +234,10 @@ class Config:
 
 # ---- Kalman filter -----------------------------------------------------------------------------
 
-# Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h.
-STD_MEASURE = 0.05  # of a measured box at score .8 (DeepSORT: 1/20)
+# Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h
+# (`STD_MEASURE` of `reobj.tracking.box_noise` holds at score .8).
 SCORE_NOISE = 0.25  # it grows with (1 - score) to this power (StrongSORT: 1)
 ORDINARY_SCORE = 0.5  # of a detection that counts once for `n_init` (default of `new_score`)
-STD_START = 0.2  # of a new track's velocity (DeepSORT: 1/16; SORT: wide)
 
 
 def kalman_predict(mean: Array, cov: Array, config: TrackerConfig) -> tuple[Array, Array]:
@@ -599,11 +599,11 @@ class Tracker:
         inside = np.isfinite(self.places.project(view, size, PLACE_IN_VIEW)[:, 0])  # (I,)
         in_view = ~known | rows_of(inside, state.identity, False)
         tracked = (state.identity, state.ends, state.size, K, size)
-        now, reach = self.places.tracks_seen(cam_from_world, *tracked)
+        now, reach = self.places.project_tracks(cam_from_world, *tracked)
         located = known | np.isfinite(state.ends[:, 0, 0])
         followed = np.zeros(len(known), bool)
         if last is not None:
-            before, reach_before = self.places.tracks_seen(last, *tracked)
+            before, reach_before = self.places.project_tracks(last, *tracked)
             followed = (state.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
             shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
             moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
@@ -628,7 +628,7 @@ class Tracker:
         state = self.state
         rows = np.flatnonzero(track_of >= 0)
         rows = rows[~rows_of(self.places.known, state.identity[track_of[rows]], False)]
-        spans = spans_of_boxes(detections.xyxy[rows], points, pose, K)
+        spans = depth_intervals(detections.xyxy[rows], points, pose, K)
         state.ends[track_of[rows]], state.size[track_of[rows]] = spans
 
     def _add_views(self, confirmed: Tracks, view: Array) -> None:
@@ -678,7 +678,7 @@ class Tracker:
         gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
         t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
         track, seen, reach = track.take(t, 1), box.T.take(d, 1), reach.take(t, 1)  # (4, M) ...
-        iou, share = overlap_within_reach(track, reach, seen)
+        iou, share = iou_within_uncertainty(track, reach, seen)
         distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1)) / GATE_CHI2
         overlap = iou * share
         same_class = state.votes.argmax(1)[t] == detections.class_id[d]
@@ -743,7 +743,7 @@ class Tracker:
         against, cost = np.zeros(len(cost), bool), cost.copy()
         cost[some] = (1 - weight) * cost[some] + weight * unlike
         overlap = pairs.iou[some] - CLASS_COST * ~pairs.same_class[some]
-        evidence = pairs.share[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
+        evidence = pairs.overlap_weight[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
         against[some] = known & (logit + evidence < 0)
         return cost, against
 
@@ -1010,7 +1010,7 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    cameras = CamerasOfFrames(poses, video.scale)
+    cameras = CameraInputs(poses, video.scale)
     looked = True if source.always_looks else None
     ahead = tracker.config.camera_motion and video.has_images and not video.is_live
     for frame in tracker._camera_motion.ahead(video) if ahead else video:

@@ -26,7 +26,7 @@ from reobj.objects.description import fitter
 from reobj.objects.hypotheses import propose
 from reobj.objects.likelihood import EXPECTED, Detected, Solids, gather_evidence
 from reobj.objects.observations import Scene, Views, gather_views
-from reobj.tracking.interpolation import fill_by_place
+from reobj.tracking.interpolation import fill_from_objects
 from reobj.types import class_shares
 
 
@@ -585,7 +585,7 @@ def test_frames_are_filled_by_the_solid() -> None:
     poses = walk(60)
     table = table_of(poses)
     seen = (table.detection_index != 0) | (table.frame < 28) | (table.frame >= 33)
-    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), chair_solids(), ["box"] * 3)
+    filled = fill_from_objects(table[seen], poses, np.array([1, 2, 3]), chair_solids(), ["box"] * 3)
     made = filled[filled.score == 0]
     true = table[~seen]
     np.testing.assert_array_equal(made.frame, true.frame)
@@ -605,13 +605,13 @@ def test_frames_are_filled_only_from_where_it_was_seen() -> None:
     angle = np.degrees(np.arccos((ray @ ray[30] / length / length[30]).clip(-1, 1)))
     near = (angle < 10) & (np.abs(np.log(length / length[30])) < np.log(1.25))
     assert 5 < near.sum() < 40  # the walk sees it from farther aside too
-    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3)
+    filled = fill_from_objects(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3)
     assert filled.frame[filled.score == 0].tolist() == [f for f in np.flatnonzero(near) if f != 30]
     own = table.detection_index[seen] == 0
     for shift, explained in (([0, 0, 0, -0.4], True), ([0.3, 0, 0.3, 0], False)):  # hidden; beside
         moved = shifted(table[seen], np.where(own[:, None], shift, 0.0))
-        again = fill_by_place(moved, poses, np.array([1, 2, 3]), solids, ["box"] * 3)
+        again = fill_from_objects(moved, poses, np.array([1, 2, 3]), solids, ["box"] * 3)
         assert ((again.score == 0).sum() == (filled.score == 0).sum()) == explained
         assert explained or len(again) == len(moved)
     never = table[seen & (table.detection_index != 0)]  # no detection, nothing to fill from
-    assert len(fill_by_place(never, poses, np.array([1]), solids[:1], ["box"])) == len(never)
+    assert len(fill_from_objects(never, poses, np.array([1]), solids[:1], ["box"])) == len(never)

@@ -83,7 +83,7 @@ def linked(
         return link(table, NAMES, *seen, None, moving=moving)
     fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
     found = locate(table, NAMES, poses, fit, priors, moving)
-    return link(table, NAMES, *seen, poses, moving=moving, solid=found.solid, overlap=found.overlap)
+    return link(table, NAMES, *seen, poses, moving=moving, label=found.label, iou=found.iou)
 
 
 def kinds(events: list[rt.LinkEvent], kept: bool = True) -> set[str]:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json, read_lines
-from reobj.objects.observations import VisiblePoints
+from reobj.visible_points import VisiblePoints
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError
 
