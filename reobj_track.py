@@ -69,17 +69,21 @@ from reobj.appearance.sampling import SamplingLayout
 from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
 from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
 from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
-from reobj.objects.description import (
-    ObjectsConfig,
+from reobj.objects.config import ObjectsConfig
+from reobj.objects.description import components_message
+from reobj.objects.fit import fill, link_and_fit
+from reobj.objects.published import solve_again
+from reobj.options import (
     check_known_size,
+    check_shape,
+    config_from_args,
+    load_size_priors,
     parse_known_size,
     parse_up,
-    size_priors,
+    read_config,
     unused_sizes,
+    write_config,
 )
-from reobj.objects.fit import fill, link_and_fit, parts_message
-from reobj.objects.published import solve_again
-from reobj.options import config_from_args, read_config, write_config
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
 from reobj.poses.readers import read_poses
@@ -119,9 +123,9 @@ from reobj.tracking.camera_motion import CameraMotion
 from reobj.tracking.ellipsoid_map import (
     CameraInputs,
     EllipsoidMap,
+    depth_intervals,
     iou_within_uncertainty,
     rows_of,
-    depth_intervals,
 )  # fmt: skip
 from reobj.types import (
     COCO_NAMES,
@@ -1072,7 +1076,7 @@ def run(
                 found, boxes = detect_all(found, video, workspace)
                 seconds["detect"] = time.monotonic() - started
             names = tuple(found.class_names)
-        check_known_size(config.objects, names)
+        check_known_size(config.objects.known_size, config.objects.priors, names)
         model = None
         started = time.monotonic()
         if readings:
@@ -1113,7 +1117,8 @@ def refit(
         result.edits = read_edits(edits) if edits else None
         config = dataclasses.replace(config or _last_config(out), input=video.config)
         _check_objects(config.objects)
-        check_known_size(config.objects, result.class_names)
+        size, priors = config.objects.known_size, config.objects.priors
+        check_known_size(size, priors, result.class_names)
         if tracks:
             poses = result.poses
             result = _given_tracks(tracks, video, config.detect, result)
@@ -1124,11 +1129,10 @@ def refit(
 
 def _check_objects(config: ObjectsConfig) -> None:
     """Refuse what the fit could not use, before minutes are spent on what comes first."""
-    size_priors(config)
+    load_size_priors(config.priors)
     if config.up:
         parse_up(config.up)
-    if config.support not in (kinds := ("auto", *quadrics.SUPPORTS)):
-        raise ReobjError(f"--support {config.support}: expected one of {', '.join(kinds)}")
+    check_shape(config.support)
     parse_known_size(config.known_size)
 
 
@@ -1198,18 +1202,19 @@ def _finish(
     started, poses = time.monotonic(), result.poses
     result.edits = result.edits or kept_edits(workspace.out)
     with Progress("objects"):
-        link_and_fit(result, config.objects)
+        result = link_and_fit(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
     filled = fill(result, video.size, gap)  # by our own solids, whatever solver is asked for
-    solve_again(result, config.objects)
+    result = solve_again(result, config.objects)
     result.tracks, result.out = filled, workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
     result.embedding_row = detected[result.embedding_row]
     result.seconds["objects"] = time.monotonic() - started
-    result.warnings += [] if poses is None else [*poses.messages, *parts_message(poses)]
+    result.warnings += [] if poses is None else [*poses.messages, *components_message(poses)]
     scores = (config.tracker.high_score, config.objects.moving_classes, config.tracker.new_score)
     result.warnings += implausible(result, *scores)
-    result.warnings += unused_sizes(config.objects, result.objects)
+    located = [o.class_name for o in result.located]
+    result.warnings += unused_sizes(config.objects.known_size, config.objects.priors, located)
     started = time.monotonic()
     shown, models = config.output, workspace.last_models()
 
@@ -1265,7 +1270,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
             write_supplied_model(poses, video, new)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
-    for message in (*video.messages, *poses.messages, *parts_message(poses)):
+    for message in (*video.messages, *poses.messages, *components_message(poses)):
         log.warning(message)
     return 0
 

@@ -25,7 +25,7 @@ from pose_worlds import arc
 from scipy.spatial.transform import Rotation
 
 import quadrics
-import reobj.objects.description
+import reobj.objects.confidence
 import reobj.poses.estimate as estimate
 import reobj.poses.mapping as mapping
 import reobj.poses.stage as stage
@@ -992,7 +992,7 @@ def _(lab: Lab) -> None:
     """Nothing is likelier than 1.1: all are in the file and the page; in the film if asked for."""
     for value, count in ((False, 0), (True, 2)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(reobj.objects.description, "DOUBTFUL", 1.1)
+            patch.setattr(reobj.objects.confidence, "LOW_CONFIDENCE", 1.1)
             shown = Mock(return_value=[])
             patch.setattr(rt, "write_pictures", shown)
             assert {found.status for found in lab.refit(value).objects} == {"doubtful"}

@@ -11,12 +11,12 @@ import quadrics
 import reobj_track as rt
 from reobj.tracking.ellipsoid_map import (
     EllipsoidMap,
+    depth_intervals,
     iou_within_uncertainty,
-    project_half_intervals,
     project_depth_intervals,
+    project_half_intervals,
     quick_fit,
     rough_sizes,
-    depth_intervals,
     usual_size,
 )
 from reobj.types import box_iou, xyxy_from_cxcywh
@@ -208,10 +208,12 @@ def test_the_points_in_a_box_tell_how_far_away_its_thing_is() -> None:
     np.testing.assert_allclose(size[0], 60 / 500 * 4, rtol=0.06)
     there = project_depth_intervals(ends, size, CAMERA.K, EYE)
     np.testing.assert_allclose(xyxy_from_cxcywh(there), boxes, atol=1e-6)
-    assert np.abs(project_half_intervals(ends, CAMERA.K @ EYE)).max() < 1e-6  # on the rays of this view
+    half = project_half_intervals(ends, CAMERA.K @ EYE)
+    assert np.abs(half).max() < 1e-6  # on the rays of this view
     aside = np.c_[np.eye(3), [-1.0, 0, 0]]  # a metre to the right: 125 px at 4 m
     moved = project_depth_intervals(ends, size, CAMERA.K, aside)[0, 0] - there[0, 0]
-    assert abs(moved + 125) < 6 and 2 < abs(project_half_intervals(ends, CAMERA.K @ aside)[0, 0]) < 12
+    half = project_half_intervals(ends, CAMERA.K @ aside)
+    assert abs(moved + 125) < 6 and 2 < abs(half[0, 0]) < 12
     nothing, _ = depth_intervals(boxes, np.empty((0, 3)), EYE, CAMERA.K)
     assert np.isnan(nothing).all()
     behind = np.c_[np.eye(3), [0, 0, -20.0]]

@@ -793,7 +793,7 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
         (("--known-size", "chair=9999m"), "cm or mm, from 0.001 to 1000 m, such as door=2.0m"),
         (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm or mm"),
         (("--priors", ROOT / "README.md"), "README.md, line 1: not valid JSON"),
-        (("--support", "cube"), "--support cube: expected one of auto, ellipsoid"),
+        (("--support", "cube"), "--shape cube: expected one of auto, ellipsoid"),
         (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
         (("--set", "tracker.return_probability=nan"), "expected =FLOAT, finite, 0 or more"),
     ],

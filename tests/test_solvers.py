@@ -47,9 +47,7 @@ def recorded(shift: float = 0.0, mirror: int = 1) -> rt.Result:
 
 def solved(result: rt.Result, **options: object) -> rt.Result:
     config = rt.ObjectsConfig(support="ellipsoid", **options)  # type: ignore[arg-type]
-    link_and_fit(result, config)
-    solve_again(result, config)
-    return result
+    return solve_again(link_and_fit(result, config), config)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +92,7 @@ def test_the_solvers_differ() -> None:
 def test_sfmo_of_three_objects_says_what_it_needs() -> None:
     result = recorded()
     result.tracks = result.tracks[result.tracks.track_id <= 3]
-    solved(result, solver="sfmo")
+    result = solved(result, solver="sfmo")
     assert {o.status for o in result.objects} == {"rejected"}
     assert {o.reason for o in result.objects} == {
         "SfMO: needs 3 frames that show the same 4 objects"

@@ -1,17 +1,17 @@
-"""Which detection is of which object: objects and their detections found in turn.
+"""Association: jointly estimate the objects, their shapes and the detection-to-object assignment.
 
-Objects are solids. Which detection is of which solid, where the solids are, and which of them exist
-is decided by log odds (`evidence`): of every detection with its solid, against every frame that
-should show a solid and does not, and against every solid.
+The objective is a sum of log odds (`likelihood`): of every detection with its object, against every
+frame that should show an object and does not, and against every object. It is maximised by
+alternating steps.
 
- 1. pursue   from many proposed solids choose those that explain most of what is not yet explained
-             (in a frame one detection speaks for a solid; others that it explains as well cost
-             nothing: detectors box parts, and things twice)
- 2. assign   in every frame each detection to at most one solid and back; tracklets stay together
- 3. refit    each solid to the detections that are clearly its own
- 4. thin     drop solids that bring less than they cost, as others explain their detections too
- 5. merge    two solids where one explains the detections of both
- 6. widen    refit, but boxes that end above the floor do not tell how wide a thing is
+ 1. select   greedily from many hypotheses those that explain most of what is not yet explained
+             (at most one detection per frame counts for an object; further overlapping ones are
+             free, since detectors emit duplicates and boxes of object parts)
+ 2. assign   in every frame each detection to at most one object and back; tracklets stay together
+ 3. refit    each shape to its unambiguous detections
+ 4. prune    objects with negative marginal gain, as others take over their detections
+ 5. merge    two objects if one explains the detections of both
+ 6. widen    refit, ignoring the unreliable edges of boxes that end above the floor
 """
 
 from __future__ import annotations
@@ -24,306 +24,337 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from reobj.objects.likelihood import MIN_LOG_ODDS, Detected, Evidence, Solids, gather_evidence
+from reobj.objects.likelihood import (
+    MIN_LOG_ODDS,
+    Evidence,
+    PosedDetections,
+    Shapes,
+    gather_evidence,
+)
 from reobj.types import Array, BoolArray, IntArray
 
 # Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).
-MISSED = 0.5  # against a solid, for each frame that should show it and has no detection of it
-NEW_SOLID = 10.0  # against each solid: three frames and more must speak for it
-# What a better box may add in step 1, so that no compromise between two things comes first
-PURSUED_CHOICE = 1.5
-# A detection tells where its solid is if that explains it so much better than others do (chosen:
-# 1 and 4 gain less, docs/trials.md)
-CLEARLY = 2.0
-KEPT_TRACKLET = 2.5  # for the solid of the detection before or after in the tracklet
-MERGE_REACH = 1.5  # merge only solids whose centres are nearer than so many mean half widths
-# Half extents of a solid, along its axes; what has its centre nearer to its own is the same thing
-# or a part of it, whatever else speaks for two (chosen; .4 to .6 are alike but for deimv2-femto)
-COINCIDE = 0.5
-ALIKE = float(np.log(1.4))  # of mean sizes; if so, also where the classes differ (laptop and tv)
-MIN_DETECTIONS = 3  # of a solid; fewer do not determine it
+MISSED = 0.5  # against an object, for each frame in which it is expected and not detected
+NEW_OBJECT = 10.0  # against each object: at least three frames must support it
+# Largest gain by a better box in step 1: else a compromise between two objects is selected first
+MAX_BOX_GAIN = 1.5
+# Log-odds margin over the runner-up that a detection needs to take part in refitting (chosen: 1 and
+# 4 gain less, docs/trials.md)
+UNAMBIGUOUS_MARGIN = 2.0
+SAME_TRACKLET = 2.5  # for the object of the previous or next detection of the tracklet
+MERGE_DISTANCE = 1.5  # largest distance of centres to merge, over the sum of the mean half widths
+# Half extents of an object, along its axes; one with its centre nearer than this is a duplicate or
+# a part of it, whatever the evidence for two (chosen; .4 to .6 are alike but for deimv2-femto)
+SAME_POSITION = 0.5
+SIMILAR_SIZE = float(np.log(1.4))  # of mean sizes; then classes may differ (laptop and tv)
+MIN_DETECTIONS = 3  # of an object; fewer do not determine it
 MAX_ROUNDS = 10  # of steps 2 to 5 (chosen)
-WIDENED = 2  # rounds of step 6 (chosen)
+WIDENING_ROUNDS = 2  # of step 6 (chosen)
 
-# detections (K,), the solid of each (K,), the classes (S,) of the solids, and the solids so far if
-# edges of boxes may be hidden by the floor's place (else None) -> S solids
-Refit = Callable[[IntArray, IntArray, IntArray, Solids | None], Solids]
-SizeLogOdds = Callable[[Solids], Array]  # (S,) of the sizes by the categories
+# detections (K,), the object of each (K,), the classes (O,) of the objects, their current shapes if
+# box edges above the floor are to be ignored (else None) -> O shapes
+FitShapes = Callable[[IntArray, IntArray, IntArray, Shapes | None], Shapes]
+SizeLogOdds = Callable[[Shapes], Array]  # (O,) of the sizes by the categories
 
 
 @dataclass(frozen=True, slots=True)
 class Association:
-    """Solids and the detections that show them.
+    """Objects and the detections assigned to them.
 
     Attributes:
-        solids: S. owner: (N,) solid of each detection, or -1. evidence: of these solids.
-        size_log_odds: (S,) by the categories.
+        shapes: of O objects. label: (N,) object of each detection, or -1.
+        evidence: of these objects. size_log_odds: (O,) by the categories.
     """
 
-    solids: Solids
-    owner: IntArray
+    shapes: Shapes
+    label: IntArray
     evidence: Evidence
     size_log_odds: Array
 
     @property
     def count(self) -> IntArray:
-        """(S,) detections of each solid."""
-        return np.bincount(self.owner[self.owner >= 0], minlength=len(self.solids))
+        """(O,) detections of each object."""
+        return np.bincount(self.label[self.label >= 0], minlength=len(self.shapes))
 
-    def gains(self, detected: Detected) -> Array:
-        """Return the log odds (S,) of each solid: its detections, missed frames and size."""
-        own = self.evidence
-        mine = self.owner[own.row] == own.solid
-        solid, row = own.solid[mine], own.row[mine]
-        worth = own.log_odds[mine] + MISSED * own.expected[detected.view[row], solid]
-        return np.asarray(np.bincount(solid, worth, len(self.solids)) - self.costs())
+    @property
+    def assigned_pairs(self) -> BoolArray:
+        """(M,) pairs of the evidence whose detection is assigned to their object."""
+        return np.asarray(self.label[self.evidence.row] == self.evidence.obj)
 
-    def clear(self) -> BoolArray:
-        """Mark detections (N,) that their solid explains clearly better than any other does.
+    def gains(self, detections: PosedDetections) -> Array:
+        """Return the log odds (O,) of each object: its detections, missed frames and size."""
+        pairs = self.assigned_pairs
+        obj, row = self.evidence.obj[pairs], self.evidence.row[pairs]
+        hit = MISSED * self.evidence.expected[detections.view[row], obj]
+        gain = np.bincount(obj, self.evidence.existence[pairs] + hit, len(self.shapes))
+        return np.asarray(gain - self.costs())
 
-        Of a solid that has fewer than `MIN_DETECTIONS` such all its detections are marked.
+    def unambiguous(self) -> BoolArray:
+        """Mark detections (N,) that fit their object clearly better than any other.
+
+        All detections of an object with fewer than `MIN_DETECTIONS` such detections are marked.
         """
-        evidence, owned = self.evidence, self.owner >= 0
-        mine = self.owner[evidence.row] == evidence.solid
-        own, other = np.full((2, len(owned)), -np.inf)
-        own[evidence.row[mine]] = evidence.choice[mine]
-        np.maximum.at(other, evidence.row[~mine], evidence.choice[~mine])
-        clear = owned & (other < own - CLEARLY)
-        few = np.bincount(self.owner[clear], minlength=len(self.solids) + 1) < MIN_DETECTIONS
-        return np.asarray(clear | owned & few[self.owner])
+        evidence = self.evidence
+        assigned = self.label >= 0
+        pairs = self.assigned_pairs
+        best, runner_up = np.full((2, len(assigned)), -np.inf)
+        best[evidence.row[pairs]] = evidence.assignment[pairs]
+        np.maximum.at(runner_up, evidence.row[~pairs], evidence.assignment[~pairs])
+        clear = assigned & (runner_up < best - UNAMBIGUOUS_MARGIN)
+        few = np.bincount(self.label[clear], minlength=len(self.shapes) + 1) < MIN_DETECTIONS
+        return np.asarray(clear | assigned & few[self.label])
 
     def costs(self) -> Array:
-        """Return the log odds (S,) against each solid if nothing showed it."""
+        """Return the log odds (O,) against each object without any detection."""
         missed = MISSED * self.evidence.expected.sum(0)
-        return np.asarray(missed + NEW_SOLID - self.size_log_odds)
+        return np.asarray(missed + NEW_OBJECT - self.size_log_odds)
 
 
 class Associator:
-    """Find the solids of a scene and their detections.
+    """Estimate the objects of a scene and assign the detections to them.
 
     Args:
-        detected: of all frames. refit: fits solids to detections. size_log_odds: what the
-            categories say of sizes.
+        detections: of all frames. fit_shapes: fits shapes to detections. size_log_odds: of shapes
+            by the size priors of their categories.
     """
 
-    def __init__(self, detected: Detected, refit: Refit, size_log_odds: SizeLogOdds) -> None:
-        self.detected, self.refit, self.size_log_odds = detected, refit, size_log_odds
+    def __init__(
+        self, detections: PosedDetections, fit_shapes: FitShapes, size_log_odds: SizeLogOdds
+    ) -> None:
+        self.detections = detections
+        self.fit_shapes = fit_shapes
+        self.size_log_odds = size_log_odds
 
-    def run(self, proposed: Solids, floor_known: bool) -> Association:
-        """Choose among proposed solids, then improve them and their detections in turn."""
-        chosen = self._pursue(self._empty(proposed, 0.0))
-        now = self._assign(proposed[chosen], np.full(len(self.detected.view), -1))
-        known = {now.owner.tobytes()}
+    def run(self, hypotheses: Shapes, floor_known: bool) -> Association:
+        """Select among hypotheses, then alternate between assignment and shapes."""
+        selected = self._select_greedily(self._unassigned(hypotheses, 0.0))
+        current = self._assign(hypotheses[selected], np.full(len(self.detections.view), -1))
+        visited = {current.label.tobytes()}
         for _ in range(MAX_ROUNDS):
-            for step in (self._refitted, self._thinned, self._merged):
-                now = step(now)
-            if (state := now.owner.tobytes()) in known:
+            for step in (self._refit, self._prune, self._merge):
+                current = step(current)
+            if (state := current.label.tobytes()) in visited:
                 break
-            known.add(state)
-        # Not before: wide solids swallow their neighbours.
-        for _ in range(WIDENED if floor_known else 0):
-            now = self._refitted(now, widened=True)
-        return now
+            visited.add(state)
+        # last, as wide shapes take over the detections of their neighbours
+        for _ in range(WIDENING_ROUNDS if floor_known else 0):
+            current = self._refit(current, widen=True)
+        return current
 
-    def _empty(self, solids: Solids, least: float = MIN_LOG_ODDS) -> Association:
-        """Look at solids of which nothing is a detection yet, by pairs of more than `least`."""
-        evidence = gather_evidence(solids, self.detected, least)
-        nothing = np.full_like(self.detected.view, -1)
-        return Association(solids, nothing, evidence, self.size_log_odds(solids))
+    def _unassigned(self, shapes: Shapes, min_log_odds: float = MIN_LOG_ODDS) -> Association:
+        """Gather the evidence of shapes without any assigned detection."""
+        evidence = gather_evidence(shapes, self.detections, min_log_odds)
+        label = np.full_like(self.detections.view, -1)
+        return Association(shapes, label, evidence, self.size_log_odds(shapes))
 
-    def _pursue(self, of: Association) -> IntArray:
-        """Choose solids one by one: each explains most of what those before do not.
+    def _select_greedily(self, hypotheses: Association) -> IntArray:
+        """Select hypotheses one by one: each adds most to those before.
 
         Returns:
-            the chosen solids, the best first.
+            the selected hypotheses, the best first.
         """
-        view, evidence, cost = self.detected.view, of.evidence, of.costs()
-        value = np.minimum(evidence.choice, evidence.log_odds + PURSUED_CHOICE)
+        view, evidence, cost = self.detections.view, hypotheses.evidence, hypotheses.costs()
+        value = np.minimum(evidence.assignment, evidence.existence + MAX_BOX_GAIN)
         positive = value > 0
-        solid, row, log_odds = evidence.solid[positive], evidence.row[positive], value[positive]
-        start = np.searchsorted(solid, np.arange(len(cost) + 1))
-        not_missed = MISSED * evidence.expected  # (V, S)
-        explained, chosen = np.zeros(len(view)), list[int]()  # explained: log odds of each row
+        obj, row, log_odds = evidence.obj[positive], evidence.row[positive], value[positive]
+        start = np.searchsorted(obj, np.arange(len(cost) + 1))
+        hit = MISSED * evidence.expected  # (V, O)
+        explained = np.zeros(len(view))  # log odds of each row
+        selected = list[int]()
 
-        def added(k: int) -> float:
-            """Return what solid k adds to those chosen, by the best of its detections a frame."""
-            own = row[start[k] : start[k + 1]]
-            best = np.zeros(len(not_missed))
-            np.maximum.at(best, view[own], log_odds[start[k] : start[k + 1]] - explained[own])
-            return float(best.sum() + not_missed[best > 0, k].sum() - cost[k])
+        def marginal_gain(k: int) -> float:
+            """Return the gain of adding hypothesis k, with its best detection of each frame."""
+            rows = row[start[k] : start[k + 1]]
+            best = np.zeros(len(hit))
+            np.maximum.at(best, view[rows], log_odds[start[k] : start[k + 1]] - explained[rows])
+            return float(best.sum() + hit[best > 0, k].sum() - cost[k])
 
-        # What a solid adds only falls as others are chosen: one that still leads after it was
-        # looked at again is the best (lazy greedy, Minoux 1978).
-        queue = [(-added(k), k) for k in range(len(cost))]
+        # The marginal gain only decreases as others are selected: a hypothesis that still leads
+        # after its gain was updated is the best (lazy greedy, Minoux 1978).
+        queue = [(-marginal_gain(k), k) for k in range(len(cost))]
         heapq.heapify(queue)
         while queue and queue[0][0] < 0:
             k = queue[0][1]
-            gain = added(k)
+            gain = marginal_gain(k)
             if -gain > queue[0][0]:
                 heapq.heapreplace(queue, (-gain, k))
                 continue
             heapq.heappop(queue)
-            chosen.append(k)
-            own = row[start[k] : start[k + 1]]
-            explained[own] = np.maximum(explained[own], log_odds[start[k] : start[k + 1]])
-        return np.array(chosen, np.int64)
+            selected.append(k)
+            rows = row[start[k] : start[k + 1]]
+            explained[rows] = np.maximum(explained[rows], log_odds[start[k] : start[k + 1]])
+        return np.array(selected, np.int64)
 
-    def _assign(self, solids: Solids, owner: IntArray) -> Association:
-        """Assign detections to solids frame by frame, given the neighbours in their tracklets.
+    def _assign(self, shapes: Shapes, label: IntArray) -> Association:
+        """Assign detections to objects frame by frame, given the neighbours in their tracklets.
 
         Args:
-            owner: (N,) of the start, or -1.
+            label: (N,) initial object of each detection, or -1.
         """
-        detected = self.detected
-        evidence = gather_evidence(solids, detected)
-        seen = np.bincount(evidence.row, minlength=len(owner)) > 0
-        owner = np.where(seen, owner, -1)
-        expected = evidence.expected[detected.view[evidence.row], evidence.solid]
-        value = evidence.choice + MISSED * expected
+        detections = self.detections
+        evidence = gather_evidence(shapes, detections)
+        has_evidence = np.bincount(evidence.row, minlength=len(label)) > 0
+        label = np.where(has_evidence, label, -1)
+        expected = evidence.expected[detections.view[evidence.row], evidence.obj]
+        value = evidence.assignment + MISSED * expected
         order = np.argsort(evidence.row, kind="stable")
-        starts = np.searchsorted(evidence.row[order], detected.rows_of_view)
+        starts = np.searchsorted(evidence.row[order], detections.start_of_view)
         for low, high in itertools.pairwise(starts):
             pairs = order[low:high]
-            solid, row = evidence.solid[pairs], evidence.row[pairs]
+            obj, row = evidence.obj[pairs], evidence.row[pairs]
             gain = value[pairs]
-            for beside in (detected.before[row], detected.after[row]):
-                gain = gain + KEPT_TRACKLET * ((beside >= 0) & (owner[beside] == solid))
-            owner[row] = -1
-            solid_at, i = np.unique(solid, return_inverse=True)
-            row_at, j = np.unique(row, return_inverse=True)
-            table = np.zeros((len(solid_at), len(row_at)))
+            for neighbour in (detections.before[row], detections.after[row]):
+                gain = gain + SAME_TRACKLET * ((neighbour >= 0) & (label[neighbour] == obj))
+            label[row] = -1
+            unique_obj, i = np.unique(obj, return_inverse=True)
+            unique_row, j = np.unique(row, return_inverse=True)
+            table = np.zeros((len(unique_obj), len(unique_row)))
             table[i, j] = gain.clip(0)
             i, j = linear_sum_assignment(table, maximize=True)
             good = table[i, j] > 0
-            owner[row_at[j[good]]] = solid_at[i[good]]
-        return Association(solids, owner, evidence, self.size_log_odds(solids))
+            label[unique_row[j[good]]] = unique_obj[i[good]]
+        return Association(shapes, label, evidence, self.size_log_odds(shapes))
 
-    def _refitted(self, now: Association, widened: bool = False) -> Association:
-        """Fit the solids to the detections clearly theirs, in the class that most of all have."""
-        owned, clear = np.flatnonzero(now.owner >= 0), np.flatnonzero(now.clear())
-        solid, label = now.owner[owned], self.detected.class_id[owned].clip(0)
-        votes = np.zeros((len(now.solids), int(label.max(initial=0)) + 1))
-        np.add.at(votes, (solid, label), self.detected.score[owned])
-        classes = np.where(votes.any(1), votes.argmax(1), now.solids.class_id)
-        fitted = self.refit(clear, now.owner[clear], classes, now.solids if widened else None)
-        well = np.isfinite(fitted.ellipsoids.center_in_world).all(1)
-        both = Solids.concatenate([now.solids, fitted])
-        pick = np.arange(len(fitted)) + np.where(well, len(fitted), 0)
-        return self._assign(both[pick], now.owner)
+    def _refit(self, current: Association, widen: bool = False) -> Association:
+        """Fit the shapes to their unambiguous detections, in the majority class of all of theirs.
 
-    def _thinned(self, now: Association) -> Association:
-        """Drop solids that bring less than they cost, as others would explain their detections.
-
-        Of those the worse half goes at once: that whose boxes others fit as well. Two that stand
-        for one thing are both superfluous, and only the boxes tell which of them is the thing.
+        Args:
+            widen: ignore the unreliable edges of boxes that end above the floor.
         """
-        evidence, owner, view = now.evidence, now.owner, self.detected.view
-        owned, mine = owner >= 0, owner[evidence.row] == evidence.solid
-        busy = np.zeros_like(evidence.expected)
-        busy[view[owned], owner[owned]] = True
-        other = owned[evidence.row] & ~mine
-        row, solid = evidence.row[other], evidence.solid[other]
-        expected = evidence.expected & ~busy  # and not shown
-        worth = MISSED * expected[view[row], solid]
+        assigned = np.flatnonzero(current.label >= 0)
+        rows = np.flatnonzero(current.unambiguous())
+        class_id = self.detections.class_id[assigned].clip(0)
+        votes = np.zeros((len(current.shapes), int(class_id.max(initial=0)) + 1))
+        np.add.at(votes, (current.label[assigned], class_id), self.detections.score[assigned])
+        classes = np.where(votes.any(1), votes.argmax(1), current.shapes.class_id)
+        fitted = self.fit_shapes(
+            rows, current.label[rows], classes, current.shapes if widen else None
+        )
+        succeeded = np.isfinite(fitted.ellipsoids.center_in_world).all(1)
+        both = Shapes.concatenate([current.shapes, fitted])
+        pick = np.arange(len(fitted)) + np.where(succeeded, len(fitted), 0)
+        return self._assign(both[pick], current.label)
 
-        def instead(value: Array) -> Array:
-            """Return what the best others would bring for the detections of each solid, (S,)."""
-            best = np.zeros(len(owner))
-            np.maximum.at(best, row, value[other] + worth)
-            return np.asarray(np.bincount(owner[owned], best[owned], len(now.solids)), np.float64)
+    def _prune(self, current: Association) -> Association:
+        """Prune objects with negative marginal gain, as others take over their detections.
 
-        marginal = now.gains(self.detected) - instead(evidence.log_odds)  # (S,)
-        fit = np.bincount(evidence.solid[mine], evidence.choice[mine], len(now.solids))
-        better = fit - instead(evidence.choice)  # (S,) than others
-        weak = np.flatnonzero((marginal < 0) | (now.count < MIN_DETECTIONS))
-        worst = weak[np.argsort(better[weak])][: (len(weak) + 1) // 2]
-        return self._without(now, worst) if len(worst) else now
+        Only the worse half (by box fit) is removed per round, because each of two duplicates is
+        redundant given the other.
+        """
+        evidence, label, view = current.evidence, current.label, self.detections.view
+        assigned = label >= 0
+        pairs = current.assigned_pairs
+        shown = np.zeros_like(evidence.expected)
+        shown[view[assigned], label[assigned]] = True
+        other = assigned[evidence.row] & ~pairs
+        row, obj = evidence.row[other], evidence.obj[other]
+        missed = evidence.expected & ~shown
+        hit = MISSED * missed[view[row], obj]
 
-    def _without(self, now: Association, gone: IntArray) -> Association:
-        """Assign anew without some of the solids."""
-        keep = np.setdiff1d(np.arange(len(now.solids)), gone)
-        number = np.full(len(now.solids) + 1, -1)
+        def best_of_others(value: Array) -> Array:
+            """Return what the best others would gain by the detections of each object, (O,)."""
+            best = np.zeros(len(label))
+            np.maximum.at(best, row, value[other] + hit)
+            gain = np.bincount(label[assigned], best[assigned], len(current.shapes))
+            return np.asarray(gain, np.float64)
+
+        marginal = current.gains(self.detections) - best_of_others(evidence.existence)  # (O,)
+        fit = np.bincount(evidence.obj[pairs], evidence.assignment[pairs], len(current.shapes))
+        advantage = fit - best_of_others(evidence.assignment)  # (O,)
+        weak = np.flatnonzero((marginal < 0) | (current.count < MIN_DETECTIONS))
+        worst = weak[np.argsort(advantage[weak])][: (len(weak) + 1) // 2]
+        return self._remove(current, worst) if len(worst) else current
+
+    def _remove(self, current: Association, removed: IntArray) -> Association:
+        """Remove some of the objects and assign again."""
+        keep = np.setdiff1d(np.arange(len(current.shapes)), removed)
+        number = np.full(len(current.shapes) + 1, -1)
         number[keep] = np.arange(len(keep))
-        return self._assign(now.solids[keep], number[now.owner])
+        return self._assign(current.shapes[keep], number[current.label])
 
-    def _merged(self, now: Association) -> Association:
-        """Merge pairs of near solids of a class where one explains the detections of both."""
-        gain = now.gains(self.detected)
-        strong, weak = _near_pairs(now.solids, gain)
+    def _merge(self, current: Association) -> Association:
+        """Merge pairs of nearby objects if one object explains the detections of both."""
+        gain = current.gains(self.detections)
+        strong, weak = _near_pairs(current.shapes, gain)
         if not len(strong):
-            return now
-        row, pair = self._joint_rows(now.owner, strong, weak)
-        fitted = self.refit(row, pair, now.solids.class_id[strong], None)
-        more = self._joint_gains(now.owner, strong, weak, fitted) - gain[strong] - gain[weak]
-        one_place = _coincide(now.solids)[strong, weak]
-        more[one_place & np.isfinite(more)] = np.inf
-        pick, gone, owner = np.arange(len(now.solids)), set[int](), now.owner.copy()
+            return current
+        row, pair = self._joint_rows(current.label, strong, weak)
+        fitted = self.fit_shapes(row, pair, current.shapes.class_id[strong], None)
+        more = self._joint_gains(current.label, strong, weak, fitted) - gain[strong] - gain[weak]
+        duplicate = _coincide(current.shapes)[strong, weak]
+        more[duplicate & np.isfinite(more)] = np.inf
+        pick = np.arange(len(current.shapes))
+        removed = set[int]()
+        label = current.label.copy()
         for p in np.argsort(-more):
             i, j = int(strong[p]), int(weak[p])
-            untouched = pick[i] == i and pick[j] == j and not {i, j} & gone
+            untouched = pick[i] == i and pick[j] == j and not {i, j} & removed
             if more[p] > 0 and untouched:
-                pick[i] = len(now.solids) + p
-                gone.add(j)
-                owner[row[pair == p]] = i
-        both = Solids.concatenate([now.solids, fitted])
-        merged = replace(now, solids=both[pick], owner=owner)
-        return self._without(merged, np.array(sorted(gone), np.int64)) if gone else now
+                pick[i] = len(current.shapes) + p
+                removed.add(j)
+                label[row[pair == p]] = i
+        if not removed:
+            return current
+        both = Shapes.concatenate([current.shapes, fitted])
+        merged = replace(current, shapes=both[pick], label=label)
+        return self._remove(merged, np.array(sorted(removed), np.int64))
 
     def _joint_rows(
-        self, owner: IntArray, strong: IntArray, weak: IntArray
+        self, label: IntArray, strong: IntArray, weak: IntArray
     ) -> tuple[IntArray, IntArray]:
-        """List the rows of both of each pair, one a frame: rows (K,) and their pairs (K,)."""
-        view, found = self.detected.view, list[IntArray]()
+        """List the rows of both objects of each pair, one per frame: rows (K,), pairs (K,)."""
+        view, rows_of_pair = self.detections.view, list[IntArray]()
         for i, j in zip(strong, weak, strict=True):
-            mine, other = np.flatnonzero(owner == i), np.flatnonzero(owner == j)
-            found.append(np.append(mine, other[~np.isin(view[other], view[mine])]))
-        pair = np.repeat(np.arange(len(strong)), [len(rows) for rows in found])
-        return np.concatenate(found), pair
+            rows, other = np.flatnonzero(label == i), np.flatnonzero(label == j)
+            rows_of_pair.append(np.append(rows, other[~np.isin(view[other], view[rows])]))
+        pair = np.repeat(np.arange(len(strong)), [len(rows) for rows in rows_of_pair])
+        return np.concatenate(rows_of_pair), pair
 
     def _joint_gains(
-        self, owner: IntArray, strong: IntArray, weak: IntArray, fitted: Solids
+        self, label: IntArray, strong: IntArray, weak: IntArray, fitted: Shapes
     ) -> Array:
-        """Return what one fitted solid brings for the detections of each pair, (P,)."""
-        view, alone = self.detected.view, self._empty(fitted)
-        evidence = alone.evidence
-        own = owner[evidence.row]
-        mine = (own == strong[evidence.solid]) | (own == weak[evidence.solid])
-        solid, row, log_odds = (x[mine] for x in (evidence.solid, evidence.row, evidence.log_odds))
-        key = solid * len(evidence.expected) + view[row]
+        """Return the gain (P,) of one fitted object with the detections of each pair."""
+        view, joint = self.detections.view, self._unassigned(fitted)
+        evidence = joint.evidence
+        row_label = label[evidence.row]
+        pairs = (row_label == strong[evidence.obj]) | (row_label == weak[evidence.obj])
+        obj, row = evidence.obj[pairs], evidence.row[pairs]
+        log_odds = evidence.existence[pairs]
+        key = obj * len(evidence.expected) + view[row]
         order = np.lexsort((-log_odds, key))
-        leading = np.zeros(len(key), bool)  # the best of its solid in its frame
-        leading[order] = np.append(True, np.diff(key[order]) != 0)[: len(key)]
-        not_missed = MISSED * evidence.expected[view[row], solid]
-        worth = log_odds + not_missed * leading
-        gain = np.bincount(solid, worth.clip(0), len(strong)) - alone.costs()
+        best_of_frame = np.zeros(len(key), bool)  # of its object
+        best_of_frame[order] = np.append(True, np.diff(key[order]) != 0)[: len(key)]
+        hit = MISSED * evidence.expected[view[row], obj]
+        worth = log_odds + hit * best_of_frame
+        gain = np.bincount(obj, worth.clip(0), len(strong)) - joint.costs()
         return np.where(np.isfinite(fitted.ellipsoids.center_in_world).all(1), gain, -np.inf)
 
 
-def _coincide(solids: Solids) -> BoolArray:
-    """Mark pairs (S, S) of solids that are in one place: no two things are.
+def _coincide(shapes: Shapes) -> BoolArray:
+    """Mark pairs (O, O) of shapes in one position, where no two objects can be.
 
-    The smaller has its centre in the middle of the larger: its back, its seat, or the same again.
+    The smaller has its centre in the middle of the larger: a part of the object, or a duplicate.
     """
-    centre, half = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes
-    a_in_b = np.einsum("abi,bij->abj", centre[:, None] - centre, solids.ellipsoids.world_from_obj)
-    inside = (np.abs(a_in_b) < COINCIDE * half).all(2)  # (S, S) a's centre in the middle of b
+    centre, half = shapes.ellipsoids.center_in_world, shapes.ellipsoids.half_axes
+    a_in_b = np.einsum("abi,bij->abj", centre[:, None] - centre, shapes.ellipsoids.world_from_obj)
+    inside = (np.abs(a_in_b) < SAME_POSITION * half).all(2)  # (O, O) a's centre in the middle of b
     volume = half.prod(1)
     inside &= volume[:, None] <= volume
     return np.asarray(inside | inside.T, bool)
 
 
-def _near_pairs(solids: Solids, gain: Array) -> tuple[IntArray, IntArray]:
-    """List pairs (P,) of solids near each other; of each that of more gain first.
+def _near_pairs(shapes: Shapes, gain: Array) -> tuple[IntArray, IntArray]:
+    """List pairs (P,) of nearby shapes, the one of larger gain first.
 
-    They are of one class, or of about one size and in one place.
+    They have one class, or similar sizes and one position.
     """
-    centre, half = solids.ellipsoids.center_in_world, solids.ellipsoids.half_axes
-    distance = np.linalg.norm(centre[:, None] - centre, axis=2)  # (S, S)
+    centre, half = shapes.ellipsoids.center_in_world, shapes.ellipsoids.half_axes
+    distance = np.linalg.norm(centre[:, None] - centre, axis=2)  # (O, O)
     width = half[:, :2].mean(1)
-    adjacent = distance < MERGE_REACH * (width[:, None] + width)
+    near = distance < MERGE_DISTANCE * (width[:, None] + width)
     size = np.log(half).mean(1)
-    alike = (np.abs(size[:, None] - size) < ALIKE) & _coincide(solids)
-    one_kind = (solids.class_id[:, None] == solids.class_id) | alike
-    a, b = np.nonzero(np.triu(adjacent & one_kind, 1))
+    similar = (np.abs(size[:, None] - size) < SIMILAR_SIZE) & _coincide(shapes)
+    same_class = shapes.class_id[:, None] == shapes.class_id
+    a, b = np.nonzero(np.triu(near & (same_class | similar), 1))
     first = gain[a] >= gain[b]
     return np.where(first, a, b), np.where(first, b, a)

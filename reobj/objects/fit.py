@@ -1,46 +1,41 @@
-"""Objects of a video: linked and fitted part by part.
+"""From tracks and cameras to objects: link the tracks, fit one shape to every identity.
 
-Cameras that come in several rigid parts (`Poses.part`) are several worlds, each with a scale of its
-own. Every part is treated like a video of its own; afterwards identities are numbered over all.
+Each connected component of the trajectory (`Poses.part`) has a world and a scale of its own and is
+processed like a video of its own. Identities are numbered over all components. Every step takes
+values and returns values; `link_and_fit` loops over the components.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, place_of
-from reobj.files import shortened
-from reobj.objects.component import (
-    Located,
-    confidence,
-    floor_under,
-    locate,
-    log_best_odds,
-    on_floor,
-)
-from reobj.objects.description import (
+from reobj.objects import confidence
+from reobj.objects.categories import name_of, on_floor
+from reobj.objects.component import ComponentObjects, associate_component, find_floor
+from reobj.objects.config import ObjectsConfig, make_fit
+from reobj.objects.description import describe_objects, describe_world
+from reobj.objects.observations import (
     MIN_SCORE,
-    ObjectsConfig,
-    describe_objects,
-    describe_world,
-    fitter,
-    name_of,
+    UNKNOWN_SCENE,
+    Fit,
+    Scene,
+    gather_views,
+    points_on,
 )
-from reobj.objects.observations import NOTHING_KNOWN, Fit, Scene, gather_views, points_on
-from reobj.objects.occlusion import hidden_edges
+from reobj.objects.occlusion import occluded_edges
 from reobj.results.edits import Edits, apply_edits
-from reobj.results.result import Result
-from reobj.tracking.interpolation import fill_by_place, fill_gaps
+from reobj.results.result import Object, Result
+from reobj.tracking.interpolation import fill_from_objects, fill_gaps
 from reobj.tracking.linking import FRAGMENT_GAP, link
 from reobj.types import (
-    BoolArray,
     Embeddings,
     IntArray,
     LinkEvent,
@@ -52,234 +47,211 @@ from reobj.types import (
 )
 
 
-def link_and_fit(result: Result, config: ObjectsConfig) -> None:
-    """Decide which detections are one object and fit its solid: in place.
+def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
+    """Decide which detections belong to one object, and fit a shape to each object.
 
-    Sets tracks (identities; detections that the tracker left out join them), objects, fits and
-    world. An object lies in one part: where the path breaks, an identity ends. Only identities that
-    the user gave may span parts; their solid is fitted in the part that has most of their boxes.
-    The result's edits come after the linker; those of an earlier fit that do not find their objects
-    any more are left out, with a warning.
+    An object lies in one component: an identity ends at a break of the trajectory. Only identities
+    given by the user may span components; their shape is fitted in the component with most of
+    their boxes. The result's edits are applied after linking. Edits of an earlier fit that no
+    longer find their objects are skipped with a warning.
 
+    Returns:
+        the result with its tracks (identities; untracked detections may join them), objects, fits
+        and world.
     Raises:
         ReobjError: an edit made now does not find its object.
     """
-    poses = result.poses
-    parts = [] if poses is None else [poses.of_part(k) for k in range(poses.part_count)]
-    fit_in: list[Fit | None] = [None] * max(len(parts), 1)
     priors = quadrics.load_priors(config.priors or None)
-    if any(p.known.sum() >= config.min_views for p in parts):
-        for k, own in enumerate(parts):
-            fit_in[k] = fitter(_options(config, k), own, result.class_names)
-    linked = _Linked(result.tracks, located=[None] * len(fit_in))
-    if not result.identities_given:
-        linked = _link_parts(result, parts, fit_in, priors, config)
-    if result.edits is not None:
-        linked = _edited(linked, result, result.edits, priors)
-        fit_in = [
-            None if fit is None else fitter(_options(config, k), parts[k], result.class_names)
-            for k, fit in enumerate(fit_in)
-        ]
-    tracks = linked.tracks
-    category = tracks.class_id if linked.category is None else linked.category  # (N,)
-    part = np.zeros(len(tracks), np.int64) if poses is None else poses.part_of(tracks.frame)  # (N,)
-    fits: list[quadrics.ObjectFits | None] = [None] * len(fit_in)
-    identity, row_of = np.unique(tracks.track_id, return_inverse=True)
-    part_of_object = _part_with_most_boxes(tracks, row_of, len(identity), part, poses, config)
-    result.objects = []
-    for k, fit in enumerate(fit_in):
-        own_rows, views = part_of_object[row_of] == k, None
-        rows = tracks[own_rows]
-        if len(rows) and fit is not None:
-            classes = object_classes(dataclasses.replace(rows, class_id=category[own_rows]))
-            group = np.searchsorted(list(classes), rows.track_id)
-            views = gather_views(rows, parts[k], group, len(classes), MIN_SCORE)
-            located = linked.located[k]
-            if located is None:
-                first = fit(views, list(classes.values()), NOTHING_KNOWN)
-                floor, ellipsoids = floor_under(parts[k], first), first.ellipsoids
-            else:
-                solid = np.array([linked.solid_of.get(identity, -1) for identity in classes])
-                floor, ellipsoids = located.floor, located.ellipsoids[solid]
-            stands = on_floor(priors, [name_of(result.class_names, c) for c in classes.values()])
-            hidden = hidden_edges(views, ellipsoids, stands & (floor is not None))
-            points = points_on(views, parts[k], ellipsoids)
-            views = dataclasses.replace(views, hidden=hidden, points=points)
-            up = None if floor is None else floor.normal
-            fits[k] = fit(views, list(classes.values()), Scene(floor, up))
-        found = describe_objects(
-            rows, result.class_names, fits[k], views, config, linked.confidence
+    poses = result.poses
+    count = 1 if poses is None else poses.part_count
+    components = [None if poses is None else poses.of_part(k) for k in range(count)]
+    fits_of = _make_fits(components, config, result.class_names)
+    if result.identities_given:
+        linked = _unlinked(result.tracks, count)
+    else:
+        tables = _split_table(result)
+        linked = _joined(
+            _link_component(*tables[k], result, components[k], fits_of[k], priors, config)
+            for k in range(count)
         )
-        result.objects += [dataclasses.replace(o, part=k) for o in found]
-    result.objects.sort(key=lambda o: o.id)
-    row = linked.rows_now(result.embedding_row)
-    foreground, background = result.embeddings.foreground, result.embeddings.background
-    result.embeddings = Embeddings(foreground[row >= 0], background[row >= 0])
-    result.tracks, result.embedding_row = tracks, row[row >= 0]
-    result.world = describe_world(poses, fits, linked.events)
-    result.fits = fits[0] if poses is None else join_fits(fits, part_of_object, poses)
+    edited = _Edited(linked, result.class_names, [], None)
+    if result.edits is not None:
+        edited = _edit(linked, result, result.edits, priors)
+        fits_of = _make_fits(components, config, edited.class_names)
+    linked = edited.linked
+    tracks = linked.tracks
+    identity, identity_of_row = np.unique(tracks.track_id, return_inverse=True)
+    component_of_object = _component_with_most_boxes(tracks, identity_of_row, len(identity), poses)
+    component_of_row = component_of_object[identity_of_row]
+    objects = list[Object]()
+    fits = list[quadrics.ObjectFits | None]()
+    for k in range(count):
+        rows = np.flatnonzero(component_of_row == k)
+        fitted = _fit_component(
+            k, rows, linked, components[k], fits_of[k], edited.class_names, priors, config
+        )
+        objects += fitted[0]
+        fits.append(fitted[1])
+    embeddings, embedding_row = _select_embeddings(result, linked.source)
+    return dataclasses.replace(
+        result,
+        tracks=tracks,
+        class_names=edited.class_names,
+        objects=sorted(objects, key=lambda o: o.id),
+        world=describe_world(poses, fits, linked.events),
+        fits=fits[0] if poses is None else join_fits(fits, component_of_object, poses),
+        embeddings=embeddings,
+        embedding_row=embedding_row,
+        warnings=[*result.warnings, *edited.warnings],
+        edits=edited.edits,
+    )
 
 
-@dataclass(slots=True)
+def _make_fits(
+    components: Sequence[Poses | None], config: ObjectsConfig, class_names: Sequence[str]
+) -> list[Fit | None]:
+    """Make the fit function of each component; None if no component has enough poses.
+
+    An upward direction given by the user is that of component 0, the largest.
+    """
+    posed = [poses for poses in components if poses is not None]
+    if not any(poses.known.sum() >= config.min_views for poses in posed):
+        return [None] * len(components)
+    others = dataclasses.replace(config, up="")
+    return [
+        make_fit(config if k == 0 else others, poses, class_names) for k, poses in enumerate(posed)
+    ]
+
+
+# ---- Linking -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
 class _Linked:
-    """Tracks with the identities of objects.
+    """Tracks with the identities of objects, of one or of all components.
 
     Attributes:
-        tracks: N rows. source: (N,) their rows before, -1: left out by the tracker; None: the same.
-        events: joins and splits. confidence: of identities that have solids in a part.
-        located: of each part, None where nothing was associated. solid_of: number of the solid that
-            an identity has there.
+        tracks: N rows. source: (N,) row of the result's tracks, -1: an untracked detection.
+        category: (N,) class whose size prior is used.
+        events: joins and splits. confidence: of identities.
+        objects: of each component, None where no association was made. label_of: number of the
+            object in these of an identity.
     """
 
     tracks: Tracks
-    source: IntArray | None = None
-    events: list[LinkEvent] = field(default_factory=list)
-    confidence: dict[int, float] = field(default_factory=dict)
-    located: list[Located | None] = field(default_factory=list)
-    solid_of: dict[int, int] = field(default_factory=dict)
-    category: IntArray | None = None  # (N,) class whose size prior counts; None: that of the row
-
-    def rows_now(self, before: IntArray) -> IntArray:
-        """Return where rows of the table before linking are now, -1: deleted."""
-        if self.source is None:
-            return before
-        now = np.full(max(self.source.max(initial=-1), before.max(initial=-1)) + 1, -1)
-        now[self.source[self.source >= 0]] = np.flatnonzero(self.source >= 0)
-        return np.asarray(now[before], np.int64)
+    source: IntArray
+    category: IntArray
+    events: list[LinkEvent]
+    confidence: dict[int, float]
+    objects: list[ComponentObjects | None]
+    label_of: dict[int, int]
 
 
-def _options(config: ObjectsConfig, part: int) -> ObjectsConfig:
-    """Return the options of a part: a direction given as up is one of the largest, part 0."""
-    return dataclasses.replace(config, up="") if part else config
+def _unlinked(tracks: Tracks, count: int) -> _Linked:
+    """Keep the given identities of tracks in so many components."""
+    return _Linked(tracks, np.arange(len(tracks)), tracks.class_id, [], {}, [None] * count, {})
 
 
-def _edited(linked: _Linked, result: Result, edits: Edits, priors: quadrics.Priors) -> _Linked:
-    """Correct identities and classes by hand; an object that the user names is surely there.
+def _split_table(result: Result) -> list[tuple[Tracks, IntArray]]:
+    """Split all detections by component, and cut tracklets at the breaks.
 
-    A new name that the priors know is a new category. Any other is a label: the size prior stays
-    that of the class which the detector gave.
+    Returns:
+        for each component the table and (N,) row of the result's tracks, or -1.
     """
-    before = linked.tracks
-    try:
-        made = apply_edits(before, result.class_names, edits)
-    except ReobjError as error:
-        if not edits.kept:
-            raise
-        result.warnings.append(f"{error}; no correction of this file was applied")
-        result.edits = None
-        return linked
-    result.class_names = made.class_names
-    result.warnings += made.messages
-    confidence, origin = dict[int, float](), dict[int, set[int]]()
-    for now, then in set(zip(made.tracks.track_id.tolist(), before.track_id.tolist(), strict=True)):
-        origin.setdefault(now, set()).add(then)
-        if then in linked.confidence:
-            sure = 1.0 if now in made.confirmed else linked.confidence[then]
-            confidence[now] = max(sure, confidence.get(now, 0.0))
-    source = np.arange(len(before)) if linked.source is None else linked.source
-    rows = (made.tracks[made.keep], source[made.keep])
-    solid_of = {i: solid for i, solid in linked.solid_of.items() if origin.get(i) == {i}}
-    names = [name_of(made.class_names, c) for c in range(len(made.class_names))]
-    known = np.append(priors.index(names) >= 0, False)[made.tracks.class_id]  # (N,)
-    category = np.where(known, made.tracks.class_id, before.class_id)[made.keep]
-    return _Linked(*rows, linked.events, confidence, linked.located, solid_of, category)
+    table, source = _with_untracked(result.tracks, result.untracked)
+    if result.poses is None:
+        return [(table, source)]
+    component = _component_of_rows(table, result.poses)
+    table = _cut_at_breaks(table, component)
+    rows_of = [np.flatnonzero(component == k) for k in range(result.poses.part_count)]
+    return [(table[rows], source[rows]) for rows in rows_of]
 
 
-def _link_parts(
+def _link_component(
+    table: Tracks,
+    source: IntArray,
     result: Result,
-    parts: Sequence[Poses],
-    fit_in: Sequence[Fit | None],
+    poses: Poses | None,
+    fit: Fit | None,
     priors: quadrics.Priors,
     config: ObjectsConfig,
 ) -> _Linked:
-    """Link each part alone, and number its identities after those of the parts before it."""
-    made, steps, sources, taken = _Linked(result.tracks), list[Tracks](), list[IntArray](), 0
-    table, source = _with_untracked(result.tracks, result.untracked)
-    part = np.zeros(len(table), np.int64)
-    if result.poses is not None:
-        part = _part_of_rows(table, result.poses)
-    table = _cut_at_parts(table, part)
-    for k, fit in enumerate(fit_in):
-        rows = np.flatnonzero(part == k)
-        located = None
-        if config.link and fit is not None and parts[k].known.sum() >= config.min_views:
-            names, moving = result.class_names, config.moving_classes
-            located = locate(table[rows], names, parts[k], fit, priors, moving, result.looked)
-        solid = np.full(len(rows), -1) if located is None else located.solid
-        keep = (source[rows] >= 0) | (solid >= 0)
-        rows, solid = rows[keep], solid[keep]
-        own = _with_tracklets(table[rows], solid, result.looked)
-        if config.link:
-            own, found = link(
-                own, result.class_names, *_embeddings_of(result, source[rows]),
-                None if located is None else parts[k], moving=config.moving_classes,
-                solid=None if located is None else solid,
-                overlap=None if located is None else located.overlap[keep], looked=result.looked,
-            )  # fmt: skip
-            made.events += found
-        else:
-            own = own.with_identities(own.track_id)
-        own = dataclasses.replace(own, track_id=own.track_id + taken)
-        taken = int(own.track_id.max(initial=taken))
-        if located is not None:
-            posed = np.isin(own.frame, parts[k].frame[parts[k].known])
-            made.confidence |= _confidences(own, solid, posed, located)
-            shown = solid >= 0
-            ids = own.track_id[shown].tolist()
-            made.solid_of |= dict(zip(ids, solid[shown].tolist(), strict=True))
-        made.located.append(located)
-        steps.append(own)
-        sources.append(source[rows])
-    order = np.argsort(np.concatenate([own.frame for own in steps]), kind="stable")
-    made.tracks, made.source = Tracks.joined(steps), np.concatenate(sources)[order]
-    return made
+    """Link the tracks of a component; identities are numbered from 1."""
+    objects = None
+    if config.link and fit and poses is not None and poses.known.sum() >= config.min_views:
+        moving = config.moving_classes
+        objects = associate_component(
+            table, result.class_names, poses, fit, priors, moving, result.looked
+        )
+    label = np.full(len(table), -1) if objects is None else objects.label
+    keep = (source >= 0) | (label >= 0)
+    table, source, label = table[keep], source[keep], label[keep]
+    tracks = _with_tracklets(table, label, result.looked)
+    events = list[LinkEvent]()
+    if config.link:
+        tracks, events = link(
+            tracks, result.class_names, *_select_embeddings(result, source),
+            None if objects is None else poses, moving=config.moving_classes,
+            label=None if objects is None else label,
+            iou=None if objects is None else objects.iou[keep], looked=result.looked,
+        )  # fmt: skip
+    else:
+        tracks = tracks.with_identities(tracks.track_id)
+    certainty: dict[int, float] = {}
+    label_of: dict[int, int] = {}
+    if objects is not None and poses is not None:
+        posed = np.isin(tracks.frame, poses.frame[poses.known])
+        certainty = confidence.of_identities(tracks, label, posed, objects.confidence)
+        shown = label >= 0
+        label_of = dict(zip(tracks.track_id[shown].tolist(), label[shown].tolist(), strict=True))
+    return _Linked(tracks, source, tracks.class_id, events, certainty, [objects], label_of)
 
 
-def _confidences(
-    tracks: Tracks, solid: IntArray, posed: BoolArray, located: Located
-) -> dict[int, float]:
-    """Return the confidence of identities: of its solid, or of its scores if it has none.
-
-    Nothing speaks for or against what was seen only in frames without a pose.
-
-    Args:
-        solid: (N,) of each row, or -1. posed: (N,) its frame has a pose.
-    """
-    found = {}
-    for rows in rows_by(tracks.track_id):
-        if not posed[rows].any():
-            continue
-        own = solid[rows][solid[rows] >= 0]
-        sure = located.confidence[own[:1]]
-        if not len(own):
-            score = log_best_odds(tracks.score[rows], np.zeros(len(rows), np.int64), 1)
-            sure = confidence(score, np.array([np.nan]))
-        found[int(tracks.track_id[rows[0]])] = float(sure[0])
-    return found
+def _joined(components: Iterable[_Linked]) -> _Linked:
+    """Join the linked components; identities are numbered after those of the components before."""
+    joined = list[Tracks]()
+    sources = list[IntArray]()
+    events = list[LinkEvent]()
+    objects = list[ComponentObjects | None]()
+    certainty: dict[int, float] = {}
+    label_of: dict[int, int] = {}
+    offset = 0
+    for linked in components:
+        joined.append(dataclasses.replace(linked.tracks, track_id=linked.tracks.track_id + offset))
+        sources.append(linked.source)
+        events += linked.events
+        objects += linked.objects
+        certainty |= {identity + offset: value for identity, value in linked.confidence.items()}
+        label_of |= {identity + offset: label for identity, label in linked.label_of.items()}
+        offset = int(joined[-1].track_id.max(initial=offset))
+    order = np.argsort(np.concatenate([tracks.frame for tracks in joined]), kind="stable")
+    tracks = Tracks.joined(joined)
+    source = np.concatenate(sources)[order]
+    return _Linked(tracks, source, tracks.class_id, events, certainty, objects, label_of)
 
 
 def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray]:
-    """Put the detections that the tracker left out among its rows, by frame.
+    """Insert the untracked detections among the rows of the tracks, by frame.
 
     Returns:
-        the table; (N,) the row of the tracks that each of its rows is, or -1.
+        the table; (N,) row of the tracks of each of its rows, or -1.
     """
     source = np.append(np.arange(len(tracks)), np.full(len(untracked), -1))
     order = np.argsort(np.append(tracks.frame, untracked.frame), kind="stable")
     return Tracks.joined([tracks, untracked]), source[order]
 
 
-def _with_tracklets(table: Tracks, solid: IntArray, looked: IntArray | None = None) -> Tracks:
-    """Give rows in no tracklet that of the row before of their solid, or one of their own.
+def _with_tracklets(table: Tracks, label: IntArray, looked: IntArray | None = None) -> Tracks:
+    """Give untracked rows the tracklet of the previous row of their object, or a new one.
 
-    A tracklet ends where more than FRAGMENT_GAP frames looked at lie between two rows.
+    A tracklet ends at a gap of more than FRAGMENT_GAP frames in which the detector was run.
     """
     tracklet = table.tracklet_id.copy()
-    fresh = int(tracklet.max(initial=0)) + 1
+    unused = int(tracklet.max(initial=0)) + 1
     number, unit = looks(table, looked)
     taken = set(zip(table.frame.tolist(), tracklet.tolist(), strict=True))
-    for rows in rows_by(solid):
-        if solid[rows[0]] < 0:
+    for rows in rows_by(label):
+        if label[rows[0]] < 0:
             continue
         for before, row in itertools.pairwise([-1, *rows.tolist()]):
             if tracklet[row]:
@@ -290,67 +262,206 @@ def _with_tracklets(table: Tracks, solid: IntArray, looked: IntArray | None = No
                 tracklet[row] = tracklet[before]
                 taken.add(key)
             else:
-                tracklet[row], fresh = fresh, fresh + 1
+                tracklet[row] = unused
+                unused += 1
     return dataclasses.replace(table, tracklet_id=tracklet)
 
 
-def _part_of_rows(tracks: Tracks, poses: Poses) -> IntArray:
-    """Return the part (N,) of rows: of their frame, or without a pose that of their tracklet.
+def _component_of_rows(tracks: Tracks, poses: Poses) -> IntArray:
+    """Return the component (N,) of rows: of their frame, or without a pose of their tracklet.
 
-    Where the path breaks, a thing that comes into view before the next part begins is of that part.
+    At a break, an unposed detection joins the component of the nearest posed detection of its
+    tracklet.
     """
-    part = poses.part_of(tracks.frame)
-    posed = place_of(poses, tracks.frame)[1]
+    component = poses.part_of(tracks.frame)
+    _, posed = place_of(poses, tracks.frame)
     for rows in rows_by(tracks.tracklet_id) if poses.part_count > 1 else ():
-        lost, own = rows[~posed[rows]], rows[posed[rows]]
-        if tracks.tracklet_id[rows[0]] and len(lost) and len(own):
-            away = np.abs(tracks.frame[lost, None] - tracks.frame[own])
-            part[lost] = part[own[away.argmin(1)]]
-    return part
+        unposed_rows, posed_rows = rows[~posed[rows]], rows[posed[rows]]
+        if tracks.tracklet_id[rows[0]] and len(unposed_rows) and len(posed_rows):
+            gap = np.abs(tracks.frame[unposed_rows, None] - tracks.frame[posed_rows])
+            component[unposed_rows] = component[posed_rows[gap.argmin(1)]]
+    return component
 
 
-def _cut_at_parts(tracks: Tracks, part: IntArray) -> Tracks:
-    """Cut tracklets where the part (N,) of their rows changes; later parts get new numbers."""
+def _cut_at_breaks(tracks: Tracks, component: IntArray) -> Tracks:
+    """Cut tracklets where the component (N,) of their rows changes; later pieces are renumbered."""
     tracklet = tracks.tracklet_id.copy()
-    for k in range(1, int(part.max(initial=0)) + 1):
-        spanning = (part == k) & (tracklet > 0) & np.isin(tracklet, tracklet[part < k])
+    for k in range(1, int(component.max(initial=0)) + 1):
+        in_earlier = np.isin(tracklet, tracklet[component < k])
+        spanning = (component == k) & (tracklet > 0) & in_earlier
         piece = np.unique(tracklet[spanning], return_inverse=True)[1]
         tracklet[spanning] = tracklet.max() + 1 + piece
     return dataclasses.replace(tracks, tracklet_id=tracklet)
 
 
-def _embeddings_of(result: Result, source: IntArray) -> tuple[Embeddings, IntArray]:
-    """Select the embeddings of some rows of the tracks (-1: none), and number them by these."""
-    number = np.full(len(result.tracks), -1)
-    number[source[source >= 0]] = np.flatnonzero(source >= 0)
-    row = number[result.embedding_row]
+def _select_embeddings(result: Result, source: IntArray) -> tuple[Embeddings, IntArray]:
+    """Select the embeddings of a table whose rows are rows (N,) of the result's tracks, or -1.
+
+    Returns:
+        n embeddings, and their rows (n,) in the table.
+    """
+    row_in_table = np.full(len(result.tracks), -1)
+    row_in_table[source[source >= 0]] = np.flatnonzero(source >= 0)
+    row = row_in_table[result.embedding_row]
     foreground, background = result.embeddings.foreground, result.embeddings.background
     return Embeddings(foreground[row >= 0], background[row >= 0]), row[row >= 0]
 
 
-def _part_with_most_boxes(
-    tracks: Tracks,
-    row_of: IntArray,
-    count: int,
-    part: IntArray,
-    poses: Poses | None,
-    config: ObjectsConfig,
+# ---- Edits -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Edited:
+    """Linked tracks after the user's edits, the class names, warnings, and the applied edits."""
+
+    linked: _Linked
+    class_names: tuple[str, ...]
+    warnings: list[str]
+    edits: Edits | None
+
+
+def _edit(linked: _Linked, result: Result, edits: Edits, priors: quadrics.Priors) -> _Edited:
+    """Correct identities and classes by hand; an object that the user names certainly exists.
+
+    A new name that the priors know is a new category. Any other is a label: the size prior stays
+    that of the detector's class.
+    """
+    before = linked.tracks
+    try:
+        applied = apply_edits(before, result.class_names, edits)
+    except ReobjError as error:
+        if not edits.kept:
+            raise
+        warning = f"{error}; no correction of this file was applied"
+        return _Edited(linked, result.class_names, [warning], None)
+    certainty: dict[int, float] = {}
+    previous: dict[int, set[int]] = {}
+    pairs = zip(applied.tracks.track_id.tolist(), before.track_id.tolist(), strict=True)
+    for new, old in set(pairs):
+        previous.setdefault(new, set()).add(old)
+        if old in linked.confidence:
+            value = 1.0 if new in applied.confirmed else linked.confidence[old]
+            certainty[new] = max(value, certainty.get(new, 0.0))
+    names = [name_of(applied.class_names, c) for c in range(len(applied.class_names))]
+    has_prior = np.append(priors.index(names) >= 0, False)[applied.tracks.class_id]  # (N,)
+    category = np.where(has_prior, applied.tracks.class_id, before.class_id)
+    edited = dataclasses.replace(
+        linked,
+        tracks=applied.tracks[applied.keep],
+        source=linked.source[applied.keep],
+        category=category[applied.keep],
+        confidence=certainty,
+        label_of={i: label for i, label in linked.label_of.items() if previous.get(i) == {i}},
+    )
+    return _Edited(edited, applied.class_names, applied.messages, edits)
+
+
+# ---- Fitting -----------------------------------------------------------------------------------
+
+
+def _component_with_most_boxes(
+    tracks: Tracks, object_of_row: IntArray, count: int, poses: Poses | None
 ) -> IntArray:
-    """Return the part (O,) that has most boxes of each object, those that a fit can use first.
+    """Return the component (O,) with most boxes of each object; boxes that a fit can use first.
 
     Args:
-        row_of: (N,) object of each row of the tracks. part: (N,) of each row.
+        object_of_row: (N,) object of each row of the tracks, of `count`.
     """
+    component = np.zeros(len(tracks), np.int64)
     usable = tracks.score >= MIN_SCORE
     if poses is not None:
+        component = poses.part_of(tracks.frame)
         usable &= place_of(poses, tracks.frame)[1]
-    votes = np.zeros((count, int(part.max(initial=0)) + 1))
-    np.add.at(votes, (row_of, part), np.where(usable, 1.0, 1 / (len(tracks) + 1)))
+    votes = np.zeros((count, int(component.max(initial=0)) + 1))
+    weight = np.where(usable, 1.0, 1 / (len(tracks) + 1))
+    np.add.at(votes, (object_of_row, component), weight)
     return np.asarray(votes.argmax(1), np.int64)
 
 
+def _fit_component(
+    component: int,
+    rows: IntArray,
+    linked: _Linked,
+    poses: Poses | None,
+    fit: Fit | None,
+    class_names: Sequence[str],
+    priors: quadrics.Priors,
+    config: ObjectsConfig,
+) -> tuple[list[Object], quadrics.ObjectFits | None]:
+    """Fit and describe the objects of a component.
+
+    Args:
+        rows: of its objects in the linked tracks.
+    """
+    tracks = linked.tracks[rows]
+    fits = views = None
+    if len(tracks) and fit is not None and poses is not None:
+        classes = object_classes(dataclasses.replace(tracks, class_id=linked.category[rows]))
+        categories = list(classes.values())
+        group = np.searchsorted(list(classes), tracks.track_id)
+        views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
+        objects = linked.objects[component]
+        if objects is None:
+            first = fit(views, categories, UNKNOWN_SCENE)
+            floor, ellipsoids = find_floor(poses, first), first.ellipsoids
+        else:
+            label = np.array([linked.label_of.get(identity, -1) for identity in classes])
+            floor, ellipsoids = objects.floor, objects.ellipsoids[label]
+        standing = on_floor(priors, [name_of(class_names, c) for c in categories])
+        views = dataclasses.replace(
+            views,
+            occluded=occluded_edges(views, ellipsoids, standing & (floor is not None)),
+            points=points_on(views, poses, ellipsoids),
+        )
+        fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
+    objects_found = describe_objects(
+        tracks, class_names, fits, views, config, linked.confidence, component
+    )
+    return objects_found, fits
+
+
+OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are per object
+
+
+def join_fits(
+    fits: Sequence[quadrics.ObjectFits | None], component_of_object: IntArray, poses: Poses
+) -> quadrics.ObjectFits | None:
+    """Join the fits of all components; scale and up are those of component 0.
+
+    Args:
+        fits: of the objects of each component, in their order; None for one without objects.
+        component_of_object: (O,).
+    """
+    if len(fits) == 1:
+        return fits[0]
+    made = [(k, fit) for k, fit in enumerate(fits) if fit is not None]
+    if not made:
+        return None
+    order = np.argsort(np.argsort(component_of_object, kind="stable"))  # (O,) row in `made`
+    inlier = np.zeros((int(poses.known.sum()), len(order)), bool)
+    for k, fit in made:
+        inlier[np.ix_(poses.part[poses.known] == k, component_of_object == k)] = fit.inlier
+    columns: dict[str, Any] = {"inlier": inlier}
+    ellipsoids = [fit.ellipsoids for _, fit in made]
+    names = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
+    arrays = (np.concatenate([getattr(e, name) for e in ellipsoids])[order] for name in names)
+    columns["ellipsoids"] = quadrics.Ellipsoids(*arrays)
+    reasons = [reason for _, fit in made for reason in fit.reason]
+    columns["reason"] = [reasons[i] for i in order]
+    for name in {f.name for f in dataclasses.fields(quadrics.ObjectFits)} - {*columns}:
+        values = [getattr(fit, name) for _, fit in made]
+        columns[name] = values[0] if name in OF_THE_WORLD else np.concatenate(values)[order]
+    if fits[0] is None:  # the scale of the largest component is unknown
+        none = quadrics.Scale(1.0, np.inf, "none")
+        columns |= {"scale": none, "up": np.zeros(3), "up_source": "none"}
+    return quadrics.ObjectFits(**columns)
+
+
+# ---- Interpolation -----------------------------------------------------------------------------
+
+
 def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
-    """Fill gaps between detections of an identity: by its solid where it has one.
+    """Interpolate gaps between detections of an identity: by its shape if it has one.
 
     Args:
         image_size: (w, h). max_gap: as of `fill_gaps`.
@@ -358,61 +469,13 @@ def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
         the tracks; frames that the detector was not run on are not filled.
     """
     tracks = result.tracks
-    for part in result.parts() if max_gap else ():
-        if part.poses is not None and (own := part.located):
-            identity, support = np.array([o.id for o in own]), [str(o.support) for o in own]
-            tracks = fill_by_place(tracks, part.poses, identity, part.ellipsoids(), support)
+    for component in result.parts() if max_gap else ():
+        if component.poses is not None and (located := component.located):
+            identity = np.array([o.id for o in located])
+            support = [str(o.support) for o in located]
+            tracks = fill_from_objects(
+                tracks, component.poses, identity, component.ellipsoids(), support
+            )
     if result.looked is not None:
         tracks = tracks[np.isin(tracks.frame, result.looked)]
     return fill_gaps(tracks, image_size, max_gap, result.looked)
-
-
-OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are by object
-
-
-def join_fits(
-    fits: Sequence[quadrics.ObjectFits | None], part_of_object: IntArray, poses: Poses
-) -> quadrics.ObjectFits | None:
-    """Join the fits of all parts into one of all objects; scale and up are those of part 0.
-
-    Args:
-        fits: of the objects of each part, in their order; None where a part has no object.
-        part_of_object: (O,).
-    """
-    if len(fits) == 1:
-        return fits[0]
-    made = [(k, fit) for k, fit in enumerate(fits) if fit is not None]
-    if not made:
-        return None
-    order = np.argsort(np.argsort(part_of_object, kind="stable"))  # (O,) place of each in `made`
-    inlier = np.zeros((int(poses.known.sum()), len(order)), bool)
-    for k, fit in made:
-        inlier[np.ix_(poses.part[poses.known] == k, part_of_object == k)] = fit.inlier
-    columns: dict[str, Any] = {"inlier": inlier}
-    solids = [fit.ellipsoids for _, fit in made]
-    names = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
-    arrays = (np.concatenate([getattr(solid, name) for solid in solids])[order] for name in names)
-    columns["ellipsoids"] = quadrics.Ellipsoids(*arrays)
-    reasons = [reason for _, fit in made for reason in fit.reason]
-    columns["reason"] = [reasons[i] for i in order]
-    for name in {f.name for f in dataclasses.fields(quadrics.ObjectFits)} - {*columns}:
-        values = [getattr(fit, name) for _, fit in made]
-        columns[name] = values[0] if name in OF_THE_WORLD else np.concatenate(values)[order]
-    if fits[0] is None:  # nothing says how large the largest part is
-        none = quadrics.Scale(1.0, np.inf, "none")
-        columns |= {"scale": none, "up": np.zeros(3), "up_source": "none"}
-    return quadrics.ObjectFits(**columns)
-
-
-def parts_message(poses: Poses) -> list[str]:
-    """Say what several parts mean for the user, and what helps; [] if there is one only."""
-    if poses.part_count == 1:
-        return []
-    parts = describe_world(poses, [None] * poses.part_count, []).parts
-    where = shortened([f"part {k}: {part.span_text}" for k, part in enumerate(parts)])
-    return [
-        f"the cameras come in {len(parts)} parts that do not connect ({where}): each has its own "
-        "frame and scale, and what is seen in two parts is listed as two objects. A recording that "
-        "overlaps more, with slower turns, or --poses gives one part; identities can be joined by "
-        "hand (in scene.html, then `objects OUT --edits`)"
-    ]

@@ -1,6 +1,7 @@
-"""Fit the ellipsoids of a video by published closed forms instead of `quadrics.fit_objects`.
+"""Fit the ellipsoids of a video by published closed-form solvers instead of `quadrics.fit_objects`.
 
-Identities, cameras, gravity and scale stay those that `link_and_fit` found: the solvers know none.
+Identities, cameras, gravity and scale remain those of `link_and_fit`: the solvers estimate none of
+them.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, import_pycolmap, triangulate_rays
-from reobj.objects.description import MIN_SCORE, OURS, ObjectsConfig, describe_objects, name_of
-from reobj.objects.observations import Views, gather_views
+from reobj.objects.categories import name_of
+from reobj.objects.config import DEFAULT_SOLVER, ObjectsConfig
+from reobj.objects.description import describe_objects
+from reobj.objects.observations import MIN_SCORE, Views, gather_views
 from reobj.results.result import Object, Result
 from reobj.types import Array, BoolArray, object_classes
 
@@ -23,83 +26,98 @@ Solved = tuple[quadrics.Ellipsoids, str]
 Solver = Callable[[Views, Poses, Sequence[str], quadrics.Priors], Solved]
 
 
-def solve_again(result: Result, config: ObjectsConfig) -> None:
-    """Replace the solids of all objects by the ellipsoids of `config.solver`: in place.
+def solve_again(result: Result, config: ObjectsConfig) -> Result:
+    """Replace the shapes of all objects by the ellipsoids of `config.solver`.
 
-    Sets objects, fits (None: these are no `ObjectFits` of ours) and a warning that says what the
-    solver does not know. Without cameras, and of "solids", all stays.
+    Returns:
+        the result with other objects, without fits (there are no `ObjectFits` of the default fit),
+        and with a warning of the solver's limitations; unchanged for the default solver or without
+        cameras.
     """
-    if config.solver == OURS or result.poses is None or result.fits is None:
-        return
+    if config.solver == DEFAULT_SOLVER or result.poses is None or result.fits is None:
+        return result
     solve, text = SOLVERS[config.solver]
-    priors, objects = quadrics.load_priors(config.priors or None), list[Object]()
-    for k, part in enumerate(result.world.parts):
+    priors = quadrics.load_priors(config.priors or None)
+    objects = list[Object]()
+    for k, component in enumerate(result.world.parts):
         before = {o.id: o for o in result.objects if o.part == k}
         rows = result.tracks[np.isin(result.tracks.track_id, list(before))]
-        poses, classes = result.poses.of_part(k), object_classes(rows)
+        poses = result.poses.of_part(k)
+        classes = object_classes(rows)
         if not len(rows) or not poses.known.any():
             objects += before.values()
             continue
         group = np.searchsorted(list(classes), rows.track_id)
         views = gather_views(rows, poses, group, len(classes), MIN_SCORE)
         names = [name_of(result.class_names, c) for c in classes.values()]
-        solids, why = solve(views, poses, names, priors)
-        solids = _vertical_axis_last(solids, part.up_in_world)
-        scale = NO_SCALE if config.solver == "sfmo" or part.scale is None else part.scale
+        ellipsoids, reason = solve(views, poses, names, priors)
+        ellipsoids = _vertical_axis_last(ellipsoids, component.up_in_world)
+        has_scale = config.solver != "sfmo" and component.scale is not None
+        scale = component.scale if has_scale and component.scale is not None else NO_SCALE
         parallax = [before[i].parallax_deg for i in classes]
-        fits = _as_fits(solids, views, np.array(parallax, np.float64), scale, why)
-        sure = {i: o.confidence for i, o in before.items() if o.confidence is not None}
-        found = describe_objects(rows, result.class_names, fits, views, config, sure)
-        objects += [dataclasses.replace(o, part=k) for o in found]
-    result.objects, result.fits = sorted(objects, key=lambda o: o.id), None
-    result.warnings.append(f"objects.solver={config.solver}: {text}")
+        fits = _as_fits(ellipsoids, views, np.array(parallax, np.float64), scale, reason)
+        confidence = {i: o.confidence for i, o in before.items() if o.confidence is not None}
+        objects += describe_objects(
+            rows, result.class_names, fits, views, config, confidence, component=k
+        )
+    warning = f"objects.solver={config.solver}: {text}"
+    return dataclasses.replace(
+        result,
+        objects=sorted(objects, key=lambda o: o.id),
+        fits=None,
+        warnings=[*result.warnings, warning],
+    )
 
 
 def _lfd(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Priors) -> Solved:
-    """Solve each object's dual quadric in closed form; of no ellipsoid the axes are NaN."""
+    """Solve each object's dual quadric in closed form; the axes are NaN if it is no ellipsoid."""
     dual_q, real = quadrics.fit_lfd(views.boxes, views.img_from_world)
-    solids = quadrics.Ellipsoids.from_dual_quadrics(dual_q)[0]
-    return _only(solids, real), "what LfD finds is no ellipsoid"
+    ellipsoids = quadrics.Ellipsoids.from_dual_quadrics(dual_q)[0]
+    return _only(ellipsoids, real), "what LfD finds is no ellipsoid"
 
 
 def _psfmo(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Priors) -> Solved:
-    """Draw the axis ratios from the category, the cameras known and linearised at each object."""
+    """Fit with axis-ratio priors of the category; cameras are linearised at each object."""
     found = quadrics.fit_psfmo(views.boxes, priors, names, views.img_from_world)
     return found.ellipsoids, "PSfMO finds no ellipsoid"
 
 
 def _sfmo(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Priors) -> Solved:
-    """Factorise the boxes, and lay the result on the points that the cameras give.
+    """Factorise the boxes, and align the result with points triangulated by the cameras.
 
-    The affine frame is free up to a similarity and a mirror image: those of least squared distance
-    of the centres from where the viewing rays of the boxes' centres meet. Ref: Umeyama, PAMI 1991.
+    The affine frame is determined up to a similarity and a reflection: those of least squared
+    distance between the centres and the triangulated box centres. Ref: Umeyama, PAMI 1991.
     """
     found = quadrics.fit_sfmo(views.boxes)
-    target = _ray_points(views, poses)  # (G, 3)
+    target = _triangulated_centers(views, poses)  # (G, 3)
     use = np.isfinite(target).all(1) & np.isfinite(found.ellipsoids.center_in_world).all(1)
-    best, least = None, np.inf
-    for twin in (found.ellipsoids, found.mirrored) if use.sum() >= 3 else ():
-        sim = import_pycolmap().estimate_sim3d(twin.center_in_world[use], target[use])
+    best = None
+    least = np.inf
+    for candidate in (found.ellipsoids, found.mirrored) if use.sum() >= 3 else ():
+        sim = import_pycolmap().estimate_sim3d(candidate.center_in_world[use], target[use])
         if sim is None:
             continue
-        turn, scale = np.asarray(sim.rotation.matrix()), float(sim.scale)
-        center = scale * twin.center_in_world @ turn.T + np.asarray(sim.translation)
+        rotation = np.asarray(sim.rotation.matrix())
+        scale = float(sim.scale)
+        center = scale * candidate.center_in_world @ rotation.T + np.asarray(sim.translation)
         error = float(((center - target)[use] ** 2).sum())
         if error < least:
-            half, axes = scale * twin.half_axes, turn @ twin.world_from_obj
-            best, least = quadrics.Ellipsoids(center, half, axes), error
+            half_axes, axes = scale * candidate.half_axes, rotation @ candidate.world_from_obj
+            best = quadrics.Ellipsoids(center, half_axes, axes)
+            least = error
     if best is None:
-        nothing = np.zeros(len(target), bool)
-        return _only(found.ellipsoids, nothing), f"SfMO: {found.note}"
+        none = np.zeros(len(target), bool)
+        return _only(found.ellipsoids, none), f"SfMO: {found.note}"
     return _only(best, found.is_ellipsoid), "what SfMO finds is no ellipsoid"
 
 
-def _only(solids: quadrics.Ellipsoids, good: BoolArray) -> quadrics.Ellipsoids:
-    """Take away the axes (NaN) of what is no ellipsoid; good: (O,)."""
-    return dataclasses.replace(solids, half_axes=np.where(good[:, None], solids.half_axes, np.nan))
+def _only(ellipsoids: quadrics.Ellipsoids, good: BoolArray) -> quadrics.Ellipsoids:
+    """Set the axes to NaN where there is no ellipsoid; good: (O,)."""
+    half_axes = np.where(good[:, None], ellipsoids.half_axes, np.nan)
+    return dataclasses.replace(ellipsoids, half_axes=half_axes)
 
 
-def _ray_points(views: Views, poses: Poses) -> Array:
+def _triangulated_centers(views: Views, poses: Poses) -> Array:
     """Triangulate the centres (G, 3) of the boxes of each group, NaN with fewer than two."""
     points = np.full((views.boxes.shape[1], 3), np.nan)
     cam_from_world = poses.cam_from_world[poses.known]  # (V, 3, 4)
@@ -113,34 +131,52 @@ def _ray_points(views: Views, poses: Poses) -> Array:
     return points
 
 
-def _vertical_axis_last(solids: quadrics.Ellipsoids, up: Array | None) -> quadrics.Ellipsoids:
-    """Name the axes anew, so that the third is the one nearest to up, as in our own solids."""
+def _vertical_axis_last(ellipsoids: quadrics.Ellipsoids, up: Array | None) -> quadrics.Ellipsoids:
+    """Permute the axes so that the third is the one nearest to up, as in the default fit."""
     if up is None:
-        return solids
-    along = np.einsum("oij,i->oj", np.nan_to_num(solids.world_from_obj), up)  # (O, 3)
+        return ellipsoids
+    along = np.einsum("oij,i->oj", np.nan_to_num(ellipsoids.world_from_obj), up)  # (O, 3)
     last = np.abs(along).argmax(1)
     order = (last[:, None] + np.array([1, 2, 3])) % 3  # cyclic: stays right-handed
     sign = np.ones((len(order), 3))
     sign[:, [0, 2]] = np.where(along[np.arange(len(last)), last] < 0, -1.0, 1.0)[:, None]
-    axes = np.take_along_axis(solids.world_from_obj, order[:, None], 2) * sign[:, None]
-    half = np.take_along_axis(solids.half_axes, order, 1)
-    return dataclasses.replace(solids, half_axes=half, world_from_obj=axes)
+    axes = np.take_along_axis(ellipsoids.world_from_obj, order[:, None], 2) * sign[:, None]
+    half_axes = np.take_along_axis(ellipsoids.half_axes, order, 1)
+    return dataclasses.replace(ellipsoids, half_axes=half_axes, world_from_obj=axes)
 
 
 def _as_fits(
-    solids: quadrics.Ellipsoids, views: Views, parallax: Array, scale: quadrics.Scale, why: str
+    ellipsoids: quadrics.Ellipsoids,
+    views: Views,
+    parallax: Array,
+    scale: quadrics.Scale,
+    reason: str,
 ) -> quadrics.ObjectFits:
-    """Describe ellipsoids as a fit without covariance, in which every box counts."""
-    arrays = (solids.center_in_world, solids.half_axes, solids.world_from_obj.reshape(-1, 9))
+    """Describe ellipsoids as a fit without covariance, in which every box is an inlier.
+
+    Args:
+        reason: why the others have no ellipsoid.
+    """
+    axes = ellipsoids.world_from_obj.reshape(-1, 9)
+    arrays = (ellipsoids.center_in_world, ellipsoids.half_axes, axes)
     finite = np.isfinite(np.concatenate(arrays, 1))  # (O, 15)
-    good: BoolArray = np.all(finite, 1) & np.all(solids.half_axes > 0, 1)  # (O,)
+    good: BoolArray = np.all(finite, 1) & np.all(ellipsoids.half_axes > 0, 1)  # (O,)
     n = len(finite)
     return quadrics.ObjectFits(
-        solids, 2 * solids.half_axes, np.full((n, 9, 9), np.nan), np.full(n, "ellipsoid"),
-        np.ones(views.boxes.shape[:2], bool), np.full(n, np.nan),
-        np.where(good, "ok", "rejected"), ["" if g else why for g in good.tolist()],
-        parallax, np.full((n, 3), np.nan), scale, np.zeros(3), "none",
-    )  # fmt: skip
+        ellipsoids=ellipsoids,
+        size=2 * ellipsoids.half_axes,
+        cov=np.full((n, 9, 9), np.nan),
+        support=np.full(n, "ellipsoid"),
+        inlier=np.ones(views.boxes.shape[:2], bool),
+        rms_px=np.full(n, np.nan),
+        status=np.where(good, "ok", "rejected"),
+        reason=["" if g else reason for g in good.tolist()],
+        parallax_deg=parallax,
+        prior_share=np.full((n, 3), np.nan),
+        scale=scale,
+        up=np.zeros(3),
+        up_source="none",
+    )
 
 
 NO_SIGMA = "no priors, no test of outliers, no uncertainty"

@@ -316,7 +316,7 @@ MAX_BREAKS = 5  # named in a message (chosen)
 def _breaks(poses: Poses) -> list[str]:
     """Say between which frames the reconstruction broke and what was done; [] if it did not.
 
-    What several parts mean for the objects is said where these are made (`reobj.objects.fit`).
+    For the consequences for objects see `components_message` of `reobj.objects.description`.
     """
     rows = np.flatnonzero(poses.known)
     at = np.flatnonzero(np.diff(poses.part[rows]))

@@ -148,7 +148,7 @@ class EllipsoidMap:
 
     @property
     def due(self) -> BoolArray:
-        """(I,) identities with enough views for a fit, more than a quarter of them since the last."""
+        """(I,) identities with enough views for a fit, more than a quarter of them new."""
         count = (self.frame >= 0).sum(1)
         return np.asarray((count >= MAP_MIN_VIEWS) & (self.fresh > count // 4), bool)
 
@@ -266,7 +266,7 @@ class EllipsoidMap:
 
 
 def rows_of(rows: Any, identity: IntArray, missing: Any) -> npt.NDArray[Any]:
-    """Take rows of a table of identities (I, ...): (T, ...), `missing` where there is no such row."""
+    """Take rows (T, ...) of a table of identities (I, ...), `missing` beyond its end or at -1."""
     table = np.concatenate([rows, np.full((1, *rows.shape[1:]), missing, rows.dtype)])
     return np.asarray(table[np.where(identity < len(rows), identity, -1)])
 
@@ -377,9 +377,7 @@ def project_half_intervals(ends: Array, img_from_world: Array) -> Array:
     return np.asarray((xy[:, 1] - xy[:, 0]) / 2)
 
 
-def iou_within_uncertainty(
-    box: Array, uncertainty: Array, detected: Array
-) -> tuple[Array, Array]:
+def iou_within_uncertainty(box: Array, uncertainty: Array, detected: Array) -> tuple[Array, Array]:
     """Compare boxes of uncertain position with detections, each moved to where it fits best.
 
     Args:

@@ -270,7 +270,7 @@ def test_solids_are_not_missed_in_frames_that_nobody_looked_at() -> None:
         given.tracks = given.tracks[keep]
         given.tracks.score[:] = 0.35
         given.looked = looked
-        link_and_fit(given, rt.ObjectsConfig())
-        sure.append([o.confidence or 0.0 for o in given.objects])
+        found = link_and_fit(given, rt.ObjectsConfig()).objects
+        sure.append([o.confidence or 0.0 for o in found])
     assert len(sure[0]) == 3
     assert min(sure[0]) > max(sure[1] or [0.0]) + 0.1
