@@ -31,19 +31,19 @@ from reobj.types import (
     unit_rows,
 )
 
-CROP_BACKBONE = "mobilenetv2_feat"  # its ConvBlock comes along (re-OBJ: a ResNet)
+CROP_BACKBONE = "mobilenetv2_feat"  # its ConvBlock is bundled (re-OBJ: a ResNet)
 
 
 def make_embedder(
     model: str, head: str = "", threads: int = 0, offline: bool = False, device: str = "cpu"
 ) -> Embedder | None:
-    """Make the embedder that `EmbedConfig.model` and `.head` name.
+    """Build the embedder named by `EmbedConfig.model` and `.head`.
 
     Args:
         model: "none"; "crops" or "crops:BACKBONE" for a `CropEmbedder`; else as of `Embedder`.
         head, threads, offline, device: as of `Embedder`.
     Returns:
-        None for "none": the tracker then goes by motion.
+        None for "none": the tracker then uses motion alone.
     """
     if model == "none":
         return None
@@ -58,20 +58,20 @@ CROP_STRIDE = 32  # of the map taken from crops: 7 x 7 for 224 px, as the last o
 
 
 class CropEmbedder(Embedder):
-    """Foreground and background embeddings in re-OBJ style: two masked crops of every object.
+    """Foreground and background embeddings as in re-OBJ: two masked crops of every object.
 
-    The grown box is cut out twice, once with all but the object hidden and once with the object
-    hidden. A backbone turns each crop into a map, and a trained ConvBlock turns the two maps,
-    stacked in the channels, into one embedding (the one that comes along first treats each alone).
+    The enlarged box is cropped twice, once with everything but the object masked and once with the
+    object masked. A backbone turns each crop into a map. A trained ConvBlock turns the two maps,
+    stacked in the channels, into one embedding (the bundled one processes each map alone first).
     Without a ConvBlock the maps are flattened (the thesis's "no-train"). A model of
     `examples/train_embedding.py` has its own head: its cells are pooled from the crops' maps as
-    `Embedder` does from the frame's.
+    `Embedder` pools them from the frame's.
 
     Args:
         model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image
             input (any batch) and a spatial output.
         head: ConvBlock (.onnx); "": crops_BACKBONE_head.onnx beside the backbone's file, else the
-            one that comes along; "none": none.
+            bundled one; "none": none.
         layout, threads, offline, device: as of `Embedder`.
     Raises:
         ReobjError: the model has no spatial output, or (when called) the ConvBlock does not fit it.
@@ -117,10 +117,10 @@ class CropEmbedder(Embedder):
         return Embeddings(unit_rows(joint), np.empty((len(rows), 0)))
 
     def cut(self, frame: Image, detections: Detections, rows: IntArray) -> tuple[Image, BoolArray]:
-        """Cut out the grown boxes of detections (N,), black beyond the frame.
+        """Crop the enlarged boxes of detections (N,), black beyond the frame.
 
         Returns:
-            crops (N, S, S, 3), and (N, S, S) the pixels that are on the object.
+            crops (N, S, S, 3), and (N, S, S) the pixels on the object.
         """
         side, (height, width) = self.layout.crop_px, frame.shape[:2]
         low, high = self._windows(detections.xyxy[rows], frame.shape[:2])
@@ -137,16 +137,16 @@ class CropEmbedder(Embedder):
         return np.stack(crops), own
 
     def masked(self, crops: Image, own: BoolArray) -> Image:
-        """Hide all but the object, and hide the object, in crops (N, S, S, 3).
+        """Mask all but the object, and mask the object, in crops (N, S, S, 3).
 
-        A frozen backbone gets ImageNet's mean colour with a soft edge there: a hard edge is the
-        strongest thing in the crop, and another mask of the same object would look different. A
-        model of our own gets black, as in its training.
+        Masked pixels are ImageNet's mean colour with a soft edge for a frozen backbone: a hard edge
+        would be the strongest feature of the crop, and another mask of the same object would look
+        different. They are black for our trained models, as in training.
 
         Args:
             own: (N, S, S) pixels on the object.
         Returns:
-            (2N, S, S, 3): the N objects alone, then their N surroundings.
+            (2N, S, S, 3): the N objects alone, then their N backgrounds.
         """
         if self.trained:
             return np.concatenate([crops * own[..., None], crops * ~own[..., None]])
@@ -174,7 +174,7 @@ class CropEmbedder(Embedder):
             isinstance(w, int) and w != n for w, n in zip(wanted, maps.shape[1:], strict=True)
         ):
             raise ReobjError(
-                f"{self.head}: takes {entry.shape}, the two maps of the backbone are "
+                f"{self.head}: expects input {entry.shape}, but the two maps of the backbone are "
                 f"(N, {', '.join(map(str, maps.shape[1:]))}): give a ConvBlock trained with this "
                 "backbone"
             )
@@ -182,7 +182,7 @@ class CropEmbedder(Embedder):
         return np.asarray(joint.reshape(len(maps), -1), np.float64)
 
     def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
-        """Return the corners (N, 2) low and high of the grown boxes, whole pixels.
+        """Return the corners (N, 2) low and high of the enlarged boxes, whole pixels.
 
         They may lie beyond the frame.
         """
@@ -210,7 +210,7 @@ class CropEmbedder(Embedder):
     ) -> tuple[Floats, Floats]:
         """Pool the maps of masked crops (2N, S, S, 3) into the cells of a trained head.
 
-        In the coordinates of its crop every object is detection 0, and all others are detection 1.
+        In the coordinates of its crop each object is detection 0, and all others are detection 1.
 
         Returns:
             foreground and background (N, cells, C + 2) of `pool_cells`.
