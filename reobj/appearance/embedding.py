@@ -299,7 +299,7 @@ class Backbone:
         return np.ascontiguousarray(maps.transpose(0, 2, 3, 1))
 
     def use_output_at_stride(self, stride: int, size_px: int) -> None:
-        """Select the first output with this stride for square images of size_px, if there is one."""
+        """Select the first output with this stride for square images of size_px, if any."""
         if self.channels_last:
             return
         names = [o.name for o in self.session.get_outputs()]
