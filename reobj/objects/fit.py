@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,39 +63,35 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
     """
     priors = quadrics.load_priors(config.priors or None)
     poses = result.poses
-    count = 1 if poses is None else poses.part_count
-    components = [None if poses is None else poses.of_part(k) for k in range(count)]
-    fits_of = _make_fits(components, config, result.class_names)
+    components = _split_trajectory(poses, config, result.class_names)
     if result.identities_given:
-        linked = _unlinked(result.tracks, count)
+        linked = _unlinked(result.tracks, len(components))
     else:
-        tables = _split_table(result)
+        tables = zip(components, _split_table(result), strict=True)
         linked = _joined(
-            _link_component(*tables[k], result, components[k], fits_of[k], priors, config)
-            for k in range(count)
+            _link_component(component, table, source, result, priors, config)
+            for component, (table, source) in tables
         )
     edited = _Edited(linked, result.class_names, [], None)
     if result.edits is not None:
         edited = _edit(linked, result, result.edits, priors)
-        fits_of = _make_fits(components, config, edited.class_names)
+        components = _split_trajectory(poses, config, edited.class_names)
     linked = edited.linked
-    tracks = linked.tracks
-    identity, identity_of_row = np.unique(tracks.track_id, return_inverse=True)
-    component_of_object = _component_with_most_boxes(tracks, identity_of_row, len(identity), poses)
-    component_of_row = component_of_object[identity_of_row]
+    identity, object_of_row = np.unique(linked.tracks.track_id, return_inverse=True)
+    component_of_object = _component_with_most_boxes(
+        linked.tracks, object_of_row, len(identity), poses
+    )
     objects = list[Object]()
     fits = list[quadrics.ObjectFits | None]()
-    for k in range(count):
-        rows = np.flatnonzero(component_of_row == k)
-        fitted = _fit_component(
-            k, rows, linked, components[k], fits_of[k], edited.class_names, priors, config
-        )
-        objects += fitted[0]
-        fits.append(fitted[1])
+    for component in components:
+        rows = np.flatnonzero(component_of_object[object_of_row] == component.number)
+        described, fit = _fit_component(component, rows, linked, edited.class_names, priors, config)
+        objects += described
+        fits.append(fit)
     embeddings, embedding_row = _select_embeddings(result, linked.source)
     return dataclasses.replace(
         result,
-        tracks=tracks,
+        tracks=linked.tracks,
         class_names=edited.class_names,
         objects=sorted(objects, key=lambda o: o.id),
         world=describe_world(poses, fits, linked.events),
@@ -107,19 +103,35 @@ def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
     )
 
 
-def _make_fits(
-    components: Sequence[Poses | None], config: ObjectsConfig, class_names: Sequence[str]
-) -> list[Fit | None]:
-    """Make the fit function of each component; None if no component has enough poses.
+class _Component(NamedTuple):
+    """A connected component of the trajectory: its poses, and how its objects are fitted.
 
-    An upward direction given by the user is that of component 0, the largest.
+    Attributes:
+        number: 0 the largest. poses: None without cameras. fit: None if no component has enough
+            poses.
     """
-    posed = [poses for poses in components if poses is not None]
-    if not any(poses.known.sum() >= config.min_views for poses in posed):
-        return [None] * len(components)
+
+    number: int
+    poses: Poses | None
+    fit: Fit | None
+
+
+def _split_trajectory(
+    poses: Poses | None, config: ObjectsConfig, class_names: Sequence[str]
+) -> list[_Component]:
+    """Split the trajectory into its components.
+
+    An upward direction given by the user is that of the largest, component 0.
+    """
+    if poses is None:
+        return [_Component(0, None, None)]
+    poses_of = [poses.of_part(k) for k in range(poses.part_count)]
+    if not any(own.known.sum() >= config.min_views for own in poses_of):
+        return [_Component(k, own, None) for k, own in enumerate(poses_of)]
     others = dataclasses.replace(config, up="")
     return [
-        make_fit(config if k == 0 else others, poses, class_names) for k, poses in enumerate(posed)
+        _Component(k, own, make_fit(config if k == 0 else others, own, class_names))
+        for k, own in enumerate(poses_of)
     ]
 
 
@@ -168,15 +180,19 @@ def _split_table(result: Result) -> list[tuple[Tracks, IntArray]]:
 
 
 def _link_component(
+    component: _Component,
     table: Tracks,
     source: IntArray,
     result: Result,
-    poses: Poses | None,
-    fit: Fit | None,
     priors: quadrics.Priors,
     config: ObjectsConfig,
 ) -> _Linked:
-    """Link the tracks of a component; identities are numbered from 1."""
+    """Link the tracks of a component; identities are numbered from 1.
+
+    Args:
+        table: detections of the component. source: (N,) their rows in the result's tracks, or -1.
+    """
+    _, poses, fit = component
     objects = None
     if config.link and fit and poses is not None and poses.known.sum() >= config.min_views:
         moving = config.moving_classes
@@ -379,11 +395,9 @@ def _component_with_most_boxes(
 
 
 def _fit_component(
-    component: int,
+    component: _Component,
     rows: IntArray,
     linked: _Linked,
-    poses: Poses | None,
-    fit: Fit | None,
     class_names: Sequence[str],
     priors: quadrics.Priors,
     config: ObjectsConfig,
@@ -393,6 +407,7 @@ def _fit_component(
     Args:
         rows: of its objects in the linked tracks.
     """
+    number, poses, fit = component
     tracks = linked.tracks[rows]
     fits = views = None
     if len(tracks) and fit is not None and poses is not None:
@@ -400,7 +415,7 @@ def _fit_component(
         categories = list(classes.values())
         group = np.searchsorted(list(classes), tracks.track_id)
         views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
-        objects = linked.objects[component]
+        objects = linked.objects[number]
         if objects is None:
             first = fit(views, categories, UNKNOWN_SCENE)
             floor, ellipsoids = find_floor(poses, first), first.ellipsoids
@@ -414,10 +429,10 @@ def _fit_component(
             points=points_on(views, poses, ellipsoids),
         )
         fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
-    objects_found = describe_objects(
-        tracks, class_names, fits, views, config, linked.confidence, component
+    described = describe_objects(
+        tracks, class_names, fits, views, config, linked.confidence, number
     )
-    return objects_found, fits
+    return described, fits
 
 
 OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are per object
