@@ -277,7 +277,7 @@ def unused_sizes(text: str, priors_path: str, located: Sequence[str]) -> list[st
     used = set(priors.canonical(located))
     names = list(map(str, parse_known_size(text)))
     return [
-        f"--known-size {name}: no {name} with a solid was found, so this sets no scale"
+        f"--known-size {name}: no {name} was located, so this sets no scale"
         for name, canonical in zip(names, priors.canonical(names), strict=True)
         if canonical not in used
     ]

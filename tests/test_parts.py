@@ -357,8 +357,9 @@ def test_up_of_the_poses_is_that_of_the_largest_part() -> None:
 
 def test_the_message_says_what_it_means_and_what_helps() -> None:
     (text,) = components_message(two_parts())
-    for words in ("2 parts", "part 0: frames 0-39", "part 1: frames 40-63", "own frame and scale",
-                  "two objects", "overlaps more", "--poses", "objects OUT --edits"):  # fmt: skip
+    for words in ("2 components", "component 0: frames 0-39", "component 1: frames 40-63",
+                  "own frame and scale", "listed twice", "more overlap", "--poses",
+                  "objects OUT --edits"):  # fmt: skip
         assert words in text
 
 
@@ -503,7 +504,7 @@ def test_poses_command_writes_a_file_for_each_part(
     assert rt.main(["poses", frames, "-o", str(tmp_path)]) == 0
     lengths = [len(np.loadtxt(tmp_path / name)) for name in ("poses.txt", "poses_part1.txt")]
     assert lengths == [38, 23]
-    assert "the cameras come in 2 parts" in capsys.readouterr().err
+    assert "the trajectory has 2 components" in capsys.readouterr().err
 
 
 def test_the_summary_has_a_line_for_each_part(parted: rt.Result) -> None:

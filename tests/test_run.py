@@ -819,7 +819,7 @@ def test_a_size_that_sets_nothing_is_said(
     names = ("--set", f"detect.class_names={tmp_path / 'names.txt'}")
     size = ("--known-size", "door=2m")
     assert cli("run", frames, "-o", tmp_path / "out", *args, *QUICK, *names, *size) == 0
-    assert "warning: --known-size door: no door with a solid" in capsys.readouterr().err
+    assert "warning: --known-size door: no door was located" in capsys.readouterr().err
     assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
 
 

@@ -89,8 +89,8 @@ def with_low_confidence(status: str, reason: str, confidence: float) -> tuple[st
     """Return status and reason of an object; below LOW_CONFIDENCE its status is "doubtful"."""
     if confidence >= LOW_CONFIDENCE:
         return status, reason
-    why = f"{100 * confidence:.0f} % likely: its detections are weak, or in few of the frames"
-    why += ", or things behind it are seen through its place"
+    why = f"{100 * confidence:.0f} % likely to exist: low detection scores, few of the expected "
+    why += "detections, or background points visible through it"
     if status == "rejected":
         why += f"; {reason}"
     return "doubtful", why

@@ -20,9 +20,7 @@ PUBLISHED_SOLVERS = ("lfd", "sfmo", "psfmo")
 class ObjectsConfig:
     """Fit one shape and its ellipsoid to every object, from tracks and cameras."""
 
-    priors: str = option(
-        "", "size priors, JSON (default: the priors.json that comes along)", "--priors"
-    )
+    priors: str = option("", "size priors, JSON (default: the bundled priors.json)", "--priors")
     known_size: str = option(
         "", "true heights that set the metric scale: 'chair=.82m,door=2m'", "--known-size"
     )
@@ -35,15 +33,15 @@ class ObjectsConfig:
     )
     solver: str = option(
         DEFAULT_SOLVER,
-        "solids (ours), or ellipsoids by a published closed form: lfd, sfmo, psfmo",
+        "solids (default), or a published closed-form solver: lfd, sfmo, psfmo",
         "--solver",
     )
     up: str = option("", "direction against gravity in the world, x,y,z (default: estimated)")
-    link: bool = option(True, "join and split the tracker's tracklets after the video")
+    link: bool = option(True, "join and split the tracks after the video")
     min_views: int = option(3, "an object seen in fewer frames with a pose gets no ellipsoid")
     moving: str = option(
         "person,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe",
-        "classes that move, comma-separated: they are tracked, but get no ellipsoid",
+        "classes that move, comma-separated: tracked, but without an ellipsoid",
     )
 
     @property

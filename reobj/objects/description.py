@@ -214,10 +214,10 @@ def components_message(poses: Poses) -> list[str]:
     if poses.part_count == 1:
         return []
     components = describe_world(poses, [None] * poses.part_count, []).parts
-    where = shortened([f"part {k}: {part.span_text}" for k, part in enumerate(components)])
+    where = shortened([f"component {k}: {part.span_text}" for k, part in enumerate(components)])
     return [
-        f"the cameras come in {len(components)} parts that do not connect ({where}): each has its "
-        "own frame and scale, and what is seen in two parts is listed as two objects. A recording "
-        "that overlaps more, with slower turns, or --poses gives one part; identities can be "
+        f"the trajectory has {len(components)} components that do not connect ({where}): each has "
+        "its own frame and scale, and an object seen in two of them is listed twice. To get one "
+        "component, record with more overlap and slower turns, or give --poses; identities can be "
         "joined by hand (in scene.html, then `objects OUT --edits`)"
     ]

@@ -73,13 +73,13 @@ def _lfd(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Prio
     """Solve each object's dual quadric in closed form; the axes are NaN if it is no ellipsoid."""
     dual_q, real = quadrics.fit_lfd(views.boxes, views.img_from_world)
     ellipsoids = quadrics.Ellipsoids.from_dual_quadrics(dual_q)[0]
-    return _only(ellipsoids, real), "what LfD finds is no ellipsoid"
+    return _only(ellipsoids, real), "the LfD solution is not an ellipsoid"
 
 
 def _psfmo(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Priors) -> Solved:
     """Fit with axis-ratio priors of the category; cameras are linearised at each object."""
     found = quadrics.fit_psfmo(views.boxes, priors, names, views.img_from_world)
-    return found.ellipsoids, "PSfMO finds no ellipsoid"
+    return found.ellipsoids, "PSfMO found no ellipsoid"
 
 
 def _sfmo(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Priors) -> Solved:
@@ -108,7 +108,7 @@ def _sfmo(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Pri
     if best is None:
         none = np.zeros(len(target), bool)
         return _only(found.ellipsoids, none), f"SfMO: {found.note}"
-    return _only(best, found.is_ellipsoid), "what SfMO finds is no ellipsoid"
+    return _only(best, found.is_ellipsoid), "the SfMO solution is not an ellipsoid"
 
 
 def _only(ellipsoids: quadrics.Ellipsoids, good: BoolArray) -> quadrics.Ellipsoids:
@@ -179,17 +179,17 @@ def _as_fits(
     )
 
 
-NO_SIGMA = "no priors, no test of outliers, no uncertainty"
+LIMITS = "no priors, no outlier rejection, no uncertainty"
 SOLVERS: dict[str, tuple[Solver, str]] = {
-    "lfd": (_lfd, f"ellipsoids in closed form, in the units of the cameras; {NO_SIGMA}"),
+    "lfd": (_lfd, f"ellipsoids in closed form, in the units of the cameras; {LIMITS}"),
     "sfmo": (
         _sfmo,
-        "shapes from boxes alone, by affine cameras, without metric meaning (size_m is null); "
-        "place, turn, size and mirror image are those that fit the cameras best",
+        "shapes from boxes alone, with affine cameras, without metric meaning (size_m is null); "
+        "the similarity transform and reflection are those that fit the cameras best",
     ),
     "psfmo": (
         _psfmo,
-        "axis ratios from the category, cameras linearised at each object, in their units; only "
-        "the ratios are a prior, sizes are not; no test of outliers, no uncertainty",
+        "axis ratios from the category, cameras linearised at each object, in the units of the "
+        "cameras; no size priors, no outlier rejection, no uncertainty",
     ),
 }
