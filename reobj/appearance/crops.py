@@ -105,10 +105,10 @@ class CropEmbedder(Embedder):
         rows = np.arange(len(detections)) if rows is None else rows
         if not len(rows):
             return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
-        crops, own = self.cut(frame, detections, rows)
-        masked = self.masked(crops, own)
+        crops, on_object = self.cut(frame, detections, rows)
+        masked = self.masked(crops, on_object)
         if self.trained:
-            cells = self._crop_cells(masked, detections, rows, frame.shape[:2], own)
+            cells = self._crop_cells(masked, detections, rows, frame.shape[:2], on_object)
             return Embeddings(*self.backbone.embed(*cells))
         fore, back = np.split(self.maps(masked), 2)  # (N, C, h, w) each
         if self.conv_block is None:
@@ -133,10 +133,10 @@ class CropEmbedder(Embedder):
         grid = self._pixel_centres(low, high)  # (N, 2, S)
         at = np.stack(np.broadcast_arrays(grid[:, 0, None, :], grid[:, 1, :, None]))  # (2, N, S, S)
         box = cxcywh_from_xyxy(detections.xyxy[rows]).T[..., None, None]  # (4, N, 1, 1)
-        own = inside_object(detections, rows[:, None, None], at, box[:2], box[2:] / 2)
-        return np.stack(crops), own
+        on_object = inside_object(detections, rows[:, None, None], at, box[:2], box[2:] / 2)
+        return np.stack(crops), on_object
 
-    def masked(self, crops: Image, own: BoolArray) -> Image:
+    def masked(self, crops: Image, on_object: BoolArray) -> Image:
         """Mask all but the object, and mask the object, in crops (N, S, S, 3).
 
         Masked pixels are ImageNet's mean colour with a soft edge for a frozen backbone: a hard edge
@@ -144,14 +144,14 @@ class CropEmbedder(Embedder):
         different. They are black for our trained models, as in training.
 
         Args:
-            own: (N, S, S) pixels on the object.
+            on_object: (N, S, S) pixels on the object.
         Returns:
             (2N, S, S, 3): the N objects alone, then their N backgrounds.
         """
         if self.trained:
-            return np.concatenate([crops * own[..., None], crops * ~own[..., None]])
+            return np.concatenate([crops * on_object[..., None], crops * ~on_object[..., None]])
         edge = self.layout.crop_px * EDGE_SHARE
-        soft = [cv2.GaussianBlur(o.astype(np.float32), (0, 0), edge) for o in own]
+        soft = [cv2.GaussianBlur(o.astype(np.float32), (0, 0), edge) for o in on_object]
         grey = np.array(IMAGENET_MEAN[::-1], np.float32)
         fore = (crops - grey) * np.stack(soft)[..., None]
         both = np.concatenate([grey + fore, crops - fore])
@@ -187,12 +187,14 @@ class CropEmbedder(Embedder):
         They may lie beyond the frame.
         """
         box = cxcywh_from_xyxy(xyxy)  # (N, 4)
-        layout, surround = self.layout, self.layout.surround_scale > 0
+        layout = self.layout
+        surround = self.layout.surround_scale > 0
         scale = max(layout.context, layout.surround_scale)
         least = max(layout.min_margin, layout.surround_min_margin * surround)
         margin = np.maximum(box[:, 2:] * scale, max(1.0, least * max(size_hw)))
         half = box[:, 2:] / 2 + margin  # (N, 2)
-        low, high = np.floor(box[:, :2] - half), np.ceil(box[:, :2] + half)
+        low = np.floor(box[:, :2] - half)
+        high = np.ceil(box[:, :2] + half)
         return low.astype(np.int64), high.astype(np.int64)
 
     def _pixel_centres(self, low: IntArray, high: IntArray) -> Array:
@@ -206,7 +208,7 @@ class CropEmbedder(Embedder):
         detections: Detections,
         rows: IntArray,
         size_hw: tuple[int, ...],
-        own: BoolArray,
+        on_object: BoolArray,
     ) -> tuple[Floats, Floats]:
         """Pool the maps of masked crops (2N, S, S, 3) into the cells of a trained head.
 
@@ -215,20 +217,21 @@ class CropEmbedder(Embedder):
         Returns:
             foreground and background (N, cells, C + 2) of `pool_cells`.
         """
-        side, count = self.layout.crop_px, len(rows)
+        side = self.layout.crop_px
+        count = len(rows)
         low, high = self._windows(detections.xyxy[rows], size_hw)
         box = (detections.xyxy[rows] - np.tile(low, 2)) * np.tile(side / (high - low), 2)  # (N, 4)
-        others = self._occupied_crops(detections, size_hw, low, high) & ~own  # (N, S, S)
+        others = self._occupied_crops(detections, size_hw, low, high) & ~on_object  # (N, S, S)
         maps = self.backbone.maps(masked)  # (2N, h, w, C)
         cells = []
-        for i in range(2 * count):  # over crops: each has a map of its own
+        for i in range(2 * count):  # each crop has its own map
             k = i % count
             some = [True, bool(others[k].any())]
             found = Detections(
                 np.stack([box[k], [0, 0, side, side]])[some],
                 np.ones(sum(some)),
                 np.zeros(sum(some), np.int64),
-                np.stack([own[k], others[k]])[some],
+                np.stack([on_object[k], others[k]])[some],
             )
             occupied = occupancy_map(found, (side, side), maps.shape[1:3])
             samples = sample_parts(found, [np.arange(1)] * 2, (side, side), occupied, self.layout)
@@ -242,7 +245,8 @@ class CropEmbedder(Embedder):
         height, width = size_hw
         occupied = occupancy_map(detections, size_hw, (height, width), self.layout.object_score)
         at = self._pixel_centres(low, high).astype(int)  # (N, 2, S)
-        x, y = at[:, 0, None, :], at[:, 1, :, None]
+        x = at[:, 0, None, :]
+        y = at[:, 1, :, None]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         return np.asarray(occupied[y.clip(0, height - 1), x.clip(0, width - 1)] & inside)
 

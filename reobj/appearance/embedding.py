@@ -215,7 +215,8 @@ def neighbour_embedding(
         (N, E) unit rows; 0 for a detection without neighbours.
     """
     others, (x, y, w, h) = np.flatnonzero(confident), cxcywh_from_xyxy(xyxy).T  # (O,), (D,) each
-    centre, size = x + 1j * y, np.sqrt(np.maximum(w, 1) * np.maximum(h, 1))
+    centre = x + 1j * y
+    size = np.sqrt(np.maximum(w, 1) * np.maximum(h, 1))
     distance = np.abs(centre[rows, None] - centre[others])  # (N, O)
     weight = np.exp(-distance / size[rows, None]) * (rows[:, None] != others)
     return unit_rows(weight @ foreground[others])
@@ -227,7 +228,8 @@ def _hellinger_rows(cells: Floats) -> Array:
     The signed square root makes a cosine of histograms a Hellinger kernel and damps strong
     channels; cells with few valid samples weigh less.
     """
-    mean, fraction = cells[..., :-2], cells[..., -2]
+    mean = cells[..., :-2]
+    fraction = cells[..., -2]
     weight = np.sqrt(fraction / np.maximum(fraction.max(1, keepdims=True), 1e-9))
     rows = np.sign(mean) * np.sqrt(np.abs(mean)) * weight[..., None]
     return unit_rows(_joined_cells(rows))
@@ -273,7 +275,8 @@ class Backbone:
                 f"(N, C, h, w), found outputs {[o.name for o in self.session.get_outputs()]}; "
                 "give another --embed model"
             )
-        self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
+        self.input = self.session.get_inputs()[0].name
+        self.output = spatial[0]
         metadata = onnx_metadata(self.session)
         self.channels_last = bool(metadata)
         self.multiple = int(metadata.get("multiple", 32))  # sides of the input, pixels
@@ -362,14 +365,14 @@ def as_embeddings(
     if embeddings is None:
         return None
     if not isinstance(embeddings, Embeddings):
-        rows = as_numbers(embeddings, "embeddings")
-        rows = rows.reshape(0, 0) if rows.ndim == 1 and not rows.size else rows
-        embeddings = Embeddings(rows, np.empty((count, 0)))
-    for part in (embeddings.foreground, embeddings.background):
-        if part.ndim != 2 or len(part) != count:
-            raise ReobjError(f"embeddings are an array of shape {part.shape}, expected ({count}, "
+        array = as_numbers(embeddings, "embeddings")
+        array = array.reshape(0, 0) if array.ndim == 1 and not array.size else array
+        embeddings = Embeddings(array, np.empty((count, 0)))
+    for rows in (embeddings.foreground, embeddings.background):
+        if rows.ndim != 2 or len(rows) != count:
+            raise ReobjError(f"embeddings are an array of shape {rows.shape}, expected ({count}, "
                              "E): one row per detection")  # fmt: skip
-        if not np.abs(part).max(initial=0) <= FLOAT32_MAX:  # NaN neither
+        if not np.abs(rows).max(initial=0) <= FLOAT32_MAX:  # False for NaN
             raise ReobjError("embeddings are not finite as float32")
     found = embeddings.foreground.shape[1] + embeddings.background.shape[1]
     if count and (not found or width not in (0, found)):
@@ -431,11 +434,13 @@ class LazyEmbeddings:
     def _fuse(self, rows: IntArray) -> Floats:
         """Compute the fused rows of detections (n,)."""
         if self.given is not None:
-            fore, back = self.given.foreground[rows], self.given.background[rows]
+            fore = self.given.foreground[rows]
+            back = self.given.background[rows]
         else:
             assert self.embedder is not None and self.frame is not None
             found = self.embedder(self.frame, self.detections, rows)
-            fore, back = found.foreground, found.background
+            fore = found.foreground
+            back = found.background
         self.foreground_width = fore.shape[1]
         weight = self.weight if back.shape[1] else 1.0
         parts = [math.sqrt(weight) * unit_rows(fore), math.sqrt(1 - weight) * unit_rows(back)]

@@ -42,7 +42,8 @@ class Gallery:
     ARRAYS = ("rows", "viewing_ray", "count", "foreground_width")  # the whole state
 
     def __init__(self, views: int = GALLERY_VIEWS, novelty: float = GALLERY_NOVELTY) -> None:
-        self.views, self.novelty = views, novelty
+        self.views = views
+        self.novelty = novelty
         self.rows = np.zeros((0, views, 0), np.float32)
         self.viewing_ray = np.zeros((0, views, 3))
         self.count = np.zeros(0, np.int64)
@@ -197,9 +198,9 @@ class SimilarityCalibration:
 
     def add_frame(self, foreground: Array, background: Array, class_id: IntArray) -> None:
         """Add all pairs of one class in a frame, cosines (n, n): the diagonal is one object."""
-        own = np.eye(len(class_id), dtype=bool)
-        other = (class_id[:, None] == class_id) & ~own
-        self.add(foreground[own], background[own], True)
+        same = np.eye(len(class_id), dtype=bool)
+        other = (class_id[:, None] == class_id) & ~same
+        self.add(foreground[same], background[same], True)
         self.add(foreground[other], background[other], False)
 
     def logit(
@@ -218,7 +219,8 @@ class SimilarityCalibration:
             view_angle_deg: between the viewing rays. The weight of the foreground decreases with
                 it; from 90 degrees on the background has no weight. NaN: as 45 degrees.
         """
-        foreground, background = np.asarray(foreground), np.asarray(background)
+        foreground = np.asarray(foreground)
+        background = np.asarray(background)
         kind = np.result_type(foreground, background)
         cosines = (foreground.astype(kind), background.astype(kind))
         scores = self.part_scores(*cosines, view_angle_deg)

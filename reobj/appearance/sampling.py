@@ -89,7 +89,8 @@ class PartSamples:
     def split(self, values: Any) -> tuple[Any, Any]:
         """Split values (K, ...) into foreground (M, cells, ...) and background (N, cells, ...)."""
         fore, back = self.shape
-        first, rest = values[: math.prod(fore)], values[math.prod(fore) :]
+        first = values[: math.prod(fore)]
+        rest = values[math.prod(fore) :]
         return first.reshape(*fore, *values.shape[1:]), rest.reshape(*back, *values.shape[1:])
 
 
@@ -115,17 +116,18 @@ def sample_parts(
     part, grid, excludes, shape = _sample_grid(layout, len(rows[0]), len(rows[1]))
     row = np.concatenate(rows).take(part)  # (L,)
     low, high = detections.xyxy.T.take(row, 1).reshape(2, 2, -1)  # (2, L) x, y, as all below
-    centre, own_half = (low + high) / 2, (high - low) / 2
-    half = own_half + np.maximum((high - low) * grid[2], grid[3] * max(size_hw))
+    centre = (low + high) / 2
+    box_half = (high - low) / 2
+    half = box_half + np.maximum((high - low) * grid[2], grid[3] * max(size_hw))
     at = centre + half * grid[:2]
     inside = ((at >= 0) & (at < size)).all(0)  # (L,)
     cell = (at / size * cells_wh).astype(int)
     index = (cell[1] * occupied.shape[1] + cell[0]) * inside
-    own = inside_object(detections, row, at, centre, own_half) & inside
-    others = occupied.take(index) & (inside > own)
-    weight = inside > (own | others & excludes)
+    on_object = inside_object(detections, row, at, centre, box_half) & inside
+    others = occupied.take(index) & (inside > on_object)
+    weight = inside > (on_object | others & excludes)
     fine = layout.samples**2
-    weight[: fine * math.prod(shape[0])] = own[: fine * math.prod(shape[0])]
+    weight[: fine * math.prod(shape[0])] = on_object[: fine * math.prod(shape[0])]
     counts = np.concatenate([weight, others]).reshape(2, -1, fine).sum(-1, dtype=np.float32)
     return PartSamples(index.reshape(-1, fine), weight.reshape(-1, fine), counts.T / fine, shape)
 
@@ -150,9 +152,11 @@ def _sample_grid(
     for *kind, cells in (box, enlarged, wider)[: 2 + (layout.surround_scale > 0)]:
         side = cells * layout.samples
         line = ((np.arange(side) + 0.5) / side * 2 - 1).reshape(cells, -1)
-        x, y = line[:, None], line[:, None, :, None]
+        x = line[:, None]
+        y = line[:, None, :, None]
         grids.append(np.stack(np.broadcast_arrays(x, y, *kind)).reshape(5, -1))
-    fore, back = grids[0], np.concatenate(grids[1:], 1)  # (5, samples of one part)
+    fore = grids[0]  # (5, samples of one part)
+    back = np.concatenate(grids[1:], 1)
     grid = np.concatenate([fore[:, :0], *[fore] * foregrounds, *[back] * backgrounds], 1)
     sizes = np.array([fore.shape[1], back.shape[1]])
     part = np.arange(foregrounds + backgrounds).repeat(sizes.repeat([foregrounds, backgrounds]))
@@ -191,7 +195,8 @@ def inside_object(
     inside = (((at - centre) / np.maximum(half, 0.5)) ** 2).sum(0) <= 1
     if detections.masks is not None:
         height, width = detections.masks.shape[1:]
-        column, row = at[0].astype(int).clip(0, width - 1), at[1].astype(int).clip(0, height - 1)
+        column = at[0].astype(int).clip(0, width - 1)
+        row = at[1].astype(int).clip(0, height - 1)
         masked = np.zeros(len(detections), bool)
         masked[[i for i in np.unique(rows) if detections.masks[i].any()]] = True
         inside = np.where(masked[rows], detections.masks[rows, row, column], inside)

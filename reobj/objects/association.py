@@ -84,7 +84,8 @@ class Association:
     def gains(self, detections: PosedDetections) -> Array:
         """Return the log odds (O,) of each object: its detections, missed frames and size."""
         pairs = self.assigned_pairs
-        obj, row = self.evidence.obj[pairs], self.evidence.row[pairs]
+        obj = self.evidence.obj[pairs]
+        row = self.evidence.row[pairs]
         hit = MISSED * self.evidence.expected[detections.view[row], obj]
         gain = np.bincount(obj, self.evidence.existence[pairs] + hit, len(self.shapes))
         return np.asarray(gain - self.costs())
@@ -153,10 +154,14 @@ class Associator:
         Returns:
             the selected hypotheses, the best first.
         """
-        view, evidence, cost = self.detections.view, hypotheses.evidence, hypotheses.costs()
+        view = self.detections.view
+        evidence = hypotheses.evidence
+        cost = hypotheses.costs()
         value = np.minimum(evidence.assignment, evidence.existence + MAX_BOX_GAIN)
         positive = value > 0
-        obj, row, log_odds = evidence.obj[positive], evidence.row[positive], value[positive]
+        obj = evidence.obj[positive]
+        row = evidence.row[positive]
+        log_odds = value[positive]
         start = np.searchsorted(obj, np.arange(len(cost) + 1))
         hit = MISSED * evidence.expected  # (V, O)
         explained = np.zeros(len(view))  # log odds of each row
@@ -201,7 +206,8 @@ class Associator:
         starts = np.searchsorted(evidence.row[order], detections.start_of_view)
         for low, high in itertools.pairwise(starts):
             pairs = order[low:high]
-            obj, row = evidence.obj[pairs], evidence.row[pairs]
+            obj = evidence.obj[pairs]
+            row = evidence.row[pairs]
             gain = value[pairs]
             for neighbour in (detections.before[row], detections.after[row]):
                 gain = gain + SAME_TRACKLET * ((neighbour >= 0) & (label[neighbour] == obj))
@@ -241,13 +247,16 @@ class Associator:
         Only the worse half (by box fit) is removed per round, because each of two duplicates is
         redundant given the other.
         """
-        evidence, label, view = current.evidence, current.label, self.detections.view
+        evidence = current.evidence
+        label = current.label
+        view = self.detections.view
         assigned = label >= 0
         pairs = current.assigned_pairs
         shown = np.zeros_like(evidence.expected)
         shown[view[assigned], label[assigned]] = True
         other = assigned[evidence.row] & ~pairs
-        row, obj = evidence.row[other], evidence.obj[other]
+        row = evidence.row[other]
+        obj = evidence.obj[other]
         missed = evidence.expected & ~shown
         hit = MISSED * missed[view[row], obj]
 
@@ -287,7 +296,8 @@ class Associator:
         removed = set[int]()
         label = current.label.copy()
         for p in np.argsort(-more):
-            i, j = int(strong[p]), int(weak[p])
+            i = int(strong[p])
+            j = int(weak[p])
             untouched = pick[i] == i and pick[j] == j and not {i, j} & removed
             if more[p] > 0 and untouched:
                 pick[i] = len(current.shapes) + p
@@ -303,9 +313,11 @@ class Associator:
         self, label: IntArray, strong: IntArray, weak: IntArray
     ) -> tuple[IntArray, IntArray]:
         """List the rows of both objects of each pair, one per frame: rows (K,), pairs (K,)."""
-        view, rows_of_pair = self.detections.view, list[IntArray]()
+        view = self.detections.view
+        rows_of_pair = list[IntArray]()
         for i, j in zip(strong, weak, strict=True):
-            rows, other = np.flatnonzero(label == i), np.flatnonzero(label == j)
+            rows = np.flatnonzero(label == i)
+            other = np.flatnonzero(label == j)
             rows_of_pair.append(np.append(rows, other[~np.isin(view[other], view[rows])]))
         pair = np.repeat(np.arange(len(strong)), [len(rows) for rows in rows_of_pair])
         return np.concatenate(rows_of_pair), pair
@@ -314,11 +326,13 @@ class Associator:
         self, label: IntArray, strong: IntArray, weak: IntArray, fitted: Shapes
     ) -> Array:
         """Return the gain (P,) of one fitted object with the detections of each pair."""
-        view, joint = self.detections.view, self._unassigned(fitted)
+        view = self.detections.view
+        joint = self._unassigned(fitted)
         evidence = joint.evidence
         row_label = label[evidence.row]
         pairs = (row_label == strong[evidence.obj]) | (row_label == weak[evidence.obj])
-        obj, row = evidence.obj[pairs], evidence.row[pairs]
+        obj = evidence.obj[pairs]
+        row = evidence.row[pairs]
         log_odds = evidence.existence[pairs]
         key = obj * len(evidence.expected) + view[row]
         order = np.lexsort((-log_odds, key))
@@ -335,7 +349,8 @@ def _coincide(shapes: Shapes) -> BoolArray:
 
     The smaller has its centre in the middle of the larger: a part of the object, or a duplicate.
     """
-    centre, half = shapes.ellipsoids.center_in_world, shapes.ellipsoids.half_axes
+    centre = shapes.ellipsoids.center_in_world
+    half = shapes.ellipsoids.half_axes
     a_in_b = np.einsum("abi,bij->abj", centre[:, None] - centre, shapes.ellipsoids.world_from_obj)
     inside = (np.abs(a_in_b) < SAME_POSITION * half).all(2)  # (O, O) a's centre in the middle of b
     volume = half.prod(1)
@@ -348,7 +363,8 @@ def _near_pairs(shapes: Shapes, gain: Array) -> tuple[IntArray, IntArray]:
 
     They have one class, or similar sizes and one position.
     """
-    centre, half = shapes.ellipsoids.center_in_world, shapes.ellipsoids.half_axes
+    centre = shapes.ellipsoids.center_in_world
+    half = shapes.ellipsoids.half_axes
     distance = np.linalg.norm(centre[:, None] - centre, axis=2)  # (O, O)
     width = half[:, :2].mean(1)
     near = distance < MERGE_DISTANCE * (width[:, None] + width)

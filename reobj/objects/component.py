@@ -86,7 +86,8 @@ def associate_component(
     fits = fit(views, classes.tolist(), Scene(trusts_classes=True))
     floor = find_floor(poses, fits)
     categories = Categories(priors, names, fits.scale)
-    usual_size, on_floor = categories.usual_size(classes), categories.on_floor(classes)
+    usual_size = categories.usual_size(classes)
+    on_floor = categories.on_floor(classes)
     hypotheses = Shapes.concatenate([
         propose(fits, views, classes, usual_size, floor, on_floor),
         _propose_from_untracked(table, observing, categories, fits.up, floor),
@@ -165,7 +166,8 @@ def _propose_from_untracked(
     table = table[(table.tracklet_id == 0) & (table.score >= HYPOTHESIS_SCORE)]
     views = gather_views(table, poses, np.arange(len(table)), len(table), 0.0)
     classes = table.class_id
-    usual_size, on_floor = categories.usual_size(classes), categories.on_floor(classes)
+    usual_size = categories.usual_size(classes)
+    on_floor = categories.on_floor(classes)
     return propose_along_rays(views, classes, usual_size, up, floor, on_floor)
 
 
@@ -205,7 +207,8 @@ def _cached_fit(
         rows: IntArray, label: IntArray, classes: IntArray, current: Shapes | None
     ) -> Shapes:
         order = np.lexsort((rows, label))
-        rows, label = rows[order], label[order]
+        rows = rows[order]
+        label = label[order]
         occluded = np.zeros((len(rows), 4), bool)
         if current is not None and scene.floor is not None:
             projected = _project(current, views)[detections.view[rows], label]

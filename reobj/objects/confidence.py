@@ -52,7 +52,8 @@ def log_best_odds(score: Array, group: IntArray, count: int) -> Array:
 def of_objects(found: Association, detections: PosedDetections, see_through: Array) -> Array:
     """Return the confidence (O,) of associated objects."""
     assigned = np.flatnonzero(found.label >= 0)
-    label, view = found.label[assigned], detections.view[assigned]
+    label = found.label[assigned]
+    view = detections.view[assigned]
     expected = found.evidence.expected
     score = log_best_odds(detections.score[assigned], label, len(found.shapes))
     hits = np.bincount(label, expected[view, label], len(found.shapes))

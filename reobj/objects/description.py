@@ -192,7 +192,8 @@ def _describe_component(poses: Poses, component: int, fits: quadrics.ObjectFits 
         (value,) = numbers(np.array([fits.scale.value]), 1.0)
         scale = quadrics.Scale(value, round(fits.scale.rel_sigma, 4), fits.scale.source)
         if fits.up.any():
-            up, up_source = fits.up, fits.up_source
+            up = fits.up
+            up_source = fits.up_source
     up = None if up is None else significant(up)
     known_scale = None if scale is None or scale.source == "none" else scale.value
     floor, reason = floor_of(poses, up, 1.0 if poses.metric else known_scale)

@@ -126,12 +126,12 @@ def _split_trajectory(
     if poses is None:
         return [_Component(0, None, None)]
     poses_of = [poses.of_part(k) for k in range(poses.part_count)]
-    if not any(own.known.sum() >= config.min_views for own in poses_of):
-        return [_Component(k, own, None) for k, own in enumerate(poses_of)]
+    if not any(p.known.sum() >= config.min_views for p in poses_of):
+        return [_Component(k, p, None) for k, p in enumerate(poses_of)]
     others = dataclasses.replace(config, up="")
     return [
-        _Component(k, own, make_fit(config if k == 0 else others, own, class_names))
-        for k, own in enumerate(poses_of)
+        _Component(k, p, make_fit(config if k == 0 else others, p, class_names))
+        for k, p in enumerate(poses_of)
     ]
 
 
@@ -160,7 +160,7 @@ class _Linked:
 
 
 def _unlinked(tracks: Tracks, count: int) -> _Linked:
-    """Keep the given identities of tracks in so many components."""
+    """Keep the identities of the tracks as they are, for `count` components."""
     return _Linked(tracks, np.arange(len(tracks)), tracks.class_id, [], {}, [None] * count, {})
 
 
@@ -201,7 +201,9 @@ def _link_component(
         )
     label = np.full(len(table), -1) if objects is None else objects.label
     keep = (source >= 0) | (label >= 0)
-    table, source, label = table[keep], source[keep], label[keep]
+    table = table[keep]
+    source = source[keep]
+    label = label[keep]
     tracks = _with_tracklets(table, label, result.looked)
     events = list[LinkEvent]()
     if config.link:
@@ -292,7 +294,8 @@ def _component_of_rows(tracks: Tracks, poses: Poses) -> IntArray:
     component = poses.part_of(tracks.frame)
     _, posed = place_of(poses, tracks.frame)
     for rows in rows_by(tracks.tracklet_id) if poses.part_count > 1 else ():
-        unposed_rows, posed_rows = rows[~posed[rows]], rows[posed[rows]]
+        unposed_rows = rows[~posed[rows]]
+        posed_rows = rows[posed[rows]]
         if tracks.tracklet_id[rows[0]] and len(unposed_rows) and len(posed_rows):
             gap = np.abs(tracks.frame[unposed_rows, None] - tracks.frame[posed_rows])
             component[unposed_rows] = component[posed_rows[gap.argmin(1)]]
@@ -319,7 +322,8 @@ def _select_embeddings(result: Result, source: IntArray) -> tuple[Embeddings, In
     row_in_table = np.full(len(result.tracks), -1)
     row_in_table[source[source >= 0]] = np.flatnonzero(source >= 0)
     row = row_in_table[result.embedding_row]
-    foreground, background = result.embeddings.foreground, result.embeddings.background
+    foreground = result.embeddings.foreground
+    background = result.embeddings.background
     return Embeddings(foreground[row >= 0], background[row >= 0]), row[row >= 0]
 
 
@@ -418,10 +422,12 @@ def _fit_component(
         objects = linked.objects[number]
         if objects is None:
             first = fit(views, categories, UNKNOWN_SCENE)
-            floor, ellipsoids = find_floor(poses, first), first.ellipsoids
+            floor = find_floor(poses, first)
+            ellipsoids = first.ellipsoids
         else:
             label = np.array([linked.label_of.get(identity, -1) for identity in classes])
-            floor, ellipsoids = objects.floor, objects.ellipsoids[label]
+            floor = objects.floor
+            ellipsoids = objects.ellipsoids[label]
         standing = on_floor(priors, [name_of(class_names, c) for c in categories])
         views = dataclasses.replace(
             views,

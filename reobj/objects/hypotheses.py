@@ -135,7 +135,8 @@ def _along_rays(
         kinds = [(size[..., 0], whole, None), (narrow, whole, None)]
         good = [stands, stands]
     axes = _upright_axes(up)
-    shapes, source = [], []
+    shapes = []
+    source = []
     for (width, height, center), keep in zip(kinds, good, strict=True):
         if center is None:  # from the top downwards
             center = point + ((top_height - height / 2) - point @ up)[..., None] * up

@@ -152,7 +152,8 @@ def _gather(
     Args:
         frequency: of the classes in all detections.
     """
-    cams, size = detections.img_from_world, detections.image_size
+    cams = detections.img_from_world
+    size = detections.image_size
     whole = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), cams)  # (V, O, 4)
     clipped = quadrics.clip_boxes(whole, size)
     visible = np.nan_to_num(box_area(clipped) / box_area(whole))  # (V, O)
@@ -168,7 +169,8 @@ def _gather(
             pairs.append((shown[i], starts[v] + j))
         obj, row = (np.concatenate(column) for column in zip(*pairs, strict=True))
         box = _box_log_odds(clipped[detections.view[row], obj], detections.box[row], size)
-        obj_class, row_class = shapes.class_id[obj], detections.class_id[row]
+        obj_class = shapes.class_id[obj]
+        row_class = detections.class_id[row]
         class_log_odds = np.log(
             CLASS_KEPT * (obj_class == row_class) / frequency[row_class.clip(0)] + 1 - CLASS_KEPT
         )

@@ -65,7 +65,8 @@ def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolAr
     shapes = ellipsoids[known]
     outline = quadrics.solid_boxes(shapes, "box", views.img_from_world)  # (V, S, 4)
     for v in np.flatnonzero(seen.any(1)):
-        camera, groups = views.img_from_world[v], np.flatnonzero(seen[v])  # (D,)
+        camera = views.img_from_world[v]  # (D,)
+        groups = np.flatnonzero(seen[v])
         points = _beside_edges(views.boxes[v, groups])  # (2, D, 4, P, 2)
         aside = (outline[v, :, :2] > points.max((0, 1, 2, 3))).any(1)
         aside |= (outline[v, :, 2:] < points.min((0, 1, 2, 3))).any(1)
@@ -83,7 +84,8 @@ def _occluded_by_nearer(views: Views, ellipsoids: quadrics.Ellipsoids) -> BoolAr
 
 def _beside_edges(box: Array) -> Array:
     """Return points (2, D, 4, P, 2) along the edges of boxes (D, 4), for each `BESIDE_EDGE`."""
-    low, high = box[:, None, :2], box[:, None, 2:]  # (D, 1, 2)
+    low = box[:, None, :2]  # (D, 1, 2)
+    high = box[:, None, 2:]
     along = low + (high - low) * EDGE_POINTS[:, None]  # (D, P, 2)
     found = []
     for beyond in BESIDE_EDGE:
@@ -105,7 +107,8 @@ def _entry_depths(points: Array, camera: Array, boxes: quadrics.Ellipsoids) -> A
     ray = np.ascontiguousarray(ray.transpose(2, 0, 1))  # (3, K, S): short axes first are fast
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = faces[:, :, None] / ray  # (2, 3, K, S)
-    enter, leave = ends.min(0).max(0), ends.max(0).min(0)  # (K, S)
+    enter = ends.min(0).max(0)  # (K, S)
+    leave = ends.max(0).min(0)
     return np.where((enter < leave) & (leave > 0), np.maximum(enter, 0), np.inf)
 
 
@@ -133,12 +136,14 @@ def see_through_ratio(
     camera = invert_rigid(poses.cam_from_world[row])[:, :, 3]  # (V, 3)
     behind, others = np.zeros((2, expected.shape[1]))
     for v in np.flatnonzero(expected.any(1)):
-        points, objects = visible.observed(row[v]), np.flatnonzero(expected[v])
+        points = visible.observed(row[v])
+        objects = np.flatnonzero(expected[v])
         ray = poses.points[points[:: len(points) // MOST_POINTS + 1]] - camera[v]  # (N, 3)
         scaled = ellipsoids.world_from_obj[objects] / ellipsoids.half_axes[objects][:, None]
         start = np.einsum("si,sij->sj", camera[v] - ellipsoids.center_in_world[objects], scaled)
         along = np.einsum("ni,sij->nsj", ray, scaled)  # in units of the half axes: unit spheres
-        a, b = (along**2).sum(2), (along * start).sum(2)  # (N, S)
+        a = (along**2).sum(2)  # (N, S)
+        b = (along * start).sum(2)
         square = (start**2).sum(1)
         root = np.sqrt((b**2 - a * (square - 1)).clip(0))
         leave = (root - b) / a  # the point is at 1

@@ -102,7 +102,8 @@ def _sfmo(views: Views, poses: Poses, names: Sequence[str], priors: quadrics.Pri
         center = scale * candidate.center_in_world @ rotation.T + np.asarray(sim.translation)
         error = float(((center - target)[use] ** 2).sum())
         if error < least:
-            half_axes, axes = scale * candidate.half_axes, rotation @ candidate.world_from_obj
+            half_axes = scale * candidate.half_axes
+            axes = rotation @ candidate.world_from_obj
             best = quadrics.Ellipsoids(center, half_axes, axes)
             least = error
     if best is None:

@@ -83,7 +83,8 @@ def assign(row: IntArray, column: IntArray, cost: Array) -> IntArray:
         return np.arange(len(row))
     some = np.flatnonzero(rival)
     rows, columns = (np.flatnonzero(np.bincount(x[some])) for x in (row, column))
-    r, c = np.searchsorted(rows, row[some]), np.searchsorted(columns, column[some])
+    r = np.searchsorted(rows, row[some])
+    c = np.searchsorted(columns, column[some])
     pair = np.full((len(rows), len(columns)), -1)
     pair[r, c] = some
     costs = np.full(pair.shape, 1e3)

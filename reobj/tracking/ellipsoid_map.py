@@ -42,7 +42,7 @@ def quick_fit(
     cameras[..., 3] *= ratio
     config = quadrics.FitConfig(iterations=10, start_views=4, start_iterations=4)
     fits = quadrics.fit_objects(boxes, cameras, image_size, support="ellipsoid", config=config)
-    own = dataclasses.replace(
+    ellipsoids = dataclasses.replace(
         fits.ellipsoids,
         center_in_world=fits.ellipsoids.center_in_world / ratio,
         half_axes=fits.ellipsoids.half_axes / ratio,
@@ -50,7 +50,7 @@ def quick_fit(
     cov = fits.cov.copy()
     cov[:, :3] /= ratio
     cov[:, :, :3] /= ratio
-    return dataclasses.replace(fits, ellipsoids=own, size=fits.size / ratio, cov=cov)
+    return dataclasses.replace(fits, ellipsoids=ellipsoids, size=fits.size / ratio, cov=cov)
 
 
 def rough_sizes(boxes: Array, img_from_world: Array) -> Array:
@@ -344,7 +344,8 @@ def depth_intervals(
     least = (box[:, 2:] / np.diag(K)[:2]).mean(1) / 2  # (D,) half the size over the depth
     depth = np.exp(median[:, None] + np.maximum(sigma, least)[:, None] * [-1, 1])  # (D, 2)
     rays = np.c_[box[:, :2], np.ones(len(box))] @ np.linalg.inv(K).T  # (D, 3) depth 1
-    rotation, offset_in_cam = cam_from_world[:, :3], cam_from_world[:, 3]
+    rotation = cam_from_world[:, :3]
+    offset_in_cam = cam_from_world[:, 3]
     ends = (depth[..., None] * rays[:, None] - offset_in_cam) @ rotation  # R' (x - t)
     return ends, box[:, 2:] / np.diag(K)[:2] * depth.mean(1, keepdims=True)
 
@@ -387,7 +388,8 @@ def iou_within_uncertainty(box: Array, uncertainty: Array, detected: Array) -> t
         the area that it may cover.
     """
     distance = np.maximum(np.abs(box[:2] - detected[:2]) - uncertainty, 0)  # (2, ...)
-    a, b = box[2:], detected[2:]
+    a = box[2:]
+    b = detected[2:]
     width, height = np.maximum(np.minimum(np.minimum(a, b), (a + b) / 2 - distance), 0)
     overlap = width * height
     union = a[0] * a[1] + b[0] * b[1] - overlap

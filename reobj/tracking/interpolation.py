@@ -111,7 +111,8 @@ def fill_from_objects(
         low, high = np.split(box[view, o], 2, axis=1)
         common = (np.minimum(rows.xyxy[:, 2:], high) - np.maximum(rows.xyxy[:, :2], low)).clip(0)
         agrees = common.prod(1) > MIN_INSIDE * box_area(rows.xyxy)
-        rows, view = rows[agrees], view[agrees]
+        rows = rows[agrees]
+        view = view[agrees]
         if not (len(rows) and len(empty)):
             continue
         direction = ray[:, o] / distance[:, o, None]

@@ -136,9 +136,11 @@ class Linker:
             enough to be duplicates on one object.
         """
         count = len(self.tracklets)
-        co_occur, overlapping = np.zeros((count, count), bool), np.zeros((count, count), bool)
+        co_occur = np.zeros((count, count), bool)
+        overlapping = np.zeros((count, count), bool)
         for rows in rows_by(self.tracks.frame):
-            here, box = self.fragment[rows], self.tracks.xyxy[rows]
+            here = self.fragment[rows]
+            box = self.tracks.xyxy[rows]
             co_occur[here[:, None], here[None]] = True
             overlapping[here[:, None], here[None]] |= box_iou(box, box) > DUPLICATE_IOU
         return co_occur, co_occur & ~overlapping
@@ -169,7 +171,8 @@ class Linker:
         """
         similarity = np.full((3, len(self.tracklets), len(self.tracklets)), np.nan)
         order = np.argsort(self.fragment[embedding_row], kind="stable")
-        rows, width = embedding_row[order], embeddings.foreground.shape[1]
+        rows = embedding_row[order]
+        width = embeddings.foreground.shape[1]
         fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
         unit = unit_rows(fused[order])  # (n, E)
         fragments, starts, block = np.unique(
@@ -279,7 +282,8 @@ def _agglomerate(
     while joined:
         joined = False
         for a, b in group[pairs]:
-            a, b = group[a], group[b]
+            a = group[a]
+            b = group[b]
             rival = max(odds[a, distinct[b]].max(initial=0), odds[b, distinct[a]].max(initial=0))
             if odds[a, b] < least * (1 + rival):
                 continue
@@ -303,7 +307,8 @@ def cut_at_gaps(tracks: Tracks, looked: IntArray | None = None) -> IntArray:
     """
     order = np.lexsort((tracks.frame, tracks.tracklet_id))
     number, unit = looks(tracks, looked)
-    tracklet, number = tracks.tracklet_id[order], number[order]
+    tracklet = tracks.tracklet_id[order]
+    number = number[order]
     gone = np.diff(number) > FRAGMENT_GAP * unit
     begins = np.append(True, (np.diff(tracklet) != 0) | gone)[: len(order)]
     fragment = np.empty(len(order), np.int64)
