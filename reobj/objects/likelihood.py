@@ -128,8 +128,9 @@ def gather_evidence(
     Args:
         min_log_odds: pairs of a lower `assignment` are dropped.
     """
-    frequency = np.bincount(detections.class_id.clip(0), detections.score) + 0.5
-    frequency = np.asarray(frequency / frequency.sum(), np.float64)
+    votes = np.bincount(detections.class_id.clip(0), detections.score) + 0.5
+    frequency: Array = np.asarray(votes, np.float64)
+    frequency /= frequency.sum()
     starts = range(0, max(len(shapes), 1), OBJECTS_AT_ONCE)
     batches = [
         _gather(shapes[k : k + OBJECTS_AT_ONCE], detections, frequency, min_log_odds)
