@@ -23,8 +23,9 @@ How it works (start reading at `run()`, then `track()`, then `Tracker.update()`)
   8. fit       one solid and its ellipsoid per object from its boxes and a size prior (quadrics.py)
 
 This file is the tool: Kalman filter, association, re-identification, the loop, the command line.
-What it uses lies in the package `reobj`: sources/ (video, detections, weights), identity/
-(embeddings, gallery, linking), poses/ (cameras), objects.py (the fit), results/ (files, pages).
+What it uses lies in the package `reobj`: sources/ (video, detections, weights), appearance/
+(embeddings, gallery), tracking/ (assignment, linking), poses/ (cameras), objects/ (association and
+fit), results/ (files, pages).
 
 Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
 [0, 1] and has its centre at (0.5, 0.5) as in COLMAP; `b_from_a` maps coordinates in a to b;
