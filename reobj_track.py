@@ -23,8 +23,9 @@ How it works (start reading at `run()`, then `track()`, then `Tracker.update()`)
   8. fit       one solid and its ellipsoid per object from its boxes and a size prior (quadrics.py)
 
 This file is the tool: Kalman filter, association, re-identification, the loop, the command line.
-What it uses lies in the package `reobj`: sources/ (video, detections, weights), identity/
-(embeddings, gallery, linking), poses/ (cameras), objects.py (the fit), results/ (files, pages).
+What it uses lies in the package `reobj`: sources/ (video, detections, weights), appearance/
+(embeddings, gallery), tracking/ (assignment, linking), poses/ (cameras), objects/ (association and
+fit), results/ (files, pages).
 
 Conventions: frames 0-based (1-based in MOT files); boxes `xyxy` in pixels, the top-left pixel spans
 [0, 1] and has its centre at (0.5, 0.5) as in COLMAP; `b_from_a` maps coordinates in a to b;
@@ -58,37 +59,33 @@ import numpy.typing as npt
 
 import quadrics
 from reobj import __version__
-from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
-from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
-from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
-from reobj.identity.assignment import Pairs, ambiguous_pairs, assign, touching
-from reobj.identity.camera_motion import CameraMotion
-from reobj.identity.crops import CropEmbedder, make_embedder
-from reobj.identity.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
-from reobj.identity.places import (
-    CamerasOfFrames,
-    EllipsoidMap,
-    overlap_within_reach,
-    rows_of,
-    spans_of_boxes,
-)  # fmt: skip
-from reobj.identity.reid import (
+from reobj.appearance.crops import CropEmbedder, make_embedder
+from reobj.appearance.embedding import EmbedConfig, Embedder, LazyEmbeddings, as_embeddings
+from reobj.appearance.reid import (
     Gallery,
     SimilarityCalibration,
     match_probability,
     part_cosines,
 )  # fmt: skip
-from reobj.identity.sampling import SamplingLayout
-from reobj.objects import (
-    ObjectsConfig,
+from reobj.appearance.sampling import SamplingLayout
+from reobj.cameras import Camera, Poses, checked_pose, viewing_rays
+from reobj.commands import SafeFormatter, make_parser, say, short_help, with_streams
+from reobj.files import Progress, atomic, load_cached, load_npz, save_npz, wrapped
+from reobj.objects.config import ObjectsConfig
+from reobj.objects.description import components_message
+from reobj.objects.fit import fill, link_and_fit
+from reobj.objects.published import solve_again
+from reobj.options import (
     check_known_size,
+    check_shape,
+    config_from_args,
+    load_size_priors,
     parse_known_size,
     parse_up,
-    size_priors,
+    read_config,
     unused_sizes,
+    write_config,
 )
-from reobj.options import config_from_args, read_config, write_config
-from reobj.parts import fill, link_and_fit, parts_message
 from reobj.poses.estimate import PosesConfig, estimate_poses
 from reobj.poses.imageless import open_video
 from reobj.poses.stage import (
@@ -116,7 +113,6 @@ from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
 from reobj.schema import validate_objects
-from reobj.solvers import solve_again
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.looked import Intervals
@@ -124,6 +120,16 @@ from reobj.sources.recorded import write_detections_npz
 from reobj.sources.video import InputConfig, Video
 from reobj.sources.weights import list_models, model_path
 from reobj.state import restore_state, state_arrays
+from reobj.tracking.assignment import Pairs, ambiguous_pairs, assign, touching
+from reobj.tracking.box_noise import STD_MEASURE, STD_POSITION, STD_START, STD_VELOCITY
+from reobj.tracking.camera_motion import CameraMotion
+from reobj.tracking.ellipsoid_map import (
+    CameraInputs,
+    EllipsoidMap,
+    depth_intervals,
+    iou_within_uncertainty,
+    rows_of,
+)  # fmt: skip
 from reobj.types import (
     COCO_NAMES,
     Array,
@@ -180,10 +186,10 @@ class TrackerConfig:
     )
     remember: bool = option(True, "recognise objects that return, however long they were away")
     std_position: float = option(
-        0.05, "process noise of a position, over the box size; more for jerky cameras"
+        STD_POSITION, "process noise of a position, over the box size; more for jerky cameras"
     )
     std_velocity: float = option(
-        1 / 80, "process noise of a velocity, over the box size; more for jerky cameras"
+        STD_VELOCITY, "process noise of a velocity, over the box size; more for jerky cameras"
     )
     appearance_weight: float = option(0.7, "share of appearance in the cost of ambiguous matches")
     foreground_weight: float = option(
@@ -235,11 +241,10 @@ class Config:
 
 # ---- Kalman filter -----------------------------------------------------------------------------
 
-# Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h.
-STD_MEASURE = 0.05  # of a measured box at score .8 (DeepSORT: 1/20)
+# Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h
+# (`STD_MEASURE` of `reobj.tracking.box_noise` holds at score .8).
 SCORE_NOISE = 0.25  # it grows with (1 - score) to this power (StrongSORT: 1)
 ORDINARY_SCORE = 0.5  # of a detection that counts once for `n_init` (default of `new_score`)
-STD_START = 0.2  # of a new track's velocity (DeepSORT: 1/16; SORT: wide)
 
 
 def kalman_predict(mean: Array, cov: Array, config: TrackerConfig) -> tuple[Array, Array]:
@@ -665,11 +670,11 @@ class Tracker:
         inside = np.isfinite(self.places.project(view, size, PLACE_IN_VIEW)[:, 0])  # (I,)
         in_view = ~known | rows_of(inside, tracks.identity, False)
         tracked = (tracks.identity, tracks.ends, tracks.size, K, size)
-        now, reach = self.places.tracks_seen(cam_from_world, *tracked)
+        now, reach = self.places.project_tracks(cam_from_world, *tracked)
         located = known | np.isfinite(tracks.ends[:, 0, 0])
         followed = np.zeros(len(known), bool)
         if last is not None:
-            before, reach_before = self.places.tracks_seen(last, *tracked)
+            before, reach_before = self.places.project_tracks(last, *tracked)
             followed = (tracks.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
             shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
             moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
@@ -695,7 +700,7 @@ class Tracker:
         tracks = self.state.tracks
         rows = np.flatnonzero(track_of >= 0)
         rows = rows[~rows_of(self.places.known, tracks.identity[track_of[rows]], False)]
-        ends, size = spans_of_boxes(frame.detections.xyxy[rows], points, pose, camera.K)
+        ends, size = depth_intervals(frame.detections.xyxy[rows], points, pose, camera.K)
         tracks.ends[track_of[rows]] = ends
         tracks.size[track_of[rows]] = size
 
@@ -753,7 +758,7 @@ class Tracker:
         gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
         t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
         track, seen, reach = track.take(t, 1), frame.box.T.take(d, 1), reach.take(t, 1)  # (4, M)
-        iou, share = overlap_within_reach(track, reach, seen)
+        iou, share = iou_within_uncertainty(track, reach, seen)
         distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1)) / GATE_CHI2
         overlap = iou * share
         same_class = tracks.votes.argmax(1)[t] == detections.class_id[d]
@@ -828,7 +833,7 @@ class Tracker:
         cost = cost.copy()
         cost[some] = (1 - weight) * cost[some] + weight * unlike
         overlap = pairs.iou[some] - CLASS_COST * ~pairs.same_class[some]
-        evidence = pairs.share[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
+        evidence = pairs.overlap_weight[some] * (IOU_ODDS * overlap - NO_OVERLAP_ODDS)
         against[some] = known & (logit + evidence < 0)
         return cost, against
 
@@ -1089,7 +1094,7 @@ def track(
     video = video if isinstance(video, Video) else Video(video)
     source = open_detections(video, DetectConfig(), detector)
     tracker = tracker or Tracker(embedder=Embedder())
-    cameras = CamerasOfFrames(poses, video.scale)
+    cameras = CameraInputs(poses, video.scale)
     looked = True if source.always_looks else None
     ahead = tracker.config.camera_motion and video.has_images and not video.is_live
     for frame in tracker.state.camera_motion.ahead(video) if ahead else video:
@@ -1140,12 +1145,12 @@ def run(
         readings = supplied_poses(video, config.poses) if in_3d else []
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
-            check_known_size(config.objects, result.class_names)
             boxes, class_names = result.tracks, result.class_names
         else:
             detected, boxes = _detect(job, detections, in_3d)
             class_names = tuple(detected.class_names)
-            check_known_size(config.objects, class_names)
+        sizes = config.objects
+        check_known_size(sizes.known_size, sizes.priors, class_names)
         poses, models = None, []
         if readings:
             poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
@@ -1180,7 +1185,8 @@ def refit(
         result.edits = read_edits(edits) if edits else None
         config = dataclasses.replace(config or _last_config(out), input=video.config)
         _check_objects(config.objects)
-        check_known_size(config.objects, result.class_names)
+        size, priors = config.objects.known_size, config.objects.priors
+        check_known_size(size, priors, result.class_names)
         if tracks:
             poses = result.poses
             result = _given_tracks(tracks, video, config.detect, result)
@@ -1223,11 +1229,10 @@ class _Job:
 
 def _check_objects(config: ObjectsConfig) -> None:
     """Refuse what the fit could not use, before minutes are spent on what comes first."""
-    size_priors(config)
+    load_size_priors(config.priors)
     if config.up:
         parse_up(config.up)
-    if config.support not in (kinds := ("auto", *quadrics.SUPPORTS)):
-        raise ReobjError(f"--support {config.support}: expected one of {', '.join(kinds)}")
+    check_shape(config.support)
     parse_known_size(config.known_size)
 
 
@@ -1313,7 +1318,7 @@ def _given_tracks(
 def _finish(job: _Job, result: Result) -> Result:
     """Link tracklets, fit one shape an object, and write all files of the output folder."""
     with job.timed("objects"):
-        _fit_objects(job, result)
+        result = _fit_objects(job, result)
     result.seconds |= job.seconds
     result.warnings += _warnings(job.config, result)
     with job.timed("write"):
@@ -1324,27 +1329,30 @@ def _finish(job: _Job, result: Result) -> Result:
     return result
 
 
-def _fit_objects(job: _Job, result: Result) -> None:
+def _fit_objects(job: _Job, result: Result) -> Result:
     """Link and fit; then fill gaps of the tracks by our own shapes, whatever solver is chosen."""
     config = job.config
     result.edits = result.edits or kept_edits(job.workspace.out)
     with Progress("objects"):
-        link_and_fit(result, config.objects)
+        result = link_and_fit(result, config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
     filled = fill(result, job.video.size, gap)
-    solve_again(result, config.objects)
+    result = solve_again(result, config.objects)
     result.tracks, result.out = filled, job.workspace.out
     detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
     result.embedding_row = detected[result.embedding_row]
+    return result
 
 
 def _warnings(config: Config, result: Result) -> list[str]:
     """Collect what the user should know of the cameras, the objects and the options."""
     poses = result.poses
-    of_cameras = [] if poses is None else [*poses.messages, *parts_message(poses)]
+    of_cameras = [] if poses is None else [*poses.messages, *components_message(poses)]
     tracker, moving = config.tracker, config.objects.moving_classes
     of_objects = implausible(result, tracker.high_score, moving, tracker.new_score)
-    return [*of_cameras, *of_objects, *unused_sizes(config.objects, result.objects)]
+    located = [o.class_name for o in result.located]
+    of_sizes = unused_sizes(config.objects.known_size, config.objects.priors, located)
+    return [*of_cameras, *of_objects, *of_sizes]
 
 
 def _write(job: _Job, result: Result) -> None:
@@ -1400,7 +1408,7 @@ def _cmd_poses(args: argparse.Namespace) -> int:
             write_supplied_model(poses, video, new)
     where = f"{workspace.out / 'poses.txt'}, {workspace.out / 'sparse'}"
     print(f"{poses.cameras_text}, {len(poses.points)} points; look at: {where}")
-    for message in (*video.messages, *poses.messages, *parts_message(poses)):
+    for message in (*video.messages, *poses.messages, *components_message(poses)):
         log.warning(message)
     return 0
 

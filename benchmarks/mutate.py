@@ -35,9 +35,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 CORE = (
-    "reobj_track.py", "quadrics.py", "reobj/frame_lookup.py", "reobj/identity/*.py",
-    "reobj/poses/supplied/*.py",
-    "reobj/results/overlay.py",
+    "reobj_track.py", "quadrics.py", "reobj/frame_lookup.py", "reobj/appearance/*.py",
+    "reobj/objects/*.py", "reobj/tracking/*.py",
+    "reobj/poses/supplied/*.py", "reobj/results/overlay.py",
     "reobj/results/evaluation.py", "reobj/sources/*.py",
 )  # fmt: skip
 FILES = (

@@ -410,7 +410,7 @@ def embedding_rows(source: str, frames: int) -> tuple[Array, IntArray]:
     import cv2
 
     import reobj_track as rt
-    from reobj.identity.embedding import Backbone
+    from reobj.appearance.embedding import Backbone
 
     cv2.setNumThreads(1)
     detector, embedder = rt.OnnxDetector("fast", threads=1), rt.Embedder(threads=1)

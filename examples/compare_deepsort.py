@@ -109,7 +109,7 @@ SOURCE = digest(
     *(CODE / f"{m}.py" for m in ("reobj_track", "quadrics")), *sorted(CODE.glob("reobj/**/*.py"))
 )  # what our own rows depend on
 EMBEDDER = digest(  # what our own embedding depends on
-    *(CODE / f"reobj/identity/{m}.py" for m in ("embedding", "sampling")),
+    *(CODE / f"reobj/appearance/{m}.py" for m in ("embedding", "sampling")),
     *sorted(own_models().glob("*.onnx")),
 )
 

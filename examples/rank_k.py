@@ -77,9 +77,9 @@ from reid_scenes import (
 from splits import add_choosing, marked, room_of, split_name, usable
 
 import reobj_track as rt
+from reobj.appearance.crops import flat_maps
+from reobj.appearance.reid import RETURN_ODDS, SimilarityCalibration, match_probability
 from reobj.files import atomic
-from reobj.identity.crops import flat_maps
-from reobj.identity.reid import RETURN_ODDS, SimilarityCalibration, match_probability
 from reobj.sources.masks import NO_RUNS
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD, onnx_session
 from reobj.types import Array, BoolArray, Image, IntArray
@@ -531,7 +531,7 @@ def scene_cases(
 
 
 def print_calibration(args: Any) -> None:
-    """Fit and print the constants of `reobj.identity.reid`, on rooms with and without masks."""
+    """Fit and print the constants of `reobj.appearance.reid`, on rooms with and without masks."""
     plans = [(plan, seed) for plan in args.plan for seed in args.calibrate]
     rooms = [
         room_scene(seed, args.cache, args.every, plan)

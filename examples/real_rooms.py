@@ -62,12 +62,12 @@ from synthetic_quadrics import table, write_table
 
 import quadrics
 import reobj_track as rt
-from reobj.objects import DOUBTFUL
-from reobj.parts import link_and_fit
+from reobj.objects.confidence import LOW_CONFIDENCE
+from reobj.objects.fit import link_and_fit
+from reobj.objects.observations import Views
 from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
 from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
-from reobj.views import Views
 
 ROOM = Path(__file__).resolve().parent / "room"
 YOLO, FEMTO, RECORDED = "detections_yolov8s.csv", "detections_femto.csv", "detections.npz"
@@ -150,31 +150,36 @@ def untracked(rows: rt.Tracks) -> BoolArray:
 
 
 # What can be left out, by name: values and functions that take the place of others meanwhile.
-EVIDENCE, ASSOCIATION = "reobj.identity.evidence", "reobj.identity.association"
+LIKELIHOOD = "reobj.objects.likelihood"
+ASSOCIATION = "reobj.objects.association"
+COMPONENT = "reobj.objects.component"
 WITHOUT: dict[str, dict[str, Any]] = {
-    "hidden edges": {f"{EVIDENCE}.HIDDEN": 0.0},
+    "hidden edges": {f"{LIKELIHOOD}.OCCLUDED_EDGES": 0.0},
     "hidden edges in the fit": {
         "quadrics.CAUCHY_HIDDEN": quadrics.CAUCHY,
         "quadrics.HUBER_HIDDEN": quadrics.HUBER,
         "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
     },
-    "edges behind nearer things": {"reobj.identity.occlusion._behind_nearer": all_visible},
-    "edges above the floor": {"reobj.identity.occlusion.ABOVE": np.inf},
-    "widening": {f"{ASSOCIATION}.WIDENED": 0},
-    "limit of a box": {f"{EVIDENCE}.MAX_BOX_LOG_ODDS": 8.0},
-    "classes": {f"{EVIDENCE}.CLASS_KEPT": 0.0},
-    "sizes": {"reobj.identity.locate.SIZE_SIGMAS": 0.0},
+    "edges behind nearer things": {"reobj.objects.occlusion._occluded_by_nearer": all_visible},
+    "edges above the floor": {"reobj.objects.occlusion.ABOVE_FLOOR": np.inf},
+    "widening": {f"{ASSOCIATION}.WIDENING_ROUNDS": 0},
+    "limit of a box": {f"{LIKELIHOOD}.MAX_BOX_EXISTENCE": 8.0},
+    "classes": {f"{LIKELIHOOD}.CLASS_KEPT": 0.0},
+    "sizes": {"reobj.objects.categories.SIZE_SIGMAS": 0.0},
     "missed frames": {f"{ASSOCIATION}.MISSED": 0.0},
-    "tracklets": {f"{ASSOCIATION}.KEPT_TRACKLET": 0.0},
-    "untracked detections": {"reobj.identity.locate._doubles": untracked},
-    "clear detections in refits": {f"{ASSOCIATION}.CLEARLY": -1e3},
+    "tracklets": {f"{ASSOCIATION}.SAME_TRACKLET": 0.0},
+    "untracked detections": {f"{COMPONENT}._duplicates": untracked},
+    "clear detections in refits": {f"{ASSOCIATION}.UNAMBIGUOUS_MARGIN": -1e3},
     "alternation": {f"{ASSOCIATION}.MAX_ROUNDS": 0},
-    "merging": {f"{ASSOCIATION}.MERGE_REACH": 0.0},
-    "distances along rays": {"reobj.identity.proposals.DISTANCES": np.empty(0)},
-    "floor": {"reobj.identity.locate.floor_under": nothing, "reobj.parts.floor_under": nothing},
-    "proposals of untracked": {"reobj.identity.locate.PROPOSING_SCORE": np.inf},
-    "points in the fit": {"reobj.parts.points_on": nothing},
-    "seen through": {"reobj.identity.locate.seen_through": never_seen_through},
+    "merging": {f"{ASSOCIATION}.MERGE_DISTANCE": 0.0},
+    "distances along rays": {"reobj.objects.hypotheses.DEPTHS": np.empty(0)},
+    "floor": {
+        f"{COMPONENT}.find_floor": nothing,
+        "reobj.objects.fit.find_floor": nothing,
+    },
+    "proposals of untracked": {f"{COMPONENT}.HYPOTHESIS_SCORE": np.inf},
+    "points in the fit": {"reobj.objects.fit.points_on": nothing},
+    "seen through": {f"{COMPONENT}.see_through_ratio": never_seen_through},
 }
 
 
@@ -273,13 +278,13 @@ NOISE_PX = 0.5  # standard deviation of the edges
 def shake(seed: int) -> None:
     """Add noise to all boxes before objects are made of them, in this process."""
 
-    def shaken(result: rt.Result, config: rt.ObjectsConfig) -> None:
+    def shaken(result: rt.Result, config: rt.ObjectsConfig) -> rt.Result:
         rng = np.random.default_rng(seed)
         for name in ("tracks", "untracked"):
             rows = getattr(result, name)
             xyxy = rows.xyxy + rng.normal(0, NOISE_PX, rows.xyxy.shape)
             setattr(result, name, dataclasses.replace(rows, xyxy=xyxy))
-        link_and_fit(result, config)
+        return link_and_fit(result, config)
 
     rt.link_and_fit = shaken  # type: ignore[attr-defined]
 
@@ -773,7 +778,9 @@ def left_out_table(made: dict[str, list[Figures]]) -> str:
 
         change = np.nan_to_num(values("idf1") - values("idf1", made[""]))
         sums = [count(float(np.nansum(values(key)))) for key in ("found", "doubles", "elsewhere")]
-        listed = [(f.get("runs", 1), r) for f in figures for c, r, _ in f["sure"] if c >= DOUBTFUL]
+        listed = [
+            (f.get("runs", 1), r) for f in figures for c, r, _ in f["sure"] if c >= LOW_CONFIDENCE
+        ]
         real, every = sum(r / runs for runs, r in listed), sum(1 / runs for runs, _ in listed)
         rows.append(
             [

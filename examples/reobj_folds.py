@@ -47,8 +47,8 @@ from synthetic_quadrics import table  # noqa: E402
 from train_head import CROP_SETUPS, ConvBlock  # noqa: E402
 
 import reobj_track as rt  # noqa: E402
+from reobj.appearance.crops import flat_maps  # noqa: E402
 from reobj.files import atomic  # noqa: E402
-from reobj.identity.crops import flat_maps  # noqa: E402
 from reobj.types import IntArray  # noqa: E402
 
 SIDE, CHANNELS = 7, 512  # of the published maps

@@ -10,12 +10,15 @@ import math
 import re
 import textwrap
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from reobj.files import WORD_MAX, atomic, read_text
-from reobj.types import ReobjError
+import numpy as np
+
+import quadrics
+from reobj.files import WORD_MAX, atomic, did_you_mean, load_json, read_text, shortened
+from reobj.types import Array, ReobjError
 
 C = TypeVar("C")
 
@@ -154,7 +157,8 @@ def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[s
     """Add the flags that the options of some sections declare ("" for those of the top level)."""
     chosen = set(sections)
     for name, f in every_option(config).items():
-        section, flag = name.rpartition(".")[0], f.metadata["flag"]
+        section = name.rpartition(".")[0]
+        flag = f.metadata["flag"]
         if flag and section in chosen:
             kind: Any = type(f.default)
             how: dict[str, Any] = {"type": kind, "metavar": kind.__name__.upper()}
@@ -162,7 +166,8 @@ def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[s
                 how = {"action": "store_true"}
             default = f" (default: {f.default})" if f.default else ""
             text = f"{f.metadata['help']}{default}".replace("%", "%%")
-            parser.add_argument(flag, dest=name, default=None, help=text, **how)
+            flags = filter(None, (flag, f.metadata["old_flag"]))
+            parser.add_argument(*flags, dest=name, default=None, help=text, **how)
 
 
 def config_from_args(config: C, args: argparse.Namespace) -> C:
@@ -196,3 +201,83 @@ def list_options(config: Any) -> str:
         lines.append(f"{f'{name}={default}':<{NAME_WIDTH}} {text[0]}")
         lines += [" " * (NAME_WIDTH + 1) + more for more in text[1:]]
     return "\n".join(lines)
+
+
+# ---- Values of the object stage ----
+
+
+def load_size_priors(path: str) -> quadrics.Priors:
+    """Load size priors, "": those that are bundled.
+
+    Raises:
+        ReobjError, QuadricsError: no JSON, too large, or no priors.
+    """
+    if path:
+        load_json(Path(path))  # checks the size of the file
+    return quadrics.load_priors(path or None)
+
+
+def parse_up(text: str) -> Array:
+    """Parse a direction x,y,z into a unit vector (3,)."""
+    try:
+        up = np.array([float(x) for x in text.split(",")])
+    except ValueError:
+        up = np.empty(0)
+    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
+        raise ReobjError(f"--set objects.up={text}: expected a direction x,y,z, such as 0,0,1")
+    up /= np.abs(up).max()  # the squares of 1e300 overflow
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def check_shape(name: str) -> None:
+    """Raise ReobjError for a kind of shape that the fit does not have."""
+    if name not in (kinds := ("auto", *quadrics.SUPPORTS)):
+        raise ReobjError(f"--shape {name}: expected one of {', '.join(kinds)}")
+
+
+KNOWN_SIZE_M = (0.001, 1000.0)  # chosen: beyond the objects of a room or a street
+
+
+def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
+    """Parse 'chair=0.82m,door=2.0m' into heights in metres by category.
+
+    >>> parse_known_size("door=2.0m, chair=82cm")
+    {'door': ('h', 2.0), 'chair': ('h', 0.82)}
+    """
+    per_metre = {"m": 1, "cm": 100, "mm": 1000}
+    sizes: dict[str | int, tuple[str | int, float]] = {}
+    for item in filter(None, (entry.strip() for entry in text.split(","))):
+        found = re.fullmatch(r"(.+?)\s*=\s*([0-9]*\.?[0-9]+|[0-9]+\.)\s*(m|cm|mm)", item)
+        height_m = float(found[2]) / per_metre[found[3]] if found else 0.0
+        if found is None or not KNOWN_SIZE_M[0] <= height_m <= KNOWN_SIZE_M[1]:
+            expected = "CATEGORY=HEIGHT in m, cm or mm, from {:g} to {:g} m, such as door=2.0m"
+            raise ReobjError(f"--known-size {item!r}: expected {expected.format(*KNOWN_SIZE_M)}")
+        sizes[found[1]] = ("h", height_m)
+    return sizes
+
+
+def check_known_size(text: str, priors_path: str, class_names: Sequence[str]) -> None:
+    """Raise ReobjError for a known size of a category that the detector does not have."""
+    names = list(map(str, parse_known_size(text)))
+    priors = load_size_priors(priors_path)
+    available = set(priors.canonical(class_names))
+    for name, canonical in zip(names, priors.canonical(names), strict=True):
+        if available and canonical not in available:
+            close = did_you_mean(name, class_names) or f"; there are {shortened(class_names)}"
+            raise ReobjError(f"--known-size {name}: no such class{close}")
+
+
+def unused_sizes(text: str, priors_path: str, located: Sequence[str]) -> list[str]:
+    """Return warnings of known sizes that set no scale: no object of their category has a shape.
+
+    Args:
+        located: class names of the objects that have a shape.
+    """
+    priors = load_size_priors(priors_path)
+    used = set(priors.canonical(located))
+    names = list(map(str, parse_known_size(text)))
+    return [
+        f"--known-size {name}: no {name} was located, so this sets no scale"
+        for name, canonical in zip(names, priors.canonical(names), strict=True)
+        if canonical not in used
+    ]

@@ -112,9 +112,12 @@ COCO_CLASSES = (
 COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in COCO_CLASSES.split())
 
 
-def option(default: Any, text: str, flag: str = "") -> Any:
-    """Declare a config field: default, help text and, for the few that users need, a flag."""
-    return field(default=default, metadata={"help": text, "flag": flag})
+def option(default: Any, text: str, flag: str = "", old_flag: str = "") -> Any:
+    """Declare a config field: default, help text and, for the few that users need, a flag.
+
+    old_flag: an earlier name of the flag that still works.
+    """
+    return field(default=default, metadata={"help": text, "flag": flag, "old_flag": old_flag})
 
 
 @dataclass(frozen=True, slots=True)

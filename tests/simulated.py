@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 
 import quadrics
 import reobj_track as rt
-from reobj.objects import MIN_SCORE, describe_objects, describe_world, fitter
-from reobj.parts import link_and_fit
+from reobj.objects.config import make_fit
+from reobj.objects.description import describe_objects, describe_world
+from reobj.objects.fit import link_and_fit
+from reobj.objects.observations import MIN_SCORE, gather_views
 from reobj.results.result import VideoInfo
 from reobj.types import object_classes
-from reobj.views import gather_views
 
 SIZE = (640, 480)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
@@ -71,7 +72,7 @@ def fitted(
         classes = object_classes(tracks)
         group = np.searchsorted(list(classes), tracks.track_id)
         views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
-        fits = fitter(config, poses, names)(views, list(classes.values()))
+        fits = make_fit(config, poses, names)(views, list(classes.values()))
     objects = describe_objects(tracks, names, fits, views, config)
     video = VideoInfo("walk.mp4", *SIZE, 30.0)
     world = describe_world(poses, [fits], [])
@@ -138,5 +139,4 @@ def unlinked(poses: rt.Poses | None = None, tracks: rt.Tracks | None = None) -> 
 
 def finished(result: rt.Result, **options: Any) -> rt.Result:
     """The same result, linked and fitted."""
-    link_and_fit(result, rt.ObjectsConfig(**options))
-    return result
+    return link_and_fit(result, rt.ObjectsConfig(**options))

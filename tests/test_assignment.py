@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from reobj.identity.assignment import AMBIGUITY_MARGIN, Pairs, ambiguous_pairs, assign, touching
+from reobj.tracking.assignment import AMBIGUITY_MARGIN, Pairs, ambiguous_pairs, assign, touching
 
 
 def random_pairs(seed: int, rows: int, columns: int, share: float) -> tuple[np.ndarray, np.ndarray]:

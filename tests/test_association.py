@@ -11,33 +11,30 @@ from test_linking import CHAIR, CUP, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity import association, evidence
-from reobj.identity import locate as locating
-from reobj.identity.association import Association, Associator
-from reobj.identity.evidence import EXPECTED, Detected, Solids, gather_evidence
-from reobj.identity.gaps import fill_by_place
-from reobj.identity.locate import (
-    USUAL_SHARE,
-    Categories,
-    confidence,
-    locate,
-    log_best_odds,
-)
-from reobj.identity.proposals import propose
-from reobj.objects import fitter
+from reobj.objects import association, categories, component, likelihood
+from reobj.objects.association import Association, Associator
+from reobj.objects.categories import Categories
+from reobj.objects.component import associate_component
+from reobj.objects.confidence import USUAL_HIT_RATE, existence_probability, log_best_odds
+from reobj.objects.config import make_fit
+from reobj.objects.hypotheses import propose
+from reobj.objects.likelihood import EXPECTED, PosedDetections, Shapes, gather_evidence
+from reobj.objects.observations import Scene, Views, gather_views
+from reobj.tracking.interpolation import fill_from_objects
 from reobj.types import class_shares
-from reobj.views import Scene, Views, gather_views
 
 
-def chairs() -> Solids:
-    return Solids(chair_solids(), np.full(3, "box"), np.full(3, CHAIR))
+def chairs() -> Shapes:
+    return Shapes(chair_solids(), np.full(3, "box"), np.full(3, CHAIR))
 
 
-def detected_in(table: rt.Tracks, poses: rt.Poses) -> Detected:
+def detected_in(table: rt.Tracks, poses: rt.Poses) -> PosedDetections:
     """Rows of frames that all have a pose, in no tracklets."""
     none = np.full(len(table), -1)
     cams = poses.camera.K @ poses.cam_from_world
-    return Detected(table.frame, table.xyxy, table.score, table.class_id, none, none, cams, SIZE)
+    return PosedDetections(
+        table.frame, table.xyxy, table.score, table.class_id, none, none, cams, SIZE
+    )
 
 
 def shifted(table: rt.Tracks, by: np.ndarray) -> rt.Tracks:
@@ -51,8 +48,8 @@ def odds_of(table: rt.Tracks, poses: rt.Poses, solid: int = 0) -> float:
     own = table[table.detection_index == 0]
     found = gather_evidence(chairs(), detected_in(own, poses))
     odds = np.full(len(own), -np.inf)
-    mine = found.solid == solid
-    odds[found.row[mine]] = found.choice[mine]
+    pairs = found.obj == solid
+    odds[found.row[pairs]] = found.assignment[pairs]
     return float(np.median(odds))
 
 
@@ -86,7 +83,7 @@ def test_of_a_thing_any_part_may_be_hidden(shown: float) -> None:
     part = projected.copy()
     part[0, 3] = 100 + shown * 200
     whole, half, some = (
-        evidence._box_log_odds(projected, box, size)[0]
+        likelihood._box_log_odds(projected, box, size)[0]
         for box in (projected, projected - [[0, 0, 0, 100]], part)
     )
     assert whole > half > 2
@@ -97,7 +94,7 @@ def test_of_a_thing_any_part_may_be_hidden(shown: float) -> None:
     beyond = projected.copy()
     beyond[0, 3] = 100 - 30  # above its upper edge
     beyond[0, 1] = 50
-    assert evidence._box_log_odds(projected, beyond, size)[0] < 0
+    assert likelihood._box_log_odds(projected, beyond, size)[0] < 0
 
 
 def test_scores_and_classes_count() -> None:
@@ -122,23 +119,23 @@ def test_a_solid_is_expected_where_most_of_it_is_in_the_image() -> None:
 
 def test_many_solids_are_looked_at_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     detected = detected_in(table_of(walk(10)), walk(10))
-    five = Solids.concatenate([chairs(), chairs()[[2, 0]]])
+    five = Shapes.concatenate([chairs(), chairs()[[2, 0]]])
     whole = gather_evidence(five, detected)
-    monkeypatch.setattr(evidence, "SOLIDS_AT_ONCE", 2)
+    monkeypatch.setattr(likelihood, "OBJECTS_AT_ONCE", 2)
     turns = gather_evidence(five, detected)
-    for name in ("solid", "row", "log_odds", "choice", "expected"):
+    for name in ("obj", "row", "existence", "assignment", "expected"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(turns, name))
-    assert len(np.unique(whole.solid)) == 5
+    assert len(np.unique(whole.obj)) == 5
 
 
 # ---- Proposals ----
 
 
-def proposed_for(table: rt.Tracks, poses: rt.Poses, floor: quadrics.Floor | None) -> Solids:
+def proposed_for(table: rt.Tracks, poses: rt.Poses, floor: quadrics.Floor | None) -> Shapes:
     group = table.detection_index
     views = gather_views(table, poses, group, 3, 0.0)
     classes = class_shares(table, group, 3).argmax(1)
-    fits = fitter(rt.ObjectsConfig(), poses, NAMES)(views, classes.tolist())
+    fits = make_fit(rt.ObjectsConfig(), poses, NAMES)(views, classes.tolist())
     usual = np.tile([0.56, 0.6, 0.835], (3, 1))
     return propose(fits, views, classes, usual, floor, np.full(3, True))
 
@@ -165,8 +162,8 @@ def test_one_view_proposes_the_place_among_others(floor: quadrics.Floor | None) 
 
 def located(table: rt.Tracks, poses: rt.Poses) -> np.ndarray:
     """The solid of each row."""
-    fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
-    return locate(table, NAMES, poses, fit, priors).solid
+    fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    return associate_component(table, NAMES, poses, fit, priors).label
 
 
 def test_weak_detections_that_agree_belong_to_the_object() -> None:
@@ -216,13 +213,13 @@ def test_where_nothing_agrees_nothing_is_located() -> None:
     corner = np.random.default_rng(1).uniform(0, 300, (len(table), 2))
     side = np.random.default_rng(2).uniform(20, 300, corner.shape)
     wild = dataclasses.replace(table, xyxy=np.concatenate([corner, corner + side], 1))
-    fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
     names = ("about", "names", "aliases")
     empty = {f.name: getattr(priors, f.name)[:0] for f in dataclasses.fields(priors)
              if f.name not in names}  # fmt: skip
     none = dataclasses.replace(priors, names=(), aliases={}, **empty)
     for known in (priors, none):
-        assert (locate(wild, NAMES, poses, fit, known).solid < 0).mean() > 0.7
+        assert (associate_component(wild, NAMES, poses, fit, known).label < 0).mean() > 0.7
 
 
 @pytest.mark.parametrize(("off_px", "name"), [(3.0, "chair"), (0.0, "couch")])
@@ -253,13 +250,17 @@ def test_chairs_at_a_table_are_as_wide_as_where_they_are_seen_whole(
     x1, y1, x2, y2 = table.xyxy.T
     half = np.stack([0.75 * x1 + 0.25 * x2, y1, 0.25 * x1 + 0.75 * x2, (y1 + y2) / 2], 1)
     seen = dataclasses.replace(table, xyxy=np.where(back[:, None], half, table.xyxy))
-    fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
     width = {}
-    for standing, rounds in ((True, association.WIDENED), (True, 0), (False, association.WIDENED)):
-        monkeypatch.setattr(association, "WIDENED", rounds)
-        monkeypatch.setattr(locating, "floor_under", Mock(return_value=floor if standing else None))
-        found = locate(seen, NAMES, poses, fit, priors)
-        assert (found.solid >= 0).mean() > 0.9 and len(found.confidence) == 3
+    for standing, rounds in (
+        (True, association.WIDENING_ROUNDS),
+        (True, 0),
+        (False, association.WIDENING_ROUNDS),
+    ):
+        monkeypatch.setattr(association, "WIDENING_ROUNDS", rounds)
+        monkeypatch.setattr(component, "find_floor", Mock(return_value=floor if standing else None))
+        found = associate_component(seen, NAMES, poses, fit, priors)
+        assert (found.label >= 0).mean() > 0.9 and len(found.confidence) == 3
         width[standing, rounds > 0] = found.ellipsoids.half_axes[:3, :2].mean()
     assert abs(width[True, True] / 0.29 - 1) < 0.1
     assert max(width[True, False], width[False, True]) < 0.85 * width[True, True]
@@ -271,7 +272,7 @@ def test_no_detections_are_fitted_twice_and_the_first_scale_holds(metric: bool) 
     poses = dataclasses.replace(walk(), metric=metric)
     table = table_of(poses)
     table = dataclasses.replace(table, tracklet_id=1 + table.detection_index)
-    fit, asked = fitter(rt.ObjectsConfig(), poses, NAMES), []
+    fit, asked = make_fit(rt.ObjectsConfig(), poses, NAMES), []
     scales = []
 
     def noted(views: Views, classes: list[int], scene: Scene) -> quadrics.ObjectFits:
@@ -280,7 +281,7 @@ def test_no_detections_are_fitted_twice_and_the_first_scale_holds(metric: bool) 
         scales.append((scene.scale, fits.scale))
         return fits
 
-    found = locate(table, NAMES, poses, noted, quadrics.load_priors())
+    found = associate_component(table, NAMES, poses, noted, quadrics.load_priors())
     assert len(scales) > 1 and len(found.confidence) == 3
     later = asked[3:]  # of the refits
     assert len(set(later)) == len(later)
@@ -290,7 +291,7 @@ def test_no_detections_are_fitted_twice_and_the_first_scale_holds(metric: bool) 
     places = found.ellipsoids.center_in_world
     assert len(places) == 4 and np.isnan(places[3]).all()
     order = np.argsort(
-        found.solid[[np.flatnonzero(table.detection_index == k)[0] for k in range(3)]]
+        found.label[[np.flatnonzero(table.detection_index == k)[0] for k in range(3)]]
     )
     np.testing.assert_allclose(places[:3], chair_solids().center_in_world[order], atol=0.05)
 
@@ -307,13 +308,13 @@ def test_twins_that_stand_close_stay_two() -> None:
     assert len(np.unique(found)) == 3
 
 
-def association_of(solids: Solids, poses: rt.Poses) -> tuple[Associator, Association]:
+def association_of(solids: Shapes, poses: rt.Poses) -> tuple[Associator, Association]:
     """The chairs' detections with solids that are never refitted."""
     table = table_of(poses)
     detected = detected_in(table, poses)
     made = Associator(
         detected,
-        lambda rows, solid, classes, before: solids[np.unique(solid)],
+        lambda rows, label, classes, current: solids[np.unique(label)],
         lambda s: np.zeros(len(s)),
     )
     return made, made._assign(solids, np.full(len(table), -1))
@@ -321,50 +322,50 @@ def association_of(solids: Solids, poses: rt.Poses) -> tuple[Associator, Associa
 
 def test_every_detection_goes_to_its_solid_one_to_one() -> None:
     _, found = association_of(chairs(), walk(30))
-    np.testing.assert_array_equal(found.owner, table_of(walk(30)).detection_index)
+    np.testing.assert_array_equal(found.label, table_of(walk(30)).detection_index)
     assert (found.gains(detected_in(table_of(walk(30)), walk(30))) > 50).all()
 
 
 def test_a_detection_without_any_evidence_loses_its_solid() -> None:
     made, found = association_of(chairs(), walk(30))
     away = dataclasses.replace(
-        found.solids.ellipsoids, center_in_world=found.solids.ellipsoids.center_in_world + 50.0
+        found.shapes.ellipsoids, center_in_world=found.shapes.ellipsoids.center_in_world + 50.0
     )
-    gone = dataclasses.replace(found.solids, ellipsoids=away)
-    assert (made._assign(gone, found.owner).owner == -1).all()
+    gone = dataclasses.replace(found.shapes, ellipsoids=away)
+    assert (made._assign(gone, found.label).label == -1).all()
 
 
 def test_a_double_is_dropped_and_its_detections_return() -> None:
     three = chairs()
-    four = Solids.concatenate([three, three[[0]]])
+    four = Shapes.concatenate([three, three[[0]]])
     made, found = association_of(four, walk(30))
     for _ in range(3):
-        found = made._thinned(found)
-    assert len(found.solids) == 3 and (found.owner >= 0).all()
+        found = made._prune(found)
+    assert len(found.shapes) == 3 and (found.label >= 0).all()
 
 
 def test_what_another_solid_explains_does_not_tell_where_a_solid_is() -> None:
     made, found = association_of(chairs(), walk(30))
-    assert found.clear().all()
-    slipped = np.flatnonzero(found.owner == 0)[:4]
-    found.owner[slipped] = 1  # four boxes of a chair are given to the next one
-    np.testing.assert_array_equal(np.flatnonzero(~found.clear()), slipped)
+    assert found.unambiguous().all()
+    slipped = np.flatnonzero(found.label == 0)[:4]
+    found.label[slipped] = 1  # four boxes of a chair are given to the next one
+    np.testing.assert_array_equal(np.flatnonzero(~found.unambiguous()), slipped)
     rows = list[np.ndarray]()
 
-    def refit(used: np.ndarray, *_: object) -> Solids:
+    def refit(used: np.ndarray, *_: object) -> Shapes:
         rows.append(used)
-        return found.solids
+        return found.shapes
 
-    made.refit = refit
-    made._refitted(found)
-    np.testing.assert_array_equal(rows[0], np.flatnonzero(found.clear()))
+    made.fit_shapes = refit
+    made._refit(found)
+    np.testing.assert_array_equal(rows[0], np.flatnonzero(found.unambiguous()))
 
 
 def test_a_double_is_fitted_to_all_its_detections_as_none_is_clear() -> None:
-    four = Solids.concatenate([chairs(), chairs()[[0]]])
+    four = Shapes.concatenate([chairs(), chairs()[[0]]])
     _, found = association_of(four, walk(30))
-    assert found.clear().all() and len(np.unique(found.owner)) >= 3
-    assert not association_of(chairs()[[]], walk(30))[1].clear().any()
+    assert found.unambiguous().all() and len(np.unique(found.label)) >= 3
+    assert not association_of(chairs()[[]], walk(30))[1].unambiguous().any()
 
 
 @pytest.mark.parametrize("first", [0, 3])
@@ -374,16 +375,16 @@ def test_of_two_that_stand_for_one_thing_the_better_placed_one_stays(first: int)
     off = dataclasses.replace(
         three.ellipsoids, center_in_world=three.ellipsoids.center_in_world + np.array([0.12, 0, 0])
     )
-    four = Solids.concatenate([three, dataclasses.replace(three, ellipsoids=off)[[0]]])
+    four = Shapes.concatenate([three, dataclasses.replace(three, ellipsoids=off)[[0]]])
     order = np.array([0, 1, 2, 3] if first == 0 else [3, 1, 2, 0])
     made, found = association_of(four[order], walk(30))
     shift = order.tolist().index(3)
     own = np.flatnonzero(table_of(walk(30)).detection_index == 0)
-    owner = found.owner.copy()
+    owner = found.label.copy()
     owner[own[::2]], owner[own[1::2]] = shift, order.tolist().index(0)
     likelier = np.where(np.arange(4) == shift, 0.0, -1.0)
-    thinned = made._thinned(dataclasses.replace(found, owner=owner, size_log_odds=likelier))
-    centre = thinned.solids.ellipsoids.center_in_world
+    pruned = made._prune(dataclasses.replace(found, label=owner, size_log_odds=likelier))
+    centre = pruned.shapes.ellipsoids.center_in_world
     assert len(centre) == 3
     assert np.abs(centre - three.ellipsoids.center_in_world[0]).max(1).min() < 1e-9
 
@@ -411,7 +412,7 @@ def test_a_part_of_a_thing_is_no_other_thing(
     )
     other = dataclasses.replace(solid, ellipsoids=moved)
     for pair in ([solid, other], [other, solid]):
-        found = association._coincide(Solids.concatenate(pair))
+        found = association._coincide(Shapes.concatenate(pair))
         assert found[0, 1] == found[1, 0] == one
 
 
@@ -433,24 +434,24 @@ def test_two_boxes_of_a_thing_in_every_frame_make_one_solid(second: float) -> No
         + three.ellipsoids.world_from_obj[:, :, 2] * three.ellipsoids.half_axes[:, [2]] / 2,
         half_axes=three.ellipsoids.half_axes * [1, 1, 0.5],
     )
-    many = Solids.concatenate([three, dataclasses.replace(three, ellipsoids=top)])
+    many = Shapes.concatenate([three, dataclasses.replace(three, ellipsoids=top)])
     made = Associator(detected_in(both, poses), Mock(), lambda s: np.zeros(len(s)))
-    assert sorted(made._pursue(made._empty(many, 0.0)).tolist()) == [0, 1, 2]
+    assert sorted(made._select_greedily(made._unassigned(many, 0.0)).tolist()) == [0, 1, 2]
 
 
 def test_the_association_ends_where_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two states that follow each other for ever are looked at once each."""
     made, found = association_of(chairs(), walk(10))
-    states = [np.where(found.owner == k, -1, found.owner) for k in (0, 1)]
+    states = [np.where(found.label == k, -1, found.label) for k in (0, 1)]
     rounds: list[int] = []
 
     def turned(now: Association) -> Association:
         rounds.append(1)
-        return dataclasses.replace(now, owner=states[len(rounds) % 2])
+        return dataclasses.replace(now, label=states[len(rounds) % 2])
 
-    for step in ("_refitted", "_thinned", "_merged"):
+    for step in ("_refit", "_prune", "_merge"):
         monkeypatch.setattr(
-            made, step, turned if step == "_merged" else lambda now, widened=False: now
+            made, step, turned if step == "_merge" else lambda now, widen=False: now
         )
     made.run(chairs(), False)
     assert len(rounds) == 3
@@ -465,25 +466,25 @@ def test_pursuit_takes_in_turn_what_adds_most() -> None:
     moved = dataclasses.replace(
         near.ellipsoids, center_in_world=near.ellipsoids.center_in_world + off
     )
-    many = Solids.concatenate([dataclasses.replace(near, ellipsoids=moved), three[[0]], three[[0]]])
+    many = Shapes.concatenate([dataclasses.replace(near, ellipsoids=moved), three[[0]], three[[0]]])
     made, _ = association_of(three, walk(30))
-    of = made._empty(many)
-    seen, cost, view = of.evidence, of.costs(), made.detected.view
-    value = np.minimum(seen.choice, seen.log_odds + association.PURSUED_CHOICE)
+    of = made._unassigned(many)
+    seen, cost, view = of.evidence, of.costs(), made.detections.view
+    value = np.minimum(seen.assignment, seen.existence + association.MAX_BOX_GAIN)
     explained, expected = np.zeros(len(view)), list[int]()
     while True:
         gain, tops = -cost, np.zeros((len(many), len(seen.expected)))
-        np.maximum.at(tops, (seen.solid, view[seen.row]), value - explained[seen.row])
+        np.maximum.at(tops, (seen.obj, view[seen.row]), value - explained[seen.row])
         gain += (tops + association.MISSED * (seen.expected.T & (tops > 0))).sum(1)
         gain[expected] = -np.inf
         if gain.max() <= 0:
             break
         expected.append(int(gain.argmax()))
-        own = (seen.solid == expected[-1]) & (value > 0)
+        own = (seen.obj == expected[-1]) & (value > 0)
         np.maximum.at(explained, seen.row[own], value[own])
-    assert len(expected) > 1 and made._pursue(of).tolist() == expected
-    few = made._empty(many, 0.0)  # pairs that speak for none add nothing
-    assert len(few.evidence.row) < len(seen.row) and made._pursue(few).tolist() == expected
+    assert len(expected) > 1 and made._select_greedily(of).tolist() == expected
+    few = made._unassigned(many, 0.0)  # pairs that speak for none add nothing
+    assert len(few.evidence.row) < len(seen.row) and made._select_greedily(few).tolist() == expected
 
 
 def test_pursuit_chooses_what_is_there() -> None:
@@ -493,17 +494,17 @@ def test_pursuit_chooses_what_is_there() -> None:
         center_in_world=three.ellipsoids.center_in_world + np.array([0.3, 0.2, 0.1]),
     )
     made, _ = association_of(three, walk(30))
-    many = Solids.concatenate([dataclasses.replace(three, ellipsoids=away), three])
-    assert sorted(made._pursue(made._empty(many)).tolist()) == [3, 4, 5]
+    many = Shapes.concatenate([dataclasses.replace(three, ellipsoids=away), three])
+    assert sorted(made._select_greedily(made._unassigned(many)).tolist()) == [3, 4, 5]
 
 
 def test_missed_frames_speak_against_a_solid(monkeypatch: pytest.MonkeyPatch) -> None:
     made, found = association_of(chairs(), walk(30))
-    gain = found.gains(made.detected)
+    gain = found.gains(made.detections)
     monkeypatch.setattr(association, "MISSED", association.MISSED + 1)
-    np.testing.assert_allclose(found.gains(made.detected), gain)  # none was missed
-    found.owner[made.detected.view < 10] = -1
-    lost = gain - found.gains(made.detected)
+    np.testing.assert_allclose(found.gains(made.detections), gain)  # none was missed
+    found.label[made.detections.view < 10] = -1
+    lost = gain - found.gains(made.detections)
     assert (lost > 10 * (association.MISSED - 1e-9)).all()
 
 
@@ -513,24 +514,25 @@ def test_a_size_is_held_against_its_category_axis_by_axis() -> None:
     metres = Categories(priors, names, quadrics.Scale(1.0, 0.0, "poses"))
     usual = metres.usual_size(np.array([CHAIR]))[0] / 2
     half = np.stack([usual, usual[[1, 0, 2]], usual * [2, 2, 0.25], usual * 5])
-    solids = Solids(
+    solids = Shapes(
         quadrics.Ellipsoids(np.zeros((4, 3)), half, np.tile(np.eye(3), (4, 1, 1))),
         np.full(4, "box"),
         np.full(4, CHAIR),
     )
     fits, turned, pancake, giant = metres.size_log_odds(solids)
-    assert fits == turned == 0 and pancake < -10 and giant == -0.5 * locating.SIZE_SIGMAS**2
+    assert fits == turned == 0 and pancake < -10 and giant == -0.5 * categories.SIZE_SIGMAS**2
     unknown = Categories(priors, names, quadrics.Scale(1.0, 0.0, "none")).size_log_odds(solids)
     assert unknown[3] > -0.5 and unknown[2] < -10
 
 
 def test_confidence_rises_with_score_and_share() -> None:
     score, share = np.array([-2.0, 0.0, 2.0]), np.array([0.0, 0.5, 1.0])
-    table = confidence(score[:, None], share)
+    table = existence_probability(score[:, None], share)
     assert (np.diff(table, axis=0) > 0).all() and (np.diff(table, axis=1) > 0).all()
     assert table[0, 0] < 0.1 and table[2, 2] > 0.9
-    assert (confidence(score, share, 0.5) < table.diagonal()).all()  # things behind it are seen
-    assert confidence(np.zeros(1), np.array([np.nan]))[0] < 0.2  # no solid explains it
+    background_seen = existence_probability(score, share, 0.5)
+    assert (background_seen < table.diagonal()).all()
+    assert existence_probability(np.zeros(1), np.array([np.nan]))[0] < 0.2  # no solid explains it
 
 
 def test_the_best_views_tell_what_a_thing_scores() -> None:
@@ -550,13 +552,17 @@ def test_where_no_frame_should_show_a_thing_the_share_is_the_usual_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Every view cuts a large table: that it is never missed does not speak against it."""
-    monkeypatch.setattr("reobj.identity.evidence.EXPECTED", 2.0)
+    monkeypatch.setattr("reobj.objects.likelihood.EXPECTED", 2.0)
     poses, priors = walk(), quadrics.load_priors()
     table = table_of(poses)
-    found = locate(table, NAMES, poses, fitter(rt.ObjectsConfig(), poses, NAMES), priors)
-    shown = found.solid >= 0
-    score = log_best_odds(table.score[shown], found.solid[shown], len(found.confidence))
-    np.testing.assert_allclose(found.confidence, confidence(score, np.full(3, USUAL_SHARE)))
+    found = associate_component(
+        table, NAMES, poses, make_fit(rt.ObjectsConfig(), poses, NAMES), priors
+    )
+    shown = found.label >= 0
+    score = log_best_odds(table.score[shown], found.label[shown], len(found.confidence))
+    np.testing.assert_allclose(
+        found.confidence, existence_probability(score, np.full(3, USUAL_HIT_RATE))
+    )
 
 
 # ---- What follows ----
@@ -568,7 +574,7 @@ def test_things_on_the_floor_reach_down_to_it() -> None:
     table = table_of(poses)
     table.xyxy[:, 3] = table.xyxy[:, 1] + 0.5 * (table.xyxy[:, 3] - table.xyxy[:, 1])
     views = gather_views(table, poses, table.detection_index, 3, 0.0)
-    fit = fitter(rt.ObjectsConfig(), poses, NAMES)
+    fit = make_fit(rt.ObjectsConfig(), poses, NAMES)
     floor = quadrics.Floor(np.array([0, 0, 1.0]), 0.0, 0.001)
     low, high = (
         fits.ellipsoids.center_in_world[:, 2] - fits.ellipsoids.half_axes[:, 2]
@@ -584,7 +590,7 @@ def test_frames_are_filled_by_the_solid() -> None:
     poses = walk(60)
     table = table_of(poses)
     seen = (table.detection_index != 0) | (table.frame < 28) | (table.frame >= 33)
-    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), chair_solids(), ["box"] * 3)
+    filled = fill_from_objects(table[seen], poses, np.array([1, 2, 3]), chair_solids(), ["box"] * 3)
     made = filled[filled.score == 0]
     true = table[~seen]
     np.testing.assert_array_equal(made.frame, true.frame)
@@ -604,13 +610,13 @@ def test_frames_are_filled_only_from_where_it_was_seen() -> None:
     angle = np.degrees(np.arccos((ray @ ray[30] / length / length[30]).clip(-1, 1)))
     near = (angle < 10) & (np.abs(np.log(length / length[30])) < np.log(1.25))
     assert 5 < near.sum() < 40  # the walk sees it from farther aside too
-    filled = fill_by_place(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3)
+    filled = fill_from_objects(table[seen], poses, np.array([1, 2, 3]), solids, ["box"] * 3)
     assert filled.frame[filled.score == 0].tolist() == [f for f in np.flatnonzero(near) if f != 30]
     own = table.detection_index[seen] == 0
     for shift, explained in (([0, 0, 0, -0.4], True), ([0.3, 0, 0.3, 0], False)):  # hidden; beside
         moved = shifted(table[seen], np.where(own[:, None], shift, 0.0))
-        again = fill_by_place(moved, poses, np.array([1, 2, 3]), solids, ["box"] * 3)
+        again = fill_from_objects(moved, poses, np.array([1, 2, 3]), solids, ["box"] * 3)
         assert ((again.score == 0).sum() == (filled.score == 0).sum()) == explained
         assert explained or len(again) == len(moved)
     never = table[seen & (table.detection_index != 0)]  # no detection, nothing to fill from
-    assert len(fill_by_place(never, poses, np.array([1]), solids[:1], ["box"])) == len(never)
+    assert len(fill_from_objects(never, poses, np.array([1]), solids[:1], ["box"])) == len(never)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from reobj.identity import camera_motion
-from reobj.identity.camera_motion import CameraMotion
+from reobj.tracking import camera_motion
+from reobj.tracking.camera_motion import CameraMotion
 from reobj.types import Frame
 
 

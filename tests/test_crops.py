@@ -18,7 +18,7 @@ from test_embedding import (
 )
 
 import reobj_track as rt
-from reobj.identity.crops import make_embedder
+from reobj.appearance.crops import make_embedder
 
 GREY = IMAGENET_MEAN[::-1].round()  # BGR
 

@@ -14,9 +14,9 @@ from simulated import SIZE, tracks_of, unlinked, walk, with_columns
 
 import quadrics
 import reobj_track as rt
-from reobj import parts
-from reobj.identity.occlusion import hidden_edges
-from reobj.parts import link_and_fit
+from reobj.objects import fit as fitting
+from reobj.objects.fit import link_and_fit
+from reobj.objects.occlusion import occluded_edges
 from reobj.results.edits import EDITS, apply_edits, kept_edits, read_edits
 from reobj.results.workspace import Workspace
 
@@ -288,7 +288,7 @@ def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
     box = tracks.xyxy[tracks.track_id == 2][0].tolist()
     edit = {"do": "delete", "object": {"id": 2, "frame": 0, "box": box}}
     result.edits = read_edits(write(tmp_path / "e.json", edit))
-    link_and_fit(result, rt.ObjectsConfig(link=False))
+    result = link_and_fit(result, rt.ObjectsConfig(link=False))
     kept = tracks.track_id[rows] != 2
     assert len(result.tracks) == 80 and SIZE == (640, 480)
     np.testing.assert_array_equal(result.embeddings.foreground, vectors[kept])
@@ -308,11 +308,10 @@ def test_solids_of_merged_objects_hide_nothing(
 
     def noted(views: Any, ellipsoids: quadrics.Ellipsoids, on_floor: Any) -> Any:
         asked.append(ellipsoids)
-        return hidden_edges(views, ellipsoids, on_floor)
+        return occluded_edges(views, ellipsoids, on_floor)
 
-    monkeypatch.setattr(parts, "hidden_edges", noted)
-    plain = unlinked(poses, tracks)
-    link_and_fit(plain, rt.ObjectsConfig())
+    monkeypatch.setattr(fitting, "occluded_edges", noted)
+    plain = link_and_fit(unlinked(poses, tracks), rt.ObjectsConfig())
     assert np.isfinite(asked[-1].half_axes).all() and len(asked[-1]) == 3  # all known to begin with
     refs = [
         {"id": i, "frame": 0, "box": plain.tracks.xyxy[(plain.tracks.track_id == i)][0].tolist()}
@@ -321,6 +320,6 @@ def test_solids_of_merged_objects_hide_nothing(
     result = unlinked(poses, tracks)
     path = write(tmp_path / "e.json", {"do": "merge", "object": refs[0], "with": refs[1]})
     result.edits = read_edits(path)
-    link_and_fit(result, rt.ObjectsConfig())
+    result = link_and_fit(result, rt.ObjectsConfig())
     assert [o.id for o in result.objects] == [1, 3]
     assert np.isfinite(asked[-1].half_axes).all(1).tolist() == [False, True]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.identity.embedding import (
+from reobj.appearance.embedding import (
     Backbone,
     LazyEmbeddings,
     as_embeddings,
@@ -491,11 +491,11 @@ def test_embeddings_as_they_come() -> None:
     ("given", "width", "message"),
     [
         (rt.Embeddings(np.ones((3, 4)), np.ones((3, 1))), 0, r"\(3, 4\), expected \(2, E\)"),
-        (np.ones((4, 2)), 0, r"\(4, 2\), expected \(2, E\): one row a detection"),
+        (np.ones((4, 2)), 0, r"\(4, 2\), expected \(2, E\): one row per detection"),
         (np.ones(8), 0, r"\(8,\), expected \(2, E\)"),  # not two rows of four
         (np.ones((2, 2, 2)), 0, r"\(2, 2, 2\), expected"),
         (rt.Embeddings(np.ones((2, 4)), np.ones((1, 4))), 0, r"\(1, 4\), expected"),
-        (np.ones((2, 4)), 5, "width 4, expected 5, as in the frames before"),
+        (np.ones((2, 4)), 5, "width 4, expected 5, as in earlier frames"),
         (np.ones((2, 0)), 0, "width 0, expected at least 1"),
         (np.array([[1, np.nan], [0, 1]]), 0, "not finite"),
         (np.array([[1, 1e39], [0, 1]]), 0, "not finite as float32"),

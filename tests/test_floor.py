@@ -14,7 +14,7 @@ from simulated import walk
 
 import quadrics
 import reobj_track as rt
-from reobj.objects import describe_world
+from reobj.objects.description import describe_world
 from reobj.poses.floor import find_floor, floor_of
 
 UP = np.array([0, 0, 1.0])

@@ -9,8 +9,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 import reobj_track as rt
-from reobj.identity.gaps import fill_gaps, smooth_boxes
-from reobj.views import gather_views
+from reobj.objects.observations import gather_views
+from reobj.tracking.interpolation import fill_gaps, smooth_boxes
 
 SIZE = (640, 480)
 

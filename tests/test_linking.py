@@ -10,9 +10,9 @@ from simulated import looking_at
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.linking import FRAGMENT_GAP, cut_at_gaps, link
-from reobj.identity.locate import locate
-from reobj.objects import fitter
+from reobj.objects.component import associate_component
+from reobj.objects.config import make_fit
+from reobj.tracking.linking import FRAGMENT_GAP, cut_at_gaps, link
 
 SIZE = (640, 480)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
@@ -75,15 +75,15 @@ def linked(
     views: np.ndarray | None = None,
     moving: tuple[str, ...] = (),
 ) -> tuple[rt.Tracks, list[rt.LinkEvent]]:
-    """`locate` and `link` as a run does; views: (N, E) embeddings of all rows, default none."""
+    """Associate and link as a run does; views: (N, E) embeddings of all rows, default none."""
     seen = (rt.Embeddings.empty(), np.empty(0, np.int64))
     if views is not None:
         seen = (rt.Embeddings(views, np.empty((len(table), 0))), np.arange(len(table)))
     if poses is None:
         return link(table, NAMES, *seen, None, moving=moving)
-    fit, priors = fitter(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
-    found = locate(table, NAMES, poses, fit, priors, moving)
-    return link(table, NAMES, *seen, poses, moving=moving, solid=found.solid, overlap=found.overlap)
+    fit, priors = make_fit(rt.ObjectsConfig(), poses, NAMES), quadrics.load_priors()
+    found = associate_component(table, NAMES, poses, fit, priors, moving)
+    return link(table, NAMES, *seen, poses, moving=moving, label=found.label, iou=found.iou)
 
 
 def kinds(events: list[rt.LinkEvent], kept: bool = True) -> set[str]:

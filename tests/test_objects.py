@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 from simulated import SIZE, chair_solids, fitted, tracks_of, walk, with_columns
 
 import quadrics
-import reobj.objects
 import reobj_track as rt
-from reobj.objects import describe_objects, describe_world, fitter, parse_known_size, parse_up
-from reobj.views import Views, gather_views
+from reobj.objects.config import make_fit
+from reobj.objects.description import describe_objects, describe_world
+from reobj.objects.observations import Views, gather_views
+from reobj.options import parse_known_size, parse_up
 
 
 def options(**changes: object) -> rt.ObjectsConfig:
@@ -199,7 +200,7 @@ def test_fitter_names_classes_beyond_the_names() -> None:
     poses = walk(10)
     tracks = with_columns(tracks_of(poses), class_id=7)
     views = gather_views(tracks, poses, tracks.track_id - 1, 3, 0.3)
-    assert len(fitter(rt.ObjectsConfig(), poses, ("cup",))(views, [7, 7, 7])) == 3
+    assert len(make_fit(rt.ObjectsConfig(), poses, ("cup",))(views, [7, 7, 7])) == 3
     assert {o.class_name for o in describe_objects(tracks, (), None, None, rt.ObjectsConfig())} == {
         "object"
     }
@@ -228,12 +229,15 @@ def a_fit(count: int = 4, **changes: object) -> tuple[quadrics.ObjectFits, Views
     return quadrics.ObjectFits(**facts | changes), views  # type: ignore[arg-type]
 
 
-def described(count: int = 4, config: rt.ObjectsConfig | None = None, **changes: object) -> object:
+def described(
+    count: int = 4, confidence: dict[int, float] | None = None, **changes: object
+) -> rt.Object:
     fits, views = a_fit(count, **changes)
     one, zero = np.ones(count, np.int64), np.zeros(count, np.int64)
     score = np.linspace(0.4, 0.8, count)
     tracks = rt.Tracks(np.arange(count), one, one, views.boxes[:, 0], score, zero, zero)
-    (found,) = describe_objects(tracks, ("lamp",), fits, views, config or rt.ObjectsConfig())
+    config = rt.ObjectsConfig()
+    (found,) = describe_objects(tracks, ("lamp",), fits, views, config, confidence)
     return found
 
 
@@ -332,15 +336,13 @@ def test_up_is_the_fits_or_the_poses(
     assert flat.scale is None and flat.up_source == ("poses" if poses_know else "none")
 
 
-@pytest.mark.parametrize(("sure", "status"), [(0.9, "ok"), (0.4, "doubtful")])
-def test_what_is_less_likely_there_than_not_is_doubtful(sure: float, status: str) -> None:
-    """It keeps its solid, but it is neither located nor counted; without a solid it says why."""
-    poses = walk(40)
-    result = fitted(tracks_of(poses), poses, options())
-    found = reobj.objects._with_confidence(result.objects[0], sure)
+@pytest.mark.parametrize(("confidence", "status"), [(0.9, "ok"), (0.4, "doubtful")])
+def test_low_confidence_is_a_status_of_its_own(confidence: float, status: str) -> None:
+    """The object keeps its shape, but is not located; a rejection keeps its reason."""
+    found = described(confidence={1: confidence})
     assert (found.status, found.located) == (status, status == "ok")
-    assert found.center is not None and found.confidence == sure
-    none = dataclasses.replace(result.objects[0], status="rejected", reason="too few", center=None)
-    found = reobj.objects._with_confidence(none, sure)
+    assert found.center is not None and found.confidence == confidence
+    rejected = {"status": np.array(["rejected"]), "reason": ["too few"]}
+    found = described(confidence={1: confidence}, **rejected)
     assert found.status == ("rejected" if status == "ok" else "doubtful")
     assert "too few" in found.reason

@@ -10,9 +10,9 @@ from test_linking import CHAIR, NAMES, SIZE, chair_solids, table_of, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.occlusion import hidden_edges, seen_through
-from reobj.objects import fitter
-from reobj.views import Views, gather_views
+from reobj.objects.config import make_fit
+from reobj.objects.observations import Views, gather_views
+from reobj.objects.occlusion import occluded_edges, see_through_ratio
 
 LEFT, UPPER, RIGHT, LOWER = range(4)
 ELSEWHERE = np.array([False, False])  # neither stands on the floor
@@ -38,7 +38,7 @@ def cut_below(views: Views) -> None:
 def test_the_edge_at_a_counter_is_hidden_and_no_other() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
-    found = hidden_edges(views, solids, ELSEWHERE)
+    found = occluded_edges(views, solids, ELSEWHERE)
     expected = np.zeros((5, 2, 4), bool)
     expected[:, 0, LOWER] = True
     np.testing.assert_array_equal(found, expected)
@@ -49,22 +49,22 @@ def test_what_is_farther_away_hides_nothing() -> None:
     solids.center_in_world[1, 1] = 0.4
     views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
     cut_below(views)
-    assert not hidden_edges(views, solids, ELSEWHERE)[:, 0].any()
+    assert not occluded_edges(views, solids, ELSEWHERE)[:, 0].any()
     solids.center_in_world[0, 1] = 1.0
-    assert hidden_edges(views, solids, ELSEWHERE)[:, 0, LOWER].all()
+    assert occluded_edges(views, solids, ELSEWHERE)[:, 0, LOWER].all()
 
 
 def test_what_covers_the_whole_box_hides_no_edge() -> None:
     """The chair is seen although a solid is in the way: that is no wall."""
     solids, views = scene(np.array([1.5, 0.1, 0.9]))
-    assert not hidden_edges(views, solids, ELSEWHERE).any()
+    assert not occluded_edges(views, solids, ELSEWHERE).any()
 
 
 def test_an_unknown_solid_hides_nothing() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
     solids.center_in_world[1] = solids.half_axes[1] = np.nan
-    assert not hidden_edges(views, solids, ELSEWHERE).any()
+    assert not occluded_edges(views, solids, ELSEWHERE).any()
 
 
 def test_a_box_that_ends_above_the_floor_tells_only_where_its_thing_begins() -> None:
@@ -77,9 +77,9 @@ def test_a_box_that_ends_above_the_floor_tells_only_where_its_thing_begins() -> 
     lower[1:] -= 0.3 * height[1:]
     expected = np.zeros((5, 2, 4), bool)
     expected[1:, 0] = [True, False, True, True]
-    found = hidden_edges(views, solids, np.array([True, False]))
+    found = occluded_edges(views, solids, np.array([True, False]))
     np.testing.assert_array_equal(found, expected)
-    assert not hidden_edges(views, solids, ELSEWHERE).any()
+    assert not occluded_edges(views, solids, ELSEWHERE).any()
 
 
 def test_no_edge_is_hidden_below_the_image() -> None:
@@ -89,7 +89,7 @@ def test_no_edge_is_hidden_below_the_image() -> None:
     whole = quadrics.solid_boxes(solids, "box", views.img_from_world)
     size = (SIZE[0], float(whole[..., 3].min()) - 20.0)
     views = dataclasses.replace(views, boxes=quadrics.clip_boxes(whole, size), image_size=size)
-    assert not hidden_edges(views, solids, ~ELSEWHERE).any()
+    assert not occluded_edges(views, solids, ~ELSEWHERE).any()
 
 
 @pytest.mark.parametrize("edge", [UPPER, LOWER])
@@ -102,9 +102,9 @@ def test_behind_a_hidden_edge_the_fit_goes_on(edge: int) -> None:
     views = gather_views(table, poses, table.detection_index, 3, 0.0)
     hidden = np.zeros(views.boxes.shape, bool)
     hidden[..., edge] = True
-    fit = fitter(rt.ObjectsConfig(), poses, NAMES)
+    fit = make_fit(rt.ObjectsConfig(), poses, NAMES)
     cut, whole = (
-        fit(dataclasses.replace(views, hidden=mask), [CHAIR] * 3) for mask in (None, hidden)
+        fit(dataclasses.replace(views, occluded=mask), [CHAIR] * 3) for mask in (None, hidden)
     )
     true = 2 * chair_solids().half_axes[:, 2]
     assert (cut.size[:, 2] < 0.8 * true).all()
@@ -125,7 +125,7 @@ def through(points: np.ndarray) -> float:
     solids, _ = scene(np.array([0.2, 0.2, 0.4]))
     every = np.indices((5, len(points))).reshape(2, -1).T
     poses = dataclasses.replace(walk(5, arc_deg=8.0), points=points, visibility=every)
-    (found,) = seen_through(solids[[0]], np.ones((5, 1), bool), poses, poses.frame)
+    (found,) = see_through_ratio(solids[[0]], np.ones((5, 1), bool), poses, poses.frame)
     return float(found)
 
 

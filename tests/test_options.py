@@ -25,7 +25,7 @@ from pose_worlds import arc
 from scipy.spatial.transform import Rotation
 
 import quadrics
-import reobj.objects
+import reobj.objects.confidence
 import reobj.poses.estimate as estimate
 import reobj.poses.sfm as sfm
 import reobj.poses.stage as stage
@@ -516,7 +516,7 @@ def _(lab: Lab) -> None:
 
 def run_on_nothing_with_backbone(lab: Lab) -> None:
     """The network of our weights by its file, without the metadata that names its head."""
-    lab.patch.setattr("reobj.identity.embedding.onnx_metadata", lambda session: {})
+    lab.patch.setattr("reobj.appearance.embedding.onnx_metadata", lambda session: {})
     config = lab.config("no-such-head.onnx", embed__model=str(own_models() / "reobj.onnx"))
     rt.run(images(lab.path / "images", 2), lab.path / "out", config, detections=lambda image: [],
            in_3d=False)  # fmt: skip
@@ -992,7 +992,7 @@ def _(lab: Lab) -> None:
     """Nothing is likelier than 1.1: all are in the file and the page; in the film if asked for."""
     for value, count in ((False, 0), (True, 2)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(reobj.objects, "DOUBTFUL", 1.1)
+            patch.setattr(reobj.objects.confidence, "LOW_CONFIDENCE", 1.1)
             shown = Mock(return_value=[])
             patch.setattr(rt, "write_pictures", shown)
             assert {found.status for found in lab.refit(value).objects} == {"doubtful"}

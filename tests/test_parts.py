@@ -30,11 +30,11 @@ from simulated import (
 )
 
 import quadrics
-import reobj.parts
+import reobj.objects.fit
 import reobj_track as rt
 from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.files import part_path
-from reobj.parts import parts_message
+from reobj.objects.description import components_message
 from reobj.poses.floor import Floor
 from reobj.results.overlay import Overlay
 from reobj.results.scene import Pictures, write_scene
@@ -127,7 +127,7 @@ def test_one_part_is_the_result_itself() -> None:
     poses = two_parts().of_part(0)
     result = finished(unlinked(poses, tracks_in_two_parts(two_parts())[: 3 * BREAK]))
     assert result.of_part(0) is result and result.parts() == [result]
-    assert parts_message(poses) == []
+    assert components_message(poses) == []
     assert {o.part for o in result.objects} == {0} and len(result.world.parts) == 1
 
 
@@ -160,7 +160,7 @@ def test_embeddings_stay_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> Non
         seen.extend(tracks.frame[rows].tolist())
         return tracks, []
 
-    monkeypatch.setattr(reobj.parts, "link", noted)
+    monkeypatch.setattr(reobj.objects.fit, "link", noted)
     finished(given)
     assert seen == frame.tolist()
 
@@ -190,7 +190,7 @@ def test_two_solids_do_not_share_a_tracklet_that_slipped() -> None:
     none, chair = np.zeros((4, 4)), np.full(4, CHAIR)
     tracklet = np.array([1, 1, 0, 0])
     table = rt.Tracks(np.array([0, 1, 2, 2]), tracklet, tracklet, none, none[0], chair, chair)
-    found = reobj.parts._with_tracklets(table, np.array([0, 1, 0, 1])).tracklet_id
+    found = reobj.objects.fit._with_tracklets(table, np.array([0, 1, 0, 1])).tracklet_id
     assert found.tolist() == [1, 1, 1, 2]
 
 
@@ -216,8 +216,8 @@ def test_the_last_fit_knows_hidden_edges(monkeypatch: pytest.MonkeyPatch) -> Non
     heights = []
     for hidden in ([False] * 4, [False, False, False, True]):
         monkeypatch.setattr(
-            reobj.parts,
-            "hidden_edges",
+            reobj.objects.fit,
+            "occluded_edges",
             lambda v, e, f, own=hidden: np.broadcast_to(own, v.boxes.shape),
         )
         found = finished(dataclasses.replace(given), link=False).objects
@@ -247,8 +247,8 @@ def test_the_last_fit_begins_with_the_places_of_the_association(
 ) -> None:
     """What hides is known from there; where nothing is associated a first fit tells."""
     for link in (True, False):
-        seen = Mock(wraps=reobj.parts.hidden_edges)
-        monkeypatch.setattr(reobj.parts, "hidden_edges", seen)
+        seen = Mock(wraps=reobj.objects.fit.occluded_edges)
+        monkeypatch.setattr(reobj.objects.fit, "occluded_edges", seen)
         calls = Mock(wraps=quadrics.fit_objects)
         monkeypatch.setattr(quadrics, "fit_objects", calls)
         result = finished(unlinked(walk(), tracks_of(walk())), link=link)
@@ -266,7 +266,7 @@ def test_the_last_fit_stands_on_the_floor(given: bool, monkeypatch: pytest.Monke
     """Gravity is that of the floor, unless the poses know it."""
     normal = np.array([0.0, np.sin(0.05), np.cos(0.05)])
     floor = quadrics.Floor(normal, 0.0, 0.01)
-    monkeypatch.setattr(reobj.parts, "floor_under", lambda poses, fits: floor)
+    monkeypatch.setattr(reobj.objects.fit, "find_floor", lambda poses, fits: floor)
     poses = walk() if given else dataclasses.replace(walk(), up_in_world=None)
     world = finished(unlinked(poses, tracks_of(poses)), link=False).world
     assert world.up_source == ("given" if given else "floor")
@@ -356,9 +356,10 @@ def test_up_of_the_poses_is_that_of_the_largest_part() -> None:
 
 
 def test_the_message_says_what_it_means_and_what_helps() -> None:
-    (text,) = parts_message(two_parts())
-    for words in ("2 parts", "part 0: frames 0-39", "part 1: frames 40-63", "own frame and scale",
-                  "two objects", "overlaps more", "--poses", "objects OUT --edits"):  # fmt: skip
+    (text,) = components_message(two_parts())
+    for words in ("2 components", "component 0: frames 0-39", "component 1: frames 40-63",
+                  "own frame and scale", "listed twice", "more overlap", "--poses",
+                  "objects OUT --edits"):  # fmt: skip
         assert words in text
 
 
@@ -503,7 +504,7 @@ def test_poses_command_writes_a_file_for_each_part(
     assert rt.main(["poses", frames, "-o", str(tmp_path)]) == 0
     lengths = [len(np.loadtxt(tmp_path / name)) for name in ("poses.txt", "poses_part1.txt")]
     assert lengths == [38, 23]
-    assert "the cameras come in 2 parts" in capsys.readouterr().err
+    assert "the trajectory has 2 components" in capsys.readouterr().err
 
 
 def test_the_summary_has_a_line_for_each_part(parted: rt.Result) -> None:

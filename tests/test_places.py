@@ -1,4 +1,4 @@
-"""Places in 3D: ellipsoids of identities, spans of viewing rays, in worlds of any unit."""
+"""The online tracker's 3D state: ellipsoids of identities and depth intervals, in any unit."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from simulated import SIZE, chair_solids, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.identity.places import (
+from reobj.tracking.ellipsoid_map import (
     EllipsoidMap,
-    VisiblePoints,
-    overlap_within_reach,
-    project_ends,
-    project_spans,
+    depth_intervals,
+    iou_within_uncertainty,
+    project_depth_intervals,
+    project_half_intervals,
     quick_fit,
     rough_sizes,
-    spans_of_boxes,
     usual_size,
 )
 from reobj.types import box_iou, xyxy_from_cxcywh
+from reobj.visible_points import VisiblePoints
 
 
 def unit(rng: np.random.Generator, n: int, dim: int = 64) -> np.ndarray:
@@ -203,31 +203,33 @@ def test_the_points_in_a_box_tell_how_far_away_its_thing_is() -> None:
     wall = np.c_[rng.uniform(-3, 3, (300, 2)), np.full(300, 6.0)]
     wall = wall[np.abs(wall[:, 0] / 6 + 0.3) > 0.1]  # a bare place
     boxes = np.array([[352.5, 210, 412.5, 270], [150, 220, 190, 260.0]])
-    ends, size = spans_of_boxes(boxes, np.concatenate([on_ball, wall]), EYE, CAMERA.K)
+    ends, size = depth_intervals(boxes, np.concatenate([on_ball, wall]), EYE, CAMERA.K)
     assert 3.7 < ends[0, 0, 2] < 4.0 < ends[0, 1, 2] < 4.6 and 5 < ends[1].mean(0)[2] < 7
     np.testing.assert_allclose(size[0], 60 / 500 * 4, rtol=0.06)
-    there = project_spans(ends, size, CAMERA.K, EYE)
+    there = project_depth_intervals(ends, size, CAMERA.K, EYE)
     np.testing.assert_allclose(xyxy_from_cxcywh(there), boxes, atol=1e-6)
-    assert np.abs(project_ends(ends, CAMERA.K @ EYE)).max() < 1e-6  # on the rays of this view
+    half = project_half_intervals(ends, CAMERA.K @ EYE)
+    assert np.abs(half).max() < 1e-6  # on the rays of this view
     aside = np.c_[np.eye(3), [-1.0, 0, 0]]  # a metre to the right: 125 px at 4 m
-    moved = project_spans(ends, size, CAMERA.K, aside)[0, 0] - there[0, 0]
-    assert abs(moved + 125) < 6 and 2 < abs(project_ends(ends, CAMERA.K @ aside)[0, 0]) < 12
-    nothing, _ = spans_of_boxes(boxes, np.empty((0, 3)), EYE, CAMERA.K)
+    moved = project_depth_intervals(ends, size, CAMERA.K, aside)[0, 0] - there[0, 0]
+    half = project_half_intervals(ends, CAMERA.K @ aside)
+    assert abs(moved + 125) < 6 and 2 < abs(half[0, 0]) < 12
+    nothing, _ = depth_intervals(boxes, np.empty((0, 3)), EYE, CAMERA.K)
     assert np.isnan(nothing).all()
     behind = np.c_[np.eye(3), [0, 0, -20.0]]
-    assert np.isnan(project_spans(ends, size, CAMERA.K, behind)).all()
+    assert np.isnan(project_depth_intervals(ends, size, CAMERA.K, behind)).all()
 
 
 def test_an_uncertain_place_overlaps_within_its_reach() -> None:
     box = np.array([[100.0, 100, 40, 20], [300, 100, 40, 20]])
     seen = np.array([[160.0, 100, 40, 20], [100, 160, 40, 20]])
     columns = box.T[..., None], seen.T[:, None]
-    iou, share = overlap_within_reach(columns[0], np.zeros((2, 1, 1)), columns[1])
+    iou, share = iou_within_uncertainty(columns[0], np.zeros((2, 1, 1)), columns[1])
     boxes = xyxy_from_cxcywh(box), xyxy_from_cxcywh(seen)
     np.testing.assert_allclose(iou, box_iou(*boxes), atol=1e-9)
     assert share.ravel().tolist() == [1, 1]
     reach = np.array([[60.0, 20], [0, 0]])[..., None]
-    iou, share = overlap_within_reach(columns[0], reach, columns[1])
+    iou, share = iou_within_uncertainty(columns[0], reach, columns[1])
     np.testing.assert_allclose(iou, [[1, 0], [0, 0]], atol=1e-9)  # to the side, not below
     np.testing.assert_allclose(share.ravel(), [0.25, 0.5])
 
@@ -240,7 +242,7 @@ def test_a_frame_sees_the_points_of_its_neighbours_of_the_same_part() -> None:
         poses.camera, poses.frame, poses.time_s, poses.cam_from_world, poses.status, "user",
         points=points, visibility=seen, part=part,
     ))  # fmt: skip
-    assert [(visible(row)[:, 0] / 3).astype(int).tolist() for row in range(6)] == [
+    assert [visible.nearby(row).tolist() for row in range(6)] == [
         [0, 1], [0, 1, 2], [0, 1, 2], [1, 2], [3], [3],
     ]  # fmt: skip
-    assert VisiblePoints(poses)(2).shape == (0, 3)
+    assert len(VisiblePoints(poses).nearby(2)) == 0

@@ -22,8 +22,7 @@ import quadrics
 import reobj_track as rt
 from reobj.cameras import load_poses, save_poses
 from reobj.files import load_cached
-from reobj.objects import parse_known_size, parse_up
-from reobj.options import read_config, with_option
+from reobj.options import parse_known_size, parse_up, read_config, with_option
 from reobj.poses.intrinsics import parse_camera
 from reobj.results.edits import apply_edits, read_edits
 from reobj.results.solids import read_true_solids

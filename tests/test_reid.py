@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from reobj.identity.reid import (
+from reobj.appearance.reid import (
     Gallery,
     SimilarityCalibration,
     match_probability,

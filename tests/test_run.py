@@ -793,7 +793,7 @@ def test_known_sizes_and_other_options_stay_with_the_folder(
         (("--known-size", "chair=9999m"), "cm or mm, from 0.001 to 1000 m, such as door=2.0m"),
         (("--known-size", "chair=.9mm"), "'chair=.9mm': expected CATEGORY=HEIGHT in m, cm or mm"),
         (("--priors", ROOT / "README.md"), "README.md, line 1: not valid JSON"),
-        (("--support", "cube"), "--support cube: expected one of auto, ellipsoid"),
+        (("--support", "cube"), "--shape cube: expected one of auto, ellipsoid"),
         (("--set", "objects.up=1,2"), "objects.up=1,2: expected a direction"),
         (("--set", "tracker.return_probability=nan"), "expected =FLOAT, finite, 0 or more"),
     ],
@@ -819,7 +819,7 @@ def test_a_size_that_sets_nothing_is_said(
     names = ("--set", f"detect.class_names={tmp_path / 'names.txt'}")
     size = ("--known-size", "door=2m")
     assert cli("run", frames, "-o", tmp_path / "out", *args, *QUICK, *names, *size) == 0
-    assert "warning: --known-size door: no door with a solid" in capsys.readouterr().err
+    assert "warning: --known-size door: no door was located" in capsys.readouterr().err
     assert "no door" in " ".join(rt.Result.load(tmp_path / "out").warnings)
 
 

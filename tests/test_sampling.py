@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.identity.sampling import (
+from reobj.appearance.sampling import (
     inside_object,
     occupancy_map,
     pool_cells,

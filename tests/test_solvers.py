@@ -12,8 +12,8 @@ from simulated import CUP, looking_at, unlinked, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.parts import link_and_fit
-from reobj.solvers import solve_again
+from reobj.objects.fit import link_and_fit
+from reobj.objects.published import solve_again
 
 CAMERA = rt.Camera("PINHOLE", 640, 480, (2600.0, 2600.0, 320.0, 240.0))
 
@@ -47,9 +47,7 @@ def recorded(shift: float = 0.0, mirror: int = 1) -> rt.Result:
 
 def solved(result: rt.Result, **options: object) -> rt.Result:
     config = rt.ObjectsConfig(support="ellipsoid", **options)  # type: ignore[arg-type]
-    link_and_fit(result, config)
-    solve_again(result, config)
-    return result
+    return solve_again(link_and_fit(result, config), config)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +92,7 @@ def test_the_solvers_differ() -> None:
 def test_sfmo_of_three_objects_says_what_it_needs() -> None:
     result = recorded()
     result.tracks = result.tracks[result.tracks.track_id <= 3]
-    solved(result, solver="sfmo")
+    result = solved(result, solver="sfmo")
     assert {o.status for o in result.objects} == {"rejected"}
     assert {o.reason for o in result.objects} == {
         "SfMO: needs 3 frames that show the same 4 objects"

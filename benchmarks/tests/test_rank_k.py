@@ -15,7 +15,7 @@ import rank_k as rk
 import reid_scenes as rs
 
 import reobj_track as rt
-from reobj.identity.reid import SimilarityCalibration
+from reobj.appearance.reid import SimilarityCalibration
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -15,7 +15,7 @@ import pytest
 from test_embedding import boxes, mean_backbone, scene_with_twins
 
 import reobj_track as rt
-from reobj.identity.embedding import trained_head
+from reobj.appearance.embedding import trained_head
 from reobj.sources.weights import onnx_metadata, onnx_session
 
 

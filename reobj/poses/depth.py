@@ -22,7 +22,7 @@ from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json, read_lines
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError
-from reobj.views import VisiblePoints
+from reobj.visible_points import VisiblePoints
 
 UNITS_PER_M = 1000.0  # of a depth map's values: mm (ScanNet, 7-Scenes, Record3D; TUM has 5000)
 INVALID = (0, 65535)  # no depth; 65535: 7-Scenes

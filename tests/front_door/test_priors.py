@@ -11,8 +11,9 @@ import synthetic_quadrics as syn
 from simulated import tracks_of, unlinked, walk
 
 import quadrics as q
-from reobj.objects import ObjectsConfig, check_known_size, unused_sizes
-from reobj.parts import link_and_fit
+from reobj.objects.config import ObjectsConfig
+from reobj.objects.fit import link_and_fit
+from reobj.options import check_known_size, unused_sizes
 from reobj.results.edits import read_edits
 
 UP = (0.0, 0.0, 1.0)
@@ -96,11 +97,10 @@ def test_boxes_that_are_not_finite_are_left_out() -> None:
 
 
 def test_synonyms_are_one_category() -> None:
-    config = ObjectsConfig(known_size="sofa=80cm")
-    check_known_size(config, ["chair", "couch"])  # raises where there is none
+    check_known_size("sofa=80cm", "", ["chair", "couch"])  # raises where there is none
     with pytest.raises(ValueError, match="no such class"):
-        check_known_size(config, ["chair", "cup"])
-    assert unused_sizes(config, []) != []
+        check_known_size("sofa=80cm", "", ["chair", "cup"])
+    assert unused_sizes("sofa=80cm", "", []) != []
     words = ["Sofa", "fridge", "table", "phone", "plant", "television", "toaster"]
     usual = ["couch", "refrigerator", "dining table", "cell phone", "potted plant", "tv", "toaster"]
     assert PRIORS.canonical(words) == usual
@@ -131,7 +131,7 @@ def test_a_label_that_no_prior_knows_keeps_the_category(
     for edits in (None, read_edits(path)):
         result = unlinked(poses, tracks)
         result.edits = edits
-        link_and_fit(result, ObjectsConfig(link=False))
+        result = link_and_fit(result, ObjectsConfig(link=False))
         found = {o.id: o for o in result.objects}[2]
         sizes.append(np.array(found.size))
     assert found.class_name == label

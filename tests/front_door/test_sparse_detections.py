@@ -12,10 +12,10 @@ import pytest
 from simulated import unlinked, walk
 
 import reobj_track as rt
-from reobj.identity.gaps import fill_gaps
-from reobj.parts import link_and_fit
+from reobj.objects.fit import link_and_fit
 from reobj.sources.detectors import DetectionCache, as_source
 from reobj.sources.looked import frames_looked_at
+from reobj.tracking.interpolation import fill_gaps
 
 TABLE, CHAIR = 60, 56
 FRAMES = 60
@@ -270,7 +270,7 @@ def test_solids_are_not_missed_in_frames_that_nobody_looked_at() -> None:
         given.tracks = given.tracks[keep]
         given.tracks.score[:] = 0.35
         given.looked = looked
-        link_and_fit(given, rt.ObjectsConfig())
-        sure.append([o.confidence or 0.0 for o in given.objects])
+        found = link_and_fit(given, rt.ObjectsConfig()).objects
+        sure.append([o.confidence or 0.0 for o in found])
     assert len(sure[0]) == 3
     assert min(sure[0]) > max(sure[1] or [0.0]) + 0.1

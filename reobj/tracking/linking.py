@@ -1,4 +1,4 @@
-"""From tracklets to objects over the whole video: by place where known, else by appearance."""
+"""Link tracklets to identities over the whole video: by 3D object if known, else by appearance."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from reobj.appearance.reid import SimilarityCalibration, paired_cosine
 from reobj.cameras import Poses, angle_deg, place_of, undistort_boxes, viewing_rays
-from reobj.identity.reid import SimilarityCalibration, paired_cosine
 from reobj.types import (
     Array,
     BoolArray,
@@ -24,14 +24,14 @@ from reobj.types import (
     unit_rows,
 )
 
-# Chosen on examples/room and redkitchen (docs/tracking.md), but for those with a source.
-LINK_PROBABILITY = 0.5  # join by appearance from this probability on, rivals considered: even odds
-# frames; views of a fragment this far apart show how the appearance of one object varies
+# Chosen on examples/room and redkitchen (docs/tracking.md) unless a source is given.
+LINK_PROBABILITY = 0.5  # least probability to join by appearance, given the rivals: even odds
+# frames between views of a fragment that show how the appearance of one object varies
 VIEW_GAP = 30
-DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes on one object
-FRAGMENT_GAP = 5  # frames read without a detection, after which a tracklet may be another object
-MIN_CHANGED = 3  # rows of another identity that are said (chosen: fewer are slips of a frame)
-LEAST_LOG_ODDS = -9.0  # said in the evidence where nothing speaks for one object
+DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes of one object
+FRAGMENT_GAP = 5  # frames without a detection after which a tracklet may be another object
+MIN_CHANGED = 3  # detections whose change of identity is reported (chosen: fewer are noise)
+LEAST_LOG_ODDS = -9.0  # reported where appearance is unknown or excludes one object
 
 
 def link(
@@ -42,19 +42,19 @@ def link(
     poses: Poses | None = None,
     *,
     moving: Collection[str] = (),
-    solid: IntArray | None = None,
-    overlap: Array | None = None,
+    label: IntArray | None = None,
+    iou: Array | None = None,
     looked: IntArray | None = None,
 ) -> tuple[Tracks, list[LinkEvent]]:
-    """Decide over the whole video which tracklets are one object.
+    """Decide over the whole video which tracklets belong to one object.
 
     Args:
         tracks: rows with the tracker's identities.
-        embeddings, embedding_row: fused embeddings of n rows, and which rows (n,) these are.
-        poses: known cameras; views from another side say less.
-        moving: names of the classes that move; they stay as the tracker has them.
-        solid, overlap: (N,) the solid that shows in each row, or -1 (`locate`), and the IoU of its
-            projection with the box; rows of one solid are one object. None: appearance decides.
+        embeddings, embedding_row: fused embeddings of n rows, and the numbers (n,) of those rows.
+        poses: cameras; the angle between two views weighs their similarity.
+        moving: names of the classes that move; they keep the tracker's identities.
+        label, iou: (N,) 3D object that each row is assigned to, or -1 (`associate_component`), and
+            the IoU of its projection with the box. None: appearance decides.
         looked: frames that the detector was run on; None: all that were read.
     Returns:
         the rows with the objects' identities, and every join and split with its evidence.
@@ -64,43 +64,44 @@ def link(
     linker = Linker(tracks, class_names, poses, moving, looked)
     linker.measure_appearance(embeddings, embedding_row)
     identity = linker.by_appearance()
-    if solid is not None:
-        solid = with_neighbours(tracks, solid, linker.fragment)
-        identity = np.where(solid >= 0, solid, identity + solid.max(initial=-1) + 1)
-    return tracks.with_identities(identity), linker.changes(identity, overlap)
+    if label is not None:
+        label = propagate_labels(tracks, label, linker.fragment)
+        identity = np.where(label >= 0, label, identity + label.max(initial=-1) + 1)
+    return tracks.with_identities(identity), linker.changes(identity, iou)
 
 
-def with_neighbours(tracks: Tracks, solid: IntArray, fragment: IntArray) -> IntArray:
-    """Give rows (N,) without a solid (-1) that of the nearest row of their fragment (N,).
+def propagate_labels(tracks: Tracks, label: IntArray, fragment: IntArray) -> IntArray:
+    """Propagate object labels (N,) to unlabelled rows (-1) of the same fragment (N,).
 
-    Not where another row of the frame shows that solid.
+    The label is that of the nearest row in time, unless that frame already has this object.
     """
-    solid = solid.copy()
-    shown = set(zip(tracks.frame[solid >= 0].tolist(), solid[solid >= 0].tolist(), strict=True))
+    label = label.copy()
+    taken = set(zip(tracks.frame[label >= 0].tolist(), label[label >= 0].tolist(), strict=True))
     for rows in rows_by(fragment):
-        known, open_ = rows[solid[rows] >= 0], rows[solid[rows] < 0]
-        if len(known) and len(open_):
-            gap = np.abs(tracks.frame[open_][:, None] - tracks.frame[known])
-            wanted = solid[known[gap.argmin(1)]]
-            for row, name in zip(open_.tolist(), wanted.tolist(), strict=True):
-                if (key := (int(tracks.frame[row]), name)) not in shown:
-                    solid[row] = name
-                    shown.add(key)
-    return solid
+        labelled = rows[label[rows] >= 0]
+        unlabelled = rows[label[rows] < 0]
+        if len(labelled) and len(unlabelled):
+            gap = np.abs(tracks.frame[unlabelled][:, None] - tracks.frame[labelled])
+            nearest = label[labelled[gap.argmin(1)]]
+            for row, name in zip(unlabelled.tolist(), nearest.tolist(), strict=True):
+                if (key := (int(tracks.frame[row]), name)) not in taken:
+                    label[row] = name
+                    taken.add(key)
+    return label
 
 
 class Linker:
     """Join and split the fragments of a video's tracklets by appearance.
 
-    Two fragments seen in one frame are never the same object, and classes that move stay as the
-    tracker has them: what surrounds them does not last. Fragments are joined as long as their most
-    similar views show one object more likely than any rival (seen beside one of the two) or another
-    object, the most similar first. This replaces what the tracker decided when it first saw them.
+    Two fragments seen in one frame are never the same object. Classes that move keep the tracker's
+    identities: their background changes. Fragments are joined, the most similar first, while their
+    most similar views are more probably one object than any rival (seen beside one of the two) or
+    another object. This replaces the tracker's online decisions.
 
     Attributes:
         fragment: (N,) fragment of each row, 0 .. L - 1: a tracklet, or a piece of one.
         log_odds: (L, L) that two look like one object, -inf: unknown.
-        co_occur: (L, L) seen in one frame; distinct: those of them that cannot be duplicates.
+        co_occur: (L, L) seen in one frame. distinct: (L, L) those that cannot be duplicates.
     """
 
     def __init__(
@@ -111,14 +112,15 @@ class Linker:
         moving: Collection[str],
         looked: IntArray | None = None,
     ) -> None:
-        self.tracks, self.poses = tracks, poses
+        self.tracks = tracks
+        self.poses = poses
         self.fragment = cut_at_gaps(tracks, looked)  # (N,)
         self._describe_fragments(class_names, moving)
         self.co_occur, self.distinct = self._co_occurrence()
         self.log_odds = np.full(self.co_occur.shape, -np.inf)
 
     def _describe_fragments(self, class_names: Sequence[str], moving: Collection[str]) -> None:
-        """Note tracklet, identity and class of every fragment and whether it moves, (L,) each."""
+        """Set tracklet, identity and class of every fragment, and whether it moves, (L,) each."""
         first = np.unique(self.fragment, return_index=True)[1]  # (L,)
         self.tracklets = self.tracks.tracklet_id[first]
         self.identity = self.tracks.track_id[first]
@@ -130,13 +132,15 @@ class Linker:
         """Find fragments that are seen in the same frame.
 
         Returns:
-            co_occur: (L, L) seen together; distinct: (L, L) those of them whose boxes never overlap
-            so much that they could be two boxes on one object.
+            co_occur: (L, L) seen together. distinct: (L, L) those of them whose boxes never overlap
+            enough to be duplicates on one object.
         """
         count = len(self.tracklets)
-        co_occur, overlapping = np.zeros((count, count), bool), np.zeros((count, count), bool)
+        co_occur = np.zeros((count, count), bool)
+        overlapping = np.zeros((count, count), bool)
         for rows in rows_by(self.tracks.frame):
-            here, box = self.fragment[rows], self.tracks.xyxy[rows]
+            here = self.fragment[rows]
+            box = self.tracks.xyxy[rows]
             co_occur[here[:, None], here[None]] = True
             overlapping[here[:, None], here[None]] |= box_iou(box, box) > DUPLICATE_IOU
         return co_occur, co_occur & ~overlapping
@@ -144,8 +148,8 @@ class Linker:
     def measure_appearance(self, embeddings: Embeddings, embedding_row: IntArray) -> None:
         """Set the log odds that fragments look like one object, -inf: unknown.
 
-        What a similarity means in this video is known without labels: fragments of a class seen
-        side by side are different, views of one fragment some time apart the same.
+        The similarity is calibrated on this video without labels: fragments of a class seen side by
+        side are different objects, views of one fragment some time apart are the same.
         """
         if not embeddings.foreground.size:
             return
@@ -165,85 +169,84 @@ class Linker:
             (L, L) cosines of foreground and of background, and degrees between the viewing rays;
             NaN where unknown. Diagonal: of views of one fragment at least VIEW_GAP frames apart.
         """
-        parts = np.full((3, len(self.tracklets), len(self.tracklets)), np.nan)
+        similarity = np.full((3, len(self.tracklets), len(self.tracklets)), np.nan)
         order = np.argsort(self.fragment[embedding_row], kind="stable")
-        rows, width = embedding_row[order], embeddings.foreground.shape[1]
+        rows = embedding_row[order]
+        width = embeddings.foreground.shape[1]
         fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
         unit = unit_rows(fused[order])  # (n, E)
         fragments, starts, block = np.unique(
             self.fragment[rows], return_index=True, return_inverse=True
         )
         ray = self._viewing_rays(rows)
-        for fragment, mine in zip(
+        for fragment, members in zip(
             fragments, np.split(np.arange(len(rows)), starts[1:]), strict=True
         ):
-            cosine = unit[mine] @ unit.T  # (k, n)
-            frame = self.tracks.frame[rows[mine]]
+            cosine = unit[members] @ unit.T  # (k, n)
+            frame = self.tracks.frame[rows[members]]
             soon = np.abs(frame[:, None] - frame) < VIEW_GAP
-            cosine[:, mine] = np.where(soon, -np.inf, cosine[:, mine])
+            cosine[:, members] = np.where(soon, -np.inf, cosine[:, members])
             view = np.lexsort((-cosine.max(0), block))[starts]  # the best of each fragment
-            own = mine[cosine[:, view].argmax(0)]
-            paired = [paired_cosine(x[own], x[view]) for x in np.split(unit, [width], 1)]
-            paired.append(angle_deg(ray[own], ray[view]))
-            parts[:, fragment, fragments] = np.where(
+            member = members[cosine[:, view].argmax(0)]
+            paired = [paired_cosine(x[member], x[view]) for x in np.split(unit, [width], 1)]
+            paired.append(angle_deg(ray[member], ray[view]))
+            similarity[:, fragment, fragments] = np.where(
                 np.isinf(cosine[:, view].max(0)), np.nan, paired
             )
-        return parts[0], parts[1], parts[2]
+        return similarity[0], similarity[1], similarity[2]
 
     def _viewing_rays(self, rows: IntArray) -> Array:
-        """Return unit vectors (n, 3) in world in which rows were seen, NaN without a pose."""
+        """Return viewing directions (n, 3) of rows, unit vectors in world, NaN without a pose."""
         if self.poses is None:
             return np.full((len(rows), 3), np.nan)
-        place, known = place_of(self.poses, self.tracks.frame[rows])
+        pose_row, known = place_of(self.poses, self.tracks.frame[rows])
         camera = self.poses.camera
-        cams = np.where(known[:, None, None], self.poses.cam_from_world[place], np.nan)
+        cams = np.where(known[:, None, None], self.poses.cam_from_world[pose_row], np.nan)
         return viewing_rays(undistort_boxes(self.tracks.xyxy[rows], camera), camera.K @ cams)
 
     def by_appearance(self) -> IntArray:
-        """Return the object of every row of the tracks, (N,), any numbering."""
+        """Return the identity (N,) of every row of the tracks, in any numbering."""
         group = np.unique(self.identity, return_inverse=True)[1]  # (L,)
         if np.isfinite(self.log_odds).any():
             keep = np.where(self.moving, -self.identity, self.tracklets)
             whole = np.unique(keep, return_inverse=True)[1]  # (L,) tracklet of each fragment
             shares = class_shares(self.tracks, whole[self.fragment], int(whole.max()) + 1)
             kind = shares.argmax(1)  # (T,)
-            kind[whole[self.moving]] = -1 - whole[self.moving]  # a kind of its own
+            kind[whole[self.moving]] = -1 - whole[self.moving]  # unique: never joined
             log_odds = _max_between_groups(self.log_odds, whole)  # (T, T)
             banned = _max_between_groups(self.co_occur, whole) | (kind[:, None] != kind)
             distinct = _max_between_groups(self.distinct, whole)
             group = _agglomerate(log_odds, banned, distinct, LINK_PROBABILITY)[whole]
         return np.asarray(group[self.fragment], np.int64)
 
-    def changes(self, identity: IntArray, overlap: Array | None) -> list[LinkEvent]:
-        """List what differs from the tracker, with the evidence.
+    def changes(self, identity: IntArray, iou: Array | None) -> list[LinkEvent]:
+        """List the differences from the tracker's identities, with the evidence.
 
         Args:
-            identity: (N,) of each row now. overlap: (N,) of its box with its solid, NaN: none.
+            identity: (N,) of each row. iou: (N,) of its box with its projected object, NaN: none.
         """
         before = self.tracks.track_id
-        known = np.full(len(identity), np.nan) if overlap is None else overlap
-        joins = self._changes(before, identity, "join", known)
-        return joins + self._changes(identity, before, "split", known)
+        iou = np.full(len(identity), np.nan) if iou is None else iou
+        joins = self._changes(before, identity, "join", iou)
+        return joins + self._changes(identity, before, "split", iou)
 
-    def _changes(
-        self, parts: IntArray, whole: IntArray, kind: str, overlap: Array
-    ) -> list[LinkEvent]:
-        """List an event for each part (N,) but the first of the groups of `whole` (N,).
+    def _changes(self, pieces: IntArray, whole: IntArray, kind: str, iou: Array) -> list[LinkEvent]:
+        """List an event for each piece (N,) but the first of the groups of `whole` (N,).
 
-        Of rows alone nothing is said.
+        Changes of fewer than MIN_CHANGED detections are not reported.
         """
-        found = []
+        events = []
         for rows in rows_by(whole):
-            pieces = [rows[own] for own in rows_by(parts[rows]) if len(own) >= MIN_CHANGED]
-            for piece in pieces[1:]:
+            long = [rows[piece] for piece in rows_by(pieces[rows]) if len(piece) >= MIN_CHANGED]
+            for piece in long[1:]:
                 rest = np.unique(self.fragment[np.setdiff1d(rows, piece)])
-                own = np.unique(self.fragment[piece])
-                log_odds = max(float(self.log_odds[np.ix_(rest, own)].max()), LEAST_LOG_ODDS)
+                fragment = np.unique(self.fragment[piece])
+                log_odds = max(float(self.log_odds[np.ix_(rest, fragment)].max()), LEAST_LOG_ODDS)
                 ids = np.unique(self.tracks.tracklet_id[rows if kind == "join" else piece]).tolist()
-                known = overlap[piece][np.isfinite(overlap[piece])]
-                iou = float(np.median(known)) if len(known) else None
-                found.append(LinkEvent(kind, tuple(ids), iou, log_odds, True))
-        return found
+                finite = iou[piece][np.isfinite(iou[piece])]
+                median_iou = float(np.median(finite)) if len(finite) else None
+                events.append(LinkEvent(kind, tuple(ids), median_iou, log_odds, True))
+        return events
 
 
 def _max_between_groups(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArray[Any]:
@@ -257,27 +260,30 @@ def _max_between_groups(matrix: npt.NDArray[Any], group: IntArray) -> npt.NDArra
 def _agglomerate(
     log_odds: Array, banned: BoolArray, distinct: BoolArray, probability: float
 ) -> IntArray:
-    """Join G things while two are probably one, rivals considered, the most similar first.
+    """Join G groups, the most similar first, while two are probably one given their rivals.
 
     Args:
-        log_odds: (G, G) that two are one; between groups those of the most similar members count.
-        banned: (G, G) which must never be joined. distinct: (G, G) which are surely different, so
+        log_odds: (G, G) that two are one; between joined groups the most similar members count.
+        banned: (G, G) that must never be joined. distinct: (G, G) that are certainly different, so
             that one rivals the other.
     Returns:
-        group of each, (G,).
+        joined group of each, (G,).
     """
-    odds, banned = np.where(banned, 0, np.exp(log_odds)), banned.copy()
+    odds = np.where(banned, 0, np.exp(log_odds))
+    banned = banned.copy()
     distinct = distinct.copy()
     np.fill_diagonal(odds, 0)
     np.fill_diagonal(distinct, False)
     least = probability / (1 - probability)  # odds against all rivals and another object
     i, j = np.nonzero(np.triu(odds >= least, 1))
     pairs = np.column_stack([i, j])[np.argsort(-odds[i, j], kind="stable")]
-    group, joined = np.arange(len(odds)), True
+    group = np.arange(len(odds))
+    joined = True
     while joined:
         joined = False
         for a, b in group[pairs]:
-            a, b = group[a], group[b]
+            a = group[a]
+            b = group[b]
             rival = max(odds[a, distinct[b]].max(initial=0), odds[b, distinct[a]].max(initial=0))
             if odds[a, b] < least * (1 + rival):
                 continue
@@ -286,12 +292,13 @@ def _agglomerate(
             distinct[a] = distinct[:, a] = distinct[a] | distinct[b]
             odds[b] = odds[:, b] = odds[a, a] = odds[a, banned[a]] = odds[banned[a], a] = 0
             distinct[b] = distinct[:, b] = distinct[a, a] = False
-            group[group == b], joined = a, True
+            group[group == b] = a
+            joined = True
     return np.unique(group, return_inverse=True)[1]
 
 
 def cut_at_gaps(tracks: Tracks, looked: IntArray | None = None) -> IntArray:
-    """Cut tracklets where more than FRAGMENT_GAP frames looked at pass without a detection.
+    """Cut tracklets at gaps of more than FRAGMENT_GAP frames in which the detector was run.
 
     Args:
         looked: frames that the detector was run on; None: all that were read.
@@ -300,7 +307,8 @@ def cut_at_gaps(tracks: Tracks, looked: IntArray | None = None) -> IntArray:
     """
     order = np.lexsort((tracks.frame, tracks.tracklet_id))
     number, unit = looks(tracks, looked)
-    tracklet, number = tracks.tracklet_id[order], number[order]
+    tracklet = tracks.tracklet_id[order]
+    number = number[order]
     gone = np.diff(number) > FRAGMENT_GAP * unit
     begins = np.append(True, (np.diff(tracklet) != 0) | gone)[: len(order)]
     fragment = np.empty(len(order), np.int64)

@@ -1,7 +1,7 @@
-"""The camera's motion in the image, from one frame to the next, by sparse optical flow.
+"""Image motion of the camera from one frame to the next, by sparse optical flow.
 
-`CameraMotion` returns a similarity transform for each new image, and `parallax` what it leaves
-unexplained near a point of a deep scene. No poses and no depth: those are of `reobj.poses`.
+`CameraMotion` estimates a similarity transform for each new image; `CameraMotion.parallax` is the
+residual motion near a point of a deep scene. Neither poses nor depth are needed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ FLOW_SIZE_PX = 320  # longer side of the image in which corners are followed (ch
 FLOW_CORNERS = 100  # corners followed (chosen, for speed; BoT-SORT: 1000)
 CORNER_QUALITY = 0.01  # least strength of a corner over that of the strongest (as BoT-SORT)
 CORNER_SPACING_PX = 12  # between corners of the small image, so that they spread (chosen)
-# nearest corners that tell the parallax of a point (chosen). IoU of the true boxes with those moved
-# so instead of by the transform alone: rendered room v900 .76 -> .82, room 0 at every 4th frame
+# nearest corners whose median is the parallax of a point (chosen). IoU of the true boxes with the
+# moved ones, against the transform alone: rendered room v900 .76 -> .82, room 0 at every 4th frame
 # .65 -> .78 (docs/tracking.md)
 PARALLAX_CORNERS = 5
 
@@ -28,14 +28,14 @@ PARALLAX_CORNERS = 5
 class CameraMotion:
     """Image motion of the camera between consecutive frames, as a 3x3 similarity transform.
 
-    RANSAC fits the transform to corners followed by optical flow (as BoT-SORT does) or, where the
-    step was too wide to follow any, to matched ORB points. It needs a number of inliers and no
-    majority: in wide steps most corners are lost. Without enough inliers the motion is the
-    identity, so a frame without texture never stops the tracker.
+    RANSAC fits the transform to corners followed by optical flow (as BoT-SORT does) or, if the step
+    was too wide to follow any, to matched ORB points. It needs a number of inliers, not a majority:
+    in wide steps most corners are lost. Without enough inliers the motion is the identity, so the
+    tracker continues through frames without texture.
 
     Attributes:
         residual_flow: (K, 4) in a deep scene (see `parallax`), else (0, 4): x, y of the corners in
-            the old image, and the motion x, y that the transform does not explain, pixels.
+            the old image, and their residual motion x, y after the transform, pixels.
         gray, corners: the latest image, small and gray, and its corners (C, 1, 2); None at first.
             They are the whole state (`ARRAYS`).
     """
@@ -46,7 +46,7 @@ class CameraMotion:
         self.gray: Image | None = None
         self.corners: Floats | None = None
         self.residual_flow = np.empty((0, 4))
-        self._ahead: _Step | None = None  # to the image that comes next, perhaps
+        self._ahead: _Step | None = None  # precomputed by `ahead` for the next image
 
     def __call__(self, image: Image) -> Array:
         """Estimate new_from_old (3, 3) between the previous image and this one (H, W, 3) BGR.
@@ -56,31 +56,35 @@ class CameraMotion:
         step = self._ahead
         if step is None or step.image is not image or step.old is not self.gray:
             step = _step(self.gray, self.corners, image)
-        self.gray, self.corners, self.residual_flow = step.gray, step.corners, step.residual_flow
+        self.gray = step.gray
+        self.corners = step.corners
+        self.residual_flow = step.residual_flow
         return step.new_from_old
 
     def ahead(self, video: Video) -> Iterator[Frame]:
-        """Iterate over a recorded video; the motion to a frame is estimated while others are used.
+        """Iterate over a recorded video; a thread estimates the motion of the next frame meanwhile.
 
-        A thread does so; nothing changes here before the frame's image is asked for.
+        The state changes only when the motion of a frame is requested.
         """
 
         def steps() -> Iterator[tuple[Frame, _Step]]:
-            gray, corners = self.gray, self.corners
+            gray = self.gray
+            corners = self.corners
             for frame in video:
                 step = _step(gray, corners, frame.image)
-                gray, corners = step.gray, step.corners
+                gray = step.gray
+                corners = step.corners
                 yield frame, step
 
         for frame, self._ahead in one_ahead(steps()):
             yield frame
 
     def parallax(self, xy: Array) -> Array:
-        """Estimate the parallax at points of the old image: their motion beyond the transform.
+        """Estimate the parallax at points of the old image: their residual motion.
 
-        Only in a deep scene, where the transform explains less than half of the corners: there a
-        point moves as the median of its nearest corners. Where the transform explains most of
-        them, the rest are objects that move by themselves, and the parallax is 0.
+        A scene is deep if less than half of the corners are inliers of the transform. There a point
+        moves as the median of its nearest corners. Otherwise the outliers are objects that move by
+        themselves, and the parallax is 0.
 
         Args:
             xy: (N, 2) pixels of the old image.
@@ -96,10 +100,10 @@ class CameraMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """The motion from one image to the next: what `CameraMotion` returns and keeps of it.
+    """Motion from one image to the next, and the state of `CameraMotion` after it.
 
     Attributes:
-        old: gray image before, None at first. image, gray: the next one, as it came and small.
+        old: previous gray image, None at first. image, gray: the next image, original and small.
     """
 
     old: Image | None
@@ -115,7 +119,8 @@ def _step(old: Image | None, corners: Floats | None, image: Image) -> _Step:
     shrink = min(1.0, FLOW_SIZE_PX / max(image.shape[:2]))
     small = shrunk(image, FLOW_SIZE_PX)
     gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
-    new_from_old, residual_flow = np.eye(3), np.empty((0, 4))
+    new_from_old = np.eye(3)
+    residual_flow = np.empty((0, 4))
     if old is not None and corners is not None and old.shape == gray.shape:
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
             old, gray, corners, np.empty_like(corners)
@@ -141,7 +146,7 @@ ORB_FAST_THRESHOLD = 7  # contrast of a corner, of 255 (chosen below OpenCV's 20
 
 
 def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
-    """Match ORB points of two gray images, however far apart: mutual nearest descriptors.
+    """Match ORB points of two gray images by mutual nearest descriptors, at any distance.
 
     Returns:
         positions (K, 2) in the old and in the new image.
@@ -161,8 +166,8 @@ def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
 
 # inliers that make a fit: in 450 pairs of frames of different videos at most 7 corners agreed
 FLOW_MIN_INLIERS = 8
-INLIER_PX = 2.0  # distance in the small image up to which a point agrees (chosen; OpenCV: 3)
-DEEP_INLIERS = 0.5  # a scene is deep where a smaller share of the corners are inliers (chosen)
+INLIER_PX = 2.0  # largest residual of an inlier in the small image (chosen; OpenCV: 3)
+DEEP_INLIERS = 0.5  # a scene is deep below this fraction of inliers (chosen)
 
 
 def _fit_similarity(old: Floats, new: Floats) -> tuple[Array, Array] | None:

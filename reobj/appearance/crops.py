@@ -1,7 +1,7 @@
 """Appearance in the style of re-OBJ: embeddings from two masked crops of every object.
 
-`CropEmbedder` has the interface of `Embedder` (`reobj.identity.embedding`), which needs one pass a
-frame instead of two crops an object; `make_embedder` makes whichever a configuration names.
+`CropEmbedder` has the interface of `Embedder` (`reobj.appearance.embedding`), which needs one pass
+per frame instead of two crops per object. `make_embedder` builds the one that a config names.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from reobj.identity.embedding import Embedder, trained_head
-from reobj.identity.sampling import (
+from reobj.appearance.embedding import Embedder, trained_head
+from reobj.appearance.sampling import (
     SamplingLayout,
     inside_object,
     occupancy_map,
@@ -31,19 +31,19 @@ from reobj.types import (
     unit_rows,
 )
 
-CROP_BACKBONE = "mobilenetv2_feat"  # its ConvBlock comes along (re-OBJ: a ResNet)
+CROP_BACKBONE = "mobilenetv2_feat"  # its ConvBlock is bundled (re-OBJ: a ResNet)
 
 
 def make_embedder(
     model: str, head: str = "", threads: int = 0, offline: bool = False, device: str = "cpu"
 ) -> Embedder | None:
-    """Make the embedder that `EmbedConfig.model` and `.head` name.
+    """Build the embedder named by `EmbedConfig.model` and `.head`.
 
     Args:
         model: "none"; "crops" or "crops:BACKBONE" for a `CropEmbedder`; else as of `Embedder`.
         head, threads, offline, device: as of `Embedder`.
     Returns:
-        None for "none": the tracker then goes by motion.
+        None for "none": the tracker then uses motion alone.
     """
     if model == "none":
         return None
@@ -58,20 +58,20 @@ CROP_STRIDE = 32  # of the map taken from crops: 7 x 7 for 224 px, as the last o
 
 
 class CropEmbedder(Embedder):
-    """Foreground and background embeddings in re-OBJ style: two masked crops of every object.
+    """Foreground and background embeddings as in re-OBJ: two masked crops of every object.
 
-    The grown box is cut out twice, once with all but the object hidden and once with the object
-    hidden. A backbone turns each crop into a map, and a trained ConvBlock turns the two maps,
-    stacked in the channels, into one embedding (the one that comes along first treats each alone).
+    The enlarged box is cropped twice, once with everything but the object masked and once with the
+    object masked. A backbone turns each crop into a map. A trained ConvBlock turns the two maps,
+    stacked in the channels, into one embedding (the bundled one processes each map alone first).
     Without a ConvBlock the maps are flattened (the thesis's "no-train"). A model of
     `examples/train_embedding.py` has its own head: its cells are pooled from the crops' maps as
-    `Embedder` does from the frame's.
+    `Embedder` pools them from the frame's.
 
     Args:
         model: backbone, a name listed by `reobj_track.py models` or an ONNX file with an image
             input (any batch) and a spatial output.
         head: ConvBlock (.onnx); "": crops_BACKBONE_head.onnx beside the backbone's file, else the
-            one that comes along; "none": none.
+            bundled one; "none": none.
         layout, threads, offline, device: as of `Embedder`.
     Raises:
         ReobjError: the model has no spatial output, or (when called) the ConvBlock does not fit it.
@@ -105,10 +105,10 @@ class CropEmbedder(Embedder):
         rows = np.arange(len(detections)) if rows is None else rows
         if not len(rows):
             return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
-        crops, own = self.cut(frame, detections, rows)
-        masked = self.masked(crops, own)
+        crops, on_object = self.cut(frame, detections, rows)
+        masked = self.masked(crops, on_object)
         if self.trained:
-            cells = self._crop_cells(masked, detections, rows, frame.shape[:2], own)
+            cells = self._crop_cells(masked, detections, rows, frame.shape[:2], on_object)
             return Embeddings(*self.backbone.embed(*cells))
         fore, back = np.split(self.maps(masked), 2)  # (N, C, h, w) each
         if self.conv_block is None:
@@ -117,10 +117,10 @@ class CropEmbedder(Embedder):
         return Embeddings(unit_rows(joint), np.empty((len(rows), 0)))
 
     def cut(self, frame: Image, detections: Detections, rows: IntArray) -> tuple[Image, BoolArray]:
-        """Cut out the grown boxes of detections (N,), black beyond the frame.
+        """Crop the enlarged boxes of detections (N,), black beyond the frame.
 
         Returns:
-            crops (N, S, S, 3), and (N, S, S) the pixels that are on the object.
+            crops (N, S, S, 3), and (N, S, S) the pixels on the object.
         """
         side, (height, width) = self.layout.crop_px, frame.shape[:2]
         low, high = self._windows(detections.xyxy[rows], frame.shape[:2])
@@ -133,25 +133,25 @@ class CropEmbedder(Embedder):
         grid = self._pixel_centres(low, high)  # (N, 2, S)
         at = np.stack(np.broadcast_arrays(grid[:, 0, None, :], grid[:, 1, :, None]))  # (2, N, S, S)
         box = cxcywh_from_xyxy(detections.xyxy[rows]).T[..., None, None]  # (4, N, 1, 1)
-        own = inside_object(detections, rows[:, None, None], at, box[:2], box[2:] / 2)
-        return np.stack(crops), own
+        on_object = inside_object(detections, rows[:, None, None], at, box[:2], box[2:] / 2)
+        return np.stack(crops), on_object
 
-    def masked(self, crops: Image, own: BoolArray) -> Image:
-        """Hide all but the object, and hide the object, in crops (N, S, S, 3).
+    def masked(self, crops: Image, on_object: BoolArray) -> Image:
+        """Mask all but the object, and mask the object, in crops (N, S, S, 3).
 
-        A frozen backbone gets ImageNet's mean colour with a soft edge there: a hard edge is the
-        strongest thing in the crop, and another mask of the same object would look different. A
-        model of our own gets black, as in its training.
+        Masked pixels are ImageNet's mean colour with a soft edge for a frozen backbone: a hard edge
+        would be the strongest feature of the crop, and another mask of the same object would look
+        different. They are black for our trained models, as in training.
 
         Args:
-            own: (N, S, S) pixels on the object.
+            on_object: (N, S, S) pixels on the object.
         Returns:
-            (2N, S, S, 3): the N objects alone, then their N surroundings.
+            (2N, S, S, 3): the N objects alone, then their N backgrounds.
         """
         if self.trained:
-            return np.concatenate([crops * own[..., None], crops * ~own[..., None]])
+            return np.concatenate([crops * on_object[..., None], crops * ~on_object[..., None]])
         edge = self.layout.crop_px * EDGE_SHARE
-        soft = [cv2.GaussianBlur(o.astype(np.float32), (0, 0), edge) for o in own]
+        soft = [cv2.GaussianBlur(o.astype(np.float32), (0, 0), edge) for o in on_object]
         grey = np.array(IMAGENET_MEAN[::-1], np.float32)
         fore = (crops - grey) * np.stack(soft)[..., None]
         both = np.concatenate([grey + fore, crops - fore])
@@ -174,7 +174,7 @@ class CropEmbedder(Embedder):
             isinstance(w, int) and w != n for w, n in zip(wanted, maps.shape[1:], strict=True)
         ):
             raise ReobjError(
-                f"{self.head}: takes {entry.shape}, the two maps of the backbone are "
+                f"{self.head}: expects input {entry.shape}, but the two maps of the backbone are "
                 f"(N, {', '.join(map(str, maps.shape[1:]))}): give a ConvBlock trained with this "
                 "backbone"
             )
@@ -182,17 +182,19 @@ class CropEmbedder(Embedder):
         return np.asarray(joint.reshape(len(maps), -1), np.float64)
 
     def _windows(self, xyxy: Array, size_hw: tuple[int, ...]) -> tuple[IntArray, IntArray]:
-        """Return the corners (N, 2) low and high of the grown boxes, whole pixels.
+        """Return the corners (N, 2) low and high of the enlarged boxes, whole pixels.
 
         They may lie beyond the frame.
         """
         box = cxcywh_from_xyxy(xyxy)  # (N, 4)
-        layout, surround = self.layout, self.layout.surround_scale > 0
+        layout = self.layout
+        surround = self.layout.surround_scale > 0
         scale = max(layout.context, layout.surround_scale)
         least = max(layout.min_margin, layout.surround_min_margin * surround)
         margin = np.maximum(box[:, 2:] * scale, max(1.0, least * max(size_hw)))
         half = box[:, 2:] / 2 + margin  # (N, 2)
-        low, high = np.floor(box[:, :2] - half), np.ceil(box[:, :2] + half)
+        low = np.floor(box[:, :2] - half)
+        high = np.ceil(box[:, :2] + half)
         return low.astype(np.int64), high.astype(np.int64)
 
     def _pixel_centres(self, low: IntArray, high: IntArray) -> Array:
@@ -206,29 +208,30 @@ class CropEmbedder(Embedder):
         detections: Detections,
         rows: IntArray,
         size_hw: tuple[int, ...],
-        own: BoolArray,
+        on_object: BoolArray,
     ) -> tuple[Floats, Floats]:
         """Pool the maps of masked crops (2N, S, S, 3) into the cells of a trained head.
 
-        In the coordinates of its crop every object is detection 0, and all others are detection 1.
+        In the coordinates of its crop each object is detection 0, and all others are detection 1.
 
         Returns:
             foreground and background (N, cells, C + 2) of `pool_cells`.
         """
-        side, count = self.layout.crop_px, len(rows)
+        side = self.layout.crop_px
+        count = len(rows)
         low, high = self._windows(detections.xyxy[rows], size_hw)
         box = (detections.xyxy[rows] - np.tile(low, 2)) * np.tile(side / (high - low), 2)  # (N, 4)
-        others = self._occupied_crops(detections, size_hw, low, high) & ~own  # (N, S, S)
+        others = self._occupied_crops(detections, size_hw, low, high) & ~on_object  # (N, S, S)
         maps = self.backbone.maps(masked)  # (2N, h, w, C)
         cells = []
-        for i in range(2 * count):  # over crops: each has a map of its own
+        for i in range(2 * count):  # each crop has its own map
             k = i % count
             some = [True, bool(others[k].any())]
             found = Detections(
                 np.stack([box[k], [0, 0, side, side]])[some],
                 np.ones(sum(some)),
                 np.zeros(sum(some), np.int64),
-                np.stack([own[k], others[k]])[some],
+                np.stack([on_object[k], others[k]])[some],
             )
             occupied = occupancy_map(found, (side, side), maps.shape[1:3])
             samples = sample_parts(found, [np.arange(1)] * 2, (side, side), occupied, self.layout)
@@ -242,7 +245,8 @@ class CropEmbedder(Embedder):
         height, width = size_hw
         occupied = occupancy_map(detections, size_hw, (height, width), self.layout.object_score)
         at = self._pixel_centres(low, high).astype(int)  # (N, 2, S)
-        x, y = at[:, 0, None, :], at[:, 1, :, None]
+        x = at[:, 0, None, :]
+        y = at[:, 1, :, None]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         return np.asarray(occupied[y.clip(0, height - 1), x.clip(0, width - 1)] & inside)
 

@@ -1,8 +1,8 @@
-"""Appearance of detections: foreground and background embeddings from one feature map a frame.
+"""Appearance of detections: foreground and background embeddings from one feature map per frame.
 
-`Embedder` computes them, `LazyEmbeddings` only for the detections that are asked for. Where the map
-is sampled is of `reobj.identity.sampling`, the same from two crops of every object, as in the
-paper, of `reobj.identity.crops`, and who is whom of `reobj.identity.reid`.
+`Embedder` computes them, `LazyEmbeddings` only for requested detections. See
+`reobj.appearance.sampling` for the sampling grid, `reobj.appearance.crops` for the paper's two-crop
+variant, `reobj.appearance.reid` for matching.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from reobj.identity.sampling import SamplingLayout, occupancy_map, pool_cells, sample_parts
+from reobj.appearance.sampling import SamplingLayout, occupancy_map, pool_cells, sample_parts
 from reobj.sources.video import resized
 from reobj.sources.weights import (
     IMAGENET_MEAN,
@@ -48,32 +48,32 @@ class EmbedConfig:
 
     model: str = option(
         "reobj",
-        "appearance model: reobj (comes along), none (motion only), a backbone (name or .onnx "
-        "file), or crops[:BACKBONE] (two crops an object, re-OBJ style)",
+        "appearance model: reobj (bundled), none (motion only), a backbone (name or .onnx file), "
+        "or crops[:BACKBONE] (two crops per object, as in re-OBJ)",
         "--embed",
     )
     head: str = option(
         "",
-        "trained head (.onnx) of a backbone; empty: the one that comes along, if any; none: the "
-        "backbone's own features",
+        "trained head (.onnx) of a backbone; empty: the bundled one, if any; none: raw features "
+        "of the backbone",
     )
 
 
 class Embedder:
-    """Foreground and background embeddings, pooled from one feature map a frame.
+    """Foreground and background embeddings, pooled from one feature map per frame.
 
-    re-OBJ sends two masked crops of each object through a ResNet; here one pass over the frame
-    serves all objects. The box and the grown box are sampled on grids: samples on the object (its
-    mask, else the ellipse inscribed in its box) make the foreground, samples on no object the
-    background; both keep a coarse spatial layout (cells). A trained model brings a head that turns
-    the cells into two short embeddings; to its background the `neighbour_embedding` is added.
+    re-OBJ sends two masked crops of each object through a ResNet; here all objects share one pass
+    over the frame. The box and the enlarged box are sampled on grids. Samples on the object (its
+    mask, else the ellipse inscribed in its box) form the foreground, samples on no object the
+    background; both keep a coarse spatial layout (cells). The head of a trained model turns the
+    cells into two short embeddings; `neighbour_embedding` is appended to its background.
 
     Args:
-        model: "reobj" for the weights that come along, or a backbone: a name listed by
+        model: "reobj" for the bundled weights, or a backbone: a name listed by
             `reobj_track.py models` or an ONNX file with an image input and a spatial output (one of
             `examples/train_embedding.py` names its head and its layout).
-        head: trained head (.onnx) of a backbone; "": the one that comes along; "none": no head.
-        layout: where the map of an untrained backbone is sampled.
+        head: trained head (.onnx) of a backbone; "": the bundled one; "none": no head.
+        layout: sampling of the map of an untrained backbone.
         threads: of onnxruntime; 0: all cores.
         offline: never download weights.
         device: cpu, cuda, coreml, ... that onnxruntime has.
@@ -81,7 +81,7 @@ class Embedder:
         ReobjError: the model is not found, or has no spatial output.
 
     Attributes:
-        layout: where the map is sampled; that of the model if it was trained.
+        layout: sampling of the map; that of the model if it was trained.
         backbone: the network, `Backbone`.
     """
 
@@ -106,26 +106,28 @@ class Embedder:
 
         Args:
             frame: (H, W, 3) BGR.
-            detections: all D detections of the frame; those that are not embedded still hide
+            detections: all D detections of the frame; those that are not embedded still mask the
                 background, and count as neighbours.
-            rows: (N,) the detections to embed; default all. Asked again about the same frame and
-                detections (the same objects in memory), only new rows are computed.
+            rows: (N,) the detections to embed; default all. In further calls for the same frame and
+                detections (identical objects in memory), only new rows are computed.
         Returns:
             Embeddings with unit rows: foreground (N, E1), background (N, E2).
         """
         rows = np.arange(len(detections)) if rows is None else rows
         if not len(rows):
             return Embeddings(np.zeros((0, 0)), np.zeros((0, 0)))
-        latest, share = self._frame(frame, detections), self.layout.neighbours * self.trained
-        wanted = latest.confident & (share > 0)
+        latest = self._frame(frame, detections)
+        weight = self.layout.neighbours * self.trained
+        wanted = latest.confident & (weight > 0)
         wanted[rows] = True
         new = np.flatnonzero(wanted & ~latest.known)
         fore, back = self._embed_cells(*self.cells(frame, detections, new, rows))
         latest.foreground = widen(latest.foreground, fore)
-        latest.foreground[new], latest.known[new] = fore, True
-        if share:
+        latest.foreground[new] = fore
+        latest.known[new] = True
+        if weight:
             around = neighbour_embedding(detections.xyxy, latest.foreground, latest.confident, rows)
-            back = np.concatenate([math.sqrt(1 - share) * back, math.sqrt(share) * around], 1)
+            back = np.concatenate([math.sqrt(1 - weight) * back, math.sqrt(weight) * around], 1)
         return Embeddings(latest.foreground[rows], unit_rows(back))
 
     def cells(
@@ -139,7 +141,7 @@ class Embedder:
 
         Args:
             foreground_rows: (M,) detections whose foreground is pooled.
-            background_rows: (N,) those whose background is; default the same.
+            background_rows: (N,) detections whose background is pooled; default the same.
         Returns:
             foreground (M, cells, C + 2) and background (N, cells, C + 2) of `pool_cells`.
         """
@@ -159,7 +161,7 @@ class Embedder:
         return not self.backbone.channels_last
 
     def _frame(self, frame: Image, detections: Detections) -> _LatestFrame:
-        """Return what is known of a frame; computes the feature map if it is a new one."""
+        """Return the cached values of a frame; computes the feature map of a new frame."""
         latest = self._latest
         if latest is None or latest.frame is not frame or latest.detections is not detections:
             features = self.backbone(frame)
@@ -170,24 +172,26 @@ class Embedder:
         """Turn cells (M, ...) and (N, ...) into foreground (M, E1) and background (N, E2)."""
         if self.trained:
             return self.backbone.embed(fore, back)
-        count = self.layout.background_cells**2  # the rest is of the wider box
+        count = self.layout.background_cells**2  # the other cells belong to the wider box
         boxes = (back[:, :count], back[:, count:])[: 1 + (self.layout.surround_scale > 0)]
         return _hellinger_rows(fore), np.concatenate([_hellinger_rows(b) for b in boxes], 1)
 
 
 class _LatestFrame:
-    """What is computed once a frame.
+    """Values that are computed once per frame.
 
     Attributes:
         features: (h, w, C) feature map. occupied: (h, w) `occupancy_map`.
-        confident: (D,) detections that hide background and count as neighbours.
+        confident: (D,) detections that mask the background and count as neighbours.
         known: (D,) detections whose foreground (D, E) is computed.
     """
 
     def __init__(
         self, frame: Image, detections: Detections, features: Floats, layout: SamplingLayout
     ) -> None:
-        self.frame, self.detections, self.features = frame, detections, features
+        self.frame = frame
+        self.detections = detections
+        self.features = features
         shape = features.shape[:2]
         self.confident = detections.score >= layout.object_score
         self.occupied = occupancy_map(detections, frame.shape, shape, layout.object_score)
@@ -198,20 +202,21 @@ class _LatestFrame:
 def neighbour_embedding(
     xyxy: Array, foreground: npt.NDArray[Any], confident: BoolArray, rows: IntArray
 ) -> Array:
-    """Sum the foreground embeddings of the other objects of a frame, the near ones more.
+    """Sum the foreground embeddings of the other objects of a frame, weighted by distance.
 
-    Each counts exp(-distance of the centres / own size). Seen from behind, an object has another
-    background but the same neighbours.
+    The weight is exp(-distance of the centres / size of the object). Seen from behind, an object
+    has another background but the same neighbours.
 
     Args:
         xyxy: (D, 4). foreground: (D, E) embeddings of all detections.
-        confident: (D,) which of them count as neighbours.
-        rows: (N,) the detections whose neighbours are wanted.
+        confident: (D,) detections that count as neighbours.
+        rows: (N,) detections whose neighbours are summed.
     Returns:
         (N, E) unit rows; 0 for a detection without neighbours.
     """
     others, (x, y, w, h) = np.flatnonzero(confident), cxcywh_from_xyxy(xyxy).T  # (O,), (D,) each
-    centre, size = x + 1j * y, np.sqrt(np.maximum(w, 1) * np.maximum(h, 1))
+    centre = x + 1j * y
+    size = np.sqrt(np.maximum(w, 1) * np.maximum(h, 1))
     distance = np.abs(centre[rows, None] - centre[others])  # (N, O)
     weight = np.exp(-distance / size[rows, None]) * (rows[:, None] != others)
     return unit_rows(weight @ foreground[others])
@@ -220,12 +225,13 @@ def neighbour_embedding(
 def _hellinger_rows(cells: Floats) -> Array:
     """Concatenate cells (N, K, C + 2) of `pool_cells` into unit rows (N, K * C).
 
-    The signed square root makes a cosine of histograms a Hellinger kernel and tames strong
-    channels; cells with few samples that count weigh less.
+    The signed square root makes a cosine of histograms a Hellinger kernel and damps strong
+    channels; cells with few valid samples weigh less.
     """
-    mean, share = cells[..., :-2], cells[..., -2]
-    trust = np.sqrt(share / np.maximum(share.max(1, keepdims=True), 1e-9))
-    rows = np.sign(mean) * np.sqrt(np.abs(mean)) * trust[..., None]
+    mean = cells[..., :-2]
+    fraction = cells[..., -2]
+    weight = np.sqrt(fraction / np.maximum(fraction.max(1, keepdims=True), 1e-9))
+    rows = np.sign(mean) * np.sqrt(np.abs(mean)) * weight[..., None]
     return unit_rows(_joined_cells(rows))
 
 
@@ -240,15 +246,15 @@ def _joined_cells(cells: Floats) -> Floats:
 class Backbone:
     """Feature maps from an ONNX network with an image input and a spatial output.
 
-    Files of `examples/train_embedding.py` state in their metadata ("reobj", JSON) how the frame is
-    resized, where the map is sampled and which file holds the head; they take BGR bytes and return
-    channels last. Any other network takes RGB normalised as ImageNet's, channels first; a head that
-    was trained for it states the same in its metadata.
+    The metadata ("reobj", JSON) of files of `examples/train_embedding.py` contain the size of the
+    frame, the sampling layout and the file of the head. These networks take BGR bytes and return
+    channels last. Any other network takes RGB normalised as for ImageNet, channels first; a head
+    that was trained for it has the same metadata.
 
     Attributes:
-        layout: where its maps are sampled. head: session of the trained head, or None.
+        layout: sampling of its maps. head: session of the trained head, or None.
         input, output: names of the tensors that are used.
-        channels_last: of the network's own maps; such networks take BGR bytes.
+        channels_last: of the network's output; such networks take BGR bytes.
     """
 
     def __init__(
@@ -269,7 +275,8 @@ class Backbone:
                 f"(N, C, h, w), found outputs {[o.name for o in self.session.get_outputs()]}; "
                 "give another --embed model"
             )
-        self.input, self.output = self.session.get_inputs()[0].name, spatial[0]
+        self.input = self.session.get_inputs()[0].name
+        self.output = spatial[0]
         metadata = onnx_metadata(self.session)
         self.channels_last = bool(metadata)
         self.multiple = int(metadata.get("multiple", 32))  # sides of the input, pixels
@@ -287,7 +294,7 @@ class Backbone:
         return np.asarray(self.maps(resized(frame, size)[None])[0])
 
     def maps(self, images: Image) -> Floats:
-        """Compute the feature maps (N, h, w, C) of BGR images (N, H, W, 3) of a fit size."""
+        """Compute the feature maps (N, h, w, C) of BGR images (N, H, W, 3) of a valid size."""
         if self.channels_last:
             return self._run(images)
         rgb = (images[..., ::-1].astype(np.float32) - IMAGENET_MEAN) / IMAGENET_STD
@@ -295,7 +302,7 @@ class Backbone:
         return np.ascontiguousarray(maps.transpose(0, 2, 3, 1))
 
     def use_output_at_stride(self, stride: int, size_px: int) -> None:
-        """Take the first output of this stride for square images of size_px, if there is one."""
+        """Select the first output with this stride for square images of size_px, if any."""
         if self.channels_last:
             return
         names = [o.name for o in self.session.get_outputs()]
@@ -324,9 +331,9 @@ def trained_head(model: str, head: str = "") -> Path | None:
 
     Args:
         head: its file, "none", or "" for BACKBONE_head.onnx (crops_BACKBONE_head.onnx) beside the
-            backbone's file, else among the weights that come along.
+            backbone's file, else among the bundled weights.
     Returns:
-        None: no head, the backbone's own features serve.
+        None: no head, the raw features of the backbone are used.
     Raises:
         ReobjError: `head` is neither a file nor "none".
     """
@@ -348,46 +355,46 @@ FLOAT32_MAX = float(np.finfo(np.float32).max)
 def as_embeddings(
     embeddings: Embeddings | npt.ArrayLike | None, count: int, width: int = 0
 ) -> Embeddings | None:
-    """Take embeddings as they come, a (D, E) array as foreground alone; None stays None.
+    """Validate embeddings; a (D, E) array is a foreground without background; None stays None.
 
     Args:
-        width: E of both parts together in the frames before; 0: there were none.
+        width: E of foreground and background together in earlier frames; 0: there were none.
     Raises:
         ReobjError: they are not `count` finite rows of this width.
     """
     if embeddings is None:
         return None
     if not isinstance(embeddings, Embeddings):
-        rows = as_numbers(embeddings, "embeddings")
-        rows = rows.reshape(0, 0) if rows.ndim == 1 and not rows.size else rows
-        embeddings = Embeddings(rows, np.empty((count, 0)))
-    for part in (embeddings.foreground, embeddings.background):
-        if part.ndim != 2 or len(part) != count:
-            raise ReobjError(f"embeddings are an array of shape {part.shape}, expected ({count}, "
-                             "E): one row a detection")  # fmt: skip
-        if not np.abs(part).max(initial=0) <= FLOAT32_MAX:  # NaN neither
+        array = as_numbers(embeddings, "embeddings")
+        array = array.reshape(0, 0) if array.ndim == 1 and not array.size else array
+        embeddings = Embeddings(array, np.empty((count, 0)))
+    for rows in (embeddings.foreground, embeddings.background):
+        if rows.ndim != 2 or len(rows) != count:
+            raise ReobjError(f"embeddings are an array of shape {rows.shape}, expected ({count}, "
+                             "E): one row per detection")  # fmt: skip
+        if not np.abs(rows).max(initial=0) <= FLOAT32_MAX:  # False for NaN
             raise ReobjError("embeddings are not finite as float32")
     found = embeddings.foreground.shape[1] + embeddings.background.shape[1]
     if count and (not found or width not in (0, found)):
-        expected = f"{width}, as in the frames before" if width else "at least 1"
+        expected = f"{width}, as in earlier frames" if width else "at least 1"
         raise ReobjError(f"embeddings of width {found}, expected {expected}")
     return embeddings
 
 
 class LazyEmbeddings:
-    """Fused embeddings of one frame's detections, computed only for the rows that are asked for.
+    """Fused embeddings of one frame's detections, computed only for requested rows.
 
-    A fused row holds foreground and background side by side, weighted so that a cosine of two rows
-    is weight * cosine of the foregrounds + (1 - weight) * cosine of the backgrounds.
+    A fused row concatenates foreground and background, weighted so that the cosine of two rows is
+    weight * cosine of the foregrounds + (1 - weight) * cosine of the backgrounds.
 
     Args:
         given: embeddings of all detections, if the caller has them.
         embedder, frame: compute the others; without both and without `given` there are none.
-        weight: share of the foreground; without a background part it is 1.
+        weight: of the foreground; 1 without a background.
 
     Attributes:
         rows: (D, E) unit rows, 0 where not done; None before the first request.
-        done: (D,) which are computed.
+        done: (D,) rows that are computed.
         foreground_width: width of the foreground in the rows.
     """
 
@@ -399,7 +406,10 @@ class LazyEmbeddings:
         detections: Detections,
         weight: float,
     ) -> None:
-        self.given, self.embedder, self.frame, self.detections = given, embedder, frame, detections
+        self.given = given
+        self.embedder = embedder
+        self.frame = frame
+        self.detections = detections
         self.weight = weight
         self.rows: Floats | None = None
         self.foreground_width = 0
@@ -407,27 +417,30 @@ class LazyEmbeddings:
 
     @property
     def available(self) -> bool:
-        """Whether embeddings can be had."""
+        """Whether embeddings can be computed or were given."""
         return self.given is not None or (self.embedder is not None and self.frame is not None)
 
     def get(self, rows: IntArray) -> Floats:
-        """Return the fused rows (N, E) of detections (N,); (0, 0) if none was ever asked for."""
+        """Return the fused rows (N, E) of detections (N,); (0, 0) if none was requested yet."""
         todo = rows[~self.done[rows]]
         if len(todo):
             fused = self._fuse(todo)  # (n, E)
             if self.rows is None:
                 self.rows = np.zeros((len(self.detections), fused.shape[1]), np.float32)
-            self.rows[todo], self.done[todo] = fused, True
+            self.rows[todo] = fused
+            self.done[todo] = True
         return np.empty((0, 0), np.float32) if self.rows is None else self.rows[rows]
 
     def _fuse(self, rows: IntArray) -> Floats:
         """Compute the fused rows of detections (n,)."""
         if self.given is not None:
-            fore, back = self.given.foreground[rows], self.given.background[rows]
+            fore = self.given.foreground[rows]
+            back = self.given.background[rows]
         else:
             assert self.embedder is not None and self.frame is not None
             found = self.embedder(self.frame, self.detections, rows)
-            fore, back = found.foreground, found.background
+            fore = found.foreground
+            back = found.background
         self.foreground_width = fore.shape[1]
         weight = self.weight if back.shape[1] else 1.0
         parts = [math.sqrt(weight) * unit_rows(fore), math.sqrt(1 - weight) * unit_rows(back)]

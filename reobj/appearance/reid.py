@@ -1,8 +1,7 @@
-"""Re-identification: what identities looked like, and what a similarity means.
+"""Re-identification by appearance: a gallery of each identity, and calibrated similarities.
 
 `Gallery` keeps a few views of every identity, `SimilarityCalibration` turns cosines into log odds,
-and `match_probability` sets these against rivals. Where identities are is of
-`reobj.identity.places`; which detection takes which identity the tracker and the linker decide.
+and `match_probability` compares these with the best rival.
 
 Axes: I identities, K views of an identity in the gallery, E width of an embedding.
 """
@@ -21,29 +20,30 @@ from reobj.types import Array, Floats, IntArray, unit_rows
 # ---- Gallery -----------------------------------------------------------------------------------
 
 GALLERY_VIEWS = 12  # views kept of every identity (chosen)
-GALLERY_NOVELTY = 0.95  # cosine to all kept views below which a view is a new one (chosen)
-GALLERY_BLEND = 0.9  # share of the kept view where a view is not new (chosen)
+GALLERY_NOVELTY = 0.95  # largest cosine to all kept views of a new view (chosen)
+GALLERY_BLEND = 0.9  # weight of the kept view if a view is not new (chosen)
 UNUSED = -2.0  # below any cosine
 
 
 class Gallery:
-    """A few diverse views of the appearance of every identity of a video, never forgotten.
+    """A few diverse views of the appearance of every identity of a video; none expires.
 
     Memory grows with the number of identities, not with time: `views` per identity at most.
 
     Args:
         views: K, views kept of every identity.
-        novelty: cosine to all kept views below which a view is kept as a new one.
+        novelty: largest cosine to all kept views of a view that is kept as a new one.
 
     Attributes:
-        rows: (I, K, E) unit rows. viewing_ray: (I, K, 3) directions they were seen in, NaN unknown.
+        rows: (I, K, E) unit rows. viewing_ray: (I, K, 3) viewing directions, NaN unknown.
         count: (I,) views held. foreground_width: width of the foreground in the rows.
     """
 
     ARRAYS = ("rows", "viewing_ray", "count", "foreground_width")  # the whole state
 
     def __init__(self, views: int = GALLERY_VIEWS, novelty: float = GALLERY_NOVELTY) -> None:
-        self.views, self.novelty = views, novelty
+        self.views = views
+        self.novelty = novelty
         self.rows = np.zeros((0, views, 0), np.float32)
         self.viewing_ray = np.zeros((0, views, 3))
         self.count = np.zeros(0, np.int64)
@@ -52,27 +52,27 @@ class Gallery:
     def add(self, identity: IntArray, rows: Floats, viewing_ray: Array) -> None:
         """Add one view to each of N different identities.
 
-        A novel view is kept; where all K are taken, it replaces the one most similar to another.
+        A novel view is kept; if all K slots are used, it replaces the one most similar to another.
         A view that is not novel is blended into the most similar one.
 
         Args:
             identity: (N,). rows: (N, E) unit rows.
-            viewing_ray: (N, 3) direction in the world in which it was seen, NaN: unknown.
+            viewing_ray: (N, 3) viewing direction in the world, NaN: unknown.
         """
         self.reserve(int(identity.max(initial=-1)) + 1, rows.shape[1])
-        own = self.rows[identity]  # (N, K, E)
-        similarity = np.einsum("nke,ne->nk", own, rows)  # (N, K)
+        views = self.rows[identity]  # (N, K, E)
+        similarity = np.einsum("nke,ne->nk", views, rows)  # (N, K)
         similarity[np.arange(self.views) >= self.count[identity][:, None]] = UNUSED
         nearest = similarity.argmax(1)  # (N,)
         novel = similarity.max(1) < self.novelty  # (N,)
-        room = self.count[identity] < self.views
-        target = np.where(novel & room, self.count[identity], nearest)  # (N,) slot that is written
-        target[novel & ~room] = _most_redundant(own[novel & ~room])
+        has_slot = self.count[identity] < self.views
+        target = np.where(novel & has_slot, self.count[identity], nearest)  # (N,) slot to write
+        target[novel & ~has_slot] = _most_redundant(views[novel & ~has_slot])
         blend = np.where(novel, 0.0, GALLERY_BLEND)[:, None]
-        picked = own[np.arange(len(identity)), target]  # (N, E)
+        picked = views[np.arange(len(identity)), target]  # (N, E)
         self.rows[identity, target] = unit_rows(blend * picked + (1 - blend) * rows)
         self.viewing_ray[identity[novel], target[novel]] = viewing_ray[novel]
-        self.count[identity] += novel & room
+        self.count[identity] += novel & has_slot
 
     def parts(
         self, rows: Floats, identity: IntArray, viewing_ray: Array
@@ -102,7 +102,7 @@ class Gallery:
         return fore, back, angle
 
     def reserve(self, identities: int, width: int) -> None:
-        """Make room for so many identities, and rows of this width if there are none yet."""
+        """Allocate this many identities, and rows of this width if there are none yet."""
         if self.rows.shape[2] == 0:
             self.rows = np.zeros((len(self.count), self.views, width), np.float32)
         if identities > len(self.count):
@@ -123,10 +123,10 @@ def _most_redundant(full: Floats) -> IntArray:
 def part_cosines(
     a: npt.NDArray[Any], b: npt.NDArray[Any], foreground_width: int
 ) -> tuple[Array, Array]:
-    """Compute the cosines of both parts of fused rows (N, E) and (M, E).
+    """Compute the cosines of foregrounds and backgrounds of fused rows (N, E) and (M, E).
 
     Returns:
-        foreground, background: (N, M) cosines, NaN where a row has no such part.
+        foreground, background: (N, M) cosines, NaN where a row lacks it.
     """
     parts = (slice(foreground_width), slice(foreground_width, None))
     foreground, background = (_cosine(a[:, part], b[:, part]) for part in parts)
@@ -150,23 +150,23 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
 
 # ---- Calibrated similarity ---------------------------------------------------------------------
 
-PRIOR_PAIRS = 10.0  # pairs that the usual mean and spread are worth (chosen)
+PRIOR_PAIRS = 10.0  # pseudo-count of the usual mean and spread (chosen)
 LOG_SIMILARITY_AT_1 = 1.03  # -log(1.03 - cosine) is finite, 3.5 at most (chosen)
 USUAL_ANGLE_DEG = 45.0  # between two views of unknown directions (chosen)
-OUTLIER_SHARE = 1e-3  # of the pairs of either kind that look like the other kind (chosen)
+OUTLIERS = 1e-3  # fraction of pairs of either kind that look like the other kind (chosen)
 
 
 class SimilarityCalibration:
     """Calibrate cosines of foreground and background to log odds of being one object.
 
-    No threshold on a cosine serves two videos, but every video shows pairs without labels: objects
-    of a class side by side in a frame are different, views of a track are of one object. The log
-    similarity of each part is counted from the middle between the means of the two kinds, in
-    standard deviations, times 1 + the distance of the means: where they are far apart a step says
-    more. The constants serve every appearance model.
+    No threshold on a cosine transfers between videos, but every video contains unlabelled pairs of
+    known kind: objects of a class side by side in a frame are different, views of a track belong to
+    one object. The log similarity of foreground and background is measured from the midpoint of the
+    means of the two kinds, in standard deviations, times 1 + the distance of the means: the
+    evidence is stronger if they are far apart. The constants hold for every appearance model.
 
     Args:
-        weight: number of pairs that the usual mean and spread are worth.
+        weight: pseudo-count of the usual mean and spread.
     Attributes:
         moments: (2, 3, 2) count, sum and sum of squares of the log similarity of foreground and
             background (last axis), of different and of same objects (first axis).
@@ -175,7 +175,8 @@ class SimilarityCalibration:
     # fitted by `examples/rank_k.py --calibrate` to 12 rendered rooms, with and without masks; the
     # weights lie between the fits of several embeddings (docs/appearance.md)
     WEIGHTS = (0.55, 0.5)  # of foreground and background
-    USUAL = ((1.3, 0.65), (1.8, 1.2))  # mean log similarity of both parts: different, same objects
+    # mean log similarity of foreground and background: of different, of same objects
+    USUAL = ((1.3, 0.65), (1.8, 1.2))
     USUAL_STD = 0.45  # of the log similarity within a kind
     ARRAYS = ("moments",)
 
@@ -189,7 +190,7 @@ class SimilarityCalibration:
         return np.asarray(-np.log(LOG_SIMILARITY_AT_1 - np.minimum(cosine, 1.0)))
 
     def add(self, foreground: Array, background: Array, same: bool) -> None:
-        """Add the cosines of pairs (N,) of one kind that the video shows; NaN: unknown."""
+        """Add the cosines of pairs (N,) of one kind; NaN: unknown."""
         value = self.log_similarity(np.stack([foreground.ravel(), background.ravel()]))  # (2, N)
         known = np.isfinite(value)
         value = np.where(known, value, 0.0)
@@ -197,9 +198,9 @@ class SimilarityCalibration:
 
     def add_frame(self, foreground: Array, background: Array, class_id: IntArray) -> None:
         """Add all pairs of one class in a frame, cosines (n, n): the diagonal is one object."""
-        own = np.eye(len(class_id), dtype=bool)
-        other = (class_id[:, None] == class_id) & ~own
-        self.add(foreground[own], background[own], True)
+        same = np.eye(len(class_id), dtype=bool)
+        other = (class_id[:, None] == class_id) & ~same
+        self.add(foreground[same], background[same], True)
         self.add(foreground[other], background[other], False)
 
     def logit(
@@ -208,31 +209,32 @@ class SimilarityCalibration:
         background: npt.ArrayLike = np.nan,
         view_angle_deg: npt.ArrayLike = np.nan,
     ) -> Array:
-        """Compute the log odds of being one object, where both kinds are equally likely beforehand.
+        """Compute the log odds of being one object, for equal prior probabilities.
 
-        They lie within about +-7, because a thousandth of the pairs may be outliers.
+        They lie within about +-7, because a fraction OUTLIERS of the pairs may be outliers.
 
         Args:
             foreground, background: cosines; any shapes that broadcast. Without a background (NaN)
-                the foreground decides; without a foreground nothing speaks for one object: -inf.
-            view_angle_deg: between the viewing rays. From another side, an object looks less like
-                itself, and from 90 degrees on its background says nothing. NaN: as 45 degrees.
+                the foreground decides; without a foreground the log odds are -inf.
+            view_angle_deg: between the viewing rays. The weight of the foreground decreases with
+                it; from 90 degrees on the background has no weight. NaN: as 45 degrees.
         """
-        foreground, background = np.asarray(foreground), np.asarray(background)
+        foreground = np.asarray(foreground)
+        background = np.asarray(background)
         kind = np.result_type(foreground, background)
         cosines = (foreground.astype(kind), background.astype(kind))
         scores = self.part_scores(*cosines, view_angle_deg)
         parts = (w * np.where(np.isnan(s), 0, s) for w, s in zip(self.WEIGHTS, scores, strict=True))
         logit = np.where(np.isnan(foreground), -np.inf, sum(parts))
-        # of a mixture of both kinds, in which OUTLIER_SHARE of either is like the other
+        # of a mixture of both kinds, in which OUTLIERS of either is like the other
         odds = np.exp(np.minimum(logit, 50))
-        bounded = (odds + OUTLIER_SHARE) / (1 + OUTLIER_SHARE * odds)
+        bounded = (odds + OUTLIERS) / (1 + OUTLIERS * odds)
         return np.asarray(np.where(odds > 0, np.log(bounded), -np.inf))
 
     def part_scores(
         self, foreground: Array, background: Array, view_angle_deg: npt.ArrayLike = np.nan
     ) -> list[Array]:
-        """Standardise the cosines (...) of both parts: evidence for one object, unweighted."""
+        """Standardise the cosines (...) of foreground and background: evidence for one object."""
         count, total, squares = self.moments.swapaxes(0, 1)  # (2, 2) each: kinds, parts
         mean = total / count
         std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
@@ -249,7 +251,7 @@ class SimilarityCalibration:
         return np.asarray(1 / (1 + np.exp(-self.logit(*known) - math.log(prior / (1 - prior)))))
 
 
-# odds beforehand that a newcomer is a certain known object and not a new one: fitted with WEIGHTS
+# prior odds that a new track is one given known object rather than a new one: fitted with WEIGHTS
 # (with other embeddings 1.0 to 1.5: docs/appearance.md)
 RETURN_ODDS = 1.8
 
@@ -257,12 +259,12 @@ RETURN_ODDS = 1.8
 def match_probability(logit: Array, prior_odds: float = RETURN_ODDS) -> Array:
     """Compute the probability (N, M) that row and column are one object: o / (1 + o + o').
 
-    o are the odds of the pair, o' those of the likeliest other pair of its row or column (the
-    ratio test among look-alikes), and 1 is for no pair at all.
+    o are the odds of the pair, o' those of the likeliest other pair of its row or column (a ratio
+    test among look-alikes), and 1 is for no pair at all.
 
     Args:
         logit: (N, M) log odds of the pairs.
-        prior_odds: how much likelier beforehand a certain pair is than none.
+        prior_odds: of a given pair against none.
     """
     odds = prior_odds * np.exp(logit)
     rival = np.maximum(_best_other(odds), _best_other(odds.T).T)

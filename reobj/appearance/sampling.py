@@ -1,7 +1,7 @@
-"""Where a feature map is sampled for the foreground and the background of detections.
+"""Sampling of a feature map for the foreground and the background of detections.
 
-`sample_parts` places the samples of both parts on the map, `pool_cells` averages them to cells. No
-network here: the map comes from `reobj.identity.embedding`.
+`sample_parts` places the samples on the map, `pool_cells` averages them to cells. The map is
+computed in `reobj.appearance.embedding`.
 
 Axes: D detections of a frame, M foregrounds, N backgrounds, K cells of S samples each, L = K * S.
 """
@@ -23,23 +23,23 @@ from reobj.types import Array, BoolArray, Detections, Floats, IntArray, cxcywh_f
 
 @dataclass(frozen=True, slots=True)
 class SamplingLayout:
-    """Where a feature map is sampled for foreground and background embeddings.
+    """Sampling layout of a feature map for foreground and background embeddings.
 
-    Trained models bring their own in their metadata; the defaults serve untrained backbones
+    Trained models have their own in their metadata; the defaults are for untrained backbones
     (chosen).
 
     Attributes:
         size_px: longer side of the backbone's input.
         samples: samples along a side of every cell.
-        context, min_margin: margin of the grown box on every side: this share of the box size, and
-            at least this share of the image's longer side.
-        object_score: detections of at least this score are no background for the others, and count
+        context, min_margin: margin of the enlarged box on every side: this fraction of the box
+            size, and at least this fraction of the image's longer side.
+        object_score: detections of at least this score mask the background of the others, and count
             as neighbours.
-        foreground_cells, background_cells: cells along a side of the box and of the grown box.
+        foreground_cells, background_cells: cells along a side of the box and of the enlarged box.
         surround_scale, surround_min_margin, surround_cells: the same for a wider box, in which
             other objects count too; scale 0: no such box.
         foreground_channels: the foreground is pooled from this many first channels only; 0: all.
-        neighbours: share of `neighbour_embedding` in the background of trained models. 0.2 and its
+        neighbours: weight of `neighbour_embedding` in the background of trained models. 0.2 and its
             distance were chosen on the six videos of docs/tracking.md.
         crop_px: side of the crops of `CropEmbedder` (224: ImageNet's).
     """
@@ -59,10 +59,7 @@ class SamplingLayout:
     crop_px: int = 224
 
     def updated(self, metadata: dict[str, Any]) -> SamplingLayout:
-        """Replace what a model's metadata state under `layout`.
-
-        They may use the names of earlier versions.
-        """
+        """Apply the `layout` of a model's metadata, with current names or those of old versions."""
         stated = metadata.get("layout", {})
         return dataclasses.replace(self, **{_EARLIER_NAMES.get(k, k): v for k, v in stated.items()})
 
@@ -75,12 +72,12 @@ _EARLIER_NAMES = {"reach": "min_margin", "wide": "surround_scale",
 class PartSamples:
     """Samples of a feature map: S in each of K cells.
 
-    First the cells of M foregrounds, then those of N backgrounds (of each the grown box, then the
-    wider one).
+    First the cells of M foregrounds, then those of N backgrounds (of each the enlarged box, then
+    the wider one).
 
     Attributes:
-        index: (K, S) flat index into the map. weight: (K, S) bool, samples that count.
-        share: (K, 2) share of the samples that count, and of those on other objects.
+        index: (K, S) flat index into the map. weight: (K, S) bool, valid samples.
+        share: (K, 2) fraction of valid samples, and of samples on other objects.
         shape: (M, cells of a foreground), (N, cells of a background).
     """
 
@@ -92,7 +89,8 @@ class PartSamples:
     def split(self, values: Any) -> tuple[Any, Any]:
         """Split values (K, ...) into foreground (M, cells, ...) and background (N, cells, ...)."""
         fore, back = self.shape
-        first, rest = values[: math.prod(fore)], values[math.prod(fore) :]
+        first = values[: math.prod(fore)]
+        rest = values[math.prod(fore) :]
         return first.reshape(*fore, *values.shape[1:]), rest.reshape(*back, *values.shape[1:])
 
 
@@ -105,9 +103,9 @@ def sample_parts(
 ) -> PartSamples:
     """Sample foregrounds and backgrounds of detections on a feature map.
 
-    What counts: of the box, samples on the object itself; of the grown box, samples on no object;
-    of the wider box, if the layout has one, samples not on the object itself. Never samples beyond
-    the image.
+    Valid are, in the box, samples on the object itself; in the enlarged box, samples on no object;
+    in the wider box, if the layout has one, samples not on the object itself. Samples beyond the
+    image are never valid.
 
     Args:
         detections: of one frame of size_hw pixels.
@@ -118,16 +116,18 @@ def sample_parts(
     part, grid, excludes, shape = _sample_grid(layout, len(rows[0]), len(rows[1]))
     row = np.concatenate(rows).take(part)  # (L,)
     low, high = detections.xyxy.T.take(row, 1).reshape(2, 2, -1)  # (2, L) x, y, as all below
-    centre, own_half = (low + high) / 2, (high - low) / 2
-    half = own_half + np.maximum((high - low) * grid[2], grid[3] * max(size_hw))
+    centre = (low + high) / 2
+    box_half = (high - low) / 2
+    half = box_half + np.maximum((high - low) * grid[2], grid[3] * max(size_hw))
     at = centre + half * grid[:2]
     inside = ((at >= 0) & (at < size)).all(0)  # (L,)
     cell = (at / size * cells_wh).astype(int)
     index = (cell[1] * occupied.shape[1] + cell[0]) * inside
-    own = inside_object(detections, row, at, centre, own_half) & inside
-    others = occupied.take(index) & (inside > own)
-    weight, fine = inside > (own | others & excludes), layout.samples**2
-    weight[: fine * math.prod(shape[0])] = own[: fine * math.prod(shape[0])]
+    on_object = inside_object(detections, row, at, centre, box_half) & inside
+    others = occupied.take(index) & (inside > on_object)
+    weight = inside > (on_object | others & excludes)
+    fine = layout.samples**2
+    weight[: fine * math.prod(shape[0])] = on_object[: fine * math.prod(shape[0])]
     counts = np.concatenate([weight, others]).reshape(2, -1, fine).sum(-1, dtype=np.float32)
     return PartSamples(index.reshape(-1, fine), weight.reshape(-1, fine), counts.T / fine, shape)
 
@@ -136,25 +136,27 @@ def sample_parts(
 def _sample_grid(
     layout: SamplingLayout, foregrounds: int, backgrounds: int
 ) -> tuple[IntArray, Array, BoolArray, Any]:
-    """Lay out the L samples of a number of parts: foregrounds first, then backgrounds.
+    """Lay out the L samples: of the foregrounds first, then of the backgrounds.
 
     Returns:
-        part: (L,) number of the part that a sample belongs to.
-        grid: (4, L) x and y in the part's box, -1 to 1; margin of that box as a share of the
-            detection's size, and its least margin as a share of the image's longer side.
-        excludes: (L,) whether samples on other objects do not count (grown boxes).
+        part: (L,) number of the foreground or background that a sample belongs to.
+        grid: (4, L) x and y in its box, -1 to 1; margin of that box as a fraction of the size of
+            the detection, and its least margin as a fraction of the image's longer side.
+        excludes: (L,) samples on other objects are not valid (enlarged boxes).
         shape: `PartSamples.shape`.
     """
     box = (0.0, 0.0, 0, layout.foreground_cells)
-    grown = (layout.context, layout.min_margin, 1, layout.background_cells)
+    enlarged = (layout.context, layout.min_margin, 1, layout.background_cells)
     wider = (layout.surround_scale, layout.surround_min_margin, 0, layout.surround_cells)
     grids = []
-    for *kind, cells in (box, grown, wider)[: 2 + (layout.surround_scale > 0)]:
+    for *kind, cells in (box, enlarged, wider)[: 2 + (layout.surround_scale > 0)]:
         side = cells * layout.samples
         line = ((np.arange(side) + 0.5) / side * 2 - 1).reshape(cells, -1)
-        x, y = line[:, None], line[:, None, :, None]
+        x = line[:, None]
+        y = line[:, None, :, None]
         grids.append(np.stack(np.broadcast_arrays(x, y, *kind)).reshape(5, -1))
-    fore, back = grids[0], np.concatenate(grids[1:], 1)  # (5, samples of one part)
+    fore = grids[0]  # (5, samples of one part)
+    back = np.concatenate(grids[1:], 1)
     grid = np.concatenate([fore[:, :0], *[fore] * foregrounds, *[back] * backgrounds], 1)
     sizes = np.array([fore.shape[1], back.shape[1]])
     part = np.arange(foregrounds + backgrounds).repeat(sizes.repeat([foregrounds, backgrounds]))
@@ -165,11 +167,11 @@ def _sample_grid(
 def pool_cells(
     features: Floats, samples: PartSamples, layout: SamplingLayout
 ) -> tuple[Floats, Floats]:
-    """Average the samples that count in each cell of a feature map (h, w, C).
+    """Average the valid samples in each cell of a feature map (h, w, C).
 
     Returns:
         foreground (M, cells, C + 2) and background (N, cells, C + 2): the mean of the channels, 0
-        where no sample counts, and `PartSamples.share`. The foreground has only the layout's first
+        without valid samples, and `PartSamples.share`. The foreground has only the layout's first
         `foreground_channels`.
     """
     sampled = features.reshape(-1, features.shape[-1]).take(samples.index, 0)  # (K, S, C)
@@ -184,9 +186,7 @@ def pool_cells(
 def inside_object(
     detections: Detections, rows: IntArray, at: Array, centre: Array, half: Array
 ) -> BoolArray:
-    """Test whether points lie on their detection.
-
-    That is in its mask, else in the ellipse inscribed in its box.
+    """Test whether points lie on their detection: in its mask, else in the inscribed ellipse.
 
     Args:
         rows: (...) detection of each point. at: (2, ...) x, y of the points, pixels.
@@ -195,7 +195,8 @@ def inside_object(
     inside = (((at - centre) / np.maximum(half, 0.5)) ** 2).sum(0) <= 1
     if detections.masks is not None:
         height, width = detections.masks.shape[1:]
-        column, row = at[0].astype(int).clip(0, width - 1), at[1].astype(int).clip(0, height - 1)
+        column = at[0].astype(int).clip(0, width - 1)
+        row = at[1].astype(int).clip(0, height - 1)
         masked = np.zeros(len(detections), bool)
         masked[[i for i in np.unique(rows) if detections.masks[i].any()]] = True
         inside = np.where(masked[rows], detections.masks[rows, row, column], inside)

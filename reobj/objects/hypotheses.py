@@ -1,8 +1,8 @@
-"""Where things might be: solids that the association chooses from.
+"""Object hypotheses that the association chooses from.
 
-Of every fragment of a tracklet the solid that is fitted to its boxes; and, as few views tell no
-distance, solids at several distances along the rays of its best boxes, and of the detections in no
-tracklet. Which of them are right other fragments tell, at other times.
+They are the shapes fitted to the boxes of each tracklet fragment and, as few views do not determine
+the depth, shapes at several depths along the rays of its best boxes and of untracked detections.
+Wrong hypotheses are rejected by later observations.
 """
 
 from __future__ import annotations
@@ -10,15 +10,17 @@ from __future__ import annotations
 import numpy as np
 
 import quadrics
-from reobj.identity.evidence import NO_SOLIDS, Solids
+from reobj.objects.likelihood import NO_SHAPES, Shapes
+from reobj.objects.observations import Views
 from reobj.types import Array, BoolArray, IntArray
-from reobj.views import Views
 
-# Distances that are tried, over that at which a box shows a thing of the usual size of its class:
-# nearer where a part is hidden (chosen; a step of a fifth is less than a chair's depth at 3 m)
-DISTANCES = np.geomspace(0.4, 1.6, 8)
-CUT_BOX = 0.3  # weight of the area of a box that touches the border, as the best view (chosen)
-STANDING_HEIGHTS = (0.3, 1.8)  # over the usual height, of what stands on the floor (chosen)
+# Depths that are tried, over the depth at which a box shows an object of the usual size of its
+# class: smaller if a part is occluded (chosen; a step of a fifth is less than a chair's depth at
+# 3 m)
+DEPTHS = np.geomspace(0.4, 1.6, 8)
+BORDER_WEIGHT = 0.3  # of the area of a box at the image border, to choose the best view (chosen)
+STANDING_HEIGHTS = (0.3, 1.8)  # of floor-standing objects, over the usual height (chosen)
+BORDER_PX = 2  # a box this near to the image border is truncated
 
 
 def propose(
@@ -28,20 +30,18 @@ def propose(
     usual_size: Array,
     floor: quadrics.Floor | None,
     on_floor: BoolArray,
-) -> Solids:
-    """Propose solids for groups of boxes.
+) -> Shapes:
+    """Propose shapes for groups of boxes: the fits, and several along rays of each group.
 
     Args:
         fits, views: of G groups. classes: (G,).
         usual_size: (G, 3) width, depth and height of their categories, in units of the world.
         floor: None if unknown. on_floor: (G,) the category stands on it.
-    Returns:
-        the fits, and several solids along a few rays of each group.
     """
     good = np.isfinite(fits.ellipsoids.center_in_world[:, 0])
-    own = Solids(fits.ellipsoids[good], fits.support[good], classes[good])
+    fitted = Shapes(fits.ellipsoids[good], fits.support[good], classes[good])
     rays = propose_along_rays(views, classes, usual_size, fits.up, floor, on_floor)
-    return Solids.concatenate([own, rays])
+    return Shapes.concatenate([fitted, rays])
 
 
 def propose_along_rays(
@@ -51,42 +51,43 @@ def propose_along_rays(
     up: Array,
     floor: quadrics.Floor | None,
     on_floor: BoolArray,
-) -> Solids:
-    """Propose solids at several distances along the rays of the best boxes of G groups.
+) -> Shapes:
+    """Propose shapes at several depths along the rays of the best boxes of G groups.
 
     Args:
         up: (3,) unit; all 0: unknown, and nothing is proposed. The others: as in `propose`.
     """
-    made = [NO_SOLIDS]
+    sets = [NO_SHAPES]
     group, view = _best_views(views)
     stands = on_floor[group] & (floor is not None)
     for standing in (True, False):
         pick = (stands == standing) & bool(up.any())
         if pick.any():
-            own = (view[pick], group[pick], usual_size[group[pick]])
-            ellipsoids, of = _along_rays(views, *own, up, floor if standing else None)
-            made.append(Solids(ellipsoids, np.full(len(of), "cylinder"), classes[of]))
-    return Solids.concatenate(made)
+            boxes = (view[pick], group[pick], usual_size[group[pick]])
+            ellipsoids, source = _along_rays(views, *boxes, up, floor if standing else None)
+            sets.append(Shapes(ellipsoids, np.full(len(source), "cylinder"), classes[source]))
+    return Shapes.concatenate(sets)
 
 
 def _best_views(views: Views) -> tuple[IntArray, IntArray]:
-    """Choose views of each group, those with the largest boxes: one of each third of its views.
+    """Choose the largest box of each third of the views of each group.
 
-    A tracklet may have slipped from one thing to another on its way.
+    (Three, as a tracklet may have slipped from one object to another.)
 
     Returns:
         groups (P,) and views (P,).
     """
     box = views.boxes
-    inside = (box[..., :2] > 2).all(-1) & (box[..., 2:] < np.array(views.image_size) - 2).all(-1)
-    area = (box[..., 2:] - box[..., :2]).prod(-1) * np.where(inside, 1.0, CUT_BOX)  # (V, G)
+    far_border = np.array(views.image_size) - BORDER_PX
+    whole = (box[..., :2] > BORDER_PX).all(-1) & (box[..., 2:] < far_border).all(-1)
+    area = (box[..., 2:] - box[..., :2]).prod(-1) * np.where(whole, 1.0, BORDER_WEIGHT)  # (V, G)
     seen = np.isfinite(area)
     third = (3 * (seen.cumsum(0) - 1)) // seen.sum(0).clip(1)
     best = [np.where(seen & (third == k), area, -1.0) for k in range(3)]
     view = np.stack([a.argmax(0) for a in best])  # (3, G)
     known = np.stack([a.max(0) > 0 for a in best])
-    part, group = np.nonzero(known)
-    return group, view[part, group]
+    index, group = np.nonzero(known)
+    return group, view[index, group]
 
 
 def _along_rays(
@@ -97,10 +98,10 @@ def _along_rays(
     up: Array,
     floor: quadrics.Floor | None,
 ) -> tuple[quadrics.Ellipsoids, IntArray]:
-    """Put upright solids along the rays of boxes, of views (g,) of groups (g,).
+    """Place upright shapes along the rays of boxes, of views (g,) of groups (g,).
 
-    They fill the box; and, wide as usual, they reach from its top down to the floor, or as far as
-    is usual: the lower part of the box is hidden then.
+    One kind fills the box. The other has the usual width and extends from the top of the box down
+    to the floor, or over the usual height, as the lower part of the object may be occluded.
 
     Returns:
         ellipsoids; the group of each.
@@ -113,37 +114,38 @@ def _along_rays(
     focal = np.sqrt(np.abs(np.linalg.det(img[:, :, :3])))  # px, of a camera in units of the world
     extent = (box[:, 2:] - box[:, :2]) / focal[:, None]  # (g, 2) at depth 1
     usual = np.column_stack([np.sqrt(usual_size[:, 0] * usual_size[:, 1]), usual_size[:, 2]])
-    depth = (usual / extent).min(1)[:, None] * DISTANCES  # (g, D)
+    depth = (usual / extent).min(1)[:, None] * DEPTHS  # (g, D)
     size = extent[:, None] * depth[..., None]  # (g, D, 2) that fills the box
-    far = depth + size[..., 0] / 2  # of the solid's middle
+    center_depth = depth + size[..., 0] / 2
     ray = np.einsum("gij,gj->gi", inverse, np.column_stack([middle, np.ones(len(box))]))
     top = np.einsum("gij,gj->gi", inverse, np.column_stack([middle[:, 0], box[:, 1], focal**0]))
-    point = centre[:, None] + ray[:, None] * far[..., None]  # (g, D, 3)
-    height = (centre[:, None] + top[:, None] * far[..., None]) @ up  # (g, D) of its upper side
+    point = centre[:, None] + ray[:, None] * center_depth[..., None]  # (g, D, 3)
+    top_height = (centre[:, None] + top[:, None] * center_depth[..., None]) @ up  # (g, D)
     narrow = np.broadcast_to(usual[:, None, 0], depth.shape)
     if floor is None:
         whole = np.broadcast_to(usual[:, None, 1], depth.shape)
         kinds = [(size[..., 0], size[..., 1], point), (narrow, whole, None)]
         good = [np.ones(depth.shape, bool), size[..., 1] < whole]
     else:
-        # the floor's height below each point: n x = d
+        # height of the point above the floor n x = d
         lift = (point @ floor.normal - floor.offset) / (floor.normal @ up)
-        whole = height - (point @ up - lift)
-        low, high = (share * usual[:, None, 1] for share in STANDING_HEIGHTS)
+        whole = top_height - (point @ up - lift)
+        low, high = (factor * usual[:, None, 1] for factor in STANDING_HEIGHTS)
         stands = (whole > low) & (whole < high)
         kinds = [(size[..., 0], whole, None), (narrow, whole, None)]
         good = [stands, stands]
     axes = _upright_axes(up)
-    solids, of = [], []
-    for (wide, tall, at), keep in zip(kinds, good, strict=True):
-        if at is None:  # from the upper side downwards
-            at = point + ((height - tall / 2) - point @ up)[..., None] * up
-        half = np.stack([wide, wide, tall], -1)[keep] / 2
-        solids.append((at[keep], half))
-        of.append(np.broadcast_to(group[:, None], depth.shape)[keep])
-    centres, halves = (np.concatenate(column) for column in zip(*solids, strict=True))
-    ellipsoids = quadrics.Ellipsoids(centres, halves, np.tile(axes, (len(centres), 1, 1)))
-    return ellipsoids, np.concatenate(of)
+    shapes = []
+    source = []
+    for (width, height, center), keep in zip(kinds, good, strict=True):
+        if center is None:  # from the top downwards
+            center = point + ((top_height - height / 2) - point @ up)[..., None] * up
+        half = np.stack([width, width, height], -1)[keep] / 2
+        shapes.append((center[keep], half))
+        source.append(np.broadcast_to(group[:, None], depth.shape)[keep])
+    centers, halves = (np.concatenate(column) for column in zip(*shapes, strict=True))
+    ellipsoids = quadrics.Ellipsoids(centers, halves, np.tile(axes, (len(centers), 1, 1)))
+    return ellipsoids, np.concatenate(source)
 
 
 def _upright_axes(up: Array) -> Array:

@@ -1,0 +1,1 @@
+"""Appearance: embeddings of detections, and what their similarity means."""

@@ -1,1 +1,0 @@
-"""identity of reobj_track."""

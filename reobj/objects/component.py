@@ -1,0 +1,239 @@
+"""Associate detections with 3D objects within one connected component of the trajectory.
+
+Classes that move, and detections that no object explains, are left to the linking by appearance
+(`reobj.tracking.linking`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+import quadrics
+from reobj.cameras import Poses, undistort_boxes
+from reobj.objects import confidence
+from reobj.objects.association import Associator, FitShapes
+from reobj.objects.categories import Categories
+from reobj.objects.hypotheses import propose, propose_along_rays
+from reobj.objects.likelihood import NO_SHAPES, PosedDetections, Shapes
+from reobj.objects.observations import Fit, Scene, Views, gather_views
+from reobj.objects.occlusion import edges_above_floor, see_through_ratio
+from reobj.poses.floor import floor_of
+from reobj.tracking.linking import cut_at_gaps
+from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
+
+# Least score of untracked detections that give hypotheses (.3 finds 73.5 objects instead of 72, in
+# 1.2 times the time: docs/trials.md)
+HYPOTHESIS_SCORE = 0.4
+DUPLICATE_IOU = 0.6  # boxes of a class that overlap more are duplicates (NMS: .5 to .7)
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentObjects:
+    """The O objects of a component and the detections assigned to them.
+
+    Attributes:
+        label: (N,) object of each row, or -1. iou: (N,) of the box with the projected object, NaN
+            without one. confidence: (O,) probability that the object exists.
+        floor: of the component, or None. ellipsoids: (O + 1,) of the objects, and NaN at the end.
+    """
+
+    label: IntArray
+    iou: Array
+    confidence: Array
+    floor: quadrics.Floor | None
+    ellipsoids: quadrics.Ellipsoids
+
+
+_UNKNOWN = quadrics.Ellipsoids(*(np.full(s, np.nan) for s in ((1, 3), (1, 3), (1, 3, 3))))
+_NO_SHAPE = Shapes(_UNKNOWN, np.array([""]), np.array([-1]))
+
+
+def associate_component(
+    rows: Tracks,
+    class_names: Sequence[str],
+    poses: Poses,
+    fit: Fit,
+    priors: quadrics.Priors,
+    moving: Collection[str] = (),
+    looked: IntArray | None = None,
+) -> ComponentObjects:
+    """Associate the detections of a component with 3D objects.
+
+    Args:
+        rows: all detections by frame; tracklet 0: untracked. moving: names of classes that move.
+        looked: frames that the detector was run on, the only ones in which a detection can be
+            missed; None: all.
+    """
+    names = np.array([*class_names, ""])
+    used = np.flatnonzero(_is_static_and_posed(rows, names, poses, moving) & ~_duplicates(rows))
+    table = rows[used]
+    tracked = table[table.tracklet_id > 0]
+    label = np.full(len(rows), -1)
+    iou = np.full(len(rows), np.nan)
+    if not len(tracked):
+        return ComponentObjects(label, iou, np.empty(0), None, _UNKNOWN)
+    fragment = cut_at_gaps(tracked, looked)
+    count = int(fragment.max()) + 1
+    observing = _without_unprocessed(poses, looked)
+    views = gather_views(tracked, observing, fragment, count, 0.0)
+    classes = class_shares(tracked, fragment, count).argmax(1)
+    fits = fit(views, classes.tolist(), Scene(trusts_classes=True))
+    floor = find_floor(poses, fits)
+    categories = Categories(priors, names, fits.scale)
+    usual_size = categories.usual_size(classes)
+    on_floor = categories.on_floor(classes)
+    hypotheses = Shapes.concatenate([
+        propose(fits, views, classes, usual_size, floor, on_floor),
+        _propose_from_untracked(table, observing, categories, fits.up, floor),
+    ])  # fmt: skip
+    detections = _posed_detections(table, poses, views)
+    scene = Scene(floor, None, None if poses.metric else fits.scale, trusts_classes=True)
+    fit_shapes = _cached_fit(detections, views, categories, scene, fit)
+    associator = Associator(detections, fit_shapes, categories.size_log_odds)
+    found = associator.run(hypotheses, floor is not None)
+    assigned = np.flatnonzero(found.label >= 0)
+    boxes = _project(found.shapes, views)[detections.view[assigned], found.label[assigned]]
+    label[used] = found.label
+    iou[used[assigned]] = quadrics.box_iou(boxes, detections.box[assigned])
+    see_through = see_through_ratio(
+        found.shapes.ellipsoids, found.evidence.expected, poses, views.frame
+    )
+    return ComponentObjects(
+        label,
+        iou,
+        confidence.of_objects(found, detections, see_through),
+        floor,
+        Shapes.concatenate([found.shapes, _NO_SHAPE]).ellipsoids,
+    )
+
+
+def _is_static_and_posed(
+    rows: Tracks, names: npt.NDArray[np.str_], poses: Poses, moving: Collection[str]
+) -> BoolArray:
+    """Mark rows (N,) of classes that do not move, in frames with a pose."""
+    moves = np.isin(names, list(moving))  # (C + 1,), the last: unknown class
+    static = ~moves[rows.class_id.clip(-1, len(names) - 1)]
+    return np.asarray(static & np.isin(rows.frame, poses.frame[poses.known]))
+
+
+def _duplicates(rows: Tracks) -> BoolArray:
+    """Mark untracked detections that overlap a better one of their class."""
+    found = np.zeros(len(rows), bool)
+    for frame_rows in rows_by(rows.frame):
+        untracked = rows.tracklet_id[frame_rows] == 0
+        best_first = frame_rows[np.lexsort((-rows.score[frame_rows], untracked))]
+        overlaps = box_iou(rows.xyxy[best_first], rows.xyxy[best_first]) > DUPLICATE_IOU
+        overlaps &= rows.class_id[best_first][:, None] == rows.class_id[best_first]
+        for i in range(len(best_first)):
+            if not found[best_first[i]]:
+                later = best_first[i + 1 :]
+                found[later] |= overlaps[i, i + 1 :] & (rows.tracklet_id[later] == 0)
+    return found
+
+
+def _without_unprocessed(poses: Poses, looked: IntArray | None) -> Poses:
+    """Remove the poses of frames that the detector was not run on."""
+    if looked is None:
+        return poses
+    unprocessed = ~np.isin(poses.frame, looked)[:, None, None]
+    return dataclasses.replace(
+        poses, cam_from_world=np.where(unprocessed, np.nan, poses.cam_from_world)
+    )
+
+
+def find_floor(poses: Poses, fits: quadrics.ObjectFits) -> quadrics.Floor | None:
+    """Find the floor, given the scale and gravity of the fits; None: unknown."""
+    if fits.scale.source == "none" or not fits.up.any():
+        return None
+    plane, _ = floor_of(poses, fits.up, fits.scale.value)
+    return None if plane is None else quadrics.Floor(plane.normal, plane.offset, plane.sigma)
+
+
+def _propose_from_untracked(
+    table: Tracks,
+    poses: Poses,
+    categories: Categories,
+    up: Array,
+    floor: quadrics.Floor | None,
+) -> Shapes:
+    """Propose shapes along the rays of good untracked detections: photos have many."""
+    table = table[(table.tracklet_id == 0) & (table.score >= HYPOTHESIS_SCORE)]
+    views = gather_views(table, poses, np.arange(len(table)), len(table), 0.0)
+    classes = table.class_id
+    usual_size = categories.usual_size(classes)
+    on_floor = categories.on_floor(classes)
+    return propose_along_rays(views, classes, usual_size, up, floor, on_floor)
+
+
+def _posed_detections(table: Tracks, poses: Poses, views: Views) -> PosedDetections:
+    """Arrange rows of frames with a pose, by frame."""
+    before, after = np.full((2, len(table)), -1)
+    order = np.lexsort((table.frame, table.tracklet_id))
+    tracklet = table.tracklet_id[order]
+    follows = (np.diff(tracklet) == 0) & (tracklet[1:] > 0)
+    after[order[:-1][follows]] = order[1:][follows]
+    before[order[1:][follows]] = order[:-1][follows]
+    return PosedDetections(
+        np.searchsorted(views.frame, table.frame),
+        undistort_boxes(table.xyxy, poses.camera),
+        table.score,
+        table.class_id,
+        before,
+        after,
+        views.img_from_world,
+        views.image_size,
+    )
+
+
+def _project(shapes: Shapes, views: Views) -> Array:
+    """Return the boxes (V, O, 4) of shapes in the images, NaN where they are out of view."""
+    boxes = quadrics.solid_boxes(shapes.ellipsoids, list(shapes.support), views.img_from_world)
+    return quadrics.clip_boxes(boxes, views.image_size)
+
+
+def _cached_fit(
+    detections: PosedDetections, views: Views, categories: Categories, scene: Scene, fit: Fit
+) -> FitShapes:
+    """Return the function that fits shapes to detections; it fits each set of them once."""
+    cache: dict[tuple[bytes, int], Shapes] = {}
+
+    def fit_shapes(
+        rows: IntArray, label: IntArray, classes: IntArray, current: Shapes | None
+    ) -> Shapes:
+        order = np.lexsort((rows, label))
+        rows = rows[order]
+        label = label[order]
+        occluded = np.zeros((len(rows), 4), bool)
+        if current is not None and scene.floor is not None:
+            projected = _project(current, views)[detections.view[rows], label]
+            occluded = edges_above_floor(detections.box[rows], projected)
+            occluded &= categories.on_floor(classes)[label, None]
+        start = np.searchsorted(label, np.arange(len(classes) + 1))
+        slices = [slice(a, b) for a, b in itertools.pairwise(start)]
+        keys = [
+            (rows[s].tobytes() + occluded[s].tobytes(), c)
+            for s, c in zip(slices, classes.tolist(), strict=True)
+        ]
+        missing = [k for k, key in enumerate(keys) if key not in cache]
+        if missing:
+            boxes = np.full((len(views.frame), len(missing), 4), np.nan)
+            score = np.zeros(boxes.shape[:2])
+            edges = np.zeros(boxes.shape, bool)
+            for column, k in enumerate(missing):
+                cell = detections.view[rows[slices[k]]], column
+                boxes[cell] = detections.box[rows[slices[k]]]
+                score[cell] = detections.score[rows[slices[k]]]
+                edges[cell] = occluded[slices[k]]
+            seen = Views(views.frame, boxes, score, views.img_from_world, views.image_size, edges)
+            fits = fit(seen, classes[missing].tolist(), scene)
+            shapes = Shapes(fits.ellipsoids, fits.support, classes[missing])
+            cache.update((keys[k], shapes[[column]]) for column, k in enumerate(missing))
+        return Shapes.concatenate([NO_SHAPES, *(cache[key] for key in keys)])
+
+    return fit_shapes

@@ -1,0 +1,97 @@
+"""Confidence of an object: the probability that it exists and is not a duplicate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reobj.objects.association import Association
+from reobj.objects.likelihood import PosedDetections, logit
+from reobj.types import Array, BoolArray, IntArray, Tracks, rows_by
+
+# Logistic regression of existence: intercept, log odds of the best scores, hit rate over the frames
+# where the object should be visible, see-through ratio (`occlusion.see_through_ratio`). Fitted to
+# 1,202 objects of 48 runs of 10 rooms (docs/tracking.md)
+CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
+USUAL_HIT_RATE = 0.75  # if it should be visible in no frame, as an always truncated table (mean)
+NO_SHAPE = -1.9  # instead of the intercept for identities without a 3D object (8 of 89 were real)
+# Number and least fraction of an object's detections that its score is taken from: most views of a
+# half-occluded object are poor (20 to 40 are alike; all of them, or ten, are worse: docs/trials.md)
+BEST_DETECTIONS = 30
+BEST_FRACTION = 0.25
+LOW_CONFIDENCE = 0.5  # below it an object is more likely absent than present
+
+
+def existence_probability(score: Array, hit_rate: Array, see_through: Array | float = 0.0) -> Array:
+    """Return the probability that objects exist.
+
+    Args:
+        score: `log_best_odds` of the detections. see_through: `occlusion.see_through_ratio`.
+        hit_rate: over the frames where the object should be visible; NaN: it has no shape.
+    """
+    intercept, of_score, of_hit_rate, of_see_through = CONFIDENCE
+    geometry = intercept + of_hit_rate * hit_rate + of_see_through * see_through
+    geometry = np.where(np.isnan(hit_rate), NO_SHAPE, geometry)
+    return np.asarray(1 / (1 + np.exp(-geometry - of_score * score)))
+
+
+def log_best_odds(score: Array, group: IntArray, count: int) -> Array:
+    """Return the log of the mean odds (count,) of the best scores (N,) of each group, -inf: none.
+
+    These are its best BEST_DETECTIONS, or its best BEST_FRACTION if that is more.
+    """
+    order = np.lexsort((-score, group))
+    size = np.bincount(group, minlength=count)
+    rank = np.arange(len(group)) - np.repeat(np.cumsum(size) - size, size)
+    used = np.maximum(BEST_DETECTIONS, np.ceil(BEST_FRACTION * size)).clip(max=size)
+    best = order[rank < np.repeat(used, size)]
+    odds = np.bincount(group[best], np.exp(logit(score[best])), count)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(odds / used.clip(1)))
+
+
+def of_objects(found: Association, detections: PosedDetections, see_through: Array) -> Array:
+    """Return the confidence (O,) of associated objects."""
+    assigned = np.flatnonzero(found.label >= 0)
+    label = found.label[assigned]
+    view = detections.view[assigned]
+    expected = found.evidence.expected
+    score = log_best_odds(detections.score[assigned], label, len(found.shapes))
+    hits = np.bincount(label, expected[view, label], len(found.shapes))
+    hit_rate = np.where(expected.any(0), hits / expected.sum(0).clip(1), USUAL_HIT_RATE)
+    return existence_probability(score, hit_rate, see_through)
+
+
+def of_identities(
+    tracks: Tracks, label: IntArray, posed: BoolArray, of_object: Array
+) -> dict[int, float]:
+    """Return the confidence of identities: of the 3D object, or from the scores without one.
+
+    Identities seen only in frames without a pose get no confidence.
+
+    Args:
+        label: (N,) 3D object of each row, or -1. posed: (N,) the frame has a pose.
+        of_object: confidence of the 3D objects.
+    """
+    found = {}
+    for rows in rows_by(tracks.track_id):
+        if not posed[rows].any():
+            continue
+        labels = label[rows][label[rows] >= 0]
+        if len(labels):
+            value = of_object[labels[:1]]
+        else:
+            score = log_best_odds(tracks.score[rows], np.zeros(len(rows), np.int64), 1)
+            value = existence_probability(score, np.array([np.nan]))
+        found[int(tracks.track_id[rows[0]])] = float(value[0])
+    return found
+
+
+def with_low_confidence(status: str, reason: str, confidence: float) -> tuple[str, str]:
+    """Return status and reason of an object; below LOW_CONFIDENCE its status is "doubtful"."""
+    if confidence >= LOW_CONFIDENCE:
+        return status, reason
+    why = f"{100 * confidence:.0f} % likely to exist: low detection scores, few of the expected "
+    why += "detections, or background points visible through it"
+    if status == "rejected":
+        why += f"; {reason}"
+    return "doubtful", why

@@ -1,0 +1,80 @@
+"""Options of the object stage, and the fit function that they define."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import quadrics
+from reobj.cameras import Poses
+from reobj.objects.observations import UNKNOWN_SCENE, Fit, Scene, Views
+from reobj.options import load_size_priors, parse_known_size, parse_up
+from reobj.types import ReobjError, option
+
+DEFAULT_SOLVER = "solids"
+PUBLISHED_SOLVERS = ("lfd", "sfmo", "psfmo")
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectsConfig:
+    """Fit one shape and its ellipsoid to every object, from tracks and cameras."""
+
+    priors: str = option("", "size priors, JSON (default: the bundled priors.json)", "--priors")
+    known_size: str = option(
+        "", "true heights that set the metric scale: 'chair=.82m,door=2m'", "--known-size"
+    )
+    support: str = option(
+        "auto",
+        "kind of shape: box, cylinder, ellipsoid, or auto (from the category, else model "
+        "selection); old flag: --support",
+        "--shape",
+        "--support",
+    )
+    solver: str = option(
+        DEFAULT_SOLVER,
+        "solids (default), or a published closed-form solver: lfd, sfmo, psfmo",
+        "--solver",
+    )
+    up: str = option("", "direction against gravity in the world, x,y,z (default: estimated)")
+    link: bool = option(True, "join and split the tracks after the video")
+    min_views: int = option(3, "an object seen in fewer frames with a pose gets no ellipsoid")
+    moving: str = option(
+        "person,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe",
+        "classes that move, comma-separated: tracked, but without an ellipsoid",
+    )
+
+    @property
+    def moving_classes(self) -> tuple[str, ...]:
+        """Names in `moving`."""
+        return tuple(filter(None, (name.strip() for name in self.moving.split(","))))
+
+
+def make_fit(config: ObjectsConfig, poses: Poses, class_names: Sequence[str]) -> Fit:
+    """Bind priors, known sizes, gravity and the kind of shape to `quadrics.fit_objects`.
+
+    Raises:
+        ReobjError, QuadricsError: an option is invalid, or the priors file cannot be read.
+    """
+    priors = load_size_priors(config.priors)
+    known_size = parse_known_size(config.known_size)
+    solvers = (DEFAULT_SOLVER, *PUBLISHED_SOLVERS)
+    if config.solver not in solvers:
+        expected = f"{DEFAULT_SOLVER} or {', '.join(PUBLISHED_SOLVERS)}"
+        raise ReobjError(f"--solver {config.solver}: expected {expected}")
+    up = parse_up(config.up) if config.up else poses.up_in_world
+    support = None if config.support == "auto" else config.support
+
+    def fit(views: Views, classes: list[int], scene: Scene = UNKNOWN_SCENE) -> quadrics.ObjectFits:
+        names = [class_names[c] if c < len(class_names) else "" for c in classes]
+        fits = quadrics.fit_objects(
+            views.boxes, views.img_from_world, views.image_size, names, priors,
+            up=scene.up if up is None else up, support=support, score=views.score,
+            hidden=views.occluded, metric=poses.metric if scene.scale is None else scene.scale,
+            known_size=known_size, floor=scene.floor, points=views.points,
+            config=quadrics.FitConfig(wrong_class=0) if scene.trusts_classes else None,
+        )  # fmt: skip
+        up_is_given = up is not None or scene.up is None
+        return fits if up_is_given else dataclasses.replace(fits, up_source="floor")
+
+    return fit

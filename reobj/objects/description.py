@@ -1,0 +1,224 @@
+"""Describe fitted objects and their world: the entries of objects.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import quadrics
+from reobj.cameras import Poses, quat_wxyz_from_matrix
+from reobj.files import numbers, rounded, shortened
+from reobj.objects.categories import name_of
+from reobj.objects.confidence import with_low_confidence
+from reobj.objects.config import ObjectsConfig
+from reobj.objects.likelihood import CLASS_KEPT
+from reobj.objects.observations import Views
+from reobj.poses.floor import floor_of
+from reobj.results.result import Object, Part, World, significant
+from reobj.types import Array, LinkEvent, Tracks, object_classes, rows_by
+
+
+def describe_objects(
+    tracks: Tracks,
+    class_names: Sequence[str],
+    fits: quadrics.ObjectFits | None,
+    views: Views | None,
+    config: ObjectsConfig,
+    confidence: Mapping[int, float] | None = None,
+    component: int = 0,
+) -> list[Object]:
+    """Describe every identity of the tracks: class, visits, and its shape or why it has none.
+
+    Without cameras the status of all is "tracked".
+
+    Args:
+        fits, views: of the identities in ascending order; None without cameras.
+        confidence: of identities, where it is known. component: of the trajectory.
+    Returns:
+        one `Object` per identity, by id.
+    """
+    objects = []
+    iou = np.empty(0)
+    if fits is not None and views is not None:
+        cameras = (views.img_from_world, views.image_size)
+        iou = quadrics.reprojection_iou(fits, views.boxes, *cameras)  # (V, O)
+    class_count = len(np.unique(tracks.class_id))
+    for i, (identity, class_id) in enumerate(object_classes(tracks).items()):
+        rows = tracks[tracks.track_id == identity]
+        frames_of_tracklets = [rows.frame[r] for r in rows_by(rows.tracklet_id)]
+        class_name = name_of(class_names, class_id)
+        moves = class_name in config.moving_classes
+        fields: dict[str, Any] = {"status": "tracked", "reason": ""}
+        if fits is not None and views is not None:
+            fields = _fit_fields(fits, i, views, iou[:, i], moves, config.min_views)
+        if confidence and identity in confidence and not moves:
+            value = confidence[identity]
+            status, reason = with_low_confidence(fields["status"], fields["reason"], value)
+            fields |= {"status": status, "reason": reason, "confidence": round(value, 3)}
+        objects.append(
+            Object(
+                id=identity,
+                class_name=class_name,
+                score=round(float(rows.score.mean()), 4),
+                frames_seen=len(np.unique(rows.frame)),
+                tracklet_ids=np.unique(rows.tracklet_id).tolist(),
+                visits=sorted([int(f.min()), int(f.max())] for f in frames_of_tracklets),
+                classes=_likeliest_classes(rows, class_names, class_count),
+                part=component,
+                **fields,
+            )
+        )
+    return objects
+
+
+# frames with the same detector error, which count as one (chosen: a third of a second)
+CORRELATED_VIEWS = 10
+
+
+def _likeliest_classes(
+    rows: Tracks, class_names: Sequence[str], class_count: int
+) -> dict[str, float]:
+    """Return the probabilities of the likeliest two classes of an object, from all its detections.
+
+    Class confusion model: correct with CLASS_KEPT, else uniform over the other classes.
+
+    Args:
+        class_count: number of classes that any object of the video may have.
+    """
+    classes, column = np.unique(rows.class_id, return_inverse=True)
+    votes = np.bincount(column, rows.score) / CORRELATED_VIEWS
+    log_odds = votes * np.log(CLASS_KEPT / (1 - CLASS_KEPT) * max(class_count - 1, 1))
+    probability = np.exp(log_odds - log_odds.max())
+    probability /= probability.sum() + (class_count - len(classes)) * np.exp(-log_odds.max())
+    best = np.argsort(-probability, kind="stable")[:2]
+    return {name_of(class_names, int(classes[k])): round(float(probability[k]), 3) for k in best}
+
+
+def _fit_fields(
+    fits: quadrics.ObjectFits, i: int, views: Views, iou: Array, moves: bool, min_views: int
+) -> dict[str, Any]:
+    """Return the fields of object i that its fit determines."""
+    seen = np.isfinite(views.boxes[:, i, 0])
+    view_count = int(seen.sum())
+    status, reason, support = _verdict(fits, i, moves, view_count, min_views)
+    fields = {
+        "status": status,
+        "reason": reason,
+        "support": support,
+        "views": view_count,
+        "dropped_boxes": int((seen & ~fits.inlier[:, i]).sum()),
+        "parallax_deg": rounded(fits.parallax_deg[i], 2),
+        "reprojection_iou_median": rounded(np.median(iou[seen]), 3) if seen.any() else None,
+    }
+    return fields if status == "rejected" else fields | _shape_fields(fits, i)
+
+
+def _verdict(
+    fits: quadrics.ObjectFits, i: int, moves: bool, view_count: int, min_views: int
+) -> tuple[str, str, str | None]:
+    """Return the status of object i, its reason, and the kind of shape."""
+    if moves:
+        return "rejected", "objects of this class move", None
+    if view_count < min_views:
+        seen_in = f"seen in {view_count} frame{'s' * (view_count != 1)} with a camera pose"
+        return "rejected", f"{seen_in}; {min_views} are needed", None
+    return str(fits.status[i]), str(fits.reason[i]), str(fits.support[i])
+
+
+def _shape_fields(fits: quadrics.ObjectFits, i: int) -> dict[str, Any]:
+    """Return ellipsoid, size and covariance of object i, None where unknown."""
+    scale = fits.scale
+    variance = np.diag(fits.cov[i])[3:6] + scale.rel_sigma**2  # of log sizes in metres: both
+    rotation = fits.ellipsoids.world_from_obj[i : i + 1]
+    values = {
+        "center": fits.ellipsoids.center_in_world[i],
+        "half_axes": fits.ellipsoids.half_axes[i],
+        "quat_wxyz": quat_wxyz_from_matrix(rotation)[0],
+        "size": fits.size[i],
+        "size_m": fits.size[i] * scale.value if scale.source != "none" else None,
+        "size_rel_sigma": np.sqrt(variance),
+        "cov": fits.cov[i],
+    }
+    unknown = {k for k, v in values.items() if v is None or not np.isfinite(v).all()}
+    fields = {k: None if k in unknown else significant(v) for k, v in values.items()}
+    if fields["center"] is not None:
+        size = float(np.max(values["half_axes"]))
+        fields["center"] = significant(values["center"], size)
+    return fields
+
+
+def describe_world(
+    poses: Poses | None,
+    fits: Sequence[quadrics.ObjectFits | None],
+    events: Sequence[LinkEvent],
+) -> World:
+    """Describe the world of the poses: units, gravity, scale, floor, frames, joins and splits.
+
+    Args:
+        fits: of each component, None where nothing was fitted.
+    """
+    if poses is None:
+        return World(links=tuple(events))
+    components = tuple(_describe_component(poses, k, fit) for k, fit in enumerate(fits))
+    largest = components[0]
+    return World(
+        units="m" if poses.metric else "arbitrary",
+        source=poses.source,
+        registered_frames=largest.registered_frames,
+        interpolated_frames=largest.interpolated_frames,
+        frames=len(poses.frame),
+        up_in_world=largest.up_in_world,
+        up_source=largest.up_source,
+        scale=largest.scale,
+        links=tuple(events),
+        parts=components,
+        floor=largest.floor,
+        floor_reason=largest.floor_reason,
+        reading=poses.reading,
+    )
+
+
+def _describe_component(poses: Poses, component: int, fits: quadrics.ObjectFits | None) -> Part:
+    """Describe one component of the trajectory from its frames and its fits."""
+    row = np.flatnonzero(poses.part == component)
+    poses = poses.of_part(component)
+    runs = np.split(poses.frame, np.flatnonzero(np.diff(row) > 1) + 1)
+    scale = None
+    up = poses.up_in_world
+    up_source = "none" if up is None else "poses"
+    if fits is not None:
+        (value,) = numbers(np.array([fits.scale.value]), 1.0)
+        scale = quadrics.Scale(value, round(fits.scale.rel_sigma, 4), fits.scale.source)
+        if fits.up.any():
+            up = fits.up
+            up_source = fits.up_source
+    up = None if up is None else significant(up)
+    known_scale = None if scale is None or scale.source == "none" else scale.value
+    floor, reason = floor_of(poses, up, 1.0 if poses.metric else known_scale)
+    return Part(
+        spans=[[int(run[0]), int(run[-1])] for run in runs if len(run)],
+        frames=len(poses.frame),
+        registered_frames=int(poses.known.sum()),
+        interpolated_frames=int((poses.status == "interpolated").sum()),
+        up_in_world=up,
+        up_source=up_source,
+        scale=scale,
+        floor=floor,
+        floor_reason=reason,
+    )
+
+
+def components_message(poses: Poses) -> list[str]:
+    """Return a warning if the trajectory has several components: consequences, and what helps."""
+    if poses.part_count == 1:
+        return []
+    components = describe_world(poses, [None] * poses.part_count, []).parts
+    where = shortened([f"component {k}: {part.span_text}" for k, part in enumerate(components)])
+    return [
+        f"the trajectory has {len(components)} components that do not connect ({where}): each has "
+        "its own frame and scale, and an object seen in two of them is listed twice. To get one "
+        "component, record with more overlap and slower turns, or give --poses; identities can be "
+        "joined by hand (in scene.html, then `objects OUT --edits`)"
+    ]

@@ -1,0 +1,502 @@
+"""From tracks and cameras to objects: link the tracks, fit one shape to every identity.
+
+Each connected component of the trajectory (`Poses.part`) has a world and a scale of its own and is
+processed like a video of its own. Identities are numbered over all components. Every step takes
+values and returns values; `link_and_fit` loops over the components.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import quadrics
+from reobj.cameras import Poses, place_of
+from reobj.objects import confidence
+from reobj.objects.categories import name_of, on_floor
+from reobj.objects.component import ComponentObjects, associate_component, find_floor
+from reobj.objects.config import ObjectsConfig, make_fit
+from reobj.objects.description import describe_objects, describe_world
+from reobj.objects.observations import (
+    MIN_SCORE,
+    UNKNOWN_SCENE,
+    Fit,
+    Scene,
+    gather_views,
+    points_on,
+)
+from reobj.objects.occlusion import occluded_edges
+from reobj.results.edits import Edits, apply_edits
+from reobj.results.result import Object, Result
+from reobj.tracking.interpolation import fill_from_objects, fill_gaps
+from reobj.tracking.linking import FRAGMENT_GAP, link
+from reobj.types import (
+    Embeddings,
+    IntArray,
+    LinkEvent,
+    ReobjError,
+    Tracks,
+    looks,
+    object_classes,
+    rows_by,
+)
+
+
+def link_and_fit(result: Result, config: ObjectsConfig) -> Result:
+    """Decide which detections belong to one object, and fit a shape to each object.
+
+    An object lies in one component: an identity ends at a break of the trajectory. Only identities
+    given by the user may span components; their shape is fitted in the component with most of
+    their boxes. The result's edits are applied after linking. Edits of an earlier fit that no
+    longer find their objects are skipped with a warning.
+
+    Returns:
+        the result with its tracks (identities; untracked detections may join them), objects, fits
+        and world.
+    Raises:
+        ReobjError: an edit made now does not find its object.
+    """
+    priors = quadrics.load_priors(config.priors or None)
+    poses = result.poses
+    components = _split_trajectory(poses, config, result.class_names)
+    if result.identities_given:
+        linked = _unlinked(result.tracks, len(components))
+    else:
+        tables = zip(components, _split_table(result), strict=True)
+        linked = _joined(
+            _link_component(component, table, source, result, priors, config)
+            for component, (table, source) in tables
+        )
+    edited = _Edited(linked, result.class_names, [], None)
+    if result.edits is not None:
+        edited = _edit(linked, result, result.edits, priors)
+        components = _split_trajectory(poses, config, edited.class_names)
+    linked = edited.linked
+    identity, object_of_row = np.unique(linked.tracks.track_id, return_inverse=True)
+    component_of_object = _component_with_most_boxes(
+        linked.tracks, object_of_row, len(identity), poses
+    )
+    objects = list[Object]()
+    fits = list[quadrics.ObjectFits | None]()
+    for component in components:
+        rows = np.flatnonzero(component_of_object[object_of_row] == component.number)
+        described, fit = _fit_component(component, rows, linked, edited.class_names, priors, config)
+        objects += described
+        fits.append(fit)
+    embeddings, embedding_row = _select_embeddings(result, linked.source)
+    return dataclasses.replace(
+        result,
+        tracks=linked.tracks,
+        class_names=edited.class_names,
+        objects=sorted(objects, key=lambda o: o.id),
+        world=describe_world(poses, fits, linked.events),
+        fits=fits[0] if poses is None else join_fits(fits, component_of_object, poses),
+        embeddings=embeddings,
+        embedding_row=embedding_row,
+        warnings=[*result.warnings, *edited.warnings],
+        edits=edited.edits,
+    )
+
+
+class _Component(NamedTuple):
+    """A connected component of the trajectory: its poses, and how its objects are fitted.
+
+    Attributes:
+        number: 0 the largest. poses: None without cameras. fit: None if no component has enough
+            poses.
+    """
+
+    number: int
+    poses: Poses | None
+    fit: Fit | None
+
+
+def _split_trajectory(
+    poses: Poses | None, config: ObjectsConfig, class_names: Sequence[str]
+) -> list[_Component]:
+    """Split the trajectory into its components.
+
+    An upward direction given by the user is that of the largest, component 0.
+    """
+    if poses is None:
+        return [_Component(0, None, None)]
+    poses_of = [poses.of_part(k) for k in range(poses.part_count)]
+    if not any(p.known.sum() >= config.min_views for p in poses_of):
+        return [_Component(k, p, None) for k, p in enumerate(poses_of)]
+    others = dataclasses.replace(config, up="")
+    return [
+        _Component(k, p, make_fit(config if k == 0 else others, p, class_names))
+        for k, p in enumerate(poses_of)
+    ]
+
+
+# ---- Linking -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Linked:
+    """Tracks with the identities of objects, of one or of all components.
+
+    Attributes:
+        tracks: N rows. source: (N,) row of the result's tracks, -1: an untracked detection.
+        category: (N,) class whose size prior is used.
+        events: joins and splits. confidence: of identities.
+        objects: of each component, None where no association was made. label_of: number of the
+            object in these of an identity.
+    """
+
+    tracks: Tracks
+    source: IntArray
+    category: IntArray
+    events: list[LinkEvent]
+    confidence: dict[int, float]
+    objects: list[ComponentObjects | None]
+    label_of: dict[int, int]
+
+
+def _unlinked(tracks: Tracks, count: int) -> _Linked:
+    """Keep the identities of the tracks as they are, for `count` components."""
+    return _Linked(tracks, np.arange(len(tracks)), tracks.class_id, [], {}, [None] * count, {})
+
+
+def _split_table(result: Result) -> list[tuple[Tracks, IntArray]]:
+    """Split all detections by component, and cut tracklets at the breaks.
+
+    Returns:
+        for each component the table and (N,) row of the result's tracks, or -1.
+    """
+    table, source = _with_untracked(result.tracks, result.untracked)
+    if result.poses is None:
+        return [(table, source)]
+    component = _component_of_rows(table, result.poses)
+    table = _cut_at_breaks(table, component)
+    rows_of = [np.flatnonzero(component == k) for k in range(result.poses.part_count)]
+    return [(table[rows], source[rows]) for rows in rows_of]
+
+
+def _link_component(
+    component: _Component,
+    table: Tracks,
+    source: IntArray,
+    result: Result,
+    priors: quadrics.Priors,
+    config: ObjectsConfig,
+) -> _Linked:
+    """Link the tracks of a component; identities are numbered from 1.
+
+    Args:
+        table: detections of the component. source: (N,) their rows in the result's tracks, or -1.
+    """
+    _, poses, fit = component
+    objects = None
+    if config.link and fit and poses is not None and poses.known.sum() >= config.min_views:
+        moving = config.moving_classes
+        objects = associate_component(
+            table, result.class_names, poses, fit, priors, moving, result.looked
+        )
+    label = np.full(len(table), -1) if objects is None else objects.label
+    keep = (source >= 0) | (label >= 0)
+    table = table[keep]
+    source = source[keep]
+    label = label[keep]
+    tracks = _with_tracklets(table, label, result.looked)
+    events = list[LinkEvent]()
+    if config.link:
+        tracks, events = link(
+            tracks, result.class_names, *_select_embeddings(result, source),
+            None if objects is None else poses, moving=config.moving_classes,
+            label=None if objects is None else label,
+            iou=None if objects is None else objects.iou[keep], looked=result.looked,
+        )  # fmt: skip
+    else:
+        tracks = tracks.with_identities(tracks.track_id)
+    certainty: dict[int, float] = {}
+    label_of: dict[int, int] = {}
+    if objects is not None and poses is not None:
+        posed = np.isin(tracks.frame, poses.frame[poses.known])
+        certainty = confidence.of_identities(tracks, label, posed, objects.confidence)
+        shown = label >= 0
+        label_of = dict(zip(tracks.track_id[shown].tolist(), label[shown].tolist(), strict=True))
+    return _Linked(tracks, source, tracks.class_id, events, certainty, [objects], label_of)
+
+
+def _joined(components: Iterable[_Linked]) -> _Linked:
+    """Join the linked components; identities are numbered after those of the components before."""
+    joined = list[Tracks]()
+    sources = list[IntArray]()
+    events = list[LinkEvent]()
+    objects = list[ComponentObjects | None]()
+    certainty: dict[int, float] = {}
+    label_of: dict[int, int] = {}
+    offset = 0
+    for linked in components:
+        joined.append(dataclasses.replace(linked.tracks, track_id=linked.tracks.track_id + offset))
+        sources.append(linked.source)
+        events += linked.events
+        objects += linked.objects
+        certainty |= {identity + offset: value for identity, value in linked.confidence.items()}
+        label_of |= {identity + offset: label for identity, label in linked.label_of.items()}
+        offset = int(joined[-1].track_id.max(initial=offset))
+    order = np.argsort(np.concatenate([tracks.frame for tracks in joined]), kind="stable")
+    tracks = Tracks.joined(joined)
+    source = np.concatenate(sources)[order]
+    return _Linked(tracks, source, tracks.class_id, events, certainty, objects, label_of)
+
+
+def _with_untracked(tracks: Tracks, untracked: Tracks) -> tuple[Tracks, IntArray]:
+    """Insert the untracked detections among the rows of the tracks, by frame.
+
+    Returns:
+        the table; (N,) row of the tracks of each of its rows, or -1.
+    """
+    source = np.append(np.arange(len(tracks)), np.full(len(untracked), -1))
+    order = np.argsort(np.append(tracks.frame, untracked.frame), kind="stable")
+    return Tracks.joined([tracks, untracked]), source[order]
+
+
+def _with_tracklets(table: Tracks, label: IntArray, looked: IntArray | None = None) -> Tracks:
+    """Give untracked rows the tracklet of the previous row of their object, or a new one.
+
+    A tracklet ends at a gap of more than FRAGMENT_GAP frames in which the detector was run.
+    """
+    tracklet = table.tracklet_id.copy()
+    unused = int(tracklet.max(initial=0)) + 1
+    number, unit = looks(table, looked)
+    taken = set(zip(table.frame.tolist(), tracklet.tolist(), strict=True))
+    for rows in rows_by(label):
+        if label[rows[0]] < 0:
+            continue
+        for before, row in itertools.pairwise([-1, *rows.tolist()]):
+            if tracklet[row]:
+                continue
+            continues = before >= 0 and number[row] - number[before] <= FRAGMENT_GAP * unit
+            key = int(table.frame[row]), int(tracklet[before])
+            if continues and key not in taken:
+                tracklet[row] = tracklet[before]
+                taken.add(key)
+            else:
+                tracklet[row] = unused
+                unused += 1
+    return dataclasses.replace(table, tracklet_id=tracklet)
+
+
+def _component_of_rows(tracks: Tracks, poses: Poses) -> IntArray:
+    """Return the component (N,) of rows: of their frame, or without a pose of their tracklet.
+
+    At a break, an unposed detection joins the component of the nearest posed detection of its
+    tracklet.
+    """
+    component = poses.part_of(tracks.frame)
+    _, posed = place_of(poses, tracks.frame)
+    for rows in rows_by(tracks.tracklet_id) if poses.part_count > 1 else ():
+        unposed_rows = rows[~posed[rows]]
+        posed_rows = rows[posed[rows]]
+        if tracks.tracklet_id[rows[0]] and len(unposed_rows) and len(posed_rows):
+            gap = np.abs(tracks.frame[unposed_rows, None] - tracks.frame[posed_rows])
+            component[unposed_rows] = component[posed_rows[gap.argmin(1)]]
+    return component
+
+
+def _cut_at_breaks(tracks: Tracks, component: IntArray) -> Tracks:
+    """Cut tracklets where the component (N,) of their rows changes; later pieces are renumbered."""
+    tracklet = tracks.tracklet_id.copy()
+    for k in range(1, int(component.max(initial=0)) + 1):
+        in_earlier = np.isin(tracklet, tracklet[component < k])
+        spanning = (component == k) & (tracklet > 0) & in_earlier
+        piece = np.unique(tracklet[spanning], return_inverse=True)[1]
+        tracklet[spanning] = tracklet.max() + 1 + piece
+    return dataclasses.replace(tracks, tracklet_id=tracklet)
+
+
+def _select_embeddings(result: Result, source: IntArray) -> tuple[Embeddings, IntArray]:
+    """Select the embeddings of a table whose rows are rows (N,) of the result's tracks, or -1.
+
+    Returns:
+        n embeddings, and their rows (n,) in the table.
+    """
+    row_in_table = np.full(len(result.tracks), -1)
+    row_in_table[source[source >= 0]] = np.flatnonzero(source >= 0)
+    row = row_in_table[result.embedding_row]
+    foreground = result.embeddings.foreground
+    background = result.embeddings.background
+    return Embeddings(foreground[row >= 0], background[row >= 0]), row[row >= 0]
+
+
+# ---- Edits -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Edited:
+    """Linked tracks after the user's edits, the class names, warnings, and the applied edits."""
+
+    linked: _Linked
+    class_names: tuple[str, ...]
+    warnings: list[str]
+    edits: Edits | None
+
+
+def _edit(linked: _Linked, result: Result, edits: Edits, priors: quadrics.Priors) -> _Edited:
+    """Correct identities and classes by hand; an object that the user names certainly exists.
+
+    A new name that the priors know is a new category. Any other is a label: the size prior stays
+    that of the detector's class.
+    """
+    before = linked.tracks
+    try:
+        applied = apply_edits(before, result.class_names, edits)
+    except ReobjError as error:
+        if not edits.kept:
+            raise
+        warning = f"{error}; no correction of this file was applied"
+        return _Edited(linked, result.class_names, [warning], None)
+    certainty: dict[int, float] = {}
+    previous: dict[int, set[int]] = {}
+    pairs = zip(applied.tracks.track_id.tolist(), before.track_id.tolist(), strict=True)
+    for new, old in set(pairs):
+        previous.setdefault(new, set()).add(old)
+        if old in linked.confidence:
+            value = 1.0 if new in applied.confirmed else linked.confidence[old]
+            certainty[new] = max(value, certainty.get(new, 0.0))
+    names = [name_of(applied.class_names, c) for c in range(len(applied.class_names))]
+    has_prior = np.append(priors.index(names) >= 0, False)[applied.tracks.class_id]  # (N,)
+    category = np.where(has_prior, applied.tracks.class_id, before.class_id)
+    edited = dataclasses.replace(
+        linked,
+        tracks=applied.tracks[applied.keep],
+        source=linked.source[applied.keep],
+        category=category[applied.keep],
+        confidence=certainty,
+        label_of={i: label for i, label in linked.label_of.items() if previous.get(i) == {i}},
+    )
+    return _Edited(edited, applied.class_names, applied.messages, edits)
+
+
+# ---- Fitting -----------------------------------------------------------------------------------
+
+
+def _component_with_most_boxes(
+    tracks: Tracks, object_of_row: IntArray, count: int, poses: Poses | None
+) -> IntArray:
+    """Return the component (O,) with most boxes of each object; boxes that a fit can use first.
+
+    Args:
+        object_of_row: (N,) object of each row of the tracks, of `count`.
+    """
+    component = np.zeros(len(tracks), np.int64)
+    usable = tracks.score >= MIN_SCORE
+    if poses is not None:
+        component = poses.part_of(tracks.frame)
+        usable &= place_of(poses, tracks.frame)[1]
+    votes = np.zeros((count, int(component.max(initial=0)) + 1))
+    weight = np.where(usable, 1.0, 1 / (len(tracks) + 1))
+    np.add.at(votes, (object_of_row, component), weight)
+    return np.asarray(votes.argmax(1), np.int64)
+
+
+def _fit_component(
+    component: _Component,
+    rows: IntArray,
+    linked: _Linked,
+    class_names: Sequence[str],
+    priors: quadrics.Priors,
+    config: ObjectsConfig,
+) -> tuple[list[Object], quadrics.ObjectFits | None]:
+    """Fit and describe the objects of a component.
+
+    Args:
+        rows: of its objects in the linked tracks.
+    """
+    number, poses, fit = component
+    tracks = linked.tracks[rows]
+    fits = views = None
+    if len(tracks) and fit is not None and poses is not None:
+        classes = object_classes(dataclasses.replace(tracks, class_id=linked.category[rows]))
+        categories = list(classes.values())
+        group = np.searchsorted(list(classes), tracks.track_id)
+        views = gather_views(tracks, poses, group, len(classes), MIN_SCORE)
+        objects = linked.objects[number]
+        if objects is None:
+            first = fit(views, categories, UNKNOWN_SCENE)
+            floor = find_floor(poses, first)
+            ellipsoids = first.ellipsoids
+        else:
+            label = np.array([linked.label_of.get(identity, -1) for identity in classes])
+            floor = objects.floor
+            ellipsoids = objects.ellipsoids[label]
+        standing = on_floor(priors, [name_of(class_names, c) for c in categories])
+        views = dataclasses.replace(
+            views,
+            occluded=occluded_edges(views, ellipsoids, standing & (floor is not None)),
+            points=points_on(views, poses, ellipsoids),
+        )
+        fits = fit(views, categories, Scene(floor, None if floor is None else floor.normal))
+    described = describe_objects(
+        tracks, class_names, fits, views, config, linked.confidence, number
+    )
+    return described, fits
+
+
+OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are per object
+
+
+def join_fits(
+    fits: Sequence[quadrics.ObjectFits | None], component_of_object: IntArray, poses: Poses
+) -> quadrics.ObjectFits | None:
+    """Join the fits of all components; scale and up are those of component 0.
+
+    Args:
+        fits: of the objects of each component, in their order; None for one without objects.
+        component_of_object: (O,).
+    """
+    if len(fits) == 1:
+        return fits[0]
+    made = [(k, fit) for k, fit in enumerate(fits) if fit is not None]
+    if not made:
+        return None
+    order = np.argsort(np.argsort(component_of_object, kind="stable"))  # (O,) row in `made`
+    inlier = np.zeros((int(poses.known.sum()), len(order)), bool)
+    for k, fit in made:
+        inlier[np.ix_(poses.part[poses.known] == k, component_of_object == k)] = fit.inlier
+    columns: dict[str, Any] = {"inlier": inlier}
+    ellipsoids = [fit.ellipsoids for _, fit in made]
+    names = [f.name for f in dataclasses.fields(quadrics.Ellipsoids)]
+    arrays = (np.concatenate([getattr(e, name) for e in ellipsoids])[order] for name in names)
+    columns["ellipsoids"] = quadrics.Ellipsoids(*arrays)
+    reasons = [reason for _, fit in made for reason in fit.reason]
+    columns["reason"] = [reasons[i] for i in order]
+    for name in {f.name for f in dataclasses.fields(quadrics.ObjectFits)} - {*columns}:
+        values = [getattr(fit, name) for _, fit in made]
+        columns[name] = values[0] if name in OF_THE_WORLD else np.concatenate(values)[order]
+    if fits[0] is None:  # the scale of the largest component is unknown
+        none = quadrics.Scale(1.0, np.inf, "none")
+        columns |= {"scale": none, "up": np.zeros(3), "up_source": "none"}
+    return quadrics.ObjectFits(**columns)
+
+
+# ---- Interpolation -----------------------------------------------------------------------------
+
+
+def fill(result: Result, image_size: tuple[int, int], max_gap: int) -> Tracks:
+    """Interpolate gaps between detections of an identity: by its shape if it has one.
+
+    Args:
+        image_size: (w, h). max_gap: as of `fill_gaps`.
+    Returns:
+        the tracks; frames that the detector was not run on are not filled.
+    """
+    tracks = result.tracks
+    for component in result.parts() if max_gap else ():
+        if component.poses is not None and (located := component.located):
+            identity = np.array([o.id for o in located])
+            support = [str(o.support) for o in located]
+            tracks = fill_from_objects(
+                tracks, component.poses, identity, component.ellipsoids(), support
+            )
+    if result.looked is not None:
+        tracks = tracks[np.isin(tracks.frame, result.looked)]
+    return fill_gaps(tracks, image_size, max_gap, result.looked)

@@ -1,0 +1,1 @@
+"""Tracking: assignment, camera motion, 3D positions, linking, interpolation."""
