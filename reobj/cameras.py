@@ -36,7 +36,8 @@ def _signals_kept() -> Iterator[None]:
     if sys.platform == "win32":
         yield
         return
-    libc, before = ctypes.CDLL(None), {}
+    libc = ctypes.CDLL(None)
+    before = {}
     for name in ("SIGTERM", "SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL"):  # glog's
         before[int(signal.Signals[name])] = ctypes.create_string_buffer(1024)
     for number, action in before.items():
@@ -118,11 +119,13 @@ class Camera:
         if len(rows):
             ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
             ahead = np.isfinite(ray).all(1) & (ray[:, 2] > 0)
-            ray, rows = ray[ahead], rows[ahead]
+            ray = ray[ahead]
+            rows = rows[ahead]
             back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
             off = np.abs(back - flat[rows]).max(1, initial=0)  # of terms without bounds it is inf
             good = off < INVERSE_PX
-            ray, rows = ray[good], rows[good]
+            ray = ray[good]
+            rows = rows[good]
             ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
 
@@ -154,7 +157,9 @@ PLAUSIBLE_FOCAL = (0.1, 10.0)  # over the longer side: fisheye to telephoto (cho
 
 def checked_camera(camera: Camera, where: str) -> Camera:
     """Return the camera; refuse intrinsics that belong to images of another size."""
-    size, centre, focal = np.array([camera.width, camera.height]), camera.K[:2, 2], camera.K[0, 0]
+    size = np.array([camera.width, camera.height])
+    centre = camera.K[:2, 2]
+    focal = camera.K[0, 0]
     low, high = PLAUSIBLE_FOCAL
     off_centre = (np.abs(centre - size / 2) > MAX_OFF_CENTRE * size).any()
     if off_centre or not low < focal / size.max() < high:
@@ -199,7 +204,8 @@ def checked_pose(
         raise ReobjError(f"cam_from_world of shape {pose.shape}, expected (3, 4): [R | t]")
     if np.isnan(pose).any():
         return None
-    offset, rotation = pose[:, 3], pose[:, :3]
+    offset = pose[:, 3]
+    rotation = pose[:, :3]
     if (np.abs(offset) > WORLD_MAX).any() or (np.abs(rotation) > 1 + RIGID_TOLERANCE).any():
         raise ReobjError(f"cam_from_world {pose.tolist()} is beyond any camera's place")
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -271,7 +277,8 @@ class Poses:
     @property
     def cameras_text(self) -> str:
         """Say how many frames have a camera, where from, and how many are interpolated."""
-        known, between = int(self.known.sum()), int((self.known & ~self.measured).sum())
+        known = int(self.known.sum())
+        between = int((self.known & ~self.measured).sum())
         origin = f"{self.source}: {self.reading}" if self.reading else self.source
         text = f"cameras: {known} of {len(self.frame)} frames ({origin})"
         return f"{text}, {between} interpolated" if between else text
@@ -379,7 +386,8 @@ def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
     edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) middles
-    side, axis = np.arange(4), np.array([0, 1, 0, 1])
+    side = np.arange(4)
+    axis = np.array([0, 1, 0, 1])
     edges[:, side, axis] = xyxy
     undistorted = camera.undistort(edges)[:, side, axis]  # (N, 4)
     limit = np.array([camera.width, camera.height] * 2)

@@ -70,7 +70,8 @@ def with_streams(program: Callable[[], int]) -> int:
         SystemExit: of argparse, after --help and for wrong words.
     """
     _open_streams()
-    code, left = 0, None
+    code = 0
+    left = None
     try:
         code = program()
     except BrokenPipeError:

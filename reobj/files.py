@@ -94,7 +94,8 @@ def writing(path: Path) -> Iterator[None]:
         beside = named.is_relative_to(path.parent) or path.is_relative_to(named)
         if number not in DISK_ERRORS or not beside:
             raise
-        why, advice = os.strerror(number), DISK_ERRORS[number]
+        why = os.strerror(number)
+        advice = DISK_ERRORS[number]
         shown = Path(*(name for name in path.parts if name != PART_RESULTS))
         raise ReobjError(f"{shown}: cannot be written ({why}); {advice}, then run again") from error
 
@@ -358,7 +359,9 @@ class Progress:
     """
 
     def __init__(self, stage: str, total: int = 0) -> None:
-        self.stage, self.total, self.done = stage, total, 0
+        self.stage = stage
+        self.total = total
+        self.done = 0
         self.started = self.shown = time.monotonic()
         self.marks = [(self.started, 0)]  # time and steps, of the last WINDOW_S
         self.enabled = sys.stderr is not None and sys.stderr.isatty()

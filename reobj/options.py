@@ -49,7 +49,8 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     options: Any = every_option(config)
     if name not in options:
         raise ReobjError(f"{where}{name}: no such option; did you mean {_likest(name, options)}?")
-    kind, in_range = type(options[name].default), ""
+    kind = type(options[name].default)
+    in_range = ""
     try:
         if isinstance(value, str) and kind is bool:
             value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
@@ -115,7 +116,9 @@ def write_config(config: Any, path: str | Path) -> None:
 
     By hand: a table of plain values in flat sections needs no package, and Python has no writer.
     """
-    default, lines, sections = type(config)(), [], ""
+    default = type(config)()
+    lines = []
+    sections = ""
     changed = {
         name: value
         for name in every_option(config)
@@ -154,7 +157,8 @@ def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[s
     """Add the flags that the options of some sections declare ("" for those of the top level)."""
     chosen = set(sections)
     for name, f in every_option(config).items():
-        section, flag = name.rpartition(".")[0], f.metadata["flag"]
+        section = name.rpartition(".")[0]
+        flag = f.metadata["flag"]
         if flag and section in chosen:
             kind: Any = type(f.default)
             how: dict[str, Any] = {"type": kind, "metavar": kind.__name__.upper()}
@@ -184,7 +188,8 @@ def config_from_args(config: C, args: argparse.Namespace) -> C:
     return config
 
 
-NAME_WIDTH, LINE_WIDTH = 32, 120  # columns of the list of options
+NAME_WIDTH = 32  # columns of the list of options
+LINE_WIDTH = 120
 
 
 def list_options(config: Any) -> str:

@@ -386,7 +386,8 @@ def text_labels(found: Any) -> list[str] | None:
         keys = ("text_labels", "labels", "class_names")
         labels: Any = next((found[key] for key in keys if _is_text(found.get(key))), None)
     elif hasattr(found, "orig_shape") and getattr(found, "boxes", None) is not None:
-        names, kinds = getattr(found, "names", None), as_numbers(found.boxes.cls, "classes")
+        names = getattr(found, "names", None)
+        kinds = as_numbers(found.boxes.cls, "classes")
         names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
         named = all(int(kind) in names for kind in kinds)
         labels = [str(names[int(kind)]) for kind in kinds] if named else None
@@ -436,7 +437,8 @@ def _mapping_parts(found: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def _box_parts(found: Any) -> tuple[Any, ...]:
     """Take xyxy, confidence, class_id and mask (supervision) or xyxy, conf and cls (Boxes)."""
-    count, parts = len(found.xyxy), [found.xyxy]
+    count = len(found.xyxy)
+    parts = [found.xyxy]
     for names, usual in ((("confidence", "conf"), np.ones), (("class_id", "cls"), np.zeros)):
         has = next((name for name in names if hasattr(found, name)), None)
         if has is None:
@@ -450,7 +452,8 @@ def _ultralytics_parts(found: Any) -> tuple[Any, ...]:
     """Take the boxes of ultralytics' `Results`, and its masks at the size of the image."""
     if found.boxes is None:
         raise ReobjError(f"ultralytics Results without boxes (another task?); {EXPECTED}")
-    parts, masks = _box_parts(found.boxes), getattr(found, "masks", None)
+    parts = _box_parts(found.boxes)
+    masks = getattr(found, "masks", None)
     if masks is None:
         return parts
     height, width = (int(side) for side in found.orig_shape)
@@ -458,8 +461,10 @@ def _ultralytics_parts(found: Any) -> tuple[Any, ...]:
     if maps.ndim != 3 or not maps.shape[1] * maps.shape[2]:
         raise ReobjError(f"masks are an array of shape {maps.shape}, expected (N, h, w)")
     scale = min(maps.shape[1] / height, maps.shape[2] / width)
-    h, w = max(round(height * scale), 1), max(round(width * scale), 1)
-    top, left = (maps.shape[1] - h) // 2, (maps.shape[2] - w) // 2
+    h = max(round(height * scale), 1)
+    w = max(round(width * scale), 1)
+    top = (maps.shape[1] - h) // 2
+    left = (maps.shape[2] - w) // 2
     maps = maps[:, top : top + h, left : left + w]
     full = np.zeros((len(maps), height, width), bool)  # (N, H, W)
     for mask, own in zip(full, maps, strict=True):
@@ -510,7 +515,8 @@ def _checked(xyxy: Any, score: Any, class_id: Any, masks: Any) -> Detections:
         if masks.ndim != 3 or len(masks) != count:
             raise ReobjError(f"masks are an array of shape {masks.shape}, expected ({count}, H, W) "
                              "at the size of the frame")  # fmt: skip
-    xyxy, score = xyxy.astype(np.float64, copy=False), score.astype(np.float64, copy=False)
+    xyxy = xyxy.astype(np.float64, copy=False)
+    score = score.astype(np.float64, copy=False)
     _check_values(xyxy, score, class_id)
     return Detections(xyxy, score, class_id.astype(np.int64, copy=False), masks)
 
@@ -595,7 +601,8 @@ def class_shares(table: Tracks, group: IntArray, count: int) -> Array:
 
 def box_area(xyxy: Array) -> Array:
     """Return the area (...) of boxes (..., 4)."""
-    width, height = xyxy[..., 2] - xyxy[..., 0], xyxy[..., 3] - xyxy[..., 1]
+    width = xyxy[..., 2] - xyxy[..., 0]
+    height = xyxy[..., 3] - xyxy[..., 1]
     return np.asarray(width * height, np.float64)
 
 

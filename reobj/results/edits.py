@@ -212,8 +212,10 @@ class _Tables:
     """Columns of tracks while edits change them; deleted rows have identity 0."""
 
     def __init__(self, tracks: Tracks, class_names: tuple[str, ...]) -> None:
-        self.tracks, self.names = tracks, list(class_names)
-        self.identity, self.class_id = tracks.track_id.copy(), tracks.class_id.copy()  # (N,)
+        self.tracks = tracks
+        self.names = list(class_names)
+        self.identity = tracks.track_id.copy()  # (N,)
+        self.class_id = tracks.class_id.copy()
         self.confirmed: set[int] = set()
 
     def make(self, edit: Edit) -> None:
@@ -237,7 +239,8 @@ class _Tables:
         """Find the row of a box; of several alike, that of the identity named, then the nearest."""
         rows = np.flatnonzero((self.identity > 0) & (self.tracks.frame == ref.frame))
         iou: Array = box_iou(self.tracks.xyxy[rows], np.array([ref.box]))[:, 0]  # (n,)
-        rows, iou = rows[iou >= SAME_BOX_IOU], iou[iou >= SAME_BOX_IOU]
+        rows = rows[iou >= SAME_BOX_IOU]
+        iou = iou[iou >= SAME_BOX_IOU]
         if not len(rows):
             box = ", ".join(f"{value:.1f}" for value in ref.box)
             raise LookupError(f"no object has the box {box} in frame {ref.frame}")
@@ -258,7 +261,8 @@ class _Tables:
         Returns:
             also what to say about the others.
         """
-        keep, messages = self.identity > 0, list[str]()
+        keep = self.identity > 0
+        messages = list[str]()
         for number in sorted(self.confirmed):
             rows: IntArray = np.flatnonzero(self.identity == number)
             rows = rows[np.argsort(-self.tracks.score[rows], kind="stable")]

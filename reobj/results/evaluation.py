@@ -61,7 +61,8 @@ def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
         rows.append(np.split(order, np.searchsorted(boxes.frame[order], frames[1:])))
     steps = []
     for g, p in zip(*rows, strict=True):
-        a, b = truth.name[g][:, None], found.name[p][None]
+        a = truth.name[g][:, None]
+        b = found.name[p][None]
         same = (a == b) | (a == "") | (b == "")
         steps.append((g, p, np.where(same, box_iou(truth.xyxy[g], found.xyxy[p]), 0.0)))
     return steps
@@ -190,10 +191,12 @@ def return_ranks(
     visit = visits(truth)
     g, p = matched_rows(truth, found)
     use = np.isfinite(embedding[p]).all(1)
-    g, p = g[use], p[use]
+    g = g[use]
+    p = p[use]
     ranks = []
     for rows in rows_by(_visit_of_object(truth, visit)[g]):
-        start, own = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
+        start = truth.frame[g[rows]].min()
+        own = int(truth.identity[g[rows[0]]])
         known = np.flatnonzero(truth.frame[g] < start)
         known = known[truth.name[g[known]] == truth.name[g[rows[0]]]]
         ids, of = np.unique(truth.identity[g[known]], return_inverse=True)
@@ -242,7 +245,8 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
             continue  # as TrackEval: a frame without either does not end a match
         kept = 1000.0 * (before[g][:, None] == p[None])  # outweighs any sum of IoU
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, kept + iou, 0))
-        g, p = g[a], p[b]
+        g = g[a]
+        p = p[b]
         switches += int(((last[g] >= 0) & (last[g] != p)).sum())
         hits += len(g)
         met[g, p] = True
@@ -250,7 +254,8 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
         last[g] = p
         before[:] = -1
         before[g] = p
-    gt, pr = int(gt_size.sum()), int(pr_size.sum())
+    gt = int(gt_size.sum())
+    pr = int(pr_size.sum())
     return {
         "MOTA": 1 - (gt + pr - 2 * hits + switches) / gt if gt else 0.0,
         "IDSW": switches,
@@ -277,7 +282,8 @@ def _identity_pairs(steps: Sequence[_Step], shape: tuple[int, ...]) -> tuple[Any
 def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
     """Compute F1, precision and recall of identities under the best one-to-one map."""
     right = float(_identity_pairs(steps, (len(gt_size), len(pr_size)))[2].sum())
-    gt, pr = int(gt_size.sum()), int(pr_size.sum())
+    gt = int(gt_size.sum())
+    pr = int(pr_size.sum())
     shares = (2 * right / max(gt + pr, 1), right / max(pr, 1), right / max(gt, 1))
     return dict(zip(("IDF1", "IDP", "IDR"), shares, strict=True))
 
@@ -307,7 +313,8 @@ def score_report(scores: dict[str, Any]) -> str:
     """Format what `evaluate` returns for the terminal."""
     tracks: dict[str, dict[str, float]] = scores["tracks"]
     found = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
-    lines, ranks = [score_table(found)], scores["ranks"]
+    lines = [score_table(found)]
+    ranks = scores["ranks"]
     if missed := [name for name in tracks if name not in found]:
         lines += wrapped(f"nothing found of: {', '.join(missed)}")
     shares = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
@@ -349,7 +356,9 @@ def evaluate(
         ReobjError: a file is missing or of another form, no true box counts, an identity has two
             boxes in a frame, or a class is in none of them.
     """
-    out, names, tracked = Path(out), COCO_NAMES, None
+    out = Path(out)
+    names = COCO_NAMES
+    tracked = None
     if out.name == TRACKS_FILE and (out.parent / LAST_TRACKS).exists():
         out = out.parent
     said: list[str] = []
@@ -384,7 +393,8 @@ def evaluate(
     result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
     result["messages"] = said
     if solids is not None:
-        pairs, poses = identity_map(truth, found), Path(truth_poses) if truth_poses else None
+        pairs = identity_map(truth, found)
+        poses = Path(truth_poses) if truth_poses else None
         result["objects"] = score_objects(Result.load(out), Path(solids), poses, pairs)
     return result
 
@@ -426,7 +436,8 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     Returns:
         number of queries and shares; {} where nothing was embedded (--embed none).
     """
-    embeddings, tracks = tracked.embeddings, tracked.tracks[tracked.embedding_row]
+    embeddings = tracked.embeddings
+    tracks = tracked.tracks[tracked.embedding_row]
     if not embeddings.foreground.size:
         return {}
     identity = np.arange(len(tracks))

@@ -111,7 +111,8 @@ def _frames_read(result: Result) -> tuple[list[int], list[str]]:
     if result.poses is not None:
         read = result.poses.frame
     elif video is not None and video.frame_count:
-        config, count = video.config, video.frame_count
+        config = video.config
+        count = video.frame_count
         read = np.arange(config.start, min(config.stop or count, count), config.every)
     return np.union1d(read, result.tracks.frame).tolist(), names
 
@@ -121,7 +122,8 @@ def export_coco_vid(result: Result, path: Path) -> None:
 
     bbox is x, y, w, h from the image's corner.
     """
-    video, tracks = result.video, result.tracks
+    video = result.video
+    tracks = result.tracks
     frames, names = _frames_read(result)
     size = {"width": video.width, "height": video.height}
     image_id = {frame: i for i, frame in enumerate(frames, 1)}
@@ -163,7 +165,8 @@ def export_cvat(result: Result, path: Path) -> None:
 
     Source: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
     """
-    tracks, video = result.tracks, result.video
+    tracks = result.tracks
+    video = result.video
     frames, _ = _frames_read(result)
     _say_parts(result, path)
     root = ET.Element("annotations")
@@ -172,7 +175,8 @@ def export_cvat(result: Result, path: Path) -> None:
     for key, value in (("name", visible_name(Path(video.path).name)), ("mode", "interpolation"),
                        ("start_frame", 0), ("stop_frame", max(frames, default=0))):  # fmt: skip
         ET.SubElement(task, key).text = str(value)
-    labels, size = ET.SubElement(task, "labels"), ET.SubElement(task, "original_size")
+    labels = ET.SubElement(task, "labels")
+    size = ET.SubElement(task, "original_size")
     for name in result.class_names:
         ET.SubElement(ET.SubElement(labels, "label"), "name").text = name
     for key in ("width", "height"):
@@ -204,7 +208,8 @@ def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[floa
     Returns:
         metres per unit (1 if unknown), and the rotation (3, 3) that brings up onto `up_axis`.
     """
-    scale, up = result.world.scale, result.world.up_in_world
+    scale = result.world.scale
+    up = result.world.up_in_world
     metres = scale.value if scale is not None and scale.source != "none" else None
     if result.located:
         if not metres:
@@ -235,18 +240,21 @@ def export_glb(result: Result, path: Path) -> None:
     result, origin = centred(_largest_part(result, path))
     scale, turn = _upright(result, path, [0.0, 1, 0])
     _say_origin(origin, path)
-    world, poses = np.eye(4), result.poses
+    world = np.eye(4)
+    poses = result.poses
     world[:3, :3] = scale * turn
     scene: Any = trimesh.Scene(metadata={"origin_in_world": origin.tolist()})
     ellipsoids = result.ellipsoids()
     columns = ellipsoids.world_from_obj * ellipsoids.half_axes[:, None]  # (O, 3, 3)
     for o, axes, center in zip(result.located, columns, ellipsoids.center_in_world, strict=True):
-        mesh, name = trimesh.creation.icosphere(subdivisions=3), f"{o.class_name} {o.id}"
+        mesh = trimesh.creation.icosphere(subdivisions=3)
+        name = f"{o.class_name} {o.id}"
         mesh.visual.face_colors = [*object_color(o.id)[::-1], 255]
         entry = o.to_json()
         mesh.metadata = {k: entry[k] for k in ("id", "class", "status", "support", "size_m")}
         world_from_sphere = np.eye(4)
-        world_from_sphere[:3, :3], world_from_sphere[:3, 3] = axes, center
+        world_from_sphere[:3, :3] = axes
+        world_from_sphere[:3, 3] = center
         scene.add_geometry(mesh, name, name, transform=world @ world_from_sphere)
     if poses is not None and len(poses.points):
         make_cloud: Any = trimesh.PointCloud
@@ -323,7 +331,8 @@ def export_nerfstudio(result: Result, path: Path) -> None:
     Ref: docs.nerf.studio, "Data conventions": camera axes of OpenGL, world_from_cam.
     """
     result, origin = centred(_largest_part(result, path))
-    poses, video = result.poses, _video_of(result)
+    poses = result.poses
+    video = _video_of(result)
     if poses is None or not poses.known.any():
         raise ReobjError(f"{path}: no cameras here, see `run`")
     if video is None:
@@ -379,14 +388,16 @@ def _image_files(video: Video, poses: Poses, place: Path, folder: Path) -> dict[
     Args:
         folder: a new one, whose files are moved to `place`.
     """
-    source, names = Path(str(video.source)), video.names
+    source = Path(str(video.source))
+    names = video.names
     if names:
         where = source if source.is_dir() else source.parent
         return {
             frame: Path(os.path.relpath(where / names[frame], place)).as_posix()
             for frame in poses.frame.tolist()
         }
-    files, wanted = {}, set(poses.frame[poses.known].tolist())
+    files = {}
+    wanted = set(poses.frame[poses.known].tolist())
     with Progress("images", len(wanted)) as progress:
         for frame in video:
             if frame.index in wanted:
@@ -421,7 +432,9 @@ class Viewer:
             import rerun as rr
         except ImportError as error:
             raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
-        self.rr, self.video, self.followed = rr, video, False
+        self.rr = rr
+        self.video = video
+        self.followed = False
         self.shrink = min(1.0, RRD_SIZE_PX / max(video.width, video.height, 1))
         name = visible_name(Path(video.path).name)
         self.rec = rr.RecordingStream("reobj_track", recording_id=name)
@@ -498,7 +511,9 @@ class Viewer:
         labels: list[str],
     ) -> None:  # fmt: skip
         """Set the time; log the camera, if the frame has a pose, and boxes in native pixels."""
-        rr, rec, shrink = self.rr, self.rec, self.shrink
+        rr = self.rr
+        rec = self.rec
+        shrink = self.shrink
         rec.set_time("frame", sequence=frame)
         rec.set_time("time", duration=frame / (self.video.fps or IMAGE_FPS))
         if poses is None or pose is None or not np.isfinite(pose).all():

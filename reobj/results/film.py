@@ -28,7 +28,8 @@ from reobj.types import Image
 H264_SIZE_PX = 1280  # longer side; larger videos are shrunk (chosen: HD, so that it plays)
 # The same, and most frames a second, for OpenCV's encoder, which takes 1.5 bits a pixel whatever
 # the picture: 30 MB a minute (chosen: labels can still be read)
-VP8_SIZE_PX, VP8_FPS = 480, 15.0
+VP8_SIZE_PX = 480
+VP8_FPS = 15.0
 # x264's own quality; "superfast" takes half the time of "veryfast" for 1.3 times the bytes. Without
 # lookahead: with it, the same pictures give other bytes every few runs (seen with PyAV 18.1, one
 # thread and no B-frames too).
@@ -102,7 +103,8 @@ class FilmWriter:
 
     def _wait(self) -> None:
         """Wait for the frame that is being encoded."""
-        pending, self.pending = self.pending, None
+        pending = self.pending
+        self.pending = None
         if pending is not None:
             with self._named():
                 pending.result()
@@ -141,7 +143,8 @@ class _H264:
     """H.264 in MP4 by PyAV."""
 
     def __init__(self, av: Any, path: Path, fps: float, size: tuple[int, int]) -> None:
-        self.av, rate = av, Fraction(fps).limit_denominator(MAX_DENOMINATOR)
+        self.av = av
+        rate = Fraction(fps).limit_denominator(MAX_DENOMINATOR)
         # faststart: the index comes first, so that a page plays what it has loaded
         self.file = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
         self.stream = self.file.add_stream("h264", rate=rate, options=H264)
@@ -172,7 +175,9 @@ class _VP8:
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
-        self.path, self.fps, self.count = path, fps, 0
+        self.path = path
+        self.fps = fps
+        self.count = 0
         with _quiet():
             self.writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), 1.0, size)
         if not self.writer.isOpened():
@@ -205,7 +210,8 @@ def _with_clock(webm: bytes, fps: float, count: int) -> bytes:
     Ref: RFC 9559: TimestampScale 0x2AD7B1 (ns of a unit), DefaultDuration 0x23E383 (ns of a frame);
     the tag DURATION is FFmpeg's, text.
     """
-    unit, frame = round(1e6 / fps).to_bytes(3, "big"), round(1e9 / fps).to_bytes(4, "big")
+    unit = round(1e6 / fps).to_bytes(3, "big")
+    frame = round(1e9 / fps).to_bytes(4, "big")
     webm = webm.replace(b"\x2a\xd7\xb1\x83\x0f\x42\x40", b"\x2a\xd7\xb1\x83" + unit, 1)
     webm = webm.replace(b"\x23\xe3\x83\x84\x3b\x9a\xca\x00", b"\x23\xe3\x83\x84" + frame, 1)
     s = count / fps

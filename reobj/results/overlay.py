@@ -28,7 +28,8 @@ from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
 
 LAYERS = ("boxes", "solids", "ellipses", "trails")
-OFF, ON = ("none", "false", "no", "off", "0"), ("true", "yes", "on", "1")
+OFF = ("none", "false", "no", "off", "0")
+ON = ("true", "yes", "on", "1")
 
 Color = tuple[int, int, int]
 
@@ -52,7 +53,8 @@ def film_layers(text: str) -> frozenset[str]:
 
 # ---- Boxes and labels --------------------------------------------------------------------------
 
-FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45  # readable at 640 px width (chosen)
+FONT = cv2.FONT_HERSHEY_SIMPLEX  # readable at 640 px width (chosen)
+FONT_SCALE = 0.45
 LABEL_MAX = 24  # characters of a class name in the film (chosen: 200 px)
 DASH_PX = 6  # of boxes that fill a gap
 
@@ -75,7 +77,8 @@ def draw_tracks(
         thin: identities whose solid is drawn too.
     """
     boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
-    ids, score = tracks.track_id.tolist(), tracks.score.tolist()
+    ids = tracks.track_id.tolist()
+    score = tracks.score.tolist()
     for obj, box, sure in zip(ids, boxes, score, strict=True):
         _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=sure == 0)
     places = {} if places is None else places
@@ -152,7 +155,8 @@ def place_labels(
 def _label_places(box: IntArray, size: IntArray) -> IntArray:
     """Top-left corners (14, 2) of a label at a box, the best first."""
     (x1, y1, x2, y2), (w, h) = box.tolist(), size.tolist()
-    xs, beside = (x1, x2 - w, (x1 + x2 - w) // 2), ((x1 - w, y1), (x2, y1))
+    xs = (x1, x2 - w, (x1 + x2 - w) // 2)
+    beside = ((x1 - w, y1), (x2, y1))
     rows = [(x, y) for y in (y1 - h, y1 + 2, y2 - h - 1, y2) for x in xs]
     return np.array([*rows[:6], *beside, *rows[6:]])
 
@@ -233,7 +237,8 @@ class Wireframes:
             ends (n, 2, 3) in the camera, in front of it; their edges (n,); front (n,): False where
             the solid hides its own edge.
         """
-        turn, shift = cam_from_world[:, :3], cam_from_world[:, 3]
+        turn = cam_from_world[:, :3]
+        shift = cam_from_world[:, 3]
         eye = -turn.T @ shift
         outside = self.planes[:, :3] @ eye - self.planes[:, 3] > 0  # (N,) faces the camera
         facing = outside[self.faces]  # (E, 2)
@@ -241,7 +246,8 @@ class Wireframes:
         ends = (self.points @ turn.T + shift)[self.edges]  # (E, 2, 3)
         wanted &= (ends[:, :, 2] > self.min_depth[:, None]).any(1)
         edge = np.flatnonzero(wanted)
-        ends, least = ends[edge], self.min_depth[edge]
+        ends = ends[edge]
+        least = self.min_depth[edge]
         for a, b in ((0, 1), (1, 0)):  # move an end that is too near along its edge
             missing = (least - ends[:, a, 2]).clip(0)  # (n,)
             share = missing / np.maximum(np.maximum(missing, ends[:, b, 2] - ends[:, a, 2]), 1e-12)
@@ -261,8 +267,10 @@ def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -
         if shape not in ("box", "cylinder"):
             continue
         mesh = _unit_box() if shape == "box" else _unit_cylinder()
-        half, turn = ellipsoids.half_axes[k], ellipsoids.world_from_obj[k]
-        center, count = ellipsoids.center_in_world[k], len(mesh[1])
+        half = ellipsoids.half_axes[k]
+        turn = ellipsoids.world_from_obj[k]
+        center = ellipsoids.center_in_world[k]
+        count = len(mesh[1])
         normal = (mesh[4][:, :3] / half) @ turn.T  # (N, 3) x = c + R (h u)
         made = (
             mesh[0] * half @ turn.T + center, mesh[1] + points, mesh[2] + faces, mesh[3],
@@ -271,7 +279,8 @@ def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -
         )  # fmt: skip
         for column, part in zip(columns, made, strict=True):
             column.append(part)
-        points, faces = points + len(mesh[0]), faces + len(mesh[4])
+        points = points + len(mesh[0])
+        faces = faces + len(mesh[4])
     empty = (
         np.empty((0, 3)), np.empty((0, 2), int), np.empty((0, 2), int), np.empty(0, bool),
         np.empty(0, int), np.empty((0, 4)), np.empty(0),
@@ -286,7 +295,8 @@ Mesh = tuple[Array, IntArray, IntArray, BoolArray, Array]  # points, edges, face
 def _unit_box() -> Mesh:
     """The cube of half side 1; face 2 k + (1 if positive) is across axis k."""
     points = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
-    edges, faces = [], []
+    edges = []
+    faces = []
     for a in range(8):
         for axis in range(3):
             if points[a, axis] < 0:
@@ -302,10 +312,12 @@ def _unit_box() -> Mesh:
 def _unit_cylinder() -> Mesh:
     """The upright cylinder of radius and half height 1, as a prism; its last two faces are caps."""
     number = np.arange(SIDES)
-    angle, following = 2 * np.pi * number / SIDES, (number + 1) % SIDES
+    angle = 2 * np.pi * number / SIDES
+    following = (number + 1) % SIDES
     ring = np.c_[np.cos(angle), np.sin(angle)]
     points = np.r_[np.c_[ring, -np.ones(SIDES)], np.c_[ring, np.ones(SIDES)]]
-    low, high = np.c_[number, following], np.c_[number, following] + SIDES
+    low = np.c_[number, following]
+    high = np.c_[number, following] + SIDES
     edges = np.r_[low, high, np.c_[number, number + SIDES]]
     caps = (np.full(SIDES, SIDES), np.full(SIDES, SIDES + 1))
     faces = np.r_[np.c_[number, caps[0]], np.c_[number, caps[1]], np.c_[number, number - 1]]
@@ -352,10 +364,12 @@ def draw_wireframes(
     ends_at = np.append(first, len(edge))[1:]  # as many as solids, also of none
     own = {k: slice(a, b) for k, a, b in zip(solids.tolist(), first, ends_at, strict=True)}
     for k in sorted(own, key=lambda k: -ends[own[k], :, 2].mean()):  # near ones last
-        mine, obj = own[k], object_id[k]
+        mine = own[k]
+        obj = object_id[k]
         if not drawn[k] or not _fits(pixels[mine], image):
             continue
-        lines, shown = np.round(pixels[mine] * (1 << SHIFT)).astype(np.int32), front[mine]
+        lines = np.round(pixels[mine] * (1 << SHIFT)).astype(np.int32)
+        shown = front[mine]
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)
         if obj in seen:
@@ -389,8 +403,11 @@ class Overlay:
         """Open the film; its suffix is that of the format that can be written here."""
         self.fps = (video.fps or IMAGE_FPS) / video.config.every
         self.writer = FilmWriter(path, self.fps, video.size)
-        self.path, self.size, self.layers = self.writer.path, self.writer.size, film_layers(layers)
-        self.scale, self.tracks = self.size[0] / video.size[0], result.tracks
+        self.path = self.writer.path
+        self.size = self.writer.size
+        self.layers = film_layers(layers)
+        self.scale = self.size[0] / video.size[0]
+        self.tracks = result.tracks
         self.sure = {o.id for o in result.located if o.status == "ok"}
         self.labels = {o.id: f"{o.id} {cut(o.class_name, LABEL_MAX)}" for o in result.objects}
         self.outlines = _project_all(result, self.scale, self.layers)
@@ -404,7 +421,8 @@ class Overlay:
         low, high = np.searchsorted(self.tracks.frame, [frame.index, frame.index + 1])
         rows = self.tracks[slice(low, high)]
         small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
-        image, seen = np.asarray(small, np.uint8), set(rows.track_id.tolist())
+        image = np.asarray(small, np.uint8)
+        seen = set(rows.track_id.tolist())
         if "trails" in self.layers:
             self._draw_trails(image, rows)
         thin = self._draw_solids(image, frame.index, seen)
@@ -497,7 +515,8 @@ def _project_all(
 # ---- Legend ------------------------------------------------------------------------------------
 
 LEGEND_COLOR = object_color(1)
-LINE_PX, SWATCH_PX = 20, 30  # height of a line, width of its picture
+LINE_PX = 20  # height of a line, width of its picture
+SWATCH_PX = 30
 
 
 def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
@@ -522,7 +541,8 @@ def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
     panel = image[top : top + height, 6 : 6 + width]
     panel[:] = panel // 4
     for k, (kind, text) in enumerate(lines):
-        x, y = 12, top + 4 + LINE_PX * k
+        x = 12
+        y = top + 4 + LINE_PX * k
         box = np.array([x, y + 4, x + SWATCH_PX - 8, y + LINE_PX - 5])
         if kind in ("box", "dashed"):
             _draw_box(image, box, LEGEND_COLOR, 1 + (len(lines) == 1), kind == "dashed")

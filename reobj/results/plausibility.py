@@ -44,7 +44,8 @@ def _few_cameras(result: Result) -> str:
     """Warn where most frames have no camera; where none has, the poses say why."""
     if result.poses is None or not 0 < 2 * result.poses.known.sum() < len(result.poses.known):
         return ""
-    known, count = result.poses.known.sum(), len(result.poses.known)
+    known = result.poses.known.sum()
+    count = len(result.poses.known)
     remedy = "film with slower turns and more overlap, or give --camera (intrinsics) or --poses"
     if result.poses.source == "user":
         remedy = "check that --poses is of this video, and that names or times of its frames agree"
@@ -87,10 +88,12 @@ def _unexplained(result: Result, high_score: float, new_score: float) -> str:
     Another detector is advised only where boxes come and go, or where objects are doubtful.
     """
     doubtful = [o.id for o in result.objects if o.status == "doubtful"]
-    tracks, weak = result.tracks, result.tracks.score < high_score
+    tracks = result.tracks
+    weak = result.tracks.score < high_score
     listed = tracks[~weak & ~np.isin(tracks.track_id, doubtful)]
     strong = Tracks.joined([tracks[~weak], result.untracked[result.untracked.score >= high_score]])
-    count, total = len(_distinct(listed)), len(_distinct(strong))
+    count = len(_distinct(listed))
+    total = len(_distinct(strong))
     if total < BOXES_MIN or 2 * count >= total:
         return ""
     text = f"{total - count} of {total} boxes of score {high_score:g} or more"
@@ -100,7 +103,8 @@ def _unexplained(result: Result, high_score: float, new_score: float) -> str:
         if 2 * (rest.score < new_score).sum() > len(rest):
             return (f"{text}: most of them are below the score at which a track starts "
                     f"(tracker.new_score={new_score:g})")  # fmt: skip
-        doubled, alone = _doubled(rest, strong), _alone(rest, strong)
+        doubled = _doubled(rest, strong)
+        alone = _alone(rest, strong)
         if 2 * doubled.sum() > len(rest):
             return (f"{text}: most of them lie on another box of their class in the same frame "
                     "(boxes without non-maximum suppression)")  # fmt: skip
@@ -113,7 +117,8 @@ def _unexplained(result: Result, high_score: float, new_score: float) -> str:
     )
 
 
-DOUBLED_IOU, SAME_IOU = 0.6, 0.3  # of two boxes on one object: in a frame (NMS: .5 to .7), and in
+DOUBLED_IOU = 0.6  # of two boxes on one object: in a frame (NMS: .5 to .7), and in
+SAME_IOU = 0.3
 # successive ones (as tracks are matched, reobj_track.LOW_IOU)
 
 
@@ -130,7 +135,8 @@ def _doubled(rows: Tracks, others: Tracks) -> BoolArray:
 
 def _alone(rows: Tracks, others: Tracks) -> BoolArray:
     """Mark rows without a box of their class near them in the frames with boxes beside theirs."""
-    frames, found = np.unique(others.frame), np.ones(len(rows), bool)
+    frames = np.unique(others.frame)
+    found = np.ones(len(rows), bool)
     for own in rows_by(rows.frame):
         at = np.searchsorted(frames, rows.frame[own[0]])
         beside = frames[[k for k in (at - 1, at + 1) if 0 <= k < len(frames)]]

@@ -33,7 +33,9 @@ def write_ply(
     Args:
         support: shapes, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
     """
-    vertices, faces, start = [], [], 0
+    vertices = []
+    faces = []
+    start = 0
     shapes = [None] * len(ellipsoids) if support is None else support
     meshes = {None: _sphere_mesh(PLY_DETAIL), "box": _box_mesh(), "cylinder": _cylinder_mesh()}
     for k, (identity, shape) in enumerate(zip(object_id, shapes, strict=True)):
@@ -43,13 +45,15 @@ def write_ply(
         vertex["xyz"] = points + ellipsoids.center_in_world[k]
         vertex["rgb"] = object_color(identity)[::-1]
         face = np.zeros(len(triangles), [("n", "u1"), ("i", "<i4", 3)])
-        face["n"], face["i"] = 3, triangles + start
+        face["n"] = 3
+        face["i"] = triangles + start
         vertices.append(vertex.tobytes())
         faces.append(face.tobytes())
         start += len(unit)
     names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
-    what, count = "ellipsoids" if support is None else "solids", sum(map(len, faces)) // FACE_BYTES
+    what = "ellipsoids" if support is None else "solids"
+    count = sum(map(len, faces)) // FACE_BYTES
     header = (
         f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {what}\n"
         f"element vertex {start}\n{''.join(names)}"
@@ -62,7 +66,8 @@ def write_ply(
 def write_point_ply(path: Path, points: Array, colors: npt.NDArray[np.uint8]) -> None:
     """Write points (N, 3) with RGB colours (N, 3) as PLY, binary little endian."""
     vertex = np.zeros(len(points), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
-    vertex["xyz"], vertex["rgb"] = points, colors
+    vertex["xyz"] = points
+    vertex["rgb"] = colors
     names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
     header = f"element vertex {len(points)}\n{''.join(names)}end_header\n"
@@ -82,12 +87,17 @@ def _box_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
 def _cylinder_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
     """Triangulate the upright cylinder of radius and half height 1, facing outwards."""
     number = np.arange(PLY_SIDES)
-    angle, following = 2 * np.pi * number / PLY_SIDES, (number + 1) % PLY_SIDES
+    angle = 2 * np.pi * number / PLY_SIDES
+    following = (number + 1) % PLY_SIDES
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     low, high = (np.column_stack([ring, np.full(PLY_SIDES, z)]) for z in (-1.0, 1.0))
     points = np.concatenate([low, high, [[0, 0, -1.0], [0, 0, 1.0]]])
-    a, b, c, d = number, following, following + PLY_SIDES, number + PLY_SIDES
-    bottom, top = np.full(PLY_SIDES, 2 * PLY_SIDES), np.full(PLY_SIDES, 2 * PLY_SIDES + 1)
+    a = number
+    b = following
+    c = following + PLY_SIDES
+    d = number + PLY_SIDES
+    bottom = np.full(PLY_SIDES, 2 * PLY_SIDES)
+    top = np.full(PLY_SIDES, 2 * PLY_SIDES + 1)
     faces = [(a, b, c), (a, c, d), (bottom, b, a), (top, d, c)]
     return points, np.concatenate([np.column_stack(f) for f in faces])
 

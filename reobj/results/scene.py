@@ -64,19 +64,23 @@ class Pictures:
     """
 
     def __init__(self, result: Result, video: Video) -> None:
-        self.tracks, self.scale = result.tracks, video.scale
+        self.tracks = result.tracks
+        self.scale = video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
         poses = [part.poses for part in result.parts()]
-        chosen, left = [np.empty(0, np.int64)], SCENE_MAX_CROPS
+        chosen = [np.empty(0, np.int64)]
+        left = SCENE_MAX_CROPS
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         for doubtful in (False, True):  # what is left of the pictures is for these
             group = [o for o in ranked if (o.status == "doubtful") == doubtful]
             count = min(max(left // max(len(group), 1), 1), SCENE_CROPS)
             rows = [diverse_rows(result.tracks, o, poses[o.part], count) for o in group[:left]]
-            chosen, left = chosen + rows, left - sum(map(len, rows))
+            chosen = chosen + rows
+            left = left - sum(map(len, rows))
         self.wanted = np.sort(np.concatenate(chosen))
-        shown, cameras = scene_steps(result), result.poses
+        shown = scene_steps(result)
+        cameras = result.poses
         if cameras is not None and cameras.known.any():
             shown = shown[cameras.known[np.searchsorted(cameras.frame, shown)]]
         self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
@@ -140,7 +144,8 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
     rows = np.flatnonzero(tracks.track_id == found.id)
     if not len(rows):
         return rows
-    frame, box = tracks.frame[rows], tracks.xyxy[rows]
+    frame = tracks.frame[rows]
+    box = tracks.xyxy[rows]
     quality = tracks.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
     place = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
     if poses is not None and found.center is not None:
@@ -191,7 +196,8 @@ def write_scene(
     Args:
         doubtful: show the doubtful objects at first; a switch of the page shows and hides them.
     """
-    steps, poses = scene_steps(result), result.poses  # (S,)
+    steps = scene_steps(result)  # (S,)
+    poses = result.poses
     count = len(np.unique(result.tracks.frame) if poses is None else poses.frame)
     seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
     of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
@@ -249,7 +255,8 @@ def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str,
     poses = result.poses
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": ""}
-    size, K = {"width": poses.camera.width, "height": poses.camera.height}, poses.camera.K
+    size = {"width": poses.camera.width, "height": poses.camera.height}
+    K = poses.camera.K
     rows = np.isin(poses.frame, steps)
     shown = invert_rigid(poses.cam_from_world[rows])
     shown[:, :, 3] -= origins[poses.part[rows]]
@@ -259,8 +266,10 @@ def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str,
 
 def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
     """Collect every `thin`-th point, scale, floor, up and sigma of points of a part; its name."""
-    poses, up = part.poses, part.world.up_in_world
-    count, spans = len(part.objects), ", ".join(p.span_text for p in part.world.parts)
+    poses = part.poses
+    up = part.world.up_in_world
+    count = len(part.objects)
+    spans = ", ".join(p.span_text for p in part.world.parts)
     facts = {
         "name": f"part {number}: {spans}; {count} object{'s' * (count != 1)}",
         "facts": _scene_facts(part.world),
@@ -367,7 +376,8 @@ def write_pictures(
         with faults.of("scene"):
             pictures = Pictures(result, video)
     sinks = [(n, sink) for n, sink in (("overlay", film), ("scene", pictures)) if sink and visible]
-    progress, complete = Progress("write", video.expected), False
+    progress = Progress("write", video.expected)
+    complete = False
     try:
         with faults.of("video"):
             for frame in video if sinks else ():

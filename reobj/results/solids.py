@@ -67,7 +67,8 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
         raise ReobjError("reconstructed cameras have a world of their own: give --gt-poses")
     truth = _true_cameras(truth_poses, poses)  # (F, 3, 4)
     use = poses.known & np.isfinite(truth[:, :, 3]).all(1)
-    ours, truth = invert_rigid(poses.cam_from_world[use]), truth[use]  # (f, 3, 4)
+    ours = invert_rigid(poses.cam_from_world[use])  # (f, 3, 4)
+    truth = truth[use]
     found = None
     if use.sum() >= 3:  # Umeyama, PAMI 1991
         found = _similarity(ours[:, :, 3], truth[:, :, 3])
@@ -159,7 +160,8 @@ def score_objects(
     if not rows:
         return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
     own = np.array([row_of[pairs[ids[i]] or 0] for i in rows])  # of ours
-    found, goal = ours[own], truth[np.array(rows)]
+    found = ours[own]
+    goal = truth[np.array(rows)]
     o3d = quadrics.volume_overlap(found, goal)  # (n,)
     error = np.linalg.norm(found.center_in_world - goal.center_in_world, axis=1)  # (n,) truth units
     size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3  # (n,) mean side
@@ -217,7 +219,9 @@ def _solids_in_truth(
         relative error of its metres per unit, None where unknown.
     """
     objects: list[Object] = []
-    centers, half_axes, axes = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty((0, 3, 3))]
+    centers = [np.empty((0, 3))]
+    half_axes = [np.empty((0, 3))]
+    axes = [np.empty((0, 3, 3))]
     scale_errors: list[float | None] = []
     faults: dict[int, ReobjError] = {}
     parts = result.parts()

@@ -25,7 +25,9 @@ from reobj.sources.cvat import read_cvat
 from reobj.sources.tables import WHOLE_MAX, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
 
-SCORED, IGNORED, ABSENT = 0, 1, 2  # roles of truth rows: counted; drops what it matches; left out
+SCORED = 0  # roles of truth rows: counted; drops what it matches; left out
+IGNORED = 1
+ABSENT = 2
 UNNAMED = ("", "object")  # names of boxes without a class
 
 
@@ -54,10 +56,12 @@ class LabelledBoxes:
 
 def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
     """Make labelled boxes of MOTChallenge rows (N, 6+); name, role: one for all rows, or (N,)."""
-    n, box = len(rows), rows[:, 2:6]
+    n = len(rows)
+    box = rows[:, 2:6]
     xyxy = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], 1)  # (N, 4)
     whole = rows[:, :2].astype(np.int64)
-    names, roles = np.broadcast_to(np.asarray(name, str), n), np.broadcast_to(role, n)
+    names = np.broadcast_to(np.asarray(name, str), n)
+    roles = np.broadcast_to(role, n)
     return LabelledBoxes(whole[:, 0], whole[:, 1], xyxy, names, np.asarray(roles, np.int64))
 
 
@@ -108,9 +112,11 @@ def read_result(out: Path, said: list[str] | None = None) -> LabelledBoxes:
     said = [] if said is None else said
     if out.is_dir():
         result = Result.load(out)
-        tracks, names = result.tracks, np.array([*result.class_names, ""], str)  # -1: unknown
+        tracks = result.tracks  # -1: unknown
+        names = np.array([*result.class_names, ""], str)
         role = np.full(len(tracks), SCORED)
-        ids, frame = tracks.track_id, tracks.frame + 1
+        ids = tracks.track_id
+        frame = tracks.frame + 1
         found = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
     else:
         found = labelled(_from_one(read_mot_rows(out), out, said))
@@ -141,7 +147,8 @@ def _read_mot(
         return labelled(rows, "", np.where(flagged, ABSENT, SCORED))
     number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
     hidden = rows[:, 8] < min_visibility
-    labels, stated = path.with_name("labels.txt"), path.with_name("gt_mot_format.json")
+    labels = path.with_name("labels.txt")
+    stated = path.with_name("gt_mot_format.json")
     if labels.exists():
         said.append(f"classes are lines of {labels.name}, from 1 (CVAT's MOT 1.1)")
         role = np.where(flagged, ABSENT, hidden * IGNORED)
@@ -295,7 +302,8 @@ def _check_identities(boxes: LabelledBoxes, path: Path) -> None:
     """Refuse boxes without identity, and an identity that has two boxes in a frame."""
     scored = boxes[boxes.role == SCORED]
     if (scored.identity < 0).any():
-        count, total = (scored.identity < 0).sum(), len(scored)
+        count = (scored.identity < 0).sum()
+        total = len(scored)
         frame = scored.frame[scored.identity < 0].min()
         why = ": detections, not tracks?" if count == total else ""
         raise ReobjError(f"{path}: {count} of {total} boxes have no identity (below 0), the first "
@@ -319,7 +327,8 @@ def check_counts(truth: LabelledBoxes, path: Path, left_out: str = "") -> None:
     """
     if (truth.role == SCORED).any():
         return
-    absent, ignored = (truth.role == ABSENT).sum(), (truth.role == IGNORED).sum()
+    absent = (truth.role == ABSENT).sum()
+    ignored = (truth.role == IGNORED).sum()
     why = "no boxes in it"
     if len(truth):
         why = (f"of {len(truth)} rows {absent} are marked not to count (column 7 is 0, or another "

@@ -104,7 +104,9 @@ def _in_brackets(
     if closing is None or not text.endswith(closing):
         raise ReobjError(f"{path}, line {at + 1}: `names: {text[:40]}`, expected [a, b], "
                          "{0: a, 1: b}, or a line for each name")  # fmt: skip
-    inside, found, place = text[1:-1].strip(), list[tuple[str, str, int]](), 0
+    inside = text[1:-1].strip()
+    found = list[tuple[str, str, int]]()
+    place = 0
     while place < len(inside):
         entry = ENTRY.match(inside, place)
         if entry is None:

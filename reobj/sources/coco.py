@@ -77,7 +77,8 @@ def parse_dataset(path: Path, data: Mapping[str, Any]) -> Dataset:
     expected = "{id, file_name, width, height}"
     images = _objects(path, data, "images", expected)
     for i, image in enumerate(images):
-        name, sides = image.get("file_name"), (image.get("width"), image.get("height"))
+        name = image.get("file_name")
+        sides = (image.get("width"), image.get("height"))
         number = image.get("frame_id", image.get("frame_index", 0))
         if not isinstance(name, str | None) or not all(map(_is_side, sides)):
             raise ReobjError(f"{path}, images[{i}]: {image!r:.80}, expected {expected}")
@@ -112,7 +113,8 @@ def _beside(path: Path, entries: Sequence[Mapping[str, Any]]) -> Dataset | None:
         ReobjError: several fit and differ in what the ids mean; or none, and the results say
             nothing else of their images.
     """
-    found, faults = list[Dataset](), list[ReobjError]()
+    found = list[Dataset]()
+    faults = list[ReobjError]()
     for other in sorted(path.parent.glob("*.json")):
         data = None
         with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
@@ -160,7 +162,8 @@ def read_coco(
         names: class names by category id from 0, () where they are not given.
         first: number of the first frame as the user says it, "": found out.
     """
-    entries, dataset = data, dataset_of(path, data)
+    entries = data
+    dataset = dataset_of(path, data)
     if dataset is not None and dataset.path == path:
         entries = dataset.entries
     if not isinstance(entries, list):
@@ -321,7 +324,9 @@ def _dataset_frames(dataset: Dataset, video: Video, first: str) -> tuple[dict[Id
     By file name; else `frame_id` (COCO-VID) or `frame_index` (TAO); else the numbers in the file
     names; else in order where there is an image for every frame.
     """
-    images, where, said = list(dataset.images.values()), str(dataset.path), ""
+    images = list(dataset.images.values())
+    where = str(dataset.path)
+    said = ""
     of_video = {image.get("video_id") for image in images} & dataset.videos.keys()
     if len(of_video) > 1:
         stem = Path(video.source).stem
@@ -398,9 +403,11 @@ def _read_oa_slam(
     path: Path, entries: Sequence[Mapping[str, Any]], names: Sequence[str], video: Video, first: str
 ) -> RecordedDetections:
     """Read OA-SLAM's and VOOM's file: an entry an image, boxes as corners, classes from 0."""
-    rows, images = list[Mapping[str, Any]](), list[str]()
+    rows = list[Mapping[str, Any]]()
+    images = list[str]()
     for at, entry in enumerate(entries):
-        name, own = entry.get("file_name"), entry.get("detections")
+        name = entry.get("file_name")
+        own = entry.get("detections")
         good = isinstance(name, str) and isinstance(own, list)
         if not good or not all(isinstance(d, dict) and _is_row(d) for d in own or ()):
             expected = "expected {file_name, detections: [{category_id, detection_score, bbox}]}"
@@ -422,7 +429,8 @@ def _read_oa_slam(
 
 
 def _is_row(row: Mapping[str, Any]) -> bool:
-    box, kind = row.get("bbox"), row.get("category_id")
+    box = row.get("bbox")
+    kind = row.get("category_id")
     whole = isinstance(kind, int) and 0 <= kind < 1 << 31
     return whole and isinstance(box, list) and len(box) == 4
 

@@ -28,11 +28,14 @@ def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
     Returns:
         times (F,) in s, how often the clock began again, and whether there were times.
     """
-    count, known = len(raw_s), np.flatnonzero(np.isfinite(raw_s))
+    count = len(raw_s)
+    known = np.flatnonzero(np.isfinite(raw_s))
     if len(known) < 2 or np.ptp(raw_s[known]) == 0:
         return np.arange(0.0, count) * step_s, 0, count < 2 and len(known) == count
     time_s: Array = np.interp(np.arange(count), known, raw_s[known])
-    steps, restarts, at = np.diff(raw_s[known]) / np.diff(known), 0, 1
+    steps = np.diff(raw_s[known]) / np.diff(known)
+    restarts = 0
+    at = 1
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else step_s
     while True:
         highest = np.maximum.accumulate(time_s[at - 1 :])
@@ -50,7 +53,8 @@ def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
             restarts += after != 0 or count - at > 1 / RESTART_SHARE
 
 
-EBML, SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"  # first two elements of Matroska and WebM
+EBML = b"\x1a\x45\xdf\xa3"  # first two elements of Matroska and WebM
+SEGMENT = b"\x18\x53\x80\x67"
 
 
 def missing_bytes(path: Path) -> int:
@@ -61,7 +65,8 @@ def missing_bytes(path: Path) -> int:
         recordings).
     """
     with contextlib.suppress(OSError, IndexError, struct.error), path.open("rb") as file:
-        size, head = path.stat().st_size, file.read(64)
+        size = path.stat().st_size
+        head = file.read(64)
         if head.startswith(EBML):
             return max(0, _matroska_end(head) - size)
         if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):

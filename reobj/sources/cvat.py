@@ -41,10 +41,12 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
             with zipfile.ZipFile(path) as packed:
                 check_unpacked(packed.getinfo("annotations.xml").file_size, XML_MAX)
                 text = packed.read("annotations.xml")
-        root, made = ET.fromstring(text), Counter[str]()
+        root = ET.fromstring(text)
+        made = Counter[str]()
         shapes = list(_of_tracks(root)) or list(_of_images(root))
         boxes = [_bounds(shape, made) for _, _, _, shape in shapes]
-        frames, labels = [f for f, _, _, _ in shapes], [name for _, _, name, _ in shapes]
+        frames = [f for f, _, _, _ in shapes]
+        labels = [name for _, _, name, _ in shapes]
         ids = np.array([identity for _, identity, _, _ in shapes], np.int64)
         size = root.find(".//meta//original_size")
         made_for = [0.0, 0.0]
@@ -124,7 +126,8 @@ def _bounds(shape: ET.Element, made: Counter[str]) -> Array:
 
 def _turned(centre: Array, half: Array, angle_deg: float, box: bool) -> Array:
     """Bound a box or ellipse of half sides (2,) that is turned about its centre (2,)."""
-    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    c = np.cos(np.radians(angle_deg))
+    s = np.sin(np.radians(angle_deg))
     sides = np.abs([[c, s], [s, c]]) * half
     reach = sides.sum(1) if box else np.sqrt((sides**2).sum(1))
     return np.hstack([centre - reach, centre + reach])

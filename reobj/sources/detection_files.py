@@ -106,7 +106,8 @@ def read_detections(
     Raises:
         ReobjError: names the file, the line and what was expected there.
     """
-    path, config = Path(path), config or DetectConfig()
+    path = Path(path)
+    config = config or DetectConfig()
     found = _read(path, video, config)
     _note_looked(found, video.frame_count)
     _check(found, path, config, video.frame_count)
@@ -250,7 +251,8 @@ PERCENT_MIN = 2.0  # a file whose best detection has 2 % holds no percents
 
 def _check_scores(found: RecordedDetections) -> None:
     """Bring scores to [0, 1] and say how: no scores at all, percents, or clipped."""
-    low, high = found.score.min(initial=0), found.score.max(initial=0)
+    low = found.score.min(initial=0)
+    high = found.score.max(initial=0)
     if len(found) and (found.score == -1).all():
         found.messages.append("scores are all -1: taken as 1")
         found.score = -found.score
@@ -285,7 +287,9 @@ EDGE_PX = 1.0  # chosen: detectors round boxes at the border to whole pixels
 
 def _usable(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
     """Tell which boxes (N,) have an area, touch the image and belong to a frame of the video."""
-    count, low, high = len(found), found.xyxy[:, :2], found.xyxy[:, 2:]
+    count = len(found)
+    low = found.xyxy[:, :2]
+    high = found.xyxy[:, 2:]
     empty = (high <= low).any(1)  # (N,)
     outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(found.size))).any(1))
     missing = (found.frame < 0) | (found.frame >= (frame_count or sys.maxsize))
@@ -362,13 +366,16 @@ def read_tracks(
     Returns:
         tracks, their class names, and messages for the user.
     """
-    path, config = Path(path), config or DetectConfig()
+    path = Path(path)
+    config = config or DetectConfig()
     limit = dataclasses.replace(config, min_score=0.0, max_detections=0)
     found = _read(path, video, limit)
     _check(found, path, limit, video.frame_count)
     if len(found):
         _check_identities(found, path)
-    start, stop, every = video.config.start, video.config.stop, video.config.every
+    start = video.config.start
+    stop = video.config.stop
+    every = video.config.every
     use = (found.frame >= start) & ((found.frame - start) % every == 0)
     use &= found.frame < (stop or sys.maxsize)
     pairs = np.column_stack([found.frame, found.identity])[use]  # (N, 2)
@@ -378,9 +385,11 @@ def read_tracks(
         raise ReobjError(f"{path}: identity {identity} has {count.max()} boxes in frame {frame} "
                          "(0-based); an object is in one place at a time")  # fmt: skip
     rows = np.flatnonzero(use)[first]
-    ids, unknown = found.identity[rows], np.full(len(rows), -1, np.int64)
+    ids = found.identity[rows]
+    unknown = np.full(len(rows), -1, np.int64)
     columns = (found.xyxy[rows], found.score[rows], found.class_id[rows], unknown)
-    tracks, names = Tracks(found.frame[rows], ids, ids, *columns), found.class_names
+    tracks = Tracks(found.frame[rows], ids, ids, *columns)
+    names = found.class_names
     if known is not None:
         unnamed = names == ("object",)
         tracks = _lend(known, tracks, unnamed)
@@ -412,14 +421,17 @@ def _lend(known: Tracks, tracks: Tracks, unnamed: bool) -> Tracks:
     The class is that of the earlier boxes that overlap an object's most, in sum over its frames,
     -1 where none shows it.
     """
-    class_id, score = tracks.class_id.copy(), tracks.score.copy()
-    overlap, old_class = np.zeros(len(tracks)), np.full(len(tracks), -1, np.int64)
+    class_id = tracks.class_id.copy()
+    score = tracks.score.copy()
+    overlap = np.zeros(len(tracks))
+    old_class = np.full(len(tracks), -1, np.int64)
     for rows in rows_by(tracks.frame):
         there = known[known.frame == tracks.frame[rows[0]]]
         if not len(there):
             continue
         iou = box_iou(tracks.xyxy[rows], there.xyxy)  # (n, m)
-        best, most = iou.argmax(1), iou.max(1)
+        best = iou.argmax(1)
+        most = iou.max(1)
         same = most > SAME_BOX
         score[rows[same]] = there.score[best[same]]
         overlap[rows] = np.where(most >= SAME_OBJECT, most, 0)

@@ -88,7 +88,8 @@ class OnnxDetector:
         self.config = config or DetectConfig()
         name = path_or_name or self.config.model
         self._most = self.config.max_detections or MODEL_DETECTIONS
-        self._grid, weights = parse_tiles(self.config.tiles), known_weights(name)
+        self._grid = parse_tiles(self.config.tiles)
+        weights = known_weights(name)
         self.path = model_path(name, offline)
         self._session = onnx_session(self.path, threads, device)
         self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
@@ -235,7 +236,8 @@ class DetectionCache:
     """
 
     def __init__(self, folder: str | Path, image_size: tuple[int, int]) -> None:
-        self.folder, self.image_size = Path(folder), image_size
+        self.folder = Path(folder)
+        self.image_size = image_size
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._fresh: dict[int, Detections] = {}  # by frame, not on disk yet
         self._skipped: set[int] = set()  # frames that were not looked at; of this run only
@@ -399,7 +401,8 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
     own = tuple(class_names) or _own_names(detector)
-    names, by_number = Vocabulary(own or COCO_NAMES), bool(own)
+    names = Vocabulary(own or COCO_NAMES)
+    by_number = bool(own)
     for name in names:
         check_length(name, "class names of the detector")
 

@@ -270,7 +270,8 @@ def times_of_names(names: Sequence[str]) -> Array | None:
     words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
     if not words or not all(words):
         return None
-    decimals, points = _decimals(names), ["." in word for (word,) in words]
+    decimals = _decimals(names)
+    points = ["." in word for (word,) in words]
     numbers = np.array(decimals or [float(word) for (word,) in words])
     if not (all(points) or (decimals and any(points)) or numbers.min() >= LEAST_STAMP):
         return None
@@ -350,7 +351,8 @@ def header_of(data: bytes) -> Header | None:
             return _jpeg_header(data)
         if data[:4] in (b"II*\0", b"MM\0*"):
             tags = _tiff_tags(data)
-            channels, bits = tags.get(277, 1), tags.get(258, 1)
+            channels = tags.get(277, 1)
+            bits = tags.get(258, 1)
             bits = bits if channels == 1 else 8
             return Header(_upright((tags.get(256, 0), tags.get(257, 0)), tags), channels, bits)
         if data[8:15] == b"WEBPVP8":
@@ -365,7 +367,8 @@ def _upright(size: tuple[int, int], tags: dict[int, int]) -> tuple[int, int]:
 
 def _jpeg_header(data: bytes) -> Header:
     """Read the first start of frame, which follows other segments, EXIF among them."""
-    at, tags = 2, dict[int, int]()
+    at = 2
+    tags = dict[int, int]()
     while data[at] == 0xFF and not (
         0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in JPEG_OTHER
     ):
@@ -398,7 +401,8 @@ def _webp_size(data: bytes) -> tuple[int, int]:
         width, height = (int.from_bytes(data[i : i + 3], "little") + 1 for i in (24, 27))
     elif data[15:16] == b"L":
         (bits,) = struct.unpack_from("<I", data, 21)
-        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        width = (bits & 0x3FFF) + 1
+        height = (bits >> 14 & 0x3FFF) + 1
     else:
         width, height = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
     return width, height

@@ -66,7 +66,8 @@ def first_number(numbers: IntArray, frame_count: int, listed: bool = False) -> i
         listed: also frames without a detection are in it, so that the first number is that of the
             first frame, or one of every N-th.
     """
-    low, high = int(numbers.min()), int(numbers.max())
+    low = int(numbers.min())
+    high = int(numbers.max())
     if low <= 0:
         return 0
     if frame_count and high == frame_count:  # from 0 there is no such frame
@@ -94,7 +95,8 @@ def frames_of_numbers(
         return numbers, ""
     start = int(first) if first else first_number(numbers, frame_count, listed)
     if start is None and usual is None:
-        low, high = int(numbers.min()), int(numbers.max())
+        low = int(numbers.min())
+        high = int(numbers.max())
         raise ReobjError(
             f"{where}: numbers {low} to {high} count frames from 0, or from 1 (then the first of "
             f"them is frame {low - 1}); say which with {OPTION}0 or {OPTION}1"

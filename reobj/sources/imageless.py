@@ -44,24 +44,32 @@ class ImagelessVideo(Video):
         names: Sequence[str] = (),
         count: int = 0,
     ) -> None:
-        self.source, self.config = str(source), config or InputConfig()
+        self.source = str(source)
+        self.config = config or InputConfig()
         self.fingerprint = source_fingerprint(source)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.size = self.working_size = (int(size[0]), int(size[1]))
         self.scale = self.pixel_aspect = 1.0
-        self.names, self.files = list(names), []
+        self.names = list(names)
+        self.files = []
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
-        self.times_s, self.times_are_known = given, given is not None
+        self.times_s = given
+        self.times_are_known = given is not None
         self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
         if given is not None and len(given) < self.frame_count:
             what = f"{len(given)} times of {self.frame_count} frames"
             raise ReobjError(f"{self.source}: {what}; expected one each")
-        self._clock, self._announced, self.fps = None, self.frame_count, IMAGE_FPS
+        self._clock = None
+        self._announced = self.frame_count
+        self.fps = IMAGE_FPS
         if given is not None and len(given) > 1:
             self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
-        self.is_live, self.read, self.dropped = False, 0, 0
-        self.skipped, self.messages = [], []
+        self.is_live = False
+        self.read = 0
+        self.dropped = 0
+        self.skipped = []
+        self.messages = []
 
     def facts(self) -> dict[str, Any]:
         """Return the arguments that make the same frames again, as JSON takes them."""

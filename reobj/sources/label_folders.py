@@ -75,7 +75,9 @@ def read_label_folder(
         messages.append(f"class names of {beside.name}")
     elif not names:
         messages.append("no class names beside it: class numbers are taken as COCO's 80")
-    rows, lines, of_file = list[list[float]](), list[str](), list[int]()
+    rows = list[list[float]]()
+    lines = list[str]()
+    of_file = list[int]()
     for at, file in enumerate(files):
         for number, line in enumerate(read_lines(file), 1):
             if cells := line.split():
@@ -122,7 +124,9 @@ def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
     every seventh is a share: then they are triangles. More are polygons, with the same at the end.
     """
     count = len(rows)
-    box, score, identity = np.zeros((count, 4)), np.ones(count), np.full(count, -1, np.int64)
+    box = np.zeros((count, 4))
+    score = np.ones(count)
+    identity = np.full(count, -1, np.int64)
     seventh = [row[6] for row in rows if len(row) == 7]
     triangles = any(value % 1 for value in seventh)
     for i, row in enumerate(rows):
@@ -130,7 +134,8 @@ def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
         rest = row[5:] if not polygon else _tail(row)
         if polygon:
             corners = np.reshape(row[1 : len(row) - len(rest)], (-1, 2))
-            low, high = corners.min(0), corners.max(0)
+            low = corners.min(0)
+            high = corners.max(0)
             box[i] = *(low + high) / 2, *(high - low)
         else:
             box[i] = row[1:5]

@@ -39,7 +39,9 @@ class Intervals:
             self.apart += frame - self.last > 1
         else:
             self.first = frame
-        self.last, self.count, self.boxes = frame, self.count + 1, self.boxes + boxes
+        self.last = frame
+        self.count = self.count + 1
+        self.boxes = self.boxes + boxes
 
     def looked_at(self, frame: int) -> bool:
         """Tell whether the detector was run on a frame without a box."""

@@ -104,7 +104,8 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
     w, h = size
     if fit != "stretch":
         ratio = min(size[0] / width, size[1] / height)
-        w, h = max(round(width * ratio), 1), max(round(height * ratio), 1)
+        w = max(round(width * ratio), 1)
+        h = max(round(height * ratio), 1)
     left, top = ((size[0] - w) // 2, (size[1] - h) // 2) if fit == "centre" else (0, 0)
     canvas = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
     canvas[top : top + h, left : left + w] = cv2.resize(image, (w, h))
@@ -113,7 +114,8 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
 
 def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[Array, Array]:
     """List the cells of all levels, row by row: x, y (A, 2) and stride (A, 1)."""
-    cells, stride = [], []
+    cells = []
+    stride = []
     for s in strides:
         y, x = np.mgrid[: math.ceil(size[1] / s), : math.ceil(size[0] / s)]
         cells.append(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
@@ -171,7 +173,8 @@ def _decode_yolo(outs: list[Any], geometry: Geometry) -> Decoded:
 
     def masks(chosen: IntArray) -> BoolArray:
         maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
-        scale, pad = ratio * geometry.scale, ratio * geometry.pad
+        scale = ratio * geometry.scale
+        pad = ratio * geometry.pad
         return _paste(maps, boxes[chosen], geometry.image_size, scale, pad, 0.0)
 
     return Decoded(boxes, score, label, masks if len(proto) else None)
@@ -185,10 +188,12 @@ def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
     then bins by level, distances from the cell's centre.
     """
     if len(outs) == 1:
-        levels, center = len(GFL_STRIDES), 0.0
+        levels = len(GFL_STRIDES)
+        center = 0.0
         scores, bins = np.split(outs[0][0], [-4 * GFL_BINS], 1)
     else:
-        levels, center = len(outs) // 2, 0.5
+        levels = len(outs) // 2
+        center = 0.5
         scores, bins = (np.concatenate(part, 1)[0] for part in (outs[:levels], outs[levels:]))
     score, label = _best_class(scores)
     keep = np.argsort(-score, kind="stable")[:MAX_CANDIDATES]  # the rest is not worth its bins
@@ -213,7 +218,8 @@ def _decode_with_nms(outs: list[Any], geometry: Geometry) -> Decoded:
     maps = [o[:, 0] for o in outs if o.ndim == 4]  # (N, h, w) probabilities
 
     def masks(chosen: IntArray) -> BoolArray:
-        low, high = boxes[chosen, :2], boxes[chosen, 2:]
+        low = boxes[chosen, :2]
+        high = boxes[chosen, 2:]
         ratio = np.array(RCNN_MASK) / np.maximum(high - low, 1e-6)  # (K, 2)
         return _paste(maps[0][chosen], boxes[chosen], geometry.image_size, ratio, -low * ratio, 0.5)
 

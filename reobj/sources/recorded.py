@@ -73,7 +73,9 @@ class RecordedDetections:
     def at(self, frame_index: int) -> Detections:
         """Return the detections of a frame in px of the working size; decodes its masks."""
         low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
-        rows, runs, masks = slice(low, high), self.runs[low:high], None
+        rows = slice(low, high)
+        runs = self.runs[low:high]
+        masks = None
         ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
         if any(map(len, runs)):
             decoded = (rle_decode(counts, self.size) for counts in runs)
@@ -189,7 +191,8 @@ def read_npz(
             raise ReobjError(f"{path}: array {key} is of {data[key].dtype}, expected {kinds}")
     if data["class_names"].ndim != 1:
         raise ReobjError(f"{path}: array class_names is {data['class_names'].shape}, expected (C,)")
-    offsets, runs = data["mask_offsets"].astype(np.int64), data["mask_counts"]
+    offsets = data["mask_offsets"].astype(np.int64)
+    runs = data["mask_counts"]
     ordered = (np.diff(offsets, prepend=0) >= 0).all() and offsets[-1:].max(initial=0) <= runs.size
     if runs.ndim != 1 or not ordered or (runs < 0).any():
         raise ReobjError(f"{path}: mask_counts and mask_offsets do not fit each other")

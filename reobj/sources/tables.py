@@ -199,15 +199,22 @@ def read_cells(path: Path) -> Table:
     expected = "6 to 10 (frame, id, left, top, w, h, score)"
     count = len(first)
     if not _is_number(first[0]):
-        table.kind, table.header = "CSV", _header(first)
-        columns, count, rows, lines = table.header, len(table.header), rows[1:], lines[1:]
+        table.kind = "CSV"
+        table.header = _header(first)
+        columns = table.header
+        count = len(table.header)
+        rows = rows[1:]
+        lines = lines[1:]
         table.line = table.line[1:]
         expected = str(count)
     elif count > 1 and not any(cells[-1] for cells in rows):  # each line ends in a separator
-        rows, count = [cells[:-1] for cells in rows], count - 1
+        rows = [cells[:-1] for cells in rows]
+        count = count - 1
         expected = str(count) if 6 <= count <= len(MOT_COLUMNS) else expected
     elif len(first) in (17, 18) and not _is_number(first[2]):
-        table.kind, columns, expected = "KITTI", KITTI_COLUMNS, str(count)
+        table.kind = "KITTI"
+        columns = KITTI_COLUMNS
+        expected = str(count)
     elif 6 <= count <= len(MOT_COLUMNS):
         expected = str(count)
     for cells, line in zip(rows, lines, strict=True):
@@ -308,7 +315,9 @@ def recorded_table(
 ) -> RecordedDetections:
     """Make the detections of a table of any kind."""
     _drop_rows(table)
-    xyxy, count, mot = _boxes(table), len(table.line), table.kind == "MOT"
+    xyxy = _boxes(table)
+    count = len(table.line)
+    mot = table.kind == "MOT"
     if mot and (table.numbers("id") % 1 != 0).any():
         raise ReobjError(f"{table.path}: the second column is no identity. If this is no MOT file: "
                          "CSV needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
@@ -369,7 +378,8 @@ def _frames(table: Table, video: Video, first: str) -> IntArray:
         if any(name.startswith("bb_") for name in table.header):  # MOTChallenge's own names
             usual = 1
         numbers = table.whole("frame")
-        count, where = video.frame_count, str(table.path)
+        count = video.frame_count
+        where = str(table.path)
         frame, text = frames_of_numbers(numbers, count, first, usual, False, where)
     elif "frame" in table.cells or "image" in table.cells:
         names = table.cells["frame" if "frame" in table.cells else "image"]
@@ -487,9 +497,11 @@ def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntA
     if number.max() > CLASS_MAX:
         text = f"class number {table.cells['class'][int(number.argmax())]}"
         raise ReobjError(f"{table.path}: {text}, expected at most {CLASS_MAX}")
-    kind, first = number.astype(np.int64), 1
+    kind = number.astype(np.int64)
+    first = 1
     if _is_boxmot(table, score, kind):
-        score[:], first = table.numbers("extra"), 0
+        score[:] = table.numbers("extra")
+        first = 0
         table.messages.append(
             "columns 7 to 9 are taken as 1, class from 0, score, as boxmot writes them"
         )

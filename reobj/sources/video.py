@@ -115,7 +115,8 @@ class Video:
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
         check_versions()
         guard_forks()
-        self._address, self.config = str(source), config or InputConfig()
+        self._address = str(source)
+        self.config = config or InputConfig()
         self.source = without_secrets(self._address)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
@@ -151,7 +152,8 @@ class Video:
     @property
     def expected(self) -> int:
         """Count the frames that an iteration yields, about: as announced before it was measured."""
-        clock, count = self._clock, self._announced
+        clock = self._clock
+        count = self._announced
         count = len(clock.times_s) if clock is not None and clock.complete else count
         stop = min(self.config.stop or count, count or self.config.stop)
         return max(math.ceil((stop - self.config.start) / self.config.every), 0)
@@ -165,12 +167,14 @@ class Video:
 
     @functools.cached_property
     def fps(self) -> float:
-        announced, times_s = self._announced_fps, self.times_s
+        announced = self._announced_fps
+        times_s = self.times_s
         if not self.files and not self.is_live and self.times_are_known:
             times_s = self._measured().times_s
         if times_s is None or len(times_s) < 2:
             return self._assumed_fps
-        steps, seconds = len(times_s) - 1, float(np.ptp(times_s))
+        steps = len(times_s) - 1
+        seconds = float(np.ptp(times_s))
         same = abs(steps / announced - seconds) <= ROUNDING_S
         return announced if same else steps / seconds
 
@@ -194,7 +198,8 @@ class Video:
             numbers = range(self.config.start, stop, self.config.every)
             times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
             decoded = ((i, float(times_s[i]), read_image(self.files[i])) for i in numbers)
-        unreadable, other_size = list[int](), list[int]()
+        unreadable = list[int]()
+        other_size = list[int]()
         for index, time_s, image in decoded if self.is_live else one_ahead(decoded):
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 (unreadable if image is None else other_size).append(index)
@@ -219,7 +224,9 @@ class Video:
 
         The image is None if it cannot be read.
         """
-        start, every, raw_s = self.config.start, self.config.every, list[float]()
+        start = self.config.start
+        every = self.config.every
+        raw_s = list[float]()
         capture = self._open()
         for index, seconds in enumerate(self._grabbed(capture)):
             if not seconds > max(raw_s[-1:], default=-math.inf):
@@ -246,7 +253,8 @@ class Video:
             for _ in range(failed):
                 index += 1
                 yield math.nan
-            index, failed = index + 1, 0
+            index = index + 1
+            failed = 0
             # Right after the grab this is the frame's true time, also at a variable rate.
             seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             yield seconds if abs(seconds) < NO_TIME_S else math.nan
@@ -286,10 +294,12 @@ class Video:
         too, and some announce a rate that no frame has. But in a file of pictures alone most bytes
         are those of its frames.
         """
-        read, last_s = len(times_s), float(times_s[-1])
+        read = len(times_s)
+        last_s = float(times_s[-1])
         if self._announced - read <= max(1.0, MISSING_SHARE * self._announced):
             return ""
-        what, stored = f"{read} frames up to {last_s:.2f} s can be read", Path(self._address)
+        what = f"{read} frames up to {last_s:.2f} s can be read"
+        stored = Path(self._address)
         if lost := missing_bytes(stored):
             return f"the file ends early: {lost} bytes are missing at its end; {what}"
         _, stored_s, size = self._packets()
@@ -303,7 +313,9 @@ class Video:
     def _packets(self) -> tuple[int, float, int]:
         """Count the frames that a file stores, undecoded; also time in s of the last, and bytes."""
         capture = self._open([cv2.CAP_PROP_FORMAT, -1])
-        count, last_s, size = 0, 0.0, 0
+        count = 0
+        last_s = 0.0
+        size = 0
         while capture.grab():
             count += 1
             last_s = max(last_s, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
@@ -316,7 +328,8 @@ class Video:
 
         Where it ends, connect again as often as the config says; the frames are counted on.
         """
-        capture, self._opened = self._opened or self._open(), None
+        capture = self._opened or self._open()
+        self._opened = None
         self.read = self.dropped = self._seen = attempts = 0
         began = time.monotonic()
         while capture is not None:
@@ -342,7 +355,8 @@ class Video:
         A thread reads all frames, so that the driver's own queue never fills with old ones.
         """
         frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_QUEUE)
-        stopped, self._came = threading.Event(), time.monotonic()
+        stopped = threading.Event()
+        self._came = time.monotonic()
         thread = threading.Thread(
             target=self._read_live, args=(capture, frames, stopped, began), daemon=True
         )
@@ -387,7 +401,8 @@ class Video:
                 if stopped.is_set():  # the driver hung; another connection counts now
                     break
                 self._came = last = time.monotonic()
-                at, self._seen = self._seen, self._seen + 1
+                at = self._seen
+                self._seen = self._seen + 1
                 if at < self.config.start or (at - self.config.start) % self.config.every:
                     continue
                 self.read += 1
@@ -435,7 +450,8 @@ class Video:
             (w, h) in px, frame rate in Hz, and number of frames (0: unknown), both as announced.
         """
         images: Iterator[Image | None] = map(read_image, [*usual, *self.files])
-        fps, count = IMAGE_FPS, len(self.files)
+        fps = IMAGE_FPS
+        count = len(self.files)
         if not self.files:
             capture = self._open()
             images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
@@ -491,7 +507,8 @@ def source_fingerprint(source: Any) -> str:
         16 hex digits; of a camera its number; of a URL what may be shown of it, and a slow hash of
         the rest: two queries of a server are two sources.
     """
-    text, path = str(source), Path(str(source))
+    text = str(source)
+    path = Path(str(source))
     if STREAM_URL.match(text):
         shown = without_secrets(text)
         rest = hashlib.pbkdf2_hmac("sha256", text.encode(), shown.encode(), HASH_ROUNDS)

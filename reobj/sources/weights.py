@@ -21,7 +21,8 @@ from reobj.types import ReobjError, log
 
 # Mean and standard deviation of the pixels of ImageNet, RGB, 0..255 (torchvision: .485, .456, .406
 # and .229, .224, .225, times 255): what most published networks were trained with.
-IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
+IMAGENET_MEAN = (123.675, 116.28, 103.53)
+IMAGENET_STD = (58.395, 57.12, 57.375)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +150,8 @@ def list_models() -> list[ModelRow]:
     """List all known weights with their state on this machine; reads and hashes the files."""
     rows = []
     for weights in WEIGHTS:
-        path, state = _find_model(weights.file), "missing"
+        path = _find_model(weights.file)
+        state = "missing"
         if path is not None:
             state = "verified" if weights.digest_of(path) == weights.digest else "changed"
         rows.append(ModelRow(weights, state, path))
@@ -166,7 +168,8 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
     Raises:
         ReobjError: unknown, changed, or not to be had; says what to do.
     """
-    path, name = Path(name_or_path).expanduser(), str(name_or_path)
+    path = Path(name_or_path).expanduser()
+    name = str(name_or_path)
     if path.is_file():
         return path
     weights = known_weights(name)
@@ -274,7 +277,8 @@ def _download(weights: Weights, part: Path) -> None:
     ):
         if response.headers.get_content_type() in WEB_PAGES:
             raise ConnectionError("a web page came instead: must you log in to this network first?")
-        size, done = weights.size or min(response.length or 0, DOWNLOAD_MAX), 0
+        size = weights.size or min(response.length or 0, DOWNLOAD_MAX)
+        done = 0
         with Progress("fetch kB", size // 1000) as progress:
             while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
                 file.write(chunk)
