@@ -511,7 +511,7 @@ def _checked(xyxy: Any, score: Any, class_id: Any, masks: Any) -> Detections:
             raise ReobjError(f"{name} are an array of shape {column.shape}, expected ({count},): "
                              "one for each box")  # fmt: skip
     if count > DETECTIONS_MAX:
-        raise ReobjError(f"{count} detections in a frame, at most {DETECTIONS_MAX} are taken: "
+        raise ReobjError(f"{count} detections in a frame, at most {DETECTIONS_MAX} are allowed: "
                          "keep those of the highest scores")  # fmt: skip
     if masks is not None:
         masks = as_numbers(masks, "masks")

@@ -129,7 +129,7 @@ def _parse(entry: Any) -> Edit:
     if not isinstance(name, str) or ("class" in fields and not name.strip()):
         raise ValueError(f"class {name!r} is no name")
     if len(name) > CLASS_NAME_MAX:
-        raise ValueError(f"class of {len(name)} characters, at most {CLASS_NAME_MAX} are taken")
+        raise ValueError(f"class of {len(name)} characters, at most {CLASS_NAME_MAX} are allowed")
     if not name.isprintable():
         raise ValueError(f"class {name!r} has characters that cannot be printed")
     visits = tuple(_box_ref(item) for item in entry.get("visits", ()))

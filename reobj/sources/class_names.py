@@ -32,7 +32,7 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     else:
         found = [(i, line.strip()) for i, line in enumerate(read_lines(path), 1) if line.strip()]
     if len(found) > CLASS_MAX:
-        raise ReobjError(f"{path}: {len(found)} class names, at most {CLASS_MAX} are taken")
+        raise ReobjError(f"{path}: {len(found)} class names, at most {CLASS_MAX} are allowed")
     for line, name in found:
         check_length(name, f"{path}, line {line}" if line else str(path))
     return tuple(name for _, name in found)
@@ -41,7 +41,7 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
 def check_length(name: str, where: str) -> None:
     """Refuse a class name of more than CLASS_NAME_MAX characters."""
     if len(name) > CLASS_NAME_MAX:
-        text = f"a class name of {len(name)} characters, at most {CLASS_NAME_MAX} are taken"
+        text = f"a class name of {len(name)} characters, at most {CLASS_NAME_MAX} are allowed"
         raise ReobjError(f"{where}: {text} ({name[:20]}...)")
 
 

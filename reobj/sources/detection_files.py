@@ -277,7 +277,7 @@ def _most(found: RecordedDetections, rows: IntArray, path: Path, most: int) -> I
     if (worst := int(rank.max(initial=-1)) + 1) > DETECTIONS_MAX:
         text = f"{worst} boxes in frame {frame[rank.argmax()]} (0-based)"
         advice = "raise detect.min_score, or keep the best with --set detect.max_detections=N"
-        raise ReobjError(f"{path}: {text}, at most {DETECTIONS_MAX} are taken; {advice}")
+        raise ReobjError(f"{path}: {text}, at most {DETECTIONS_MAX} are allowed; {advice}")
     return rows
 
 

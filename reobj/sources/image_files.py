@@ -304,7 +304,7 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
         data = np.fromfile(path, np.uint8)
         claimed = header_of(data.tobytes())
         if claimed is not None and (pixels := math.prod(claimed.size)) > PIXELS_MAX:
-            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are taken")
+            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are allowed")
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None

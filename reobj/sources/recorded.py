@@ -176,7 +176,7 @@ def read_npz(
     data, _ = load_npz(path, sealed)
     for key, most in SIZES.items():
         if key in data and data[key].size > most:
-            raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are taken")
+            raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are allowed")
     count = len(np.atleast_1d(data.get("frame", ())))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))

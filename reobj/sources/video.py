@@ -459,7 +459,7 @@ class Video:
             pixels = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
             if pixels > PIXELS_MAX:
                 raise ReobjError(f"{self.source}: frames of {pixels:.0f} pixels, at most "
-                                 f"{PIXELS_MAX} are taken")  # fmt: skip
+                                 f"{PIXELS_MAX} are allowed")  # fmt: skip
             if not self._address.isdecimal():
                 count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
             self.is_live = self.is_live and not count  # a URL may be that of a file
