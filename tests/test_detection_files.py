@@ -361,7 +361,9 @@ def test_npz_of_more_than_is_taken(
     monkeypatch.setitem(recorded.SIZES, key, count)
     assert len(rt.read_detections(path, video)) == 2
     monkeypatch.setitem(recorded.SIZES, key, count - 1)
-    with pytest.raises(rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are allowed"):
+    with pytest.raises(
+        rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are allowed"
+    ):
         rt.read_detections(path, video)
 
 

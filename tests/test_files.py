@@ -104,7 +104,12 @@ def test_text_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("limit", "most", "text", "what"),
     [
-        ("LINES_MAX", 3, "a\nb\nc\nd\n", "a.txt: 4 lines, at most 3 are allowed; cut it into pieces"),
+        (
+            "LINES_MAX",
+            3,
+            "a\nb\nc\nd\n",
+            "a.txt: 4 lines, at most 3 are allowed; cut it into pieces",
+        ),
         ("LINES_MAX", 3, "a\x0bb\x1cc\u2028d\x85e", "a.txt: 4 lines, at most 3 are allowed"),
         ("LINE_MAX", 3, "ab\nabcd\n", "a.txt: a line of 5 characters, at most 3 are allowed"),
         ("TEXT_MAX", 9, "a\n" * 5, "a.txt: more than 0 MB of text"),
