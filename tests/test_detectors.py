@@ -450,7 +450,7 @@ def spoilt(**change: Any) -> dict[str, Any]:
         (detr(), True, ""),
         (detr(), False, "its layout is SSD with built-in NMS"),  # would count classes from 1
         (spoilt(boxes=[[[0.1, 0.1, 0.5, 0.5]] * 2]), True, "boxes that are not in pixels"),
-        (spoilt(boxes=[[BOX, [np.nan] * 4]]), True, "boxes that are no numbers"),
+        (spoilt(boxes=[[BOX, [np.nan] * 4]]), True, "boxes that are not finite"),
         (spoilt(scores=[[SCORE, -2.0]]), True, "scores outside 0..1"),  # logits
         (spoilt(scores=[[SCORE, 1.5]]), True, "scores outside 0..1"),
         (spoilt(labels=np.array([[LABEL, 90]])), True, "classes beyond its 80"),

@@ -306,8 +306,8 @@ def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolA
     if 2 * (empty | outside).sum() > count:  # the format is wrong, not a few boxes
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, or another "
-            "video?"
+            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, or "
+            "another video?"
         )
     numbers = shortened(np.unique(recorded.frame[missing]).tolist())
     text = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
