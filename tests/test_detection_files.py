@@ -293,7 +293,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": 9})),
          r"entry 0: mask of 9 pixels in a video of \(640, 480\)"),
         ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: .*NaN, infinite"),
-        ("d.json", json.dumps(coco_entries(image_id="x")), "names such as 'x' mean no frame"),
+        ("d.json", json.dumps(coco_entries(image_id="x")), "names such as 'x' match no frame"),
         ("d.json", "[1, 2]", "entry 0: 1, expected an object such as"),
         ("d.npz", "no zip", "d.npz: damaged"),
     ],
