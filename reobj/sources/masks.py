@@ -41,7 +41,7 @@ RUN_BITS = 35
 def coco_runs(text: str) -> Counts:
     """Decode COCO's compressed run lengths (maskApi.c of pycocotools, rleFrString).
 
-    Each character holds five bits, lowest first; bit 32: more follow; bit 16 of the last: sign.
+    Each character holds five bits, lowest first; flag 0x20: more follow; 0x10 of the last: sign.
     From the fourth run on a number is the difference to the last run but one.
     """
     runs: list[int] = []
