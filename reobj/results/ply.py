@@ -1,6 +1,6 @@
-"""Ellipsoids and solids as coloured triangle meshes, and points: PLY files.
+"""PLY files of solids, as coloured triangle meshes, and of points.
 
-Coordinates are doubles: those of a map projection have a step of .5 m in float32.
+Coordinates are doubles: in float32 those of a map projection have a resolution of .5 m.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from reobj.files import atomic
 from reobj.types import Array, object_color
 
 PLY_DETAIL = 2  # subdivisions of an octahedron: 512 triangles an ellipsoid
-PLY_SIDES = 48  # of the prism that stands for a cylinder (chosen: round to the eye)
-FACE_BYTES = 13  # of a triangle: how many corners, and their numbers
+PLY_SIDES = 48  # sides of the prism that approximates a cylinder (chosen: looks round)
+FACE_BYTES = 13  # bytes of a triangle in the file: number of corners and their indices
 
 
 def write_ply(
@@ -28,10 +28,10 @@ def write_ply(
 ) -> None:
     """Write solids as one coloured triangle mesh (PLY, binary little endian), in world.
 
-    Each is closed, its triangles face outwards, and shares no vertex with another.
+    Each solid is closed, its triangles face outwards, and it shares no vertex with others.
 
     Args:
-        support: shapes, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
+        support: shape of each, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
     """
     vertices = []
     faces = []
@@ -52,10 +52,10 @@ def write_ply(
         start += len(unit)
     names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
-    what = "ellipsoids" if support is None else "solids"
+    content = "ellipsoids" if support is None else "solids"
     count = sum(map(len, faces)) // FACE_BYTES
     header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {what}\n"
+        f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {content}\n"
         f"element vertex {start}\n{''.join(names)}"
         f"element face {count}\nproperty list uchar int vertex_indices\nend_header\n"
     )
@@ -103,7 +103,7 @@ def _cylinder_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
 
 
 def _sphere_mesh(detail: int) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Triangulate the unit sphere: points (P, 3), triangles (T, 3) of a divided octahedron."""
+    """Triangulate the unit sphere: points (P, 3), triangles (T, 3) of a subdivided octahedron."""
     points = np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
                       [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])  # fmt: skip
