@@ -327,8 +327,8 @@ def test_coordinates_beyond_any_image(tmp_path: Path, video: rt.Video) -> None:
         ({"frame": np.array([0.5])}, "array frame is of float64, expected iu"),
         ({"class_names": np.array([1])}, "array class_names is of int64, expected U"),
         ({"class_names": np.array("x")}, "array class_names is"),
-        ({"mask_offsets": np.array([0, 9])}, "mask_counts and mask_offsets do not fit"),
-        ({"mask_offsets": np.array([5, 0])}, "mask_counts and mask_offsets do not fit"),
+        ({"mask_offsets": np.array([0, 9])}, "mask_counts and mask_offsets are inconsistent"),
+        ({"mask_offsets": np.array([5, 0])}, "mask_counts and mask_offsets are inconsistent"),
     ],
 )
 def test_npz_of_other_kinds(

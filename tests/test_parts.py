@@ -661,7 +661,7 @@ def test_a_part_without_true_cameras_is_not_found(
 ) -> None:
     found = score_objects(parted, *truth(tmp_path, BREAK), {1: 1, 2: 5, 3: 6})
     assert found["found"] == 1 and found["part_scale_errors"][1] is None
-    assert "part 1 of the cameras is not scored in 3D" in caplog.text
+    assert "component 1 of the trajectory is not evaluated in 3D" in caplog.text
     with pytest.raises(rt.ReobjError, match="poses in common"):
         score_objects(parted, *truth(tmp_path, 2), {1: 1})
 
