@@ -602,12 +602,12 @@ def test_exports_in_3d_hold_the_largest_part(
 ) -> None:
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
     text = exported(parted_folder, "glb", tmp_path / "a.glb", caplog)
-    assert "holds part 0 of 2 (frames 0-39)" in text
+    assert "contains component 0 of 2 (frames 0-39)" in text
     scene: Any = trimesh.load(tmp_path / "a.glb")
     assert set(scene.graph.nodes_geometry) == {"chair 1", "chair 2", "chair 3", "points", "cameras"}
     assert len(scene.geometry["points"].vertices) == 3
     pytest.importorskip("rerun", reason="pip install rerun-sdk (extra viewer)")
-    assert "holds part 0 of 2" in exported(parted_folder, "rrd", tmp_path / "a.rrd", caplog)
+    assert "contains component 0 of 2" in exported(parted_folder, "rrd", tmp_path / "a.rrd", caplog)
     assert (tmp_path / "a.rrd").stat().st_size > 1000
 
 
