@@ -271,7 +271,7 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
     count = len(part.objects)
     spans = ", ".join(p.span_text for p in part.world.parts)
     facts = {
-        "name": f"part {number}: {spans}; {count} object{'s' * (count != 1)}",
+        "name": f"component {number}: {spans}; {count} object{'s' * (count != 1)}",
         "facts": _scene_facts(part.world),
         "scale": part.world.to_json()["scale"],
     }
