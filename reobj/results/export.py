@@ -283,9 +283,6 @@ def export_ply(result: Result, path: Path) -> None:
     write_ply(path, result.ellipsoids(), [o.id for o in located], [o.support for o in located])
 
 
-CSV_AXES = ("x", "y", "z")
-
-
 def export_csv(result: Result, path: Path) -> None:
     """Write a table of the objects, one a line, for spreadsheets and pandas.
 
@@ -294,7 +291,7 @@ def export_csv(result: Result, path: Path) -> None:
     """
     head = ["id", "class", "status", "reason", "score", "confidence", "support"]
     vectors = ("center", "size", "size_m", "size_rel_sigma")
-    head += [f"{name}_{axis}" for name in vectors for axis in CSV_AXES]
+    head += [f"{name}_{axis}" for name in vectors for axis in "xyz"]
     head += ["qw", "qx", "qy", "qz", "views", "frames_seen", "visits", "part"]
     with atomic(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")

@@ -41,7 +41,6 @@ LEAST_FPS = 1.0  # Hz; at lower rates frames are repeated: a frame in WebM lasts
 LEAST_PX = 16  # px of a side: a block of the codecs; OpenCV's VP8 fails below
 KEYFRAME_S = 2  # s between keyframes, to which a player can seek (chosen)
 WEBM_HEAD = 1 << 16  # bytes; contains all before the first frame (FFmpeg: under 1000)
-MAX_DENOMINATOR = 1001  # of frame rates such as 30000/1001
 
 
 def import_av() -> Any:
@@ -144,7 +143,7 @@ class _H264:
 
     def __init__(self, av: Any, path: Path, fps: float, size: tuple[int, int]) -> None:
         self.av = av
-        rate = Fraction(fps).limit_denominator(MAX_DENOMINATOR)
+        rate = Fraction(fps).limit_denominator(1001)  # such as 30000/1001
         # faststart: the index comes first, so that a browser plays the file while loading it
         self.file = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
         self.stream = self.file.add_stream("h264", rate=rate, options=H264)

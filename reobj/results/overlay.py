@@ -22,6 +22,7 @@ from reobj.cameras import Camera
 from reobj.files import cut
 from reobj.results.film import FilmWriter
 from reobj.results.origin import centred
+from reobj.results.ply import CYLINDER_SIDES as SIDES
 from reobj.results.result import Result
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
@@ -208,7 +209,6 @@ def ellipse_of_dual_conic(
 
 # ---- Boxes and cylinders in 3D -----------------------------------------------------------------
 
-SIDES = 48  # sides of the prism that approximates a cylinder (chosen: looks round)
 NEAR = 0.05  # longest half extents, least depth at which an edge of a solid is drawn (chosen)
 BEND = 8  # segments of an edge where the lens distorts (chosen: looks smooth)
 SHIFT = 4  # sub-pixel bits of OpenCV's lines

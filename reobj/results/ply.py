@@ -15,9 +15,7 @@ import quadrics
 from reobj.files import atomic
 from reobj.types import Array, object_color
 
-PLY_DETAIL = 2  # subdivisions of an octahedron: 512 triangles an ellipsoid
-PLY_SIDES = 48  # sides of the prism that approximates a cylinder (chosen: looks round)
-FACE_BYTES = 13  # bytes of a triangle in the file: number of corners and their indices
+CYLINDER_SIDES = 48  # sides of the prism that approximates a cylinder (chosen: looks round)
 
 
 def write_ply(
@@ -36,8 +34,13 @@ def write_ply(
     vertices = []
     faces = []
     start = 0
+    count = 0
     shapes = [None] * len(ellipsoids) if support is None else support
-    meshes = {None: _sphere_mesh(PLY_DETAIL), "box": _box_mesh(), "cylinder": _cylinder_mesh()}
+    meshes = {
+        None: _sphere_mesh(2),
+        "box": _box_mesh(),
+        "cylinder": _cylinder_mesh(),
+    }  # 512 triangles a sphere
     for k, (identity, shape) in enumerate(zip(object_id, shapes, strict=True)):
         unit, triangles = meshes.get(shape, meshes[None])  # (P, 3), (T, 3)
         points = (ellipsoids.half_axes[k] * unit) @ ellipsoids.world_from_obj[k].T
@@ -50,10 +53,10 @@ def write_ply(
         vertices.append(vertex.tobytes())
         faces.append(face.tobytes())
         start += len(unit)
+        count += len(triangles)
     names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
     content = "ellipsoids" if support is None else "solids"
-    count = sum(map(len, faces)) // FACE_BYTES
     header = (
         f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {content}\n"
         f"element vertex {start}\n{''.join(names)}"
@@ -86,18 +89,18 @@ def _box_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
 
 def _cylinder_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
     """Triangulate the upright cylinder of radius and half height 1, facing outwards."""
-    number = np.arange(PLY_SIDES)
-    angle = 2 * np.pi * number / PLY_SIDES
-    following = (number + 1) % PLY_SIDES
+    number = np.arange(CYLINDER_SIDES)
+    angle = 2 * np.pi * number / CYLINDER_SIDES
+    following = (number + 1) % CYLINDER_SIDES
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    low, high = (np.column_stack([ring, np.full(PLY_SIDES, z)]) for z in (-1.0, 1.0))
+    low, high = (np.column_stack([ring, np.full(CYLINDER_SIDES, z)]) for z in (-1.0, 1.0))
     points = np.concatenate([low, high, [[0, 0, -1.0], [0, 0, 1.0]]])
     a = number
     b = following
-    c = following + PLY_SIDES
-    d = number + PLY_SIDES
-    bottom = np.full(PLY_SIDES, 2 * PLY_SIDES)
-    top = np.full(PLY_SIDES, 2 * PLY_SIDES + 1)
+    c = following + CYLINDER_SIDES
+    d = number + CYLINDER_SIDES
+    bottom = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES)
+    top = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES + 1)
     faces = [(a, b, c), (a, c, d), (bottom, b, a), (top, d, c)]
     return points, np.concatenate([np.column_stack(f) for f in faces])
 

@@ -129,7 +129,6 @@ MOT_PEDESTRIAN = 1  # class of MOTChallenge that counts
 # Person on vehicle, static person, distractor, reflection; MOT20 also: vehicle that is not
 # motorised (TrackEval 1.3.0, mot_challenge_2d_box.py)
 MOT_DISTRACTORS = {"MOT16": (2, 7, 8, 12), "MOT17": (2, 7, 8, 12), "MOT20": (2, 6, 7, 8, 12)}
-MOT_CLASSES = 13  # number of classes of MOTChallenge
 
 
 def _read_mot(
@@ -217,7 +216,7 @@ def _benchmark(name: str, path: Path, number: IntArray, flagged: BoolArray) -> s
         if match := re.match(r"(MOT16|MOT17|MOT20)-\d+", text):
             return match[1]
     other = number != MOT_PEDESTRIAN
-    known = ((number >= 1) & (number <= MOT_CLASSES)).all()
+    known = ((number >= 1) & (number <= 13)).all()
     return "MOT17" if known and other.any() and (flagged == other).all() else ""
 
 
