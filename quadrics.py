@@ -1,4 +1,4 @@
-"""Ellipsoids and solids of static objects from 2D detection boxes in several views.
+"""Fit boxes, cylinders and ellipsoids of static objects to 2D detection boxes in several views.
 
 Usage:
     import quadrics
@@ -9,10 +9,10 @@ Usage:
 
 How `fit_objects` works:
     1. Every visible box edge is an image line l; its back-projected plane P'l = (n, d) touches
-       the object: -(n.c + d) = h(n), h the support function of the solid (box, cylinder or
-       ellipsoid). Edges on the image border are one-sided.
-    2. Start: consensus of viewing rays and of the depths that the size priors suggest; several
-       orientations; robust loss; one batched Levenberg-Marquardt with analytic Jacobians.
+       the object: -(n.c + d) = h(n), h the support function of the shape (box, cylinder or
+       ellipsoid). Edges on the image border are one-sided constraints.
+    2. Starts: consensus of the viewing rays and of the depths at which the size priors hold;
+       several orientations; robust loss; one batched Levenberg-Marquardt with analytic Jacobians.
     3. Explicit inlier test per view, noise level re-estimated, final fit, 9x9 covariance.
     4. Scale and gravity from the priors of the categories when the poses give none.
 
@@ -21,8 +21,10 @@ where an object is unseen; img_from_world (F, 3, 4) = K [R | t] of cameras looki
 axes; rotation world_from_obj with the object's axes as columns (third axis = up where up is
 known); covariance order: center (3, world), log half axes (3), rotation vector (3, object frame).
 Axes of the shape comments: F frames, O objects, V views of one object, E = 4 edges of one view
-(left, top, right, bottom), B problems (object x shape x start) solved side by side.
-Constants stand where they are read. Those without a source are chosen (docs/quadrics.md).
+(left, top, right, bottom), B problems (object x shape x start) of one batch, L live objects
+(those with a usable box).
+"Solid": the shape with its pose and size. Constants stand beside their use; those without a source
+were chosen on simulated and recorded scenes (docs/quadrics.md, docs/trials.md).
 
 References:
     [LfD]   Rubino, Crocco, Del Bue: 3D object localisation from multi-view detections. PAMI 2018
@@ -56,9 +58,10 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 ELLIPSOID, BOX, CYLINDER = 0, 1, 2
-BY_CATEGORY, BY_EVIDENCE = -1, -2  # support not named by the caller
-SUPPORTS = ("ellipsoid", "box", "cylinder")  # index = code
-# axes that share one root in the support function: h = sum over groups of sqrt(sum a_k^2 m_k^2)
+BY_CATEGORY, BY_EVIDENCE = -1, -2  # codes of a shape that the caller leaves open
+SUPPORTS = ("ellipsoid", "box", "cylinder")  # names of the shapes, index = code
+# Row k marks the axes under the same root as axis k in the support function
+# h = sum over groups of sqrt(sum a_k^2 m_k^2)
 AXIS_GROUPS: Array = np.array(
     [np.ones((3, 3)), np.eye(3), [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
 )  # (3 supports, 3, 3)
@@ -66,7 +69,7 @@ AXIS_ORDERS: IntArray = np.array([p for p in np.ndindex(3, 3, 3) if len(set(p)) 
 
 
 class QuadricsError(ValueError):
-    """Input that cannot be used; the message says what was expected."""
+    """Unusable input; the message names the argument and what was expected."""
 
 
 # ---- Configuration --------------------------------------------------------------------------
@@ -74,19 +77,19 @@ class QuadricsError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
-    """Set what a user of `fit_objects` may reasonably change.
+    """Options of `fit_objects`.
 
     Attributes:
-        edge_noise_px, edge_noise_rel: How far a box edge lies from the object's true outline, as a
-            standard deviation: hypot(edge_noise_px, edge_noise_rel * box width or height). Only a
-            first guess: the boxes themselves correct both by one factor an object.
-        border_px: An edge nearer to the image border than this (px) and twice its noise only says
-            that the object reaches it.
-        correlation_deg: Views of an object nearer to each other than this (deg) repeat their errors
-            and count as fewer; 0: every view counts fully, and no error is common to all of them.
-        max_views: An object seen in more frames is fitted from this many, spread over the path.
-        start_views: On this many views the candidate orientations and shapes of an object compete;
-            fewer are faster and more often let the wrong one win.
+        edge_noise_px, edge_noise_rel: Standard deviation of a box edge about the object's true
+            outline: hypot(edge_noise_px, edge_noise_rel * box width or height). Initial values:
+            one factor an object is estimated from the boxes.
+        border_px: An edge nearer to the image border than this (px) plus twice its noise is
+            one-sided: the object reaches it and may extend beyond.
+        correlation_deg: Views of an object less than this (deg) apart have correlated errors and
+            count as fewer; 0: all views are independent.
+        max_views: Most views of an object that are used, spread evenly over the camera's path.
+        start_views: Number of views on which the candidate orientations and shapes of an object
+            are compared; fewer are faster and select a wrong candidate more often.
         start_iterations: Optimisation steps of each candidate on those views.
         iterations: Most optimisation steps on all views; a fit that has converged stops earlier.
         wrong_class: Probability that an object's category is wrong; 0: no category is overruled.
@@ -100,7 +103,7 @@ class FitConfig:
     start_views: int = 8
     start_iterations: int = 7
     iterations: int = 40
-    wrong_class: float = 0.05  # (measured: .03 to .25 give nearly the same)
+    wrong_class: float = 0.05  # measured: .03 to .25 give nearly the same results
 
 
 # ---- Ellipsoids and dual quadrics -----------------------------------------------------------
@@ -108,7 +111,7 @@ class FitConfig:
 
 @dataclass(frozen=True, slots=True)
 class Ellipsoids:
-    """Struct of arrays of O ellipsoids (or of the solids that they are inscribed in)."""
+    """Struct of arrays of O ellipsoids (or of the solids in which they are inscribed)."""
 
     center_in_world: Array  # (O, 3)
     half_axes: Array  # (O, 3) along the columns of world_from_obj
@@ -131,7 +134,7 @@ class Ellipsoids:
     @staticmethod
     @np.errstate(all="ignore")
     def from_dual_quadrics(dual_q: Array) -> tuple[Ellipsoids, BoolArray]:
-        """Split dual quadrics into ellipsoids and say which are real ones.
+        """Decompose dual quadrics into ellipsoids and test which of them are real.
 
         Args:
             dual_q: (O, 4, 4), any scale.
@@ -142,12 +145,12 @@ class Ellipsoids:
         scaled = -dual_q / _nonzero(dual_q[:, 3:, 3:])  # (O, 4, 4)
         center = -scaled[:, :3, 3]  # (O, 3)
         block = scaled[:, :3, :3] + center[:, :, None] * center[:, None, :]  # (O, 3, 3)
-        good = _finite(scaled, 1, 2) & _finite(block, 1, 2)  # (O,)
+        finite = _finite(scaled, 1, 2) & _finite(block, 1, 2)  # (O,)
         value, rot = _eigh(block)
         rot[np.linalg.det(rot) < 0, :, 0] *= -1.0
-        value[~good] = np.nan
+        value[~finite] = np.nan
         ellipsoids = Ellipsoids(center, np.sqrt(np.abs(value)), rot)
-        return ellipsoids, good & (value > 0).all(1)
+        return ellipsoids, finite & (value > 0).all(1)
 
 
 def _dual_quadrics(center: Array, block: Array) -> Array:
@@ -159,13 +162,13 @@ def _dual_quadrics(center: Array, block: Array) -> Array:
 
 
 def _chunks(n: int, size: int) -> Iterator[IntArray]:
-    """Split the numbers below n into runs of at most `size`."""
+    """Split the indices 0 to n - 1 into consecutive chunks of at most `size`."""
     for lo in range(0, n, size):
         yield np.arange(lo, min(lo + size, n))
 
 
 def _finite(x: Array, *axes: int) -> BoolArray:
-    """Test whether everything along the given axes is finite."""
+    """Test whether all values along the given axes are finite."""
     return np.asarray(np.isfinite(x).all(axis=axes))
 
 
@@ -174,7 +177,7 @@ def _nonzero(x: Array, tiny: float = 1e-300) -> Array:
 
 
 def _solve(lhs: Array, rhs: Array) -> Array:
-    """Solve (B, n, n) x = (B, n) without ever raising: NaN gives 0, singular the least norm."""
+    """Solve (B, n, n) x = (B, n); 0 where not finite, the least norm solution where singular."""
     bad = ~(_finite(lhs, 1, 2) & _finite(rhs, 1))
     if bad.any():
         lhs = np.where(bad[:, None, None], np.eye(lhs.shape[1]), lhs)
@@ -205,7 +208,8 @@ def project(dual_q: Array, img_from_world: Array) -> tuple[Array, BoolArray]:
     Ref: [HZ] eq. 8.8: C* = P Q* P'.
     """
     cams = _with_positive_depth(img_from_world)  # (F, 3, 4)
-    path: Any = ("einsum_path", (0, 1), (0, 1)) if len(cams) == 1 else True  # is found, but slowly
+    # For one camera the contraction order is given: numpy's search takes longer than the product
+    path: Any = ("einsum_path", (0, 1), (0, 1)) if len(cams) == 1 else True
     dual_c = np.einsum("fik,okl,fjl->foij", cams, dual_q, cams, optimize=path)  # (F, O, 3, 3)
     depth = -np.einsum("ok,fk->fo", dual_q[:, :, 3], cams[:, 2])  # (F, O) of the centre
     return dual_c, (dual_c[..., 2, 2] < 0) & (depth > 0)
@@ -235,20 +239,24 @@ def _with_positive_depth(img_from_world: Array) -> Array:
 
 
 def _support_codes(support: str | Sequence[str | None] | None, n: int) -> IntArray:
-    """Turn support names into codes (n,); None: BY_CATEGORY, "evidence": BY_EVIDENCE."""
+    """Convert shape names to codes (n,); None: BY_CATEGORY, "evidence": BY_EVIDENCE."""
     names = [support] * n if support is None or isinstance(support, str) else list(support)
     if len(names) != n:
-        raise QuadricsError(f"{len(names)} supports for {n} objects: give one name or one each")
-    table: dict[str | None, int] = {name: k for k, name in enumerate(SUPPORTS)}
-    table.update({None: BY_CATEGORY, "evidence": BY_EVIDENCE})
-    unknown = {str(x) for x in names if x not in table}
+        raise QuadricsError(
+            f"support: {len(names)} shapes for {n} objects; give one for all or one for each"
+        )
+    codes: dict[str | None, int] = {name: k for k, name in enumerate(SUPPORTS)}
+    codes.update({None: BY_CATEGORY, "evidence": BY_EVIDENCE})
+    unknown = {str(name) for name in names if name not in codes}
     if unknown:
-        raise QuadricsError(f"unknown support {sorted(unknown)}: use {SUPPORTS} or 'evidence'")
-    return np.array([table[x] for x in names], np.int64)
+        raise QuadricsError(
+            f"support: unknown shape {sorted(unknown)}; use one of {SUPPORTS}, or 'evidence'"
+        )
+    return np.array([codes[name] for name in names], np.int64)
 
 
 def _corner_bounds(solids: Ellipsoids, cams: Array, near: float) -> Array:
-    """Bound the eight projected corners (F, O, 4); corners behind are pulled to `near`."""
+    """Bound the eight projected corners (F, O, 4); corners behind the camera get depth `near`."""
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)  # (3, 8)
     offset = solids.world_from_obj @ (solids.half_axes[:, :, None] * signs)  # (O, 3, 8)
     corner = solids.center_in_world[:, :, None] + offset  # (O, 3, 8)
@@ -281,27 +289,28 @@ def solid_boxes(
 
     Args:
         solids: O centres, half extents, rotations.
-        support: one of SUPPORTS, or one name an object.
+        support: shape of all, one of SUPPORTS, or of each.
         img_from_world: (F, 3, 4).
+        near: least depth of a projected corner of a box, world units.
     Returns:
-        (F, O, 4) xyxy in pixels, not clipped; NaN where nothing is in front of the camera.
+        (F, O, 4) xyxy in pixels, not clipped; NaN where no part is in front of the camera.
     """
     codes = _support_codes(support, len(solids))
     if (codes < 0).any():
-        raise QuadricsError(f"solids have a shape: name one of {SUPPORTS} for each")
+        raise QuadricsError(f"support: a shape is missing; name one of {SUPPORTS} for each solid")
     cams = _with_positive_depth(np.asarray(img_from_world, np.float64))  # (F, 3, 4)
     boxes = np.full((len(cams), len(solids), 4), np.nan)
     for code in np.unique(codes):
-        pick = np.flatnonzero(codes == code)
-        part = solids[pick]
+        row = np.flatnonzero(codes == code)
+        same_shape = solids[row]
         if code == BOX:
-            boxes[:, pick] = _corner_bounds(part, cams, near)
+            boxes[:, row] = _corner_bounds(same_shape, cams, near)
         elif code == CYLINDER:
-            boxes[:, pick] = _rim_bounds(part, cams)
+            boxes[:, row] = _rim_bounds(same_shape, cams)
         else:
-            dual_c, visible = project(part.dual_quadrics(), cams)
+            dual_c, visible = project(same_shape.dual_quadrics(), cams)
             outline = boxes_from_dual_conics(dual_c)
-            boxes[:, pick] = np.where(visible[..., None], outline, np.nan)
+            boxes[:, row] = np.where(visible[..., None], outline, np.nan)
     return boxes
 
 
@@ -316,7 +325,7 @@ def clip_boxes(boxes_xyxy: Array, image_size: tuple[float, float]) -> Array:
 
 @np.errstate(all="ignore")
 def box_iou(a: Array, b: Array) -> Array:
-    """Measure the IoU (...) of (..., 4) xyxy boxes pair by pair; 0 where one of them is NaN."""
+    """Compute the IoU (...) of (..., 4) xyxy boxes pair by pair; 0 where one of them is NaN."""
     size = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
     inter = np.prod(np.clip(size, 0.0, None), -1)
     union = np.prod(a[..., 2:] - a[..., :2], -1) + np.prod(b[..., 2:] - b[..., :2], -1) - inter
@@ -331,22 +340,23 @@ def reprojection_iou(
     image_size: tuple[float, float],
     support: str | Sequence[str] | None = None,
 ) -> Array:
-    """Compare each fitted solid's projected box, clipped to the image, with its detection.
+    """Compute the IoU of each fitted solid's projected box, clipped to the image, and its box.
 
     Args:
-        fits: of `fit_objects`, or plain solids; boxes_xyxy: (F, O, 4); img_from_world: (F, 3, 4).
-        support: shape of plain solids (default "ellipsoid"), one name or one an object.
+        fits: result of `fit_objects`, or solids without their shape.
+        boxes_xyxy: (F, O, 4); img_from_world: (F, 3, 4).
+        support: shape of such solids, of all or of each (default: "ellipsoid").
     Returns:
         IoU (F, O); 0 where the object is unseen, behind the camera or outside the image.
     """
     solids = fits.ellipsoids if isinstance(fits, ObjectFits) else fits
     if support is None:
         support = list(fits.support) if isinstance(fits, ObjectFits) else "ellipsoid"
-    out = np.zeros(boxes_xyxy.shape[:2])
-    for part in _chunks(len(boxes_xyxy), 256):  # frames, to bound the memory
-        predicted = clip_boxes(solid_boxes(solids, support, img_from_world[part]), image_size)
-        out[part] = box_iou(predicted, clip_boxes(boxes_xyxy[part], image_size))
-    return out
+    iou = np.zeros(boxes_xyxy.shape[:2])
+    for frames in _chunks(len(boxes_xyxy), 256):  # bounds the memory
+        predicted = clip_boxes(solid_boxes(solids, support, img_from_world[frames]), image_size)
+        iou[frames] = box_iou(predicted, clip_boxes(boxes_xyxy[frames], image_size))
+    return iou
 
 
 # ---- Priors ---------------------------------------------------------------------------------
@@ -365,23 +375,23 @@ class Priors:
     support: IntArray  # (C,) codes of SUPPORTS
     yaw_symmetric: BoolArray  # (C,)
     upright: BoolArray  # (C,)
-    on_floor: BoolArray  # (C,) stands on the floor
+    on_floor: BoolArray  # (C,) objects of the category stand on the floor
 
     def index(self, categories: Sequence[str | None]) -> IntArray:
-        """Find the row of each category (O,), -1 where it is not in the table."""
-        table = {_plain(name): k for k, name in enumerate(self.names)}
-        named = self.canonical([c or "" for c in categories])
-        return np.array([table.get(name, -1) for name in named], np.int64)
+        """Find the row of each category (O,); -1 where the priors do not have it."""
+        row_of = {_normalised(name): k for k, name in enumerate(self.names)}
+        names = self.canonical([c or "" for c in categories])
+        return np.array([row_of.get(name, -1) for name in names], np.int64)
 
     def canonical(self, names: Sequence[str]) -> list[str]:
-        """Return one name for all synonyms, in small letters; of unknown names their own."""
-        own = {_plain(name) for name in self.names}
-        aliases = {_plain(alias): _plain(name) for alias, name in self.aliases.items()}
-        plain = [_plain(name) for name in names]
-        return [name if name in own else aliases.get(name, name) for name in plain]
+        """Replace synonyms by the category's name, in lower case; other names stay."""
+        known = {_normalised(name) for name in self.names}
+        aliases = {_normalised(alias): _normalised(name) for alias, name in self.aliases.items()}
+        normalised = [_normalised(name) for name in names]
+        return [name if name in known else aliases.get(name, name) for name in normalised]
 
 
-def _plain(name: str) -> str:
+def _normalised(name: str) -> str:
     """Normalise a category: "Potted_Plant" and "potted plant" are the same."""
     return re.sub(r"[\s_\-]+", " ", name.strip().lower())
 
@@ -392,15 +402,15 @@ def load_priors(path: str | Path | None = None) -> Priors:
     Keys "about" and "aliases" are reserved; every other key is a category.
     """
     path = Path(__file__).with_name("priors.json") if path is None else Path(path)
-    what = "not valid JSON"
+    fault = "not valid JSON"
     try:
         table = dict(json.loads(path.read_text(encoding="utf-8")))
         aliases = {a: str(name) for a, name in dict(table.pop("aliases", {})).items()}
         table.pop("about", None)
-        what = "a category lacks or garbles"
+        fault = "a category has a missing or invalid field"
         rows = [_prior_row(entry) for entry in table.values()]
     except (AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
-        raise QuadricsError(f"{path}: {what} ({error}); see docs/quadrics.md") from error
+        raise QuadricsError(f"{path}: {fault} ({error}); see docs/quadrics.md") from error
     columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
     if not rows:
         columns = [np.zeros(s) for s in ((0, 3), (0, 3, 3), (0, 2), (0, 2, 2))]
@@ -408,9 +418,13 @@ def load_priors(path: str | Path | None = None) -> Priors:
     return Priors(tuple(table), aliases, *columns)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused below
+@np.errstate(over="ignore", invalid="ignore")  # values that are not finite are refused below
 def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Parse one category into the columns of `Priors`; without "axis_ratio" the sizes imply it."""
+    """Parse one category into the columns of `Priors`; "axis_ratio" defaults to that of the sizes.
+
+    Raises:
+        ValueError: a size or variance is not finite or not positive.
+    """
     size = entry["size_m"]
     mean, std = (np.array(size[key], np.float64).reshape(3) for key in ("mean", "log_std"))
     corr_wd, corr_wh, corr_dh = size.get("corr", (0.0, 0.0, 0.0))
@@ -427,9 +441,10 @@ def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
         for cov in (log_cov, ratios[1])
     ]
     if not np.isfinite([*log_mean, *ratios[0]]).all() or min(variances) <= 0:
-        raise ValueError("sizes and variances are finite and above 0")
+        raise ValueError("sizes and variances must be finite and positive")
     code = SUPPORTS.index(entry.get("support", "ellipsoid"))
-    round_, upright = bool(entry.get("yaw_symmetric", False)), bool(entry.get("upright", True))
+    round_ = bool(entry.get("yaw_symmetric", False))
+    upright = bool(entry.get("upright", True))
     return log_mean, log_cov, *ratios, code, round_, upright, entry.get("stands_on") == "floor"
 
 
@@ -437,7 +452,7 @@ def _prior_row(entry: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 class _Cameras(NamedTuple):
-    """F cameras with metric depth: rows scaled so that the third row gives depth."""
+    """F cameras, scaled so that the third row gives the depth in world units."""
 
     matrix: Array  # (F, 3, 4), NaN where unusable
     center: Array  # (F, 3)
@@ -445,7 +460,7 @@ class _Cameras(NamedTuple):
 
 
 def _cameras(img_from_world: Array, limit: float = 1e12) -> _Cameras:
-    """Invert cameras; singular, NaN or huge ones become NaN."""
+    """Invert cameras; NaN where singular, not finite or with entries beyond `limit`."""
     cams = np.array(img_from_world, np.float64).reshape(-1, 3, 4)
     cams[~(np.abs(cams) < limit).all((1, 2))] = np.nan
     cams = _with_positive_depth(cams)  # (F, 3, 4)
@@ -454,16 +469,17 @@ def _cameras(img_from_world: Array, limit: float = 1e12) -> _Cameras:
     unit = linear / np.where(size > 0, size, 1.0)
     bad = ~(np.abs(np.linalg.det(unit)) > 1e-9) | ~_finite(cams, 1, 2)
     inverse = np.linalg.inv(np.where(bad[:, None, None], np.eye(3), linear))
-    cams[bad], inverse[bad] = np.nan, np.nan
+    cams[bad] = np.nan
+    inverse[bad] = np.nan
     center = -np.einsum("fij,fj->fi", inverse, cams[:, :, 3])  # (F, 3)
     return _Cameras(cams, center, inverse)
 
 
 def _usable_boxes(boxes_xyxy: Array, cams: _Cameras, limit: float = 1e7) -> BoolArray:
-    """Say which boxes (F, O) are finite, of positive area, sane, and in a posed frame."""
-    sane = (np.abs(boxes_xyxy) < limit).all(-1)
-    area = (boxes_xyxy[..., 2:] - boxes_xyxy[..., :2] > 1e-6).all(-1)
-    return sane & area & _finite(cams.center, 1)[:, None]
+    """Test which boxes (F, O) are finite, below `limit` px, of positive area, and have a pose."""
+    bounded = (np.abs(boxes_xyxy) < limit).all(-1)
+    has_area = (boxes_xyxy[..., 2:] - boxes_xyxy[..., :2] > 1e-6).all(-1)
+    return bounded & has_area & _finite(cams.center, 1)[:, None]
 
 
 def _select_views(
@@ -472,9 +488,9 @@ def _select_views(
     """Choose up to `max_views` frames an object, spread evenly along the camera's path.
 
     Args:
-        usable, quality: (F, O); in each stretch of path the frame of best quality is taken.
-        leap: in upper quartiles of the steps, the most that one step counts: cameras of a broken
-            stretch that fly away must not take all the views.
+        usable, quality: (F, O); in each segment of the path the frame of best quality is chosen.
+        leap: upper limit of the length of a step, over the upper quartile of all steps: outliers
+            among the camera positions must not attract all views.
     Returns:
         (O, V) frame numbers, -1 where an object has fewer; V = the most any object has.
     """
@@ -485,20 +501,22 @@ def _select_views(
     posed = _finite(cams.center, 1)
     step = np.zeros(len(center))
     step[posed] = np.linalg.norm(np.diff(center[posed], axis=0, prepend=center[posed][:1]), axis=1)
-    step = np.minimum(step, leap * np.quantile(step[posed], 0.75))  # some box has a pose
-    step[posed] += 0.2 * step.sum() / max(posed.sum(), 1) + 1e-12  # time counts a little
+    step = np.minimum(step, leap * np.quantile(step[posed], 0.75))
+    # a fifth of the length is time: also a camera that rests gives several views
+    step[posed] += 0.2 * step.sum() / max(posed.sum(), 1) + 1e-12
     path = np.cumsum(step)[frame]  # (K,)
     n_obj = usable.shape[1]
-    low, high = np.full(n_obj, np.inf), np.full(n_obj, -np.inf)
+    low = np.full(n_obj, np.inf)
+    high = np.full(n_obj, -np.inf)
     np.minimum.at(low, obj, path)
     np.maximum.at(high, obj, path)
     count = np.bincount(obj, minlength=n_obj)
-    share = (path - low[obj]) / np.maximum(high - low, 1e-12)[obj]
+    fraction = (path - low[obj]) / np.maximum(high - low, 1e-12)[obj]
     order = np.lexsort((path, obj))
     rank = np.empty(len(obj), np.int64)
     rank[order] = np.arange(len(obj)) - np.repeat(np.cumsum(count) - count, count)
-    bucket = np.minimum((share * max_views).astype(np.int64), max_views - 1)
-    bucket = np.where(count[obj] <= max_views, rank, bucket)  # few views: take all
+    bucket = np.minimum((fraction * max_views).astype(np.int64), max_views - 1)
+    bucket = np.where(count[obj] <= max_views, rank, bucket)  # few views: all are used
     order = np.lexsort((-quality[frame, obj], bucket, obj))
     chosen = order[_group_starts(obj[order], bucket[order])]  # sorted by object, then bucket
     per_obj = np.bincount(obj[chosen], minlength=n_obj)
@@ -509,7 +527,7 @@ def _select_views(
 
 
 class _Rows:
-    """Struct of arrays with one row each for the same things: indexing picks things."""
+    """Struct of arrays; indexing selects rows of all of them."""
 
     __slots__: tuple[str, ...] = ()
 
@@ -524,11 +542,11 @@ class _Edges(_Rows):
     normal: Array  # (O, V, E, 3) unit, outward
     offset: Array  # (O, V, E)
     gain: Array  # (O, V, E) residual in sigma = gain * (n.c + d + h) / depth
-    one_sided: BoolArray  # (O, V, E) only "the solid does not reach the border" counts
+    one_sided: BoolArray  # (O, V, E) no residual where the solid extends beyond the edge
     used: BoolArray  # (O, V, E)
-    depth_row: Array  # (O, V, 4)
+    depth_row: Array  # (O, V, 4) third row of the camera
     sigma_px: Array  # (O, V, E)
-    share: Array  # (O, V, E) how many views share this one's errors; gain holds 1 / sqrt(share)
+    redundancy: Array  # (O, V, E) effective number of views with the same errors; gain has 1 / sqrt
 
 
 def _tangent_planes(boxes: Array, cams: Array, one_sided: BoolArray, cfg: FitConfig) -> _Edges:
@@ -536,12 +554,13 @@ def _tangent_planes(boxes: Array, cams: Array, one_sided: BoolArray, cfg: FitCon
 
     Args:
         boxes: (O, V, 4), NaN where there is no view; cams: (O, V, 3, 4), with metric depth.
-        one_sided: (O, V, 4) edges that only say that the solid reaches them.
+        one_sided: (O, V, 4) edges beyond which the object may extend.
     """
     lines = np.zeros((*boxes.shape, 3))  # (O, V, E, 3): l.(u, v, 1) is the signed distance in px,
     lines[..., [0, 2], 0] = -1, 1  # positive outside the box
     lines[..., [1, 3], 1] = -1, 1
-    lines[..., :2, 2], lines[..., 2:, 2] = boxes[..., :2], -boxes[..., 2:]
+    lines[..., :2, 2] = boxes[..., :2]
+    lines[..., 2:, 2] = -boxes[..., 2:]
     size = np.tile(boxes[..., 2:] - boxes[..., :2], 2)  # (O, V, E) px across the edge
     sigma = np.hypot(cfg.edge_noise_px, cfg.edge_noise_rel * size)
     plane = np.einsum("ovek,ovkj->ovej", lines, cams)  # (O, V, E, 4)
@@ -552,15 +571,17 @@ def _tangent_planes(boxes: Array, cams: Array, one_sided: BoolArray, cfg: FitCon
     sigma_px = np.where(used, sigma, 1.0)
     gain = np.where(used, norm / sigma_px, 0.0)
     depth_row = np.where(used.any(-1)[..., None], cams[..., 2, :], [0.0, 0.0, 0.0, 1.0])
-    own = (clean[..., :3], clean[..., 3], gain, one_sided & used, used, depth_row, sigma_px)
-    return _Edges(*own, np.ones_like(gain))
+    return _Edges(
+        clean[..., :3], clean[..., 3], gain, one_sided & used, used, depth_row, sigma_px,
+        np.ones_like(gain),
+    )  # fmt: skip
 
 
 # ---- LfD ------------------------------------------------------------------------------------
 
 
 def _ray_point(center: Array, ray: Array, weight: Array) -> Array:
-    """Intersect rays (O, V, 3) from `center` in points (O, 3) by weighted least squares."""
+    """Intersect rays (O, V, 3) from `center` (O, V, 3) by weighted least squares: points (O, 3)."""
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     across = np.eye(3) - unit[..., :, None] * unit[..., None, :]  # (O, V, 3, 3)
     lhs = np.einsum("ov,ovij->oij", weight, across) + 1e-9 * np.eye(3)
@@ -570,12 +591,13 @@ def _ray_point(center: Array, ray: Array, weight: Array) -> Array:
 
 
 def _congruence(matrix: Array) -> Array:
-    """Write the map Q -> M Q M' as rows (..., R, C) between the upper triangles of both.
+    """Return the matrix (..., R, C) of the map Q -> M Q M' between their upper triangles.
 
     matrix: (..., k, n) M; R = k (k + 1) / 2, C = n (n + 1) / 2. Ref: [LfD]; [SfMO] G_red.
     """
     (r, s), (i, j) = (np.triu_indices(n) for n in matrix.shape[-2:])
-    r, s = r[:, None], s[:, None]
+    r = r[:, None]
+    s = s[:, None]
     rows: Array = matrix[..., r, i] * matrix[..., s, j]
     rows += np.where(i != j, matrix[..., r, j] * matrix[..., s, i], 0.0)
     return rows
@@ -593,7 +615,7 @@ def _lfd_system(boxes: Array, cams: Array, origin: Array, unit: Array, seen: Boo
     """Stack the homogeneous systems (O, 6V + V, 10 + V) of LfD in normalised coordinates.
 
     Rows: (normalised P) applied to the 10 entries of Q*, minus beta times the conic; one more row
-    a view pins beta = 0 where the object is unseen. Ref: [LfD]: beta C* = P Q* P'.
+    per view fixes beta = 0 where the object is unseen. Ref: [LfD]: beta C* = P Q* P'.
     """
     n_obj, n_view = seen.shape
     half = 0.5 * (boxes[..., 2:] - boxes[..., :2])  # (O, V, 2)
@@ -607,9 +629,11 @@ def _lfd_system(boxes: Array, cams: Array, origin: Array, unit: Array, seen: Boo
     local[..., :2, :] /= scale[..., None, None]
     block = _congruence(local)  # (O, V, 6, 10)
     conic = np.zeros((n_obj, n_view, 6))
-    conic[..., 0], conic[..., 3] = (half[..., 0] / scale) ** 2, (half[..., 1] / scale) ** 2
+    conic[..., 0] = (half[..., 0] / scale) ** 2
+    conic[..., 3] = (half[..., 1] / scale) ** 2
     conic[..., 5] = -1.0
-    view, on = np.arange(n_view), seen[..., None]  # (V,), (O, V, 1)
+    view = np.arange(n_view)  # (V,)
+    on = seen[..., None]  # (O, V, 1)
     top = np.zeros((n_obj, n_view, 6, 10 + n_view))
     top[..., :10] = np.where(on[..., None], block, 0.0)
     top[:, view, :, 10 + view] = np.where(on, -conic, 0.0).transpose(1, 0, 2)
@@ -622,8 +646,8 @@ def _lfd_system(boxes: Array, cams: Array, origin: Array, unit: Array, seen: Boo
 def fit_lfd(boxes_xyxy: Array, img_from_world: Array) -> tuple[Array, BoolArray]:
     """Fit ellipsoids to boxes in closed form, all objects at once.
 
-    Needs >= 3 views and > ~20 deg between them; below that it is often no ellipsoid at all.
-    Invariant to shifts and units of the world: solved around the rays' meeting point.
+    Needs >= 3 views and > ~20 deg between them; with less the result is often no ellipsoid.
+    Invariant to shifts and units of the world: solved about the intersection of the rays.
 
     Args:
         boxes_xyxy: (F, O, 4), NaN where unseen; img_from_world: (F, 3, 4).
@@ -641,7 +665,8 @@ def fit_lfd(boxes_xyxy: Array, img_from_world: Array) -> tuple[Array, BoolArray]
     dual_q = np.full((n_obj, 4, 4), np.nan)
     if not enough.any():
         return dual_q, np.zeros(n_obj, bool)
-    index, seen = index[enough], seen[enough]
+    index = index[enough]
+    seen = seen[enough]
     boxes = boxes_xyxy[index, np.flatnonzero(enough)[:, None]]  # (O, V, 4)
     boxes = np.where(seen[..., None], boxes, [0, 0, 1, 1.0])
     mats = np.where(seen[..., None, None], cams.matrix[index], np.eye(3, 4))  # (O, V, 3, 4)
@@ -649,20 +674,22 @@ def fit_lfd(boxes_xyxy: Array, img_from_world: Array) -> tuple[Array, BoolArray]
     ray, extent = _rays(boxes, cams, index)
     origin = _ray_point(center, ray, seen.astype(np.float64))  # (O, 3)
     depth = np.abs(np.einsum("ovj,oj->ov", mats[..., 2, :3], origin) + mats[..., 2, 3])
-    # an object measures ~.1 unit, as in the authors' data: the null vector's norm is not scale free
+    # an object measures about .1 units, as in the authors' data: the norm of the null vector
+    # depends on the scale
     unit = 10.0 * np.sum(seen * depth * extent.mean(-1), 1) / seen.sum(1) + 1e-12  # (O,)
     system = _lfd_system(boxes, mats, origin, unit, seen)
     solution = np.linalg.svd(system, full_matrices=False)[2][:, -1, :10]  # (O, 10)
     local_q = _symmetric(solution, 4)  # (O, 4, 4), may be at infinity
     local_q = local_q / -_nonzero(local_q[:, 3:, 3:], 1e-12)
     world_from_local = unit[:, None, None] * np.eye(4)  # (O, 4, 4)
-    world_from_local[:, :3, 3], world_from_local[:, 3, 3] = origin, 1.0
+    world_from_local[:, :3, 3] = origin
+    world_from_local[:, 3, 3] = 1.0
     dual_q[enough] = world_from_local @ local_q @ world_from_local.transpose(0, 2, 1)
     return dual_q, Ellipsoids.from_dual_quadrics(dual_q)[1]
 
 
 def _rays(boxes: Array, cams: _Cameras, index: IntArray) -> tuple[Array, Array]:
-    """Back-project box centres to rays of depth 1 (O, V, 3) and boxes to sizes there (O, V, 2).
+    """Back-project boxes to depth 1: centres as rays (O, V, 3), widths and heights (O, V, 2).
 
     boxes: (O, V, 4); index: (O, V) their frames, -1 where there is none.
     """
@@ -677,15 +704,17 @@ def _rays(boxes: Array, cams: _Cameras, index: IntArray) -> tuple[Array, Array]:
 
 # ---- SfMO and PSfMO: affine cameras ---------------------------------------------------------
 
-UNKNOWN_RATIO_COV: Array = 0.5 * np.eye(2) + 0.25  # log(w/h), log(d/h) of an unknown category
+# Covariance of log(w/h) and log(d/h) of an unknown category
+UNKNOWN_RATIO_COV: Array = 0.5 * np.eye(2) + 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class SfmoResult:
-    """Affine cameras and ellipsoids from boxes alone: shape only, no metric meaning.
+    """Affine cameras and ellipsoids from boxes alone, without metric meaning.
 
-    The frame is arbitrary (similarity), and the mirror image (z -> -z) explains affine views
-    equally well: `mirrored` holds it. `ok` is False when there is too little to factorise.
+    Defined up to a similarity (arbitrary frame) and a reflection (z -> -z), which affine views
+    cannot distinguish: `mirrored` is the reflected solution. `ok` is False where there are too few
+    frames or objects to factorise; `note` gives the reason.
     """
 
     ellipsoids: Ellipsoids
@@ -698,11 +727,11 @@ class SfmoResult:
 
 
 def _ellipses(boxes_xyxy: Array | None, dual_c: Array | None) -> tuple[Array, Array, BoolArray]:
-    """Read dual conics, or the ellipses inscribed in boxes, as centres and shapes.
+    """Convert dual conics, or the ellipses inscribed in boxes, to centres and shapes.
 
     Returns:
         centres (F, O, 2), shape rows (F, O, 3) = entries 11, 12, 22 of the centred dual ellipse
-        ((a^2, 0, b^2) for a box), and which are seen (F, O).
+        ((a^2, 0, b^2) for a box), and seen (F, O).
     """
     if dual_c is not None:
         conic = np.asarray(dual_c, np.float64)
@@ -716,16 +745,16 @@ def _ellipses(boxes_xyxy: Array | None, dual_c: Array | None) -> tuple[Array, Ar
         square = (0.5 * (boxes[..., 2:] - boxes[..., :2])) ** 2
         rows = np.stack([square[..., 0], np.zeros(square.shape[:-1]), square[..., 1]], -1)
     else:
-        raise QuadricsError("give boxes_xyxy (F, O, 4) or dual_c (F, O, 3, 3)")
+        raise QuadricsError("no measurements: give boxes_xyxy (F, O, 4) or dual_c (F, O, 3, 3)")
     return center, rows, _finite(rows, -1) & (np.abs(center) < 1e7).all(-1)
 
 
 def _complete_rank3(tracks: Array, seen: BoolArray, iterations: int = 500) -> Array:
-    """Fill the holes of centre tracks (F, 2, O) with a rank-3 affine model x = M S + t.
+    """Complete centre tracks (F, 2, O) with a rank-3 affine model x = M S + t.
 
     Masked alternation: cameras (M, t) by least squares with the points fixed, then points with the
-    cameras fixed, lightly damped; starts from a truncated SVD of the tracks with holes interpolated
-    over the frames (which are taken to be in order).
+    cameras fixed, lightly damped. Initial value: truncated SVD of the tracks, with missing entries
+    interpolated over the frames (assumed to be in temporal order).
     Ref: Hartley and Schaffalitzky, PowerFactorization, 2003.
     """
     n_frame, _, n_obj = tracks.shape
@@ -741,7 +770,8 @@ def _complete_rank3(tracks: Array, seen: BoolArray, iterations: int = 500) -> Ar
     filled = filled.T  # (2F, O)
     mean = filled.mean(1, keepdims=True)
     points = np.linalg.svd(filled - mean, full_matrices=False)[2][:3].T  # (O, 3)
-    last, ridge = np.inf, np.diag([1e-2, 1e-2, 1e-2, 1e-9])  # holds frames with few objects
+    last = np.inf
+    ridge = np.diag([1e-2, 1e-2, 1e-2, 1e-9])  # regularises frames with few objects
     for _ in range(iterations):
         points = np.linalg.qr(points - points.mean(0))[0] * np.sqrt(n_obj)  # (O, 3)
         wide = np.concatenate([points, np.ones((n_obj, 1))], 1)  # (O, 4)
@@ -778,14 +808,15 @@ def _fit_shapes(design: Array, rows: Array, seen: BoolArray) -> Array:
     weight = seen.T[:, :, None, None].astype(np.float64)  # (O, F, 1, 1)
     target = np.where(seen.T[..., None], rows.transpose(1, 0, 2), 0.0)  # (O, F, 3)
     flat = (design * weight).reshape(len(target), -1, 6)
-    flat = np.where(np.isfinite(flat).all((1, 2), keepdims=True), flat, 0.0)  # no quadric then
+    # not finite: the system is set to 0, and so is the quadric
+    flat = np.where(np.isfinite(flat).all((1, 2), keepdims=True), flat, 0.0)
     entries = np.linalg.pinv(flat) @ target.reshape(len(target), -1, 1)  # (O, 6, 1)
     return _symmetric(np.asarray(entries[..., 0], np.float64), 3)
 
 
 @np.errstate(all="ignore")
 def fit_sfmo(boxes_xyxy: Array | None, dual_c: Array | None = None) -> SfmoResult:
-    """Factorise boxes alone into affine cameras and ellipsoids: structure from motion with objects.
+    """Factorise boxes into affine cameras and ellipsoids: structure from motion with objects.
 
     Needs >= 4 objects in general position and >= 3 frames. Unseen boxes (NaN) are completed by a
     rank-3 model. Scale, rotation and mirror image of the result are arbitrary.
@@ -793,18 +824,18 @@ def fit_sfmo(boxes_xyxy: Array | None, dual_c: Array | None = None) -> SfmoResul
     Args:
         boxes_xyxy: (F, O, 4), NaN where unseen, or None when dual_c (F, O, 3, 3) holds ellipses.
     Returns:
-        SfmoResult; `ok` is False where there is too little to factorise.
+        SfmoResult; `ok` is False where there are too few frames or objects.
     Ref: [SfMO].
     """
     center_px, rows, seen = _ellipses(boxes_xyxy, dual_c)
     n_obj = seen.shape[1]
-    # frames with few objects say little and extrapolate wildly: leave them out when others do
-    rich, some = (np.flatnonzero(seen.sum(1) >= k) for k in (max(5, 0.65 * n_obj), 4))
-    frames = rich if len(rich) >= 3 else some
+    # frames with few objects are ill-conditioned: used only where too few others remain
+    rich, enough = (np.flatnonzero(seen.sum(1) >= k) for k in (max(5, 0.65 * n_obj), 4))
+    frames = rich if len(rich) >= 3 else enough
     cams = np.full((len(seen), 2, 4), np.nan)
     if n_obj < 4 or len(frames) < 3:
         nan = Ellipsoids(*(np.full(s, np.nan) for s in ((n_obj, 3), (n_obj, 3), (n_obj, 3, 3))))
-        note = "needs 3 frames that show the same 4 objects"
+        note = "needs at least 3 frames that show the same 4 objects"
         return SfmoResult(nan, nan, cams, np.zeros(n_obj, bool), np.nan, False, note)
     on = seen[frames]
     tracks = _complete_rank3(center_px[frames].transpose(0, 2, 1), on)  # (F', 2, O)
@@ -821,32 +852,33 @@ def fit_sfmo(boxes_xyxy: Array | None, dual_c: Array | None = None) -> SfmoResul
     ellipsoids, real = Ellipsoids.from_dual_quadrics(_dual_quadrics(points, block))
     cams[frames] = np.concatenate([affine, offset[..., None]], 2)
     flip = np.array([1.0, 1.0, -1.0])
-    twin = _dual_quadrics(points * flip, block * flip[:, None] * flip)
-    mirrored = Ellipsoids.from_dual_quadrics(twin)[0]
+    reflected = _dual_quadrics(points * flip, block * flip[:, None] * flip)
+    mirrored = Ellipsoids.from_dual_quadrics(reflected)[0]
     rms = float(np.sqrt((error**2).mean()))
     return SfmoResult(ellipsoids, mirrored, cams, real, rms, True, "affine, no metric meaning")
 
 
 @dataclass(frozen=True, slots=True)
 class PsfmoResult:
-    """PSfMO: ellipsoids whose shape is drawn from the category's distribution of axis ratios."""
+    """Result of PSfMO: ellipsoids with a prior on the axis ratios of their category."""
 
     ellipsoids: Ellipsoids
-    mirrored: Ellipsoids | None  # the other solution of affine cameras; None with known cameras
+    mirrored: Ellipsoids | None  # reflected solution of affine cameras; None with known cameras
     noise: Array  # (O,) sigma of the shape rows, relative to their mean
-    permutation: IntArray  # (O, 3) prior axis (w, d, h) behind each ellipsoid axis
+    permutation: IntArray  # (O, 3) prior axis (w, d, h) assigned to each ellipsoid axis
     log_likelihood: Array  # (O,)
     start: SfmoResult | None  # None when the cameras were given
 
 
 def _shape_gaussian(priors: Priors, categories: Sequence[str | None]) -> tuple[Array, Array]:
-    """Turn priors of log axis ratios into Gaussians of u = a^2 / sum a^2: (O, 3), (O, 3, 3).
+    """Convert priors of log axis ratios to Gaussians of u = a^2 / sum a^2: (O, 3), (O, 3, 3).
 
     Five-point Gauss-Hermite rule in both directions. Ref: [PSfMO] shape model.
     """
     index = priors.index(categories)
     known = index >= 0
-    mean_log, cov_log = np.zeros((len(index), 2)), np.tile(UNKNOWN_RATIO_COV, (len(index), 1, 1))
+    mean_log = np.zeros((len(index), 2))
+    cov_log = np.tile(UNKNOWN_RATIO_COV, (len(index), 1, 1))
     mean_log[known] = priors.ratio_mean[index[known]]
     cov_log[known] = priors.ratio_cov[index[known]]
     node, weight = np.polynomial.hermite_e.hermegauss(5)
@@ -875,7 +907,8 @@ def _psfmo_em(
         s^2 (P h + mu) (B, 3): squared half axes, sigma (B,), log likelihood (B,).
     """
     value, vector = np.linalg.eigh(cov)
-    basis, spread = vector[:, :, 1:], np.maximum(value[:, 1:], 1e-8)  # (B, 3, 2), (B, 2)
+    basis = vector[:, :, 1:]  # (B, 3, 2)
+    spread = np.maximum(value[:, 1:], 1e-8)  # (B, 2)
     h = np.zeros((len(mean), 2))
     sigma2 = np.full(len(mean), 1e-2)
     for _ in range(iterations):
@@ -908,16 +941,16 @@ def fit_psfmo(
     dual_c: Array | None = None,
     iterations: int = 50,
 ) -> PsfmoResult:
-    """Fit ellipsoids whose axis ratios are drawn from the category (probabilistic SfMO).
+    """Fit ellipsoids with a prior on the axis ratios of their category (probabilistic SfMO).
 
-    Without cameras it starts from `fit_sfmo` (affine frame, no metric meaning); with img_from_world
+    Without cameras `fit_sfmo` initialises it (affine frame, no metric meaning); with img_from_world
     (F, 3, 4) each camera is linearised at the object's centre and the result is in world units.
-    Orientation comes from the start; all six assignments of the category's axes (w, d, h) to the
-    ellipsoid's are tried and the likeliest is kept.
+    The orientation is that of the initial value; of the six assignments of the category's axes
+    (w, d, h) to the ellipsoid's the one of highest likelihood is returned.
 
     Args:
         boxes_xyxy, dual_c: as in `fit_sfmo`. categories: (O,); unknown ones get a broad prior.
-        iterations: steps of EM.
+        iterations: EM iterations.
     Returns:
         PsfmoResult; NaN axes where an object is seen in fewer than two frames.
     Ref: [PSfMO].
@@ -937,18 +970,21 @@ def fit_psfmo(
     rot = np.where(usable[:, None, None], solids.world_from_obj, np.eye(3))
     i, j = np.triu_indices(3)
     outer = rot[:, i] * rot[:, j]  # (O, 6, 3): upper triangle of R diag(l) R' = outer l
-    on, n = seen.T[..., None], len(solids)  # (O, F, 1)
+    n = len(solids)
+    on = seen.T[..., None]  # (O, F, 1)
     target = np.where(on, rows.transpose(1, 0, 2), 0.0)  # (O, F, 3)
     count = np.maximum(3.0 * seen.sum(0), 1.0)
     unit = np.abs(target).sum((1, 2)) / count + 1e-12  # (O,) measurements over their mean
     system = np.where(on[..., None], design @ outer[:, None], 0.0).reshape(n, -1, 3)
-    system, target = system / unit[:, None, None], target.reshape(n, -1) / unit[:, None]
+    system = system / unit[:, None, None]
+    target = target.reshape(n, -1) / unit[:, None]
     results = [
         _psfmo_em(system, target, count, mean[:, p], cov[:, p][:, :, p], iterations)
         for p in AXIS_ORDERS
     ]
     squared, noise, likelihood = (np.stack(column) for column in zip(*results, strict=True))
-    best, row = np.argmax(np.nan_to_num(likelihood, nan=-np.inf), 0), np.arange(n)  # (O,)
+    best = np.argmax(np.nan_to_num(likelihood, nan=-np.inf), 0)  # (O,)
+    row = np.arange(n)
     half = np.where(usable[:, None], np.sqrt(np.maximum(squared[best, row], 0.0)), np.nan)
     mirrored = None if start is None else replace(start.mirrored, half_axes=half)
     return PsfmoResult(
@@ -960,9 +996,10 @@ def fit_psfmo(
 def _known_camera_start(
     center_px: Array, rows: Array, seen: BoolArray, img_from_world: Array
 ) -> tuple[Ellipsoids, Array]:
-    """Intersect the rays of the box centres, linearise the cameras there and fit the shapes.
+    """Triangulate the box centres, linearise the cameras there and fit the ellipsoids.
 
-    Returns the ellipsoids (least squares, no prior) and the affine cameras (O, F, 2, 3).
+    Returns:
+        the ellipsoids (least squares, no prior) and the affine cameras (O, F, 2, 3).
     """
     cams = _cameras(img_from_world)
     seen = seen & _finite(cams.center, 1)[:, None]
@@ -983,14 +1020,14 @@ def _known_camera_start(
 
 # ---- Levenberg-Marquardt over a batch of solids ---------------------------------------------
 
-NEAR_DEPTH = 1e-3  # of the longest half axis; a centre nearer to the camera counts as behind it
-BEHIND = 12.0  # sigma, constant residual of the edges of a view that has the object behind it
-SMOOTH = 1e-3  # rounds the kink of |m| in the support of box and cylinder
-SIZE_WALL = 2.5  # sigma of growth, beyond it the size prior turns quartic
-SIZE_WALL_RISE = 16.0  # how steep: extra cost rise * (s^2 - wall^2)^2 / wall^2
-# Positive residuals (the solid sticks out of the box) happen whenever something stands in front of
-# the object: they turn robust sooner than negative ones.
-CAUCHY = 3.0  # sigma, scale of the loss while outliers are still in
+NEAR_DEPTH = 1e-3  # longest half axes; a centre of less depth counts as behind the camera
+BEHIND = 12.0  # sigma, constant residual of the edges of a view with the object behind the camera
+SMOOTH = 1e-3  # smooths the kink of |m| in the support function of box and cylinder
+SIZE_WALL = 2.5  # sigma of growth beyond which the size prior is quartic
+SIZE_WALL_RISE = 16.0  # factor of the extra cost: rise * (s^2 - wall^2)^2 / wall^2
+# Positive residuals (the solid extends beyond the box) also arise from occlusion: their loss has a
+# smaller scale than that of negative ones.
+CAUCHY = 3.0  # sigma, scale of the loss before the inlier test
 CAUCHY_HIDDEN = 2.0  # sigma, same for positive residuals
 HUBER = 3.0  # sigma, scale of the loss after the inlier test
 HUBER_HIDDEN = 2.5  # sigma, same for positive residuals
@@ -1005,7 +1042,8 @@ class _State(_Rows):
     rot: Array  # (B, 3, 3) world_from_obj
 
     def put(self, index: IntArray | BoolArray, other: _State) -> None:
-        self.center[index], self.log_half[index] = other.center, other.log_half
+        self.center[index] = other.center
+        self.log_half[index] = other.log_half
         self.rot[index] = other.rot
 
     def moved(self, delta: Array) -> _State:
@@ -1016,24 +1054,24 @@ class _State(_Rows):
 
 @dataclass(frozen=True, slots=True)
 class _Problem(_Rows):
-    """What stays fixed in each of B problems, besides the edges."""
+    """Priors, floor and points of B problems, constant during the optimisation."""
 
     groups: Array  # (B, 3, 3) of AXIS_GROUPS
     size_mean: Array  # (B, 3) prior of log half axes, world units
-    size_info: Array  # (B, 3, 3) its inverse covariance, round things tied
-    size_var: Array  # (B, 3) its variance an axis, floored: the scale of the wall
+    size_info: Array  # (B, 3, 3) its inverse covariance; ties width and depth of round objects
+    size_var: Array  # (B, 3) its variance an axis, at least SIZE_WALL_LOG^2: the unit of SIZE_WALL
     up: Array  # (B, 3) unit, or zeros
     tilt_info: Array  # (B, 3) 1 / rad^2 for the three components of up in object axes
     vertical: Array  # (B, 3) 1 for the vertical axis
-    floor: Array  # (B, 4) plane n, d: n x = d that the solid stands on
-    floor_info: Array  # (B,) 1 / sigma^2 of its lower side over that plane, 0: stands elsewhere
-    points: Array  # (B, P, 3) that may lie on it
-    point_weight: Array  # (B, P) of how many points each is one, 0: none
-    point_sigma: Array  # (B,) of how far they lie outside, world units
+    floor: Array  # (B, 4) plane n, d: n x = d
+    floor_info: Array  # (B,) 1 / sigma^2 of the height of the lower side over the floor; 0: free
+    points: Array  # (B, P, 3) that may lie on the object
+    point_weight: Array  # (B, P) of the points, 0: no point
+    point_sigma: Array  # (B,) of a point's distance outside the solid, world units
 
 
 def rotations(rotvec: Array) -> Array:
-    """Turn rotation vectors (B, 3), rad, into matrices (B, 3, 3). Ref: Rodrigues."""
+    """Convert rotation vectors (B, 3), rad, to matrices (B, 3, 3). Ref: Rodrigues."""
     angle = np.linalg.norm(rotvec, axis=-1)[:, None, None]  # (B, 1, 1)
     skew = _skew(rotvec)
     s = np.sinc(angle / np.pi)
@@ -1043,7 +1081,7 @@ def rotations(rotvec: Array) -> Array:
 
 
 def rotation_vectors(rot: Array) -> Array:
-    """Turn rotation matrices (B, 3, 3) into vectors (B, 3), by quaternions: exact near pi too."""
+    """Convert rotation matrices (B, 3, 3) to vectors (B, 3) by quaternions: accurate near pi."""
     diag = np.einsum("bii->bi", rot)
     trace = diag.sum(1)
     square = np.concatenate([1.0 + trace[:, None], 1.0 + 2.0 * diag - trace[:, None]], 1)  # (B, 4)
@@ -1063,7 +1101,7 @@ def rotation_vectors(rot: Array) -> Array:
 
 
 def _state_difference(a: _State, b: _State, code: IntArray) -> Array:
-    """Find the smallest increment (B, 9) from solid b to solid a, over relabellings of a's axes."""
+    """Find the smallest increment (B, 9) from solid b to solid a over permutations of a's axes."""
     signs = np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, 8).T
     group = np.array([np.eye(3)[:, order] * s for order in AXIS_ORDERS for s in signs])
     group = group[np.linalg.det(group) > 0]  # the 24 rotations of the axes onto themselves
@@ -1079,25 +1117,31 @@ def _state_difference(a: _State, b: _State, code: IntArray) -> Array:
 
 
 def _skew(v: Array) -> Array:
-    """Write the cross product with v (..., 3) as a matrix (..., 3, 3): _skew(v) @ x = v x x."""
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    """Return the cross product matrix (..., 3, 3) of v (..., 3): _skew(v) @ x = v x x."""
+    x = v[..., 0]
+    y = v[..., 1]
+    z = v[..., 2]
     out = np.zeros((*v.shape, 3))
-    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = x, y, z
-    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -x, -y, -z
+    out[..., 2, 1] = x
+    out[..., 0, 2] = y
+    out[..., 1, 0] = z
+    out[..., 1, 2] = -x
+    out[..., 2, 0] = -y
+    out[..., 0, 1] = -z
     return out
 
 
 def _residuals(
     state: _State, edges: _Edges, groups: Array, jacobian: bool, smooth: float = SMOOTH
 ) -> tuple[Array, Array]:
-    """Measure signed edge residuals: how far the solid sticks out of each tangent plane.
+    """Compute signed edge residuals: how far the solid extends beyond each tangent plane.
 
     h = sum_k p_k with p_k = a_k^2 m_k^2 / sqrt(sum of its group), m = R' n; then dh/dlog a_k = p_k
     and dh/dm_k = a_k^2 m_k / sqrt(...). Residual = gain (n.c + d + h) / depth(c): the distance in
     the image between the solid's outline and the edge, to second order.
 
     Returns:
-        value (B, M) in sigma, M = V E, 0 where unused; jacobian (B, M, 9), empty if not asked for.
+        value (B, M) in sigma, M = V E, 0 where unused; jacobian (B, M, 9), empty on request.
     """
     n_prob, n_view, n_edge = edges.offset.shape
     flat = n_view * n_edge
@@ -1110,13 +1154,13 @@ def _residuals(
     m = normal @ state.rot  # (B, M, 3)
     square = (m * m + smooth**2) * (half * half)
     root = np.sqrt(square @ groups) + 1e-300
-    part = square / root  # (B, M, 3)
-    gap = (normal @ state.center[:, :, None])[..., 0] + edges.offset.reshape(n_prob, flat)
-    gap += part.sum(-1)
+    p = square / root  # (B, M, 3)
+    excess = (normal @ state.center[:, :, None])[..., 0] + edges.offset.reshape(n_prob, flat)
+    excess += p.sum(-1)
     scale = (edges.gain * inv_depth[..., None]).reshape(n_prob, flat)  # (B, M)
-    off = edges.one_sided.reshape(n_prob, flat) & (gap > 0)
-    scale[off] = 0.0
-    value = scale * gap
+    free = edges.one_sided.reshape(n_prob, flat) & (excess > 0)
+    scale[free] = 0.0
+    value = scale * excess
     value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = BEHIND
     if not jacobian:
         return value, np.empty(0)
@@ -1124,7 +1168,7 @@ def _residuals(
     shrink = np.repeat(inv_depth, n_edge, 1) * value * (scale > 0)  # (B, M)
     rows = np.repeat(edges.depth_row[..., :3], n_edge, 1)  # (B, M, 3)
     jac[..., :3] = scale[..., None] * normal - shrink[..., None] * rows
-    jac[..., 3:6] = scale[..., None] * part
+    jac[..., 3:6] = scale[..., None] * p
     v = (scale[..., None] * m) * (half * half) / root  # dh/dm, scaled
     jac[..., 6] = v[..., 1] * m[..., 2] - v[..., 2] * m[..., 1]
     jac[..., 7] = v[..., 2] * m[..., 0] - v[..., 0] * m[..., 2]
@@ -1152,6 +1196,8 @@ def _robust(value: Array, loss: str) -> tuple[Array, Array]:
 
 
 class _Normal(NamedTuple):
+    """Normal equations of B problems."""
+
     cost: Array  # (B,)
     hessian: Array  # (B, 9, 9) Gauss-Newton, half of the cost's second derivative
     gradient: Array  # (B, 9) half of the cost's gradient
@@ -1160,7 +1206,7 @@ class _Normal(NamedTuple):
 def _normal_equations(
     state: _State, edges: _Edges, prob: _Problem, loss: str, smooth: float = SMOOTH
 ) -> _Normal:
-    """Sum up cost, gradient, Gauss-Newton Hessian of edges, points, size, tilt and floor."""
+    """Sum cost, gradient and Gauss-Newton Hessian of edges, points, size, tilt and floor."""
     value, jacobian = _residuals(state, edges, prob.groups, True, smooth)
     rho, weight = _robust(value, loss)
     weighted = (jacobian * weight[..., None]).transpose(0, 2, 1)  # (B, 9, M)
@@ -1181,8 +1227,9 @@ def _normal_equations(
 
 
 def _prior_terms(state: _State, prob: _Problem) -> _Normal:
-    """Sum up cost, gradient and Hessian of what is known of size, tilt and floor."""
-    hessian, gradient = np.zeros((len(state.center), 9, 9)), np.zeros((len(state.center), 9))
+    """Sum cost, gradient and Hessian of the priors of size, tilt and height over the floor."""
+    hessian = np.zeros((len(state.center), 9, 9))
+    gradient = np.zeros((len(state.center), 9))
     cost, gradient[:, 3:6], hessian[:, 3:6, 3:6] = _size_prior(state, prob)
     up = (prob.up[:, None] @ state.rot)[:, 0]  # (B, 3) in object axes
     turn = _skew(up)  # (B, 3, 3): d up / d rotvec
@@ -1191,7 +1238,7 @@ def _prior_terms(state: _State, prob: _Problem) -> _Normal:
     gradient[:, 6:] = (turn.transpose(0, 2, 1) @ (tilt * up)[..., None])[..., 0]
     half = prob.vertical * np.exp(state.log_half)  # (B, 3)
     height = (prob.floor[:, :3] * state.center).sum(1) - prob.floor[:, 3] - half.sum(1)
-    row = np.concatenate([prob.floor[:, :3], -half], 1)  # (B, 6) its derivative
+    row = np.concatenate([prob.floor[:, :3], -half], 1)  # (B, 6) derivative of the height
     weighted_row = prob.floor_info[:, None] * row
     hessian[:, :6, :6] += weighted_row[:, :, None] * row[:, None]
     gradient[:, :6] += weighted_row * height[:, None]
@@ -1199,7 +1246,7 @@ def _prior_terms(state: _State, prob: _Problem) -> _Normal:
 
 
 def _points_outside(state: _State, prob: _Problem) -> tuple[Array, Array]:
-    """Measure how far points lie outside the box around a solid, along its axes; inside is 0.
+    """Compute how far points lie outside the box around a solid, along its axes; 0 inside.
 
     Returns:
         value (B, P, 3) in sigma; jacobian (B, P, 3, 9).
@@ -1218,25 +1265,25 @@ def _points_outside(state: _State, prob: _Problem) -> tuple[Array, Array]:
 def _size_prior(state: _State, prob: _Problem) -> tuple[Array, Array, Array]:
     """Return cost (B,), half gradient (B, 3), information (B, 3, 3) of the log-normal size prior.
 
-    Quadratic in log size; quartic for growth beyond SIZE_WALL: edges that may be hidden or lie on
-    the image border leave solids free to grow, and no chair is 100 m long. Shrinking stays
-    quadratic: of a hidden object the boxes show a part.
+    Quadratic in log size; quartic for growth beyond SIZE_WALL: occluded edges and edges on the
+    image border do not bound a solid from above. Shrinking stays quadratic: a partly occluded
+    object looks smaller.
     """
     error = state.log_half - prob.size_mean  # (B, 3)
     pull = (prob.size_info @ error[..., None])[..., 0]
-    own = (error > 0) / prob.size_var  # (B, 3)
+    growth_info = (error > 0) / prob.size_var  # (B, 3)
     wall = SIZE_WALL**2
-    over = np.maximum((own * error**2).sum(1) - wall, 0.0)  # (B,) sigma^2
+    over = np.maximum((growth_info * error**2).sum(1) - wall, 0.0)  # (B,) sigma^2
     steep = (2.0 * SIZE_WALL_RISE / wall * over)[:, None]  # (B, 1)
     cost = (error * pull).sum(1) + SIZE_WALL_RISE / wall * over**2
-    extra = (steep * own)[:, None] * np.eye(3)  # (B, 3, 3)
-    return cost, pull + steep * own * error, prob.size_info + extra
+    extra = (steep * growth_info)[:, None] * np.eye(3)  # (B, 3, 3)
+    return cost, pull + steep * growth_info * error, prob.size_info + extra
 
 
 def _step(normal: _Normal, damping: Array, reach: Array) -> Array:
     """Solve for the damped step (B, 9), scaled by the Hessian's diagonal (Marquardt), and limit it.
 
-    At most a third of the distance `reach` (B,), a factor 4 in size, 0.7 rad in rotation.
+    Limits: a third of the mean depth `reach` (B,), a factor 4 in size, 0.7 rad in rotation.
     """
     diag = np.einsum("bii->bi", normal.hessian)  # (B, 9)
     scale = 1.0 / np.sqrt(np.maximum(diag, 1e-12 * (1e-300 + diag.max(1, keepdims=True))))
@@ -1253,14 +1300,16 @@ def _step(normal: _Normal, damping: Array, reach: Array) -> Array:
 def _minimise(
     state: _State, edges: _Edges, prob: _Problem, loss: str, iterations: int
 ) -> tuple[_State, Array, Array]:
-    """Run Levenberg-Marquardt on B problems side by side; converged ones leave the batch.
+    """Run Levenberg-Marquardt on a batch of B problems; converged ones leave the batch.
 
-    Returns the states, their costs (B,) and their Hessians (B, 9, 9).
+    Returns:
+        the states, their costs (B,) and their Hessians (B, 9, 9).
     """
     normal = _normal_equations(state, edges, prob, loss)
     state, final = (state[np.arange(len(normal.cost))] for _ in range(2))  # copies
-    cost, hessian = normal.cost.copy(), normal.hessian.copy()
-    alive = np.arange(len(cost))  # (A,) problems still moving
+    cost = normal.cost.copy()
+    hessian = normal.hessian.copy()
+    alive = np.arange(len(cost))  # (A,) problems that have not converged
     damping = np.full(len(cost), 1e-3)
     seen = edges.used.any(-1)  # (B, V)
     reach = np.sum(np.abs(_depth(state, edges)) * seen, 1) / np.maximum(seen.sum(1), 1) + 1e-12
@@ -1275,32 +1324,37 @@ def _minimise(
             old[better] = fresh[better]
         done = (better & (gain < 1e-5 * (1.0 + new.cost))) | (damping > 1e6)
         final.put(alive[better], state[better])
-        cost[alive[better]], hessian[alive[better]] = new.cost[better], new.hessian[better]
+        cost[alive[better]] = new.cost[better]
+        hessian[alive[better]] = new.hessian[better]
         if done.all():
             break
         if done.mean() > 0.25:  # shrink the batch
             keep = np.flatnonzero(~done)
-            state, edges, prob = state[keep], edges[keep], prob[keep]
+            state = state[keep]
+            edges = edges[keep]
+            prob = prob[keep]
             normal = _Normal(*(x[keep] for x in normal))
-            alive, damping, reach = alive[keep], damping[keep], reach[keep]
+            alive = alive[keep]
+            damping = damping[keep]
+            reach = reach[keep]
     return final, cost, hessian
 
 
 # ---- fit_objects: data, priors, starts ------------------------------------------------------
 
-START_OFFSET = 0.5  # box sizes, a ray that misses the centre by more does not support it
-START_CUT_VOTE = 0.3  # vote of a box that touches the border
-START_DEPTH_LOG = 0.3  # log, how well a box's extent tells the depth of a known size
-START_SIZE_LOG = 0.25  # log, how well it tells the size at a known depth
-START_CENTER = 0.1  # box sizes, sigma of a box's centre as the centre's image
-# Points in the boxes of a thing. Chosen on hololens_kitchen and redkitchen, where sigmas of .05 to
-# .15, worths of 10 to 60 and .3 elsewhere are alike; of the points half are on the thing.
-POINT_REL = 0.08  # sigma of a point, over the half width that is usual for the category
-POINT_ELSEWHERE = 0.1  # odds of a point of something else, over one on the thing
-POINTS_WORTH = 20.0  # all points of a thing together: neighbours err alike
-ELSEWHERE_M = 1.0  # m, spread of the height of objects that need not stand on the floor
-STANDING_REL = 0.012  # sigma of a standing thing's lower side, over its height (chosen: carpets)
-# Size of an unknown category: the spread of the 110 indoor categories of priors.json.
+START_OFFSET = 0.5  # box sizes, inlier threshold of the distance of a ray from the centre
+START_CUT_VOTE = 0.3  # weight of the vote of a box that touches the image border
+START_DEPTH_LOG = 0.3  # log, sigma of the depth from a box's extent and a known size
+START_SIZE_LOG = 0.25  # log, sigma of the size from a box's extent and a known depth
+START_CENTER = 0.1  # box sizes, sigma of a box's centre as the image of the object's
+# Points in the boxes of an object: about half lie on it. Chosen on hololens_kitchen and redkitchen,
+# insensitive within .05 to .15, to .3, and 10 to 60 (docs/quadrics.md).
+POINT_REL = 0.08  # sigma of a point's distance, over the usual half width of the category
+POINT_ELSEWHERE = 0.1  # prior odds of a point on another object, uniform in space
+POINTS_WORTH = 20.0  # total weight of an object's points: the errors of neighbours correlate
+ELSEWHERE_M = 1.0  # m, sigma of the height of objects that need not stand on the floor
+STANDING_REL = 0.012  # sigma of the lower side's height over the floor, over the object's height
+# Size of an unknown category: distribution of the 110 indoor categories of priors.json.
 UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean
 UNKNOWN_SIZE_LOG = 0.9  # log, standard deviation of the common size
 UNKNOWN_ASPECT_LOG = 0.6  # log, standard deviation of each axis about the common size
@@ -1327,10 +1381,10 @@ class _Data(_Rows):
 
 @dataclass(frozen=True, slots=True)
 class _Spec:
-    """What is assumed about objects before looking at the boxes, in H hypotheses.
+    """Priors of H hypotheses about the objects.
 
-    An object without a known category has one hypothesis, any other two: it is of its category, or
-    the category is wrong and says nothing.
+    An object without a known category has one hypothesis, any other two: the category is right, or
+    it is wrong and the priors of unknown categories hold.
     """
 
     obj: IntArray  # (H,) object
@@ -1338,39 +1392,63 @@ class _Spec:
     size_mean: Array  # (H, 3) log half axes, world units
     size_cov: Array  # (H, 3, 3)
     kind: IntArray  # (H,) row of the category in the priors, -1 unknown
-    natural: IntArray  # (H,) support that the size prior is about, -1 unknown category
-    allowed: BoolArray  # (H, 3) supports to try
+    natural: IntArray  # (H,) shape to which the size prior applies, -1 unknown category
+    allowed: BoolArray  # (H, 3) shapes to try
     round_: BoolArray  # (H,) yaw symmetric
     upright: BoolArray  # (H,)
     up: Array  # (3,) unit or zeros
-    tilt_rad: float  # how uncertain `up` is
+    tilt_rad: float  # sigma of an object's vertical axis about `up`
     floor: Array  # (4,) plane n, d: n x = d
-    floor_sigma: Array  # (H,) of an object's lower side over it, inf: it may stand elsewhere
-    points: Array  # (H, P, 3) that may lie on it
-    point_weight: Array  # (H, P) of how many points each is one, 0: none
+    floor_sigma: Array  # (H,) of the height of an object's lower side; inf: need not stand there
+    points: Array  # (H, P, 3) that may lie on the object
+    point_weight: Array  # (H, P) of the points, 0: no point
 
 
-def _gather_data(
-    boxes: Array, one_sided: BoolArray, usable: BoolArray, quality: Array, cams: _Cameras,
-    cfg: FitConfig,
-) -> _Data:  # fmt: skip
-    """Choose each object's views and back-project their edges."""
-    index = _select_views(usable, quality, cams, cfg.max_views)  # (O, V)
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """Checked boxes and cameras."""
+
+    boxes: Array  # (F, O, 4)
+    one_sided: BoolArray  # (F, O, 4)
+    usable: BoolArray  # (F, O)
+    cams: _Cameras
+
+    def of(self, obj: IntArray) -> _Measured:
+        """Select objects."""
+        return _Measured(self.boxes[:, obj], self.one_sided[:, obj], self.usable[:, obj], self.cams)
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """Arguments of `fit_objects` about the L live objects, besides their boxes."""
+
+    categories: list[str | None]  # (L,)
+    priors: Priors | None
+    codes: IntArray  # (L,) shapes, BY_CATEGORY or BY_EVIDENCE
+    points: Array  # (L, P, 3), NaN: no point
+    sizes: list[tuple[int, int, float]]  # row, axis of the prior, metres
+    wrong_class: float  # probability that a category is wrong
+
+
+def _gather_data(measured: _Measured, quality: Array, cfg: FitConfig) -> _Data:
+    """Choose each object's views by `quality` (F, O) and back-project their edges."""
+    cams = measured.cams
+    index = _select_views(measured.usable, quality, cams, cfg.max_views)  # (O, V)
     seen = (index >= 0)[..., None]
-    own = index, np.arange(len(index))[:, None]
-    picked = np.where(seen, boxes[own], np.nan)  # (O, V, 4)
+    column = np.arange(len(index))[:, None]
+    boxes = np.where(seen, measured.boxes[index, column], np.nan)  # (O, V, 4)
     mats = np.where(seen[..., None], cams.matrix[index], np.nan)  # (O, V, 3, 4)
-    edges = _tangent_planes(picked, mats, one_sided[own], cfg)
-    ray, extent = _rays(np.where(seen, picked, [0.0, 0.0, 1.0, 1.0]), cams, index)
+    edges = _tangent_planes(boxes, mats, measured.one_sided[index, column], cfg)
+    ray, extent = _rays(np.where(seen, boxes, [0.0, 0.0, 1.0, 1.0]), cams, index)
     center = np.where(seen, cams.center[index], 0.0)  # (O, V, 3)
-    # Errors of a detector, of occlusion and of a solid that only resembles the object repeat in
-    # neighbouring frames; counting each frame as a new measurement would make the result too sure.
+    # Errors of the detector, of occlusion and of the shape model correlate between neighbouring
+    # frames: independent measurements of all of them would give too small a covariance.
     if cfg.correlation_deg > 0:
         point = _ray_point(center, ray, seen[..., 0].astype(np.float64))  # (O, 3)
         angle = np.arccos(np.clip(_cosines(center, point), -1.0, 1.0))  # (O, V, V)
-        near = np.exp(-0.5 * (angle / np.deg2rad(cfg.correlation_deg)) ** 2) * seen[:, None, :, 0]
-        share = np.maximum(near.sum(-1), 1.0)[..., None] * edges.share  # (O, V, E)
-        edges = replace(edges, gain=edges.gain / np.sqrt(share), share=share)
+        corr = np.exp(-0.5 * (angle / np.deg2rad(cfg.correlation_deg)) ** 2) * seen[:, None, :, 0]
+        redundancy = np.maximum(corr.sum(-1), 1.0)[..., None] * edges.redundancy  # (O, V, E)
+        edges = replace(edges, gain=edges.gain / np.sqrt(redundancy), redundancy=redundancy)
     return _Data(index, ray, extent, center, edges)
 
 
@@ -1381,54 +1459,61 @@ def _cosines(center: Array, point: Array) -> Array:
     return np.asarray(view @ view.transpose(0, 2, 1))
 
 
-def _prior_spec(
-    names: Sequence[str | None], priors: Priors | None, codes: IntArray, points: Array,
-    wrong_class: float, world: _World,
-) -> _Spec:  # fmt: skip
-    """Look up size, shape and uprightness of every object, in world units; list hypotheses."""
-    rows = np.full(len(names), -1) if priors is None else priors.index(names)
-    # without a scale the sizes of all are open: only `_scale_from_priors` doubts the categories
-    doubted = (rows >= 0) & (wrong_class > 0) & (world.scale_sigma < UNKNOWN_SCALE_LOG)
-    obj = np.concatenate([np.arange(len(names)), np.flatnonzero(doubted)])
+def _prior_spec(given: _Given, world: _World) -> _Spec:
+    """Look up the priors of size, shape and uprightness in world units; list the hypotheses."""
+    n_obj = len(given.categories)
+    priors = given.priors
+    rows = np.full(n_obj, -1) if priors is None else priors.index(given.categories)
+    # without a scale all sizes are free: a wrong category is considered by `_scale_from_priors`
+    doubted = (rows >= 0) & (given.wrong_class > 0) & (world.scale_sigma < UNKNOWN_SCALE_LOG)
+    obj = np.concatenate([np.arange(n_obj), np.flatnonzero(doubted)])
     rows = np.concatenate([rows, np.full(len(obj) - len(rows), -1)])
-    n, known = len(obj), rows >= 0
-    log_odds = np.where(known, np.log1p(-wrong_class), 0.0)
-    if wrong_class > 0:
-        log_odds[len(names) :] = np.log(wrong_class / len(SUPPORTS))
-    codes, points = codes[obj], points[obj]
+    n = len(obj)
+    known = rows >= 0
+    log_odds = np.where(known, np.log1p(-given.wrong_class), 0.0)
+    if given.wrong_class > 0:
+        log_odds[n_obj:] = np.log(given.wrong_class / len(SUPPORTS))
+    codes = given.codes[obj]
+    points = given.points[obj]
     mean = np.tile(np.log(UNKNOWN_SIZE_M), (n, 1))  # (O, 3)
     cov = np.tile(UNKNOWN_ASPECT_LOG**2 * np.eye(3) + UNKNOWN_SIZE_LOG**2, (n, 1, 1))  # (O, 3, 3)
-    natural, round_, upright = np.full(n, -1), np.zeros(n, bool), np.ones(n, bool)
+    natural = np.full(n, -1)
+    round_ = np.zeros(n, bool)
+    upright = np.ones(n, bool)
     if priors is not None and known.any():
         pick = rows[known]
-        mean[known], cov[known] = priors.log_mean[pick], priors.log_cov[pick]
-        natural[known], round_[known] = priors.support[pick], priors.yaw_symmetric[pick]
+        mean[known] = priors.log_mean[pick]
+        cov[known] = priors.log_cov[pick]
+        natural[known] = priors.support[pick]
+        round_[known] = priors.yaw_symmetric[pick]
         upright[known] = priors.upright[pick]
     cov = cov + world.scale_sigma**2
-    wanted = np.where(codes == BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
-    allowed = (wanted[:, None] == np.arange(3)) | (wanted < 0)[:, None]
+    code = np.where(codes == BY_EVIDENCE, -1, np.where(codes >= 0, codes, natural))  # (O,)
+    allowed = (code[:, None] == np.arange(3)) | (code < 0)[:, None]
     size_mean = mean - np.log(2.0) - world.log_scale
-    plane, floor_sigma = np.zeros(4), np.full(n, np.inf)
+    plane = np.zeros(4)
+    floor_sigma = np.full(n, np.inf)
     if priors is not None and world.floor is not None and world.scale_source != "none":
         plane = np.append(world.floor.normal, world.floor.offset)
         stands = known & priors.on_floor[rows]
-        own = STANDING_REL * 2.0 * np.exp(size_mean[:, 2])
-        floor_sigma = np.where(stands, np.hypot(world.floor.sigma, own), np.inf)
+        standing_sigma = STANDING_REL * 2.0 * np.exp(size_mean[:, 2])
+        floor_sigma = np.where(stands, np.hypot(world.floor.sigma, standing_sigma), np.inf)
         elsewhere = ELSEWHERE_M / np.exp(world.log_scale)
         log_odds += np.where(stands, np.log(elsewhere / floor_sigma), 0.0)
-    there = _finite(points, 2)  # (O, P)
-    weight = there * np.minimum(POINTS_WORTH / np.maximum(there.sum(1, keepdims=True), 1), 1.0)
+    is_point = _finite(points, 2)  # (O, P)
+    count = is_point.sum(1, keepdims=True)
+    weight = is_point * np.minimum(POINTS_WORTH / np.maximum(count, 1), 1.0)
     return _Spec(
         obj, log_odds, size_mean, cov, rows, natural, allowed, round_, upright, world.up,
-        world.tilt_rad, plane, floor_sigma, np.where(there[..., None], points, 0.0), weight,
+        world.tilt_rad, plane, floor_sigma, np.where(is_point[..., None], points, 0.0), weight,
     )  # fmt: skip
 
 
 def _shape_shift(log_half: Array, natural: IntArray, code: IntArray) -> Array:
-    """Compute the log factor (B,) from the size of an object's own solid to a stand-in ellipsoid's.
+    """Compute the log ratio (B,) of the sizes of shape `code` and of shape `natural`.
 
-    An ellipsoid tangent to the boxes of a cuboid is larger than the cuboid: equal mean support,
-    sum(a) / 2 against sqrt(sum(a^2) / 3) (rms over directions; 1.5 for a cube, 1 for a rod).
+    An ellipsoid tangent to the boxes of a cuboid is larger than the cuboid. Both have the same mean
+    support: sum(a) / 2 and sqrt(sum(a^2) / 3) (rms over directions; 1.5 for a cube, 1 for a rod).
     """
     half = np.exp(log_half - log_half.max(1, keepdims=True))
     factor = 0.5 * half.sum(1) / np.sqrt((half**2).sum(1) / 3.0)
@@ -1438,7 +1523,7 @@ def _shape_shift(log_half: Array, natural: IntArray, code: IntArray) -> Array:
 
 
 def _start_rotations(up: Array) -> Array:
-    """List rotations (3 axes, 4 yaws, 3, 3) with object axis k along up (z when it is zero)."""
+    """List rotations (3 axes, 4 yaws, 3, 3) with object axis k along up (z if up is zero)."""
     frame = np.eye(3)
     if np.any(up):
         x = np.cross(frame[np.argmin(np.abs(up))], up)
@@ -1451,23 +1536,24 @@ def _start_rotations(up: Array) -> Array:
 
 
 def _start_table(spec: _Spec) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """List the problems: hypothesis, support, vertical axis, yaw, each (B,)."""
+    """List the starts: hypothesis, shape, vertical axis, yaw, each (B,)."""
     n = len(spec.size_mean)
-    use = np.ones((n, 3, 3, 4), bool) & spec.allowed[:, :, None, None]  # H, support, axis, yaw
-    use[spec.upright & bool(np.any(spec.up)), :, :2] = False  # up unknown: any axis may stand
-    use[:, CYLINDER, 1] = False  # a lying cylinder: axis 0 and 1 vertical are the same
+    use = np.ones((n, 3, 3, 4), bool) & spec.allowed[:, :, None, None]  # H, shape, axis, yaw
+    use[spec.upright & bool(np.any(spec.up)), :, :2] = False  # up unknown: any axis is vertical
+    use[:, CYLINDER, 1] = False  # a lying cylinder: axes 0 and 1 are equivalent
     round_ = spec.round_[:, None] | (np.arange(3) == CYLINDER) & (spec.natural != CYLINDER)[:, None]
     use[:, :, 2, 1:] &= ~round_[:, :, None]
-    use[spec.natural < 0, :, 2, 2:] = False  # width and depth alike: a quarter turn is the same
+    use[spec.natural < 0, :, 2, 2:] = False  # same prior of width and depth: symmetric by 90 deg
     hyp, code, axis, yaw = np.nonzero(use)
     return hyp, code, axis, yaw
 
 
 def _pair_points(cam_center: Array, ray: Array) -> Array:
-    """Find the midpoints (O, S (S - 1) / 2, 3) of the shortest links between all pairs of rays."""
+    """Find the midpoints (O, S (S - 1) / 2, 3) of the shortest segments between pairs of rays."""
     i, j = np.triu_indices(ray.shape[1], 1)
     unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    a, b = unit[:, i], unit[:, j]
+    a = unit[:, i]
+    b = unit[:, j]
     base = cam_center[:, j] - cam_center[:, i]
     cos = (a * b).sum(-1)
     det = np.maximum(1.0 - cos**2, 1e-12)
@@ -1478,7 +1564,10 @@ def _pair_points(cam_center: Array, ray: Array) -> Array:
 
 
 def _ray_misfit(data: _Data, points: Array) -> tuple[Array, Array]:
-    """Measure points (O, C, 3): squared offset from box centres in box sizes, depth; (O, C, V)."""
+    """Project points (O, C, 3): squared distances from box centres in box sizes, depths.
+
+    Both (O, C, V).
+    """
     rows = data.edges.depth_row
     depth = np.einsum("ocj,ovj->ocv", points, rows[..., :3]) + rows[:, None, :, 3]
     safe = np.where(depth > 0, depth, np.inf)[..., None]
@@ -1489,14 +1578,14 @@ def _ray_misfit(data: _Data, points: Array) -> tuple[Array, Array]:
 
 
 def _start_points(data: _Data, spec: _Spec) -> tuple[Array, Array, BoolArray]:
-    """Find robust starts from rays and prior depths.
+    """Estimate robust starts from rays and prior depths.
 
-    Candidates are the midpoints of all ray pairs and one point a ray at the depth where the box
-    has the prior's mean extent; the candidate with the best consensus is refined by weighted least
-    squares over inlier rays, the prior depth entering with its own sigma.
+    Candidates are the midpoints of all pairs of rays and one point a ray at the depth where the box
+    has the prior's mean extent. The candidate of best consensus is refined by weighted least
+    squares over the inlier rays and the prior depth with its sigma.
 
     Returns:
-        centres (O, 3), log half axes (O, 3), and which of the S views agree on the centre (O, S).
+        centres (O, 3), log half axes (O, 3), and inlier (O, S) of the S views.
     """
     seen = data.edges.used.any(-1).astype(np.float64)  # (O, S)
     weight = seen * np.where(data.edges.one_sided.any(-1), START_CUT_VOTE, 1.0)
@@ -1513,16 +1602,16 @@ def _start_points(data: _Data, spec: _Spec) -> tuple[Array, Array, BoolArray]:
     vote += 0.1 * np.minimum(ratio**2, 4.0)
     best = np.argmin((vote * weight[:, None]).sum(-1), 1)  # (O,)
     row = np.arange(len(best))
-    near = 4.0 * np.nan_to_num(misfit[row, best], posinf=1e6) / START_OFFSET**2  # (O, S)
-    agree = weight / (1.0 + near) ** 2
+    distance = 4.0 * np.nan_to_num(misfit[row, best], posinf=1e6) / START_OFFSET**2  # (O, S)
+    agree = weight / (1.0 + distance) ** 2
     center, z = _refine_start(data, single, points[row, best], agree, prior_depth, sigma)
     seen_size = (agree * z * extent).sum(1) / np.maximum(agree.sum(1), 1e-12)
     growth = np.log(np.maximum(seen_size, 1e-12)) - np.log(np.exp(spec.size_mean).sum(1))
-    share = common / (common + START_SIZE_LOG**2)
-    log_half = spec.size_mean + (share * np.clip(growth, -12.0, 12.0))[:, None]
-    trusted = (seen > 0) & (near < 4.0)
-    trusted |= (2.0 * trusted.sum(1) < seen.sum(1))[:, None]  # no majority: trust all
-    return center, log_half, trusted
+    gain = common / (common + START_SIZE_LOG**2)
+    log_half = spec.size_mean + (gain * np.clip(growth, -12.0, 12.0))[:, None]
+    inlier = (seen > 0) & (distance < 4.0)
+    inlier |= (2.0 * inlier.sum(1) < seen.sum(1))[:, None]  # no majority: all views are used
+    return center, log_half, inlier
 
 
 def _refine_start(
@@ -1530,7 +1619,11 @@ def _refine_start(
 ) -> tuple[Array, Array]:
     """Refine centres (O, 3) by weighted least squares over rays and prior depths.
 
-    Returns centres (O, 3) and their depths (O, S).
+    Args:
+        single: (O, S, 3) points of the rays at `prior_depth` (O, S), whose sigma is `sigma` (log).
+        agree: (O, S) weights.
+    Returns:
+        centres (O, 3) and their depths (O, S).
     """
     unit = data.ray / np.linalg.norm(data.ray, axis=-1, keepdims=True)
     along = unit[..., :, None] * unit[..., None, :]  # (O, S, 3, 3)
@@ -1539,39 +1632,40 @@ def _refine_start(
     count = np.maximum((agree > 0).sum(1), 1)[:, None]
     for _ in range(2):
         across = agree / (z * START_CENTER * extent) ** 2
-        depth = agree / (prior_depth * sigma) ** 2 / count  # one common error: counts once
+        depth = agree / (prior_depth * sigma) ** 2 / count  # the error is common to all views
         info = across[..., None, None] * (np.eye(3) - along) + depth[..., None, None] * along
         target = (info @ (single - center[:, None])[..., None]).sum(1)[..., 0]  # (O, 3)
         lhs = info.sum(1)
         size = np.trace(lhs, axis1=1, axis2=2) + 1e-300
         step = _solve(lhs / size[:, None, None] + 1e-12 * np.eye(3), target / size[:, None])
-        front = _ray_misfit(data, (center + step)[:, None])[1][:, 0]  # (O, S)
-        okay = _finite(step, 1) & (((front > 0) * agree).sum(1) > 0.5 * agree.sum(1))
-        center = np.where(okay[:, None], center + step, center)
-        z = np.where(okay[:, None], np.maximum(front, 1e-9), z)
+        new_z = _ray_misfit(data, (center + step)[:, None])[1][:, 0]  # (O, S)
+        accepted = _finite(step, 1) & (((new_z > 0) * agree).sum(1) > 0.5 * agree.sum(1))
+        center = np.where(accepted[:, None], center + step, center)
+        z = np.where(accepted[:, None], np.maximum(new_z, 1e-9), z)
     return center, z
 
 
 # ---- fit_objects: starts, inliers, evidence -------------------------------------------------
 
-# Log evidence on the first views; what is farther behind is dropped (of the winners on all views
-# 3 in 1,000 were, measured on simulated boxes)
+# Log evidence on the first views below the best at which a candidate is dropped (measured on
+# simulated boxes: 3 in 1,000 of the winners on all views were lower)
 BEHIND_LOG = 6.0
-CHUNK = 384  # problems solved side by side: they fit the second-level cache of a core
-ROUND_LOG = 0.05  # log, spread of width / depth of yaw-symmetric categories
-SIZE_WALL_LOG = 0.25  # log, least spread that SIZE_WALL counts in: a category may be wrong
-NOISE_PRIOR_DOF = 12.0  # weight, in residuals, of the nominal noise against the residuals seen
-OBJECT_NOISE_DOF = 20.0  # weight of the pooled noise level in one object's own level
+CHUNK = 384  # problems of a batch: they fit the second-level cache of a core
+ROUND_LOG = 0.05  # log, sigma of width / depth of yaw-symmetric categories
+SIZE_WALL_LOG = 0.25  # log, least sigma of which SIZE_WALL is a multiple: a category may be wrong
+NOISE_PRIOR_DOF = 12.0  # residuals, weight of the nominal noise level
+OBJECT_NOISE_DOF = 20.0  # residuals, weight of the pooled noise level in that of one object
 NOISE_RANGE = (0.05, 20.0)  # limits of the noise factor
-VIEW_OUTLIER = 6.0  # mean squared residual of a view (chi2 .9999, 4 dof, is 23.5 / 4)
-EDGE_OUTLIER = 5.0  # sigma, a single edge farther off is dropped (occlusion)
-HIDDEN_CAP = 7.4  # most that a hidden edge costs: -2 log(.2 hidden / 20 sigma / .4)
-OUTLIER_CAP = 12.0  # most that any other edge costs, for .02 wrong
-UPPER, LOWER = 1, 3  # edges of a box
-# Of objects that stand on the floor, the share whose lower part something nearer occludes in all
-# views: that of `HIDDEN` among the votes for the scale
+VIEW_OUTLIER = 6.0  # sigma^2, largest mean square of a view (chi2 .9999, 4 dof, is 23.5 / 4)
+EDGE_OUTLIER = 5.0  # sigma, residual beyond which an edge is an outlier (occlusion)
+# sigma^2, largest costs of an edge: -2 log(p / 20 sigma / .4), p the probability of an outlier
+HIDDEN_CAP = 7.4  # p = .2: an edge that may be occluded
+OUTLIER_CAP = 12.0  # p = .02: any other edge
+# Fraction of the objects on the floor whose lower part is occluded in all views; that of `HIDDEN`
+# among the votes for the scale
 OCCLUDED_BELOW = 0.25
-# (9, 9) information that keeps unobservable rotations finite; .9 rad: a uniform angle in +-90 deg
+# (9, 9) information that keeps unobservable rotations finite: sigma .9 rad, that of a uniform angle
+# within +-90 deg
 ROTATION_CAP: Array = np.diag([0.0] * 6 + [0.9**-2] * 3)
 
 
@@ -1581,19 +1675,19 @@ class _Fit(_Rows):
 
     obj: IntArray  # (B,)
     hyp: IntArray  # (B,) hypothesis of `_Spec`
-    code: IntArray  # (B,) support
+    code: IntArray  # (B,) shape
     axis: IntArray  # (B,) vertical axis
     state: _State
     hessian: Array  # (B, 9, 9) at unit noise
-    good: BoolArray  # (B, V, E) edges in use
+    inlier: BoolArray  # (B, V, E) edges in use
     noise: Array  # (B,) factor on the nominal edge sigma
     evidence: Array  # (B,)
     views: BoolArray  # (B, V) inlier views
-    spread: Array  # (B, 9, 9) second moment of rival solutions
+    spread: Array  # (B, 9, 9) second moment of the other local minima
 
 
 def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Problem:
-    """Gather the fixed terms of fits: hypothesis, support `code`, vertical axis, each (B,)."""
+    """Gather the constant terms of fits of a hypothesis, shape and vertical axis, each (B,)."""
     mean = spec.size_mean[hyp]
     shift = _shape_shift(mean, spec.natural[hyp], code)
     tilt = np.full((len(hyp), 3), 1.0 / spec.tilt_rad**2) * bool(np.any(spec.up))
@@ -1606,7 +1700,8 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
     level = 0.5 * (mean[:, [0, 0, 2]] + mean[:, [1, 1, 2]])
     mean = np.where(round_[:, None], level, mean)
     var = np.maximum(np.einsum("oii->oi", spec.size_cov), SIZE_WALL_LOG**2)
-    var = np.where(spec.kind[:, None] < 0, 3.0 * var, var)[hyp]  # the axes share what is unknown
+    # without a category the axes' errors are common: their mean square counts, not the sum
+    var = np.where(spec.kind[:, None] < 0, 3.0 * var, var)[hyp]
     return _Problem(
         AXIS_GROUPS[code], mean + shift[:, None], info, var, up, tilt,
         np.eye(3)[axis], floor, spec.floor_sigma[hyp] ** -2.0, spec.points[hyp],
@@ -1617,52 +1712,57 @@ def _problems(spec: _Spec, hyp: IntArray, code: IntArray, axis: IntArray) -> _Pr
 def _minimise_all(
     state: _State, edges_of: Callable[[IntArray], _Edges], prob: _Problem, loss: str, steps: int
 ) -> tuple[_State, Array, Array]:
-    """Run `_minimise` in chunks of problems; `edges_of` gathers the edges of some of them."""
+    """Run `_minimise` in chunks of problems; `edges_of` gathers the edges of a chunk."""
     n = len(state.center)
-    out, cost, hessian = state[np.arange(n)], np.zeros(n), np.zeros((n, 9, 9))
-    for part in _chunks(n, CHUNK):
-        done = _minimise(state[part], edges_of(part), prob[part], loss, steps)
-        out.put(part, done[0])
-        cost[part], hessian[part] = done[1], done[2]
-    return out, cost, hessian
+    final = state[np.arange(n)]
+    cost = np.zeros(n)
+    hessian = np.zeros((n, 9, 9))
+    for chunk in _chunks(n, CHUNK):
+        solved = _minimise(state[chunk], edges_of(chunk), prob[chunk], loss, steps)
+        final.put(chunk, solved[0])
+        cost[chunk] = solved[1]
+        hessian[chunk] = solved[2]
+    return final, cost, hessian
 
 
 def _best_starts(few: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
-    """Try all starts on few views; keep the best of each hypothesis and support."""
+    """Try all starts on few views; keep the best of each hypothesis and shape."""
     hyp, code, axis, yaw = _start_table(spec)
-    center, log_half, trusted = _start_points(few[spec.obj], spec)
+    center, log_half, agrees = _start_points(few[spec.obj], spec)
     edges = few.edges[spec.obj]
-    used = edges.used & trusted[..., None]  # (H, S, E)
+    used = edges.used & agrees[..., None]  # (H, S, E)
     edges = replace(edges, used=used, gain=edges.gain * used)
     prob = _problems(spec, hyp, code, axis)
     shift = _shape_shift(log_half[hyp], spec.natural[hyp], code)
     rot = _start_rotations(spec.up)[axis, yaw]
     start = _State(center[hyp], log_half[hyp] + shift[:, None], rot)
     state, cost, hessian = _minimise_all(
-        start, lambda part: edges[hyp[part]], prob, "cauchy", cfg.start_iterations
+        start, lambda chunk: edges[hyp[chunk]], prob, "cauchy", cfg.start_iterations
     )
-    # noise level integrated out (Student t): a poor fit must not buy an absurd size
-    pull, n = _size_prior(state, prob)[0], _count(used[hyp], few, spec.obj[hyp])
+    # noise level integrated out (Student t): an absurd size must not win by a slightly better fit
+    pull = _size_prior(state, prob)[0]
+    n = _count(used[hyp], few, spec.obj[hyp])
     misfit = np.log1p(np.maximum(cost - pull, 0.0) / NOISE_PRIOR_DOF)
     cost = (NOISE_PRIOR_DOF + n) * misfit + pull
-    order = np.lexsort((cost, code, hyp))  # groups of one hypothesis and support, best first
+    order = np.lexsort((cost, code, hyp))  # groups of one hypothesis and shape, best first
     first = _group_starts(hyp[order], code[order])
     best = order[first][np.cumsum(first) - 1]  # (B,) best of its group, in sorted order
     delta = _state_difference(state[order], state[best], code[order])
     rise = cost[order] - cost[best]
-    # Each start's solution counts with its likelihood ratio: modes that the data cannot tell apart
-    # (yaw of a box in few views) widen the covariance by their second moment about the best.
+    # The solution of each start has its likelihood ratio as weight: modes that the data do not
+    # distinguish (yaw of a box in few views) widen the covariance by their second moment.
     weight = np.exp(-0.5 * np.clip(rise, 0.0, 100.0))
-    other = np.where((weight < 1e-3)[:, None], 0.0, delta)
-    moment = weight[:, None, None] * other[:, :, None] * other[:, None]  # (B, 9, 9)
+    delta = np.where((weight < 1e-3)[:, None], 0.0, delta)
+    moment = weight[:, None, None] * delta[:, :, None] * delta[:, None]  # (B, 9, 9)
     total, mass = (np.add.reduceat(x, np.flatnonzero(first)) for x in (moment, weight))
     keep = order[first]
     obj = spec.obj[hyp[keep]]
-    good: BoolArray = used[hyp[keep]]
-    zero, one = np.zeros(len(keep)), np.ones(len(keep))
+    inlier: BoolArray = used[hyp[keep]]
+    noise = np.ones(len(keep))
+    evidence = np.zeros(len(keep))
     return _Fit(
-        obj, hyp[keep], code[keep], axis[keep], state[keep], hessian[keep], good, one, zero,
-        np.asarray(good.any(-1)), total / mass[:, None, None],
+        obj, hyp[keep], code[keep], axis[keep], state[keep], hessian[keep], inlier, noise,
+        evidence, np.asarray(inlier.any(-1)), total / mass[:, None, None],
     )  # fmt: skip
 
 
@@ -1673,122 +1773,122 @@ def _group_starts(*keys: IntArray) -> BoolArray:
     return first
 
 
-def _with_edges(fit: _Fit, data: _Data, part: IntArray) -> _Edges:
-    """Gather edges of some of the problems, outliers switched off and the noise level applied."""
-    good = fit.good[part]
-    edges = data.edges[fit.obj[part]]
-    return replace(edges, gain=edges.gain * good / fit.noise[part, None, None], used=good)
+def _inlier_edges(fit: _Fit, data: _Data, rows: IntArray) -> _Edges:
+    """Gather the inlier edges of problems at their noise level."""
+    inlier = fit.inlier[rows]
+    edges = data.edges[fit.obj[rows]]
+    return replace(edges, gain=edges.gain * inlier / fit.noise[rows, None, None], used=inlier)
 
 
 def _refit(fit: _Fit, data: _Data, spec: _Spec, cfg: FitConfig, loss: str) -> None:
     """Minimise over all views with the fit's inlier edges and noise level, in place."""
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     fit.state, _, fit.hessian = _minimise_all(
-        fit.state, lambda part: _with_edges(fit, data, part), prob, loss, cfg.iterations
+        fit.state, lambda rows: _inlier_edges(fit, data, rows), prob, loss, cfg.iterations
     )
 
 
 def _all_residuals(fit: _Fit, data: _Data) -> Array:
-    """Compute residuals (B, V, E) in nominal sigma of every edge, outlier or not."""
-    out = np.zeros(fit.good.shape)
-    for part in _chunks(len(fit.obj), CHUNK):
-        edges = data.edges[fit.obj[part]]
-        value, _ = _residuals(fit.state[part], edges, AXIS_GROUPS[fit.code[part]], jacobian=False)
-        out[part] = value.reshape(out[part].shape) * np.sqrt(edges.share)
-    return out
+    """Compute residuals (B, V, E) in nominal sigma of all edges, outliers included."""
+    residuals = np.zeros(fit.inlier.shape)
+    for rows in _chunks(len(fit.obj), CHUNK):
+        edges = data.edges[fit.obj[rows]]
+        value, _ = _residuals(fit.state[rows], edges, AXIS_GROUPS[fit.code[rows]], jacobian=False)
+        residuals[rows] = value.reshape(residuals[rows].shape) * np.sqrt(edges.redundancy)
+    return residuals
 
 
 def _free_dof(fit: _Fit, spec: _Spec, data: _Data) -> Array:
-    """Count residuals minus parameters that the data determine (B,): trace of the hat matrix."""
+    """Compute degrees of freedom (B,): residuals minus the trace of the hat matrix."""
     prior_info = np.zeros((len(fit.obj), 9, 9))
     prior_info[:, 3:6, 3:6] = np.linalg.inv(spec.size_cov)[fit.hyp]
     cov = _safe_inverse(fit.hessian)
-    used_up = 9.0 - np.einsum("bij,bji->b", cov, prior_info)
-    used_up -= 2.0 * bool(np.any(spec.up))  # tilt: two angles held by the upright prior
-    return np.asarray(np.maximum(_count(fit.good, data, fit.obj) - np.clip(used_up, 3.0, 9.0), 0.5))
+    trace = 9.0 - np.einsum("bij,bji->b", cov, prior_info)
+    trace -= 2.0 * bool(np.any(spec.up))  # tilt: two angles determined by the upright prior
+    return np.asarray(np.maximum(_count(fit.inlier, data, fit.obj) - np.clip(trace, 3.0, 9.0), 0.5))
 
 
 def _count(used: BoolArray, data: _Data, obj: IntArray) -> Array:
-    """Count the independent residuals (B,) among the edges (B, V, E) in use."""
-    return np.asarray((used / data.edges.share[obj]).sum((1, 2)))
+    """Compute the effective number (B,) of independent residuals of the edges (B, V, E) in use."""
+    return np.asarray((used / data.edges.redundancy[obj]).sum((1, 2)))
 
 
 def _least(values: Array, obj: IntArray) -> Array:
-    """Find the lowest of the values (B,) of all fits to the same object, for each fit."""
+    """Return for each fit the lowest value (B,) of all fits to the same object."""
     best = np.full(int(obj.max()) + 1, np.inf)
     np.minimum.at(best, obj, values)
     return np.asarray(best[obj])
 
 
 def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: bool) -> None:
-    """Estimate the noise factor: pooled over all objects, then each object's own, shrunk.
+    """Estimate the noise factor: pooled over all objects, then per object with shrinkage.
 
-    Inverse-gamma posteriors: the nominal level with NOISE_PRIOR_DOF, the pooled one with
-    OBJECT_NOISE_DOF. Pooled by the median over objects: those that a bad stretch of cameras saw do
-    not judge the rest. Robust: from the median residual instead of the mean square.
+    Inverse-gamma posteriors: prior weights NOISE_PRIOR_DOF of the nominal and OBJECT_NOISE_DOF of
+    the pooled level. The pooled level is the median over the objects, so that objects in a segment
+    of bad poses do not affect the others. Robust: from the median residual, not the mean square.
     """
-    n = np.maximum(_count(fit.good, data, fit.obj), 1.0)
+    n = np.maximum(_count(fit.inlier, data, fit.obj), 1.0)
     dof = _free_dof(fit, spec, data)
     if robust:
-        size = np.where(fit.good, np.abs(value), np.nan).reshape(len(n), -1)
-        size[~fit.good.any((1, 2))] = 0.0
-        square = (np.nanmedian(size, 1) / 0.6745) ** 2 * n
+        size = np.where(fit.inlier, np.abs(value), np.nan).reshape(len(n), -1)
+        size[~fit.inlier.any((1, 2))] = 0.0
+        square = (np.nanmedian(size, 1) / 0.6745) ** 2 * n  # .6745: median of |N(0, 1)|
     else:
         capped = np.minimum(value**2, (HUBER * fit.noise[:, None, None]) ** 2)
-        square = (capped * fit.good / data.edges.share[fit.obj]).sum((1, 2))
+        square = (capped * fit.inlier / data.edges.redundancy[fit.obj]).sum((1, 2))
     level = square / dof
-    mine = level <= _least(level, fit.obj)  # of the supports tried, the one that fits
-    level /= (1.0 - 2.0 / (9.0 * dof)) ** 3  # the median of chi2 / dof: Wilson and Hilferty 1931
-    middle = _weighted_median(level[mine], np.minimum(dof[mine], OBJECT_NOISE_DOF))
-    total = dof[mine].sum()
-    pooled = (NOISE_PRIOR_DOF + middle * total) / (NOISE_PRIOR_DOF + total)
-    own = (OBJECT_NOISE_DOF * pooled + square) / (OBJECT_NOISE_DOF + dof)
-    fit.noise = np.clip(np.sqrt(own), *NOISE_RANGE)
+    best = level <= _least(level, fit.obj)  # the hypothesis and shape of each object that fits best
+    level /= (1.0 - 2.0 / (9.0 * dof)) ** 3  # median of chi2 / dof: Wilson and Hilferty 1931
+    median = _weighted_median(level[best], np.minimum(dof[best], OBJECT_NOISE_DOF))
+    total = dof[best].sum()
+    pooled = (NOISE_PRIOR_DOF + median * total) / (NOISE_PRIOR_DOF + total)
+    variance = (OBJECT_NOISE_DOF * pooled + square) / (OBJECT_NOISE_DOF + dof)
+    fit.noise = np.clip(np.sqrt(variance), *NOISE_RANGE)
 
 
 def _weighted_median(values: Array, weight: Array) -> float:
-    """Find the value (N,) below which half of the weight lies."""
+    """Compute the weighted median of values (N,)."""
     order = np.argsort(values)
-    share = np.cumsum(weight[order])
-    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
+    total = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def _inlier_views(standard: Array, used: BoolArray) -> BoolArray:
-    """Tell the views (...) that the solid explains from their residuals (..., E) in sigma.
+    """Classify views (...) as inliers of the solid by their residuals (..., E) in sigma.
 
-    A view agrees when its mean square is small, when three quarters of its edges are close, or when
-    half are close and the others only say that part of the object is hidden.
+    An inlier has a small mean square; or inliers among three quarters of its edges; or among half
+    of them where all other residuals are positive, as of a partly occluded object.
     """
     count = np.maximum((used & (standard != 0.0)).sum(-1), 1)
     mean = (np.minimum(standard**2, 1e6) * used).sum(-1) / count
     close = used & (np.abs(standard) <= EDGE_OUTLIER)
-    share = close.sum(-1) / np.maximum(used.sum(-1), 1)
-    hidden_only = ~(used & (standard < -EDGE_OUTLIER)).any(-1)
-    agrees = (mean <= VIEW_OUTLIER) | (share >= 0.75) | ((share >= 0.5) & hidden_only)
-    return np.asarray(used.any(-1) & agrees)
+    fraction = close.sum(-1) / np.maximum(used.sum(-1), 1)
+    occluded = ~(used & (standard < -EDGE_OUTLIER)).any(-1)
+    inlier = (mean <= VIEW_OUTLIER) | (fraction >= 0.75) | ((fraction >= 0.5) & occluded)
+    return np.asarray(used.any(-1) & inlier)
 
 
 def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data) -> Array:
-    """Compute the Laplace evidence (B,) of each support, noise integrated out (Student t).
+    """Compute the Laplace evidence (B,) of each fit, noise integrated out (Student t).
 
     -2 log p = (v + n) log(1 + S / v) + priors of size, tilt, floor + log det(H)
     - log det(information of the size prior) - 2 log_odds, S the truncated squares.
-    What stands on a known floor may be occluded in its lower part in all views at once: with
-    probability OCCLUDED_BELOW edges that end inside it in views that end above the floor are free.
+    The lower part of an object on a known floor may be occluded in all views: with probability
+    OCCLUDED_BELOW, positive residuals in views whose lower edge is above the floor are free.
     """
     used = data.edges.used[fit.obj]
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     pull = _prior_terms(fit.state, prob).cost
-    noise = _least(fit.noise, fit.obj)  # the level that the best support reaches
+    noise = _least(fit.noise, fit.obj)
     standard = value / noise[:, None, None]  # (B, V, E)
     cap = np.where(value > 0, HIDDEN_CAP, OUTLIER_CAP)
-    cost = np.minimum(standard**2, cap) * used / data.edges.share[fit.obj]
+    cost = np.minimum(standard**2, cap) * used / data.edges.redundancy[fit.obj]
     dof = NOISE_PRIOR_DOF + _count(used, data, fit.obj)
     misfit = dof * np.log1p(cost.sum((1, 2)) / NOISE_PRIOR_DOF)
     stands = np.isfinite(spec.floor_sigma[fit.hyp])
-    above = stands[:, None] & (standard[..., LOWER] > EDGE_OUTLIER)  # (B, V)
+    above = stands[:, None] & (standard[..., 3] > EDGE_OUTLIER)  # (B, V), lower edge
     free = above[..., None] & (value > 0)
-    free[..., UPPER] = False
+    free[..., 1] = False  # upper edge
     occluded = dof * np.log1p(np.where(free, 0.0, cost).sum((1, 2)) / NOISE_PRIOR_DOF)
     either = np.logaddexp(
         np.log1p(-OCCLUDED_BELOW) - 0.5 * misfit, np.log(OCCLUDED_BELOW) - 0.5 * occluded
@@ -1800,18 +1900,20 @@ def _log_evidence(fit: _Fit, value: Array, spec: _Spec, data: _Data) -> Array:
 
 
 def _safe_inverse(hessian: Array) -> Array:
-    """Invert information matrices (B, 9, 9) by scaled eigenvalues; tiny ones are floored."""
+    """Invert information matrices (B, 9, 9) by scaled eigenvalues, at least 1e-10."""
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", hessian), 1e-30))  # (B, 9)
     value, vector = _eigh(hessian * scale[:, :, None] * scale[:, None, :])
     inverse = (vector / np.maximum(value, 1e-10)[:, None]) @ vector.transpose(0, 2, 1)
     return np.asarray(inverse * scale[:, :, None] * scale[:, None, :])
 
 
-PROBE = 1.5  # sigma, where the cost is probed
-BEND_WEIGHT = 4.0  # of q q'; its second moment is .75, the 95 % tail of nine needs more
+PROBE = 1.5  # sigma, displacement at which the cost is evaluated
+BEND_WEIGHT = (
+    4.0  # of q q'; its second moment is .75, the 95 % region of nine parameters needs more
+)
 MAX_BEND = 30.0  # sigma, limit of the bend of a principal axis
 MAX_WIDENING = 4.0  # limit of the stretching, as a factor on sigma
-SMOOTH_COV = 0.05  # rounds the kink of |m| as SMOOTH does, by as much as m varies near a kink
+SMOOTH_COV = 0.05  # as SMOOTH, about the variation of m near a kink
 
 
 def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
@@ -1820,52 +1922,56 @@ def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
     Along each principal axis v of the Laplace covariance the mode is displaced by +-k sigma and the
     other eight directions are re-minimised (one Gauss-Newton step): the path s v + s^2 q / 2. With
     s ~ N(0, 1) its second moment is v v' + 3/4 q q' (BEND_WEIGHT is more, for the tail); where
-    the cost along the path grows slower than s^2 (kinks of box and cylinder; points that pull
-    another way than the boxes), v is stretched. Points take no other part: they bound one side.
+    the cost along the path grows slower than s^2 (kinks of box and cylinder; points that disagree
+    with the boxes), v is stretched. Points have no other effect: they are one-sided bounds.
     Ref: second-order delta method.
     """
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     prob = replace(prob, points=prob.points[:, :0])
-    out = np.empty_like(fit.hessian)
-    for part in _chunks(len(out), CHUNK // 36):  # each is displaced in 18 ways (measured)
-        own = (fit.state[part], _with_edges(fit, data, part), prob[part])
-        info = _normal_equations(*own, "huber", SMOOTH_COV).hessian + ROTATION_CAP
+    cov = np.empty_like(fit.hessian)
+    for rows in _chunks(len(cov), CHUNK // 36):  # 18 displacements of each (size measured)
+        batch = (fit.state[rows], _inlier_edges(fit, data, rows), prob[rows])
+        info = _normal_equations(*batch, "huber", SMOOTH_COV).hessian + ROTATION_CAP
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", info), 1e-30))  # (B, 9)
         value, vector = _eigh(info * scale[:, :, None] * scale[:, None, :])
         axes = scale[:, :, None] * vector / np.sqrt(np.maximum(value, 1e-10))[:, None]  # (B, 9, 9)
-        out[part] = _second_moment(*own, axes)
-    return out
+        cov[rows] = _second_moment(*batch, axes)
+    return cov
 
 
 def _second_moment(state: _State, edges: _Edges, prob: _Problem, axes: Array) -> Array:
-    """Sum up stretched v v' + BEND_WEIGHT q q' over the principal axes v (B, 9, 9 as columns)."""
-    base, row = _normal_equations(state, edges, prob, "huber").cost, np.arange(18 * len(axes))
+    """Sum stretched v v' + BEND_WEIGHT q q' over the principal axes v (B, 9, 9 as columns)."""
+    base = _normal_equations(state, edges, prob, "huber").cost
+    row = np.arange(18 * len(axes))
     side, i, b = np.unravel_index(row, (2, 9, len(axes)))  # of R = 18 B displaced solids
-    own = axes[b]  # (R, 9, 9)
-    moved = state[b].moved(np.array([-PROBE, PROBE])[side, None] * own[row, :, i])
+    basis = axes[b]  # (R, 9, 9)
+    moved = state[b].moved(np.array([-PROBE, PROBE])[side, None] * basis[row, :, i])
     normal = _normal_equations(moved, edges[b], prob[b], "huber")
-    hess = own.transpose(0, 2, 1) @ normal.hessian @ own + 1e-3 * np.eye(9)  # whitened
-    grad = (own.transpose(0, 2, 1) @ normal.gradient[..., None])[..., 0]
-    hess[row, i], hess[row, :, i], hess[row, i, i], grad[row, i] = 0.0, 0.0, 1.0, 0.0
+    hess = basis.transpose(0, 2, 1) @ normal.hessian @ basis + 1e-3 * np.eye(9)  # whitened
+    grad = (basis.transpose(0, 2, 1) @ normal.gradient[..., None])[..., 0]
+    hess[row, i] = 0.0
+    hess[row, :, i] = 0.0
+    hess[row, i, i] = 1.0
+    grad[row, i] = 0.0
     step = np.clip(-_solve(hess, grad), -MAX_BEND, MAX_BEND)  # (R, 9) whitened
     rise = normal.cost + 2.0 * (grad * step).sum(1)
     rise = rise + np.einsum("bi,bij,bj->b", step, hess, step) - base[b]
     widen = PROBE**2 / np.maximum(rise, PROBE**2 / MAX_WIDENING**2)
     widen = widen.reshape(2, 9, -1, 1).max(0, initial=1.0)  # (9, B, 1)
-    bend = ((own @ step[..., None]) / PROBE**2).reshape(2, 9, -1, 9).sum(0)  # (9, B, 9)
+    bend = ((basis @ step[..., None]) / PROBE**2).reshape(2, 9, -1, 9).sum(0)  # (9, B, 9)
     v = axes.transpose(2, 0, 1) * np.sqrt(widen)  # (9, B, 9)
     moments = v[..., None] * v[..., None, :] + BEND_WEIGHT * bend[..., None] * bend[..., None, :]
     return np.asarray(moments.sum(0))
 
 
 def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
-    """Fit every object: starts, robust fit, noise, inliers, final fit, support."""
+    """Fit every object: starts, robust fit, noise level, inliers, final fit, model selection."""
     few = data.take_views(cfg.start_views)
     fit = _best_starts(few, spec, cfg)
     _refit(fit, few, spec, cfg, "cauchy")
     fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few)
     fit = fit[fit.evidence >= -BEHIND_LOG - _least(-fit.evidence, fit.obj)]
-    fit.good = data.edges.used[fit.obj]
+    fit.inlier = data.edges.used[fit.obj]
     _refit(fit, data, spec, cfg, "cauchy")
     for robust in (True, False):
         value = _all_residuals(fit, data)
@@ -1873,11 +1979,11 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
         used = data.edges.used[fit.obj]
         standard = value / fit.noise[:, None, None]  # (B, V, E)
         fit.views = _inlier_views(standard, used)
-        fit.good = used & (np.abs(standard) <= EDGE_OUTLIER) & fit.views[..., None]
+        fit.inlier = used & (np.abs(standard) <= EDGE_OUTLIER) & fit.views[..., None]
         _refit(fit, data, spec, cfg, "huber")
     fit.evidence = _log_evidence(fit, _all_residuals(fit, data), spec, data)
     sigma = np.sqrt(_safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]])  # (B, 3)
-    # only a size that the boxes tell overrules a category
+    # a category is overruled only by a size that the boxes determine
     fit.evidence[(fit.hyp != fit.obj) & (sigma > LOOSE_LOG).any(1)] = -np.inf
     order = np.lexsort((-fit.evidence, fit.obj))
     return fit[order[_group_starts(fit.obj[order])]]
@@ -1885,21 +1991,23 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
 
 # ---- fit_objects: scale, gravity, report ----------------------------------------------------
 
-CAMERA_ROLL_DEG = 6.0  # deg, spread of a hand-held camera's roll
+CAMERA_ROLL_DEG = 6.0  # deg, sigma of a hand-held camera's roll
 CAMERA_PITCH_DEG = 35.0  # deg, same of its pitch
-CAMERA_UP_VIEWS = 4.0  # views of independent roll that a video is worth
-UPRIGHT_TILT_DEG = 1.5  # deg, how upright an object stands when gravity is known
-SCALE_MIN_PARALLAX_DEG = 3.0  # deg, objects seen from narrower angles give no scale
-UNKNOWN_SCALE_LOG = 3.0  # log, prior spread of the global scale when the poses have none
-SCENE_LOG = 0.5  # log, scale of what priors leave out; twice the median spread of their axes
-# Share of votes, log by which they are too high, log sigma. Wrong class: lists of objects from
-# detectors had 10 to 38 % in two rooms. Hidden in part: at least half of the size is seen.
+CAMERA_UP_VIEWS = 4.0  # most views of a video whose roll is independent
+UPRIGHT_TILT_DEG = 1.5  # deg, sigma of an object's vertical axis where gravity is given
+SCALE_MIN_PARALLAX_DEG = 3.0  # deg, least parallax of an object that votes for the scale
+UNKNOWN_SCALE_LOG = 3.0  # log, prior sigma of the global scale where the poses have none
+# log, sigma of a scene's sizes about the priors; twice the median sigma of their axes
+SCENE_LOG = 0.5
+# Mixture of votes for the scale: weight, bias (log), sigma (log). The terms are right votes, wrong
+# classes (10 to 38 % of the listed objects in two recordings) and partly occluded objects, of
+# whose size at least half is visible.
 HIDDEN = [(0.25 / 3.0, float(-np.log(seen)), 0.0) for seen in (0.58, 0.75, 0.92)]
 VOTES = ((0.5, 0.0, 0.0), (0.25, 0.0, UNKNOWN_SIZE_LOG), *HIDDEN)
 
 
 class Scale(NamedTuple):
-    """Metres per world unit, its relative standard deviation and where it comes from."""
+    """Metres per world unit, its relative standard deviation and its source."""
 
     value: float
     rel_sigma: float
@@ -1908,19 +2016,18 @@ class Scale(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ObjectFits:
-    """Result of `fit_objects` for O objects, in the world units of the poses given."""
+    """Result of `fit_objects` for O objects, in world units."""
 
     ellipsoids: Ellipsoids  # inscribed in the solid for box and cylinder
     size: Array  # (O, 3) full extents of the solid along the object's axes
     cov: Array  # (O, 9, 9) center, log half axes, rotation vector in the object frame
-    support: npt.NDArray[np.str_]  # (O,)
+    support: npt.NDArray[np.str_]  # (O,) shape, one of SUPPORTS
     inlier: BoolArray  # (F, O)
     rms_px: Array  # (O,) of the inlier edges
     status: npt.NDArray[np.str_]  # (O,) "ok" | "prior_dominated" | "rejected"
     reason: list[str]  # (O,)
     parallax_deg: Array  # (O,) widest angle between inlier viewing rays
-    # (O, 3) of each log axis: sigma by boxes, points and prior / the prior's; 1: cov tells no more
-    prior_share: Array
+    prior_share: Array  # (O, 3) posterior / prior sigma of each log axis; 1: the data add nothing
     scale: Scale
     up: Array  # (3,) unit, or zeros when unknown
     up_source: str  # "given" | "cameras" | "none"
@@ -1933,13 +2040,14 @@ class ObjectFits:
 def camera_up(img_from_world: Array) -> tuple[Array, float]:
     """Estimate "up" roughly from the cameras of a hand-held video.
 
-    Level cameras: up is perpendicular to every camera's x axis (roll small) and near the mean
-    upward image direction (pitch free). Minimises mean((x.u)^2) / roll^2 + |u - m|^2 / pitch^2.
+    Assumes level cameras: up is perpendicular to every camera's x axis (small roll) and near the
+    mean upward image direction m (free pitch). Minimises
+    mean((x.u)^2) / roll^2 + |u - m|^2 / pitch^2.
 
     Args:
         img_from_world: (F, 3, 4), NaN where unknown.
     Returns:
-        up (3,), a unit vector or zeros when the views are mixed, and its sigma in rad.
+        up (3,), a unit vector, or zeros where the cameras' orientations disagree; its sigma, rad.
     """
     ray = _cameras(img_from_world).ray
     ray = ray[_finite(ray, 1, 2)]  # (F, 3, 3)
@@ -1949,7 +2057,8 @@ def camera_up(img_from_world: Array) -> tuple[Array, float]:
     mean = up.mean(0)
     if np.linalg.norm(mean) < 0.3:
         return np.zeros(3), np.inf
-    roll, pitch = np.deg2rad(CAMERA_ROLL_DEG), np.deg2rad(CAMERA_PITCH_DEG)
+    roll = np.deg2rad(CAMERA_ROLL_DEG)
+    pitch = np.deg2rad(CAMERA_PITCH_DEG)
     info = min(len(x), CAMERA_UP_VIEWS) * x.T @ x / len(x) / roll**2 + np.eye(3) / pitch**2
     best = np.linalg.solve(info, mean / pitch**2)
     best /= np.linalg.norm(best)
@@ -1959,47 +2068,49 @@ def camera_up(img_from_world: Array) -> tuple[Array, float]:
 
 
 def _scale_from_priors(fit: _Fit, data: _Data, spec: _Spec) -> tuple[float, float] | None:
-    """Estimate log metres per unit and its sigma from the sizes of well-seen known objects.
+    """Estimate log metres per unit and its sigma from the sizes of objects of known categories.
 
-    One vote an object: generalised least squares of log(prior) - log(fitted) over its axes, `spec`
-    holding the priors in metres; then one a category: the weighted median, which some objects that
-    are hidden in part (they look small and vote too high) cannot move far.
+    One vote an object: generalised least squares of log(prior) - log(fitted) over its axes, with
+    the priors of `spec` in metres. Then one vote a category: the weighted median, which is robust
+    to partly occluded objects (they look small and vote too high).
     """
-    prior, kind = _problems(spec, fit.hyp, fit.code, fit.axis), spec.kind[fit.hyp]
-    known = np.linalg.inv(prior.size_info)  # (B, 3, 3)
-    inverse = np.linalg.inv(known + _safe_inverse(fit.hessian + ROTATION_CAP)[:, 3:6, 3:6])
+    prior = _problems(spec, fit.hyp, fit.code, fit.axis)
+    kind = spec.kind[fit.hyp]
+    prior_cov = np.linalg.inv(prior.size_info)  # (B, 3, 3)
+    inverse = np.linalg.inv(prior_cov + _safe_inverse(fit.hessian + ROTATION_CAP)[:, 3:6, 3:6])
     info = inverse.sum((1, 2))
     weight = inverse.sum(2) / info[:, None]  # (B, 3) of the axes
     vote = (weight * (prior.size_mean - fit.state.log_half)).sum(1)
-    shared = np.einsum("bi,bij,bj->b", weight, known, weight)  # (B,) variance in the category
+    kind_var = np.einsum("bi,bij,bj->b", weight, prior_cov, weight)  # (B,) variance in the category
     use = (kind >= 0) & np.isfinite(vote) & (fit.views.sum(1) >= 2)
     use &= _parallax(fit, data) >= SCALE_MIN_PARALLAX_DEG
-    middle, variance = [], []
-    for one in np.unique(kind[use]):
-        own = use & (kind == one)
-        middle.append(_weighted_median(vote[own], info[own]))
-        spread = np.median((vote[own] - middle[-1]) ** 2 * info[own]) / 0.6745**2
-        # look-alikes: the objects of a category are one draw of its size, however many they are
-        alike = shared[own].mean() * (1.0 - 1.0 / own.sum())
-        variance.append(max(spread, 1.0) / info[own].sum() + alike)
-    return _pool_categories(np.array(middle), np.array(variance)) if middle else None
+    median = []
+    variance = []
+    for category in np.unique(kind[use]):
+        member = use & (kind == category)
+        median.append(_weighted_median(vote[member], info[member]))
+        spread = np.median((vote[member] - median[-1]) ** 2 * info[member]) / 0.6745**2
+        # look-alikes: all objects of a category count as one draw of its size
+        common = kind_var[member].mean() * (1.0 - 1.0 / member.sum())
+        variance.append(max(spread, 1.0) / info[member].sum() + common)
+    return _pool_categories(np.array(median), np.array(variance)) if median else None
 
 
-def _pool_categories(middle: Array, variance: Array) -> tuple[float, float]:
+def _pool_categories(vote: Array, variance: Array) -> tuple[float, float]:
     """Pool the votes (C,) of categories: mean and standard deviation of the posterior, on a grid.
 
-    A vote has its own variance (C,) and one of the scene, alike for all categories and integrated
-    out (kinds unknown to the priors); VOTES says what else can be wrong with it.
+    The variance of a vote is the sum of `variance` (C,) and of one of the scene (its objects differ
+    from those of the priors), common to all categories and integrated out. VOTES models outliers.
     Ref: random effects, DerSimonian and Laird 1986; contaminated normal, Tukey 1960.
     """
-    grid = np.linspace(middle.min() - 2.0, middle.max() + 2.0, 501)  # (G,)
+    grid = np.linspace(vote.min() - 2.0, vote.max() + 2.0, 501)  # (G,)
     extra = np.linspace(0.0, 3.0, 7)  # (T,) sigma of the half-normal
-    own = variance + (SCENE_LOG * extra[:, None]) ** 2  # (T, C)
-    likely = np.zeros((len(grid), *own.shape))  # (G, T, C)
-    for share, shift, sigma in VOTES:
-        square = (middle - shift - grid[:, None, None]) ** 2 / (own + sigma**2)
-        likely += share * np.exp(-0.5 * square) / np.sqrt(own + sigma**2)
-    log_post = np.log(likely + 1e-300).sum(2) - 0.5 * extra**2  # (G, T)
+    total = variance + (SCENE_LOG * extra[:, None]) ** 2  # (T, C)
+    likelihood = np.zeros((len(grid), *total.shape))  # (G, T, C)
+    for mass, bias, sigma in VOTES:
+        square = (vote - bias - grid[:, None, None]) ** 2 / (total + sigma**2)
+        likelihood += mass * np.exp(-0.5 * square) / np.sqrt(total + sigma**2)
+    log_post = np.log(likelihood + 1e-300).sum(2) - 0.5 * extra**2  # (G, T)
     post = np.exp(log_post - log_post.max()).sum(1)
     mean = np.average(grid, weights=post)
     return float(mean), float(np.sqrt(np.average((grid - mean) ** 2, weights=post)))
@@ -2009,31 +2120,31 @@ def _known_sizes(
     known_size: Mapping[str | int, tuple[str | int, float]] | None,
     categories: Sequence[str | None] | None, live: IntArray, priors: Priors | None,
 ) -> list[tuple[int, int, float]]:  # fmt: skip
-    """Match the sizes that the user knows to live objects: (row, axis, metres) each."""
+    """Assign the sizes that the user measured to live objects: (row, axis, metres) each."""
 
     def same(a: str, b: str) -> bool:
-        one, other = [_plain(a), _plain(b)] if priors is None else priors.canonical([a, b])
-        return one == other
+        names = [_normalised(a), _normalised(b)] if priors is None else priors.canonical([a, b])
+        return names[0] == names[1]
 
-    out = []
+    sizes = []
     for key, (name, metres) in (known_size or {}).items():
         axis = name if isinstance(name, int) else "wdh".find(name[:1].lower())
         if axis not in (0, 1, 2) or not metres > 0:
             raise QuadricsError(f"known_size[{key!r}] = {name, metres}: give (w|d|h, metres > 0)")
         for row, number in enumerate(live.tolist()):
-            own = None if categories is None else categories[number]
-            if key == number or (isinstance(key, str) and same(key, own or "")):
-                out.append((row, axis, metres))
-    return out
+            category = None if categories is None else categories[number]
+            if key == number or (isinstance(key, str) and same(key, category or "")):
+                sizes.append((row, axis, metres))
+    return sizes
 
 
 def _scale_from_known(
     fit: _Fit, sizes: list[tuple[int, int, float]], cfg: FitConfig
 ) -> tuple[float, float] | None:
-    """Estimate log metres per unit and its sigma from sizes that the user knows.
+    """Estimate log metres per unit and its sigma from sizes that the user measured.
 
-    The boxes of all objects have an error in common, as in `_report`: a detector that draws them
-    tight does so for every object.
+    The sigma includes the error that the boxes of all objects have in common (`_posterior`): a
+    detector whose boxes are too tight draws all of them too tight.
     """
     if not sizes:
         return None
@@ -2047,12 +2158,12 @@ def _scale_from_known(
     return _weighted_median(vote, info), float(np.sqrt(1.0 / info.sum() + common))
 
 
-# Axes of a solid by its vertical one, which comes last
+# Row k: cyclic order of the axes that puts the vertical axis k last
 UPRIGHT_ORDERS: IntArray = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 
 
 def _parallax(fit: _Fit, data: _Data) -> Array:
-    """Measure the widest angle (B,) in degrees between rays from inlier cameras to the centre."""
+    """Compute the widest angle (B,), deg, between rays from inlier cameras to the centre."""
     cos = _cosines(data.cam_center[fit.obj], fit.state.center)  # (B, V, V)
     pair = fit.views[:, :, None] & fit.views[:, None]
     lowest = np.where(pair, cos, 1.0).min((1, 2))
@@ -2060,12 +2171,12 @@ def _parallax(fit: _Fit, data: _Data) -> Array:
 
 
 def _vertical_axis_last(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntArray]:
-    """Relabel axes so that the vertical one comes third (not for lying cylinders).
+    """Permute axes so that the vertical one is the third (not for lying cylinders).
 
-    Every start has its vertical axis pointing up, so the third axis does too.
+    The vertical axis of every start points up, so the third axis does too.
 
     Returns:
-        solids, their covariance (B, 9, 9), and order (B, 3): the prior's axis behind each new one.
+        solids, their covariance (B, 9, 9), and order (B, 3): the prior's axis of each new one.
     """
     order = UPRIGHT_ORDERS[np.where(fit.code == CYLINDER, 2, fit.axis)]
     row = np.arange(len(fit.obj))[:, None]
@@ -2077,106 +2188,110 @@ def _vertical_axis_last(fit: _Fit, cov: Array) -> tuple[Ellipsoids, Array, IntAr
 
 
 def _inlier_table(
-    solids: Ellipsoids, codes: IntArray, noise: Array, boxes: Array, one_sided: BoolArray,
-    usable: BoolArray, cams: _Cameras, cfg: FitConfig,
-) -> BoolArray:  # fmt: skip
-    """Apply the inlier test (F, O) to every usable box, also to those that the fit did not use."""
-    inlier = np.zeros(usable.shape, bool)
-    frame, obj = np.nonzero(usable)
-    for part in _chunks(len(frame), 60000):  # boxes, to bound the memory
-        f, o = frame[part], obj[part]
-        seen, cam, cut = boxes[f, o][:, None], cams.matrix[f][:, None], one_sided[f, o][:, None]
-        edges = _tangent_planes(seen, cam, cut, cfg)
-        own = solids[o]
-        state = _State(own.center_in_world, np.log(own.half_axes), own.world_from_obj)
+    solids: Ellipsoids, codes: IntArray, noise: Array, measured: _Measured, cfg: FitConfig
+) -> BoolArray:
+    """Apply the inlier test (F, O) to all usable boxes, including those that were not fitted."""
+    inlier = np.zeros(measured.usable.shape, bool)
+    frame, obj = np.nonzero(measured.usable)
+    for chunk in _chunks(len(frame), 60000):  # bounds the memory
+        f = frame[chunk]
+        o = obj[chunk]
+        boxes = measured.boxes[f, o][:, None]
+        cams = measured.cams.matrix[f][:, None]
+        edges = _tangent_planes(boxes, cams, measured.one_sided[f, o][:, None], cfg)
+        solid = solids[o]
+        state = _State(solid.center_in_world, np.log(solid.half_axes), solid.world_from_obj)
         value = _residuals(state, edges, AXIS_GROUPS[codes[o]], jacobian=False)[0]
         inlier[f, o] = _inlier_views(value / noise[o, None], edges.used[:, 0])
     return inlier
 
 
-MAX_NOISE = 18.0  # noise factor: a third of the size; boxes that err more are not of one thing
-# Of the cut edges of real detectors a third end over 3 px inside, a tenth over this
+MAX_NOISE = 18.0  # noise factor, about a third of the size: larger errors are not of one object
+# sigma of an edge, margin of the image border: of the edges that the border cuts a third lie more
+# than 3 px inside it, a tenth more than this (two recordings, two detectors: docs/quadrics.md)
 BORDER_SIGMAS = 2.0
-MIN_INLIER_SHARE = 0.4  # of the views; below it the object is rejected
-ABSURD_SIZE = 6.0  # sigma of growth above the prior: rejected
-ODD_SIZE = 3.5  # sigma from the prior: said in the reason
-ODD_FACTOR = 1.25  # of the usual size, geometric mean of the axes: said of an overruled category
-PRIOR_DOMINATED = 0.7071  # prior_share above which the prior brought more than boxes and points
-LOOSE_LOG = 0.35  # log, an axis less certain than this is not called measured
-MIN_PARALLAX_DEG = 1.0  # deg, below it depth is the prior's
+MIN_INLIER_SHARE = 0.4  # fraction of inlier views below which the object is rejected
+ABSURD_SIZE = 6.0  # sigma of growth over the prior above which the object is rejected
+ODD_SIZE = 3.5  # sigma from the prior above which `reason` reports the size
+ODD_FACTOR = 1.25  # of the usual size (geometric mean of the axes): not a reason to overrule below
+PRIOR_DOMINATED = 0.7071  # prior_share of equal information of prior and data: 1 / sqrt(2)
+LOOSE_LOG = 0.35  # log, sigma above which the size of an axis counts as not measured
+MIN_PARALLAX_DEG = 1.0  # deg, parallax below which the depth rests on the size prior
 
 
-def _rejection_reasons(fit: _Fit, post: Array, seen: IntArray, grown: Array) -> list[str]:
-    """Say why each of B fits must be rejected; empty where nothing is wrong."""
-    finite = _finite(fit.state.center, 1) & _finite(post, 1)
-    out = []
+def _rejection_reasons(fit: _Fit, size_sigma: Array, seen: IntArray, growth: Array) -> list[str]:
+    """Give the reason to reject each of B fits; empty where it is accepted."""
+    finite = _finite(fit.state.center, 1) & _finite(size_sigma, 1)
+    reasons = []
     for b, (noise, inside) in enumerate(zip(fit.noise, fit.views.sum(1), strict=True)):
         why = ""
         if not finite[b]:
             why = "no finite solution"
         elif noise > MAX_NOISE:
             why = f"the boxes fit no solid: errors {noise:.1f} times the usual"
-        elif grown[b] > ABSURD_SIZE:
-            why = f"size is {grown[b]:.1f} sigma above its category's"
+        elif growth[b] > ABSURD_SIZE:
+            why = f"size is {growth[b]:.1f} sigma above its category's"
         elif inside < max(1.0, MIN_INLIER_SHARE * seen[b]):
             why = f"only {inside} of {seen[b]} boxes agree on one solid"
-        out.append(why)
-    return out
+        reasons.append(why)
+    return reasons
 
 
 def _overruled(fit: _Fit, spec: _Spec) -> list[str]:
-    """Say why the boxes overrule the category of each of B fits; empty where they do not."""
+    """Give the reason to overrule the category of each of B fits; empty where it holds."""
     usual = _problems(spec, fit.obj, fit.code, fit.axis).size_mean  # of the category
     error = fit.state.log_half - usual
     size = np.exp(error.mean(1))  # (B,)
-    # axis 2 of `usual` is its height: on its side another one of the solid's is as long
+    # axis 2 of `usual` is the height: of an object on its side another axis has that length
     turned = np.abs(fit.state.log_half[:, AXIS_ORDERS] - usual[:, None]).sum(2).argmin(1)
-    out = []
+    reasons = []
     for b in range(len(size)):
         why = f"size is {size[b]:.2g} times the usual"
         if max(size[b], 1.0 / size[b]) < ODD_FACTOR:
             on_side = AXIS_ORDERS[turned[b], 2] != 2
             why = "it lies on its side" if on_side else "its proportions are not the usual ones"
-        out.append(why if fit.hyp[b] != fit.obj[b] else "")
-    return out
+        reasons.append(why if fit.hyp[b] != fit.obj[b] else "")
+    return reasons
 
 
 def _status(
-    fit: _Fit, spec: _Spec, share: Array, post: Array, parallax: Array, seen: IntArray
+    fit: _Fit, spec: _Spec, posterior: _Posterior, parallax: Array, seen: IntArray
 ) -> tuple[list[str], list[str]]:
-    """Decide the status of each of B fits and give its reason.
+    """Classify each of B fits and give the reason.
 
     Args:
-        share, post: (B, 3) `prior_share` and posterior sigma of the log axes.
-        parallax: (B,) deg; seen: (B,) views given.
+        parallax: (B,) deg; seen: (B,) number of views.
     Returns:
         "ok", "prior_dominated" or "rejected", and the reason (empty: none), B each.
     """
-    weak = (share > PRIOR_DOMINATED) | (post > LOOSE_LOG)
+    weak = (posterior.prior_share > PRIOR_DOMINATED) | (posterior.size_sigma > LOOSE_LOG)
     prob = _problems(spec, fit.hyp, fit.code, fit.axis)
     error = fit.state.log_half - prob.size_mean
-    far = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))  # (B,) sigma
-    grown = np.sqrt(((error > 0) / prob.size_var * error**2).sum(1))  # (B,) same, growth alone
+    deviation = np.sqrt(np.einsum("bi,bij,bj->b", error, prob.size_info, error))  # (B,) sigma
+    growth = np.sqrt(((error > 0) / prob.size_var * error**2).sum(1))  # (B,) same, growth alone
     overruled = _overruled(fit, spec)
-    status, reason = [], []
-    for b, wrong in enumerate(_rejection_reasons(fit, post, seen, grown)):
+    status = []
+    reason = []
+    rejections = _rejection_reasons(fit, posterior.size_sigma, seen, growth)
+    for b, rejection in enumerate(rejections):
         doubt = []
         if weak[b].any():
             axes = ", ".join("xyz"[k] for k in np.flatnonzero(weak[b]))
             doubt.append(f"size along {axes} rests on the prior")
         if parallax[b] < MIN_PARALLAX_DEG:
             doubt.append(f"parallax {parallax[b]:.1f} deg: depth rests on the prior")
-        status.append("rejected" if wrong else "prior_dominated" if doubt else "ok")
-        if far[b] > ODD_SIZE:
-            why = "another thing?" if grown[b] > 0.7 * far[b] else "hidden in part?"
-            doubt.append(f"size is {far[b]:.1f} sigma from its category's: {why}")
-        doubt += [f"category overruled: {overruled[b]}"] * bool(overruled[b])
-        reason.append("; ".join([wrong] * bool(wrong) + doubt))
+        status.append("rejected" if rejection else "prior_dominated" if doubt else "ok")
+        if deviation[b] > ODD_SIZE:
+            why = "another object?" if growth[b] > 0.7 * deviation[b] else "partly occluded?"
+            doubt.append(f"size is {deviation[b]:.1f} sigma from its category's: {why}")
+        if overruled[b]:
+            doubt.append(f"category overruled: {overruled[b]}")
+        reason.append("; ".join([rejection, *doubt] if rejection else doubt))
     return status, reason
 
 
 class Floor(NamedTuple):
-    """A plane that things stand on."""
+    """The plane on which objects stand."""
 
     normal: Array  # (3,) unit, upwards
     offset: float  # normal @ x == offset on it, world units
@@ -2184,13 +2299,13 @@ class Floor(NamedTuple):
 
 
 class _World(NamedTuple):
-    """What is known about scale and gravity in one pass."""
+    """Scale and gravity of one pass."""
 
-    log_scale: float
+    log_scale: float  # log metres per world unit
     scale_sigma: float
     scale_source: str
-    up: Array
-    tilt_rad: float
+    up: Array  # (3,) unit or zeros
+    tilt_rad: float  # sigma of an object's vertical axis about `up`
     up_source: str
     floor: Floor | None = None
 
@@ -2198,7 +2313,7 @@ class _World(NamedTuple):
 def _first_world(
     up: Sequence[float] | Array | None, metric: bool | Scale, cams: _Cameras, floor: Floor | None
 ) -> _World:
-    """Collect what is known at first: scale and gravity as given, or gravity as cameras tell it."""
+    """Return scale and gravity as given; gravity defaults to that of level cameras."""
     scale = (0.0, 0.0, "poses") if metric else (0.0, UNKNOWN_SCALE_LOG, "none")
     if isinstance(metric, Scale):
         scale = (float(np.log(metric.value)), metric.rel_sigma, metric.source)
@@ -2217,7 +2332,7 @@ def _check_input(
     boxes: Array, cams: Array, image_size: tuple[float, float], names: Sequence[Any] | None,
     points: Array,
 ) -> None:  # fmt: skip
-    """Raise QuadricsError where shapes do not fit together."""
+    """Raise QuadricsError where array shapes do not fit together."""
     if boxes.ndim != 3 or boxes.shape[2] != 4:
         raise QuadricsError(f"boxes_xyxy has shape {boxes.shape}, expected (frames, objects, 4)")
     if cams.shape != (len(boxes), 3, 4):
@@ -2253,123 +2368,176 @@ def fit_objects(
 
     Args:
         boxes_xyxy: (F, O, 4) px, NaN where unseen. img_from_world: (F, 3, 4), NaN where unknown.
-        image_size: (width, height) px; edges on the border count one-sided.
+        image_size: (width, height) px; edges on the border are one-sided.
         categories, priors: category of each object, `load_priors()`.
-        up: (3,) world direction against gravity; None: roughly that of level cameras.
-        support: None (by category, by the evidence where the category is unknown), "evidence"
-            (always by the evidence), "box" | "cylinder" | "ellipsoid", or one an object.
-        score: (F, O) detection scores, used to choose among many views.
-        hidden: (F, O, 4) edges left, upper, right, lower behind which the object may go on.
+        up: (3,) world direction against gravity; None: estimated, assuming level cameras.
+        support: shape of all objects or of each: "box", "cylinder", "ellipsoid", "evidence" (model
+            selection), or None (that of the category; model selection where it is unknown).
+        score: (F, O) detection scores; of many views those of high score are preferred.
+        hidden: (F, O, 4) True where the object may be occluded at an edge (left, upper, right,
+            lower) and extend beyond it.
         metric: True: world units are metres; False: one global scale is estimated from the priors;
-            a Scale: it is known.
-        known_size: {category or object number: ("w" | "d" | "h", metres)}; overrides True.
-        floor: what categories stand on whose prior says so, once the scale is known.
-        points: (O, P, 3) sparse points that may lie on each object, NaN: fewer. The solid should
-            hold them; some may be of something else.
-        config: the few numbers that a user may change.
+            a Scale: given.
+        known_size: {category or object number: ("w" | "d" | "h", metres)}; replaces metric=True.
+        floor: plane of the objects whose category stands on the floor; used once the scale is
+            given or estimated.
+        points: (O, P, 3) sparse points that may lie on each object, padded with NaN; outliers are
+            down-weighted.
     Returns:
-        ObjectFits in world units. It never raises on ugly numbers: such objects are "rejected".
+        ObjectFits in world units; objects whose numbers are unusable have status "rejected".
     Raises:
-        QuadricsError: shapes that do not fit together, an unknown support, a garbled known_size.
+        QuadricsError: array shapes do not fit together, or an invalid support or known_size.
     """
     cfg = config or FitConfig()
-    boxes, given = np.asarray(boxes_xyxy, np.float64), np.asarray(img_from_world, np.float64)
-    on_them = np.zeros((boxes.shape[1], 0, 3)) if points is None else np.asarray(points, np.float64)
-    _check_input(boxes, given, image_size, categories, on_them)
+    boxes = np.asarray(boxes_xyxy, np.float64)
+    cameras = np.asarray(img_from_world, np.float64)
+    sparse = np.zeros((boxes.shape[1], 0, 3)) if points is None else np.asarray(points, np.float64)
+    _check_input(boxes, cameras, image_size, categories, sparse)
     codes = _support_codes(support, boxes.shape[1])
-    cams = _cameras(given)
+    cams = _cameras(cameras)
     usable = _usable_boxes(boxes, cams)
     quality = np.nan_to_num(np.asarray(1.0 if score is None else score, np.float64))
-    near = cfg.border_px + BORDER_SIGMAS * cfg.edge_noise_rel * (boxes[..., 2:] - boxes[..., :2])
-    far = np.array(image_size) - near
-    one_sided = np.concatenate([boxes[..., :2] <= near, boxes[..., 2:] >= far], -1)  # (F, O, 4)
+    margin = cfg.border_px + BORDER_SIGMAS * cfg.edge_noise_rel * (boxes[..., 2:] - boxes[..., :2])
+    limit = np.array(image_size) - margin
+    one_sided = np.concatenate([boxes[..., :2] <= margin, boxes[..., 2:] >= limit], -1)  # (F, O, 4)
     one_sided |= False if hidden is None else np.asarray(hidden, bool)
-    quality = quality + ~one_sided.any(-1)  # (F, O), whole boxes first
+    quality = quality + ~one_sided.any(-1)  # (F, O), complete boxes first
     live = np.flatnonzero(usable.any(0))  # (L,)
-    known = isinstance(metric, Scale) and metric.source != "none"
-    sizes = [] if known else _known_sizes(known_size, categories, live, priors)
-    world = _first_world(up, metric if known else bool(metric is True and not sizes), cams, floor)
+    has_scale = isinstance(metric, Scale) and metric.source != "none"
+    sizes = [] if has_scale else _known_sizes(known_size, categories, live, priors)
+    is_metric = metric if has_scale else bool(metric is True and not sizes)
+    world = _first_world(up, is_metric, cams, floor)
     if not len(live):
-        return _report(None, boxes, one_sided, usable, cams, live, world, cfg)
-    seen = (boxes[:, live], one_sided[:, live], usable[:, live], quality[:, live])
-    data = _gather_data(*seen, cams, cfg)
+        return _none_fitted(usable.shape, world)
+    measured = _Measured(boxes, one_sided, usable, cams).of(live)
+    data = _gather_data(measured, quality[:, live], cfg)
     names = [None if categories is None else categories[int(k)] for k in live]
-    known_of = (names, priors, codes[live], on_them[live], cfg.wrong_class)
-    fit, spec, world = _solve_passes(data, known_of, sizes, world, cfg)
-    return _report((fit, spec, data), boxes, one_sided, usable, cams, live, world, cfg)
+    given = _Given(names, priors, codes[live], sparse[live], sizes, cfg.wrong_class)
+    fit, spec, world = _solve_passes(data, given, world, cfg)
+    posterior = _posterior(fit, spec, data, measured.boxes, cfg)
+    inlier = _inlier_table(posterior.solids, fit.code, fit.noise, measured, cfg)
+    live_fits = _live_fits(fit, spec, data, posterior, inlier, world)
+    return _with_live(_none_fitted(usable.shape, world), live, live_fits)
 
 
 def _solve_passes(
-    data: _Data, known: tuple[Sequence[str | None], Priors | None, IntArray, Array, float],
-    sizes: list[tuple[int, int, float]], world: _World, cfg: FitConfig,
-) -> tuple[_Fit, _Spec, _World]:  # fmt: skip
-    """Fit once; if that tells the scale, fit again with it.
-
-    Args:
-        known: categories, priors, supports and points of the objects, and how often a category
-            is wrong.
-    """
-    spec = _prior_spec(*known, world)
+    data: _Data, given: _Given, world: _World, cfg: FitConfig
+) -> tuple[_Fit, _Spec, _World]:
+    """Fit once; where that determines a scale, which the poses lack, fit again with it."""
+    spec = _prior_spec(given, world)
     fit = _fit_all(data, spec, cfg)
     if world.scale_source != "none":
         return fit, spec, world
-    found, source = _scale_from_known(fit, sizes, cfg), "known_size"
-    if found is None:
-        metric = _prior_spec(*known, world._replace(scale_sigma=0.0))
-        found, source = _scale_from_priors(fit, data, metric), "priors"
-    if found is None:
+    scale = _scale_from_known(fit, given.sizes, cfg)
+    source = "known_size"
+    if scale is None:
+        metric = _prior_spec(given, world._replace(scale_sigma=0.0))
+        scale = _scale_from_priors(fit, data, metric)
+        source = "priors"
+    if scale is None:
         return fit, spec, world
-    world = world._replace(log_scale=found[0], scale_sigma=found[1], scale_source=source)
-    spec = _prior_spec(*known, world)
+    world = world._replace(log_scale=scale[0], scale_sigma=scale[1], scale_source=source)
+    spec = _prior_spec(given, world)
     return _fit_all(data, spec, cfg), spec, world
 
 
-def _report(
-    solved: tuple[_Fit, _Spec, _Data] | None, boxes: Array, one_sided: BoolArray, usable: BoolArray,
-    cams: _Cameras, live: IntArray, world: _World, cfg: FitConfig,
-) -> ObjectFits:  # fmt: skip
-    """Spread the fits of the live objects over all O objects and judge them."""
-    n = boxes.shape[1]
-    solids = Ellipsoids(*(np.full(s, np.nan) for s in ((n, 3), (n, 3), (n, 3, 3))))
-    cov, rms, angle = np.full((n, 9, 9), np.nan), np.full(n, np.nan), np.zeros(n)
-    share, inlier = np.ones((n, 3)), np.zeros(usable.shape, bool)
-    status, reason = ["rejected"] * n, ["no usable box in a posed frame"] * n
-    names = ["ellipsoid"] * n
-    if solved is not None:
-        fit, spec, data = solved
-        wide = _curved_covariance(fit, data, spec) + fit.spread
-        # the noise level is itself estimated: Student's 95 % region for three parameters
-        wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
-        if cfg.correlation_deg > 0:  # the boxes of a thing have errors in common, as large as one's
-            size_px = np.nanmedian(boxes[:, live, 2:] - boxes[:, live, :2], (0, 2))
-            edge = fit.noise * np.hypot(cfg.edge_noise_px / size_px, cfg.edge_noise_rel)
-            wide[:, [3, 4, 5], [3, 4, 5]] += 2.0 * edge[:, None] ** 2  # opposite edges, of the size
-        found, cov[live], order = _vertical_axis_last(fit, wide)
-        for name in ("center_in_world", "half_axes", "world_from_obj"):
-            getattr(solids, name)[live] = getattr(found, name)
-        prior = np.sqrt(np.einsum("bii->bi", spec.size_cov))[fit.hyp[:, None], order]
-        post = np.sqrt(np.einsum("bii->bi", cov[live])[:, 3:6])
-        shrink = np.ones((len(live), 9))
-        shrink[:, 3:6] = np.minimum(1.0, prior / post)  # data never make a size less certain
-        cov[live] *= shrink[:, :, None] * shrink[:, None]
-        post = post * shrink[:, 3:6]
-        told = _safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]]
-        rests = np.all(shrink[:, 3:6] < 1.0, axis=1, keepdims=True)  # no side is known better
-        share[live] = np.where(rests, 1.0, np.sqrt(np.take_along_axis(told, order, 1)) / prior)
-        angle[live] = _parallax(fit, data)
-        square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.good
-        rms[live] = np.sqrt(square.sum((1, 2)) / np.maximum(fit.good.sum((1, 2)), 1))
-        seen = (data.index >= 0).sum(1)
-        verdict, why = _status(fit, spec, share[live], post, angle[live], seen)
-        for row, k in enumerate(live.tolist()):
-            status[k], reason[k], names[k] = verdict[row], why[row], SUPPORTS[fit.code[row]]
-        own = (boxes[:, live], one_sided[:, live], usable[:, live], cams, cfg)
-        inlier[:, live] = _inlier_table(found, fit.code, fit.noise, *own)
-    scale = Scale(float(np.exp(world.log_scale)), world.scale_sigma, world.scale_source)
+@dataclass(frozen=True, slots=True)
+class _Posterior:
+    """Posterior of L fits, the vertical axis last."""
+
+    solids: Ellipsoids
+    cov: Array  # (L, 9, 9)
+    size_sigma: Array  # (L, 3) of the log axes
+    prior_share: Array  # (L, 3) as in `ObjectFits`
+
+
+def _posterior(fit: _Fit, spec: _Spec, data: _Data, boxes: Array, cfg: FitConfig) -> _Posterior:
+    """Compute the covariance of the fits to `boxes` (F, L, 4) and the prior's part in it."""
+    wide = _curved_covariance(fit, data, spec) + fit.spread
+    # the noise level is itself estimated: Student's 95 % region for three parameters
+    wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
+    if cfg.correlation_deg > 0:  # error common to all boxes of an object, as large as that of one
+        size_px = np.nanmedian(boxes[..., 2:] - boxes[..., :2], (0, 2))
+        edge = fit.noise * np.hypot(cfg.edge_noise_px / size_px, cfg.edge_noise_rel)
+        wide[:, [3, 4, 5], [3, 4, 5]] += 2.0 * edge[:, None] ** 2  # opposite edges, of the size
+    solids, cov, order = _vertical_axis_last(fit, wide)
+    prior = np.sqrt(np.einsum("bii->bi", spec.size_cov))[fit.hyp[:, None], order]
+    size_sigma = np.sqrt(np.einsum("bii->bi", cov)[:, 3:6])
+    shrink = np.ones((len(cov), 9))
+    shrink[:, 3:6] = np.minimum(1.0, prior / size_sigma)  # data never make a size less certain
+    cov *= shrink[:, :, None] * shrink[:, None]
+    laplace = _safe_inverse(fit.hessian + ROTATION_CAP)[:, [3, 4, 5], [3, 4, 5]]
+    no_gain = np.all(shrink[:, 3:6] < 1.0, axis=1, keepdims=True)  # no axis is more certain
+    ratio = np.sqrt(np.take_along_axis(laplace, order, 1)) / prior
+    return _Posterior(solids, cov, size_sigma * shrink[:, 3:6], np.where(no_gain, 1.0, ratio))
+
+
+def _none_fitted(shape: tuple[int, ...], world: _World) -> ObjectFits:
+    """Make the result of (F, O) `shape` where no object has a usable box."""
+    n = shape[1]
     return ObjectFits(
-        solids, 2.0 * solids.half_axes, cov, np.array(names, dtype=np.str_), inlier, rms,
-        np.array(status, dtype=np.str_), reason, angle, share, scale, world.up, world.up_source,
-    )  # fmt: skip
+        ellipsoids=Ellipsoids(
+            np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+        ),
+        size=np.full((n, 3), np.nan),
+        cov=np.full((n, 9, 9), np.nan),
+        support=np.array(["ellipsoid"] * n, dtype=np.str_),
+        inlier=np.zeros(shape, bool),
+        rms_px=np.full(n, np.nan),
+        status=np.array(["rejected"] * n, dtype=np.str_),
+        reason=["no usable box in a posed frame"] * n,
+        parallax_deg=np.zeros(n),
+        prior_share=np.ones((n, 3)),
+        scale=_scale_of(world),
+        up=world.up,
+        up_source=world.up_source,
+    )
+
+
+def _scale_of(world: _World) -> Scale:
+    return Scale(float(np.exp(world.log_scale)), world.scale_sigma, world.scale_source)
+
+
+def _live_fits(
+    fit: _Fit, spec: _Spec, data: _Data, posterior: _Posterior, inlier: BoolArray, world: _World
+) -> ObjectFits:
+    """Make the result of the L live objects; inlier: (F, L)."""
+    square = (_all_residuals(fit, data) * data.edges.sigma_px) ** 2 * fit.inlier
+    parallax = _parallax(fit, data)
+    status, reason = _status(fit, spec, posterior, parallax, (data.index >= 0).sum(1))
+    return ObjectFits(
+        ellipsoids=posterior.solids,
+        size=2.0 * posterior.solids.half_axes,
+        cov=posterior.cov,
+        support=np.array(SUPPORTS)[fit.code],
+        inlier=inlier,
+        rms_px=np.sqrt(square.sum((1, 2)) / np.maximum(fit.inlier.sum((1, 2)), 1)),
+        status=np.array(status, dtype=np.str_),
+        reason=reason,
+        parallax_deg=parallax,
+        prior_share=posterior.prior_share,
+        scale=_scale_of(world),
+        up=world.up,
+        up_source=world.up_source,
+    )
+
+
+def _with_live(fits: ObjectFits, live: IntArray, live_fits: ObjectFits) -> ObjectFits:
+    """Put the results of the live objects into those of all O objects."""
+    for name in ("center_in_world", "half_axes", "world_from_obj"):
+        getattr(fits.ellipsoids, name)[live] = getattr(live_fits.ellipsoids, name)
+    for name in ("size", "cov", "rms_px", "parallax_deg", "prior_share"):
+        getattr(fits, name)[live] = getattr(live_fits, name)
+    fits.inlier[:, live] = live_fits.inlier
+    support = fits.support.tolist()
+    status = fits.status.tolist()
+    for row, k in enumerate(live.tolist()):
+        support[k] = str(live_fits.support[row])
+        status[k] = str(live_fits.status[row])
+        fits.reason[k] = live_fits.reason[row]
+    return replace(
+        fits, support=np.array(support, dtype=np.str_), status=np.array(status, dtype=np.str_)
+    )
 
 
 # ---- Overlap of volumes ---------------------------------------------------------------------
@@ -2391,7 +2559,8 @@ def volume_overlap(a: Ellipsoids, b: Ellipsoids, nodes: int = 40) -> Array:
         raise QuadricsError(f"{len(a)} and {len(b)} ellipsoids: the two lists must pair up")
     iou = np.empty(len(a))
     for part in _chunks(len(a), 256):  # pairs, to bound the memory
-        one, two = a[part], b[part]
+        one = a[part]
+        two = b[part]
         to_unit = one.world_from_obj.transpose(0, 2, 1) / one.half_axes[:, :, None]  # (O, 3, 3)
         root = to_unit @ (two.world_from_obj * two.half_axes[:, None, :])
         safe = _finite(root, 1, 2)[:, None, None]
@@ -2410,7 +2579,8 @@ def _ball_ellipsoid_volume(center: Array, half: Array, nodes: int) -> Array:
     """Integrate the volume (O,) common to the unit ball and ellipsoids with level axes."""
     node, mass = np.polynomial.legendre.leggauss(nodes)
     t = 0.5 * np.pi * (node + 1.0)  # x = -cos t: for integrands that end in square roots
-    x, w = -np.cos(t), 0.5 * np.pi * mass * np.sin(t)
+    x = -np.cos(t)
+    w = 0.5 * np.pi * mass * np.sin(t)
     low = np.maximum(-1.0, center[:, 2] - half[:, 2])  # (O,)
     high = np.minimum(1.0, center[:, 2] + half[:, 2])
     z = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * x  # (O, N)

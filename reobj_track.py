@@ -176,28 +176,32 @@ class TrackerConfig:
     high_score: float = option(
         0.4, "detections of at least this score are matched first", "--high-score"
     )
-    low_score: float = option(0.1, "what is left is matched with scores down to this (ByteTrack)")
-    new_score: float = option(0.5, "a new track starts at a detection of at least this score")
+    low_score: float = option(
+        0.1, "second association round: minimum detection score (ByteTrack); raise it for noisy "
+        "detectors"
+    )  # fmt: skip
+    new_score: float = option(0.5, "minimum score of the detection that starts a new track")
     n_init: int = option(
-        3, "detections of score .5 before a new object gets its identity; a return needs one less"
-    )
+        3, "confirm a track once its scores sum to n_init x 0.5; re-identified tracks need 0.5 "
+        "less; raise it for fewer false objects"
+    )  # fmt: skip
     coast_frames: int = option(
-        30, "frames, of those looked at, that a track lives on without a detection", "--coast"
+        30, "frames with detector output that a track survives without a detection", "--coast"
     )
-    remember: bool = option(True, "recognise objects that return, however long they were away")
+    remember: bool = option(True, "re-identify objects that return, after any time")
     std_position: float = option(
-        STD_POSITION, "process noise of a position, over the box size; more for jerky cameras"
+        STD_POSITION, "process noise of the position, over the box size; raise it for jerky cameras"
     )
     std_velocity: float = option(
-        STD_VELOCITY, "process noise of a velocity, over the box size; more for jerky cameras"
+        STD_VELOCITY, "process noise of the velocity, over the box size; raise it for jerky cameras"
     )
-    appearance_weight: float = option(0.7, "share of appearance in the cost of ambiguous matches")
+    appearance_weight: float = option(0.7, "weight of appearance in the cost of ambiguous matches")
     foreground_weight: float = option(
-        0.5, "share of the foreground in the appearance; less trusts the surroundings more"
+        0.5, "weight of the foreground in the appearance; the rest is that of the surroundings"
     )
-    embed_every: int = option(10, "frames looked at after which every track is embedded again")
+    embed_every: int = option(10, "frames with detector output between two embeddings of a track")
     return_probability: float = option(
-        0.5, "probability from which on a return is recognised; more for fewer wrong identities"
+        0.5, "minimum probability of a re-identification; raise it for fewer wrong identities"
     )
     camera_motion: bool = option(True, "compensate the camera's motion (sparse optical flow)")
 
@@ -207,20 +211,21 @@ class OutputConfig:
     """Files written."""
 
     overlay: str = option(
-        "solids", "what overlay.mp4 (or .webm) shows over boxes: solids, ellipses, trails; or none"
+        "solids",
+        "layers of the overlay video besides boxes: solids, ellipses, trails; none: no video",
     )
-    scene: bool = option(True, "write scene.html")
+    scene: bool = option(True, "write the viewer, scene.html")
     doubtful: bool = option(
-        False, "show doubtful objects too: in tracks.txt, in the film, on the page at first"
+        False, "include low-confidence objects in tracks.txt, overlay video and viewer"
     )
     fill_gaps: int = option(
         5,
-        "fill gaps of up to so many frames in the tracks, after the video (score 0; 0: never); "
-        "an object's solid fills all frames from about where it was seen in others",
+        "interpolate track gaps of up to N frames (0: off); interpolated boxes have score 0. 3D "
+        "objects are also projected into frames from nearby viewpoints",
     )
 
     def __post_init__(self) -> None:
-        film_layers(self.overlay)  # a wrong word is said before anything is computed
+        film_layers(self.overlay)  # an invalid value is an error before the run starts
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +240,9 @@ class Config:
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     threads: int = option(0, "threads of onnxruntime and OpenCV (0: all cores)", "--threads")
-    device: str = option("cpu", "of networks: cpu, cuda, coreml, ... (onnxruntime)", "--device")
+    device: str = option(
+        "cpu", "device of the networks: cpu, cuda, coreml, ... (onnxruntime)", "--device"
+    )
     offline: bool = option(False, "never download weights", "--offline")
 
 

@@ -1,9 +1,9 @@
 """Cameras: intrinsics, poses of a video, rigid transforms, viewing rays, pycolmap's models.
 
-Conventions: `cam_from_world` maps world points into the camera (x right, y down, z forward, as
-OpenCV and COLMAP have it); pixels are COLMAP's, the centre of the first pixel is (0.5, 0.5).
-How poses are found or read is the business of `reobj.poses`; here is what they are, and how they
-are written (npz, TUM, COLMAP).
+Conventions: `cam_from_world` maps world points into the camera (x right, y down, z forward, as in
+OpenCV and COLMAP); pixels are COLMAP's: the centre of the first pixel is (0.5, 0.5).
+`reobj.poses` estimates and reads poses; this module holds their types and writers (npz, TUM,
+COLMAP).
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from reobj.types import Array, BoolArray, IntArray, ReobjError, as_numbers
 
 @contextlib.contextmanager
 def _signals_kept() -> Iterator[None]:
-    """Keep what this process does on signals, whatever a package that is loaded here installs.
+    """Restore the process's signal handlers after a package that is loaded here installed its own.
 
-    By the C library, because Python sets handlers in the main thread only; what it stores of one
-    (struct sigaction, 152 bytes on Linux) is handed back unread.
+    By the C library, because Python sets handlers in the main thread only. The stored struct
+    sigaction (152 bytes on Linux) is not interpreted.
     """
     if sys.platform == "win32":
         yield
         return
-    libc, before = ctypes.CDLL(None), {}
+    libc = ctypes.CDLL(None)
+    before = {}
     for name in ("SIGTERM", "SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE", "SIGILL"):  # glog's
         before[int(signal.Signals[name])] = ctypes.create_string_buffer(1024)
     for number, action in before.items():
@@ -49,9 +50,9 @@ def _signals_kept() -> Iterator[None]:
 
 
 def import_pycolmap() -> Any:
-    """Import pycolmap when it is needed: without its log on stderr and its handlers of signals.
+    """Import pycolmap on demand, without its log on stderr and its signal handlers.
 
-    They print a C++ trace where a process is ended (SIGTERM), also in processes forked from it.
+    The handlers would print a C++ trace when a process is ended (SIGTERM), also in forked ones.
     """
     if "pycolmap" not in sys.modules:
         with _signals_kept():
@@ -67,27 +68,27 @@ def camera_parameters(model: str) -> list[str]:
     """List the parameters of one of COLMAP's camera models in their order: fx, fy, cx, cy, ...
 
     Raises:
-        ReobjError: the installed pycolmap does not know it, or it has no focal length.
+        ReobjError: the installed pycolmap lacks the model, or the model has no focal length.
     """
     pycolmap = import_pycolmap()
-    known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-    if model not in known:
-        raise ReobjError(f"no camera model {model}; pycolmap has {', '.join(known)}")
-    made = pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2)
-    if not made.focal_length_idxs():
+    models = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+    if model not in models:
+        raise ReobjError(f"no camera model {model}; pycolmap has {', '.join(models)}")
+    camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2)
+    if not camera.focal_length_idxs():
         raise ReobjError(f"a {model} camera has no focal length; cut perspective images out of it")
-    return [name.strip() for name in made.params_info.split(",")]
+    return [name.strip() for name in camera.params_info.split(",")]
 
 
-INVERSE_PX = 0.01  # between a pixel and its undistorted ray distorted again (chosen: no error)
+INVERSE_PX = 0.01  # px, largest error of undistorting and distorting a pixel (chosen: negligible)
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Intrinsics as COLMAP has them.
+    """Intrinsics in COLMAP's conventions.
 
     Attributes:
-        model: COLMAP's name of the camera model: PINHOLE, OPENCV, ...; any that pycolmap has.
+        model: COLMAP's name of the camera model: PINHOLE, OPENCV, ...; any of pycolmap's.
         width, height: of the images, pixels.
         params: in the model's order: focal length(s), principal point, distortion.
     """
@@ -108,8 +109,8 @@ class Camera:
     def undistort(self, xy: Array) -> Array:
         """Map pixels (..., 2) to those of a pinhole camera with the same K.
 
-        NaN stays NaN; so become pixels that a pinhole cannot have (90 deg off the axis or more),
-        and those outside of what the distortion was fitted to, which it does not map back.
+        NaN for NaN, for rays 90 deg or more off the axis, and for pixels where the distortion has
+        no inverse (outside of the region to which it was fitted).
         """
         camera = self.to_pycolmap()
         flat = np.asarray(xy, np.float64).reshape(-1, 2)
@@ -118,43 +119,48 @@ class Camera:
         if len(rows):
             ray = np.asarray(camera.cam_ray_from_img(flat[rows]), np.float64)  # (n, 3)
             ahead = np.isfinite(ray).all(1) & (ray[:, 2] > 0)
-            ray, rows = ray[ahead], rows[ahead]
+            ray = ray[ahead]
+            rows = rows[ahead]
             back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
-            off = np.abs(back - flat[rows]).max(1, initial=0)  # of terms without bounds it is inf
-            good = off < INVERSE_PX
-            ray, rows = ray[good], rows[good]
+            error = np.abs(back - flat[rows]).max(1, initial=0)  # inf where the terms diverge
+            inverted = error < INVERSE_PX
+            ray = ray[inverted]
+            rows = rows[inverted]
             ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
         return ideal.reshape(np.shape(xy))
 
     def to_pycolmap(self) -> Any:
-        """Return the same camera as `pycolmap.Camera` with id 1.
+        """Convert to a `pycolmap.Camera` with id 1.
 
         Raises:
-            ReobjError: no model of the installed pycolmap, or other parameters than it has.
+            ReobjError: the installed pycolmap lacks the model, or the model has other parameters.
         """
         names = camera_parameters(self.model)
         if len(self.params) != len(names):
-            what = f"{len(self.params)} parameters of a {self.model} camera"
-            raise ReobjError(f"{what}; expected {', '.join(names)}")
-        own = {"model": self.model, "width": self.width, "height": self.height}
-        return import_pycolmap().Camera(camera_id=1, params=list(self.params), **own)
+            found = f"{len(self.params)} parameters of a {self.model} camera"
+            raise ReobjError(f"{found}; expected {', '.join(names)}")
+        fields = {"model": self.model, "width": self.width, "height": self.height}
+        return import_pycolmap().Camera(camera_id=1, params=list(self.params), **fields)
 
     def resized(self, size: tuple[int, int]) -> Camera:
         """Return the camera of the same images resized to (w, h), distortion included."""
         if (self.width, self.height) == size:
             return self
-        made = self.to_pycolmap()
-        made.rescale(*size)
-        return Camera(self.model, *size, tuple(made.params.tolist()))
+        camera = self.to_pycolmap()
+        camera.rescale(*size)
+        return Camera(self.model, *size, tuple(camera.params.tolist()))
 
 
-MAX_OFF_CENTRE = 0.2  # of the principal point from the middle, over the size (chosen: wide)
-PLAUSIBLE_FOCAL = (0.1, 10.0)  # over the longer side: fisheye to telephoto (chosen: wide)
+# Plausibility of intrinsics (chosen: wide; from fisheye to telephoto lenses)
+MAX_OFF_CENTRE = 0.2  # image sides, of the principal point from the middle
+PLAUSIBLE_FOCAL = (0.1, 10.0)  # longer image sides, of the focal length
 
 
 def checked_camera(camera: Camera, where: str) -> Camera:
-    """Return the camera; refuse intrinsics that belong to images of another size."""
-    size, centre, focal = np.array([camera.width, camera.height]), camera.K[:2, 2], camera.K[0, 0]
+    """Return the camera; refuse intrinsics of images of another size."""
+    size = np.array([camera.width, camera.height])
+    centre = camera.K[:2, 2]
+    focal = camera.K[0, 0]
     low, high = PLAUSIBLE_FOCAL
     off_centre = (np.abs(centre - size / 2) > MAX_OFF_CENTRE * size).any()
     if off_centre or not low < focal / size.max() < high:
@@ -166,32 +172,33 @@ def checked_camera(camera: Camera, where: str) -> Camera:
 
 
 RIGID_TOLERANCE = 1e-3  # of R R' from the identity; chosen: float32 poses of devices are at 1e-6
-WORLD_MAX = 1e9  # of a camera's place; chosen: the Earth in cm fits, in any unit it is a mistake
+WORLD_MAX = 1e9  # world units, of a camera's position; chosen: the Earth in cm fits
 
 
 def usable(camera: Camera) -> bool:
-    """Tell whether a camera has a size, finite parameters and focal lengths above 0."""
+    """Test whether a camera has a size, finite parameters and positive focal lengths."""
     sized = min(camera.width, camera.height) > 0 and bool(np.isfinite(camera.params).all())
     return sized and bool((np.diag(camera.K)[:2] > 0).all())
 
 
-PART_MAX = 1000  # chosen: each has a map of its own; a walk of an hour has a few
+PART_MAX = 1000  # components of a trajectory; chosen: a walk of an hour has a few
 
 
 def checked_pose(
     cam_from_world: Any, camera: Camera | None, points: Any = None, part: Any = 0
 ) -> Array | None:
-    """Return the pose (3, 4) of one frame; None where it is not known: None, or holds NaN.
+    """Validate and return the pose (3, 4) of one frame; None for None or NaN.
 
     Args:
-        points: (N, 3) in world, or None. part: of the path, whose world that is.
+        points: (N, 3) in world, or None. part: component of the trajectory, with its own world.
     Raises:
-        ReobjError: no rigid pose, no camera that it can be of, no points, no number of a part.
+        ReobjError: the pose is not rigid, or its camera, the points or `part` are invalid.
     """
     if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
         raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
     if not isinstance(part, int | np.integer) or not 0 <= part <= PART_MAX:
-        raise ReobjError(f"part {part!r}, expected the number of a part of the path, from 0")
+        raise ReobjError(f"part {part!r}, expected the number of a component of the trajectory, "
+                         "from 0")  # fmt: skip
     if cam_from_world is None:
         return None
     pose = as_numbers(cam_from_world, "cam_from_world").astype(np.float64)
@@ -199,14 +206,17 @@ def checked_pose(
         raise ReobjError(f"cam_from_world of shape {pose.shape}, expected (3, 4): [R | t]")
     if np.isnan(pose).any():
         return None
-    offset, rotation = pose[:, 3], pose[:, :3]
+    offset = pose[:, 3]
+    rotation = pose[:, :3]
     if (np.abs(offset) > WORLD_MAX).any() or (np.abs(rotation) > 1 + RIGID_TOLERANCE).any():
-        raise ReobjError(f"cam_from_world {pose.tolist()} is beyond any camera's place")
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise ReobjError(f"cam_from_world: its rotation is none (off by {off:.2g}, determinant "
-                         f"{np.linalg.det(rotation):.2g}); expected [R | t], x right, y down, "
-                         "z forward")  # fmt: skip
+        raise ReobjError(f"cam_from_world {pose.tolist()}: values too large for a pose; expected "
+                         "[R | t]")  # fmt: skip
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    determinant = np.linalg.det(rotation)
+    if error > RIGID_TOLERANCE or determinant < 0:
+        raise ReobjError("cam_from_world: the 3x3 block is not a rotation (orthogonality error "
+                         f"{error:.2g}, determinant {determinant:.2g}); expected [R | t], x right, "
+                         "y down, z forward")  # fmt: skip
     if not isinstance(camera, Camera):
         raise ReobjError("cam_from_world without a camera: give camera=rt.Camera(...) as well")
     if not usable(camera):
@@ -215,7 +225,7 @@ def checked_pose(
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """Return the pinhole part of a camera for images resized by `scale`, without distortion."""
+    """Return the pinhole camera, without distortion, of images resized by `scale`."""
     K = camera.K
     params = (K[0, 0] * scale, K[1, 1] * scale, K[0, 2] * scale, K[1, 2] * scale)
     return Camera("PINHOLE", round(camera.width * scale), round(camera.height * scale), params)
@@ -227,7 +237,7 @@ class Poses:
 
     Attributes:
         camera: intrinsics at the frames' native size, the same for all frames.
-        frame: (F,) source frame numbers, ascending, one for every frame that was read.
+        frame: (F,) source frame numbers of all frames that were read, ascending.
         time_s: (F,) seconds.
         cam_from_world: (F, 3, 4), NaN where there is no pose.
         status: (F,) "keyframe", "pnp", "interpolated", "supplied" or "none".
@@ -235,13 +245,12 @@ class Poses:
         metric: True when world units are metres.
         up_in_world: (3,) unit vector against gravity, or None if unknown.
         points: (N, 3) sparse points in world; colors (N, 3) uint8 RGB.
-        visibility: (M, 2) which points were observed in which frames: row of the frame, row of the
-            point.
-        part: (F,) rigid part of the path that each frame belongs to, 0 the largest. Every part has
-            a world and a scale of its own: nothing is known of how two of them lie to each other.
-            A frame without a pose counts to the part of the nearest frame that has one.
-        messages: what the user should know (spans without poses and what helps).
-        reading: how supplied poses were read: format, and the rule that found their frames.
+        visibility: (M, 2) observations of the points: row of the frame, row of the point.
+        part: (F,) connected component of the trajectory of each frame, 0 the largest. Each has its
+            own world frame and scale; the transform between two of them is unknown. A frame without
+            a pose belongs to the component of the nearest frame with one.
+        messages: warnings (frames without poses, and what to do about them).
+        reading: how supplied poses were read: format, and the rule that matched their frames.
     """
 
     camera: Camera
@@ -265,29 +274,30 @@ class Poses:
 
     @property
     def measured(self) -> BoolArray:
-        """Mark the frames (F,) whose pose was not interpolated between those of others."""
+        """Mark the frames (F,) whose pose was not interpolated."""
         return np.asarray(self.known & (self.status != "interpolated"), bool)
 
     @property
     def cameras_text(self) -> str:
-        """Say how many frames have a camera, where from, and how many are interpolated."""
-        known, between = int(self.known.sum()), int((self.known & ~self.measured).sum())
+        """Summarise the number of frames with a pose, its source, and how many are interpolated."""
+        known = int(self.known.sum())
+        interpolated = int((self.known & ~self.measured).sum())
         origin = f"{self.source}: {self.reading}" if self.reading else self.source
         text = f"cameras: {known} of {len(self.frame)} frames ({origin})"
-        return f"{text}, {between} interpolated" if between else text
+        return f"{text}, {interpolated} interpolated" if interpolated else text
 
     @property
     def part_count(self) -> int:
-        """Number of parts, at least 1."""
+        """Number of components, at least 1."""
         return int(self.part.max(initial=0)) + 1
 
     def part_of(self, frame: IntArray) -> IntArray:
-        """Return the part (n,) of frames (n,); one that was not read to the next that was."""
+        """Return the component (n,) of frames (n,); frames that were not read: of the next one."""
         row = np.searchsorted(self.frame, frame).clip(max=len(self.frame) - 1)
         return np.asarray(self.part[row], np.int64)
 
     def of_part(self, part: int) -> Poses:
-        """Return one part alone: its frames, poses and points in its world, and no messages."""
+        """Return one component: its frames, poses and points, without messages."""
         rows = np.flatnonzero(self.part == part)
         row_of = np.full(len(self.frame), -1)
         row_of[rows] = np.arange(len(rows))
@@ -296,7 +306,7 @@ class Poses:
         return dataclasses.replace(
             self,
             **{k: getattr(self, k)[rows] for k in ("frame", "time_s", "cam_from_world", "status")},
-            up_in_world=None if part else self.up_in_world,  # of another world
+            up_in_world=None if part else self.up_in_world,  # given in the world of component 0
             points=self.points[kept],
             colors=self.colors[kept],
             visibility=np.column_stack([row_of[seen[:, 0]], np.searchsorted(kept, seen[:, 1])]),
@@ -316,7 +326,7 @@ _POSE_ARRAYS = (
 
 
 def save_poses(path: Path, poses: Poses, **more: Any) -> None:
-    """Write poses as npz, whole or not at all; `more` goes into its metadata."""
+    """Write poses as npz, atomically; `more` goes into its metadata."""
     facts = more | {
         "camera": dataclasses.asdict(poses.camera),
         "source": poses.source,
@@ -329,7 +339,7 @@ def save_poses(path: Path, poses: Poses, **more: Any) -> None:
 
 
 def load_poses(path: Path) -> Poses:
-    """Read what `save_poses` wrote."""
+    """Read a file of `save_poses`."""
     data, facts = load_npz(path, sealed=True)
     arrays = {k: data[k] for k in _POSE_ARRAYS}
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
@@ -364,28 +374,29 @@ def place_of(poses: Poses, frame: IntArray) -> tuple[IntArray, BoolArray]:
     """Find the rows of frames (n,) in the poses.
 
     Returns:
-        place: (n,) row of each in `poses`, meaningless where it has none. known: (n,) True where
-        the frame has a pose.
+        row: (n,) in `poses`, undefined where the frame is not in them. known: (n,) True where the
+        frame has a pose.
     """
-    place = np.searchsorted(poses.frame, frame).clip(0, len(poses.frame) - 1)
-    return place, np.asarray((poses.frame[place] == frame) & poses.known[place], bool)
+    row = np.searchsorted(poses.frame, frame).clip(0, len(poses.frame) - 1)
+    return row, np.asarray((poses.frame[row] == frame) & poses.known[row], bool)
 
 
 def undistort_boxes(xyxy: Array, camera: Camera) -> Array:
-    """Undistort boxes (N, 4) by the middles of their edges; edges at the image border stay.
+    """Undistort boxes (N, 4) by the midpoints of their edges; edges at the image border stay.
 
-    A box is NaN where an edge has no undistorted pixel.
+    A box is NaN where an edge cannot be undistorted.
     """
     if not len(xyxy) or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return xyxy
-    edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) middles
-    side, axis = np.arange(4), np.array([0, 1, 0, 1])
+    edges = np.tile(((xyxy[:, :2] + xyxy[:, 2:]) / 2)[:, None], (1, 4, 1))  # (N, 4, 2) midpoints
+    side = np.arange(4)
+    axis = np.array([0, 1, 0, 1])
     edges[:, side, axis] = xyxy
     undistorted = camera.undistort(edges)[:, side, axis]  # (N, 4)
     limit = np.array([camera.width, camera.height] * 2)
     at_border = (xyxy <= 1) | (xyxy >= limit - 1)
-    found = np.where(at_border, xyxy, undistorted)
-    return np.where(np.isfinite(found).all(1, keepdims=True), found, np.nan)
+    boxes = np.where(at_border, xyxy, undistorted)
+    return np.where(np.isfinite(boxes).all(1, keepdims=True), boxes, np.nan)
 
 
 def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:
@@ -393,7 +404,7 @@ def viewing_rays(xyxy: Array, img_from_world: Array) -> Array:
 
     Args:
         xyxy: (N, 4) undistorted pixels. img_from_world: K @ cam_from_world, (3, 4) for all or
-            (N, 3, 4) one each; NaN where unknown, and so is the ray then.
+            (N, 3, 4), NaN where unknown (the ray is NaN too).
     """
     # x ~ A X + a: the ray through x runs along A^-1 x (Hartley & Zisserman 2004, eq. 6.14)
     center = np.column_stack([(xyxy[:, :2] + xyxy[:, 2:]) / 2, np.ones(len(xyxy))])  # (N, 3)
@@ -413,8 +424,8 @@ def triangulate_rays(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, 
         cam_from_world: (n, 3, 4). rays_in_cam: (n, 3) unit vectors.
     Returns:
         ray: (n, 3) unit vectors in world axes. centre: (n, 3) of the cameras in world. point: (3,)
-        in world, with the least sum of squared distances from the rays (of parallel rays the one
-        nearest to the origin).
+        in world of least squared distances from the rays (for parallel rays: nearest to the
+        origin).
     """
     world_from_cam = invert_rigid(cam_from_world)
     ray = np.einsum("nij,nj->ni", world_from_cam[:, :, :3], rays_in_cam)
@@ -425,12 +436,12 @@ def triangulate_rays(cam_from_world: Array, rays_in_cam: Array) -> tuple[Array, 
     return ray, centre, point
 
 
-CV_FROM_GL = np.diag([1.0, -1.0, -1.0])  # axes of a camera: OpenGL has y up and z backward
-NO_SCALE = "units: arbitrary"  # in the head of our TUM files, for `reobj.poses.supplied.readers`
+CV_FROM_GL = np.diag([1.0, -1.0, -1.0])  # camera axes; OpenGL: y up, z backward
+NO_SCALE = "units: arbitrary"  # in the header of our TUM files, for `reobj.poses.supplied.readers`
 
 
 def write_tum(path: Path, poses: Poses) -> None:
-    """Write the known poses as TUM rows: seconds, world_from_cam, quaternion xyzw."""
+    """Write the known poses as TUM rows: time in s, position, quaternion xyzw (world_from_cam)."""
     world_from_cam = invert_rigid(poses.cam_from_world[poses.known])
     xyzw = np.roll(quat_wxyz_from_matrix(world_from_cam[:, :, :3]), -1, 1)
     table = np.column_stack([poses.time_s[poses.known], world_from_cam[:, :, 3], xyzw])  # (N, 8)
@@ -444,10 +455,10 @@ def write_tum(path: Path, poses: Poses) -> None:
 def write_colmap(path: Path, poses: Poses, image_names: Sequence[str]) -> None:
     """Write a COLMAP text model of all known poses and points, without observations.
 
-    A binary model that pycolmap wrote of the same reconstruction stays: it has the observations.
+    A binary model of the same reconstruction by pycolmap is kept: it has the observations.
 
     Args:
-        image_names: (F,) name of every frame of `poses`.
+        image_names: (F,) of the frames of `poses`.
     """
     path.mkdir(parents=True, exist_ok=True)
     if poses.source == "pycolmap" and (path / "images.bin").exists():
@@ -492,7 +503,7 @@ class SparseModel:
 
 
 def read_sparse_model(folder: Path) -> SparseModel:
-    """Read a COLMAP model, binary or text, by pycolmap."""
+    """Read a COLMAP model, binary or text, with pycolmap."""
     model = import_pycolmap().Reconstruction(str(folder))
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     points = sorted(model.points3D.items())

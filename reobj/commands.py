@@ -1,6 +1,6 @@
-"""The command line: its commands and flags, short help, messages that name the right word.
+"""Command line: commands and flags, short help, error messages with suggestions.
 
-What a command does is the business of `reobj_track`.
+The functions of the commands are in `reobj_track`.
 """
 
 from __future__ import annotations
@@ -21,25 +21,26 @@ from reobj.options import add_flags, list_options
 from reobj.types import ReobjError, one_line, printable, without_secrets
 
 Command = Callable[[argparse.Namespace], int]
-SHELLS = ("bash", "zsh")  # shtab's script for tcsh knows no flags of commands
+SHELLS = ("bash", "zsh")  # shtab's script for tcsh does not complete the flags of commands
 TRACKS_HELP = (
-    "identities from a file instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, YOLO labels"
+    "file of identities, used instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, YOLO labels"
 )
 DETECTIONS_HELP = (
-    "recorded detections instead: MOT, KITTI, CSV, COCO JSON, folder of YOLO labels, CVAT, npz"
+    "file of detections, used instead of the detector: MOT, KITTI, CSV, COCO JSON, folder of YOLO "
+    "labels, CVAT, npz"
 )
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line that names the right word."""
+    """Argument parser whose errors are one line with a suggestion."""
 
     def error(self, message: str) -> NoReturn:
         """Print one line and stop with exit code 2."""
-        if found := re.match(r"unrecognized arguments: .*?(--[\w-]+)", message):
-            message += did_you_mean(found[1], self._words("--"))
-        elif found := re.search(r"invalid choice: '([^']*)'", message):
+        if flag := re.match(r"unrecognized arguments: .*?(--[\w-]+)", message):
+            message += did_you_mean(flag[1], self._words("--"))
+        elif choice := re.search(r"invalid choice: '([^']*)'", message):
             message = re.sub(r"^argument (\S+): ", r"\1: ", message)
-            message += did_you_mean(found[1], re.findall(r"'?([\w-]+)'?[,)]", message))
+            message += did_you_mean(choice[1], re.findall(r"'?([\w-]+)'?[,)]", message))
         self.exit(2, f"error: {one_line(message)} (see {self.prog} --help)\n")
 
     def _words(self, start: str) -> list[str]:
@@ -53,30 +54,31 @@ class Parser(argparse.ArgumentParser):
 
 
 class SafeFormatter(logging.Formatter):
-    """Write log lines without the secrets of URLs, and control characters of names escaped."""
+    """Format log lines without the secrets of URLs and with control characters escaped."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line, or lines."""
+        """Format a record."""
         return "\n".join(map(printable, without_secrets(super().format(record)).split("\n")))
 
 
 def with_streams(program: Callable[[], int]) -> int:
-    """Run a program whose standard streams may be closed, full, or a pipe that nobody reads.
+    """Run a program whose standard streams may be closed, full, or a pipe without a reader.
 
     Returns:
-        the exit code of the program; 0 where the reader of its output (head, less) has seen enough
-        before it ended; 2 where the output cannot be written.
+        the exit code of the program; 0 if the reader of its output (head, less) ended first; 2 if
+        the output cannot be written.
     Raises:
-        SystemExit: of argparse, after --help and for wrong words.
+        SystemExit: of argparse, after --help and for invalid arguments.
     """
     _open_streams()
-    code, left = 0, None
+    code = 0
+    system_exit = None
     try:
         code = program()
     except BrokenPipeError:
         pass
     except SystemExit as error:
-        left = error
+        system_exit = error
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -84,28 +86,30 @@ def with_streams(program: Callable[[], int]) -> int:
         if not isinstance(error, BrokenPipeError):
             say(f"error: the output cannot be written ({error.strerror})")
             return 2
-    if left is not None:
-        raise left
+    if system_exit is not None:
+        raise system_exit
     return code
 
 
 def _open_streams() -> None:
-    """Open the standard streams that are closed; what they cannot encode is escaped."""
+    """Open closed standard streams; let all of them escape what they cannot encode."""
     for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
         try:
             os.fstat(number)
-        except OSError:  # closed: a file opened next would get its number, and C code's messages
+        except (
+            OSError
+        ):  # the next file that is opened would get its number: C code would print there
             while os.open(os.devnull, os.O_RDWR) < number:
                 pass
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "r+"))
-    for stream in (sys.stdout, sys.stderr):  # no name of a class or file ends a run
+    for stream in (sys.stdout, sys.stderr):  # an unusual name of a class or file must not end a run
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="backslashreplace")
 
 
 def say(text: str) -> None:
-    """Print a line on stderr, if anyone reads it."""
+    """Print a line on stderr; ignore a closed stderr."""
     try:
         print(text, file=sys.stderr, flush=True)
     except OSError:
@@ -113,10 +117,10 @@ def say(text: str) -> None:
 
 
 def _discard(stream: Any) -> None:
-    """Send what is left in a buffer nowhere, so that the interpreter's own flush succeeds."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, stream.fileno())
-    os.close(nowhere)
+    """Redirect a stream to the null device, so that the interpreter's last flush succeeds."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, stream.fileno())
+    os.close(null)
 
 
 class _ListOptions(argparse.Action):
@@ -128,7 +132,7 @@ class _ListOptions(argparse.Action):
 
 
 class _Completion(argparse.Action):
-    """--completion SHELL: print the script that completes the installed program's words, stop."""
+    """--completion SHELL: print the completion script of the installed program, then stop."""
 
     def __call__(self, parser: argparse.ArgumentParser, _: Any, shell: Any, *__: Any) -> None:
         try:
@@ -144,7 +148,7 @@ def make_parser(
     """Make the parser of the tool.
 
     Args:
-        config: with the default options. commands: function of each command. exports: formats.
+        config: default options. commands: function of each command. exports: formats of `export`.
     """
 
     def command(name: str, text: str, example: str, *sections: str) -> Any:
@@ -153,43 +157,47 @@ def make_parser(
 
     parser = Parser(
         prog="reobj_track.py",
-        description="Objects of a hand-held video of a static scene: which detections are the same "
-        "physical object, and where each one is in 3D.",
+        description="Re-identify object instances in a hand-held video of a static scene and "
+        "localise them in 3D.",
         epilog="Example: reobj_track.py run room.mp4 -o out; then open out/scene.html.",
     )
     parser.add_argument("--version", action="version", version=f"reobj_track {__version__}")
-    text = "list what --set section.field=value can set"
+    text = "list all options of --set section.field=value"
     parser.add_argument("--options", action=_ListOptions, nargs=0, const=config, help=text)
-    text = "print a script that completes the words of `reobj-track` (needs shtab)"
+    text = "print a shell completion script for `reobj-track` (needs shtab)"
     parser.add_argument("--completion", action=_Completion, choices=SHELLS, help=text)
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_run(command, "run", "video -> identities -> cameras -> ellipsoids -> files to look at")
+    _add_run(command, "run", "identities, cameras and 3D objects of a video, with files to view")
     _add_run(command, "track", "identities only (2D)")
     _add_run(command, "poses", "cameras only (pycolmap)")
-    text = "(re)fit the ellipsoids from what an output folder already holds, with its last options"
+    text = "fit the objects of an output folder again, by default with its last options"
     add = command("objects", text, "out --known-size chair=0.82m", "objects", "output")
     add("out", help="output folder of an earlier `run`")
-    text = "only check objects.json against its schema"
+    text = "only validate objects.json against its schema"
     add("--validate", action="store_true", help=text)
     add("--tracks", help=TRACKS_HELP)
-    add("--edits", help="corrections by hand, saved by scene.html; later fits keep them")
+    add("--edits", help="file of corrections, saved by scene.html; later fits apply it too")
     text = "compare with ground truth: HOTA, IDF1, MOTA, O3D ..."
     add = command("eval", text, "out --gt gt.txt")
     add("out", type=Path, help="output folder of an earlier `run`, or a tracks.txt")
-    add("--gt", type=Path, required=True, help="true tracks, MOTChallenge gt.txt")
-    add("--gt-objects", type=Path, help="true solids, e.g. a gt_objects.json")
+    add("--gt", type=Path, required=True,
+        help="true tracks: MOTChallenge gt.txt, KITTI, CVAT or COCO-VID")  # fmt: skip
+    add("--gt-objects", type=Path, help="true 3D objects, e.g. gt_objects.json")
     add("--gt-poses", type=Path, help="true cameras, TUM or 4x4 world_from_cam a line (default: "
         "poses.txt or poses_c2w.txt beside --gt-objects)")  # fmt: skip
-    add("--classes", default="", help="score these classes only, comma-separated")
-    add("--min-visibility", type=float, default=0.0, help="ignore truth that is less visible")
-    text = "write what an output folder holds in another tool's format"
+    add("--classes", default="", help="evaluate these classes only, comma-separated")
+    add("--min-visibility", type=float, default=0.0,
+        help="ignore true boxes of lower visibility (0 to 1)")  # fmt: skip
+    text = "convert the results of an output folder to the format of another tool"
     add = command("export", text, "out --to glb")
     add("out", help="output folder of an earlier `run`")
-    add("--to", required=True, choices=exports, help="the format")
+    add("--to", required=True, choices=exports, help="format to write")
     add("-o", "--output", help="file to write (default: in the output folder)")
     text = "list, download and verify weights"
     add = command("models", text, "fast", "")
-    add("names", nargs="*", metavar="NAME", help="weights to download or verify; none: list all")
+    add(
+        "names", nargs="*", metavar="NAME", help="weights to download or verify (default: list all)"
+    )
     return parser
 
 
@@ -200,14 +208,22 @@ def _add_run(command: Any, name: str, text: str) -> None:
         "poses": ("input", "poses", ""),
     }[name]
     add = command(name, text, "room.mp4 -o out", *sections)
-    text = "video file, folder of images, glob in quotes, camera index, stream URL (`run`: or none)"
+    text = "video file, folder of images, quoted glob, camera index or stream URL"
+    if name == "run":
+        text += "; none: no images, only --detections and --poses"
     add("video", nargs="?" if name == "run" else None, help=text)
     add("-o", "--out", required=True, help="output folder")
-    add("--overwrite", action="store_true", help="write into a folder that holds something else")
+    add(
+        "--overwrite",
+        action="store_true",
+        help="use a folder that holds other files or results of another video",
+    )
     if name != "poses":
         add("--detections", help=DETECTIONS_HELP)
         add("--tracks", help=TRACKS_HELP)
-        add("--show", action="store_true", help="follow it live in rerun's viewer (needs rerun)")
+        add(
+            "--show", action="store_true", help="show progress live in rerun's viewer (needs rerun)"
+        )
 
 
 def add_command(
@@ -219,10 +235,10 @@ def add_command(
     config: Any,
     *sections: str,
 ) -> argparse.ArgumentParser:
-    """Add a command with the flags of some sections of a config, --set, and the log options.
+    """Add a command with the flags of sections of a config, --set, and the log options.
 
     Args:
-        example: of its use, without the program's name.
+        example: arguments of a typical call.
     """
     parser: argparse.ArgumentParser = sub.add_parser(
         name,
@@ -235,34 +251,35 @@ def add_command(
     if any(sections):
         add("--config", metavar="FILE", help="options from a TOML file; flags override it")
         add("--save-config", metavar="FILE", help="write the options of this run, for --config")
-    more = "any other option, e.g. tracker.coast_frames=60; --options lists them"
-    add("--set", action="append", metavar="SECTION.FIELD=VALUE", help=more)
-    add("-v", "--verbose", action="store_true", help="say what is being done")
-    add("--debug", action="store_true", help="say more, and show tracebacks")
+    text = "set any option, e.g. tracker.coast_frames=60; --options lists them"
+    add("--set", action="append", metavar="SECTION.FIELD=VALUE", help=text)
+    add("-v", "--verbose", action="store_true", help="log each step")
+    add("--debug", action="store_true", help="log details, and tracebacks of errors")
     parser.set_defaults(func=func, config=None, save_config=None)
     return parser
 
 
 def short_help(parser: argparse.ArgumentParser, words: Sequence[str]) -> str | None:
-    """Return a few lines for a bare program or a bare command that needs arguments, else None."""
+    """Return short help for a call without arguments that needs some, else None."""
     commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     if not words:
         names = [f"  {a.dest:<10}{a.help}" for a in commands._choices_actions]
         lines = [str(parser.description), "", *names, "", str(parser.epilog)]
     elif len(words) == 1 and words[0] in commands.choices:
-        own = commands.choices[words[0]]
-        if not any(a.required and a.nargs != "*" for a in own._actions):
+        command = commands.choices[words[0]]
+        if not any(a.required and a.nargs != "*" for a in command._actions):
             return None
-        lines = [str(own.description), str(own.epilog), f"All flags: {own.prog} --help"]
+        lines = [str(command.description), str(command.epilog)]
+        lines.append(f"All flags: {command.prog} --help")
     else:
         return None
     return "\n".join(piece for line in lines for piece in wrapped(line) or [""])
 
 
 def completion(parser: argparse.ArgumentParser, shell: str) -> str:
-    """Return a completion script, made by shtab.
+    """Return a completion script of shtab.
 
-    shtab and not argcomplete: its script is static, so that a Tab does not start Python and import
+    Not of argcomplete: shtab's script is static, so completion does not start Python and import
     OpenCV.
     """
     try:

@@ -1,7 +1,4 @@
-"""Files that are written whole or not at all, text, JSON and npz; progress; text for messages.
-
-What a file means is the business of the rooms that read and write it.
-"""
+"""Atomic files, locks, text, JSON and npz; progress; text for messages."""
 
 from __future__ import annotations
 
@@ -35,10 +32,10 @@ T = TypeVar("T")
 def atomic(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces it at the end of the `with` block.
 
-    An exception in the block leaves `path` as it was, and nothing beside it.
+    An exception in the block leaves `path` unchanged and removes the temporary file.
 
     Raises:
-        ReobjError: the disk is full, may not be written, or fails: where, why and what to do.
+        ReobjError: a disk error (DISK_ERRORS): where, why and what to do.
     """
     part = path.with_name(f".part-{path.name}")
     with writing(path), _folder(path.parent):
@@ -52,7 +49,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _folder(path: Path) -> Iterator[None]:
-    """Make a folder; those that were not there are removed again if the block fails."""
+    """Make a folder and its parents; new ones are removed again if the block fails."""
     new = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
     try:
@@ -64,7 +61,7 @@ def _folder(path: Path) -> Iterator[None]:
         raise
 
 
-DISK_ERRORS = {
+DISK_ERRORS = {  # what to do about each
     errno.ENOSPC: "make room on this disk",
     errno.EDQUOT: "make room: your quota is used up",
     errno.EFBIG: "choose a folder on a file system that takes larger files",
@@ -74,17 +71,17 @@ DISK_ERRORS = {
     errno.EEXIST: "a file stands where a folder should be: move it away",
     errno.ENOTDIR: "a file stands where a folder should be: move it away",
     errno.EISDIR: "a folder stands where a file should be: move it away",
-    errno.EIO: "look at the disk: it fails",
-}  # what to do about them
-NUMPY_FULL = re.compile(r"\d+ requested and \d+ written")  # its error without a number
+    errno.EIO: "disk I/O error: check the disk",
+}
+NUMPY_FULL = re.compile(r"\d+ requested and \d+ written")  # numpy's message, without an errno
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Say where and what to do if the disk is why the block cannot write `path`.
+    """Convert disk errors of the block that writes `path` to errors that say what to do.
 
     Raises:
-        ReobjError: for errors of DISK_ERRORS; others, and those of files elsewhere, pass.
+        ReobjError: for DISK_ERRORS. Other errors, and those of files in other folders, pass.
     """
     try:
         yield
@@ -94,17 +91,18 @@ def writing(path: Path) -> Iterator[None]:
         beside = named.is_relative_to(path.parent) or path.is_relative_to(named)
         if number not in DISK_ERRORS or not beside:
             raise
-        why, advice = os.strerror(number), DISK_ERRORS[number]
+        why = os.strerror(number)
+        advice = DISK_ERRORS[number]
         shown = Path(*(name for name in path.parts if name != PART_RESULTS))
         raise ReobjError(f"{shown}: cannot be written ({why}); {advice}, then run again") from error
 
 
 @contextlib.contextmanager
 def locked(path: Path, wait_s: float = 0.0) -> Iterator[None]:
-    """Hold the lock of a file, which the system frees when the process ends, however it ends.
+    """Hold the lock of a file; the system releases it when the process ends, even if killed.
 
     Args:
-        wait_s: for another process that holds it.
+        wait_s: longest time to wait for another process that holds it.
     Raises:
         LockedError: another process, or this one, still holds it.
     """
@@ -124,11 +122,11 @@ class LockedError(ReobjError):
     """A lock is held by another process."""
 
 
-LOCK_POLL_S = 0.05  # chosen: soon enough for a person
+LOCK_POLL_S = 0.05  # s between attempts; chosen: a person does not notice the delay
 
 
 def _lock(handle: int) -> bool:
-    """Take the lock of an open file; False if it is held, True too where there are no locks."""
+    """Take the lock of an open file; False if it is held; True where the system has no locks."""
     try:
         _take_lock(handle)
     except OSError as error:
@@ -140,7 +138,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def _take_lock(handle: int) -> None:
-        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # the first byte, whether it is there or not
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # the first byte, also of an empty file
 else:
     import fcntl
 
@@ -158,14 +156,13 @@ PART_RESULTS = ".part-results"
 def staged(folder: Path, name: str = PART_RESULTS) -> Iterator[Path]:
     """Yield an empty folder whose files replace those of `folder` at the end of the block.
 
-    All of them are there before the first one is replaced: an exception in the block leaves
-    `folder` as it was, and so does a folder where a file belongs. Files that were not made anew
-    stay.
+    All new files are complete before the first one is replaced: an exception in the block leaves
+    `folder` unchanged, and so does a folder in the place of a file. Other files stay.
 
     Args:
         name: of the empty folder, in `folder`.
     Raises:
-        ReobjError: as `check_places`, or the disk is why it cannot be written.
+        ReobjError: as `check_places`, or a disk error.
     """
     part = folder / name
     with writing(folder), _folder(folder):
@@ -173,9 +170,9 @@ def staged(folder: Path, name: str = PART_RESULTS) -> Iterator[Path]:
         part.mkdir()
         try:
             yield part
-            made = [p.relative_to(part) for p in sorted(part.rglob("*")) if p.is_file()]
-            check_places(folder, made)
-            for file in made:
+            files = [p.relative_to(part) for p in sorted(part.rglob("*")) if p.is_file()]
+            check_places(folder, files)
+            for file in files:
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 (part / file).replace(folder / file)
         finally:
@@ -183,26 +180,26 @@ def staged(folder: Path, name: str = PART_RESULTS) -> Iterator[Path]:
 
 
 def check_places(folder: Path, names: Iterable[str | Path]) -> None:
-    """Refuse files (paths within a folder) that cannot be replaced by new ones of that name.
+    """Refuse files (paths within a folder) that cannot be written or replaced.
 
     Raises:
-        ReobjError: a folder is where a file belongs, something else where a folder belongs, or a
-            folder may not be written into.
+        ReobjError: the path of a file is a folder, that of a folder is none, or a folder is not
+            writable.
     """
     for name in map(Path, names):
         for path in (folder / parent for parent in name.parents):
             if os.path.lexists(path) and not path.is_dir():
                 raise ReobjError(f"{path}: is no folder, but one is written here; move it away")
             if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
-                what = "is not writable, but results are written here; allow it (chmod u+w)"
-                raise ReobjError(f"{path}: {what}")
+                fault = "is not writable, but results are written here; allow it (chmod u+w)"
+                raise ReobjError(f"{path}: {fault}")
         if (path := folder / name).is_dir() and not path.is_symlink():
             raise ReobjError(f"{path}: is a folder, but a file is written here; move it away")
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file is on the disk: renamed before, a power cut leaves it empty."""
-    with contextlib.suppress(OSError):  # a folder, or a file system that has no such thing
+    """Flush a file to the disk: a power cut after a rename could otherwise leave it empty."""
+    with contextlib.suppress(OSError):  # a folder, or a file system without fsync
         handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -211,7 +208,7 @@ def _sync(path: Path) -> None:
 
 
 def part_path(path: Path, part: int) -> Path:
-    """Name the file or folder of one part of the cameras' path: that of part 0 is `path` itself.
+    """Name the file or folder of one component of the trajectory; that of component 0 is `path`.
 
     >>> part_path(Path("poses.txt"), 2).name
     'poses_part2.txt'
@@ -220,23 +217,23 @@ def part_path(path: Path, part: int) -> Path:
 
 
 def part_paths(path: Path) -> list[Path]:
-    """List what is there of `part_path` for all parts but part 0."""
+    """List the existing files or folders of `part_path`, without that of component 0."""
     return sorted(path.parent.glob(f"{path.stem}_part[0-9]*{path.suffix}"))
 
 
 TEXT_MAX = 1 << 28  # characters of a file; chosen: a million detections with masks have 2e8
-LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame; 2 GB once read
+LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame, 2 GB of memory
 LINE_MAX = 1 << 22  # characters; chosen: the observations of 100,000 points in COLMAP's text
-OTHER_BREAKS = "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"  # where str.splitlines breaks lines too
-JSON_MAX = 1 << 31  # bytes once read; chosen: two million detections with masks
-JSON_BYTES = {"{": 200, "[": 64, ",": 64}  # that what follows takes, about (sys.getsizeof)
+OTHER_BREAKS = "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"  # further line breaks of str.splitlines
+JSON_MAX = 1 << 31  # bytes of memory; chosen: two million detections with masks
+JSON_BYTES = {"{": 200, "[": 64, ",": 64}  # bytes of memory per sign, about (sys.getsizeof)
 NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
 
 
 def read_text(path: Path, most: int | None = None, errors: str = "strict") -> str:
     """Read a UTF-8 file, with or without a byte order mark.
 
-    most: characters that it may have; default: TEXT_MAX. errors: as in `open`.
+    most: largest number of characters; default: TEXT_MAX. errors: as in `open`.
     """
     most = most or TEXT_MAX
     try:
@@ -255,43 +252,43 @@ def read_lines(path: Path) -> list[str]:
     count = text.count("\n") + sum(map(text.count, OTHER_BREAKS))
     if count > LINES_MAX:
         raise ReobjError(
-            f"{path}: {count} lines, at most {LINES_MAX} are taken; cut it into pieces"
+            f"{path}: {count} lines, at most {LINES_MAX} are allowed; cut it into pieces"
         )
     lines = text.splitlines(keepends=True)
     if lines and (longest := max(map(len, lines))) > LINE_MAX:
-        raise ReobjError(f"{path}: a line of {longest} characters, at most {LINE_MAX} are taken")
+        raise ReobjError(f"{path}: a line of {longest} characters, at most {LINE_MAX} are allowed")
     return lines
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file that takes at most JSON_MAX bytes then; an error names the line."""
+    """Read a JSON file of at most JSON_MAX bytes in memory; an error names the line."""
     text = read_text(path)
     if (size := sum(text.count(sign) * each for sign, each in JSON_BYTES.items())) > JSON_MAX:
-        taken = f"would take {size >> 20} MB of memory, at most {JSON_MAX >> 20} MB are taken"
-        raise ReobjError(f"{path}: {taken}; cut it into pieces")
-    if found := re.search(r"\d{309}", text):
-        line = text.count("\n", 0, found.start()) + 1
+        memory = f"would take {size >> 20} MB of memory, at most {JSON_MAX >> 20} MB are allowed"
+        raise ReobjError(f"{path}: {memory}; cut it into pieces")
+    if digits := re.search(r"\d{309}", text):
+        line = text.count("\n", 0, digits.start()) + 1
         raise ReobjError(f"{path}, line {line}: a number of more than 308 digits")
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise ReobjError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from error
     except (RecursionError, ValueError) as error:  # nested too deep
-        raise ReobjError(f"{path}: no JSON that can be meant ({error})") from error
+        raise ReobjError(f"{path}: invalid JSON ({error})") from error
 
 
 def check_unpacked(size: int, most: int) -> None:
-    """Refuse what is packed before it takes memory: a small zip may hold gigabytes."""
+    """Refuse archives by their unpacked size, before they take memory: zip bombs."""
     if size > most:
-        raise ReobjError(f"unpacks to {size >> 20} MB, at most {most >> 20} MB are taken")
+        raise ReobjError(f"unpacks to {size >> 20} MB, at most {most >> 20} MB are allowed")
 
 
 def save_npz(path: Path, arrays: Mapping[str, Any], **metadata: Any) -> None:
     """Write arrays, and metadata as JSON, to a compressed npz file; same input, same bytes."""
-    own: dict[str, Any] = {name: np.asarray(values) for name, values in arrays.items()}
-    metadata = metadata | {"digest": _digest(own, metadata)}
+    content: dict[str, Any] = {name: np.asarray(values) for name, values in arrays.items()}
+    metadata = metadata | {"digest": _digest(content, metadata)}
     with atomic(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, **own, metadata=np.array(json.dumps(metadata)))
+        np.savez_compressed(file, **content, metadata=np.array(json.dumps(metadata)))
 
 
 def _digest(arrays: Mapping[str, Any], metadata: Mapping[str, Any]) -> str:
@@ -308,11 +305,12 @@ def load_npz(path: Path, sealed: bool = False) -> tuple[dict[str, Any], dict[str
     """Read a file that `save_npz` wrote, or any npz file without pickled objects.
 
     Args:
-        sealed: refuse one that is not as `save_npz` wrote it: what is in it is then not checked.
+        sealed: refuse a file whose digest differs from that of `save_npz`; callers then need no
+            checks of the content.
     Returns:
         the arrays, and the metadata ({} if the file has none).
     Raises:
-        ReobjError: damaged, no npz file, or of more than NPZ_MAX bytes.
+        ReobjError: damaged, no npz file, or larger than NPZ_MAX bytes.
     """
     try:
         with zipfile.ZipFile(path) as file:
@@ -323,44 +321,46 @@ def load_npz(path: Path, sealed: bool = False) -> tuple[dict[str, Any], dict[str
         metadata: dict[str, Any] = dict(json.loads(str(text)))
         digest = metadata.pop("digest", "")
         if sealed and digest != _digest(arrays, metadata):
-            raise ValueError("its content is not what was written")
-    except Exception as error:  # zip, zlib and numpy each have their own for damaged files
+            raise ValueError("the content does not match its digest")
+    except Exception as error:  # zip, zlib and numpy have their own exceptions for damaged files
         raise ReobjError(f"{path}: damaged, or no npz file ({error})") from error
     return arrays, metadata
 
 
 def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
-    """Read a file of the cache; None where there is none, or a damaged one: said, and removed."""
+    """Read a file of the cache; None where it is missing or damaged (then it is removed)."""
     if not path.exists():
         return None
     try:
         return read(path)
     except (ReobjError, OSError) as error:
-        log.warning("%s; computed again", error)
+        log.warning("%s; it is removed and computed again", error)
         if path.is_dir():
             shutil.rmtree(path)
         path.unlink(missing_ok=True)
         return None
 
 
-REDRAW_S = 0.1  # chosen: as often as an eye follows, too seldom to cost time
-WINDOW_S = 5.0  # of the past that the rate is measured in (chosen: what is slow now is seen now)
+REDRAW_S = 0.1  # s between updates; chosen: readable, and rare enough to cost no time
+WINDOW_S = 5.0  # s, period of which the rate is the mean; chosen: changes show soon
 
 
 class Progress:
-    """Show one line a stage on stderr with rate and time left, if stderr is a terminal.
+    """Show one progress line a stage on stderr with rate and time left, if stderr is a terminal.
 
-    Used in a `with` block: left without an exception, the stage is complete, whatever the total
-    was thought to be.
+    Used in a `with` block: the stage is complete if the block ends without an exception, whatever
+    the expected total was.
 
     Attributes:
         done, total: steps so far and in all (0: unknown).
     """
 
     def __init__(self, stage: str, total: int = 0) -> None:
-        self.stage, self.total, self.done = stage, total, 0
+        self.stage = stage
+        self.total = total
+        self.done = 0
         self.started = self.shown = time.monotonic()
-        self.marks = [(self.started, 0)]  # time and steps, of the last WINDOW_S
+        self.marks = [(self.started, 0)]  # time and number of steps, within the last WINDOW_S
         self.enabled = sys.stderr is not None and sys.stderr.isatty()
 
     def __enter__(self) -> Progress:
@@ -390,33 +390,34 @@ class Progress:
         self._write(text + (f", {rate:.1f}/s" if rate else ""))
 
     def _write(self, text: str) -> None:
-        sys.stderr.write(f"\r{self.stage:<10}{text}\x1b[K")  # erase what a longer line left behind
+        sys.stderr.write(f"\r{self.stage:<10}{text}\x1b[K")  # erases the rest of a longer line
         sys.stderr.flush()
 
     def close(self, complete: bool = True) -> float:
-        """Finish the line, at 100 % if the stage is complete; returns the seconds since the start.
+        """Finish the line, at 100 % if the stage is complete, with the mean rate of the stage.
 
-        The rate shown then is that of the whole stage.
+        Returns:
+            seconds since the start.
         """
         seconds = time.monotonic() - self.started
         if self.enabled:
             text = ""
             if self.done:
-                share = f"/{self.done} 100 %" if complete else f"/{self.total}" * (self.total > 0)
-                text = f"{self.done}{share}, "
+                total = f"/{self.done} 100 %" if complete else f"/{self.total}" * (self.total > 0)
+                text = f"{self.done}{total}, "
             text += f"{seconds:.1f} s" + ("" if complete else ", not finished")
-            if self.done and seconds > REDRAW_S:  # what came from the cache has no rate
+            if self.done and seconds > REDRAW_S:  # the rate of a cached stage means nothing
                 text += f", {self.done / seconds:.1f}/s"
             self._write(text)
             sys.stderr.write("\n")
         return seconds
 
 
-WORD_MAX = 100  # characters that are compared; chosen: our words are shorter, the time is quadratic
+WORD_MAX = 100  # characters that are compared, in quadratic time; chosen: our words are shorter
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Name the known word that a wrong one is most like, for messages; "" if none is.
+    """Suggest the known word most similar to a wrong one, for messages; "" if none is similar.
 
     >>> did_you_mean("chiar", ["cup", "chair"])
     '; did you mean chair?'
@@ -426,7 +427,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def shortened(items: Sequence[Any]) -> str:
-    """Write the first five items, for messages.
+    """Format the first five items, for messages.
 
     >>> shortened([1, 2, 3, 4, 5, 6])
     '1, 2, 3, 4, 5, ...'
@@ -443,39 +444,39 @@ def cut(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-PRINT_WIDTH = 100  # columns of what is printed
+PRINT_WIDTH = 100  # columns of printed text
 
 
 def wrapped(text: str) -> list[str]:
-    """Wrap a line for the terminal; what follows is indented."""
+    """Wrap a line for the terminal; continuation lines are indented."""
     return textwrap.wrap(text, PRINT_WIDTH, subsequent_indent="  ", break_long_words=False)
 
 
 def spans(numbers: Iterable[int], step: int = 1) -> str:
-    """Write ascending numbers as spans of those at most `step` apart, for messages.
+    """Format ascending numbers as ranges of numbers at most `step` apart, for messages.
 
     >>> spans([3, 4, 5, 9])
     '3-5, 9'
     """
-    found: list[list[int]] = []
+    ranges: list[list[int]] = []
     for n in numbers:
-        if found and n - found[-1][1] <= step:
-            found[-1][1] = n
+        if ranges and n - ranges[-1][1] <= step:
+            ranges[-1][1] = n
         else:
-            found.append([n, n])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in found)
+            ranges.append([n, n])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in ranges)
 
 
 def rounded(value: float | None, digits: int) -> float | None:
-    """Round for JSON, which has no NaN and no infinity: these become None."""
+    """Round for JSON; NaN and infinity, which JSON lacks, become None."""
     return None if value is None or not math.isfinite(value) else round(float(value), digits)
 
 
 def decimals(sigma: float) -> int:
-    """Return how many decimals a value of standard deviation `sigma` is worth.
+    """Return the number of decimals to print of a value of standard deviation `sigma`.
 
-    The last digit is worth a sigma at most and more than a tenth of it: the error of rounding makes
-    the sigma 4 % larger at most (1 / 12 in variance). The page's `decimals` is the same.
+    The step of the last decimal lies between a tenth of sigma and sigma: rounding increases the
+    sigma by at most 4 % (1 / 12 in variance). The viewer's `decimals` (data.js) is the same.
 
     >>> decimals(0.2), decimals(0.046), decimals(0.009), decimals(30)
     (1, 2, 3, 0)
@@ -484,9 +485,9 @@ def decimals(sigma: float) -> int:
 
 
 def texts_with_sigma(values: Array, sigma: Array | None) -> list[tuple[str, ...]]:
-    """Write values (N,) and their sigmas with the decimals that the best known of them is worth.
+    """Format values (N,) and their sigmas with the decimals of the smallest sigma.
 
-    Without sigmas the values alone, in three digits.
+    Without sigmas: the values in three digits.
 
     >>> texts_with_sigma(np.array([0.444, 0.5]), np.array([0.05, 0.2]))
     [('0.44', '0.05'), ('0.50', '0.20')]
@@ -498,23 +499,23 @@ def texts_with_sigma(values: Array, sigma: Array | None) -> list[tuple[str, ...]
 
 
 def numbers(values: Array, size: float = math.inf) -> list[float]:
-    """Round to six significant digits, for JSON: far below any accuracy, and stable text.
+    """Round to six significant digits, for JSON: below any accuracy, and reproducible text.
 
     Args:
-        size: of what lies at these coordinates; they are rounded to a millionth of it where that is
-            finer: those of a map projection have seven digits before the point.
+        size: of the object at these coordinates; they are rounded to a millionth of it where that
+            is finer (map projections have seven digits before the point).
 
     >>> numbers(np.array([5400000.1234567, 0.00012345678]), 0.9)
     [5400000.123457, 0.000123457]
     """
-    kept = [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
+    digits = [float(f"{v:.6g}") for v in np.asarray(values).ravel()]
     if not 0 < size < math.inf:
-        return kept
+        return digits
     fine = [round(float(v), 6 - math.ceil(math.log10(size))) for v in np.asarray(values).ravel()]
-    pairs = zip(np.asarray(values).ravel(), kept, fine, strict=True)
+    pairs = zip(np.asarray(values).ravel(), digits, fine, strict=True)
     return [min(a, b, key=lambda text: abs(text - v)) for v, a, b in pairs]
 
 
 def base64_text(values: npt.NDArray[Any], kind: str) -> str:
-    """Encode an array's bytes, C order, as the dtype `kind` ("<f4"), for pages with scripts."""
+    """Encode an array's bytes, C order, as the dtype `kind` ("<f4"), in base64 for HTML pages."""
     return base64.b64encode(np.asarray(values, kind).tobytes()).decode()

@@ -1,4 +1,4 @@
-"""Options: fields of config dataclasses, set by flags, --set section.field=value, TOML files."""
+"""Options: fields of the config dataclasses; set by flags, --set section.field=value and TOML."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def every_option(config: Any) -> dict[str, dataclasses.Field[Any]]:
     """List the options of a config by their name for --set: `section.field`, or `field`."""
     options: dict[str, dataclasses.Field[Any]] = {}
     for f in dataclasses.fields(config):
-        own = getattr(config, f.name)
-        if dataclasses.is_dataclass(own):
-            options |= {f"{f.name}.{g.name}": g for g in dataclasses.fields(own)}
+        section = getattr(config, f.name)
+        if dataclasses.is_dataclass(section):
+            options |= {f"{f.name}.{g.name}": g for g in dataclasses.fields(section)}
         else:
             options[f.name] = f
     return options
@@ -42,17 +42,19 @@ def value_of(config: Any, name: str) -> Any:
 
 
 def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
-    """Return the config with one option changed; a text is converted to the option's type.
+    """Return the config with one option changed; a string is converted to the option's type.
 
     Args:
-        where: begins the message of an error.
+        where: source of the option; begins the message of an error.
     Raises:
-        ReobjError: no such option, or the value is none of its type.
+        ReobjError: no such option, or a value of another type.
     """
     options: Any = every_option(config)
     if name not in options:
-        raise ReobjError(f"{where}{name}: no such option; did you mean {_likest(name, options)}?")
-    kind, in_range = type(options[name].default), ""
+        similar = _most_similar(name, options)
+        raise ReobjError(f"{where}{name}: no such option; did you mean {similar}?")
+    kind = type(options[name].default)
+    in_range = ""
     try:
         if isinstance(value, str) and kind is bool:
             value = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False,
@@ -76,29 +78,29 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
     return changed  # type: ignore[no-any-return]
 
 
-def _likest(name: str, options: Iterable[str]) -> str:
-    """Name the option most like a wrong one: as a whole, or its field, or a word of its field."""
+def _most_similar(name: str, options: Iterable[str]) -> str:
+    """Find the option most similar to a wrong name: as a whole, by its field or a word of it."""
     name = name[:WORD_MAX]
 
-    def likeness(option: str) -> float:
+    def similarity(option: str) -> float:
         field_name = option.rpartition(".")[2]
         words = (option, field_name, *field_name.split("_"))
         return max(difflib.SequenceMatcher(None, name, word).ratio() for word in words)
 
-    return max(options, key=likeness)
+    return max(options, key=similarity)
 
 
 # ---- Files of options ----
 
 
-CONFIG_MAX = 1 << 20  # characters; chosen: a thousand times what all options take
+CONFIG_MAX = 1 << 20  # characters of a file; chosen: a thousand times the length of all options
 
 
 def read_config(config: C, path: str | Path) -> C:
-    """Apply a TOML file of options, by section; paths in it are those of the working folder.
+    """Apply a TOML file of options, by section; its paths are relative to the working folder.
 
     Raises:
-        ReobjError: no TOML, no such option, or a value that is none of its type.
+        ReobjError: invalid TOML, no such option, or a value of another type.
     """
     path = Path(path)
     try:
@@ -107,24 +109,26 @@ def read_config(config: C, path: str | Path) -> C:
         raise ReobjError(f"{path}: not valid TOML ({error})") from None
     for key, value in table.items():
         inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else None
-        for name, own in (inner if inner is not None else {key: value}).items():
-            own = _with_bytes(own) if isinstance(own, str) else own
-            config = with_option(config, name, own, f"{path}: ")
+        for name, setting in (inner if inner is not None else {key: value}).items():
+            setting = _with_bytes(setting) if isinstance(setting, str) else setting
+            config = with_option(config, name, setting, f"{path}: ")
     return config
 
 
 def write_config(config: Any, path: str | Path) -> None:
     """Write the options that differ from the defaults as TOML, for `read_config`.
 
-    By hand: a table of plain values in flat sections needs no package, and Python has no writer.
+    Written by hand: Python has no TOML writer, and flat sections of plain values need no package.
     """
-    default, lines, sections = type(config)(), [], ""
+    default = type(config)()
+    lines = []
+    sections = ""
     changed = {
         name: value
         for name in every_option(config)
         if (value := value_of(config, name)) != value_of(default, name)
     }
-    for name in sorted(changed, key=lambda name: "." in name):  # those of no section come first
+    for name in sorted(changed, key=lambda name: "." in name):  # options without a section first
         section, _, field_name = name.rpartition(".")
         lines += [f"\n[{section}]"] if section != sections else []
         lines.append(f"{field_name} = {_toml(changed[name])}")
@@ -135,9 +139,9 @@ def write_config(config: Any, path: str | Path) -> None:
 
 
 def _toml(value: str | float) -> str:
-    """Write a value: a text as JSON has it, but DEL escaped too; numbers as Python has them.
+    """Format a value: strings as in JSON, with DEL escaped too; numbers as in Python.
 
-    Paths are bytes: one that is no UTF-8 stands as \\udc80 to \\udcff, as Python names it.
+    Bytes of paths that are not UTF-8 are written as \\udc80 to \\udcff, Python's surrogate escapes.
     """
     if isinstance(value, str):
         value = re.sub("[\udc80-\udcff]", lambda byte: f"\\udc{ord(byte[0]) & 255:02x}", value)
@@ -146,7 +150,7 @@ def _toml(value: str | float) -> str:
 
 
 def _with_bytes(text: str) -> str:
-    """Put the bytes that `_toml` names back into a text."""
+    """Convert the escaped bytes of `_toml` back."""
     return re.sub(r"\\udc([89a-f][0-9a-f])", lambda byte: chr(0xDC00 + int(byte[1], 16)), text)
 
 
@@ -154,26 +158,26 @@ def _with_bytes(text: str) -> str:
 
 
 def add_flags(parser: argparse.ArgumentParser, config: Any, sections: Iterable[str]) -> None:
-    """Add the flags that the options of some sections declare ("" for those of the top level)."""
+    """Add the flags of the options in the given sections ("": top level) to a parser."""
     chosen = set(sections)
     for name, f in every_option(config).items():
         section = name.rpartition(".")[0]
         flag = f.metadata["flag"]
         if flag and section in chosen:
             kind: Any = type(f.default)
-            how: dict[str, Any] = {"type": kind, "metavar": kind.__name__.upper()}
+            settings: dict[str, Any] = {"type": kind, "metavar": kind.__name__.upper()}
             if kind is bool:
-                how = {"action": "store_true"}
+                settings = {"action": "store_true"}
             default = f" (default: {f.default})" if f.default else ""
             text = f"{f.metadata['help']}{default}".replace("%", "%%")
             flags = filter(None, (flag, f.metadata["old_flag"]))
-            parser.add_argument(*flags, dest=name, default=None, help=text, **how)
+            parser.add_argument(*flags, dest=name, default=None, help=text, **settings)
 
 
 def config_from_args(config: C, args: argparse.Namespace) -> C:
-    """Apply --config FILE, then the flags that were given, then every --set section.field=value.
+    """Apply --config FILE, then the flags, then every --set section.field=value.
 
-    The result is written to --save-config FILE.
+    The result is written to --save-config FILE, if given.
     """
     options: Any = every_option(config)
     if args.config:
@@ -189,11 +193,12 @@ def config_from_args(config: C, args: argparse.Namespace) -> C:
     return config
 
 
-NAME_WIDTH, LINE_WIDTH = 32, 120  # columns of the list of options
+NAME_WIDTH = 32  # columns of the names in the list of options
+LINE_WIDTH = 120  # columns of the list
 
 
 def list_options(config: Any) -> str:
-    """Return the list of all options, one below the other: name, default and meaning."""
+    """Return the list of all options, one a line: name, default and meaning."""
     lines = []
     for name, f in every_option(config).items():
         default = str(f.default) if len(str(f.default)) < 12 else f"{str(f.default)[:9]}..."

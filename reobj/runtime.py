@@ -1,4 +1,4 @@
-"""Packages that are used here: their versions; OpenCV's log, and its threads in a fork."""
+"""Versions of the required packages; OpenCV's log, and its threads in forked processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import cv2
 
 from reobj.types import ReobjError
 
-# The lower bounds of pyproject.toml; the tests run with them too (.ci/lowest.txt).
+# Lower bounds, as in pyproject.toml; the tests also run with them (.ci/lowest.txt).
 LEAST_VERSIONS = {
     "opencv-python-headless": "4.10",
     "numpy": "1.26.4",
@@ -26,39 +26,40 @@ LEAST_VERSIONS = {
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Read 4.10.0 of "4.10.0-dev" as (4, 10, 0)."""
-    found = re.match(r"\d+(\.\d+)*", version)
-    return tuple(map(int, found[0].split("."))) if found else ()
+    """Parse the leading numbers of a version: "4.10.0-dev" is (4, 10, 0)."""
+    match = re.match(r"\d+(\.\d+)*", version)
+    return tuple(map(int, match[0].split("."))) if match else ()
 
 
 @functools.cache
 def check_versions() -> None:
-    """Check the versions of what is installed.
+    """Check the versions of the installed packages.
 
-    OpenCV says its own: other packages of it (opencv-python) write into the same folder, and pip
-    does not know which one came last. What has no entry of the package manager is not checked.
+    OpenCV's version is that of the module: its other distributions (opencv-python) write into the
+    same folder, and pip's metadata do not show which was installed last. Packages without metadata
+    are not checked.
 
     Raises:
-        ReobjError: the first that is too old.
+        ReobjError: a package is too old.
     """
     for package, least in LEAST_VERSIONS.items():
-        found = cv2.__version__
+        installed = cv2.__version__
         if package != "opencv-python-headless":
             try:
-                found = importlib.metadata.version(package)
+                installed = importlib.metadata.version(package)
             except importlib.metadata.PackageNotFoundError:
                 continue
-        if _numbers(found) < _numbers(least):
+        if _numbers(installed) < _numbers(least):
             name = "OpenCV" if package.startswith("opencv") else package
             force = " --force-reinstall" if name == "OpenCV" else ""
-            raise ReobjError(f"{name} {found} is installed, {least} or later is needed: "
+            raise ReobjError(f"{name} {installed} is installed, {least} or later is needed: "
                              f'pip install{force} "{package}>={least}"')  # fmt: skip
 
 
 @contextlib.contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's remarks off stderr: they name no file, our errors do."""
-    log: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 5 and 4
+    """Silence OpenCV's log on stderr: unlike our errors it names no file."""
+    log: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 5, 4
     before = log.setLogLevel(0)
     try:
         yield
@@ -82,8 +83,8 @@ def _allow_threads() -> None:
 def guard_forks() -> None:
     """End OpenCV's threads before this process is forked; they start again when needed.
 
-    The pool of threads does not exist in the forked process, and OpenCV waits for it there, also
-    when the number of threads is changed: it must end before the fork.
+    A forked process does not have the thread pool, but OpenCV waits for it there, also when the
+    number of threads is changed.
     """
     if hasattr(os, "register_at_fork"):  # not on Windows
         os.register_at_fork(

@@ -1,4 +1,4 @@
-"""Shapes that flow through the tool: frames, detections, embeddings, tracks; boxes; errors."""
+"""Data types of the tool: frames, detections, embeddings, tracks; box geometry; errors."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ log = logging.getLogger("reobj_track")
 
 
 class ReobjError(ValueError):
-    """A mistake in the input: says what, where, what was expected and what to do (exit code 2).
+    """Unusable input (exit code 2): what is wrong, where, what was expected and what to do.
 
-    As `one_line` has it.
+    The message passes through `one_line`.
     """
 
     def __init__(self, text: str = "") -> None:
         super().__init__(one_line(text))
 
 
-MESSAGE_MAX = 700  # characters; chosen: ours are shorter, what is longer is the input's
+MESSAGE_MAX = 700  # characters; chosen: our messages are shorter, longer ones quote the input
 
 
 def one_line(text: str) -> str:
-    """Make a message of a text that may hold anything of the input.
+    """Make a text that may quote any input safe to print as one line.
 
-    Without secrets of URLs; control characters are escaped; of long texts the middle is left out.
+    Removes the secrets of URLs, escapes control characters, cuts the middle out of long texts.
     """
-    return _cut(printable(_cut(without_secrets(text))))
+    return _without_middle(printable(_without_middle(without_secrets(text))))
 
 
-def _cut(text: str) -> str:
+def _without_middle(text: str) -> str:
     if len(text) <= MESSAGE_MAX:
         return text
     return f"{text[: MESSAGE_MAX // 2]} ... {text[-MESSAGE_MAX // 3 :]}"
 
 
 def printable(text: str) -> str:
-    """Escape what is no printable character, so that names in a text cannot steer a terminal.
+    """Escape characters that are not printable, so that a name cannot control the terminal.
 
     >>> printable("a chair\\n")
     'a chair\\\\n'
@@ -60,11 +60,11 @@ def printable(text: str) -> str:
 
 
 def without_secrets(text: str) -> str:
-    """Leave of the URLs in a text what may be shown and written: scheme, host and path.
+    """Remove secrets from the URLs in a text: scheme, host and path remain.
 
-    User and password go, also a password with "@" or "/" in it, and all after the path: queries
-    and parameters, where cameras take passwords too. Where nothing tells which is which, only the
-    scheme is left.
+    Removed are user and password, also a password that contains "@" or "/", and all after the path:
+    queries and parameters may hold passwords of cameras. A URL whose components are ambiguous is
+    reduced to its scheme.
 
     >>> without_secrets("rtsp://me:secret@10.0.0.7/stream?pwd=x")
     'rtsp://10.0.0.7/stream'
@@ -72,22 +72,22 @@ def without_secrets(text: str) -> str:
     return URL.sub(_public_part, text)
 
 
-# A scheme: two letters at least (C:/ is a drive), few enough for linear time.
+# The scheme has at least two letters (C:/ is a drive) and at most 31, for linear time.
 URL = re.compile(r"([a-z][a-z0-9+.-]{1,30}:/+)(\S*)", re.IGNORECASE)
-PARAMETERS = re.compile(r"[?#;&=]")  # begin what is no path: also rtsp://host/user=me&password=x
+PARAMETERS = re.compile(r"[?#;&=]")  # end the path; rtsp://host/user=me&password=x has one too
 
 
 def _public_part(url: re.Match[str]) -> str:
     """Cut a URL to scheme, host and path."""
     scheme, rest = url.groups()
     user, _, rest = rest.rpartition("@")
-    if PARAMETERS.search(user):  # of a password, or the "@" is one of a query
+    if PARAMETERS.search(user):  # the password has a parameter sign, or the "@" is in a query
         return f"{scheme}..."
     return scheme + PARAMETERS.split(rest)[0]
 
 
 def visible_name(name: str) -> str:
-    """Replace what no name should have: control characters, which XML cannot hold either.
+    """Replace control characters of a name by U+FFFD; XML cannot hold them either.
 
     >>> visible_name("a chair").isprintable()
     True
@@ -95,7 +95,7 @@ def visible_name(name: str) -> str:
     return CONTROLS.sub("\ufffd", name)
 
 
-CONTROLS = re.compile(  # C0, C1, surrogates, those that turn the direction of text, no characters
+CONTROLS = re.compile(  # C0, C1, surrogates, marks of text direction, noncharacters
     "[\x00-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069\ufffe\uffff]"
 )
 
@@ -113,7 +113,7 @@ COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in COCO_CLAS
 
 
 def option(default: Any, text: str, flag: str = "", old_flag: str = "") -> Any:
-    """Declare a config field: default, help text and, for the few that users need, a flag.
+    """Declare a config field: default, help text and, for common options, a flag.
 
     old_flag: an earlier name of the flag that still works.
     """
@@ -159,25 +159,25 @@ class Detections:
 
     @staticmethod
     def empty() -> Detections:
-        """Make the detections of a frame without any."""
+        """Return zero detections."""
         return Detections(np.empty((0, 4)), np.empty(0), np.empty(0, np.int64))
 
     @staticmethod
     def from_array(rows: npt.ArrayLike) -> Detections:
-        """Make from (N, 6) rows x1, y1, x2, y2, confidence, class; [] is a frame without any.
+        """Convert (N, 6) rows x1, y1, x2, y2, confidence, class; [] gives zero detections.
 
         >>> Detections.from_array([[0, 0, 10, 20, 0.9, 56]]).class_id
         array([56])
         """
-        return _checked(*_row_parts(rows))
+        return _checked(*_columns_of_rows(rows))
 
     @staticmethod
-    def from_supervision(found: Any) -> Detections:
-        """Make from supervision's `Detections`; what is None there: score 1, class 0, no mask."""
-        return as_detections(found)
+    def from_supervision(detections: Any) -> Detections:
+        """Convert supervision's `Detections`; None becomes score 1, class 0, no mask."""
+        return as_detections(detections)
 
     def to_supervision(self) -> Any:
-        """Return the same as supervision's `Detections`, which must be installed."""
+        """Convert to `supervision.Detections` (needs supervision)."""
         try:
             import supervision
         except ImportError as error:
@@ -189,7 +189,7 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Embeddings:
-    """Two-part appearance of detections: rows of unit length for object and surroundings.
+    """Appearance of detections: rows of unit length for the object and for its surroundings.
 
     Attributes:
         foreground: (D, E1); background: (D, E2), E2 may be 0.
@@ -200,22 +200,22 @@ class Embeddings:
 
     @staticmethod
     def empty() -> Embeddings:
-        """Make the embeddings of no detections."""
+        """Return the embeddings of zero detections."""
         return Embeddings(np.empty((0, 0)), np.empty((0, 0)))
 
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Tracked detections as a struct of arrays of length M: of a frame, or of a whole video.
+    """Tracked detections of a frame or of a video, as a struct of arrays of length M.
 
     Attributes:
-        frame: number of the frame: what a `Tracker` returns counts its updates, from 0; a table of
-            a video has the source's numbers, in ascending order.
-        track_id: identity, from 1; 0 while a track is still tentative.
-        tracklet_id: uninterrupted piece of track, from 1; an identity that returns has several.
-        xyxy, score, class_id: of the detection; in the table of a video in native pixels.
-        detection_index: row of the detection in what was handed to the tracker; -1: unknown, or a
-            filled gap (score 0).
+        frame: frame numbers. Of a `Tracker`: number of its update, from 0. Of a video: numbers of
+            the source, ascending.
+        track_id: identity, from 1; 0 while the track is tentative.
+        tracklet_id: uninterrupted segment of a track, from 1; an identity that returns has several.
+        xyxy, score, class_id: of the detection; of a video in native pixels.
+        detection_index: row among the detections that the tracker was given; -1: unknown, or an
+            interpolated gap (score 0).
     """
 
     frame: IntArray
@@ -234,34 +234,35 @@ class Tracks:
 
     @staticmethod
     def empty() -> Tracks:
-        """Make the tracks of a frame or video without any."""
+        """Return zero tracked detections."""
         none = np.empty(0, np.int64)
         return Tracks(none, none, none, np.empty((0, 4)), np.empty(0), none, none)
 
     @staticmethod
     def concatenate(frames: Sequence[int], steps: Sequence[Tracks], scale: float = 1.0) -> Tracks:
-        """Make the table of a video from a tracker's results, frame by frame.
+        """Concatenate a tracker's results of each frame to the table of a video.
 
-        Rows of a tracklet get the identity that was confirmed later; what never was is left out.
+        All rows of a tracklet get the identity that it was confirmed with later; rows of tracklets
+        that were never confirmed are left out.
 
         Args:
-            frames: source number of each. scale: pixels of the frames per native pixel.
+            frames: source number of each step. scale: pixels of the frames per native pixel.
         """
         if not steps:
             return Tracks.empty()
         columns = [f.name for f in dataclasses.fields(Tracks)]
-        all_of = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
-        all_of["frame"] = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
-        tracklets, inverse = np.unique(all_of["tracklet_id"], return_inverse=True)
+        values = {n: np.concatenate([getattr(s, n) for s in steps]) for n in columns}
+        values["frame"] = np.repeat(np.asarray(frames, np.int64), [len(s) for s in steps])
+        tracklets, inverse = np.unique(values["tracklet_id"], return_inverse=True)
         identity = np.zeros(len(tracklets), np.int64)
-        np.maximum.at(identity, inverse, all_of["track_id"])
-        all_of |= {"track_id": identity[inverse], "xyxy": all_of["xyxy"] / scale}
-        table = Tracks(**all_of)
+        np.maximum.at(identity, inverse, values["track_id"])
+        values |= {"track_id": identity[inverse], "xyxy": values["xyxy"] / scale}
+        table = Tracks(**values)
         return table[table.track_id > 0]
 
     @staticmethod
     def joined(tables: Sequence[Tracks]) -> Tracks:
-        """Put tables behind each other and order their rows by frame."""
+        """Concatenate tables and sort their rows by frame."""
         names = [f.name for f in dataclasses.fields(Tracks)]
         rows = Tracks(*(np.concatenate([getattr(t, name) for t in tables]) for name in names))
         return rows[np.argsort(rows.frame, kind="stable")]
@@ -279,15 +280,15 @@ class Tracks:
         return np.column_stack(columns).astype(np.float64).reshape(-1, 8)
 
     def to_supervision(self, detections: Any) -> Any:
-        """Return the rows of supervision's `Detections` that are tracked, with `tracker_id` set.
+        """Select the tracked rows of supervision's `Detections` and set their `tracker_id`.
 
         Args:
-            detections: what was handed to `update` (anything that has `tracker_id` and can be
-                indexed by rows); its masks and data are kept, itself it stays as it is.
+            detections: those that `update` was given (any type with `tracker_id` that can be
+                indexed by rows); unchanged. Masks and data are copied.
         """
-        found = detections[self.detection_index]
-        found.tracker_id = self.track_id
-        return found
+        tracked = detections[self.detection_index]
+        tracked.tracker_id = self.track_id
+        return tracked
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,10 +296,10 @@ class LinkEvent:
     """A join or a split of tracklets and its evidence.
 
     Attributes:
-        kind: "join" or "split". tracklets: ids of all that it concerns. kept: always True; False
-            in older files, of a join that was tried and undone.
-        place_iou: median overlap of the boxes with their solid, None where appearance decided.
-        appearance_log_odds: that it is one object, by its embeddings (`SimilarityCalibration`).
+        kind: "join" or "split". tracklets: ids of the tracklets. kept: always True; False in older
+            files, for a join that was undone.
+        place_iou: median IoU of the boxes with the projected object; None where appearance decided.
+        appearance_log_odds: of one object, from the embeddings (`SimilarityCalibration`).
     """
 
     kind: str
@@ -311,109 +312,114 @@ class LinkEvent:
     def from_json(entry: dict[str, Any]) -> LinkEvent:
         """Read an entry of objects.json's links; before 0.2 the log odds were called `look`."""
         log_odds = entry.get("appearance_log_odds", entry.get("look", 0.0))
-        found = (entry["kind"], tuple(entry["tracklets"]), entry["place_iou"], log_odds)
-        return LinkEvent(*found, entry["kept"])
+        tracklets = tuple(entry["tracklets"])
+        return LinkEvent(entry["kind"], tracklets, entry["place_iou"], log_odds, entry["kept"])
 
 
-# ---- What other libraries hand over -------------------------------------------------------------
+# ---- Detections of other libraries --------------------------------------------------------------
 
 EXPECTED = (
     "expected (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics Results or Boxes; "
     "supervision Detections; a dict of boxes, scores, labels; or rt.Detections"
 )
-COORDINATE_MAX = 1e7  # px; chosen: a thousand times the widest images; beyond it is a mistake
-CLASS_MAX = 32_767  # chosen: above ImageNet-21k's 21,841; a class costs each track 8 bytes
+COORDINATE_MAX = 1e7  # px; chosen: a thousand times the widest images; larger ones are errors
+CLASS_MAX = 32_767  # class number; chosen: above ImageNet-21k's 21,841; costs 8 bytes a track each
 CLASS_NAME_MAX = 200  # characters; chosen: arrays of names are as wide as the longest
-DETECTIONS_MAX = 3_000  # in a frame; chosen: pairs with as many tracks take 72 MB a matrix
-MASK_THRESHOLD = 0.5  # of masks that are probabilities (torchvision, Mask R-CNN)
+DETECTIONS_MAX = 3_000  # of a frame; chosen: a matrix of as many tracks takes 72 MB
+MASK_THRESHOLD = 0.5  # on mask probabilities (torchvision, Mask R-CNN)
 
 
-def as_detections(found: Any, class_id: Any = None) -> Detections:
-    """Convert the detections of one frame, as the libraries of the field hand them over.
+def as_detections(detections: Any, class_id: Any = None) -> Detections:
+    """Convert the detections of one frame from the types of common libraries.
 
-    Takes `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class, as array, tensor or list;
+    Accepts `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class, as array, tensor or list;
     ultralytics' `Results` and `Boxes`; supervision's `Detections`; dicts of boxes, scores, labels
-    and masks (torchvision, transformers); and a list of one of these, which is what a model returns
-    for a batch of one image. Class ids stay what they are (torchvision counts COCO's from 1).
-    Nothing is reshaped, clipped, reordered or dropped.
+    and masks (torchvision, transformers); and a list of one of these, as models return for a batch
+    of one image. Class ids are not mapped (torchvision counts COCO's from 1). Nothing is reshaped,
+    clipped, reordered or dropped.
 
     Args:
-        class_id: (D,) in place of the classes that it has, such as the numbers of `text_labels`.
+        class_id: (D,) replaces the classes, e.g. by the numbers of `text_labels`.
     Returns:
-        The same object where it is ours already.
+        The same object if it is a valid `Detections`.
     Raises:
-        ReobjError: anything else, or values that cannot be meant: inverted boxes, coordinates that
-            are not finite or beyond 1e7, scores outside [0, 1], classes that are no index.
+        ReobjError: another type, or invalid values: inverted boxes, coordinates that are not finite
+            or beyond 1e7, scores outside [0, 1], classes that are no index.
     """
-    found = _only(found)
+    detections = _single(detections)
     if class_id is not None:
-        return _with_classes(found, class_id)
-    if isinstance(found, Detections):
-        made = _checked(found.xyxy, found.score, found.class_id, found.masks)
-        same = all(getattr(made, name) is getattr(found, name) for name in found.__slots__)
-        return found if same else made
-    if isinstance(found, Mapping):
-        return _checked(*_mapping_parts(found))
-    if hasattr(found, "orig_shape") and hasattr(found, "boxes"):
-        return _checked(*_ultralytics_parts(found))
-    return _checked(*(_box_parts(found) if hasattr(found, "xyxy") else _row_parts(found)))
+        return _with_classes(detections, class_id)
+    if isinstance(detections, Detections):
+        checked = _checked(detections.xyxy, detections.score, detections.class_id, detections.masks)
+        names = detections.__slots__
+        same = all(getattr(checked, name) is getattr(detections, name) for name in names)
+        return detections if same else checked
+    if isinstance(detections, Mapping):
+        return _checked(*_columns_of_mapping(detections))
+    if hasattr(detections, "orig_shape") and hasattr(detections, "boxes"):
+        return _checked(*_columns_of_ultralytics(detections))
+    if hasattr(detections, "xyxy"):
+        return _checked(*_columns_of_boxes(detections))
+    return _checked(*_columns_of_rows(detections))
 
 
-def _only(found: Any) -> Any:
-    """Return the detections of a batch of one image, anything else as it is."""
-    if isinstance(found, list | tuple) and len(found) == 1 and _is_whole(found[0]):
-        return found[0]
-    return found
+def _single(detections: Any) -> Any:
+    """Return the only element of a batch of one image; other types unchanged."""
+    if isinstance(detections, list | tuple) and len(detections) == 1 and _is_frame(detections[0]):
+        return detections[0]
+    return detections
 
 
-def _with_classes(found: Any, class_id: Any) -> Detections:
-    """Convert detections as they are handed over, with other classes (D,)."""
-    if isinstance(found, Mapping):
-        return as_detections({**found, "labels": class_id})
-    if hasattr(found, "orig_shape") and hasattr(found, "boxes"):
-        box, score, _, masks = _ultralytics_parts(found)
+def _with_classes(detections: Any, class_id: Any) -> Detections:
+    """Convert detections of another library, their classes replaced by (D,) `class_id`."""
+    if isinstance(detections, Mapping):
+        return as_detections({**detections, "labels": class_id})
+    if hasattr(detections, "orig_shape") and hasattr(detections, "boxes"):
+        box, score, _, masks = _columns_of_ultralytics(detections)
     else:
-        box, score, _, masks = _box_parts(found)
+        box, score, _, masks = _columns_of_boxes(detections)
     return _checked(box, score, class_id, masks)
 
 
-def text_labels(found: Any) -> list[str] | None:
-    """Return the labels of detections that come as text, None where only class numbers do.
+def text_labels(detections: Any) -> list[str] | None:
+    """Return the text labels of detections; None where they have class numbers only.
 
     Of dicts `labels`, `text_labels` or `class_names` of strings (transformers' open-vocabulary
     models); of ultralytics' `Results` by its `names`; of supervision's `Detections`
     `data["class_name"]`.
     """
-    found = _only(found)
-    if isinstance(found, Mapping):
+    detections = _single(detections)
+    if isinstance(detections, Mapping):
         keys = ("text_labels", "labels", "class_names")
-        labels: Any = next((found[key] for key in keys if _is_text(found.get(key))), None)
-    elif hasattr(found, "orig_shape") and getattr(found, "boxes", None) is not None:
-        names, kinds = getattr(found, "names", None), as_numbers(found.boxes.cls, "classes")
+        texts = (detections[key] for key in keys if _is_text(detections.get(key)))
+        labels: Any = next(texts, None)
+    elif hasattr(detections, "orig_shape") and getattr(detections, "boxes", None) is not None:
+        names = getattr(detections, "names", None)
+        kinds = as_numbers(detections.boxes.cls, "classes")
         names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
         named = all(int(kind) in names for kind in kinds)
         labels = [str(names[int(kind)]) for kind in kinds] if named else None
     else:
-        data = getattr(found, "data", None)
+        data = getattr(detections, "data", None)
         labels = data.get("class_name") if isinstance(data, Mapping) else None
         labels = labels if _is_text(labels) else None
     return None if labels is None else [str(label) for label in labels]
 
 
 def _is_text(labels: Any) -> bool:
-    """Tell whether labels are a list or array of strings, with one at least."""
+    """Test whether labels are a list or array of at least one string."""
     if isinstance(labels, np.ndarray):
         labels = labels.tolist()
     usable = isinstance(labels, list | tuple) and len(labels) > 0
     return usable and all(isinstance(label, str) for label in labels)
 
 
-def _is_whole(found: Any) -> bool:
-    """Tell whether it is the detections of a frame, not a row of them."""
-    return isinstance(found, Mapping) or any(hasattr(found, name) for name in ("xyxy", "boxes"))
+def _is_frame(item: Any) -> bool:
+    """Test whether an item holds the detections of a frame, not one row of them."""
+    return isinstance(item, Mapping) or any(hasattr(item, name) for name in ("xyxy", "boxes"))
 
 
-def _row_parts(rows: Any) -> tuple[Any, ...]:
+def _columns_of_rows(rows: Any) -> tuple[Any, ...]:
     """Split (N, 6) rows into boxes, scores and classes."""
     rows = as_numbers(rows, "detections")
     if rows.ndim == 1 and not rows.size:
@@ -423,124 +429,128 @@ def _row_parts(rows: Any) -> tuple[Any, ...]:
     return rows[:, :4], rows[:, 4], rows[:, 5], None
 
 
-def _mapping_parts(found: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Take boxes, scores, labels and masks (N, H, W) or (N, 1, H, W) of a dict."""
-    missing = [key for key in ("boxes", "scores", "labels") if key not in found]
+def _columns_of_mapping(detections: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return boxes, scores, labels and masks, (N, H, W) or (N, 1, H, W), of a dict."""
+    missing = [key for key in ("boxes", "scores", "labels") if key not in detections]
     if missing:
         raise ReobjError(f"detections are a dict without {', '.join(missing)}; {EXPECTED}")
-    if _is_text(found["labels"]):
+    if _is_text(detections["labels"]):
         raise ReobjError("labels are text; a `Tracker` takes class numbers, functions given to "
                          "`track` and `run` may return text")  # fmt: skip
-    masks = None if found.get("masks") is None else as_numbers(found["masks"], "masks")
+    masks = None if detections.get("masks") is None else as_numbers(detections["masks"], "masks")
     if masks is not None and masks.ndim == 4 and masks.shape[1] == 1:
         masks = masks[:, 0]
-    return found["boxes"], found["scores"], found["labels"], masks
+    return detections["boxes"], detections["scores"], detections["labels"], masks
 
 
-def _box_parts(found: Any) -> tuple[Any, ...]:
-    """Take xyxy, confidence, class_id and mask (supervision) or xyxy, conf and cls (Boxes)."""
-    count, parts = len(found.xyxy), [found.xyxy]
-    for names, usual in ((("confidence", "conf"), np.ones), (("class_id", "cls"), np.zeros)):
-        has = next((name for name in names if hasattr(found, name)), None)
-        if has is None:
+def _columns_of_boxes(detections: Any) -> tuple[Any, ...]:
+    """Return xyxy, confidence, class_id and mask (supervision) or xyxy, conf and cls (Boxes)."""
+    count = len(detections.xyxy)
+    columns = [detections.xyxy]
+    for names, default in ((("confidence", "conf"), np.ones), (("class_id", "cls"), np.zeros)):
+        name = next((name for name in names if hasattr(detections, name)), None)
+        if name is None:
             raise ReobjError(f"detections have xyxy, but no {' or '.join(names)}; {EXPECTED}")
-        values = getattr(found, has)
-        parts.append(usual(count) if values is None else values)
-    return *parts, getattr(found, "mask", None)
+        values = getattr(detections, name)
+        columns.append(default(count) if values is None else values)
+    return *columns, getattr(detections, "mask", None)
 
 
-def _ultralytics_parts(found: Any) -> tuple[Any, ...]:
-    """Take the boxes of ultralytics' `Results`, and its masks at the size of the image."""
-    if found.boxes is None:
+def _columns_of_ultralytics(results: Any) -> tuple[Any, ...]:
+    """Return the boxes of ultralytics' `Results`, and its masks at the size of the image."""
+    if results.boxes is None:
         raise ReobjError(f"ultralytics Results without boxes (another task?); {EXPECTED}")
-    parts, masks = _box_parts(found.boxes), getattr(found, "masks", None)
+    columns = _columns_of_boxes(results.boxes)
+    masks = getattr(results, "masks", None)
     if masks is None:
-        return parts
-    height, width = (int(side) for side in found.orig_shape)
+        return columns
+    height, width = (int(side) for side in results.orig_shape)
     maps = as_numbers(masks.data, "masks").astype(np.float32)  # (N, h, w) of the padded input
     if maps.ndim != 3 or not maps.shape[1] * maps.shape[2]:
         raise ReobjError(f"masks are an array of shape {maps.shape}, expected (N, h, w)")
     scale = min(maps.shape[1] / height, maps.shape[2] / width)
-    h, w = max(round(height * scale), 1), max(round(width * scale), 1)
-    top, left = (maps.shape[1] - h) // 2, (maps.shape[2] - w) // 2
+    h = max(round(height * scale), 1)
+    w = max(round(width * scale), 1)
+    top = (maps.shape[1] - h) // 2
+    left = (maps.shape[2] - w) // 2
     maps = maps[:, top : top + h, left : left + w]
     full = np.zeros((len(maps), height, width), bool)  # (N, H, W)
-    for mask, own in zip(full, maps, strict=True):
-        mask[:] = cv2.resize(own, (width, height)) > MASK_THRESHOLD
-    return *parts[:3], full
+    for mask, small in zip(full, maps, strict=True):
+        mask[:] = cv2.resize(small, (width, height)) > MASK_THRESHOLD
+    return *columns[:3], full
 
 
-def as_numbers(values: Any, what: str) -> npt.NDArray[Any]:
-    """Convert arrays, lists and tensors of any library, by numpy's own protocol, to numbers."""
+def as_numbers(values: Any, name: str) -> npt.NDArray[Any]:
+    """Convert arrays, lists and tensors of any library to a numeric array; name: for errors."""
     if isinstance(values, np.ndarray) and values.dtype.kind in "fiub":
         return values
     if hasattr(values, "detach") and hasattr(values, "cpu"):  # a tensor, perhaps on a GPU
         values = values.detach().cpu()
     try:
-        made = np.asarray(values)
-        if made.dtype.kind == "O":
-            made = made.astype(np.float64)
+        array = np.asarray(values)
+        if array.dtype.kind == "O":
+            array = array.astype(np.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         reason = str(error).partition("\n")[0]
-        raise ReobjError(f"{what} are no array of numbers ({reason}); {EXPECTED}") from error
-    if made.dtype.kind not in "fiub" or made.ndim == 0:
-        kind = type(values).__name__ if made.ndim == 0 else made.dtype.name
-        raise ReobjError(f"{what} are {kind}, no array of numbers; {EXPECTED}")
-    return made
+        raise ReobjError(f"{name} are no array of numbers ({reason}); {EXPECTED}") from error
+    if array.dtype.kind not in "fiub" or array.ndim == 0:
+        kind = type(values).__name__ if array.ndim == 0 else array.dtype.name
+        raise ReobjError(f"{name} are {kind}, no array of numbers; {EXPECTED}")
+    return array
 
 
 def _checked(xyxy: Any, score: Any, class_id: Any, masks: Any) -> Detections:
-    """Make `Detections` of parts that fit each other and can be meant; else say what is wrong."""
-    xyxy, score, class_id = (
-        as_numbers(part, what)
-        for part, what in ((xyxy, "boxes"), (score, "scores"), (class_id, "classes"))
-    )
+    """Validate the arrays and build `Detections`."""
+    xyxy = as_numbers(xyxy, "boxes")
+    score = as_numbers(score, "scores")
+    class_id = as_numbers(class_id, "classes")
     count = len(xyxy)
     if xyxy.shape != (count, 4):
         raise ReobjError(
             f"boxes are an array of shape {xyxy.shape}, expected (N, 4) x1, y1, x2, y2"
         )
-    for part, what in ((score, "scores"), (class_id, "classes")):
-        if part.shape != (count,):
-            raise ReobjError(f"{what} are an array of shape {part.shape}, expected ({count},): one "
-                             "for each box")  # fmt: skip
+    for column, name in ((score, "scores"), (class_id, "classes")):
+        if column.shape != (count,):
+            raise ReobjError(f"{name} are an array of shape {column.shape}, expected ({count},): "
+                             "one for each box")  # fmt: skip
     if count > DETECTIONS_MAX:
-        raise ReobjError(f"{count} detections in a frame, at most {DETECTIONS_MAX} are taken: "
-                         "keep the best")  # fmt: skip
+        raise ReobjError(f"{count} detections in a frame, at most {DETECTIONS_MAX} are allowed: "
+                         "keep those of the highest scores")  # fmt: skip
     if masks is not None:
         masks = as_numbers(masks, "masks")
         masks = masks if masks.dtype == bool else masks > MASK_THRESHOLD
         if masks.ndim != 3 or len(masks) != count:
             raise ReobjError(f"masks are an array of shape {masks.shape}, expected ({count}, H, W) "
                              "at the size of the frame")  # fmt: skip
-    xyxy, score = xyxy.astype(np.float64, copy=False), score.astype(np.float64, copy=False)
+    xyxy = xyxy.astype(np.float64, copy=False)
+    score = score.astype(np.float64, copy=False)
     _check_values(xyxy, score, class_id)
     return Detections(xyxy, score, class_id.astype(np.int64, copy=False), masks)
 
 
 def _check_values(xyxy: Array, score: Array, class_id: npt.NDArray[Any]) -> None:
-    """Refuse boxes (N, 4), scores (N,) and classes (N,) that cannot be meant."""
-    finite = np.abs(xyxy) <= COORDINATE_MAX  # not NaN either
+    """Refuse invalid boxes (N, 4), scores (N,) and classes (N,)."""
+    finite = np.abs(xyxy) <= COORDINATE_MAX  # False for NaN
     ordered = xyxy[:, 2:] >= xyxy[:, :2]
-    likely = (score >= 0) & (score <= 1)
-    named = (class_id >= 0) & (class_id <= CLASS_MAX) & (class_id == np.floor(class_id))
-    for good, values, expected in (
+    probability = (score >= 0) & (score <= 1)
+    index = (class_id >= 0) & (class_id <= CLASS_MAX) & (class_id == np.floor(class_id))
+    for valid, values, expected in (
         (finite, xyxy, f"finite coordinates in pixels, at most {COORDINATE_MAX:g}"),
         (ordered, xyxy, "x1 <= x2 and y1 <= y2: corners, not x, y, width, height"),
-        (likely, score, "a confidence in [0, 1]"),
-        (named, class_id, f"a class number from 0 to {CLASS_MAX}"),
+        (probability, score, "a confidence in [0, 1]"),
+        (index, class_id, f"a class number from 0 to {CLASS_MAX}"),
     ):
-        if not good.all():
-            row = int(np.argwhere(~good)[0, 0])
+        if not valid.all():
+            row = int(np.argwhere(~valid)[0, 0])
             raise ReobjError(f"detection {row}: {values[row]}, expected {expected}")
 
 
 def as_frame(image: Any, masks: BoolArray | None = None) -> Image:
-    """Return a BGR image (H, W, 3) uint8 as it is, or in C order where it was a view.
+    """Validate a BGR image (H, W, 3) uint8; a view is copied to C order.
 
     Raises:
-        ReobjError: anything else: gray, with alpha, or of another type; or masks (D, H, W) of
-            another size.
+        ReobjError: the image is grey, has alpha or another type; or masks (D, H, W) have another
+            size.
     """
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape[2:] != (3,):
         kind = type(image).__name__
@@ -557,7 +567,7 @@ def as_frame(image: Any, masks: BoolArray | None = None) -> Image:
 
 
 def frame_step(frame: IntArray) -> int:
-    """Return the frames from one that was read to the next: more than 1 with `--every`.
+    """Return the interval between frames that were read (more than 1 with `--every`).
 
     frame: (N,) numbers of frames that were read.
     """
@@ -566,13 +576,12 @@ def frame_step(frame: IntArray) -> int:
 
 
 def looks(table: Tracks, looked: IntArray | None) -> tuple[IntArray, int]:
-    """Count the frames that the detector was run on.
+    """Number the frames on which the detector was run.
 
     Args:
-        looked: (F,) their numbers, ascending; None: all that were read, `frame_step` apart.
+        looked: (F,) their frame numbers, ascending; None: all that were read, `frame_step` apart.
     Returns:
-        (N,) a number of the frame of each row, and how much it grows from one such frame to the
-        next.
+        (N,) number of the frame of each row, and the difference between consecutive frames.
     """
     if looked is None:
         return table.frame, frame_step(table.frame)
@@ -590,7 +599,7 @@ def object_classes(table: Tracks) -> dict[int, int]:
 
 
 def class_shares(table: Tracks, group: IntArray, count: int) -> Array:
-    """Return the share of every class in the scores of each group of rows, (count, C)."""
+    """Return the fraction of every class in the scores of each group of rows, (count, C)."""
     votes = np.zeros((count, int(table.class_id.max(initial=0)) + 1))
     np.add.at(votes, (group, table.class_id.clip(0)), table.score)
     return np.asarray(votes / np.maximum(votes.sum(1, keepdims=True), 1e-9))
@@ -598,7 +607,8 @@ def class_shares(table: Tracks, group: IntArray, count: int) -> Array:
 
 def box_area(xyxy: Array) -> Array:
     """Return the area (...) of boxes (..., 4)."""
-    width, height = xyxy[..., 2] - xyxy[..., 0], xyxy[..., 3] - xyxy[..., 1]
+    width = xyxy[..., 2] - xyxy[..., 0]
+    height = xyxy[..., 3] - xyxy[..., 1]
     return np.asarray(width * height, np.float64)
 
 
@@ -633,7 +643,7 @@ def rows_by(group: IntArray) -> list[IntArray]:
 def widen(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Pad the second axis of a with zeros to the width of b.
 
-    (For classes or embeddings that are seen for the first time.)
+    (For the first occurrence of a class or an embedding.)
     """
     if a.ndim != 2 or a.shape[1] >= b.shape[1]:
         return a

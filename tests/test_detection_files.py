@@ -266,7 +266,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
         ("d.txt", "1,-1,10,ten,30,40,.9\n", "line 1: 'ten' is no finite number"),
         ("d.txt", "0,10.5,20.5,40,60,.9,56\n", "needs a header"),  # CSV without a header is no MOT
         ("d.txt", "99,-1,10,20,30,40,.9\n",
-         "frames that the video has not .0-based: 98; it has 20.: detections of another video"),
+         "frames that the video lacks .0-based: 98; it has 20.: detections of another video"),
         ("d.txt", "1,-1,.1,.2,.3,.4,.9\n", "no coordinate above 1.5: normalised"),
         ("d.txt", LINE + "1,-1,9000,20,30,40,.9\n" * 2,
          r"0 of 3 boxes have no area and 2 lie outside the image of \(640, 480\)"),
@@ -293,7 +293,7 @@ LINE = "1,-1,10,20,30,40,.9\n"
         ("d.json", json.dumps(coco_entries(segmentation={"size": [480, 640], "counts": 9})),
          r"entry 0: mask of 9 pixels in a video of \(640, 480\)"),
         ("d.json", json.dumps(coco_entries(score=float("nan"))), "entry 0: .*NaN, infinite"),
-        ("d.json", json.dumps(coco_entries(image_id="x")), "names such as 'x' mean no frame"),
+        ("d.json", json.dumps(coco_entries(image_id="x")), "names such as 'x' match no frame"),
         ("d.json", "[1, 2]", "entry 0: 1, expected an object such as"),
         ("d.npz", "no zip", "d.npz: damaged"),
     ],
@@ -327,8 +327,8 @@ def test_coordinates_beyond_any_image(tmp_path: Path, video: rt.Video) -> None:
         ({"frame": np.array([0.5])}, "array frame is of float64, expected iu"),
         ({"class_names": np.array([1])}, "array class_names is of int64, expected U"),
         ({"class_names": np.array("x")}, "array class_names is"),
-        ({"mask_offsets": np.array([0, 9])}, "mask_counts and mask_offsets do not fit"),
-        ({"mask_offsets": np.array([5, 0])}, "mask_counts and mask_offsets do not fit"),
+        ({"mask_offsets": np.array([0, 9])}, "mask_counts and mask_offsets are inconsistent"),
+        ({"mask_offsets": np.array([5, 0])}, "mask_counts and mask_offsets are inconsistent"),
     ],
 )
 def test_npz_of_other_kinds(
@@ -361,7 +361,9 @@ def test_npz_of_more_than_is_taken(
     monkeypatch.setitem(recorded.SIZES, key, count)
     assert len(rt.read_detections(path, video)) == 2
     monkeypatch.setitem(recorded.SIZES, key, count - 1)
-    with pytest.raises(rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are taken"):
+    with pytest.raises(
+        rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are allowed"
+    ):
         rt.read_detections(path, video)
 
 
@@ -425,7 +427,7 @@ def test_bad_npz(tmp_path: Path, video: rt.Video, change: dict[str, Any], expect
         ("d.txt", LINE + "20,-1,10,20,30,40,.9\n", "", 2),  # the last frame
         ("d.csv", CSV + "-1,10,20,30,40,.9,56\n", "1 boxes of frames .* -1; it has 20. dropped", 2),
         ("d.txt", LINE + "21,-1,10,20,30,40,.9\n50,-1,1,2,3,4,.9\n",
-         "2 boxes of frames that the video has not .0-based: 20, 49; it has 20. dropped", 1),
+         "2 boxes of frames that the video lacks .0-based: 20, 49; it has 20. dropped", 1),
         ("d.txt", LINE.replace(".9", "-1") * 2, "scores are all -1: taken as 1", 2),
         ("d.txt", LINE + LINE.replace(".9", "1.7"), r"scores from 0.9 to 1.7 clipped", 2),
         ("d.txt", "", "no detections in this file", 0),
@@ -478,7 +480,7 @@ def test_a_column_of_times_finds_images_named_by_their_times(tmp_path: Path) -> 
     path.write_text("timestamp,coco80_class,x,y,w,h,score\n" + "\n".join(rows) + "\n")
     found = rt.read_detections(path, rt.Video(tmp_path))
     assert found.frame.tolist() == [0, 1, 3] and set(found.class_id.tolist()) == {73}
-    assert any("1 boxes of frames that the video has not" in text for text in found.messages)
+    assert any("1 boxes of frames that the video lacks" in text for text in found.messages)
     counted = tmp_path / "counted"
     counted.mkdir()
     cv2.imwrite(str(counted / "0001.png"), np.zeros((48, 64, 3), np.uint8))

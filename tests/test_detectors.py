@@ -450,7 +450,7 @@ def spoilt(**change: Any) -> dict[str, Any]:
         (detr(), True, ""),
         (detr(), False, "its layout is SSD with built-in NMS"),  # would count classes from 1
         (spoilt(boxes=[[[0.1, 0.1, 0.5, 0.5]] * 2]), True, "boxes that are not in pixels"),
-        (spoilt(boxes=[[BOX, [np.nan] * 4]]), True, "boxes that are no numbers"),
+        (spoilt(boxes=[[BOX, [np.nan] * 4]]), True, "boxes that are not finite"),
         (spoilt(scores=[[SCORE, -2.0]]), True, "scores outside 0..1"),  # logits
         (spoilt(scores=[[SCORE, 1.5]]), True, "scores outside 0..1"),
         (spoilt(labels=np.array([[LABEL, 90]])), True, "classes beyond its 80"),
@@ -706,7 +706,7 @@ def test_a_file_is_asked_by_frame_number(clip: rt.Video, tmp_path: Path) -> None
     assert [f.index for f in clip] == [0, 2, 4]
     assert [source(f).xyxy[0, 0] for f in clip] == [5, 6, 7]  # half of 10, 12, 14
     assert source.class_names == ("object",)
-    assert any("frames that the video has not" in text for text in source.messages)
+    assert any("frames that the video lacks" in text for text in source.messages)
     assert source.cached(tmp_path / "cache", clip.working_size) is source  # it is on disk
     recorded = as_source(rt.read_detections(path, clip))
     assert recorded(frame(4)).xyxy[0, 0] == 7 and recorded.messages == source.messages

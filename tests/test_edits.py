@@ -94,7 +94,7 @@ def test_identities_after_edits(
 
 def test_a_merge_says_that_both_were_seen_at_once(tmp_path: Path) -> None:
     made = applied(tmp_path, MERGE)
-    assert "what is now object 1 is seen twice in 10 frames" in made.messages[0]
+    assert "merged object 1 has two boxes in 10 frames" in made.messages[0]
     assert "1 correction by hand applied" in made.messages[1] and made.confirmed == {1}
 
 
@@ -149,7 +149,7 @@ def test_what_is_not_found_is_said(tmp_path: Path, edit: dict[str, Any], said: s
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3]}}], "is no box"),
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3e300, 4]}}], "is no box"),
         ([{**DELETE, "object": {"frame": 1, "box": [1, 2, 3, "x"]}}], "edit 1"),
-        ([{**DELETE, "object": {"frame": 1.5, "box": [1, 2, 3, 4]}}], "whole numbers"),
+        ([{**DELETE, "object": {"frame": 1.5, "box": [1, 2, 3, 4]}}], "not whole numbers"),
         ([{**DELETE, "object": {"box": [1, 2, 3, 4]}}], "edit 1: 'frame'"),
         ([{**DELETE, "object": 6}], "edit 1"),
     ],

@@ -503,7 +503,7 @@ def test_command_line_prints_a_table_and_refuses_other_files(
     files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
     assert rt.main(["eval", str(files[0]), "--gt", str(files[1])]) == 0
     text = capsys.readouterr().out
-    assert "IDF1" in text and "Rank-k: no embeddings here" in text
+    assert "IDF1" in text and "Rank-k: no embeddings" in text
     (tmp_path / "bad.txt").write_text("not a table\n")
     assert rt.main(["eval", str(files[0]), "--gt", str(tmp_path / "bad.txt")]) == 2
     error = capsys.readouterr().err
@@ -710,7 +710,7 @@ def test_3d_needs_cameras(tmp_path: Path) -> None:
     with pytest.raises(rt.ReobjError, match="give --gt-poses"):
         score_objects(result, solids, None, {4: 9})
     result.poses = None
-    with pytest.raises(rt.ReobjError, match="no cameras here"):
+    with pytest.raises(rt.ReobjError, match="no cameras, so there is no evaluation"):
         score_objects(result, solids, path, {4: 9})
 
 

@@ -418,7 +418,7 @@ def test_track_only_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     pytest.importorskip("trimesh", reason="pip install '.[viewer]'")
     assert cli("export", tmp_path / "out", "--to", "glb") == 2
     error = capsys.readouterr().err
-    assert "nothing to show in 3D" in error and len(error.splitlines()) == 1
+    assert "nothing to export" in error and len(error.splitlines()) == 1
     assert not (tmp_path / "out/objects.glb").exists()
 
 

@@ -214,7 +214,7 @@ def test_a_full_disk_is_said(tmp_path: Path, encoder: str) -> None:
 
 
 def test_a_film_that_cannot_be_written_is_an_error(tmp_path: Path, encoder: str) -> None:
-    with pytest.raises(OSError, match=r"overlay.*: the film cannot be written"):
+    with pytest.raises(OSError, match=r"overlay.*: the overlay cannot be written"):
         FilmWriter(tmp_path / "nowhere" / "overlay.mp4", FPS, SIZE)
 
 

@@ -603,12 +603,12 @@ def test_exports_in_3d_hold_the_largest_part(
 ) -> None:
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
     text = exported(parted_folder, "glb", tmp_path / "a.glb", caplog)
-    assert "holds part 0 of 2 (frames 0-39)" in text
+    assert "contains component 0 of 2 (frames 0-39)" in text
     scene: Any = trimesh.load(tmp_path / "a.glb")
     assert set(scene.graph.nodes_geometry) == {"chair 1", "chair 2", "chair 3", "points", "cameras"}
     assert len(scene.geometry["points"].vertices) == 3
     pytest.importorskip("rerun", reason="pip install rerun-sdk (extra viewer)")
-    assert "holds part 0 of 2" in exported(parted_folder, "rrd", tmp_path / "a.rrd", caplog)
+    assert "contains component 0 of 2" in exported(parted_folder, "rrd", tmp_path / "a.rrd", caplog)
     assert (tmp_path / "a.rrd").stat().st_size > 1000
 
 
@@ -662,7 +662,7 @@ def test_a_part_without_true_cameras_is_not_found(
 ) -> None:
     found = score_objects(parted, *truth(tmp_path, BREAK), {1: 1, 2: 5, 3: 6})
     assert found["found"] == 1 and found["part_scale_errors"][1] is None
-    assert "part 1 of the cameras is not scored in 3D" in caplog.text
+    assert "component 1 of the trajectory is not evaluated in 3D" in caplog.text
     with pytest.raises(rt.ReobjError, match="poses in common"):
         score_objects(parted, *truth(tmp_path, 2), {1: 1})
 

@@ -163,9 +163,9 @@ def elsewhere(found: rt.Tracks) -> rt.Tracks:
     [
         (boxes(70, 300, 0.45), "below the score at which a track starts (tracker.new_score=0.5)"),
         (rt.Tracks.joined([boxes(70, 300), boxes(70, 302, 0.8), boxes(70, 301, 0.7)]),
-         "lie on another box of their class in the same frame"),
+         "overlap a better box of their class in the same frame"),
         (boxes(70, 300), ""),  # they go on: no cause is known
-        (elsewhere(boxes(70, 300)), "no other near them in the frames before and after"),
+        (elsewhere(boxes(70, 300)), "overlap no box in the frames before and after"),
     ],
 )  # fmt: skip
 def test_the_cause_that_most_unexplained_boxes_have(untracked: rt.Tracks, cause: str) -> None:

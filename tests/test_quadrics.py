@@ -912,7 +912,7 @@ def test_support_may_differ_by_object(room) -> None:
     assert fits.support[1] == "ellipsoid" and fits.support[0] == "box"  # chairs
     assert fits.support[names.index("bottle")] == "cylinder"
     assert (fits.ellipsoids.world_from_obj[:, :, 2] @ np.array(UP) > 0.9).all()
-    with pytest.raises(q.QuadricsError, match="solids have a shape"):
+    with pytest.raises(q.QuadricsError, match="a shape is missing"):
         q.solid_boxes(fits.ellipsoids, "evidence", cams)
 
 
@@ -984,7 +984,7 @@ def test_wrong_shapes_say_what_is_expected(arguments, message: str) -> None:
     for points in (np.zeros((3, 4, 3)), np.zeros((2, 3))):
         with pytest.raises(q.QuadricsError, match="points has shape"):
             q.fit_objects(*seen, points=points)
-    for support, complaint in (("cone", "unknown support"), (["box"], "1 supports for 2 objects")):
+    for support, complaint in (("cone", "unknown shape"), (["box"], "1 shapes for 2 objects")):
         with pytest.raises(q.QuadricsError, match=complaint):
             q.fit_objects(*seen, support=support)
     for fit in (q.fit_sfmo, lambda x: q.fit_psfmo(x, q.load_priors(), [])):
@@ -1367,5 +1367,5 @@ def test_priors_beyond_numbers_are_refused(tmp_path: Path, key: str) -> None:
     size = {"mean": [2, 0.9, 0.8], "log_std": [0.2, 0.2, 0.2], "corr": [0, 0, 0]}
     path = tmp_path / "p.json"
     path.write_text(json.dumps({"couch": {"size_m": size | {key: [1e308, -1e308, 1e308]}}}))
-    with pytest.raises(q.QuadricsError, match="a category lacks or garbles"):
+    with pytest.raises(q.QuadricsError, match="a category has a missing or invalid field"):
         q.load_priors(path)

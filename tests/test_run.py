@@ -661,7 +661,9 @@ def test_overlay_cut_by_a_full_disk_is_not_kept(
     )
     assert done.returncode == 0, done.stderr
     assert "/overlay." in done.stderr and done.stderr.count("\n") == 1
-    assert "warning: no film: OSError" in done.stderr and "output.overlay=none" in done.stderr
+    assert (
+        "warning: no overlay video: OSError" in done.stderr and "output.overlay=none" in done.stderr
+    )
     assert not list((tmp_path / "out").glob("*overlay*"))
     assert (tmp_path / "out/tracks.txt").exists() and (tmp_path / "out/config.toml").exists()
 

@@ -325,11 +325,15 @@ def test_merges_and_splits_are_told(browser: Browser, page: Path) -> None:
         {kind: "split", tracklets: [1, 1], place_iou: 0, appearance_log_odds: 1, kept: true})""")
     browser.eval("select(objects[0])")
     text = browser.eval("$('panel').innerText")
-    assert "tracklets 1 (object 1), 3 (object 3): overlap of places 0.2" in text
-    assert "tried and undone" in text and "parts of tracklets 1 (object 1) show different" in text
+    assert "tracklets 1 (object 1), 3 (object 3): overlap in 3D 0.2" in text
+    assert (
+        "undone: one solid" in text and "parts of tracklets 1 (object 1) are at different" in text
+    )
     assert "undefined" not in text and "NaN" not in text
     browser.eval("select(objects[1])")
-    assert "overlap of places 0.12, likeness 1.99" in browser.eval("$('panel').innerText")
+    assert "overlap in 3D 0.12, log odds of the appearance 1.99" in browser.eval(
+        "$('panel').innerText"
+    )
 
 
 def test_the_slider_plays_the_cameras(browser: Browser, page: Path) -> None:
@@ -729,7 +733,7 @@ def test_parts_are_chosen_and_everything_follows(browser: Browser, parted_folder
         "cloud.geometry.attributes.position.count]"
     )
     assert browser.eval("[$('part').hidden, $('part').options.length]") == [False, 2]
-    assert browser.eval("document.title") == "frames: 6 objects in 2 parts"
+    assert browser.eval("document.title") == "frames: 6 objects in 2 components"
     assert browser.eval(rows) == [1, 2, 3]
     assert browser.eval(shown) == [[1, 2, 3], 40, 38, 39, 3]
     assert browser.eval("$('facts').textContent").startswith("cameras of 38 of 40 frames")

@@ -95,7 +95,7 @@ def test_sfmo_of_three_objects_says_what_it_needs() -> None:
     result = solved(result, solver="sfmo")
     assert {o.status for o in result.objects} == {"rejected"}
     assert {o.reason for o in result.objects} == {
-        "SfMO: needs 3 frames that show the same 4 objects"
+        "SfMO: needs at least 3 frames that show the same 4 objects"
     }
     assert all(o.center is None for o in result.objects)
 

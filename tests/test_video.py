@@ -233,7 +233,7 @@ def test_bad_images_are_skipped(tmp_path: Path) -> None:
         ),
         (
             lambda d: (d / "a.png", (d / "a.png").write_bytes(b"x"))[0],
-            "not one frame can be decoded",
+            "no frame can be decoded",
         ),
         (lambda d: 77, "cannot be opened as a camera"),
         (lambda d: (write_video(d / "b.mp4", 3), rt.InputConfig(start=3)), "it has only 3 frames"),
@@ -453,7 +453,7 @@ def test_headers_tell_the_number_of_pixels(
 def test_a_name_that_is_no_utf8_is_one_line(tmp_path: Path, movie: Path) -> None:
     path = os.fsencode(tmp_path) + b"/room\xff.mp4"
     Path(os.fsdecode(path)).write_bytes(movie.read_bytes())
-    with pytest.raises(rt.ReobjError, match="this name is no UTF-8; rename the file") as caught:
+    with pytest.raises(rt.ReobjError, match="the name is not UTF-8; rename the file") as caught:
         rt.Video(os.fsdecode(path))
     str(caught.value).encode()  # can be printed
 
@@ -578,7 +578,7 @@ def test_a_lost_source_is_connected_again(
     assert video.read == frames and seen[-1][0] == frames - 1  # counted on, whatever was dropped
     assert seen == sorted(seen) and len({index for index, _ in seen}) == len(seen)
     assert len(flaky.cameras) == attempts
-    assert re.findall(r"0: ended; connecting again in ([\d.]+) s", caplog.text) == waits
+    assert re.findall(r"0: ended; reconnecting in ([\d.]+) s", caplog.text) == waits
     assert all(camera.released for camera in flaky.cameras if camera.n)
 
 

@@ -1,7 +1,7 @@
-"""Corrections by hand: merge, split, rename, delete objects; edits.json, which the page saves.
+"""Manual corrections: merge, split, rename, delete objects; edits.json, which the viewer saves.
 
-An edit names an object by one of its boxes, so that it still finds the object when the linker
-numbers identities anew.
+An edit refers to an object by one of its boxes, so that it stays valid when the linker renumbers
+the identities.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from reobj.types import (
 FORMAT = "reobj-edits"
 FORMAT_VERSION = 1
 EDITS = "edits.json"  # in an output folder
-FIELDS = {  # of an edit, beside `do`
+FIELDS = {  # keys of an edit besides `do`
     "merge": ("object", "with"),
     "split": ("object", "visits"),
     "rename": ("object", "class"),
@@ -39,11 +39,11 @@ FIELDS = {  # of an edit, beside `do`
 
 @dataclass(frozen=True, slots=True)
 class BoxRef:
-    """A box that shows an object.
+    """Reference to an object by one of its boxes.
 
     Attributes:
-        frame: number of the source's frame. box: (4,) x1, y1, x2, y2, native pixels.
-        id: of the object when the edit was made; 0: of no interest.
+        frame: frame number of the source. box: (4,) x1, y1, x2, y2, native pixels.
+        id: of the object when the edit was made; 0: unknown.
     """
 
     frame: int
@@ -53,12 +53,12 @@ class BoxRef:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """One correction; the file's entry is `entry`.
+    """One correction.
 
     Attributes:
-        do: "merge", "split", "rename" or "delete". object: what it is about.
-        other: merge: the one that `object` is the same as. visits: split: a box of each visit that
-            becomes another object. class_name: rename.
+        do: "merge", "split", "rename" or "delete". object: the object to correct.
+        other: of a merge: the other object. visits: of a split: a box of each visit that becomes
+            another object. class_name: of a rename.
     """
 
     do: str
@@ -69,18 +69,18 @@ class Edit:
 
     @property
     def text(self) -> str:
-        """Say what is done, for messages."""
+        """Short description, for messages."""
         other = f" with {self.other.id}" if self.other else ""
         return f"{self.do} {self.object.id}{other}"
 
 
 @dataclass(frozen=True, slots=True)
 class Edits:
-    """The edits of a file, in the order in which they are made.
+    """The edits of a file, in the order of their application.
 
     Attributes:
-        edits: of them. entries: the same as the file has them. path: of the file, for messages.
-        kept: they were made earlier, and may not fit any more.
+        edits: parsed. entries: as in the file. path: of the file, for messages.
+        kept: stored by an earlier fit; they may not match the current result.
     """
 
     edits: tuple[Edit, ...]
@@ -93,7 +93,7 @@ def read_edits(path: str | Path) -> Edits:
     """Read a file of edits.
 
     Raises:
-        ReobjError: it is no such file, with the edit at fault.
+        ReobjError: another kind of file, or an invalid edit.
     """
     path = Path(path)
     data = load_json(path)
@@ -107,13 +107,13 @@ def read_edits(path: str | Path) -> Edits:
         try:
             edits.append(_parse(entry))
         except (KeyError, TypeError, ValueError) as error:
-            what = f"{path}, edit {number}: {error if str(error) else 'cannot be read'}"
-            raise ReobjError(f"{what}; expected {_expected(entry)}") from error
+            fault = f"{path}, edit {number}: {error if str(error) else 'cannot be read'}"
+            raise ReobjError(f"{fault}; expected {_expected(entry)}") from error
     return Edits(tuple(edits), data["edits"], path)
 
 
 def _expected(entry: Any) -> str:
-    """Say what an edit of this kind consists of."""
+    """Return the keys of an edit of this kind, for messages."""
     do = entry.get("do") if isinstance(entry, dict) else None
     if not isinstance(do, str) or do not in FIELDS:
         return f'"do": one of {", ".join(FIELDS)}'
@@ -129,7 +129,7 @@ def _parse(entry: Any) -> Edit:
     if not isinstance(name, str) or ("class" in fields and not name.strip()):
         raise ValueError(f"class {name!r} is no name")
     if len(name) > CLASS_NAME_MAX:
-        raise ValueError(f"class of {len(name)} characters, at most {CLASS_NAME_MAX} are taken")
+        raise ValueError(f"class of {len(name)} characters, at most {CLASS_NAME_MAX} are allowed")
     if not name.isprintable():
         raise ValueError(f"class {name!r} has characters that cannot be printed")
     visits = tuple(_box_ref(item) for item in entry.get("visits", ()))
@@ -141,15 +141,15 @@ def _parse(entry: Any) -> Edit:
 
 def _box_ref(item: Any) -> BoxRef:
     box = tuple(float(value) for value in item["box"])
-    if len(box) != 4 or not (np.abs(box) <= COORDINATE_MAX).all():  # NaN too
+    if len(box) != 4 or not (np.abs(box) <= COORDINATE_MAX).all():  # refuses NaN too
         raise ValueError(f"box {item['box']} is no box")
     if type(item["frame"]) is not int or type(item.get("id", 0)) is not int:
-        raise ValueError(f"frame {item['frame']}, id {item.get('id')}: whole numbers")
+        raise ValueError(f"frame {item['frame']}, id {item.get('id')}: not whole numbers")
     return BoxRef(item["frame"], box, item.get("id", 0))
 
 
 def write_edits(folder: Path, edits: Edits | None) -> None:
-    """Write edits into a new folder of results, for later fits; an empty list makes no file."""
+    """Write edits into a new folder of results, for later fits; no file for an empty list."""
     if edits is None or not edits.edits:
         return
     data = {"format": FORMAT, "version": FORMAT_VERSION, "edits": edits.entries}
@@ -158,7 +158,7 @@ def write_edits(folder: Path, edits: Edits | None) -> None:
 
 
 def kept_edits(folder: Path) -> Edits | None:
-    """Read the edits that an output folder keeps; None if it has none."""
+    """Read the edits in an output folder; None if there are none."""
     path = folder / EDITS
     return dataclasses.replace(read_edits(path), kept=True) if path.exists() else None
 
@@ -169,8 +169,8 @@ class Edited:
 
     Attributes:
         tracks: the N rows with their new identities and classes. keep: (N,) False: deleted.
-        class_names: of the tracks. confirmed: identities that the user says are there.
-        messages: what the user should know.
+        class_names: of the tracks. confirmed: identities that the user confirmed by an edit.
+        messages: for the user.
     """
 
     tracks: Tracks
@@ -183,82 +183,89 @@ class Edited:
 def apply_edits(tracks: Tracks, class_names: tuple[str, ...], edits: Edits) -> Edited:
     """Correct identities and classes of tracks.
 
-    A merged object keeps the lower identity; what is split off gets the next free one; nothing else
-    is renumbered. Where both of two merged objects have a box in a frame, the weaker is left out.
+    A merged object keeps the lower identity; the visits split off get the next free one; other
+    identities stay. Where two merged objects have boxes in the same frame, the box of lower score
+    is dropped.
 
     Raises:
-        ReobjError: an edit finds no such box, with its number.
+        ReobjError: the box of an edit does not exist.
     """
-    made = _Tables(tracks, class_names)
+    table = _Tables(tracks, class_names)
     for number, edit in enumerate(edits.edits, 1):
         where = f"{edits.path}, edit {number} ({edit.text})"
         try:
-            made.make(edit)
+            table.apply(edit)
         except LookupError as error:
             hint = "were these edits made for another result? make them anew in scene.html"
             raise ReobjError(f"{where}: {error.args[0]}; {hint}") from error
-    keep, messages = made.without_duplicates(str(edits.path))
+    keep, messages = table.without_duplicates(str(edits.path))
     if (count := len(edits.edits)) > 0:
         messages.append(f"{count} correction{'s' * (count != 1)} by hand applied ({EDITS})")
-    table = dataclasses.replace(tracks, track_id=made.identity, class_id=made.class_id)
-    confirmed = made.confirmed & set(made.identity[keep].tolist())
-    return Edited(table, keep, tuple(made.names), confirmed, messages)
+    edited = dataclasses.replace(tracks, track_id=table.identity, class_id=table.class_id)
+    confirmed = table.confirmed & set(table.identity[keep].tolist())
+    return Edited(edited, keep, tuple(table.names), confirmed, messages)
 
 
-SAME_BOX_IOU = 0.9  # chosen: a box rounded to .1 px, 10 px wide, overlaps itself by .98
+SAME_BOX_IOU = (
+    0.9  # least IoU with the box of an edit; chosen: rounding to .1 px costs .02 at 10 px
+)
 
 
 class _Tables:
-    """Columns of tracks while edits change them; deleted rows have identity 0."""
+    """Columns of tracks during the application of edits; deleted rows have identity 0."""
 
     def __init__(self, tracks: Tracks, class_names: tuple[str, ...]) -> None:
-        self.tracks, self.names = tracks, list(class_names)
-        self.identity, self.class_id = tracks.track_id.copy(), tracks.class_id.copy()  # (N,)
+        self.tracks = tracks
+        self.names = list(class_names)
+        self.identity = tracks.track_id.copy()  # (N,)
+        self.class_id = tracks.class_id.copy()  # (N,)
         self.confirmed: set[int] = set()
 
-    def make(self, edit: Edit) -> None:
-        """Make one edit; LookupError where it finds nothing."""
-        own = int(self.identity[self._row_of(edit.object)])
+    def apply(self, edit: Edit) -> None:
+        """Apply one edit; LookupError if its object does not exist."""
+        identity = int(self.identity[self._row_of(edit.object)])
         if edit.do == "delete":
-            self.identity[self.identity == own] = 0
+            self.identity[self.identity == identity] = 0
         elif edit.do == "rename":
             if edit.class_name not in self.names:
                 self.names.append(edit.class_name)
-            self.class_id[self.identity == own] = self.names.index(edit.class_name)
-            self.confirmed.add(own)
+            self.class_id[self.identity == identity] = self.names.index(edit.class_name)
+            self.confirmed.add(identity)
         elif edit.do == "split":
-            self._split(own, edit.visits)
-        elif edit.other is not None:  # merge; one already where the linker sees it by itself now
-            kept, gone = sorted((own, int(self.identity[self._row_of(edit.other)])))
-            self.identity[self.identity == gone] = kept
+            self._split(identity, edit.visits)
+        elif edit.other is not None:  # merge; without effect if the linker has merged them since
+            kept, removed = sorted((identity, int(self.identity[self._row_of(edit.other)])))
+            self.identity[self.identity == removed] = kept
             self.confirmed.add(kept)
 
     def _row_of(self, ref: BoxRef) -> int:
-        """Find the row of a box; of several alike, that of the identity named, then the nearest."""
+        """Find the row of a box: prefer the identity of the reference, then the highest IoU."""
         rows = np.flatnonzero((self.identity > 0) & (self.tracks.frame == ref.frame))
         iou: Array = box_iou(self.tracks.xyxy[rows], np.array([ref.box]))[:, 0]  # (n,)
-        rows, iou = rows[iou >= SAME_BOX_IOU], iou[iou >= SAME_BOX_IOU]
+        rows = rows[iou >= SAME_BOX_IOU]
+        iou = iou[iou >= SAME_BOX_IOU]
         if not len(rows):
             box = ", ".join(f"{value:.1f}" for value in ref.box)
             raise LookupError(f"no object has the box {box} in frame {ref.frame}")
         return int(rows[np.lexsort((-iou, self.identity[rows] != ref.id))[0]])
 
-    def _split(self, own: int, visits: tuple[BoxRef, ...]) -> None:
-        found = [row for visit in visits if self.identity[row := self._row_of(visit)] == own]
-        pieces = self.tracks.tracklet_id[np.array(found, np.int64)]
-        off = (self.identity == own) & np.isin(self.tracks.tracklet_id, pieces)
-        if not ((self.identity == own) & ~off).any():
+    def _split(self, identity: int, visits: tuple[BoxRef, ...]) -> None:
+        rows = [row for visit in visits if self.identity[row := self._row_of(visit)] == identity]
+        tracklets = self.tracks.tracklet_id[np.array(rows, np.int64)]
+        moved = (self.identity == identity) & np.isin(self.tracks.tracklet_id, tracklets)
+        if not ((self.identity == identity) & ~moved).any():
             raise LookupError("these are all visits of the object")
-        if off.any():  # else it is apart already
-            self.identity[off] = self.identity.max() + 1
+        if moved.any():  # else they are another object already
+            self.identity[moved] = self.identity.max() + 1
 
     def without_duplicates(self, where: str) -> tuple[BoolArray, list[str]]:
-        """Choose the rows (N,) that stay: of a merged object's boxes in a frame the best scored.
+        """Select the rows (N,) to keep: in each frame the best box of a merged object.
 
         Returns:
-            also what to say about the others.
+            True for rows to keep (N,), and messages about the others.
         """
-        keep, messages = self.identity > 0, list[str]()
+        keep = self.identity > 0
+        messages = list[str]()
         for number in sorted(self.confirmed):
             rows: IntArray = np.flatnonzero(self.identity == number)
             rows = rows[np.argsort(-self.tracks.score[rows], kind="stable")]
@@ -266,6 +273,6 @@ class _Tables:
             keep[np.setdiff1d(rows, best)] = False
             if (both := len(rows) - len(best)) > 0:
                 frames = f"{both} frame{'s' * (both != 1)}"
-                text = f"what is now object {number} is seen twice in {frames}"
-                messages.append(f"{where}: {text}; the weaker box is left out")
+                text = f"merged object {number} has two boxes in {frames}"
+                messages.append(f"{where}: {text}; the box of lower score is left out")
         return keep, messages

@@ -1,6 +1,6 @@
 """Evaluation against ground truth: HOTA, CLEAR MOT, IDF1, Rank-k of returns; in 3D: solids.py.
 
-Start at `evaluate`; `score_tracks` scores any two sets of `LabelledBoxes`. Writes nothing.
+Start at `evaluate`; `score_tracks` compares any two sets of `LabelledBoxes`. Writes no files.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ from reobj.types import (
     unit_rows,
 )
 
-MATCH_IOU = 0.5 - 1e-12  # of a box and its truth, but for HOTA (MOTChallenge); .5 itself is enough
-TINY = 1e-12  # of scores and unions: not zero
+MATCH_IOU = 0.5 - 1e-12  # least IoU of a match, except for HOTA (MOTChallenge: .5, inclusive)
+TINY = 1e-12  # least score of a pair, and least union
 
 _Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), IoU (g, p)
 
 
 def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
-    """Pair truth and result frame by frame.
+    """Compute the IoU of truth and result in each frame.
 
     Returns:
-        for every frame with either, by number: rows of the truth (g,) and of the result (p,), and
-        their IoU (g, p), 0 between different classes.
+        for every frame with boxes, ascending: rows of the truth (g,) and of the result (p,), and
+        their IoU (g, p), 0 for different classes.
     """
     frames = np.union1d(truth.frame, found.frame)
     rows = []
@@ -61,21 +61,22 @@ def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
         rows.append(np.split(order, np.searchsorted(boxes.frame[order], frames[1:])))
     steps = []
     for g, p in zip(*rows, strict=True):
-        a, b = truth.name[g][:, None], found.name[p][None]
+        a = truth.name[g][:, None]
+        b = found.name[p][None]
         same = (a == b) | (a == "") | (b == "")
         steps.append((g, p, np.where(same, box_iou(truth.xyxy[g], found.xyxy[p]), 0.0)))
     return steps
 
 
 def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
-    """Assign rows to columns of the largest total score, without pairs of score 0."""
+    """Assign rows to columns with the largest total score, without pairs of score 0."""
     rows, columns = linear_sum_assignment(-score)
-    good = score[rows, columns] > TINY
-    return rows[good], columns[good]
+    positive = score[rows, columns] > TINY
+    return rows[positive], columns[positive]
 
 
 def drop_ignored(truth: LabelledBoxes, found: LabelledBoxes) -> LabelledBoxes:
-    """Drop results that are matched to an ignored row of the truth, as MOTChallenge does."""
+    """Drop results matched to an ignored true box, as MOTChallenge does."""
     keep = np.ones(len(found), bool)
     for g, p, iou in _frame_steps(truth, found) if (truth.role == IGNORED).any() else ():
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
@@ -89,8 +90,8 @@ def _numbered(
     """Number the identities of truth and result.
 
     Returns:
-        true identities (G,) and found ones (P,), the steps with their numbers in place of rows, and
-        how many boxes each has, (G,) and (P,).
+        identities of truth (G,) and result (P,), the steps with identity numbers instead of rows,
+        and the number of boxes of each identity, (G,) and (P,).
     """
     truth = truth[truth.role == SCORED]
     gt_ids, gt, gt_size = np.unique(truth.identity, return_inverse=True, return_counts=True)
@@ -100,12 +101,13 @@ def _numbered(
 
 
 def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
-    """Compute HOTA, CLEAR MOT and identity scores as TrackEval does, and scores of our own.
+    """Compute HOTA, CLEAR MOT and identity scores as TrackEval does, and further scores.
 
     Returns:
-        shares in [0, 1] and counts by name. Ours: `ids_per_object`, identities matched at IoU .5 to
-        a true object, mean over the objects that were matched at all; `returns`, true objects that
-        came back (see `visits`), and `returns_kept`, the share of them that kept an identity.
+        rates in [0, 1] and counts by name. Further ones: `ids_per_object`, number of identities
+        matched to a true object at IoU .5, mean over the matched objects; `returns`, number of
+        returns of true objects (see `visits`); `returns_kept`, rate of returns with an earlier
+        identity of the object.
     Ref: Luiten et al., IJCV 2021; Bernardin & Stiefelhagen, 2008; Ristani et al., 2016.
     """
     found = drop_ignored(truth, found)
@@ -115,13 +117,13 @@ def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]
     return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
 
 
-AWAY_FRAMES = 30  # without a box, after which an object has left; chosen: about a second
+AWAY_FRAMES = 30  # frames without a box after which an object has left; chosen: about a second
 
 
 def visits(truth: LabelledBoxes, away: int = AWAY_FRAMES) -> IntArray:
     """Number the visits of each object: (N,) visit of each box, from 0.
 
-    A new one begins where the next box of an object is more than `away` frames later.
+    A new visit begins after more than `away` frames without a box of the object.
     """
     order = np.lexsort((truth.frame, truth.identity))
     new = np.append(True, np.diff(truth.identity[order]) != 0)[: len(order)]
@@ -139,10 +141,10 @@ def _visit_of_object(truth: LabelledBoxes, visit: IntArray) -> IntArray:
 
 
 def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, IntArray]:
-    """Match truth and result frame by frame, at IoU >= .5 and of the largest total IoU.
+    """Match truth and result frame by frame at IoU >= .5, with the largest total IoU.
 
     Returns:
-        rows of the truth that count and of the result, (M,) each, pair by pair.
+        rows (M,) of the SCORED true boxes and of the result.
     """
     pairs = [np.empty((2, 0), np.int64)]
     for g, p, iou in _frame_steps(truth, found):
@@ -154,9 +156,9 @@ def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, 
 
 
 def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
-    """Count returns of true objects, and the share whose main identity they had on a visit before.
+    """Count returns of true objects, and the rate whose main identity is that of an earlier visit.
 
-    Visits without any match are left out.
+    Visits without a match are left out.
     """
     visit = visits(truth)
     g, p = matched_rows(truth, found)
@@ -170,43 +172,45 @@ def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
     return {"returns": len(kept), "returns_kept": sum(kept) / max(len(kept), 1)}
 
 
-QUERY_FRAMES = 10  # first ones of a return, whose boxes are queries; chosen: .3 s of video
+QUERY_FRAMES = 10  # first frames of a return, whose boxes are queries; chosen: .3 s
 
 
 def return_ranks(
     truth: LabelledBoxes, found: LabelledBoxes, embedding: npt.NDArray[Any]
 ) -> IntArray:
-    """Rank the right object by cosine similarity alone, for the first views of every return.
+    """Rank the correct object by cosine similarity for the first views of every return.
 
-    A query is a box of the first frames of a return (see `visits`); its gallery are all boxes of
-    earlier frames whose objects have its class; of each object the most similar box counts.
-    Rank-k is the share of ranks <= k.
+    A query is a box of the first frames of a return (see `visits`). Its gallery consists of all
+    boxes of earlier frames with the same class; each object has the similarity of its most similar
+    box. Rank-k is the rate of ranks <= k.
 
     Args:
-        embedding: (N, E) unit rows, one for each row of `found`; NaN where there is none.
+        embedding: (N, E) unit rows for the rows of `found`, NaN: not embedded.
     Returns:
         (Q,) ranks from 1.
     """
     visit = visits(truth)
     g, p = matched_rows(truth, found)
     use = np.isfinite(embedding[p]).all(1)
-    g, p = g[use], p[use]
+    g = g[use]
+    p = p[use]
     ranks = []
     for rows in rows_by(_visit_of_object(truth, visit)[g]):
-        start, own = truth.frame[g[rows]].min(), int(truth.identity[g[rows[0]]])
-        known = np.flatnonzero(truth.frame[g] < start)
-        known = known[truth.name[g[known]] == truth.name[g[rows[0]]]]
-        ids, of = np.unique(truth.identity[g[known]], return_inverse=True)
-        if own in ids:
-            first = rows[truth.frame[g[rows]] < start + QUERY_FRAMES]
-            best = np.full((len(ids), len(first)), -np.inf)
-            np.maximum.at(best, of, embedding[p[known]] @ embedding[p[first]].T)
-            ranks.append(1 + (best > best[ids == own]).sum(0))
+        start = truth.frame[g[rows]].min()
+        identity = int(truth.identity[g[rows[0]]])
+        gallery = np.flatnonzero(truth.frame[g] < start)
+        gallery = gallery[truth.name[g[gallery]] == truth.name[g[rows[0]]]]
+        ids, of = np.unique(truth.identity[g[gallery]], return_inverse=True)
+        if identity in ids:
+            queries = rows[truth.frame[g[rows]] < start + QUERY_FRAMES]
+            best = np.full((len(ids), len(queries)), -np.inf)
+            np.maximum.at(best, of, embedding[p[gallery]] @ embedding[p[queries]].T)
+            ranks.append(1 + (best > best[ids == identity]).sum(0))
     return np.concatenate(ranks) if ranks else np.empty(0, np.int64)
 
 
 def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
-    """Compute HOTA, detection and association accuracy, each the mean over IoU .05 to .95."""
+    """Compute HOTA, DetA and AssA, each the mean over the IoU thresholds .05 to .95."""
     align = np.zeros((len(gt_size), len(pr_size)))  # (G, P) soft number of common frames
     for g, p, iou in steps:
         union = iou.sum(0)[None] + iou.sum(1)[:, None] - iou
@@ -231,18 +235,19 @@ def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[
 
 
 def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
-    """Compute CLEAR MOT at IoU .5; a match of the frame before is kept while it overlaps."""
-    last = np.full(len(gt_size), -1)  # identity of the last match ever
-    before = last.copy()  # and of the match in the last frame with truth
+    """Compute CLEAR MOT at IoU .5; a match of the previous frame is kept while it is valid."""
+    last = np.full(len(gt_size), -1)  # identity of the last match in any frame
+    before = last.copy()  # same in the last frame with boxes of truth and result
     switches = hits = 0
     starts = np.zeros(len(gt_size), np.int64)
     met = np.zeros((len(gt_size), len(pr_size)), bool)
     for g, p, iou in steps:
         if not len(g) or not len(p):
-            continue  # as TrackEval: a frame without either does not end a match
-        kept = 1000.0 * (before[g][:, None] == p[None])  # outweighs any sum of IoU
+            continue  # as in TrackEval: such a frame does not end a match
+        kept = 1000.0 * (before[g][:, None] == p[None])  # larger than any sum of IoU
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, kept + iou, 0))
-        g, p = g[a], p[b]
+        g = g[a]
+        p = p[b]
         switches += int(((last[g] >= 0) & (last[g] != p)).sum())
         hits += len(g)
         met[g, p] = True
@@ -250,7 +255,8 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
         last[g] = p
         before[:] = -1
         before[g] = p
-    gt, pr = int(gt_size.sum()), int(pr_size.sum())
+    gt = int(gt_size.sum())
+    pr = int(pr_size.sum())
     return {
         "MOTA": 1 - (gt + pr - 2 * hits + switches) / gt if gt else 0.0,
         "IDSW": switches,
@@ -262,10 +268,10 @@ def _clear(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict
 
 
 def _identity_pairs(steps: Sequence[_Step], shape: tuple[int, ...]) -> tuple[Any, Any, Array]:
-    """Map true to found identities one to one, for the most frames in common.
+    """Map identities of truth and result one to one, with the most common frames.
 
     Returns:
-        numbers of true and of found identities and their frames in common, (K,) each.
+        numbers of the identities of truth and result, and their common frames, (K,) each.
     """
     common = np.zeros(shape)
     for g, p, iou in steps:
@@ -276,14 +282,18 @@ def _identity_pairs(steps: Sequence[_Step], shape: tuple[int, ...]) -> tuple[Any
 
 def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[str, float]:
     """Compute F1, precision and recall of identities under the best one-to-one map."""
-    right = float(_identity_pairs(steps, (len(gt_size), len(pr_size)))[2].sum())
-    gt, pr = int(gt_size.sum()), int(pr_size.sum())
-    shares = (2 * right / max(gt + pr, 1), right / max(pr, 1), right / max(gt, 1))
-    return dict(zip(("IDF1", "IDP", "IDR"), shares, strict=True))
+    hits = float(_identity_pairs(steps, (len(gt_size), len(pr_size)))[2].sum())
+    gt = int(gt_size.sum())
+    pr = int(pr_size.sum())
+    return {
+        "IDF1": 2 * hits / max(gt + pr, 1),
+        "IDP": hits / max(pr, 1),
+        "IDR": hits / max(gt, 1),
+    }
 
 
 def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | None]:
-    """Map every true identity to the found one of the most common frames, one to one, or None."""
+    """Map every true identity to one of the result, one to one by common frames, or to None."""
     gt_ids, ids, steps, *_ = _numbered(truth, found)
     a, b, _ = _identity_pairs(steps, (len(gt_ids), len(ids)))
     pairs: dict[int, int | None] = dict.fromkeys(gt_ids.tolist())
@@ -291,11 +301,11 @@ def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | 
 
 
 _COLUMNS = "HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split()
-_COUNTS = ("IDSW", "Frag", "ids_per_object")  # the others are shares
+_COUNTS = ("IDSW", "Frag", "ids_per_object")  # the other columns are rates
 
 
 def score_table(scores: dict[str, dict[str, float]]) -> str:
-    """Format one line for each name, shares in per cent."""
+    """Format one line for each name, rates in per cent."""
     lines = [f"{'':<14}" + "".join(f"{c[:7]:>8}" for c in _COLUMNS)]
     for name, score in scores.items():
         cells = [score[c] * (1 if c in _COUNTS else 100) for c in _COLUMNS]
@@ -304,18 +314,19 @@ def score_table(scores: dict[str, dict[str, float]]) -> str:
 
 
 def score_report(scores: dict[str, Any]) -> str:
-    """Format what `evaluate` returns for the terminal."""
+    """Format the result of `evaluate` for the terminal."""
     tracks: dict[str, dict[str, float]] = scores["tracks"]
-    found = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
-    lines, ranks = [score_table(found)], scores["ranks"]
-    if missed := [name for name in tracks if name not in found]:
+    matched = {n: s for n, s in tracks.items() if n == "all" or s["IDF1"] or s["HOTA"] or s["IDP"]}
+    lines = [score_table(matched)]
+    ranks = scores["ranks"]
+    if missed := [name for name in tracks if name not in matched]:
         lines += wrapped(f"nothing found of: {', '.join(missed)}")
-    shares = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
+    rates = [f"{k.replace('rank', 'Rank-')} {v:.3f}" for k, v in ranks.items() if k != "queries"]
     if ranks:
         lines.append(f"returns by appearance alone, {ranks['queries']:.0f} queries: "
-                     + (", ".join(shares) or "no returns"))  # fmt: skip
+                     + (", ".join(rates) or "no returns"))  # fmt: skip
     else:
-        lines.append("Rank-k: no embeddings here (an output folder of `run` or `track` keeps them)")
+        lines.append("Rank-k: no embeddings (an output folder of `run` or `track` has them)")
     if "objects" in scores:
         numbers = {k: v for k, v in scores["objects"].items() if isinstance(v, int | float)}
         lines.append("3D: " + ", ".join(f"{k} {v:.3g}" for k, v in numbers.items()))
@@ -332,59 +343,64 @@ def evaluate(
     classes: Sequence[str] = (),
     min_visibility: float = 0.0,
 ) -> dict[str, Any]:
-    """Score an output folder of `run`, or a tracks.txt, against ground truth.
+    """Evaluate an output folder of `run`, or a tracks.txt, against ground truth.
 
-    Truth of frames that --start, --stop and --every left out, or that the detector was not run on,
-    does not count; nor do boxes in the latter.
+    Boxes of truth and result do not count in frames on which the detector was not run, nor true
+    boxes in frames excluded by --start, --stop and --every.
 
     Args:
-        out: folder; or MOT rows. The tracks.txt in an output folder means the folder.
+        out: output folder, or MOT rows; tracks.txt of an output folder means the folder.
         gt: MOTChallenge gt.txt, KITTI tracking labels, CVAT for video, COCO-VID.
-        solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam a line. classes: only
-            these. min_visibility: truth that is less visible is ignored.
+        solids: gt_objects.json; truth_poses: TUM, or a 4x4 world_from_cam a line. classes: to
+            evaluate, (): all. min_visibility: true boxes of lower visibility are ignored.
     Returns:
         {"tracks": scores by class, "ranks": Rank-k of the returns, "objects": scores in 3D,
-        "messages": what was assumed}.
+        "messages": assumptions about the files}.
     Raises:
-        ReobjError: a file is missing or of another form, no true box counts, an identity has two
-            boxes in a frame, or a class is in none of them.
+        ReobjError: a file is missing or of another format, no true box counts, an identity has two
+            boxes in a frame, or a class does not occur.
     """
-    out, names, tracked = Path(out), COCO_NAMES, None
+    out = Path(out)
+    names = COCO_NAMES
+    tracked = None
     if out.name == TRACKS_FILE and (out.parent / LAST_TRACKS).exists():
         out = out.parent
-    said: list[str] = []
-    found = read_result(out, said)
+    notes: list[str] = []
+    found = read_result(out, notes)
     if (out / LAST_TRACKS).exists():
         workspace = Workspace.open(out)
         tracked = workspace.load_last()
         names = tracked.class_names
     size = (0, 0) if tracked is None else (tracked.video.width, tracked.video.height)
-    truth = read_truth(Path(gt), names, min_visibility, said, size)
+    truth = read_truth(Path(gt), names, min_visibility, notes, size)
     check_counts(truth, Path(gt))
     if tracked is not None:
         read = truth[_was_read(truth.frame - 1, workspace.source[1])]
         check_counts(
             read, Path(gt), "none lies in a frame that was read (--start, --stop, --every)"
         )
-        truth, found = _looked_at(read, found, tracked.looked, said)
+        truth, found = _looked_at(read, found, tracked.looked, notes)
         check_counts(truth, Path(gt), "none lies in a frame that the detector was run on")
-    truth, found, named = with_common_names(truth, found, said)
+    truth, found, named = with_common_names(truth, found, notes)
     unknown = set(classes) - set(truth.name) - set(found.name)
     if unknown:
-        raise ReobjError(f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor found")
-    wanted = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
+        raise ReobjError(
+            f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor in the result"
+        )
+    names_scored = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
     if classes:
         truth, found = _of_classes(truth, found, classes, named)
         check_counts(truth, Path(gt), f"none is of {', '.join(classes)}")
     scores = {"all": score_tracks(truth, found)}
-    if named and len(wanted) > 1:
-        for name in wanted:
+    if named and len(names_scored) > 1:
+        for name in names_scored:
             scores[name] = score_tracks(*_of_classes(truth, found, [name], named))
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
     result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
-    result["messages"] = said
+    result["messages"] = notes
     if solids is not None:
-        pairs, poses = identity_map(truth, found), Path(truth_poses) if truth_poses else None
+        pairs = identity_map(truth, found)
+        poses = Path(truth_poses) if truth_poses else None
         result["objects"] = score_objects(Result.load(out), Path(solids), poses, pairs)
     return result
 
@@ -395,27 +411,27 @@ TRACKS_FILE = "tracks.txt"  # of an output folder
 def _of_classes(
     truth: LabelledBoxes, found: LabelledBoxes, classes: Sequence[str], named: bool
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
-    """Keep the rows of some classes.
+    """Select the boxes of some classes.
 
-    Where the result has no classes (not `named`), boxes on other truth are dropped with it.
+    If the result has no classes (not `named`), true boxes of other classes become IGNORED.
     """
-    mine, theirs = (np.isin(x.name, [*classes, ""]) for x in (truth, found))
+    true_rows, found_rows = (np.isin(boxes.name, [*classes, ""]) for boxes in (truth, found))
     if named:
-        return truth[mine], found[theirs]
-    role = np.where(mine | (truth.role != SCORED), truth.role, IGNORED)
+        return truth[true_rows], found[found_rows]
+    role = np.where(true_rows | (truth.role != SCORED), truth.role, IGNORED)
     return dataclasses.replace(truth, role=role), found
 
 
 def _looked_at(
-    truth: LabelledBoxes, found: LabelledBoxes, looked: IntArray | None, said: list[str]
+    truth: LabelledBoxes, found: LabelledBoxes, looked: IntArray | None, notes: list[str]
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
-    """Keep the frames that the detector was run on (None: all)."""
+    """Select the frames on which the detector was run (None: all)."""
     if looked is None:
         return truth, found
     kept = truth[np.isin(truth.frame - 1, looked)]
-    said.append(
+    notes.append(
         f"{len(truth) - len(kept)} of {len(truth)} true boxes do not count: they lie in frames "
-        f"that the detector was not run on (it was on {len(looked)})"
+        f"on which the detector was not run (it was run on {len(looked)})"
     )
     return kept, found[np.isin(found.frame - 1, looked)]
 
@@ -424,9 +440,10 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     """Compute Rank-k of the returns by appearance alone (`return_ranks`), k = 1, 5, 20, 50.
 
     Returns:
-        number of queries and shares; {} where nothing was embedded (--embed none).
+        number of queries and rates; {} without embeddings (--embed none).
     """
-    embeddings, tracks = tracked.embeddings, tracked.tracks[tracked.embedding_row]
+    embeddings = tracked.embeddings
+    tracks = tracked.tracks[tracked.embedding_row]
     if not embeddings.foreground.size:
         return {}
     identity = np.arange(len(tracks))

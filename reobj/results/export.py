@@ -1,6 +1,6 @@
-"""Files for other tools, from an output folder: COCO-VID, CSV, CVAT, GLB, nerfstudio, PLY, rerun.
+"""Export of results to COCO-VID, CSV, CVAT, GLB, nerfstudio, PLY and rerun.
 
-Start at `export`. A writer takes a `Result` and a path; `EXPORTS` lists them.
+Start at `export`. EXPORTS lists the writers.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ from reobj.types import (
 
 
 def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
-    """Write what an output folder holds in another tool's format.
+    """Convert the results of an output folder to the format of another tool.
 
     Args:
         out: output folder of `run`. to: a name in EXPORTS.
-        path: default: OUT/ and the format's own name.
+        path: file to write; default: in OUT, with the format's default name.
     Returns:
-        The file written.
+        path of the written file.
     Raises:
-        ReobjError: no such format, no output folder, one of another version, or the format's
-            package is missing.
+        ReobjError: no such format, no output folder or one of another version, or a missing
+            package.
     """
     if to not in EXPORTS:
         raise ReobjError(f"no export called {to!r}; there are {', '.join(EXPORTS)}")
@@ -76,23 +76,24 @@ def export(out: str | Path, to: str, path: str | Path | None = None) -> Path:
 
 
 def _largest_part(result: Result, path: Path) -> Result:
-    """Return the objects and cameras that fit into one world; warns of those that do not."""
+    """Return the objects and cameras of component 0; warn if there are others."""
     if len(parts := result.world.parts) > 1:
-        held = f"part 0 of {len(parts)} ({parts[0].span_text})"
-        log.warning("%s holds %s: the others have a frame and scale of their own", path, held)
+        exported = f"component 0 of {len(parts)} ({parts[0].span_text})"
+        log.warning("%s contains %s: the others have other frames and scales", path, exported)
     return result.of_part(0)
 
 
-def _say_parts(result: Result, path: Path) -> None:
-    """Say which objects are of which part: an object that two parts show is two of them."""
+def _warn_of_components(result: Result, path: Path) -> None:
+    """Warn that objects are not joined across components, and list those of each."""
     if len(result.world.parts) > 1:
         ids = [spans(o.id for o in part.objects) or "none" for part in result.parts()]
-        of = [f"{part.span_text}: {i}" for part, i in zip(result.world.parts, ids, strict=True)]
-        log.warning("%s: no object is joined over the parts; objects of %s", path, "; ".join(of))
+        lists = [f"{part.span_text}: {i}" for part, i in zip(result.world.parts, ids, strict=True)]
+        text = "; ".join(lists)
+        log.warning("%s: objects are not joined across components; objects of %s", path, text)
 
 
 def _video_of(result: Result) -> Video | None:
-    """Open the video of a result; None if it was moved or deleted since: most exports need none."""
+    """Open the video of a result; None if it was moved or deleted: most exports do not need it."""
     if result.out is not None and (result.out / "cache" / "source.json").is_file():
         with contextlib.suppress(ReobjError):
             return Workspace.open(result.out).video()
@@ -100,10 +101,10 @@ def _video_of(result: Result) -> Video | None:
 
 
 def _frames_read(result: Result) -> tuple[list[int], list[str]]:
-    """List the frames that were read or have a track (filled gaps), ascending.
+    """List the frames that were read or have a track (interpolated gaps), ascending.
 
     Returns:
-        source frame numbers, and the image names by frame number ([]: a video, or it is gone).
+        source frame numbers, and the image names by frame number ([]: a video, or it is missing).
     """
     video = _video_of(result)
     names = video.names if video is not None else []
@@ -111,17 +112,19 @@ def _frames_read(result: Result) -> tuple[list[int], list[str]]:
     if result.poses is not None:
         read = result.poses.frame
     elif video is not None and video.frame_count:
-        config, count = video.config, video.frame_count
+        config = video.config
+        count = video.frame_count
         read = np.arange(config.start, min(config.stop or count, count), config.every)
     return np.union1d(read, result.tracks.frame).tolist(), names
 
 
 def export_coco_vid(result: Result, path: Path) -> None:
-    """Write COCO-VID as MMTracking reads it: images with frame_id, annotations with instance_id.
+    """Write COCO-VID for MMTracking: images with frame_id, annotations with instance_id.
 
-    bbox is x, y, w, h from the image's corner.
+    bbox is x, y, w, h in the corner convention.
     """
-    video, tracks = result.video, result.tracks
+    video = result.video
+    tracks = result.tracks
     frames, names = _frames_read(result)
     size = {"width": video.width, "height": video.height}
     image_id = {frame: i for i, frame in enumerate(frames, 1)}
@@ -130,7 +133,7 @@ def export_coco_vid(result: Result, path: Path) -> None:
          "video_id": 1, "frame_id": f}
         for f in frames
     ]  # fmt: skip
-    _say_parts(result, path)
+    _warn_of_components(result, path)
     part_of: dict[int, dict[str, int]] = {}
     if len(result.world.parts) > 1:
         part_of = {o.id: {"part": o.part} for o in result.objects}
@@ -159,20 +162,22 @@ def export_cvat(result: Result, path: Path) -> None:
     """Write "CVAT for video 1.1": one track an object, every box a keyframe.
 
     `outside` marks the frame after each visit. CVAT numbers tracks from 0 in the order of the file:
-    track 0 is object 1. Filled gaps are left out: corrected by hand they would count as detections.
+    track 0 is object 1. Interpolated boxes are left out: reimported, they would be detections.
 
-    Source: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
+    Ref: cvat/apps/dataset_manager/formats/cvat.py; only keyframes are imported.
     """
-    tracks, video = result.tracks, result.video
+    tracks = result.tracks
+    video = result.video
     frames, _ = _frames_read(result)
-    _say_parts(result, path)
+    _warn_of_components(result, path)
     root = ET.Element("annotations")
     ET.SubElement(root, "version").text = "1.1"
     task = ET.SubElement(ET.SubElement(root, "meta"), "task")
     for key, value in (("name", visible_name(Path(video.path).name)), ("mode", "interpolation"),
                        ("start_frame", 0), ("stop_frame", max(frames, default=0))):  # fmt: skip
         ET.SubElement(task, key).text = str(value)
-    labels, size = ET.SubElement(task, "labels"), ET.SubElement(task, "original_size")
+    labels = ET.SubElement(task, "labels")
+    size = ET.SubElement(task, "original_size")
     for name in result.class_names:
         ET.SubElement(ET.SubElement(labels, "label"), "name").text = name
     for key in ("width", "height"):
@@ -188,7 +193,7 @@ def export_cvat(result: Result, path: Path) -> None:
 
 
 def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> None:
-    """Add the boxes of a track, and one `outside` in the frame that follows the end of a visit."""
+    """Add the boxes of a track, and an `outside` box in the frame after each visit."""
     seen = set(rows.frame.tolist())
     for frame, box in zip(rows.frame.tolist(), rows.xyxy, strict=True):
         corners = {k: f"{v:.2f}" for k, v in zip(CVAT_BOX, box, strict=True)}
@@ -199,12 +204,13 @@ def _cvat_boxes(track: ET.Element, rows: Tracks, following: dict[int, int]) -> N
 
 
 def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[float, Array]:
-    """Measure the world for a viewer; warns of what is unknown.
+    """Compute scale and rotation of the world for a viewer; warn if scale or up is unknown.
 
     Returns:
-        metres per unit (1 if unknown), and the rotation (3, 3) that brings up onto `up_axis`.
+        metres per unit (1 if unknown), and the rotation (3, 3) from up to `up_axis`.
     """
-    scale, up = result.world.scale, result.world.up_in_world
+    scale = result.world.scale
+    up = result.world.up_in_world
     metres = scale.value if scale is not None and scale.source != "none" else None
     if result.located:
         if not metres:
@@ -215,18 +221,18 @@ def _upright(result: Result, path: Path, up_axis: Sequence[float]) -> tuple[floa
     return metres or 1.0, np.asarray(turn)
 
 
-def _say_origin(origin: Array, path: Path) -> None:
-    """Say by how much a world far from its origin was moved: the format has float32."""
+def _warn_of_origin(origin: Array, path: Path) -> None:
+    """Warn if the world was shifted, for formats with float32."""
     if origin.any():
-        place = ", ".join(f"{value:.12g}" for value in origin)
-        log.warning("%s: its origin is %s of the world: the format has float32", path, place)
+        point = ", ".join(f"{value:.12g}" for value in origin)
+        log.warning("%s: its origin is %s of the world: the format has float32", path, point)
 
 
 def export_glb(result: Result, path: Path) -> None:
-    """Write binary glTF 2.0 with trimesh: a mesh an object, the sparse points, the camera path.
+    """Write binary glTF 2.0 with trimesh: a mesh per object, the sparse points, the camera path.
 
-    The nodes are called "CLASS ID", each mesh has facts of its object in `extras`. y is up, units
-    are metres if the scale is known.
+    The nodes are named "CLASS ID"; `extras` of a mesh has data of its object. y is up, units are
+    metres if the scale is known.
     """
     try:
         import trimesh
@@ -234,19 +240,22 @@ def export_glb(result: Result, path: Path) -> None:
         raise ReobjError("trimesh is not installed: pip install 'reobj-track[viewer]'") from error
     result, origin = centred(_largest_part(result, path))
     scale, turn = _upright(result, path, [0.0, 1, 0])
-    _say_origin(origin, path)
-    world, poses = np.eye(4), result.poses
+    _warn_of_origin(origin, path)
+    world = np.eye(4)
+    poses = result.poses
     world[:3, :3] = scale * turn
     scene: Any = trimesh.Scene(metadata={"origin_in_world": origin.tolist()})
     ellipsoids = result.ellipsoids()
     columns = ellipsoids.world_from_obj * ellipsoids.half_axes[:, None]  # (O, 3, 3)
     for o, axes, center in zip(result.located, columns, ellipsoids.center_in_world, strict=True):
-        mesh, name = trimesh.creation.icosphere(subdivisions=3), f"{o.class_name} {o.id}"
+        mesh = trimesh.creation.icosphere(subdivisions=3)
+        name = f"{o.class_name} {o.id}"
         mesh.visual.face_colors = [*object_color(o.id)[::-1], 255]
         entry = o.to_json()
         mesh.metadata = {k: entry[k] for k in ("id", "class", "status", "support", "size_m")}
         world_from_sphere = np.eye(4)
-        world_from_sphere[:3, :3], world_from_sphere[:3, 3] = axes, center
+        world_from_sphere[:3, :3] = axes
+        world_from_sphere[:3, 3] = center
         scene.add_geometry(mesh, name, name, transform=world @ world_from_sphere)
     if poses is not None and len(poses.points):
         make_cloud: Any = trimesh.PointCloud
@@ -256,7 +265,8 @@ def export_glb(result: Result, path: Path) -> None:
         centers = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
         scene.add_geometry(trimesh.load_path(centers), "cameras", "cameras", transform=world)
     if not scene.geometry:
-        raise ReobjError(f"{path}: nothing to show in 3D: no solids and no cameras here, see `run`")
+        raise ReobjError(f"{path}: nothing to export: the result has no solids and no cameras, see "
+                         "`run`")  # fmt: skip
     with atomic(path) as part:
         part.write_bytes(scene.export(file_type="glb"))
 
@@ -264,30 +274,26 @@ def export_glb(result: Result, path: Path) -> None:
 def export_ply(result: Result, path: Path) -> None:
     """Write the solids as one coloured, closed triangle mesh (trimesh, Open3D, MeshLab).
 
-    In the world of poses.txt and its units: boxes, cylinders and ellipsoids as they were fitted.
+    In the world and units of poses.txt: the fitted boxes, cylinders and ellipsoids.
     """
     result = _largest_part(result, path)
     if not result.located:
-        raise ReobjError(f"{path}: nothing to show in 3D: no solids here, see `run`")
+        raise ReobjError(f"{path}: nothing to export: the result has no solids, see `run`")
     located = result.located
     write_ply(path, result.ellipsoids(), [o.id for o in located], [o.support for o in located])
-
-
-CSV_AXES = ("x", "y", "z")
 
 
 def export_csv(result: Result, path: Path) -> None:
     """Write a table of the objects, one a line, for spreadsheets and pandas.
 
-    Lengths are in world units, `_m` in metres; empty where unknown. A text that a spreadsheet would
-    take for a formula gets an apostrophe before it.
+    Lengths are in world units, `_m` in metres; empty where unknown. Text that a spreadsheet would
+    read as a formula gets an apostrophe.
     """
-    part = {"newline": "", "encoding": "utf-8"}
     head = ["id", "class", "status", "reason", "score", "confidence", "support"]
     vectors = ("center", "size", "size_m", "size_rel_sigma")
-    head += [f"{name}_{axis}" for name in vectors for axis in CSV_AXES]
+    head += [f"{name}_{axis}" for name in vectors for axis in "xyz"]
     head += ["qw", "qx", "qy", "qz", "views", "frames_seen", "visits", "part"]
-    with atomic(path) as made, made.open("w", **part) as file:  # type: ignore[call-overload]
+    with atomic(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(head)
         for o in result.objects:
@@ -303,31 +309,32 @@ def _numbers(values: Array | None, count: int) -> list[float | None]:
 
 
 def _cell(value: Any) -> Any:
-    """Keep a text from being run as a formula (CWE-1236: = + - @, tab and carriage return)."""
+    """Protect text from evaluation as a formula (CWE-1236: = + - @, tab, carriage return)."""
     return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 
 
-NERF_MODELS = {  # nerfstudio's names, and the distortion that they know in nerfstudio's order
+NERF_MODELS = {  # nerfstudio's camera models, and their distortion parameters in its order
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
     "OPENCV": ("k1", "k2", "p1", "p2"),
 }
-GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: x right, y up, z backwards
+GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes; OpenGL: x right, y up, z backward
 
 
 def export_nerfstudio(result: Result, path: Path) -> None:
-    """Write transforms.json for nerfstudio, with points to start from and the images of a video.
+    """Write transforms.json for nerfstudio, with initial points and the images of a video.
 
-    The world is that of poses.txt. Images of a folder stay where they are; frames of a video are
-    written beside the file, into images/.
+    The world is that of poses.txt. Images of a folder are referenced; frames of a video are written
+    to images/ beside the file.
 
     Ref: docs.nerf.studio, "Data conventions": camera axes of OpenGL, world_from_cam.
     """
     result, origin = centred(_largest_part(result, path))
-    poses, video = result.poses, _video_of(result)
+    poses = result.poses
+    video = _video_of(result)
     if poses is None or not poses.known.any():
-        raise ReobjError(f"{path}: no cameras here, see `run`")
+        raise ReobjError(f"{path}: the result has no cameras, see `run`")
     if video is None:
-        raise ReobjError(f"{path}: the video is gone, and nerfstudio needs its images")
+        raise ReobjError(f"{path}: nerfstudio needs the images, but the video was moved or deleted")
     if not video.has_images:
         raise ReobjError(f"{path}: this run had no images, and nerfstudio needs them; try --to rrd")
     with staged(path.parent, ".part-nerfstudio") as folder:
@@ -335,10 +342,10 @@ def export_nerfstudio(result: Result, path: Path) -> None:
 
 
 def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, folder: Path) -> None:
-    """Write what becomes `path`, its points and images into a new folder.
+    """Write `path`, its points and images into a new folder.
 
     Args:
-        origin: (3,) in the world of poses.txt, of the one that is written.
+        origin: (3,) of the written world, in the world of poses.txt.
     """
     world_from_cam = np.tile(np.eye(4), (len(poses.frame), 1, 1))
     world_from_cam[:, :3] = invert_rigid(poses.cam_from_world)
@@ -358,14 +365,14 @@ def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, fol
 
 
 def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
-    """Describe the intrinsics as nerfstudio reads them; warns of a lens that it does not know."""
+    """Convert the intrinsics to nerfstudio's; warn about distortion that it does not support."""
     values = dict(zip(camera_parameters(camera.model), camera.params, strict=True))
     model = "OPENCV_FISHEYE" if camera.model == "OPENCV_FISHEYE" else "OPENCV"
     terms = {"k1": values.pop("k", 0.0)} | {k: v for k, v in values.items() if k[0] in "kp"}
     known = {k: terms.get(k, 0.0) for k in NERF_MODELS[model]}
     pinhole = {"f", "fx", "fy", "cx", "cy", "k"}
     if any(v for k, v in values.items() if k not in known and k not in pinhole):
-        log.warning("%s: nerfstudio has no %s cameras: the rest of its distortion is left out",
+        log.warning("%s: nerfstudio has no %s cameras: further distortion parameters are left out",
                     path, camera.model)  # fmt: skip
     K = camera.K
     facts = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
@@ -373,20 +380,22 @@ def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
     return {"camera_model": model, **{k: float(v) for k, v in facts.items()}, **size, **known}
 
 
-def _image_files(video: Video, poses: Poses, place: Path, folder: Path) -> dict[int, str]:
-    """Name the image file of each frame, as seen from `place`; those of a video are written.
+def _image_files(video: Video, poses: Poses, target: Path, folder: Path) -> dict[int, str]:
+    """Return the image file of each frame, relative to `target`; write those of a video.
 
     Args:
-        folder: a new one, whose files are moved to `place`.
+        folder: a new one, whose files are moved to `target`.
     """
-    source, names = Path(str(video.source)), video.names
+    source = Path(str(video.source))
+    names = video.names
     if names:
-        where = source if source.is_dir() else source.parent
+        images = source if source.is_dir() else source.parent
         return {
-            frame: Path(os.path.relpath(where / names[frame], place)).as_posix()
+            frame: Path(os.path.relpath(images / names[frame], target)).as_posix()
             for frame in poses.frame.tolist()
         }
-    files, wanted = {}, set(poses.frame[poses.known].tolist())
+    files = {}
+    wanted = set(poses.frame[poses.known].tolist())
     with Progress("images", len(wanted)) as progress:
         for frame in video:
             if frame.index in wanted:
@@ -402,30 +411,32 @@ def _image_files(video: Video, poses: Poses, place: Path, folder: Path) -> dict[
 
 # ---- rerun -------------------------------------------------------------------------------------
 
-RRD_SIZE_PX = 640  # longer side of the images in a recording (chosen: 40 kB a frame)
+RRD_SIZE_PX = 640  # px, longer side of the images in a recording (chosen: 40 kB a frame)
 
 
 class Viewer:
-    """A recording in rerun: to a file, or live to its viewer while a video is tracked.
+    """A rerun recording: to a file, or live to its viewer while a video is tracked.
 
-    Ellipsoids, points and, on the timelines `frame` and `time`, the camera, its image and the boxes
-    in it; z is up, units are metres if the scale is known.
+    Contains ellipsoids, points and, on the timelines `frame` and `time`, the camera, its image and
+    the boxes in it; z is up, units are metres if the scale is known.
 
     Attributes:
-        followed: the images of the video were shown already, while it was tracked.
+        followed: the images of the video were logged while it was tracked.
     """
 
     def __init__(self, video: VideoInfo, start: Callable[[Any], Any] | None = None) -> None:
-        """Open a recording of a video; `start` says where it goes (default: rerun's viewer)."""
+        """Open a recording of a video; `start` connects its output (default: rerun's viewer)."""
         try:
             import rerun as rr
         except ImportError as error:
             raise ReobjError("rerun is not installed: pip install 'reobj-track[viewer]'") from error
-        self.rr, self.video, self.followed = rr, video, False
+        self.rr = rr
+        self.video = video
+        self.followed = False
         self.shrink = min(1.0, RRD_SIZE_PX / max(video.width, video.height, 1))
         name = visible_name(Path(video.path).name)
         self.rec = rr.RecordingStream("reobj_track", recording_id=name)
-        self.rec.set_log_time_enabled(False)  # when the export was made is of no interest
+        self.rec.set_log_time_enabled(False)  # same result, same timelines
         if start is None:
             self.rec.spawn()
         else:
@@ -438,7 +449,7 @@ class Viewer:
         self, steps: Iterable[tuple[Frame, Tracks]], names: Sequence[str], video: Video,
         poses: Poses | None,
     ) -> Iterator[tuple[Frame, Tracks]]:  # fmt: skip
-        """Show each frame of a running `track` as it comes, and hand it on."""
+        """Log and yield each frame of a running `track`."""
         self.followed = True
         if poses is not None:
             poses = shifted(poses, far_origin(poses))
@@ -457,14 +468,16 @@ class Viewer:
             yield frame, tracks
 
     def show(self, result: Result, path: Path, images: bool) -> None:
-        """Log a result: its solids, points and all frames; of several parts the largest in 3D.
+        """Log a result: solids and points (of the largest component), and all frames.
 
         Args:
             path: for warnings. images: read the video again and log its images.
         """
-        rr, rec, (largest, origin) = self.rr, self.rec, centred(_largest_part(result, path))
+        rr = self.rr
+        rec = self.rec
+        largest, origin = centred(_largest_part(result, path))
         scale, turn = _upright(largest, path, [0.0, 0, 1])
-        _say_origin(origin, path)
+        _warn_of_origin(origin, path)
         names = {o.id: f"{o.id} {o.class_name}" for o in result.objects}
         rec.log("world", rr.Transform3D(mat3x3=turn), static=True)  # a scale: no pinholes
         ellipsoids = largest.ellipsoids()
@@ -480,7 +493,9 @@ class Viewer:
         if (poses := largest.poses) is not None:
             cloud = rr.Points3D(scale * poses.points, colors=poses.colors)
             rec.log("world/points", cloud, static=True)
-        pose_of, tracks, (frames, _) = _pose_by_frame(poses), result.tracks, _frames_read(result)
+        pose_of = _pose_by_frame(poses)
+        tracks = result.tracks
+        frames, _ = _frames_read(result)
         video = _video_of(result) if images else None
         shown = iter(video if video is not None and video.has_images else ())
         ahead = next(shown, None)
@@ -498,7 +513,9 @@ class Viewer:
         labels: list[str],
     ) -> None:  # fmt: skip
         """Set the time; log the camera, if the frame has a pose, and boxes in native pixels."""
-        rr, rec, shrink = self.rr, self.rec, self.shrink
+        rr = self.rr
+        rec = self.rec
+        shrink = self.shrink
         rec.set_time("frame", sequence=frame)
         rec.set_time("time", duration=frame / (self.video.fps or IMAGE_FPS))
         if poses is None or pose is None or not np.isfinite(pose).all():
@@ -521,11 +538,11 @@ class Viewer:
         size = (round(self.shrink * self.video.width), round(self.shrink * self.video.height))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
-        made = self.rr.EncodedImage(contents=data, media_type="image/jpeg")
-        self.rec.log("world/camera/image", made)
+        encoded = self.rr.EncodedImage(contents=data, media_type="image/jpeg")
+        self.rec.log("world/camera/image", encoded)
 
     def close(self) -> None:
-        """Send or write what is left."""
+        """Send or write the remaining data."""
         self.rec.disconnect()
 
 
@@ -536,17 +553,17 @@ def _pose_by_frame(poses: Poses | None) -> dict[int, Array]:
 
 
 def export_rrd(result: Result, path: Path) -> None:
-    """Write a recording for the rerun viewer with rerun-sdk: what `Viewer` shows, with images."""
+    """Write a recording of `Viewer`, with images, for the rerun viewer (needs rerun-sdk)."""
     with atomic(path) as part, tempfile.TemporaryDirectory() as folder:
         try:
-            place = os.fsencode(part).decode()
-        except UnicodeDecodeError:  # rerun takes no other names
-            place = f"{folder}/scene.rrd"
-        viewer = Viewer(result.video, lambda rec: rec.save(place))
+            file = os.fsencode(part).decode()
+        except UnicodeDecodeError:  # rerun requires UTF-8 names
+            file = f"{folder}/scene.rrd"
+        viewer = Viewer(result.video, lambda rec: rec.save(file))
         viewer.show(result, path, images=True)
         viewer.close()
         if not part.exists():
-            shutil.move(place, part)
+            shutil.move(file, part)
 
 
 EXPORTS: dict[str, tuple[str, Callable[[Result, Path], None]]] = {  # name: file in OUT, writer

@@ -1,4 +1,4 @@
-"""Worlds far from their origin (map projections), moved near it: float32 holds seven digits."""
+"""Shift worlds far from their origin (map projections), as float32 has seven digits."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from reobj.cameras import Poses, invert_rigid
 from reobj.results.result import Result
 from reobj.types import Array
 
-FAR = 100  # extents: float32 has 24 bits, 2 ** -24 of 100 extents is 6e-6 of one
+FAR = 100  # extents; float32 has 24 bits: 2 ** -24 of 100 extents is 6e-6 of one
 
 
-def far_origin(poses: Poses | None, places: Array | None = None) -> Array:
-    """Return a place (3,) amid the cameras of one world if its origin is far, else zeros.
+def far_origin(poses: Poses | None, points: Array | None = None) -> Array:
+    """Return a point (3,) amid the cameras of a world if its origin is far away, else zeros.
 
-    It is a multiple of the power of ten below the extent, so that it is short to state.
+    It is rounded to the power of ten below the extent, for short numbers.
 
     Args:
-        places: (N, 3) of objects, which count for the extent.
+        points: (N, 3) of objects, included in the extent.
     """
     if poses is None or not poses.known.any():
         return np.zeros(3)
     eye = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]  # (F, 3)
     middle = np.median(eye, 0)
-    spread = eye if places is None else np.concatenate([eye, places])
-    extent = float(np.linalg.norm(spread - middle, axis=1).max())
+    every = eye if points is None else np.concatenate([eye, points])
+    extent = float(np.linalg.norm(every - middle, axis=1).max())
     if not np.linalg.norm(middle) > FAR * extent > 0:
         return np.zeros(3)
     step = 10.0 ** math.floor(math.log10(extent))
@@ -35,17 +35,17 @@ def far_origin(poses: Poses | None, places: Array | None = None) -> Array:
 
 
 def shifted(poses: Poses, origin: Array) -> Poses:
-    """Return the cameras and points of a world whose origin is another place (3,)."""
+    """Return the cameras and points of a world after a shift of its origin to `origin` (3,)."""
     cams = poses.cam_from_world.copy()
     cams[:, :, 3] += cams[:, :, :3] @ origin
     return dataclasses.replace(poses, cam_from_world=cams, points=poses.points - origin)
 
 
 def centred(part: Result) -> tuple[Result, Array]:
-    """Move the world of a part (`Result.of_part`) near its origin, if it is far; without the fits.
+    """Shift the world of a component (`Result.of_part`) if its origin is far away.
 
     Returns:
-        the part, and the place (3,) in its world that is the origin now.
+        the component, then without fits, and the position (3,) of the new origin in the old world.
     """
     centers = np.array([o.center for o in part.located], np.float64).reshape(-1, 3)
     origin = far_origin(part.poses, centers)

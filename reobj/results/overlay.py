@@ -1,7 +1,7 @@
-"""The film: boxes, identities and back-projected solids drawn over every frame.
+"""Overlay video: boxes, identities and projected solids drawn over every frame.
 
-`Overlay` is a sink under the one loop over the video (`write_pictures` in scene.py); `film` writes
-what it draws.
+`write_pictures` in scene.py reads the video and passes each frame to `Overlay`; `film` encodes the
+drawn frames.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ from reobj.cameras import Camera
 from reobj.files import cut
 from reobj.results.film import FilmWriter
 from reobj.results.origin import centred
+from reobj.results.ply import CYLINDER_SIDES as SIDES
 from reobj.results.result import Result
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
 
 LAYERS = ("boxes", "solids", "ellipses", "trails")
-OFF, ON = ("none", "false", "no", "off", "0"), ("true", "yes", "on", "1")
+OFF = ("none", "false", "no", "off", "0")
+ON = ("true", "yes", "on", "1")
 
 Color = tuple[int, int, int]
 
 
 def film_layers(text: str) -> frozenset[str]:
-    """Parse what the film shows besides boxes; empty: no film.
+    """Parse the layers of the overlay video; empty: no video.
 
     >>> sorted(film_layers("solids, trails"))
     ['boxes', 'solids', 'trails']
@@ -52,9 +54,10 @@ def film_layers(text: str) -> frozenset[str]:
 
 # ---- Boxes and labels --------------------------------------------------------------------------
 
-FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.45  # readable at 640 px width (chosen)
-LABEL_MAX = 24  # characters of a class name in the film (chosen: 200 px)
-DASH_PX = 6  # of boxes that fill a gap
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+FONT_SCALE = 0.45  # readable at 640 px width (chosen)
+LABEL_MAX = 24  # characters of a class name in a label (chosen: 200 px)
+DASH_PX = 6  # px, dashes of interpolated boxes
 
 
 def draw_tracks(
@@ -65,19 +68,21 @@ def draw_tracks(
     places: dict[int, int] | None = None,
     thin: frozenset[int] = frozenset(),
 ) -> None:
-    """Draw the boxes and identities of one frame's rows, in place; dashed where they fill a gap.
+    """Draw the boxes and identities of one frame's rows, in place; interpolated boxes are dashed.
 
-    Labels never cover each other: one that finds no free place at its box is left out.
+    Labels do not overlap: one without free space at its box is left out.
 
     Args:
         labels: text of each identity; scale: image pixels per pixel of the tracks.
-        places: where the labels of the frame before were, changed here: they jump less.
+        places: position (index) of each identity's label in the previous frame, updated here, so
+            that labels jump less.
         thin: identities whose solid is drawn too.
     """
     boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
-    ids, score = tracks.track_id.tolist(), tracks.score.tolist()
-    for obj, box, sure in zip(ids, boxes, score, strict=True):
-        _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=sure == 0)
+    ids = tracks.track_id.tolist()
+    scores = tracks.score.tolist()
+    for obj, box, score in zip(ids, boxes, scores, strict=True):
+        _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=score == 0)
     places = {} if places is None else places
     texts = [labels.get(obj, str(obj)) for obj in ids]
     sizes = np.array([_text_size(text) for text in texts], int).reshape(-1, 2)
@@ -101,16 +106,17 @@ def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed:
 
 
 def _text_size(text: str) -> tuple[int, int]:
-    """Width and height of a label's tag."""
+    """Return the width and height of a label."""
     (width, height), base = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
     return width + 4, height + base + 2
 
 
 def _draw_label(image: Image, text: str, spot: tuple[int, int], color: Color) -> None:
-    """Draw text on a filled tag with its corner at `spot`."""
-    (x, y), (width, height) = spot, _text_size(text)
+    """Draw text on a filled rectangle with its top-left corner at `spot`."""
+    x, y = spot
+    width, height = _text_size(text)
     cv2.rectangle(image, (x, y), (x + width - 1, y + height - 1), color, -1)
-    ink = (0,) * 3 if sum(color) > 380 else (255,) * 3  # dark on light
+    ink = (0,) * 3 if sum(color) > 380 else (255,) * 3  # black on light colours
     _, base = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
     cv2.putText(image, text, (x + 2, y + height - base), FONT, FONT_SCALE, ink, 1, cv2.LINE_AA)
 
@@ -122,20 +128,20 @@ def place_labels(
     image_size: tuple[int, int],
     places: dict[int, int],
 ) -> list[tuple[int, int] | None]:
-    """Choose a place for each label, at its box, inside the image, free of other labels.
+    """Choose a position for each label at its box, inside the image and free of other labels.
 
     Args:
         sizes: (N, 2) of the labels, boxes: (N, 4), both pixels.
-        places: number of the place that each identity's label had last; changed here.
+        places: index of the last position of each identity's label; updated here.
     Returns:
-        top-left corner of each label, None where no place is free.
+        top-left corner of each label, None where no position is free.
     """
     taken = np.empty((0, 4), int)
     spots: list[tuple[int, int] | None] = []
     limit = np.array(image_size)
     for obj, size, box in zip(ids, sizes, boxes, strict=True):
         corners = _label_places(box, size).clip(0, np.maximum(limit - size, 0))  # (P, 2)
-        free = (  # left of, above, right of or below every other
+        free = (  # left of, above, right of or below all others
             (corners[:, None] >= taken[:, 2:]) | (corners[:, None] + size <= taken[:, :2])
         ).any(2).all(1)  # fmt: skip
         order = [places.get(obj, 0), *range(len(corners))]
@@ -150,16 +156,18 @@ def place_labels(
 
 
 def _label_places(box: IntArray, size: IntArray) -> IntArray:
-    """Top-left corners (14, 2) of a label at a box, the best first."""
-    (x1, y1, x2, y2), (w, h) = box.tolist(), size.tolist()
-    xs, beside = (x1, x2 - w, (x1 + x2 - w) // 2), ((x1 - w, y1), (x2, y1))
+    """List the top-left corners (14, 2) of a label at a box, best first."""
+    x1, y1, x2, y2 = box.tolist()
+    w, h = size.tolist()
+    xs = (x1, x2 - w, (x1 + x2 - w) // 2)
+    beside = ((x1 - w, y1), (x2, y1))
     rows = [(x, y) for y in (y1 - h, y1 + 2, y2 - h - 1, y2) for x in xs]
     return np.array([*rows[:6], *beside, *rows[6:]])
 
 
 # ---- Ellipses ----------------------------------------------------------------------------------
 
-MAX_AXIS = 4  # image sides; longer outlines are of objects beside the camera and only confuse
+MAX_AXIS = 4  # longer image sides; larger outlines, of objects beside the camera, are not drawn
 
 
 def draw_ellipses(
@@ -180,13 +188,13 @@ def draw_ellipses(
 def ellipse_of_dual_conic(
     dual_c: Array,
 ) -> tuple[tuple[float, float], tuple[float, float], float] | None:
-    """Convert a dual conic C* (3, 3) to the ellipse that cv2.ellipse draws, None if it is none.
+    """Convert a dual conic C* (3, 3) to an ellipse for cv2.ellipse; None for other conics.
 
     C* = [S - m m', -m; -m', -1] up to scale: m is the centre, the eigenvalues of S are the squared
     half axes.
 
     Returns:
-        centre in OpenCV's pixels, full axes, angle of the first axis from x towards y in degrees.
+        centre in OpenCV's pixels, full axes, angle of the first axis from x towards y, deg.
     """
     conic = dual_c / -dual_c[2, 2]
     center = -conic[:2, 2]
@@ -201,10 +209,9 @@ def ellipse_of_dual_conic(
 
 # ---- Boxes and cylinders in 3D -----------------------------------------------------------------
 
-SIDES = 48  # of the prism that a cylinder is drawn as (chosen: round to the eye)
-NEAR = 0.05  # half extents of a solid: nearer to the camera's plane its edges are cut (chosen)
-BEND = 8  # pieces that an edge is drawn in where the lens distorts (chosen: smooth to the eye)
-SHIFT = 4  # bits of a pixel that OpenCV draws lines with
+NEAR = 0.05  # longest half extents, least depth at which an edge of a solid is drawn (chosen)
+BEND = 8  # segments of an edge where the lens distorts (chosen: looks smooth)
+SHIFT = 4  # sub-pixel bits of OpenCV's lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,9 +220,9 @@ class Wireframes:
 
     Attributes:
         points: (P, 3). edges: (E, 2) points. faces: (E, 2) the two faces that meet in each edge.
-        crease: (E,) False between facets of a round side: seen only where it is the outline.
+        crease: (E,) False between facets of a curved side: visible only on the outline.
         solid: (E,) number of the solid. planes: (N, 4) of the faces: n . x - d > 0 outside.
-        min_depth: (E,) least depth that is drawn.
+        min_depth: (E,) least depth at which it is drawn.
     """
 
     points: Array
@@ -227,13 +234,14 @@ class Wireframes:
     min_depth: Array
 
     def segments(self, cam_from_world: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Cut out what one camera (3, 4) may see.
+        """Clip the edges to the front of one camera (3, 4).
 
         Returns:
-            ends (n, 2, 3) in the camera, in front of it; their edges (n,); front (n,): False where
-            the solid hides its own edge.
+            ends (n, 2, 3) in camera coordinates; their edges (n,); front (n,): False where the
+            solid occludes its own edge.
         """
-        turn, shift = cam_from_world[:, :3], cam_from_world[:, 3]
+        turn = cam_from_world[:, :3]
+        shift = cam_from_world[:, 3]
         eye = -turn.T @ shift
         outside = self.planes[:, :3] @ eye - self.planes[:, 3] > 0  # (N,) faces the camera
         facing = outside[self.faces]  # (E, 2)
@@ -241,19 +249,20 @@ class Wireframes:
         ends = (self.points @ turn.T + shift)[self.edges]  # (E, 2, 3)
         wanted &= (ends[:, :, 2] > self.min_depth[:, None]).any(1)
         edge = np.flatnonzero(wanted)
-        ends, least = ends[edge], self.min_depth[edge]
-        for a, b in ((0, 1), (1, 0)):  # move an end that is too near along its edge
+        ends = ends[edge]
+        least = self.min_depth[edge]
+        for a, b in ((0, 1), (1, 0)):  # move an end of too little depth along its edge
             missing = (least - ends[:, a, 2]).clip(0)  # (n,)
-            share = missing / np.maximum(np.maximum(missing, ends[:, b, 2] - ends[:, a, 2]), 1e-12)
-            ends[:, a] += share[:, None] * (ends[:, b] - ends[:, a])
+            length = np.maximum(np.maximum(missing, ends[:, b, 2] - ends[:, a, 2]), 1e-12)
+            ends[:, a] += (missing / length)[:, None] * (ends[:, b] - ends[:, a])
         return ends, edge, np.asarray(facing[edge].any(1), bool)
 
 
 def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -> Wireframes:
-    """Make the edges of solids that ellipsoids are inscribed in; none of those without edges.
+    """Make the edges of the solids in which ellipsoids are inscribed.
 
     Args:
-        support: (S,) "box" or "cylinder"; others have no edges.
+        support: (S,) "box" or "cylinder"; other shapes have no edges.
     """
     columns: list[list[Any]] = [[] for _ in range(7)]
     points = faces = 0
@@ -261,17 +270,20 @@ def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -
         if shape not in ("box", "cylinder"):
             continue
         mesh = _unit_box() if shape == "box" else _unit_cylinder()
-        half, turn = ellipsoids.half_axes[k], ellipsoids.world_from_obj[k]
-        center, count = ellipsoids.center_in_world[k], len(mesh[1])
+        half = ellipsoids.half_axes[k]
+        turn = ellipsoids.world_from_obj[k]
+        center = ellipsoids.center_in_world[k]
+        count = len(mesh[1])
         normal = (mesh[4][:, :3] / half) @ turn.T  # (N, 3) x = c + R (h u)
-        made = (
+        values = (
             mesh[0] * half @ turn.T + center, mesh[1] + points, mesh[2] + faces, mesh[3],
             np.full(count, k), np.c_[normal, mesh[4][:, 3] + normal @ center],
             np.full(count, NEAR * half.max()),
         )  # fmt: skip
-        for column, part in zip(columns, made, strict=True):
-            column.append(part)
-        points, faces = points + len(mesh[0]), faces + len(mesh[4])
+        for column, array in zip(columns, values, strict=True):
+            column.append(array)
+        points = points + len(mesh[0])
+        faces = faces + len(mesh[4])
     empty = (
         np.empty((0, 3)), np.empty((0, 2), int), np.empty((0, 2), int), np.empty(0, bool),
         np.empty(0, int), np.empty((0, 4)), np.empty(0),
@@ -284,9 +296,10 @@ Mesh = tuple[Array, IntArray, IntArray, BoolArray, Array]  # points, edges, face
 
 
 def _unit_box() -> Mesh:
-    """The cube of half side 1; face 2 k + (1 if positive) is across axis k."""
+    """Make the cube of half side 1; face 2 k + (1 if positive) is normal to axis k."""
     points = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, 8).T
-    edges, faces = [], []
+    edges = []
+    faces = []
     for a in range(8):
         for axis in range(3):
             if points[a, axis] < 0:
@@ -300,12 +313,14 @@ def _unit_box() -> Mesh:
 
 
 def _unit_cylinder() -> Mesh:
-    """The upright cylinder of radius and half height 1, as a prism; its last two faces are caps."""
+    """Make a prism for the upright cylinder of radius and half height 1; caps are last."""
     number = np.arange(SIDES)
-    angle, following = 2 * np.pi * number / SIDES, (number + 1) % SIDES
+    angle = 2 * np.pi * number / SIDES
+    following = (number + 1) % SIDES
     ring = np.c_[np.cos(angle), np.sin(angle)]
     points = np.r_[np.c_[ring, -np.ones(SIDES)], np.c_[ring, np.ones(SIDES)]]
-    low, high = np.c_[number, following], np.c_[number, following] + SIDES
+    low = np.c_[number, following]
+    high = np.c_[number, following] + SIDES
     edges = np.r_[low, high, np.c_[number, number + SIDES]]
     caps = (np.full(SIDES, SIDES), np.full(SIDES, SIDES + 1))
     faces = np.r_[np.c_[number, caps[0]], np.c_[number, caps[1]], np.c_[number, number - 1]]
@@ -317,7 +332,7 @@ def _unit_cylinder() -> Mesh:
 
 
 def image_points(camera: Camera, points: Array) -> Array:
-    """Project points (..., 3) in the camera, in front of it, to pixels (..., 2); lens included."""
+    """Project points (..., 3) in front of a camera, in its frame, to pixels (..., 2), distorted."""
     flat = points.reshape(-1, 3)
     if camera.model == "PINHOLE" or not len(flat):
         pixels = flat[:, :2] / flat[:, 2:] @ camera.K[:2, :2].T + camera.K[:2, 2]
@@ -336,26 +351,28 @@ def draw_wireframes(
     drawn: BoolArray,
     seen: set[int],
 ) -> None:
-    """Draw solids in place, the farthest first; edges that a solid hides itself are thin and dim.
+    """Draw solids in place, farthest first; self-occluded edges are thin and dim.
 
     Args:
         scale: image pixels per pixel of the camera. object_id, drawn: (S,) identities of the
             solids, and which ones to draw.
-        seen: identities with a box in this frame; solids of others are thin, without hidden edges.
+        seen: identities with a box in this frame; other solids are thin, without occluded edges.
     """
     ends, edge, front = frames.segments(cam_from_world)
     pieces = 1 if camera.model == "PINHOLE" else BEND
-    share = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
-    line = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
+    fraction = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
+    line = ends[:, :1] + fraction * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
     pixels = scale * image_points(camera, line) - 0.5  # OpenCV draws with the pixel's centre at 0
-    solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are in a row
-    ends_at = np.append(first, len(edge))[1:]  # as many as solids, also of none
-    own = {k: slice(a, b) for k, a, b in zip(solids.tolist(), first, ends_at, strict=True)}
-    for k in sorted(own, key=lambda k: -ends[own[k], :, 2].mean()):  # near ones last
-        mine, obj = own[k], object_id[k]
-        if not drawn[k] or not _fits(pixels[mine], image):
+    solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are consecutive
+    stop = np.append(first, len(edge))[1:]  # (S,)
+    edges_of = {k: slice(a, b) for k, a, b in zip(solids.tolist(), first, stop, strict=True)}
+    for k in sorted(edges_of, key=lambda k: -ends[edges_of[k], :, 2].mean()):  # nearest last
+        rows = edges_of[k]
+        obj = object_id[k]
+        if not drawn[k] or not _fits(pixels[rows], image):
             continue
-        lines, shown = np.round(pixels[mine] * (1 << SHIFT)).astype(np.int32), front[mine]
+        lines = np.round(pixels[rows] * (1 << SHIFT)).astype(np.int32)
+        shown = front[rows]
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)
         if obj in seen:
@@ -365,46 +382,50 @@ def draw_wireframes(
 
 
 def _fits(pixels: Array, image: Image) -> bool:
-    """True where an outline (n, B, 2) can be drawn, and is not of something beside the camera."""
+    """Test whether an outline (n, B, 2) is finite and not too large (object beside the camera)."""
     flat = pixels.reshape(-1, 2)
     return bool(np.isfinite(flat).all() and np.ptp(flat, 0).max() < MAX_AXIS * max(image.shape))
 
 
-# ---- The film ----------------------------------------------------------------------------------
+# ---- The video ---------------------------------------------------------------------------------
 
-LEGEND_S = 2.0  # the legend is shown (chosen: long enough to be read)
-TRAIL_S = 1.0  # of the past that a trail shows (chosen)
+LEGEND_S = 2.0  # s that the legend is shown (chosen: long enough to read)
+TRAIL_S = 1.0  # s, length of a trail (chosen)
 
 
 class Overlay:
-    """Draw the film frame by frame.
+    """Draw the overlay video frame by frame.
 
     Solids that rest on a prior are drawn only while their object is detected.
 
     Attributes:
-        path: of the film. size: (w, h) of the pictures. scale: of their pixels per native pixel.
+        path: of the video. size: (w, h) of its frames. scale: their pixels per native pixel.
     """
 
     def __init__(self, result: Result, path: Path, video: Video, layers: str = "solids") -> None:
-        """Open the film; its suffix is that of the format that can be written here."""
+        """Open the video; the suffix of `path` is replaced by that of the available format."""
         self.fps = (video.fps or IMAGE_FPS) / video.config.every
         self.writer = FilmWriter(path, self.fps, video.size)
-        self.path, self.size, self.layers = self.writer.path, self.writer.size, film_layers(layers)
-        self.scale, self.tracks = self.size[0] / video.size[0], result.tracks
-        self.sure = {o.id for o in result.located if o.status == "ok"}
+        self.path = self.writer.path
+        self.size = self.writer.size
+        self.layers = film_layers(layers)
+        self.scale = self.size[0] / video.size[0]
+        self.tracks = result.tracks
+        self.measured = {o.id for o in result.located if o.status == "ok"}
         self.labels = {o.id: f"{o.id} {cut(o.class_name, LABEL_MAX)}" for o in result.objects}
         self.outlines = _project_all(result, self.scale, self.layers)
         self.places: dict[int, int] = {}
         self.cameras = _cameras(result) if "solids" in self.layers else {}
         self.legend = _legend(result, self.layers)
-        self.trails: dict[int, list[tuple[int, Array]]] = {}  # by identity: count, place
+        self.trails: dict[int, list[tuple[int, Array]]] = {}  # by identity: frame, position
 
     def take(self, frame: Frame) -> None:
         """Draw and append one frame."""
         low, high = np.searchsorted(self.tracks.frame, [frame.index, frame.index + 1])
         rows = self.tracks[slice(low, high)]
         small = cv2.resize(frame.image, self.size, interpolation=cv2.INTER_AREA)
-        image, seen = np.asarray(small, np.uint8), set(rows.track_id.tolist())
+        image = np.asarray(small, np.uint8)
+        seen = set(rows.track_id.tolist())
         if "trails" in self.layers:
             self._draw_trails(image, rows)
         thin = self._draw_solids(image, frame.index, seen)
@@ -414,63 +435,67 @@ class Overlay:
         self.writer.write(image)
 
     def _draw_solids(self, image: Image, frame: int, seen: set[int]) -> frozenset[int]:
-        """Draw what is known in 3D; returns the identities that were drawn."""
+        """Draw the solids of a frame.
+
+        Returns:
+            identities in `seen` whose solid was drawn.
+        """
         shown: set[int] = set()
         if frame in self.cameras:
             solids, ids, camera, cam_from_world = self.cameras[frame]
-            drawn = np.array([i in seen or i in self.sure for i in ids], bool)
+            drawn = np.array([i in seen or i in self.measured for i in ids], bool)
             draw_wireframes(image, solids, camera, cam_from_world, self.scale, ids, drawn, seen)
             shown |= set(np.array(ids)[np.unique(solids.solid)].tolist())
         if frame in self.outlines:
             ids, dual_c, visible = self.outlines[frame]
-            drawn = visible & np.array([i in seen or i in self.sure for i in ids], bool)
+            drawn = visible & np.array([i in seen or i in self.measured for i in ids], bool)
             draw_ellipses(image, dual_c, drawn, ids, seen)
             shown |= set(ids)
         return frozenset(shown & seen)
 
     def _draw_trails(self, image: Image, rows: Tracks) -> None:
-        """Draw where the middle of each box was in the last second of the film."""
+        """Draw the path of the centre of each box in the last TRAIL_S seconds."""
         now = self.writer.count
         for obj, box in zip(rows.track_id.tolist(), rows.xyxy * self.scale, strict=True):
             trail = self.trails.setdefault(obj, [])
             trail.append((now, box.reshape(2, 2).mean(0)))
             trail[:] = [step for step in trail if step[0] >= now - TRAIL_S * self.fps]
-            line = np.array([place for _, place in trail]).round().astype(np.int32)  # (n, 2)
+            line = np.array([center for _, center in trail]).round().astype(np.int32)  # (n, 2)
             cv2.polylines(image, [line], False, object_color(obj), 2, cv2.LINE_AA)
 
     def close(self, complete: bool) -> None:
-        """Finish the film; it appears only if it is complete."""
+        """Finish the video; the file appears only if it is complete."""
         self.writer.close(complete)
 
 
 def _located_by_part(result: Result) -> list[tuple[Result, list[int]]]:
-    """List the parts with cameras and solids, and the identities of these.
+    """List the components with cameras and solids, and the identities of the solids.
 
-    A world far from its origin is moved: dual quadrics hold squares of coordinates.
+    Worlds far from their origin are shifted: dual quadrics contain squares of coordinates.
     """
     parts = [(centred(part)[0], [o.id for o in part.located]) for part in result.parts()]
     return [(p, ids) for p, ids in parts if p.poses is not None and ids and p.poses.known.any()]
 
 
 def _cameras(result: Result) -> dict[int, tuple[Wireframes, list[int], Camera, Array]]:
-    """Collect by frame number: solids and identities of its part, its camera and its pose."""
-    found = {}
+    """Map frame numbers to the solids and identities of the component, the camera and the pose."""
+    cameras = {}
     for part, ids in _located_by_part(result):
         poses = part.poses
         assert poses is not None
         solids = wireframes(part.ellipsoids(), [o.support for o in part.located])
         for frame, pose in zip(poses.frame[poses.known].tolist(), poses.cam_from_world[poses.known],
                                strict=True):  # fmt: skip
-            found[frame] = (solids, ids, poses.camera, pose)
-    return found
+            cameras[frame] = (solids, ids, poses.camera, pose)
+    return cameras
 
 
 def _project_all(
     result: Result, scale: float, layers: frozenset[str]
 ) -> dict[int, tuple[list[int], Array, BoolArray]]:
-    """Project the ellipsoids into the frames with a pose of their part.
+    """Project the ellipsoids into the frames with a pose in their component.
 
-    Of all located objects where `layers` has ellipses; else, with solids, of those without edges.
+    With the layer ellipses: all located objects; with solids: those whose shape has no edges.
 
     Returns:
         by frame number: identities (O), dual conics (O, 3, 3) in scaled pixels, and visible (O,).
@@ -480,8 +505,8 @@ def _project_all(
     for part, ids in _located_by_part(result):
         poses = part.poses
         assert poses is not None
-        round_ones = np.array([o.support not in ("box", "cylinder") for o in part.located])
-        chosen = np.full(len(ids), "ellipses" in layers) | (round_ones & ("solids" in layers))
+        no_edges = np.array([o.support not in ("box", "cylinder") for o in part.located])
+        chosen = np.full(len(ids), "ellipses" in layers) | (no_edges & ("solids" in layers))
         if not chosen.any():
             continue
         img_from_world = scaled @ poses.camera.K @ poses.cam_from_world[poses.known]  # (F, 3, 4)
@@ -497,11 +522,12 @@ def _project_all(
 # ---- Legend ------------------------------------------------------------------------------------
 
 LEGEND_COLOR = object_color(1)
-LINE_PX, SWATCH_PX = 20, 30  # height of a line, width of its picture
+LINE_PX = 20  # px, height of a line
+SWATCH_PX = 30  # px, width of the sample beside it
 
 
 def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
-    """List the kinds of lines in this film and what they mean."""
+    """List the kinds of lines in this video and their meaning."""
     lines = [("box", "detected; number = identity")]
     if (result.tracks.score == 0).any():
         lines.append(("dashed", "not detected: filled in"))
@@ -522,7 +548,8 @@ def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
     panel = image[top : top + height, 6 : 6 + width]
     panel[:] = panel // 4
     for k, (kind, text) in enumerate(lines):
-        x, y = 12, top + 4 + LINE_PX * k
+        x = 12
+        y = top + 4 + LINE_PX * k
         box = np.array([x, y + 4, x + SWATCH_PX - 8, y + LINE_PX - 5])
         if kind in ("box", "dashed"):
             _draw_box(image, box, LEGEND_COLOR, 1 + (len(lines) == 1), kind == "dashed")

@@ -1,6 +1,6 @@
-"""Ellipsoids and solids as coloured triangle meshes, and points: PLY files.
+"""PLY files of solids, as coloured triangle meshes, and of points.
 
-Coordinates are doubles: those of a map projection have a step of .5 m in float32.
+Coordinates are doubles: in float32 those of a map projection have a resolution of .5 m.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import quadrics
 from reobj.files import atomic
 from reobj.types import Array, object_color
 
-PLY_DETAIL = 2  # subdivisions of an octahedron: 512 triangles an ellipsoid
-PLY_SIDES = 48  # of the prism that stands for a cylinder (chosen: round to the eye)
-FACE_BYTES = 13  # of a triangle: how many corners, and their numbers
+CYLINDER_SIDES = 48  # sides of the prism that approximates a cylinder (chosen: looks round)
 
 
 def write_ply(
@@ -28,14 +26,21 @@ def write_ply(
 ) -> None:
     """Write solids as one coloured triangle mesh (PLY, binary little endian), in world.
 
-    Each is closed, its triangles face outwards, and shares no vertex with another.
+    Each solid is closed, its triangles face outwards, and it shares no vertex with others.
 
     Args:
-        support: shapes, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
+        support: shape of each, "box", "cylinder" or "ellipsoid"; None: all are ellipsoids.
     """
-    vertices, faces, start = [], [], 0
+    vertices = []
+    faces = []
+    start = 0
+    count = 0
     shapes = [None] * len(ellipsoids) if support is None else support
-    meshes = {None: _sphere_mesh(PLY_DETAIL), "box": _box_mesh(), "cylinder": _cylinder_mesh()}
+    meshes = {
+        None: _sphere_mesh(2),
+        "box": _box_mesh(),
+        "cylinder": _cylinder_mesh(),
+    }  # 512 triangles a sphere
     for k, (identity, shape) in enumerate(zip(object_id, shapes, strict=True)):
         unit, triangles = meshes.get(shape, meshes[None])  # (P, 3), (T, 3)
         points = (ellipsoids.half_axes[k] * unit) @ ellipsoids.world_from_obj[k].T
@@ -43,15 +48,17 @@ def write_ply(
         vertex["xyz"] = points + ellipsoids.center_in_world[k]
         vertex["rgb"] = object_color(identity)[::-1]
         face = np.zeros(len(triangles), [("n", "u1"), ("i", "<i4", 3)])
-        face["n"], face["i"] = 3, triangles + start
+        face["n"] = 3
+        face["i"] = triangles + start
         vertices.append(vertex.tobytes())
         faces.append(face.tobytes())
         start += len(unit)
+        count += len(triangles)
     names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
-    what, count = "ellipsoids" if support is None else "solids", sum(map(len, faces)) // FACE_BYTES
+    content = "ellipsoids" if support is None else "solids"
     header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {what}\n"
+        f"ply\nformat binary_little_endian 1.0\ncomment reobj_track {content}\n"
         f"element vertex {start}\n{''.join(names)}"
         f"element face {count}\nproperty list uchar int vertex_indices\nend_header\n"
     )
@@ -62,7 +69,8 @@ def write_ply(
 def write_point_ply(path: Path, points: Array, colors: npt.NDArray[np.uint8]) -> None:
     """Write points (N, 3) with RGB colours (N, 3) as PLY, binary little endian."""
     vertex = np.zeros(len(points), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
-    vertex["xyz"], vertex["rgb"] = points, colors
+    vertex["xyz"] = points
+    vertex["rgb"] = colors
     names = [f"property double {n}\n" for n in "xyz"]
     names += [f"property uchar {n}\n" for n in ("red", "green", "blue")]
     header = f"element vertex {len(points)}\n{''.join(names)}end_header\n"
@@ -81,19 +89,24 @@ def _box_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
 
 def _cylinder_mesh() -> tuple[Array, npt.NDArray[np.int64]]:
     """Triangulate the upright cylinder of radius and half height 1, facing outwards."""
-    number = np.arange(PLY_SIDES)
-    angle, following = 2 * np.pi * number / PLY_SIDES, (number + 1) % PLY_SIDES
+    number = np.arange(CYLINDER_SIDES)
+    angle = 2 * np.pi * number / CYLINDER_SIDES
+    following = (number + 1) % CYLINDER_SIDES
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    low, high = (np.column_stack([ring, np.full(PLY_SIDES, z)]) for z in (-1.0, 1.0))
+    low, high = (np.column_stack([ring, np.full(CYLINDER_SIDES, z)]) for z in (-1.0, 1.0))
     points = np.concatenate([low, high, [[0, 0, -1.0], [0, 0, 1.0]]])
-    a, b, c, d = number, following, following + PLY_SIDES, number + PLY_SIDES
-    bottom, top = np.full(PLY_SIDES, 2 * PLY_SIDES), np.full(PLY_SIDES, 2 * PLY_SIDES + 1)
+    a = number
+    b = following
+    c = following + CYLINDER_SIDES
+    d = number + CYLINDER_SIDES
+    bottom = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES)
+    top = np.full(CYLINDER_SIDES, 2 * CYLINDER_SIDES + 1)
     faces = [(a, b, c), (a, c, d), (bottom, b, a), (top, d, c)]
     return points, np.concatenate([np.column_stack(f) for f in faces])
 
 
 def _sphere_mesh(detail: int) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Triangulate the unit sphere: points (P, 3), triangles (T, 3) of a divided octahedron."""
+    """Triangulate the unit sphere: points (P, 3), triangles (T, 3) of a subdivided octahedron."""
     points = np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2],
                       [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])  # fmt: skip

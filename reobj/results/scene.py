@@ -1,8 +1,8 @@
-"""scene.html: one self-contained page of objects, cameras, points and pictures.
+"""Viewer, scene.html: a self-contained page of objects, cameras, points and pictures.
 
-The page's sources are in page/, beside this file: page.html names the others, they are put in here.
+Its sources are in page/, beside this file; page.html includes the other files.
 
-`write_pictures` is the one loop over the video that makes the overlay and the pictures of the page.
+`write_pictures` reads the video once for the overlay video and the pictures of the viewer.
 """
 
 from __future__ import annotations
@@ -44,39 +44,43 @@ from reobj.types import (
     rows_by,
 )
 
-# Chosen so that the page of a video of three minutes with 50 objects stays below 10 MB.
-SCENE_CROPS = 8  # pictures of each object in scene.html
-SCENE_MAX_CROPS = 480  # and of all objects together
-SCENE_CROP_PX = 112  # longer side of these pictures
-SCENE_FRAMES = 60  # video frames in scene.html, behind the solids and beside the time slider
-SCENE_FRAME_PX = 640  # longer side of these frames
-JPEG_QUALITY = 60  # WebP takes half the bytes, and eight times the time (chosen)
-CROP_MARGIN = 0.1  # of the box's sides, on every side: shows what the object stands on
+# Chosen: the page of a video of three minutes with 50 objects stays below 10 MB
+SCENE_CROPS = 8  # crops of an object
+SCENE_MAX_CROPS = 480  # crops of all objects
+SCENE_CROP_PX = 112  # px, longer side of a crop
+SCENE_FRAMES = 60  # video frames, behind the solids and beside the time slider
+SCENE_FRAME_PX = 640  # px, longer side of these frames
+JPEG_QUALITY = 60  # WebP needs half the bytes and eight times the time (chosen)
+CROP_MARGIN = 0.1  # box sides, margin of a crop: shows what the object stands on (chosen)
 
 
 class Pictures:
-    """Cut small pictures for the scene page while the video is read: objects and whole frames.
+    """Collect crops of the objects and whole frames for the viewer while the video is read.
 
     Attributes:
-        wanted: rows of the tracks to cut, in their order. whole: numbers of the frames to keep.
-        crops: [frame number, base64] of each object's pictures, by identity, by time.
-        frames: [frame number, base64] of whole frames, without the distortion of the lens.
+        wanted: rows of the tracks to crop, ascending. whole: numbers of the frames to keep.
+        crops: [frame number, base64] of each object's crops, by identity, in temporal order.
+        frames: [frame number, base64] of whole frames, undistorted.
     """
 
     def __init__(self, result: Result, video: Video) -> None:
-        self.tracks, self.scale = result.tracks, video.scale
+        self.tracks = result.tracks
+        self.scale = video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
         poses = [part.poses for part in result.parts()]
-        chosen, left = [np.empty(0, np.int64)], SCENE_MAX_CROPS
+        chosen = [np.empty(0, np.int64)]
+        left = SCENE_MAX_CROPS
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
-        for doubtful in (False, True):  # what is left of the pictures is for these
+        for doubtful in (False, True):  # low-confidence objects get the remaining crops
             group = [o for o in ranked if (o.status == "doubtful") == doubtful]
             count = min(max(left // max(len(group), 1), 1), SCENE_CROPS)
             rows = [diverse_rows(result.tracks, o, poses[o.part], count) for o in group[:left]]
-            chosen, left = chosen + rows, left - sum(map(len, rows))
+            chosen = chosen + rows
+            left = left - sum(map(len, rows))
         self.wanted = np.sort(np.concatenate(chosen))
-        shown, cameras = scene_steps(result), result.poses
+        shown = scene_steps(result)
+        cameras = result.poses
         if cameras is not None and cameras.known.any():
             shown = shown[cameras.known[np.searchsorted(cameras.frame, shown)]]
         self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
@@ -84,7 +88,7 @@ class Pictures:
         self.grid: npt.NDArray[np.float32] | None = None  # of undistorted pixels, made once
 
     def take(self, frame: Frame) -> None:
-        """Cut the wanted boxes from this frame, and keep it if it is wanted as a whole."""
+        """Crop the wanted boxes of this frame, and keep the frame if it is one of `whole`."""
         rows = self.wanted[self.tracks.frame[self.wanted] == frame.index]
         height, width = frame.image.shape[:2]
         for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
@@ -99,7 +103,7 @@ class Pictures:
             self.frames.append((frame.index, _jpeg(image, SCENE_FRAME_PX)))
 
     def _undistorted(self, image: Image) -> Image:
-        """Remove the lens's distortion from a small picture, so that solids lie where they are."""
+        """Undistort a small picture, so that projected solids coincide with their objects."""
         camera = self.camera
         if camera is None or camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
             return image
@@ -110,15 +114,15 @@ class Pictures:
 
 
 def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.float32]:
-    """Find where the pixels of a pinhole picture lie in the lens's, (height, width, 2) float32.
+    """Return the distorted pixel of each pixel of a pinhole picture, (height, width, 2) float32.
 
-    In pixels of OpenCV: the first one's centre is (0, 0).
+    In OpenCV's pixels: the centre of the first one is (0, 0).
     """
     small = camera.resized((width, height))
     xy = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2) + 0.5
     rays = np.hstack([xy, np.ones((len(xy), 1))]) @ np.linalg.inv(small.K).T  # (N, 3)
-    found = np.asarray(small.to_pycolmap().img_from_cam(rays), np.float64) - 0.5
-    return np.nan_to_num(found, nan=-1.0).reshape(height, width, 2).astype(np.float32)
+    distorted = np.asarray(small.to_pycolmap().img_from_cam(rays), np.float64) - 0.5
+    return np.nan_to_num(distorted, nan=-1.0).reshape(height, width, 2).astype(np.float32)
 
 
 def _jpeg(image: Image, size_px: int) -> str:
@@ -129,30 +133,31 @@ def _jpeg(image: Image, size_px: int) -> str:
 
 
 def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int) -> IntArray:
-    """Choose the most different views of one object, (n,) rows of the tracks, n <= count.
+    """Choose diverse views of one object: (n,) rows of the tracks, n <= count.
 
-    The best box comes first (large, of good score), then whatever is farthest from the chosen ones
-    in time and, where there are cameras, in viewing direction.
+    First the best box (large, high score), then repeatedly the box farthest from the chosen ones in
+    time and, where there are cameras, in viewing direction.
 
     Args:
-        poses: of the object's part.
+        poses: of the object's component.
     """
     rows = np.flatnonzero(tracks.track_id == found.id)
     if not len(rows):
         return rows
-    frame, box = tracks.frame[rows], tracks.xyxy[rows]
+    frame = tracks.frame[rows]
+    box = tracks.xyxy[rows]
     quality = tracks.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
-    place = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
+    feature = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
     if poses is not None and found.center is not None:
         at, known = place_of(poses, frame)
         eye = invert_rigid(poses.cam_from_world[at])[:, :, 3]  # (N, 3)
         ray = np.where(known[:, None], eye - found.center, np.nan)
         ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), np.finfo(float).tiny)
-        place = np.hstack([place, np.nan_to_num(ray)])  # (N, 4)
-        quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # no pose: last
+        feature = np.hstack([feature, np.nan_to_num(ray)])  # (N, 4)
+        quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # without a pose: last
     chosen = [int(quality.argmax())]
     while len(chosen) < min(count, len(rows)):
-        gap = np.linalg.norm(place[:, None] - place[chosen], axis=2).min(1)  # (N,)
+        gap = np.linalg.norm(feature[:, None] - feature[chosen], axis=2).min(1)  # (N,)
         best = int((gap * quality**0.5).argmax())
         if gap[best] == 0:
             break
@@ -160,17 +165,17 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
     return np.asarray(rows[chosen], np.int64)
 
 
-SCENE_STEPS = 1500  # positions of the time slider; of longer videos every n-th frame (chosen)
+SCENE_STEPS = 1500  # most positions of the time slider; longer videos: every n-th frame (chosen)
 
 
 def scene_steps(result: Result) -> IntArray:
-    """List the frames that the time slider of the page goes through, (S,)."""
+    """List the frames (S,) of the time slider of the viewer."""
     frames = np.unique(result.tracks.frame) if result.poses is None else result.poses.frame
     return frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]
 
 
 def page_text() -> str:
-    """Return the page without its data: page.html, with `@{file}` replaced by these files."""
+    """Return the page without its data: page.html, with each `@{file}` replaced by the file."""
     folder = Path(__file__).with_name("page")
     text = (folder / "page.html").read_text(encoding="utf-8")
 
@@ -185,13 +190,14 @@ def write_scene(
 ) -> None:
     """Write scene.html: solids, cameras, points and pictures in one page that needs no network.
 
-    Its data are objects.json's entries, and base64 of little-endian float32 / uint8 arrays. A world
-    far from its origin is moved: `origin` of its part says where that is now.
+    Its data are the entries of objects.json, and base64 of little-endian float32 / uint8 arrays. A
+    world far from its origin is shifted, by `origin` of its component.
 
     Args:
-        doubtful: show the doubtful objects at first; a switch of the page shows and hides them.
+        doubtful: show low-confidence objects initially; a switch shows and hides them.
     """
-    steps, poses = scene_steps(result), result.poses  # (S,)
+    steps = scene_steps(result)  # (S,)
+    poses = result.poses
     count = len(np.unique(result.tracks.frame) if poses is None else poses.frame)
     seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
     of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
@@ -222,7 +228,7 @@ def write_scene(
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     head, tail = page_text().split("@DATA@")
-    with atomic(path) as part:  # no name can end the script
+    with atomic(path) as part:  # "<" is escaped: no name can end the script element
         part.write_text(head + text.replace("<", "\\u003c") + tail, encoding="utf-8")
 
 
@@ -230,39 +236,42 @@ def _boxes_in(result: Result, frame: int) -> list[list[float]]:
     """List the detections of a frame: identity, x1, y1, x2, y2, undistorted, native pixels."""
     rows = result.tracks[(result.tracks.frame == frame) & (result.tracks.score > 0)]
     box = rows.xyxy if result.poses is None else undistort_boxes(rows.xyxy, result.poses.camera)
-    good = np.isfinite(box).all(1)
+    finite = np.isfinite(box).all(1)
     return [
         [i, *b]
-        for i, b in zip(rows.track_id[good].tolist(), box[good].round(1).tolist(), strict=True)
+        for i, b in zip(rows.track_id[finite].tolist(), box[finite].round(1).tolist(), strict=True)
     ]
 
 
-SCENE_POINTS = 20000  # sparse points shown; of more every n-th (chosen: .4 MB of the page)
+SCENE_POINTS = 20000  # most sparse points; else every n-th (chosen: .4 MB of the page)
 
 
 def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str, Any]:
-    """Collect the intrinsics and the cameras of the steps, each in the world of its part.
+    """Collect the intrinsics and the cameras of the steps, each in the world of its component.
 
     Args:
-        origins: (P, 3) of the parts.
+        origins: (P, 3) of the components.
     """
     poses = result.poses
     if poses is None or not poses.known.any():
         return {"camera": None, "poses": ""}
-    size, K = {"width": poses.camera.width, "height": poses.camera.height}, poses.camera.K
+    size = {"width": poses.camera.width, "height": poses.camera.height}
+    K = poses.camera.K
     rows = np.isin(poses.frame, steps)
     shown = invert_rigid(poses.cam_from_world[rows])
     shown[:, :, 3] -= origins[poses.part[rows]]
-    inside = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return {"camera": size | inside, "poses": base64_text(shown, "<f4")}
+    pinhole = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return {"camera": size | pinhole, "poses": base64_text(shown, "<f4")}
 
 
 def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
-    """Collect every `thin`-th point, scale, floor, up and sigma of points of a part; its name."""
-    poses, up = part.poses, part.world.up_in_world
-    count, spans = len(part.objects), ", ".join(p.span_text for p in part.world.parts)
+    """Collect name, scale, floor, up, every `thin`-th point and their sigma of a component."""
+    poses = part.poses
+    up = part.world.up_in_world
+    count = len(part.objects)
+    spans = ", ".join(p.span_text for p in part.world.parts)
     facts = {
-        "name": f"part {number}: {spans}; {count} object{'s' * (count != 1)}",
+        "name": f"component {number}: {spans}; {count} object{'s' * (count != 1)}",
         "facts": _scene_facts(part.world),
         "scale": part.world.to_json()["scale"],
     }
@@ -273,9 +282,10 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
     if (floor := part.world.floor) is not None:
         facts["floor"] = {"normal": floor.normal.tolist(), "offset": floor.offset}
     eye = invert_rigid(poses.cam_from_world[poses.known])[:, :, 3]
-    some = (poses.points[:: len(poses.points) // 500 + 1], eye[:: len(eye) // 50 + 1])
-    if len(some[0]):  # as for the floor: a share of the distance
-        distance = np.linalg.norm(some[0][:, None] - some[1], axis=2).min(1)
+    points = poses.points[:: len(poses.points) // 500 + 1]
+    eyes = eye[:: len(eye) // 50 + 1]
+    if len(points):  # sigma as for the floor: proportional to the distance
+        distance = np.linalg.norm(points[:, None] - eyes, axis=2).min(1)
         facts["point_sigma"] = NOISE * float(np.median(distance))
     return facts | {
         "points": base64_text(poses.points[::thin], "<f4"),
@@ -287,17 +297,19 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
 def _scene_object(
     found: Object, origin: Array, tracks: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
-    """Describe an object for the page.
+    """Collect the data of an object for the viewer.
 
-    Its entry of objects.json, its colour, its pictures, its size as text, the steps in which it is
-    seen (first, last, first, last ...), and its visits, each with its best box, by which an edit
-    names it (first, last, frame, x1, y1, x2, y2).
+    Its entry of objects.json, colour, crops, size as text, the steps in which it is seen (first,
+    last, first, last ...), and its visits, each with its best box, the reference of edits (first,
+    last, frame, x1, y1, x2, y2).
     """
-    own = tracks[tracks.track_id == found.id]
-    seen = np.isin(steps, own.frame)
+    rows_of_object = tracks[tracks.track_id == found.id]
+    seen = np.isin(steps, rows_of_object.frame)
     runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
     runs[1::2] -= 1
-    detected = own[own.score > 0] if own.score.any() else own  # without filled gaps
+    detected = rows_of_object
+    if detected.score.any():  # without interpolated boxes
+        detected = detected[detected.score > 0]
     visits = []
     for rows in rows_by(detected.tracklet_id):
         best = rows[detected.score[rows].argmax()]
@@ -315,7 +327,7 @@ def _scene_object(
 
 
 def _why_flat(result: Result) -> str:
-    """Say why the page has nothing to show in 3D; "" if it has."""
+    """Return the reason why the viewer has nothing to show in 3D; "" if it has."""
     if result.poses is not None and result.poses.known.any():
         return ""
     reasons = [w for w in result.warnings if "pose" in w or "identities only" in w]
@@ -344,17 +356,18 @@ def write_pictures(
     scene: bool = True,
     doubtful: bool = False,
 ) -> list[str]:
-    """Write the film and scene.html in one pass over the video.
+    """Write the overlay video and scene.html in one pass over the video.
 
     Each file appears only when it is complete. A live source cannot be read again, and frames may
-    have no images: no overlay then, and a page without pictures.
+    have no images: then there is no overlay video, and the viewer has no pictures.
 
     Args:
-        overlay: what the film shows (`film_layers`); "none": no film.
-        doubtful: show doubtful objects in the film, and at first on the page, which holds them.
+        overlay: layers of the overlay video (`film_layers`); "none": no video.
+        doubtful: include low-confidence objects in the overlay video; in the viewer, which always
+            contains them, show them initially.
     Returns:
-        what could not be made, why, and the option that leaves it out. With the environment
-        variable REOBJ_RAISE, as in our tests, faults of the program are raised instead.
+        messages about files that could not be written, with the option to omit them. With the
+        environment variable REOBJ_RAISE, as in our tests, bugs are raised instead.
     """
     visible = video.has_images and not video.is_live
     shown = result if doubtful else result.without_doubtful()
@@ -367,7 +380,8 @@ def write_pictures(
         with faults.of("scene"):
             pictures = Pictures(result, video)
     sinks = [(n, sink) for n, sink in (("overlay", film), ("scene", pictures)) if sink and visible]
-    progress, complete = Progress("write", video.expected), False
+    progress = Progress("write", video.expected)
+    complete = False
     try:
         with faults.of("video"):
             for frame in video if sinks else ():
@@ -390,10 +404,10 @@ def write_pictures(
 
 
 class _Faults:
-    """What went wrong with the pictures of a result, each once.
+    """Errors while the pictures of a result are written.
 
     Attributes:
-        found: the first error of each: "video", and the options of the section `output`.
+        found: the first error of "video" and of each option of the section `output`.
     """
 
     def __init__(self) -> None:
@@ -401,7 +415,7 @@ class _Faults:
 
     @contextlib.contextmanager
     def of(self, name: str) -> Iterator[None]:
-        """Keep an exception of the block."""
+        """Store an exception of the block."""
         try:
             yield
         except Exception as error:
@@ -411,12 +425,12 @@ class _Faults:
             self.found.setdefault(name, error)
 
     def messages(self) -> list[str]:
-        """Name what is missing, the reason, and the option to leave it out."""
+        """Return what is missing, the reason, and the option to omit it."""
         texts = {
-            "video": "no film, and a page without the pictures from there on: reading the video "
-            "again failed with {} (--set output.overlay=none leaves the film out)",
-            "overlay": "no film: {} (--set output.overlay=none leaves it out)",
-            "scene": "no scene.html: {} (--set output.scene=false leaves it out)",
+            "video": "no overlay video, and a viewer without later pictures: reading the video "
+            "again failed with {} (--set output.overlay=none omits the overlay)",
+            "overlay": "no overlay video: {} (--set output.overlay=none omits it)",
+            "scene": "no scene.html: {} (--set output.scene=false omits it)",
         }
         return [
             one_line(texts[name].format(f"{type(error).__name__}: {error}"))

@@ -1,6 +1,6 @@
-"""Evaluation in 3D: ellipsoids against true solids, after an alignment by the cameras.
+"""Evaluation in 3D: ellipsoids against true solids, after an alignment of the cameras.
 
-Start at `score_objects`. Writes nothing.
+Start at `score_objects`. Writes no files.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from reobj.poses.supplied.pose_formats import matrix_rows
 from reobj.results.result import Object, Result
 from reobj.types import Array, IntArray, ReobjError, log
 
-MIN_HALF_AXIS = 0.005  # world units of the truth, metres: a sheet is taken as 1 cm thick (chosen)
+MIN_HALF_AXIS = 0.005  # world units of the truth, m: sheets count as 1 cm thick (chosen)
 
 
 def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
     """Read ids and ellipsoids of a gt_objects.json: `half_axes`, or extents `size` with axes `R`.
 
-    Where an object has a `visible_part`, that is the truth: no camera saw the rest.
+    The `visible_part` of an object, if given, is the truth: no camera saw the rest.
     """
     try:
         entries = load_json(path)["objects"]
@@ -36,7 +36,7 @@ def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
         center = np.array([e["center"] for e in seen], np.float64).reshape(-1, 3)
         half_axes = np.maximum(np.array(half, np.float64).reshape(-1, 3), MIN_HALF_AXIS)
         rotation = np.array(axes, np.float64).reshape(-1, 3, 3)
-        if not all(np.isfinite(part).all() for part in (center, half_axes, rotation)):
+        if not all(np.isfinite(array).all() for array in (center, half_axes, rotation)):
             raise ValueError("a number is not finite")
         return [int(e["id"]) for e in entries], quadrics.Ellipsoids(center, half_axes, rotation)
     except ReobjError:
@@ -47,66 +47,70 @@ def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
 
 
 def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, Array, Array]:
-    """Align the world of the largest part with the truth's by a similarity of the cameras.
+    """Align the world of the largest component with the truth's by a similarity of the cameras.
 
-    Poses that the user supplied are in the truth's world already. Of centres alone the turn is as
-    uncertain as the path is short, and at the distance of the objects it is their error: where the
-    true directions of view are those of our axes, they count too.
+    Supplied poses are in the world of the truth already. Camera centres of a short trajectory
+    determine the rotation poorly, which displaces distant objects: if the camera axes follow the
+    same convention as the truth's, their directions are aligned too.
 
     Args:
-        truth_poses: TUM, or a 4x4 world_from_cam a line; None is enough for supplied poses.
+        truth_poses: TUM, or a 4x4 world_from_cam a line; may be None for supplied poses.
     Returns:
         scale, rotation (3, 3) and shift (3,): x_in_truth = scale * rotation @ x_in_ours + shift.
     """
     poses = result.of_part(0).poses
     if poses is None:
-        raise ReobjError(f"{result.out}: no cameras here, so nothing to compare in 3D; see `run`")
+        raise ReobjError(f"{result.out}: no cameras, so there is no evaluation in 3D; see `run`")
     if poses.source == "user":
         return 1.0, np.eye(3), np.zeros(3)
     if truth_poses is None:
-        raise ReobjError("reconstructed cameras have a world of their own: give --gt-poses")
+        raise ReobjError(
+            "reconstructed cameras use an arbitrary frame; give --gt-poses to align them"
+        )
     truth = _true_cameras(truth_poses, poses)  # (F, 3, 4)
     use = poses.known & np.isfinite(truth[:, :, 3]).all(1)
-    ours, truth = invert_rigid(poses.cam_from_world[use]), truth[use]  # (f, 3, 4)
-    found = None
+    ours = invert_rigid(poses.cam_from_world[use])  # (f, 3, 4)
+    truth = truth[use]
+    similarity = None
     if use.sum() >= 3:  # Umeyama, PAMI 1991
-        found = _similarity(ours[:, :, 3], truth[:, :, 3])
-    if found is None:
+        similarity = _similarity(ours[:, :, 3], truth[:, :, 3])
+    if similarity is None:
         raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
-    scale, turn, _ = found
-    residual = turn @ ours[:, :, :3] @ truth[:, :, :3].swapaxes(1, 2)  # (f, 3, 3)
+    scale, rotation, _ = similarity
+    residual = rotation @ ours[:, :, :3] @ truth[:, :, :3].swapaxes(1, 2)  # (f, 3, 3)
     cosine = (np.trace(residual, axis1=1, axis2=2) - 1) / 2  # of its angle
     solids = result.of_part(0).ellipsoids().center_in_world  # (S, 3)
     if not len(solids) or not np.median(cosine) > math.cos(math.radians(SAME_AXES_DEG)):
-        return found
-    away = float(np.median(np.linalg.norm(solids[:, None] - ours[:, :, 3], axis=2)))
-    ahead = [
-        np.concatenate([cams[:, :, 3], *(cams[:, :, 3] + far * cams[:, :, k] for k in range(3))])
-        for cams, far in ((ours, away), (truth, scale * away))
-    ]  # (4 f, 3) each: the centres, and points along the camera's axes as far as the objects
-    return _similarity(*ahead) or found
+        return similarity
+    distance = float(np.median(np.linalg.norm(solids[:, None] - ours[:, :, 3], axis=2)))
+    points = [
+        np.concatenate([cams[:, :, 3], *(cams[:, :, 3] + d * cams[:, :, k] for k in range(3))])
+        for cams, d in ((ours, distance), (truth, scale * distance))
+    ]  # (4 f, 3) each: centres, and points on the camera axes at the distance of the objects
+    return _similarity(*points) or similarity
 
 
-SAME_AXES_DEG = 10.0  # between true and own directions of view, at most (chosen; another convention
-# of axes is 90 or 180 degrees off)
+# deg, largest angle between true and estimated camera axes of one convention; others differ by 90
+# or 180 deg (chosen)
+SAME_AXES_DEG = 10.0
 
 
 def _similarity(ours: Array, truth: Array) -> tuple[float, Array, Array] | None:
-    """Estimate scale, rotation and shift from points (N, 3) to points, or None."""
-    found = import_pycolmap().estimate_sim3d(ours, truth)
-    if found is None:
+    """Estimate scale, rotation and translation from points (N, 3) to points; None: degenerate."""
+    similarity = import_pycolmap().estimate_sim3d(ours, truth)
+    if similarity is None:
         return None
-    turn = np.asarray(found.rotation.matrix(), np.float64)
-    return float(found.scale), turn, np.asarray(found.translation)
+    rotation = np.asarray(similarity.rotation.matrix(), np.float64)
+    return float(similarity.scale), rotation, np.asarray(similarity.translation)
 
 
-SAME_TIME_S = 0.02  # of a frame and its true pose; chosen: half a frame at 25 Hz
+SAME_TIME_S = 0.02  # s between a frame and its true pose; chosen: half a frame at 25 Hz
 
 
 def _true_cameras(path: Path, poses: Poses) -> Array:
     """Read world_from_cam (F, 3, 4) of the poses' frames, NaN where unknown.
 
-    TUM rows belong to the frame of their time; of rows of 12 or 16 numbers, row n to frame n.
+    TUM rows are matched to frames by time; of rows of 12 or 16 numbers, row n is frame n.
     """
     try:
         table = np.loadtxt(read_lines(path), ndmin=2)
@@ -126,16 +130,16 @@ def _true_cameras(path: Path, poses: Poses) -> Array:
     table = table[np.argsort(table[:, 0], kind="stable")]
     after = np.searchsorted(table[:, 0], poses.time_s).clip(max=len(table) - 1)  # (F,)
     pair = np.stack([(after - 1).clip(0), after])  # (2, F) the rows before and after
-    late = np.abs(table[pair, 0] - poses.time_s)  # (2, F)
-    nearest = np.where(late[0] <= late[1], *pair)  # (F,)
-    far = late.min(0) > SAME_TIME_S
-    turn = np.full((len(nearest), 3, 3), np.nan)
+    difference = np.abs(table[pair, 0] - poses.time_s)  # (2, F)
+    nearest = np.where(difference[0] <= difference[1], *pair)  # (F,)
+    unmatched = difference.min(0) > SAME_TIME_S
+    rotation = np.full((len(nearest), 3, 3), np.nan)
     xyzw = table[nearest, 4:]
-    whole = np.isfinite(xyzw).all(1) & (np.linalg.norm(xyzw, axis=1) > 0)
-    if whole.any():
-        turn[whole] = Rotation.from_quat(xyzw[whole]).as_matrix()
-    rows = np.concatenate([turn, table[nearest, 1:4, None]], 2)  # (F, 3, 4)
-    return np.where(far[:, None, None], np.nan, rows)
+    valid = np.isfinite(xyzw).all(1) & (np.linalg.norm(xyzw, axis=1) > 0)
+    if valid.any():
+        rotation[valid] = Rotation.from_quat(xyzw[valid]).as_matrix()
+    rows = np.concatenate([rotation, table[nearest, 1:4, None]], 2)  # (F, 3, 4)
+    return np.where(unmatched[:, None, None], np.nan, rows)
 
 
 def score_objects(
@@ -145,12 +149,12 @@ def score_objects(
 
     Args:
         solids: gt_objects.json. truth_poses: as in `align_with_truth`.
-        pairs: found identity of every true one, or None (`identity_map`): an object counts as found
-            only if the identities say so.
+        pairs: identity matched to each true one, or None (`identity_map`); objects are matched by
+            identity only.
     Returns:
-        counts and errors by name, centre errors in units of the truth; `o3d_all` counts 0 for every
-        true object without ellipsoid; `sizes_inside`: share of the sides within 2 sigma, but for
-        the scale; `scale_error`: of our metres per unit, relative.
+        counts and errors by name, centre errors in units of the truth; `o3d_all`: 0 for every true
+        object without an ellipsoid; `sizes_inside`: fraction of the sides within 2 sigma, apart
+        from the scale; `scale_error`: relative error of our metres per unit.
     """
     ids, truth = read_true_solids(solids)
     located, ours, scale_errors = _solids_in_truth(result, truth_poses)
@@ -158,15 +162,16 @@ def score_objects(
     rows = [i for i, t in enumerate(ids) if pairs.get(t) in row_of]  # of the truth
     if not rows:
         return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
-    own = np.array([row_of[pairs[ids[i]] or 0] for i in rows])  # of ours
-    found, goal = ours[own], truth[np.array(rows)]
-    o3d = quadrics.volume_overlap(found, goal)  # (n,)
-    error = np.linalg.norm(found.center_in_world - goal.center_in_world, axis=1)  # (n,) truth units
-    size = np.abs(np.log(found.half_axes.prod(1) / goal.half_axes.prod(1))) / 3  # (n,) mean side
+    our_rows = np.array([row_of[pairs[ids[i]] or 0] for i in rows])
+    found = ours[our_rows]
+    true = truth[np.array(rows)]
+    o3d = quadrics.volume_overlap(found, true)  # (n,)
+    error = np.linalg.norm(found.center_in_world - true.center_in_world, axis=1)  # (n,) truth units
+    size = np.abs(np.log(found.half_axes.prod(1) / true.half_axes.prod(1))) / 3  # (n,) mean side
     each = [
         {"id": ids[i], "object": located[j].id, "class": located[j].class_name, "o3d": a,
          "center_error": b}
-        for i, j, a, b in zip(rows, own.tolist(), o3d.tolist(), error.tolist(), strict=True)
+        for i, j, a, b in zip(rows, our_rows.tolist(), o3d.tolist(), error.tolist(), strict=True)
     ]  # fmt: skip
     return {
         "true": len(pairs),
@@ -176,7 +181,7 @@ def score_objects(
         "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
         "center_error_median": float(np.median(error)),
         "size_error_median": float(np.expm1(np.median(size))),
-        "sizes_inside": share_inside(sizes_in_sigma(located, own, found, goal)),
+        "sizes_inside": share_inside(sizes_in_sigma(located, our_rows, found, true)),
         "scale_error": scale_errors[0],
         **({"part_scale_errors": scale_errors} if len(scale_errors) > 1 else {}),
         "objects": each,
@@ -186,7 +191,7 @@ def score_objects(
 def sizes_in_sigma(
     objects: Sequence[Object], rows: IntArray, found: quadrics.Ellipsoids, goal: quadrics.Ellipsoids
 ) -> Array:
-    """Return the errors (n, 3) of log sides along the true axes over their sigma; NaN without one.
+    """Return the errors (n, 3) of log sides along the true axes in sigma; NaN without a sigma.
 
     Args:
         rows: (n,) of the objects. found, goal: their ellipsoids and the true ones, in one world.
@@ -202,7 +207,7 @@ def sizes_in_sigma(
 
 
 def share_inside(in_sigma: Array) -> float | None:
-    """Return the share of errors within 2 sigma; None if none is known."""
+    """Return the fraction of errors within 2 sigma; None if all are NaN."""
     known = in_sigma[np.isfinite(in_sigma)]
     return float((np.abs(known) < 2).mean()) if len(known) else None
 
@@ -210,14 +215,16 @@ def share_inside(in_sigma: Array) -> float | None:
 def _solids_in_truth(
     result: Result, truth_poses: Path | None
 ) -> tuple[list[Object], quadrics.Ellipsoids, list[float | None]]:
-    """Bring the solids into the truth's world, each part by an alignment of its own.
+    """Transform the solids to the world of the truth; each component is aligned separately.
 
     Returns:
-        the located objects of the parts that can be aligned and their ellipsoids; of every part the
-        relative error of its metres per unit, None where unknown.
+        the located objects of the components that can be aligned and their ellipsoids; of every
+        component the relative error of its metres per unit, None where unknown.
     """
     objects: list[Object] = []
-    centers, half_axes, axes = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty((0, 3, 3))]
+    centers = [np.empty((0, 3))]
+    half_axes = [np.empty((0, 3))]
+    axes = [np.empty((0, 3, 3))]
     scale_errors: list[float | None] = []
     faults: dict[int, ReobjError] = {}
     parts = result.parts()
@@ -238,6 +245,6 @@ def _solids_in_truth(
     if len(faults) == len(parts):
         raise faults[0]
     for k, fault in faults.items():
-        log.warning("part %d of the cameras is not scored in 3D: %s", k, fault)
+        log.warning("component %d of the trajectory is not evaluated in 3D: %s", k, fault)
     solids = (np.concatenate(arrays) for arrays in (centers, half_axes, axes))
     return objects, quadrics.Ellipsoids(*solids), scale_errors

@@ -1,1 +1,1 @@
-"""What comes in: frames, weights, recorded detections, detectors."""
+"""Inputs: frames, weights, recorded detections, detectors."""

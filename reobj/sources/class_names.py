@@ -1,4 +1,4 @@
-"""Names of classes by number: text files, data.yaml of YOLO datasets, labels as they come."""
+"""Class names by number: text files, JSON, data.yaml of YOLO datasets, text labels of detectors."""
 
 from __future__ import annotations
 
@@ -16,37 +16,39 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     """Read class names in the order of their numbers.
 
     Args:
-        path: text with one name a line, empty lines do not count; or data.yaml, whose `names` are a
-            list or a map from numbers, in either of YAML's two ways of writing; or JSON with the
-            same.
+        path: text file with one name a line (empty lines are skipped); or data.yaml whose `names`
+            are a list or a map from numbers, in block or flow style; or JSON with the same content.
     Raises:
-        ReobjError: no names, more than CLASS_MAX, or one of more than CLASS_NAME_MAX characters,
-            with its line.
+        ReobjError: no names, more than CLASS_MAX, or one of more than CLASS_NAME_MAX characters.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix in YAML_SUFFIXES:
-        found = _yaml_names(path)
+        names = _yaml_names(path)
     elif suffix == ".json":
-        found = _json_names(path)
+        names = _json_names(path)
     else:
-        found = [(i, line.strip()) for i, line in enumerate(read_lines(path), 1) if line.strip()]
-    if len(found) > CLASS_MAX:
-        raise ReobjError(f"{path}: {len(found)} class names, at most {CLASS_MAX} are taken")
-    for line, name in found:
+        names = [(i, line.strip()) for i, line in enumerate(read_lines(path), 1) if line.strip()]
+    if len(names) > CLASS_MAX:
+        raise ReobjError(f"{path}: {len(names)} class names, at most {CLASS_MAX} are allowed")
+    for line, name in names:
         check_length(name, f"{path}, line {line}" if line else str(path))
-    return tuple(name for _, name in found)
+    return tuple(name for _, name in names)
 
 
 def check_length(name: str, where: str) -> None:
     """Refuse a class name of more than CLASS_NAME_MAX characters."""
     if len(name) > CLASS_NAME_MAX:
-        text = f"a class name of {len(name)} characters, at most {CLASS_NAME_MAX} are taken"
+        text = f"a class name of {len(name)} characters, at most {CLASS_NAME_MAX} are allowed"
         raise ReobjError(f"{where}: {text} ({name[:20]}...)")
 
 
 def _numbered(entries: Iterable[tuple[str, str, int]], where: str) -> list[tuple[int, str]]:
-    """Order (number, name, line) by number; numbers without a name are called `class N`."""
+    """Sort (number, name, line) by number; missing numbers get the name `class N`.
+
+    Returns:
+        (line, name) of each number, from 0.
+    """
     named: dict[int, tuple[int, str]] = {}
     for number, name, line in entries:
         if not number.isdecimal() or int(number) > CLASS_MAX:
@@ -58,7 +60,7 @@ def _numbered(entries: Iterable[tuple[str, str, int]], where: str) -> list[tuple
 
 
 def _json_names(path: Path) -> list[tuple[int, str]]:
-    """Read a JSON list of names, a map from numbers, or either of them under `names`."""
+    """Read (line, name) of a JSON list of names, a map from numbers, or either under `names`."""
     data = load_json(path)
     data = data.get("names", data) if isinstance(data, dict) else data
     if isinstance(data, list) and all(isinstance(name, str) for name in data):
@@ -76,26 +78,30 @@ ENTRY = re.compile(  # of a list or map in brackets: [a, 'b c'], {0: a, 1: "b"}
 
 
 def _yaml_names(path: Path) -> list[tuple[int, str]]:
-    """Read `names` of a YAML file: that key alone, no other part of the language."""
-    lines = [_without_remark(line) for line in read_lines(path)]
+    """Read (line, name) of the key `names` of a YAML file; other YAML is not parsed."""
+    lines = [_without_comment(line) for line in read_lines(path)]
     at = next((i for i, line in enumerate(lines) if NAMES_KEY.match(line)), None)
     if at is None:
         raise ReobjError(f"{path}: no `names:` in it; expected YOLO's data.yaml, or a text file "
                          "with one class name a line")  # fmt: skip
     text = lines[at].partition(":")[2].strip()
-    found = _in_brackets(lines, at, text, path) if text else _block(lines, at, path)
-    if not found:
+    entries = _flow_entries(lines, at, text, path) if text else _block_entries(lines, at)
+    if not entries:
         raise ReobjError(f"{path}, line {at + 1}: `names:` lists no names")
-    numbers = [number for number, _, _ in found]
+    numbers = [number for number, _, _ in entries]
     if all(numbers):
-        return _numbered(found, str(path))
-    return [(line, name) for _, name, line in found]
+        return _numbered(entries, str(path))
+    return [(line, name) for _, name, line in entries]
 
 
-def _in_brackets(
+def _flow_entries(
     lines: Sequence[str], at: int, text: str, path: Path
 ) -> list[tuple[str, str, int]]:
-    """Read [a, b] or {0: a, 1: b} that begins with `text` in line `at`, over any lines."""
+    """Read [a, b] or {0: a, 1: b}, begun by `text` in line `at` and continued in the next lines.
+
+    Returns:
+        (number or "", name, line) of each entry.
+    """
     closing = {"[": "]", "{": "}"}.get(text[0])
     for line in lines[at + 1 :]:
         if closing is None or text.endswith(closing):
@@ -104,22 +110,24 @@ def _in_brackets(
     if closing is None or not text.endswith(closing):
         raise ReobjError(f"{path}, line {at + 1}: `names: {text[:40]}`, expected [a, b], "
                          "{0: a, 1: b}, or a line for each name")  # fmt: skip
-    inside, found, place = text[1:-1].strip(), list[tuple[str, str, int]](), 0
-    while place < len(inside):
-        entry = ENTRY.match(inside, place)
+    content = text[1:-1].strip()
+    entries = list[tuple[str, str, int]]()
+    position = 0
+    while position < len(content):
+        entry = ENTRY.match(content, position)
         if entry is None:
-            raise ReobjError(f"{path}, line {at + 1}: {inside[place : place + 40]!r} in `names` "
-                             "cannot be read")  # fmt: skip
+            raise ReobjError(f"{path}, line {at + 1}: {content[position : position + 40]!r} in "
+                             "`names` cannot be read")  # fmt: skip
         one = entry["one"]
         name = one.replace("''", "'") if one is not None else entry["two"] or entry["plain"] or ""
-        found.append((entry["number"] or "", name.strip(), at + 1))
-        place = entry.end()
-    return found
+        entries.append((entry["number"] or "", name.strip(), at + 1))
+        position = entry.end()
+    return entries
 
 
-def _block(lines: Sequence[str], at: int, path: Path) -> list[tuple[str, str, int]]:
-    """Read the lines `- a` or `0: a` that follow line `at`."""
-    found = []
+def _block_entries(lines: Sequence[str], at: int) -> list[tuple[str, str, int]]:
+    """Read the lines `- a` or `0: a` after line `at`: (number or "", name, line) of each."""
+    entries = []
     for i, line in enumerate(lines[at + 1 :], at + 2):
         if not line.strip():
             continue
@@ -128,19 +136,19 @@ def _block(lines: Sequence[str], at: int, path: Path) -> list[tuple[str, str, in
             break  # the next key
         name = (entry[1] if entry[1] is not None else entry[3]).strip()
         quoted = len(name) > 1 and name[0] == name[-1] and name[0] in "'\""
-        found.append((entry[2] or "", name[1:-1] if quoted else name, i))
-    return found
+        entries.append((entry[2] or "", name[1:-1] if quoted else name, i))
+    return entries
 
 
-def _without_remark(line: str) -> str:
-    """Cut a line of YAML at its remark."""
+def _without_comment(line: str) -> str:
+    """Remove the comment of a line of YAML."""
     return re.sub(r"(^|\s)#.*", "", line.rstrip())
 
 
 class Vocabulary(Sequence[str]):
-    """Hold class names by number; labels that were not in it yet get the next numbers.
+    """Class names by number; new labels get the next numbers.
 
-    One object is shared by all that ask for the names of a detector whose labels come as text.
+    Shared by all users of the class names of a detector with text labels.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -148,7 +156,7 @@ class Vocabulary(Sequence[str]):
         self._number = {name: i for i, name in reversed(list(enumerate(self._names)))}
 
     def numbers(self, labels: Sequence[str]) -> list[int]:
-        """Return the numbers of labels, new ones included."""
+        """Return the numbers of labels; new labels are added."""
         return [self._number_of(visible_name(label)) for label in labels]
 
     def _number_of(self, label: str) -> int:

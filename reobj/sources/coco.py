@@ -1,7 +1,7 @@
 """Detections and tracks in JSON: COCO results and datasets, OA-SLAM.
 
-Start at `read_coco`. What image ids and category ids mean is found in the file itself, in a dataset
-beside it, or in the ids: numbers and names of images.
+Start at `read_coco`. Image and category ids are resolved by the file itself, by a dataset JSON
+beside it, or as numbers and names of images.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from reobj.sources.recorded import RecordedDetections, scale_to
 from reobj.sources.video import Video
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
-COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's ids 1 to 90, without a class
+COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # unused among COCO's category ids 1 to 90
 COCO_IDS = tuple(i for i in range(1, 91) if i not in COCO_GAPS)
 Id = int | str
 
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """Hold the images and categories of a COCO dataset, checked.
+    """Images and categories of a valid COCO dataset.
 
     Attributes:
         path: of the file. images: by id. categories: names by id. videos: names by id.
-        entries: its annotations, None where it has none.
+        entries: annotations, or None.
     """
 
     path: Path
@@ -50,14 +50,14 @@ class Dataset:
 
 
 def _objects(path: Path, data: Mapping[str, Any], key: str, expected: str) -> list[dict[str, Any]]:
-    """Return a list of objects that have an id; an error names the entry."""
-    found = data.get(key) or []
-    if not isinstance(found, list):
-        raise ReobjError(f"{path}: {key} is {found!r:.40}, expected a list of {expected}")
-    for i, entry in enumerate(found):
+    """Return the JSON objects in the list `key`, each with a valid id; an error names the entry."""
+    entries = data.get(key) or []
+    if not isinstance(entries, list):
+        raise ReobjError(f"{path}: {key} is {entries!r:.40}, expected a list of {expected}")
+    for i, entry in enumerate(entries):
         if not isinstance(entry, dict) or not _is_id(entry.get("id")):
             raise ReobjError(f"{path}, {key}[{i}]: {entry!r:.40}, expected {expected}")
-    return found
+    return entries
 
 
 def _is_id(value: Any) -> bool:
@@ -69,15 +69,16 @@ def _is_side(value: Any) -> bool:
 
 
 def parse_dataset(path: Path, data: Mapping[str, Any]) -> Dataset:
-    """Check the parts of a COCO dataset that are used.
+    """Validate the fields of a COCO dataset that are used.
 
     Raises:
-        ReobjError: names the entry and what was expected there.
+        ReobjError: an invalid entry, and what was expected.
     """
     expected = "{id, file_name, width, height}"
     images = _objects(path, data, "images", expected)
     for i, image in enumerate(images):
-        name, sides = image.get("file_name"), (image.get("width"), image.get("height"))
+        name = image.get("file_name")
+        sides = (image.get("width"), image.get("height"))
         number = image.get("frame_id", image.get("frame_index", 0))
         if not isinstance(name, str | None) or not all(map(_is_side, sides)):
             raise ReobjError(f"{path}, images[{i}]: {image!r:.80}, expected {expected}")
@@ -97,7 +98,7 @@ def parse_dataset(path: Path, data: Mapping[str, Any]) -> Dataset:
 
 
 def dataset_of(path: Path, data: Any) -> Dataset | None:
-    """Return the dataset that a JSON file of this content is, or that beside it which fits it."""
+    """Return the dataset in the content of a JSON file, or the matching one beside the file."""
     if isinstance(data, dict):
         return parse_dataset(path, data) if "images" in data else None
     entries = [e for e in data if isinstance(e, dict)] if isinstance(data, list) else []
@@ -106,48 +107,48 @@ def dataset_of(path: Path, data: Any) -> Dataset | None:
 
 
 def _beside(path: Path, entries: Sequence[Mapping[str, Any]]) -> Dataset | None:
-    """Find the dataset beside a file of results whose ids fit those of the results.
+    """Find the dataset beside a file of results that has all ids of the results.
 
     Raises:
-        ReobjError: several fit and differ in what the ids mean; or none, and the results say
-            nothing else of their images.
+        ReobjError: several datasets match and disagree; or none does, and the results do not name
+            their images.
     """
-    found, faults = list[Dataset](), list[ReobjError]()
+    datasets = list[Dataset]()
+    faults = list[ReobjError]()
     for other in sorted(path.parent.glob("*.json")):
         data = None
-        with contextlib.suppress(ValueError, OSError):  # what is no JSON is no dataset either
+        with contextlib.suppress(ValueError, OSError):  # an invalid JSON file is no dataset
             data = load_json(other) if other != path else None
         if isinstance(data, dict) and data.get("images"):
             try:
-                found.append(parse_dataset(other, data))
+                datasets.append(parse_dataset(other, data))
             except ReobjError as error:
                 faults.append(error)
     ids = {entry["image_id"] for entry in entries}
     kinds = {e["category_id"] for e in entries if _is_id(e.get("category_id"))}
-    fit = [d for d in found if ids <= d.images.keys()]
-    fit = [d for d in fit if not d.categories or kinds <= d.categories.keys()]
-    if len(fit) > 1:
-        means = [
+    matches = [d for d in datasets if ids <= d.images.keys()]
+    matches = [d for d in matches if not d.categories or kinds <= d.categories.keys()]
+    if len(matches) > 1:
+        names = [
             ([d.images[i].get("file_name") for i in sorted(ids, key=str)],
              [d.categories.get(k) for k in sorted(kinds, key=str)])
-            for d in fit
+            for d in matches
         ]  # fmt: skip
-        if any(meant != means[0] for meant in means[1:]):
-            both = " and ".join(d.path.name for d in fit[:2])
+        if any(other_names != names[0] for other_names in names[1:]):
+            both = " and ".join(d.path.name for d in matches[:2])
             raise ReobjError(f"{path}: {both} beside it both have the ids of its images, for other "
-                             "images or classes; leave the one that belongs to it")  # fmt: skip
-    if fit or all("file_name" in e or isinstance(e["image_id"], str) for e in entries):
-        return fit[0] if fit else None
+                             "images or classes; keep only the dataset of this file")  # fmt: skip
+    if matches or all("file_name" in e or isinstance(e["image_id"], str) for e in entries):
+        return matches[0] if matches else None
     if faults:
         raise faults[0]
-    if not found:
+    if not datasets:
         return None
-    only = found[0]
-    lost: list[Any] = sorted(ids - only.images.keys(), key=str)
-    what = f"image_id {lost[0]}" if lost else f"category_id {min(kinds, key=str)}"
-    raise ReobjError(f"{path}: {what} is not in the dataset JSON beside this file "
-                     f"({shortened([d.path.name for d in found])}); put the one there that belongs "
-                     "to it, or none")  # fmt: skip
+    missing: list[Any] = sorted(ids - datasets[0].images.keys(), key=str)
+    fault = f"image_id {missing[0]}" if missing else f"category_id {min(kinds, key=str)}"
+    raise ReobjError(f"{path}: {fault} is not in the dataset JSON beside this file "
+                     f"({shortened([d.path.name for d in datasets])}); put the dataset of this "
+                     "file there, or remove them")  # fmt: skip
 
 
 def read_coco(
@@ -156,11 +157,12 @@ def read_coco(
     """Read COCO results, a COCO or COCO-VID dataset, or OA-SLAM's file.
 
     Args:
-        data: the content of the file.
-        names: class names by category id from 0, () where they are not given.
-        first: number of the first frame as the user says it, "": found out.
+        data: content of the file.
+        names: class names by category id from 0, (): not given.
+        first: number of the first frame, "": inferred.
     """
-    entries, dataset = data, dataset_of(path, data)
+    entries = data
+    dataset = dataset_of(path, data)
     if dataset is not None and dataset.path == path:
         entries = dataset.entries
     if not isinstance(entries, list):
@@ -183,14 +185,12 @@ def _read_coco(
     video: Video,
     first: str,
 ) -> RecordedDetections:
-    """Read COCO entries, whose ids are those of a dataset, or names and numbers of images."""
+    """Read COCO entries with ids of a dataset, or with names or numbers of images."""
     for at, entry in enumerate(entries):
-        found = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
-        if not _is_id(found["image_id"]) or not _is_id(found["category_id"]):
-            expected = "expected two ids and a bbox of 4"
-            raise ReobjError(f"{path}, entry {at}: {found}, {expected}")
-        if not isinstance(found["bbox"], list) or len(found["bbox"]) != 4:
-            raise ReobjError(f"{path}, entry {at}: {found}, expected two ids and a bbox of 4")
+        fields = {key: entry.get(key) for key in ("image_id", "category_id", "bbox")}
+        has_ids = _is_id(fields["image_id"]) and _is_id(fields["category_id"])
+        if not has_ids or not isinstance(fields["bbox"], list) or len(fields["bbox"]) != 4:
+            raise ReobjError(f"{path}, entry {at}: {fields}, expected two ids and a bbox of 4")
     messages: list[str] = []
     class_id, class_names = _categories(path, entries, dataset, names, messages)
     frame, size, looked = _images(path, entries, dataset, video, first, messages)
@@ -216,15 +216,15 @@ def _box_and_score(path: Path, entries: Sequence[Mapping[str, Any]]) -> tuple[Ar
     for at, entry in enumerate(entries):
         row = [*entry["bbox"], entry.get("score", 1.0)]
         if any(isinstance(v, bool) or not isinstance(v, int | float) for v in row):
-            found = {key: entry.get(key) for key in ("bbox", "score")}
-            raise ReobjError(f"{path}, entry {at}: {found!r:.80}, expected numbers")
+            fields = {key: entry.get(key) for key in ("bbox", "score")}
+            raise ReobjError(f"{path}, entry {at}: {fields!r:.80}, expected numbers")
         rows.append(row)
     values = np.array(rows, np.float64).reshape(-1, 5)
     return values[:, :4], values[:, 4]
 
 
 def _identity(entry: Mapping[str, Any], where: str) -> int:
-    """Return track_id or instance_id, also of CVAT's attributes; -1: none."""
+    """Return track_id or instance_id, also from CVAT's attributes; -1: none."""
     attributes = entry.get("attributes")
     for holder in (entry, attributes if isinstance(attributes, dict) else {}):
         for key in ("track_id", "instance_id"):
@@ -244,8 +244,8 @@ def _categories(
 ) -> tuple[IntArray, tuple[str, ...]]:
     """Return the class (N,) of every entry and the class names.
 
-    Category ids are those of the dataset; else positions in `names`, from 0, or from 1 where only
-    that fits; else COCO's own.
+    Category ids are those of the dataset; else positions in `names` from 0, or from 1 if only that
+    is possible; else COCO's.
     """
     used = list(dict.fromkeys(entry["category_id"] for entry in entries))
     name_of: dict[Id, str] = dict(zip(COCO_IDS, COCO_NAMES, strict=True))
@@ -285,7 +285,7 @@ def _images(
 
     Returns:
         frame (N,) of every entry, -1: none; size (N, 2) of its image, 0: unknown; and the frames
-        that a dataset lists, ascending, None where there is none.
+        listed in the dataset, ascending, None without a dataset.
     """
     size = np.zeros((len(entries), 2))
     ids = [entry["image_id"] for entry in entries]
@@ -316,29 +316,33 @@ def _images(
 
 
 def _dataset_frames(dataset: Dataset, video: Video, first: str) -> tuple[dict[Id, int], str]:
-    """Return the frame of every image of a dataset, -1: none, and what to say of the rule.
+    """Return the frame of every image of a dataset, -1: none, and a message about the rule.
 
-    By file name; else `frame_id` (COCO-VID) or `frame_index` (TAO); else the numbers in the file
-    names; else in order where there is an image for every frame.
+    By file name; else by `frame_id` (COCO-VID) or `frame_index` (TAO); else by the numbers in the
+    file names; else in order, if there is an image for every frame.
     """
-    images, where, said = list(dataset.images.values()), str(dataset.path), ""
-    of_video = {image.get("video_id") for image in images} & dataset.videos.keys()
-    if len(of_video) > 1:
+    images = list(dataset.images.values())
+    where = str(dataset.path)
+    note = ""
+    ids = {image.get("video_id") for image in images} & dataset.videos.keys()
+    if len(ids) > 1:
         stem = Path(video.source).stem
-        own = [i for i, name in dataset.videos.items() if i in of_video and Path(name).stem == stem]
+        same_name = [
+            i for i, name in dataset.videos.items() if i in ids and Path(name).stem == stem
+        ]
         named = video.names and any("file_name" in image for image in images)
-        if len(own) != 1 and not named:
+        if len(same_name) != 1 and not named:
             some = shortened(sorted(dataset.videos.values()))
-            raise ReobjError(f"{where}: {len(of_video)} videos ({some}), none of them called "
-                             f"{stem}; leave one, or rename it")  # fmt: skip
-        if len(own) == 1:
-            left = [image for image in images if image.get("video_id") == own[0]]
-            said = f"{len(images) - len(left)} images of other videos left out"
-            images = left
+            raise ReobjError(f"{where}: {len(ids)} videos ({some}), none of them called {stem}; "
+                             "keep one, or rename it")  # fmt: skip
+        if len(same_name) == 1:
+            kept = [image for image in images if image.get("video_id") == same_name[0]]
+            note = f"{len(images) - len(kept)} images of other videos left out"
+            images = kept
     frame, text = _image_frames(images, video, first, where)
-    found: dict[Id, int] = dict.fromkeys(dataset.images, -1)
-    found |= dict(zip((image["id"] for image in images), frame.tolist(), strict=True))
-    return found, "; ".join(filter(None, (said, text)))
+    frame_of: dict[Id, int] = dict.fromkeys(dataset.images, -1)
+    frame_of |= dict(zip((image["id"] for image in images), frame.tolist(), strict=True))
+    return frame_of, "; ".join(filter(None, (note, text)))
 
 
 def _image_frames(
@@ -397,38 +401,41 @@ def _mask(mask: Any, size: tuple[int, int], scale: Array, where: str) -> Counts:
 def _read_oa_slam(
     path: Path, entries: Sequence[Mapping[str, Any]], names: Sequence[str], video: Video, first: str
 ) -> RecordedDetections:
-    """Read OA-SLAM's and VOOM's file: an entry an image, boxes as corners, classes from 0."""
-    rows, images = list[Mapping[str, Any]](), list[str]()
+    """Read the file of OA-SLAM and VOOM: one entry per image, boxes as corners, classes from 0."""
+    rows = list[Mapping[str, Any]]()
+    images = list[str]()
     for at, entry in enumerate(entries):
-        name, own = entry.get("file_name"), entry.get("detections")
-        good = isinstance(name, str) and isinstance(own, list)
-        if not good or not all(isinstance(d, dict) and _is_row(d) for d in own or ()):
+        name = entry.get("file_name")
+        detections = entry.get("detections")
+        valid = isinstance(name, str) and isinstance(detections, list)
+        if not valid or not all(isinstance(d, dict) and _is_row(d) for d in detections or ()):
             expected = "expected {file_name, detections: [{category_id, detection_score, bbox}]}"
             raise ReobjError(f"{path}, entry {at}: {entry!r:.80}, {expected}")
-        rows += own or []
-        images += [str(name)] * len(own or ())
-    every = list(dict.fromkeys(str(entry["file_name"]) for entry in entries))
-    found, text = frames_of_names(every, video, str(path), first, None, True)
-    frame_of = dict(zip(every, found.tolist(), strict=True))
-    known = list(names or COCO_NAMES)
+        rows += detections or []
+        images += [str(name)] * len(detections or ())
+    distinct = list(dict.fromkeys(str(entry["file_name"]) for entry in entries))
+    frame, text = frames_of_names(distinct, video, str(path), first, None, True)
+    frame_of = dict(zip(distinct, frame.tolist(), strict=True))
     count = len(rows)
     return RecordedDetections(
         np.array([frame_of[name] for name in images], np.int64),
         np.array([row["bbox"] for row in rows], np.float64).reshape(-1, 4),
         np.array([row.get("detection_score", 1.0) for row in rows], np.float64),
-        np.array([row["category_id"] for row in rows], np.int64), [NO_RUNS] * count, tuple(known),
-        video.size, video.working_size, np.arange(count), "detection", [text] if text else [],
+        np.array([row["category_id"] for row in rows], np.int64), [NO_RUNS] * count,
+        tuple(names or COCO_NAMES), video.size, video.working_size, np.arange(count), "detection",
+        [text] if text else [],
     )  # fmt: skip
 
 
 def _is_row(row: Mapping[str, Any]) -> bool:
-    box, kind = row.get("bbox"), row.get("category_id")
+    box = row.get("bbox")
+    kind = row.get("category_id")
     whole = isinstance(kind, int) and 0 <= kind < 1 << 31
     return whole and isinstance(box, list) and len(box) == 4
 
 
 def image_size_of(dataset: Dataset | None) -> tuple[int, int] | None:
-    """Return the (w, h) that all images of a dataset have, None where it does not say so."""
+    """Return the (w, h) common to all images of a dataset; None where they differ or lack it."""
     images: Iterable[Mapping[str, Any]] = dataset.images.values() if dataset else ()
     sizes = {(image.get("width"), image.get("height")) for image in images}
     if len(sizes) != 1:
@@ -438,7 +445,7 @@ def image_size_of(dataset: Dataset | None) -> tuple[int, int] | None:
 
 
 def image_names_of(path: Path, data: Any) -> list[str]:
-    """List the images that a JSON file names, in its dataset or in each entry; [] where none."""
+    """List the image names in a JSON file's dataset or entries; [] where there are none."""
     dataset = dataset_of(path, data)
     entries: Any = dataset.images.values() if dataset else data if isinstance(data, list) else ()
     names = [e.get("file_name") for e in entries if isinstance(e, dict)]

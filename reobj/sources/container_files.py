@@ -1,4 +1,4 @@
-"""Video files as they are stored: times of their frames, and whether their end is missing."""
+"""Video containers: monotonic frame times, and truncated files."""
 
 from __future__ import annotations
 
@@ -10,29 +10,32 @@ import numpy as np
 
 from reobj.types import Array
 
-# Of the time that frames take at the usual rate, that goes by from before a step back of the clock
-# until it is past that time again: after a wrong stamp all of it, of equal stamps an equal part;
-# where a recording begins again, and another follows it, one step of many. Chosen: five frames
+# Time from a backward step of the clock until it passes its last value, over what these frames take
+# at the usual rate: 1 after one wrong time stamp, less for repeated ones, near 0 where a second
+# recording begins. Below it the clock has restarted. Chosen: reached by five frames
 RESTART_SHARE = 0.25
 
 
 def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
-    """Make times of frames (F,) increase.
+    """Make the times of frames (F,) strictly increasing.
 
-    Single wrong or equal ones are interpolated. Where the clock begins again (recordings that were
-    appended to each other), it goes on one step after the frame before. Times up to the first
-    that is not later than all before it stay as they are.
+    Single wrong or equal times are interpolated. Where the clock restarts (concatenated
+    recordings), times continue one step after the frame before. Times before the first one that
+    does not increase are unchanged.
 
     Args:
-        raw_s: as the container gives them, NaN: none. step_s: between frames where it gives none.
+        raw_s: times in the container, NaN: none. step_s: interval of frames without times.
     Returns:
-        times (F,) in s, how often the clock began again, and whether there were times.
+        times (F,) in s, number of restarts of the clock, and whether the container has times.
     """
-    count, known = len(raw_s), np.flatnonzero(np.isfinite(raw_s))
+    count = len(raw_s)
+    known = np.flatnonzero(np.isfinite(raw_s))
     if len(known) < 2 or np.ptp(raw_s[known]) == 0:
         return np.arange(0.0, count) * step_s, 0, count < 2 and len(known) == count
     time_s: Array = np.interp(np.arange(count), known, raw_s[known])
-    steps, restarts, at = np.diff(raw_s[known]) / np.diff(known), 0, 1
+    steps = np.diff(raw_s[known]) / np.diff(known)
+    restarts = 0
+    at = 1
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else step_s
     while True:
         highest = np.maximum.accumulate(time_s[at - 1 :])
@@ -42,7 +45,7 @@ def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
         at += int(back[0])
         last = time_s[at - 1]
         later = np.flatnonzero(time_s[at:] > last)
-        after = int(later[0]) if len(later) else 0  # frames that are not later than the last
+        after = int(later[0]) if len(later) else 0  # number of frames that are not later
         if after and time_s[at + after] - last > RESTART_SHARE * (after + 1) * step:
             time_s[at : at + after] = np.linspace(last, time_s[at + after], after + 2)[1:-1]
         else:
@@ -50,18 +53,19 @@ def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
             restarts += after != 0 or count - at > 1 / RESTART_SHARE
 
 
-EBML, SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"  # first two elements of Matroska and WebM
+EBML = b"\x1a\x45\xdf\xa3"  # id of the first element of Matroska and WebM (RFC 9559)
+SEGMENT = b"\x18\x53\x80\x67"  # id of the second
 
 
 def missing_bytes(path: Path) -> int:
-    """Count the bytes that the boxes of MP4, Matroska, WebM or AVI announce beyond the file's end.
+    """Count the bytes of MP4, Matroska, WebM or AVI boxes that lie beyond the end of the file.
 
     Returns:
-        0 where nothing is missing, and for containers that announce no lengths (MPEG-TS, live
-        recordings).
+        0 for complete files, and for containers without lengths (MPEG-TS, live recordings).
     """
     with contextlib.suppress(OSError, IndexError, struct.error), path.open("rb") as file:
-        size, head = path.stat().st_size, file.read(64)
+        size = path.stat().st_size
+        head = file.read(64)
         if head.startswith(EBML):
             return max(0, _matroska_end(head) - size)
         if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
@@ -70,7 +74,7 @@ def missing_bytes(path: Path) -> int:
                 file.seek(end)
                 data = file.read(16)
                 (length,) = struct.unpack_from(">I", data)
-                if length == 1:  # a long one
+                if length == 1:  # 64-bit length
                     (length,) = struct.unpack_from(">Q", data, 8)
                 if length < 8:  # 0: to the end of the file
                     return 0
@@ -81,7 +85,7 @@ def missing_bytes(path: Path) -> int:
             while end + 8 <= size:
                 file.seek(end)
                 kind, length = struct.unpack("<4sI", file.read(8))
-                if kind != b"RIFF" or length in (0, 0xFFFFFFFF):  # other data, or never finished
+                if kind != b"RIFF" or length in (0, 0xFFFFFFFF):  # other data, or not finalised
                     return 0
                 padded = int(length) % 2
                 end += 8 + int(length) + padded
@@ -89,11 +93,11 @@ def missing_bytes(path: Path) -> int:
     return 0
 
 
-HEAD_BYTES = 1 << 16  # chosen: the tracks are described before the first frame
+HEAD_BYTES = 1 << 16  # bytes; chosen: contains the track headers, which precede the first frame
 
 
 def holds_pictures_only(path: Path) -> bool:
-    """Tell whether a file is Matroska or WebM without a track of sound; other containers: False."""
+    """Test whether a file is Matroska or WebM without an audio track; other containers: False."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         head = file.read(HEAD_BYTES)
         # TrackType (RFC 9559, 5.1.4.1.3): 2 is audio
@@ -102,7 +106,7 @@ def holds_pictures_only(path: Path) -> bool:
 
 
 def _matroska_end(head: bytes) -> int:
-    """Return where the segment, which holds all but the header, ends; 0: not announced."""
+    """Return the end of the segment (all but the header), in bytes; 0: unknown."""
     at, length = _vint(head, len(EBML))
     at += length
     if head[at : at + 4] != SEGMENT:
@@ -112,7 +116,7 @@ def _matroska_end(head: bytes) -> int:
 
 
 def _vint(data: bytes, at: int) -> tuple[int, int]:
-    """Read a number of variable length (RFC 8794): where it ends, and its value; 0: unknown."""
+    """Read an integer of variable length (RFC 8794): its end, and its value; 0: unknown."""
     count = 9 - int(data[at]).bit_length()
     if count > 8 or at + count > len(data):
         raise struct.error("no length")

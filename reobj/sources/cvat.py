@@ -1,4 +1,4 @@
-"""CVAT for video 1.1 and for images 1.1: boxes, and the shapes that are taken as boxes."""
+"""CVAT for video 1.1 and for images 1.1: boxes, and bounding boxes of other shapes."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from reobj.sources.recorded import RecordedDetections, scale_to
 from reobj.sources.video import Video
 from reobj.types import Array, ReobjError
 
-XML_MAX = 1 << 27  # bytes; chosen: 800,000 boxes; the parser takes ten times as much
+XML_MAX = 1 << 27  # bytes; chosen: 800,000 boxes; the parser needs ten times as much memory
 CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
 SHAPES = ("box", "polygon", "polyline", "points", "ellipse", "mask", "cuboid")
 
 
 def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
-    """Read what is not "outside"; identity is track id + 1.
+    """Read all shapes that are not "outside"; the identity is the track id + 1.
 
-    Shapes that are no upright boxes are taken as their bounding boxes, and counted.
+    Shapes other than upright boxes become their bounding boxes, and are counted in a message.
 
     Args:
-        path: XML, or the zip that CVAT gives. first: number of the first frame as the user says it.
+        path: XML, or CVAT's zip. first: number of the first frame, "": 0.
     Raises:
-        ReobjError: no such file, or no shape in it.
+        ReobjError: the file is missing, of another format, or has no shapes.
     """
     try:
         check_unpacked(path.stat().st_size, XML_MAX)
@@ -41,34 +41,37 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
             with zipfile.ZipFile(path) as packed:
                 check_unpacked(packed.getinfo("annotations.xml").file_size, XML_MAX)
                 text = packed.read("annotations.xml")
-        root, made = ET.fromstring(text), Counter[str]()
+        root = ET.fromstring(text)
+        bounded = Counter[str]()  # number of shapes of each kind that became bounding boxes
         shapes = list(_of_tracks(root)) or list(_of_images(root))
-        boxes = [_bounds(shape, made) for _, _, _, shape in shapes]
-        frames, labels = [f for f, _, _, _ in shapes], [name for _, _, name, _ in shapes]
+        boxes = [_bounds(shape, bounded) for _, _, _, shape in shapes]
+        frames = [f for f, _, _, _ in shapes]
+        labels = [name for _, _, name, _ in shapes]
         ids = np.array([identity for _, identity, _, _ in shapes], np.int64)
         size = root.find(".//meta//original_size")
-        made_for = [0.0, 0.0]
+        image_size = [0.0, 0.0]
         if size is not None:
-            made_for = [float(size.findtext(side, "0")) for side in ("width", "height")]
+            image_size = [float(size.findtext(side, "0")) for side in ("width", "height")]
     except ReobjError as error:
         raise ReobjError(f"{path}: {error}") from error
-    except Exception as error:  # zip and zlib have their own for damaged files, and so has expat
+    except Exception as error:  # zip, zlib and expat have their own exceptions for damaged files
         raise ReobjError(f"{path}: no annotations of CVAT for video 1.1 ({error!r:.200})") from None
     skeletons = sum(1 for _ in root.iter("skeleton"))
     if not shapes:
         raise ReobjError(f"{path}: no track with a box; export the task as 'CVAT for video 1.1'")
-    messages = [f"{n} {what} taken as their bounding boxes" for what, n in sorted(made.items())]
+    messages = [f"{n} {kind} taken as their bounding boxes" for kind, n in sorted(bounded.items())]
     messages += [f"{skeletons} skeletons left out"] if skeletons else []
     if isinstance(frames[0], str):
-        frame, said = frames_of_names([str(f) for f in frames], video, str(path), first, None, True)
-        messages += [said] if said else []
+        frame, text = frames_of_names([str(f) for f in frames], video, str(path), first, None, True)
+        messages += [text] if text else []
     else:
         frame = np.array(frames, np.int64) - int(first or 0)
     names, class_id = np.unique(labels, return_inverse=True)
     for name in names.tolist():
         check_length(name, f"{path}, label")
     n = len(shapes)
-    scale = scale_to(video.size, np.tile(made_for, (n, 1)), np.ones(n, bool), str(path), messages)
+    size_of = np.tile(image_size, (n, 1))
+    scale = scale_to(video.size, size_of, np.ones(n, bool), str(path), messages)
     return RecordedDetections(
         frame, np.array(boxes, np.float64) * scale, np.ones(n), class_id.astype(np.int64),
         [NO_RUNS] * n, tuple(names.tolist()), video.size, video.working_size, np.arange(n), "box",
@@ -89,42 +92,46 @@ def _of_tracks(root: ET.Element) -> Iterator[Shape]:
 
 
 def _of_images(root: ET.Element) -> Iterator[Shape]:
-    """Yield the shapes of images (CVAT for images), which have no identities."""
+    """Yield the shapes of CVAT for images, which have no identities (0)."""
     for image in root.iter("image"):
         for shape in image:
             if shape.tag in SHAPES:
                 yield image.attrib["name"], 0, shape.attrib["label"], shape
 
 
-def _bounds(shape: ET.Element, made: Counter[str]) -> Array:
-    """Return the bounding box (4,) of a shape; count what is no upright box."""
-    own = shape.attrib
+def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:
+    """Return the bounding box (4,) of a shape; count shapes other than upright boxes."""
+    attributes = shape.attrib
     if shape.tag == "box":
-        low, high = np.array([float(own[key]) for key in CVAT_BOX]).reshape(2, 2)
-        angle = float(own.get("rotation", "0") or 0)
+        low, high = np.array([float(attributes[key]) for key in CVAT_BOX]).reshape(2, 2)
+        angle = float(attributes.get("rotation", "0") or 0)
         if not angle % 180:
             return np.hstack([low, high])
-        made["turned boxes"] += 1
-        return _turned((low + high) / 2, (high - low) / 2, angle, box=True)
-    made[shape.tag + "s" * (shape.tag != "points")] += 1
+        bounded["turned boxes"] += 1
+        return _rotated_bounds((low + high) / 2, (high - low) / 2, angle, box=True)
+    bounded[shape.tag + "s" * (shape.tag != "points")] += 1
     if shape.tag == "ellipse":
-        centre = np.array([float(own["cx"]), float(own["cy"])])
-        radii = np.array([float(own["rx"]), float(own["ry"])])
-        return _turned(centre, radii, float(own.get("rotation", "0") or 0), box=False)
+        centre = np.array([float(attributes["cx"]), float(attributes["cy"])])
+        radii = np.array([float(attributes["rx"]), float(attributes["ry"])])
+        angle = float(attributes.get("rotation", "0") or 0)
+        return _rotated_bounds(centre, radii, angle, box=False)
     if shape.tag == "mask":
-        low = np.array([float(own["left"]), float(own["top"])])
-        return np.hstack([low, low + np.array([float(own["width"]), float(own["height"])])])
+        low = np.array([float(attributes["left"]), float(attributes["top"])])
+        size = np.array([float(attributes["width"]), float(attributes["height"])])
+        return np.hstack([low, low + size])
     if shape.tag == "cuboid":
-        places = [[float(v) for k, v in own.items() if re.fullmatch(axis + "[tb][lr][12]", k)]
-                  for axis in "xy"]  # fmt: skip
-        return np.array([min(places[0]), min(places[1]), max(places[0]), max(places[1])])
-    corners = np.array([pair.split(",") for pair in own["points"].split(";") if pair], np.float64)
+        x, y = ([float(v) for k, v in attributes.items() if re.fullmatch(axis + "[tb][lr][12]", k)]
+                for axis in "xy")  # fmt: skip
+        return np.array([min(x), min(y), max(x), max(y)])
+    pairs = [pair.split(",") for pair in attributes["points"].split(";") if pair]
+    corners = np.array(pairs, np.float64)
     return np.hstack([corners.min(0), corners.max(0)])
 
 
-def _turned(centre: Array, half: Array, angle_deg: float, box: bool) -> Array:
-    """Bound a box or ellipse of half sides (2,) that is turned about its centre (2,)."""
-    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+def _rotated_bounds(centre: Array, half: Array, angle_deg: float, box: bool) -> Array:
+    """Bound a box or ellipse of half sides (2,), rotated about its centre (2,)."""
+    c = np.cos(np.radians(angle_deg))
+    s = np.sin(np.radians(angle_deg))
     sides = np.abs([[c, s], [s, c]]) * half
     reach = sides.sum(1) if box else np.sqrt((sides**2).sum(1))
     return np.hstack([centre - reach, centre + reach])

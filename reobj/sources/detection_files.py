@@ -1,8 +1,8 @@
-"""Recorded detections and tracks of other tools, in one table of readers, checked in one place.
+"""Recorded detections and tracks of other tools: one table of readers, one validation.
 
-Start at `read_detections` and `read_tracks`. Every reader makes a `RecordedDetections`, which is
-then checked here: what cannot be meant is an error that names the line, single rows that are of no
-use are dropped and counted in its messages.
+Start at `read_detections` and `read_tracks`. Every reader returns a `RecordedDetections`, which is
+then validated: invalid content raises an error with the line number; unusable rows are dropped and
+counted in a message.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from reobj.types import (
 
 @dataclass(frozen=True, slots=True)
 class DetectConfig:
-    """Choose the detector and which detections are used, recorded ones included."""
+    """Detector, and filter of detections, recorded ones included."""
 
     model: str = option(
         "deimv2-n",
@@ -56,42 +56,42 @@ class DetectConfig:
     )
     tiles: str = option(
         "",
-        "detect in so many overlapping tiles too, COLUMNSxROWS such as 2x2: finds smaller things, "
-        "for 1 + COLUMNS * ROWS times the time",
+        "also detect on a COLUMNSxROWS grid of overlapping tiles, e.g. 2x2: finds small objects, "
+        "costs 1 + COLUMNS*ROWS runs per frame",
         "--detector-tiles",
     )
-    min_score: float = option(0.1, "drop detections with a lower score (ByteTrack: .1)")
+    min_score: float = option(0.1, "drop detections of a lower score (ByteTrack: .1)")
     classes: str = option("", "comma-separated class names to keep (default: all)", "--classes")
     class_names: str = option(
-        "", "class names where they are not COCO's: a text file, one a line, or a data.yaml"
+        "", "file of class names that are not COCO's: text, one a line, or a data.yaml"
     )
     first_frame: str = option(
-        "", "number that a file of detections gives the first frame, 0 or 1 (default: found out)"
+        "", "number of the first frame in a file of detections, 0 or 1 (default: inferred)"
     )
     max_detections: int = option(
-        0, "most detections that are kept in a frame, best first (0: 100 of a model, all of a file)"
+        0, "most detections per frame, by score (0: 100 of a model, all of a file)"
     )
 
 
 def unnamed_class(class_id: int, count: int) -> str:
-    """Write the message about a class id beyond the class names."""
+    """Return the message about a class id without a class name."""
     return (f"class {class_id}, but there are only {count} class names: give a file of names with "
             "--set detect.class_names=FILE")  # fmt: skip
 
 
 def class_filter(wanted: str, names: Sequence[str]) -> IntArray:
-    """Return the ids of comma-separated class names, whatever their case.
+    """Return the ids of comma-separated class names; case does not matter.
 
     Raises:
         ReobjError: a name that is not among `names`.
     """
-    known = {name.lower().replace("_", " "): i for i, name in enumerate(names)}
+    id_of = {name.lower().replace("_", " "): i for i, name in enumerate(names)}
     chosen = [name.strip().lower().replace("_", " ") for name in wanted.split(",") if name.strip()]
-    unknown = [name for name in chosen if name not in known]
+    unknown = [name for name in chosen if name not in id_of]
     if unknown:
-        close = did_you_mean(unknown[0], known) or f" among {', '.join(names)}"
+        close = did_you_mean(unknown[0], id_of) or f" among {', '.join(names)}"
         raise ReobjError(f"--classes: no class {', '.join(unknown)}{close}")
-    return np.array([known[name] for name in chosen], np.int64)
+    return np.array([id_of[name] for name in chosen], np.int64)
 
 
 def read_detections(
@@ -100,21 +100,21 @@ def read_detections(
     """Read recorded detections of a video, in any format of READERS.
 
     Args:
-        path: the file, or a folder of YOLO labels; boxes in px of the source, frame numbers of the
-            source.
+        path: the file, or a folder of YOLO labels; boxes in px and frame numbers of the source.
         config: min_score, classes, class_names, first_frame and max_detections apply.
     Raises:
-        ReobjError: names the file, the line and what was expected there.
+        ReobjError: the file, the line and what was expected.
     """
-    path, config = Path(path), config or DetectConfig()
-    found = _read(path, video, config)
-    _note_looked(found, video.frame_count)
-    _check(found, path, config, video.frame_count)
-    return found
+    path = Path(path)
+    config = config or DetectConfig()
+    recorded = _read(path, video, config)
+    _note_looked(recorded, video.frame_count)
+    _check(recorded, path, config, video.frame_count)
+    return recorded
 
 
 def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
-    """Read a file of any format as it is, unchecked."""
+    """Read a file of any format without validation."""
     if not path.exists():
         raise ReobjError(f"{path}: no such file of detections")
     if config.first_frame not in ("", "0", "1"):
@@ -125,18 +125,18 @@ def _read(path: Path, video: Video, config: DetectConfig) -> RecordedDetections:
     except ReobjError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ReobjError(f"{path}: an entry is not as expected: {error!r}") from error
+        raise ReobjError(f"{path}: an entry cannot be read: {error!r}") from error
 
 
-def _note_looked(found: RecordedDetections, frame_count: int) -> None:
-    """Note which frames the detector was run on: those that the file lists, else inferred."""
-    listed = found.looked is not None
-    if found.looked is None:
-        found.looked = frames_looked_at(found.frame, frame_count)
-    elif not 0 < len(found.looked) < (frame_count or sys.maxsize):
-        found.looked = None
-    if found.looked is not None:
-        found.messages.append(looked_message(found.looked, listed))
+def _note_looked(recorded: RecordedDetections, frame_count: int) -> None:
+    """Set the frames on which the detector was run: as the file lists them, else inferred."""
+    listed = recorded.looked is not None
+    if recorded.looked is None:
+        recorded.looked = frames_looked_at(recorded.frame, frame_count)
+    elif not 0 < len(recorded.looked) < (frame_count or sys.maxsize):
+        recorded.looked = None
+    if recorded.looked is not None:
+        recorded.messages.append(looked_message(recorded.looked, listed))
 
 
 Reader = Callable[[Path, Sequence[str], Video, str], RecordedDetections]
@@ -151,7 +151,7 @@ SUFFIXES = {".npz": "npz", ".json": "json", ".xml": "cvat", ".zip": "cvat"}  # o
 
 
 def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
-    """Read a table of records, or one of COCO's kinds."""
+    """Read a table of records, or a COCO or OA-SLAM file."""
     data = load_json(path)
     table = table_of_records(path, data)
     if table is not None:
@@ -160,7 +160,7 @@ def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> Re
 
 
 def _kind(path: Path) -> str:
-    """Return the reader that a file is for."""
+    """Return the key of READERS for a file."""
     return "folder" if path.is_dir() else SUFFIXES.get(path.suffix.lower(), "table")
 
 
@@ -175,7 +175,7 @@ def recorded_times(path: Path) -> Array | None:
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Return the (w, h) of the images that a file of detections was made for, if it says so."""
+    """Return the (w, h) of the images of a file of detections; None if the file lacks it."""
     kind = _kind(path)
     if kind == "npz":
         return npz_image_size(path)
@@ -183,7 +183,7 @@ def image_size(path: Path) -> tuple[int, int] | None:
 
 
 def image_names(path: Path) -> list[str]:
-    """List the images that a file of detections or a dataset beside it names; [] where none."""
+    """List the image names in a file of detections or a dataset beside it; [] if there are none."""
     kind = _kind(path)
     if kind == "json":
         return coco.image_names_of(path, load_json(path))
@@ -192,131 +192,140 @@ def image_names(path: Path) -> list[str]:
     return tables.image_names_of(read_cells(path)) if kind == "table" else []
 
 
-def _check(found: RecordedDetections, path: Path, config: DetectConfig, frame_count: int) -> None:
-    """Check detections of any format, drop what is not used and sort the rest by frame and score.
+def _check(
+    recorded: RecordedDetections, path: Path, config: DetectConfig, frame_count: int
+) -> None:
+    """Validate and filter detections of any format; sort them by frame and score.
 
-    Errors for what cannot be meant, messages for single rows.
+    Invalid content is an error; dropped rows are counted in a message.
     """
-    _check_rows(found, path)
-    keep = _usable(found, path, frame_count)
-    _check_scores(found)
-    if (low := keep & (found.score < config.min_score)).any():
-        text = f"{low.sum()} of {len(found)} boxes have a score below {config.min_score:g}"
-        found.messages.append(f"{text} (detect.min_score): left out")
-    keep &= found.score >= config.min_score
+    _check_rows(recorded, path)
+    keep = _usable(recorded, path, frame_count)
+    _check_scores(recorded)
+    if (low := keep & (recorded.score < config.min_score)).any():
+        text = f"{low.sum()} of {len(recorded)} boxes have a score below {config.min_score:g}"
+        recorded.messages.append(f"{text} (detect.min_score): left out")
+    keep &= recorded.score >= config.min_score
     if config.classes:
-        keep &= np.isin(found.class_id, class_filter(config.classes, found.class_names))
-    if not len(found):
-        found.messages.append("no detections in this file")
+        keep &= np.isin(recorded.class_id, class_filter(config.classes, recorded.class_names))
+    if not len(recorded):
+        recorded.messages.append("no detections in this file")
     elif not keep.any():
-        found.messages.append(
-            f"none of {len(found)} boxes is left: those of score {config.min_score:g} or more "
+        recorded.messages.append(
+            f"none of {len(recorded)} boxes is left: those of score {config.min_score:g} or more "
             f"(detect.min_score){f' and class {config.classes}' * bool(config.classes)} are used"
         )
     rows = np.flatnonzero(keep)
-    rows = rows[np.lexsort((rows, -found.score[rows], found.frame[rows]))]  # best first
-    found.select(_most(found, rows, path, config.max_detections))
-    found.messages[:] = [f"{path.name}: {text}" for text in found.messages]
+    rows = rows[np.lexsort((rows, -recorded.score[rows], recorded.frame[rows]))]  # best first
+    recorded.select(_best_per_frame(recorded, rows, path, config.max_detections))
+    recorded.messages[:] = [f"{path.name}: {text}" for text in recorded.messages]
 
 
-def _check_rows(found: RecordedDetections, path: Path) -> None:
-    """Refuse values and masks that cannot be meant; names the first row at fault."""
+def _check_rows(recorded: RecordedDetections, path: Path) -> None:
+    """Refuse invalid values and masks; the error names the first such row."""
     with np.errstate(invalid="ignore", over="ignore"):  # inf - inf
-        finite = np.isfinite(found.xyxy.sum(1) + found.score)  # (N,)
-    finite &= (np.abs(found.xyxy) <= COORDINATE_MAX).all(1)
-    named = np.isin(found.class_id, np.arange(len(found.class_names)))
-    lengths = np.array([*map(len, found.class_names), 0])
-    short = lengths[np.where(named, found.class_id, -1)] <= CLASS_NAME_MAX
-    pixels = np.array([runs.sum() for runs in found.runs], np.int64)  # (N,)
-    masked = np.array([len(runs) > 0 for runs in found.runs], bool)
-    fits = ~masked | (pixels == math.prod(found.size))
+        finite = np.isfinite(recorded.xyxy.sum(1) + recorded.score)  # (N,)
+    finite &= (np.abs(recorded.xyxy) <= COORDINATE_MAX).all(1)
+    named = np.isin(recorded.class_id, np.arange(len(recorded.class_names)))
+    lengths = np.array([*map(len, recorded.class_names), 0])
+    short = lengths[np.where(named, recorded.class_id, -1)] <= CLASS_NAME_MAX
+    pixels = np.array([runs.sum() for runs in recorded.runs], np.int64)  # (N,)
+    masked = np.array([len(runs) > 0 for runs in recorded.runs], bool)
+    fits = ~masked | (pixels == math.prod(recorded.size))
     for row in np.flatnonzero(~(finite & named & short & fits))[:1]:
-        where = f"{path}, {found.unit} {found.line[row]}"
-        text = f"mask of {pixels[row]} pixels in a video of {found.size}"
+        where = f"{path}, {recorded.unit} {recorded.line[row]}"
+        text = f"mask of {pixels[row]} pixels in a video of {recorded.size}"
         if not finite[row]:
-            text = f"{found.xyxy[row]}, {found.score[row]}: NaN, infinite or beyond 1e7 pixels"
+            text = (
+                f"{recorded.xyxy[row]}, {recorded.score[row]}: NaN, infinite or beyond 1e7 pixels"
+            )
         elif not named[row]:
-            text = unnamed_class(int(found.class_id[row]), len(found.class_names))
+            text = unnamed_class(int(recorded.class_id[row]), len(recorded.class_names))
         elif not short[row]:
-            check_length(found.class_names[found.class_id[row]], where)
+            check_length(recorded.class_names[recorded.class_id[row]], where)
         raise ReobjError(f"{where}: {text}")
-    for name in found.class_names:
+    for name in recorded.class_names:
         check_length(name, f"{path}, class names")
 
 
-PERCENT = 100.0
-PERCENT_MIN = 2.0  # a file whose best detection has 2 % holds no percents
+PERCENT_MIN = 2.0  # highest score above which scores are percentages; chosen: 2 % is no best score
 
 
-def _check_scores(found: RecordedDetections) -> None:
-    """Bring scores to [0, 1] and say how: no scores at all, percents, or clipped."""
-    low, high = found.score.min(initial=0), found.score.max(initial=0)
-    if len(found) and (found.score == -1).all():
-        found.messages.append("scores are all -1: taken as 1")
-        found.score = -found.score
-    elif PERCENT_MIN < high <= PERCENT and low >= 0:
-        found.messages.append(f"scores from {found.score.min():g} to {high:g} are taken as percent")
-        found.score = found.score / PERCENT
+def _check_scores(recorded: RecordedDetections) -> None:
+    """Convert scores to [0, 1]: -1 for all, percentages, or clipped; with a message."""
+    low = recorded.score.min(initial=0)
+    high = recorded.score.max(initial=0)
+    if len(recorded) and (recorded.score == -1).all():
+        recorded.messages.append("scores are all -1: taken as 1")
+        recorded.score = -recorded.score
+    elif PERCENT_MIN < high <= 100 and low >= 0:
+        recorded.messages.append(
+            f"scores from {recorded.score.min():g} to {high:g} are taken as percent"
+        )
+        recorded.score = recorded.score / 100.0
     elif low < 0 or high > 1:
-        out = (found.score < 0) | (found.score > 1)
-        text = f"scores from {found.score.min():g} to {high:g} clipped to [0, 1]"
-        found.messages.append(f"{text}: {out.sum()} of {len(found)} boxes")
-        found.score = np.clip(found.score, 0, 1)
+        outside = (recorded.score < 0) | (recorded.score > 1)
+        text = f"scores from {recorded.score.min():g} to {high:g} clipped to [0, 1]"
+        recorded.messages.append(f"{text}: {outside.sum()} of {len(recorded)} boxes")
+        recorded.score = np.clip(recorded.score, 0, 1)
 
 
-def _most(found: RecordedDetections, rows: IntArray, path: Path, most: int) -> IntArray:
-    """Keep of the rows, sorted by frame and score, the best `most` (0: all) of each frame."""
-    frame = found.frame[rows]
+def _best_per_frame(
+    recorded: RecordedDetections, rows: IntArray, path: Path, most: int
+) -> IntArray:
+    """Select the best `most` (0: all) rows of each frame; rows: sorted by frame and score."""
+    frame = recorded.frame[rows]
     rank = np.arange(len(rows)) - np.searchsorted(frame, frame)  # within its frame
     if most and (rank >= most).any():
         text = f"{(rank >= most).sum()} boxes beyond the best {most} of a frame left out"
-        found.messages.append(f"{text} (detect.max_detections)")
+        recorded.messages.append(f"{text} (detect.max_detections)")
         return rows[rank < most]
     if (worst := int(rank.max(initial=-1)) + 1) > DETECTIONS_MAX:
         text = f"{worst} boxes in frame {frame[rank.argmax()]} (0-based)"
         advice = "raise detect.min_score, or keep the best with --set detect.max_detections=N"
-        raise ReobjError(f"{path}: {text}, at most {DETECTIONS_MAX} are taken; {advice}")
+        raise ReobjError(f"{path}: {text}, at most {DETECTIONS_MAX} are allowed; {advice}")
     return rows
 
 
-UNUSABLE_SHARE = 0.5  # chosen: where most boxes are of no use, it is the format that is wrong
-EDGE_PX = 1.0  # chosen: detectors round boxes at the border to whole pixels
+EDGE_PX = 1.0  # px beyond the image border; chosen: detectors round boxes to whole pixels
 
 
-def _usable(found: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
-    """Tell which boxes (N,) have an area, touch the image and belong to a frame of the video."""
-    count, low, high = len(found), found.xyxy[:, :2], found.xyxy[:, 2:]
+def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
+    """Test which boxes (N,) have an area, overlap the image and belong to a frame of the video."""
+    count = len(recorded)
+    low = recorded.xyxy[:, :2]
+    high = recorded.xyxy[:, 2:]
     empty = (high <= low).any(1)  # (N,)
-    outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(found.size))).any(1))
-    missing = (found.frame < 0) | (found.frame >= (frame_count or sys.maxsize))
-    if count and found.xyxy.max() <= NORMALISED_MAX:
+    outside = np.logical_and(~empty, ((high <= 0) | (low >= np.array(recorded.size))).any(1))
+    missing = (recorded.frame < 0) | (recorded.frame >= (frame_count or sys.maxsize))
+    if count and recorded.xyxy.max() <= NORMALISED_MAX:
         raise ReobjError(f"{path}: no coordinate above {NORMALISED_MAX}: normalised to 0..1? "
                          "Multiply them by the image size")  # fmt: skip
-    if reading := _other_reading(found.xyxy, found.size):
+    if reading := _other_reading(recorded.xyxy, recorded.size):
         raise ReobjError(f"{path}: {reading}")
-    if (empty | outside).sum() > UNUSABLE_SHARE * count:
+    if 2 * (empty | outside).sum() > count:  # the format is wrong, not a few boxes
         raise ReobjError(
             f"{path}: {empty.sum()} of {count} boxes have no area and {outside.sum()} lie outside "
-            f"the image of {found.size}: x, y, w, h where x1, y1, x2, y2 is expected, or another "
-            "video?"
+            f"the image of {recorded.size}: x, y, w, h where x1, y1, x2, y2 is expected, or "
+            "another video?"
         )
-    numbers = shortened(np.unique(found.frame[missing]).tolist())
-    text = f"of frames that the video has not (0-based: {numbers}; it has {frame_count or 'some'})"
+    numbers = shortened(np.unique(recorded.frame[missing]).tolist())
+    text = f"of frames that the video lacks (0-based: {numbers}; it has {frame_count or 'some'})"
     if count and missing.all():
         raise ReobjError(f"{path}: all detections are {text}: detections of another video?")
-    for bad, what in ((empty, "without area"), (outside, "wholly outside the image"),
-                      (missing, text)):  # fmt: skip
+    for bad, fault in ((empty, "without area"), (outside, "wholly outside the image"),
+                       (missing, text)):  # fmt: skip
         if bad.any():
-            first = f"{found.unit} {found.line[bad][0]}"
-            found.messages.append(f"{bad.sum()} boxes {what} dropped, the first at {first}")
+            first = f"{recorded.unit} {recorded.line[bad][0]}"
+            recorded.messages.append(f"{bad.sum()} boxes {fault} dropped, the first at {first}")
     return np.logical_not(empty | outside | missing)
 
 
 def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
-    """Name what boxes (N, 4) fit that cannot be meant as they are, "" where they can.
+    """Describe the box format that boxes (N, 4) probably have; "" if corners are valid.
 
-    A box with its second corner before the first, or with its centre outside the image, cannot.
-    Then the usual mistakes are tried; one counts if all boxes fit the image with it.
+    Corners are invalid if the second is before the first or the centre lies outside the image.
+    Then common mistakes are tried; one is the cause if all boxes fit the image with it.
     """
     image = np.array(size, np.float64)
     centre = (xyxy[:, :2] + xyxy[:, 2:]) / 2
@@ -326,22 +335,23 @@ def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
         return ""
     why = f"{inverted.sum()} of {len(xyxy)} boxes have x2 < x1 or y2 < y1 and {beyond.sum()} have "
     why += f"their centre outside the image of {size}"
-    added = np.hstack([xyxy[:, :2], xyxy[:, :2] + xyxy[:, 2:]])
-    taken = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-    for box, limit, what in (
+    from_sizes = np.hstack([xyxy[:, :2], xyxy[:, :2] + xyxy[:, 2:]])
+    from_corners = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
+    for box, limit, cause in (
         (xyxy, image[::-1], f"all fit the frame turned by 90 deg, {size[::-1]}: made on frames "
                             "that were not turned upright? Detect on upright frames"),
-        (added, image, "all fit it as x, y, w, h: name the columns so, or give corners"),
-        (taken, image, "all fit it if w and h are the corner x2, y2: name them so, or give sizes"),
+        (from_sizes, image, "all fit it as x, y, w, h: name the columns so, or give corners"),
+        (from_corners, image,
+         "all fit it if w and h are the corner x2, y2: name them so, or give sizes"),
     ):  # fmt: skip
         inside = (box >= -EDGE_PX).all(1) & (box[:, :2] <= box[:, 2:]).all(1)
         if (inside & (box[:, 2:] <= limit + EDGE_PX).all(1)).all():
-            return f"{why}; {what}"
+            return f"{why}; {cause}"
     return ""
 
 
-SAME_BOX = 0.95  # overlap (IoU) from which a box of a tracks file counts as the tracker's own
-SAME_OBJECT = 0.5  # overlap (IoU) from which two boxes show one object (PASCAL VOC)
+SAME_BOX = 0.95  # IoU from which a box of a tracks file is an unmoved box of the tracker
+SAME_OBJECT = 0.5  # IoU from which two boxes show the same object (PASCAL VOC)
 
 
 def read_tracks(
@@ -351,82 +361,90 @@ def read_tracks(
     known: Tracks | None = None,
     known_names: Sequence[str] = (),
 ) -> tuple[Tracks, tuple[str, ...], list[str]]:
-    """Read identities made elsewhere or corrected by hand.
+    """Read identities of another tool or of manual corrections.
 
     Args:
-        path: any file of `read_detections` that has identities: CVAT for video 1.1 (XML or its
-            zip), COCO (track_id or instance_id, also in CVAT's attributes), MOT, KITTI, CSV,
-            YOLO labels; frames that the video's options leave out are not used.
-        known, known_names: earlier tracks of the video and their class names: they lend their
-            scores to boxes that were not moved, and their classes to files that have none.
+        path: any file of `read_detections` with identities: CVAT for video 1.1 (XML or zip), COCO
+            (track_id or instance_id, also in CVAT's attributes), MOT, KITTI, CSV, YOLO labels;
+            frames excluded by the video's options are not used.
+        known, known_names: earlier tracks of the video and their class names; their scores are
+            copied to unmoved boxes, their classes to files without classes.
     Returns:
         tracks, their class names, and messages for the user.
     """
-    path, config = Path(path), config or DetectConfig()
+    path = Path(path)
+    config = config or DetectConfig()
     limit = dataclasses.replace(config, min_score=0.0, max_detections=0)
-    found = _read(path, video, limit)
-    _check(found, path, limit, video.frame_count)
-    if len(found):
-        _check_identities(found, path)
-    start, stop, every = video.config.start, video.config.stop, video.config.every
-    use = (found.frame >= start) & ((found.frame - start) % every == 0)
-    use &= found.frame < (stop or sys.maxsize)
-    pairs = np.column_stack([found.frame, found.identity])[use]  # (N, 2)
+    recorded = _read(path, video, limit)
+    _check(recorded, path, limit, video.frame_count)
+    if len(recorded):
+        _check_identities(recorded, path)
+    start = video.config.start
+    stop = video.config.stop
+    every = video.config.every
+    use = (recorded.frame >= start) & ((recorded.frame - start) % every == 0)
+    use &= recorded.frame < (stop or sys.maxsize)
+    pairs = np.column_stack([recorded.frame, recorded.identity])[use]  # (N, 2)
     unique, first, count = np.unique(pairs, axis=0, return_index=True, return_counts=True)
     if (count > 1).any():
         frame, identity = unique[count.argmax()]
         raise ReobjError(f"{path}: identity {identity} has {count.max()} boxes in frame {frame} "
                          "(0-based); an object is in one place at a time")  # fmt: skip
     rows = np.flatnonzero(use)[first]
-    ids, unknown = found.identity[rows], np.full(len(rows), -1, np.int64)
-    columns = (found.xyxy[rows], found.score[rows], found.class_id[rows], unknown)
-    tracks, names = Tracks(found.frame[rows], ids, ids, *columns), found.class_names
+    ids = recorded.identity[rows]
+    unknown = np.full(len(rows), -1, np.int64)
+    columns = (recorded.xyxy[rows], recorded.score[rows], recorded.class_id[rows], unknown)
+    tracks = Tracks(recorded.frame[rows], ids, ids, *columns)
+    names = recorded.class_names
     if known is not None:
         unnamed = names == ("object",)
-        tracks = _lend(known, tracks, unnamed)
+        tracks = _with_known(tracks, known, unnamed)
         names = tuple(known_names) if unnamed else names
         if unnamed:
             without = (tracks.class_id < 0).sum()
-            text = f"{path.name}: no classes: {len(tracks) - without} boxes have the class of the "
-            found.messages.append(f"{text}earlier object that they show, {without} are `object`")
-    return tracks, names, found.messages
+            text = f"{path.name}: no classes: {len(tracks) - without} boxes get the class of the "
+            recorded.messages.append(f"{text}earlier object that they show, {without} are `object`")
+    return tracks, names, recorded.messages
 
 
-def _check_identities(found: RecordedDetections, path: Path) -> None:
-    """Leave out boxes without an identity (-1), and count from 1; refuse a file without any."""
-    has = found.identity >= 0 if len(found.identity) else np.zeros(len(found), bool)
-    if not has.any():
-        raise ReobjError(f"{path}: not every box has an identity, none has: no file of tracks")
-    if not has.all():
-        text = f"{path.name}: {(~has).sum()} of {len(found)} boxes without an identity left out"
-        found.messages.append(text)
-        found.select(np.flatnonzero(has))
-    if found.identity.min() == 0:
-        found.messages.append(f"{path.name}: there is an identity 0: 1 is added to all of them")
-        found.identity = found.identity + 1
+def _check_identities(recorded: RecordedDetections, path: Path) -> None:
+    """Drop boxes without an identity (-1), make identities count from 1; refuse files without."""
+    identified = recorded.identity >= 0 if len(recorded.identity) else np.zeros(len(recorded), bool)
+    if not identified.any():
+        raise ReobjError(f"{path}: no box has an identity; expected a file of tracks")
+    if not identified.all():
+        count = (~identified).sum()
+        text = f"{path.name}: {count} of {len(recorded)} boxes without an identity left out"
+        recorded.messages.append(text)
+        recorded.select(np.flatnonzero(identified))
+    if recorded.identity.min() == 0:
+        recorded.messages.append(f"{path.name}: identities count from 0: 1 is added to all of them")
+        recorded.identity = recorded.identity + 1
 
 
-def _lend(known: Tracks, tracks: Tracks, unnamed: bool) -> Tracks:
-    """Give unmoved boxes their earlier scores, and unnamed objects their class.
+def _with_known(tracks: Tracks, known: Tracks, unnamed: bool) -> Tracks:
+    """Copy scores of earlier tracks to unmoved boxes, and classes to unnamed objects.
 
-    The class is that of the earlier boxes that overlap an object's most, in sum over its frames,
-    -1 where none shows it.
+    The class has the largest sum of IoU over the frames of an object; -1: no overlap.
     """
-    class_id, score = tracks.class_id.copy(), tracks.score.copy()
-    overlap, old_class = np.zeros(len(tracks)), np.full(len(tracks), -1, np.int64)
+    class_id = tracks.class_id.copy()
+    score = tracks.score.copy()
+    overlap = np.zeros(len(tracks))
+    known_class = np.full(len(tracks), -1, np.int64)
     for rows in rows_by(tracks.frame):
-        there = known[known.frame == tracks.frame[rows[0]]]
-        if not len(there):
+        same_frame = known[known.frame == tracks.frame[rows[0]]]
+        if not len(same_frame):
             continue
-        iou = box_iou(tracks.xyxy[rows], there.xyxy)  # (n, m)
-        best, most = iou.argmax(1), iou.max(1)
-        same = most > SAME_BOX
-        score[rows[same]] = there.score[best[same]]
-        overlap[rows] = np.where(most >= SAME_OBJECT, most, 0)
-        old_class[rows] = np.where(most >= SAME_OBJECT, there.class_id[best], -1)
+        iou = box_iou(tracks.xyxy[rows], same_frame.xyxy)  # (n, m)
+        best = iou.argmax(1)
+        best_iou = iou.max(1)
+        unmoved = best_iou > SAME_BOX
+        score[rows[unmoved]] = same_frame.score[best[unmoved]]
+        overlap[rows] = np.where(best_iou >= SAME_OBJECT, best_iou, 0)
+        known_class[rows] = np.where(best_iou >= SAME_OBJECT, same_frame.class_id[best], -1)
     if unnamed:
         for rows in rows_by(tracks.track_id):
-            votes = rows[old_class[rows] >= 0]
-            shares = np.bincount(old_class[votes], overlap[votes])
-            class_id[rows] = int(shares.argmax()) if len(votes) else -1
+            voters = rows[known_class[rows] >= 0]
+            votes = np.bincount(known_class[voters], overlap[voters])
+            class_id[rows] = int(votes.argmax()) if len(voters) else -1
     return dataclasses.replace(tracks, class_id=class_id, score=score)

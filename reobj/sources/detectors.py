@@ -1,8 +1,8 @@
-"""Detectors: ONNX models, a cache, and one interface to whatever finds objects in frames.
+"""Detectors: ONNX models, a cache, and one interface to all sources of detections.
 
-Start at `open_detections` (by configuration) or `as_source` (a detector in hand): both give a
-`DetectionSource`, which answers for frames. The layouts that `OnnxDetector` knows are in
-`onnx_layouts`; files of detections are read in `detection_files`.
+Start at `open_detections` (from a configuration) or `as_source` (from a detector): both return a
+`DetectionSource`, which maps frames to detections. Output layouts of ONNX models: `onnx_layouts`;
+files of detections: `detection_files`.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ from reobj.types import (
     visible_name,
 )
 
-DYNAMIC_SIDE = 640  # px, longer side that models for any size are fed (YOLO11 was trained so)
-MODEL_DETECTIONS = 100  # in a frame (COCO's own limit, maxDets)
-NMS_IOU = 0.6  # boxes of a class that overlap by more are one, where NMS is left to us (NanoDet)
-SIZE_MULTIPLE = 32  # px; such models want multiples of their largest stride
+DYNAMIC_SIDE = 640  # px, longer input side of models with a dynamic size (YOLO11's training size)
+MODEL_DETECTIONS = 100  # most detections of a frame (COCO's maxDets)
+NMS_IOU = 0.6  # IoU above which boxes of a class are duplicates, for models without NMS (NanoDet)
+SIZE_MULTIPLE = 32  # px, input sides are multiples of the largest stride of such models
 
 
 class OnnxDetector:
-    """Detect objects with an ONNX model, whose layout is read from its inputs and outputs.
+    """Detect objects with an ONNX model, whose layout is inferred from its inputs and outputs.
 
         detector = OnnxDetector("fast")
         detections = detector(image)  # BGR; boxes in its pixels
@@ -72,9 +72,9 @@ class OnnxDetector:
         threads: of onnxruntime (0: all cores). offline: never download.
         device: cpu, cuda, coreml, ... (`onnx_session`).
     Attributes:
-        class_names: names by class id. layout: name of the layout found. path: the file.
+        class_names: names by class id. layout: name of the inferred layout. path: of the file.
     Raises:
-        ReobjError: no file, or no layout that is known; lists those that are.
+        ReobjError: no such file, or an unknown layout.
     """
 
     def __init__(
@@ -88,20 +88,21 @@ class OnnxDetector:
         self.config = config or DetectConfig()
         name = path_or_name or self.config.model
         self._most = self.config.max_detections or MODEL_DETECTIONS
-        self._grid, weights = parse_tiles(self.config.tiles), known_weights(name)
+        self._grid = parse_tiles(self.config.tiles)
+        weights = known_weights(name)
         self.path = model_path(name, offline)
         self._session = onnx_session(self.path, threads, device)
         self._inputs = [(i.name, list(i.shape), i.type) for i in self._session.get_inputs()]
         _, shape, kind = self._inputs[0]
         if kind != "tensor(float)" or len(shape) not in (3, 4) or shape[-3] != 3:
             raise self._refusal(f"input is {kind} {shape}, expected an image (1, 3, H, W)")
-        trial = self._try_out()
+        trial = self._trial_run()
         accepting = [layout for layout in LAYOUTS if layout.accepts(trial)]
         if not accepting:
             outputs = zip(self._session.get_outputs(), trial.outputs, strict=True)
-            found = ", ".join(f"{output.name} {array.shape}" for output, array in outputs)
+            shapes = ", ".join(f"{output.name} {array.shape}" for output, array in outputs)
             known = "; ".join(layout.name for layout in LAYOUTS)
-            text = f"outputs {found}; known layouts: {known}{weights.fallback if weights else ''}"
+            text = f"outputs {shapes}; known layouts: {known}{weights.fallback if weights else ''}"
             raise self._refusal(text)
         self._layout = accepting[0]
         self.layout = self._layout.name
@@ -117,64 +118,64 @@ class OnnxDetector:
         image = as_frame(image)
         if self._grid == (1, 1):
             return self._detect(image)
-        found = detect_in_tiles(self._detect, image, self._grid)
-        return found[: self._most]
+        return detect_in_tiles(self._detect, image, self._grid)[: self._most]
 
     def _detect(self, image: Image) -> Detections:
-        """Run the network once, on the whole of an image."""
+        """Run the network once, on the whole image."""
         size = self._input_size(image.shape[1], image.shape[0])
         canvas, geometry = fit_image(image, size, self._layout.fit)
         outputs = self._session.run(None, self._feeds(canvas, geometry.image_size, self._layout))
-        found = self._layout.decode(outputs, geometry)
-        boxes = np.clip(found.xyxy, 0, np.tile(geometry.image_size, 2))
-        label = found.class_id - self._layout.first
-        keep = self._select(boxes, found.score, label)
+        decoded = self._layout.decode(outputs, geometry)
+        boxes = np.clip(decoded.xyxy, 0, np.tile(geometry.image_size, 2))
+        label = decoded.class_id - self._layout.first
+        keep = self._select(boxes, decoded.score, label)
         if len(keep) and label[keep].max() >= len(self.class_names):
             text = unnamed_class(label[keep].max(), len(self.class_names))
             raise ReobjError(f"{self.path}: {text}")
-        masks = found.masks(keep) if found.masks is not None else None
-        return Detections(boxes[keep], found.score[keep], label[keep], masks)
+        masks = decoded.masks(keep) if decoded.masks is not None else None
+        return Detections(boxes[keep], decoded.score[keep], label[keep], masks)
 
     def _refusal(self, reason: str) -> ReobjError:
-        """Make the error that this is no known detector."""
+        """Make the error for a file that is no known detector."""
         return ReobjError(f"{self.path}: no known object detector: {reason}")
 
     def _fault(self, trial: Trial, expected: str) -> str:
-        """Say what a trial on grey shows that a model of our table cannot give; "": nothing."""
+        """Find why the outputs of a trial run are not those of layout `expected`; "": they are."""
         if not self.layout.startswith(expected):
             return f"its layout is {self.layout}"
-        same = Geometry(trial.size, trial.size, (1.0, 1.0), (0, 0))
-        found = self._layout.decode(trial.outputs, same)
-        if not np.isfinite(found.xyxy).all() or not ((found.score >= 0) & (found.score <= 1)).all():
-            return "boxes that are no numbers, or scores outside 0..1"
-        if len(found.xyxy) and np.abs(found.xyxy).max() <= NORMALISED_MAX:
+        identity = Geometry(trial.size, trial.size, (1.0, 1.0), (0, 0))
+        decoded = self._layout.decode(trial.outputs, identity)
+        score = decoded.score
+        if not np.isfinite(decoded.xyxy).all() or not ((score >= 0) & (score <= 1)).all():
+            return "boxes that are not finite, or scores outside 0..1"
+        if len(decoded.xyxy) and np.abs(decoded.xyxy).max() <= NORMALISED_MAX:
             return "boxes that are not in pixels"
-        labels = found.class_id - self._layout.first
+        labels = decoded.class_id - self._layout.first
         count = len(self.class_names)
         return f"classes beyond its {count}" if labels.max(initial=0) >= count else ""
 
     def _select(self, boxes: Array, score: Array, label: IntArray) -> IntArray:
         """Select rows by score, area, class and NMS; best first."""
-        good = (score >= self.config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
-        good &= label >= 0
+        use = (score >= self.config.min_score) & (boxes[:, 2:] > boxes[:, :2]).all(1)
+        use &= label >= 0
         if self._allowed is not None:
-            good &= np.isin(label, self._allowed)
-        rows = np.flatnonzero(good)
+            use &= np.isin(label, self._allowed)
+        rows = np.flatnonzero(use)
         rows = rows[np.argsort(-score[rows], kind="stable")][:MAX_CANDIDATES]
         if self._layout.nms:
             rows = rows[nms(boxes[rows], label[rows], NMS_IOU)]
         return rows[: self._most]
 
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the (w, h) to feed for an image: the model's, or the image's at DYNAMIC_SIDE."""
-        own = self._inputs[0][1][:-3:-1]
+        """Return the input (w, h) for an image: the model's, or the image's at DYNAMIC_SIDE."""
+        fixed = self._inputs[0][1][:-3:-1]
         ratio = DYNAMIC_SIDE / max(width, height) / SIZE_MULTIPLE
-        free = [max(math.ceil(round(v * ratio, 3)), 1) * SIZE_MULTIPLE for v in (width, height)]
-        w, h = (a if isinstance(a, int) else b for a, b in zip(own, free, strict=True))
+        scaled = [max(math.ceil(round(v * ratio, 3)), 1) * SIZE_MULTIPLE for v in (width, height)]
+        w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
         return w, h
 
     def _feeds(self, canvas: Image, image_size: tuple[int, int], layout: Layout) -> dict[str, Any]:
-        """Make the model's inputs of a fitted BGR image: the image, and its size if wanted."""
+        """Make the model's inputs from a fitted BGR image: the image, and its size if required."""
         name, shape, _ = self._inputs[0]
         mean, std = np.array([layout.mean, layout.std], np.float32)
         blob = (canvas[..., ::-1] if layout.rgb else canvas).astype(np.float32)
@@ -182,8 +183,8 @@ class OnnxDetector:
         feeds = {name: blob[None] if len(shape) == 4 else blob}
         return feeds | {other: np.array([image_size]) for other, _, _ in self._inputs[1:]}
 
-    def _try_out(self) -> Trial:
-        """Run the model on a grey image to learn the shapes of its outputs."""
+    def _trial_run(self) -> Trial:
+        """Run the model on a grey image to get the shapes of its outputs."""
         size = self._input_size(DYNAMIC_SIDE, DYNAMIC_SIDE)
         grey = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
         try:
@@ -194,12 +195,12 @@ class OnnxDetector:
         return Trial([np.asarray(output) for output in outputs], len(self._inputs), size)
 
     def _names(self, count: int) -> tuple[str, ...]:
-        """Name the `count` classes (0: unknown): by the user, the model, COCO, or by numbers."""
+        """Name `count` classes (0: unknown) by option, metadata of the model, COCO, or numbers."""
         if self.config.class_names:
             return load_class_names(self.config.class_names)
-        own = self._session.get_modelmeta().custom_metadata_map.get("names", "")
-        if own.startswith("{"):
-            return tuple(str(name) for _, name in sorted(ast.literal_eval(own).items()))
+        names = self._session.get_modelmeta().custom_metadata_map.get("names", "")
+        if names.startswith("{"):
+            return tuple(str(name) for _, name in sorted(ast.literal_eval(names).items()))
         if count in (0, len(COCO_NAMES)):
             return COCO_NAMES
         log.warning("%s: %d classes without names: give a file of names with --set "
@@ -211,9 +212,9 @@ def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
     """Suppress boxes that overlap a better one of their class (greedy NMS).
 
     Args:
-        xyxy: (N, 4), best first. max_iou: most overlap that is left.
+        xyxy: (N, 4), best first. max_iou: largest IoU of two remaining boxes of a class.
     Returns:
-        Rows that are kept, ascending.
+        remaining rows, ascending.
     """
     xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
     rank = np.arange(len(xyxy), 0, -1)
@@ -221,24 +222,25 @@ def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
     return np.sort(np.array(kept, np.int64))
 
 
-CACHE_FRAMES = 64  # a file of the cache; chosen: a kill loses a few seconds of work at most
+CACHE_FRAMES = 64  # frames of a cache file; chosen: a kill loses a few seconds of work at most
 
 
 class DetectionCache:
-    """Keep the detections of a video on disk, so that a killed run goes on where it stopped.
+    """Cache of the detections of a video on disk, from which a killed run resumes.
 
-    A folder of npz files with `CACHE_FRAMES` frames each, written whole or not at all: a kill loses
-    the frames since the last `flush`. A damaged file is warned about and removed.
+    A folder of npz files with `CACHE_FRAMES` frames each, written atomically: a kill loses the
+    frames since the last `flush`. Damaged files are removed with a warning.
 
     Args:
-        folder: nothing else belongs there. image_size: (w, h) of the frames and of their masks.
+        folder: for the cache alone. image_size: (w, h) of the frames and of their masks.
     """
 
     def __init__(self, folder: str | Path, image_size: tuple[int, int]) -> None:
-        self.folder, self.image_size = Path(folder), image_size
+        self.folder = Path(folder)
+        self.image_size = image_size
         self._stored: dict[int, RecordedDetections] = {}  # by frame
-        self._fresh: dict[int, Detections] = {}  # by frame, not on disk yet
-        self._skipped: set[int] = set()  # frames that were not looked at; of this run only
+        self._pending: dict[int, Detections] = {}  # by frame, not on disk yet
+        self._skipped: set[int] = set()  # frames of this run on which the detector was not run
         chunks = sorted(p for p in self.folder.glob("chunk_*.npz") if p.stem[6:].isdecimal())
         self._next = 1 + max((int(path.stem[6:]) for path in chunks), default=-1)
         for path in chunks:
@@ -249,56 +251,57 @@ class DetectionCache:
                 path.unlink(missing_ok=True)
 
     def _load(self, path: Path) -> None:
-        """Take the frames of a file over, packed as they are stored."""
+        """Add the frames of a file, with packed masks."""
         chunk, done = read_npz(path, self.image_size, self.image_size, sealed=True)
         self._stored |= dict.fromkeys(done.tolist(), chunk)
 
     def __contains__(self, index: int) -> bool:
-        """Tell whether a frame was put here, also one that was not looked at."""
-        return index in self._fresh or index in self._stored or index in self._skipped
+        """Test whether `put` was called for a frame."""
+        return index in self._pending or index in self._stored or index in self._skipped
 
     def get(self, index: int) -> Detections | None:
-        """Return the detections of a frame, None if it was not detected yet or not looked at."""
-        if index in self._fresh:
-            return self._fresh[index]
+        """Return the detections of a frame; None if the detector was not run on it."""
+        if index in self._pending:
+            return self._pending[index]
         return self._stored[index].at(index) if index in self._stored else None
 
     def put(self, index: int, detections: Detections | None) -> None:
-        """Store the detections of a frame, also when there are none or (None) nobody looked."""
+        """Store the detections of a frame; None: the detector was not run on it."""
         if detections is None:
             self._skipped.add(index)
             return
-        self._fresh[index] = detections
-        if len(self._fresh) >= CACHE_FRAMES:
+        self._pending[index] = detections
+        if len(self._pending) >= CACHE_FRAMES:
             self.flush()
 
     def flush(self) -> None:
-        """Write what is not on disk yet."""
-        if not self._fresh:
+        """Write the pending frames to disk."""
+        if not self._pending:
             return
-        frames = sorted(self._fresh.items())
+        frames = sorted(self._pending.items())
         path = self.folder / f"chunk_{self._next:06d}.npz"
         done = {"done": np.array([index for index, _ in frames])}
         save_npz(path, pack_detections(frames, [], self.image_size) | done)
         self._next += 1
-        self._fresh.clear()
+        self._pending.clear()
         self._load(path)
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionSource:
-    """Answer for the detections of a frame, wherever they come from: `source(frame)`.
+    """Source of the detections of a frame: `source(frame)`.
 
     Attributes:
-        detect: Frame -> Detections in px of its image; None: the frame is not looked at.
+        detect: Frame -> Detections in px of its image; None: the detector was not run on it.
         class_names: by class id; a `Vocabulary` grows with the labels of an open-vocabulary
             detector.
-        key: changes with everything that the detections depend on besides the video; "": unknown,
-            then nothing that follows from them may be cached either.
+        key: cache key of all inputs of the detections besides the video; "": unknown, so results
+            derived from them must not be cached either.
         messages: for the user.
-        slow: worth keeping on disk. cache: where they are kept.
-        recorded: those of a file, all known beforehand.
-        always_looks: where it finds nothing, there is nothing; None alone is a frame not looked at.
+        slow: detections are worth caching. cache: of the detections.
+        recorded: detections of a file, all available in advance.
+        always_looks: zero detections mean an empty frame, and only None a frame on which the
+            detector was not run.
     """
 
     detect: Callable[[Frame], Detections | None]
@@ -315,30 +318,31 @@ class DetectionSource:
             object.__setattr__(self, "class_names", tuple(map(visible_name, self.class_names)))
 
     def __call__(self, frame: Frame) -> Detections:
-        """Return the detections of a frame; none of one that is not looked at."""
-        found = self.look(frame)
-        return Detections.empty() if found is None else found
+        """Return the detections of a frame; zero if the detector was not run on it."""
+        detections = self.look(frame)
+        return Detections.empty() if detections is None else detections
 
     def look(self, frame: Frame) -> Detections | None:
-        """Return the detections of a frame, from the cache if they are there; None: not looked."""
+        """Return the detections of a frame, cached if possible; None: the detector was not run."""
         if self.cache is not None and frame.index in self.cache:
             return self.cache.get(frame.index)
-        found = self.detect(frame)
+        detections = self.detect(frame)
         if self.cache is not None:
-            self.cache.put(frame.index, found)
-        return found
+            self.cache.put(frame.index, detections)
+        return detections
 
     def cached(self, folder: str | Path, image_size: tuple[int, int]) -> DetectionSource:
-        """Keep detections in a folder of this video and `key`, where that pays and is allowed.
+        """Return the source with a cache in `folder`, if it is slow and has a key.
 
-        Call `flush` at the end, also after an error or Ctrl-C.
+        The folder is that of the video and `key`. Call `flush` at the end, also after an error or
+        Ctrl-C.
         """
         if not self.slow or not self.key:
             return self
         return dataclasses.replace(self, cache=DetectionCache(folder, image_size))
 
     def flush(self) -> None:
-        """Write what the cache still holds; safe in a `finally`: a failure is a warning."""
+        """Write the pending frames of the cache; a failure is a warning: safe in a `finally`."""
         if self.cache is not None:
             try:
                 self.cache.flush()
@@ -354,11 +358,11 @@ def open_detections(
     offline: bool = False,
     device: str = "cpu",
 ) -> DetectionSource:
-    """Open what finds the objects in a video.
+    """Open the source of the detections of a video.
 
     Args:
-        detections: a file for `read_detections`; a function, of which `config` gives only the class
-            names, or anything else that `as_source` takes; or None: the ONNX model of `config`.
+        detections: a file for `read_detections`; a function or another argument of `as_source`, for
+            which `config` gives only the class names; or None: the ONNX model of `config`.
         threads: of onnxruntime (0: all cores). offline: never download weights. device: of the
             ONNX model, cpu, cuda, coreml, ...
     """
@@ -376,20 +380,20 @@ def open_detections(
 
 
 def _cache_key(config: DetectConfig, *source: str | int) -> str:
-    """Make a key of what identifies a source, the options and the file of class names."""
+    """Make a cache key from the identity of a source, the options and the class names' file."""
     names = source_fingerprint(config.class_names) if config.class_names else ""
     return json.dumps([*source, dataclasses.asdict(config), names])
 
 
 def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource:
-    """Make a source of detections of whatever finds objects.
+    """Make a source of detections from any detector.
 
     Args:
-        detector: a DetectionSource, RecordedDetections (asked by frame number), an OnnxDetector, or
-            any function of a BGR image (H, W, 3) uint8 that returns what `Tracker.update` takes,
-            boxes in its px; None: it did not look at this image.
-        class_names: of a function; ahead of its own attribute `class_names` or `names`
-            (ultralytics) and of COCO's.
+        detector: a DetectionSource, RecordedDetections (by frame number), an OnnxDetector, or a
+            function of a BGR image (H, W, 3) uint8 that returns detections as `Tracker.update`
+            accepts them, in px of the image; None: it was not run on this image.
+        class_names: of a function; default: its attribute `class_names` or `names` (ultralytics),
+            else COCO's.
     """
     if isinstance(detector, DetectionSource):
         return detector
@@ -398,35 +402,36 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
     if not callable(detector):
         raise ReobjError(f"{detector!r:.80} is no detector: expected a function image -> detections"
                          "; a file is opened by read_detections(path, video)")  # fmt: skip
-    own = tuple(class_names) or _own_names(detector)
-    names, by_number = Vocabulary(own or COCO_NAMES), bool(own)
+    stated_names = tuple(class_names) or _stated_names(detector)
+    names = Vocabulary(stated_names or COCO_NAMES)
+    silent = bool(stated_names)
     for name in names:
         check_length(name, "class names of the detector")
 
     def detect(frame: Frame) -> Detections | None:
-        nonlocal by_number
+        nonlocal silent
         try:
             answer = detector(frame.image)
             if answer is None:
                 return None
             labels = None if class_names else text_labels(answer)
             kinds = None if labels is None else np.array(names.numbers(labels), np.int64)
-            found = as_detections(answer, kinds)
+            detections = as_detections(answer, kinds)
         except ReobjError as error:
             raise ReobjError(f"frame {frame.index}: {error}") from error
-        if len(found) and found.class_id.max() >= len(names):
-            text = unnamed_class(int(found.class_id.max()), len(names))
+        if len(detections) and detections.class_id.max() >= len(names):
+            text = unnamed_class(int(detections.class_id.max()), len(names))
             raise ReobjError(f"frame {frame.index}: {text}")
-        if isinstance(answer, Mapping) and kinds is None and not by_number and len(found):
+        if isinstance(answer, Mapping) and kinds is None and not silent and len(detections):
             log.warning(ASSUMED_NAMES)
-            by_number = True  # said once
-        return found
+            silent = True  # one warning is enough
+        return detections
 
     return DetectionSource(detect, names, always_looks=isinstance(detector, OnnxDetector))
 
 
 def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
-    """Make a source of the detections of a file; of frames that were not looked at None."""
+    """Make a source from the detections of a file; None for frames without detector output."""
     looked = None if recorded.looked is None else set(recorded.looked.tolist())
 
     def detect(frame: Frame) -> Detections | None:
@@ -439,13 +444,14 @@ def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
 
 
 ASSUMED_NAMES = (
-    "class numbers of the detector are named as COCO's 80, from 0; torchvision and DETR count its "
-    "91 from 1: give the names (detect.class_names, or an attribute `names` of the function)"
+    "the detector has no class names: its numbers are read as COCO's 80 classes, from 0; "
+    "torchvision and DETR count 91 from 1: give the names (detect.class_names, or an attribute "
+    "`names` of the function)"
 )
 
 
-def _own_names(detector: Any) -> tuple[str, ...]:
-    """Return the class names that a detector states, a list or a dict by id; () if it has none."""
+def _stated_names(detector: Any) -> tuple[str, ...]:
+    """Return the class names in a detector's attributes, a list or a dict by id; () if none."""
     names = getattr(detector, "class_names", None) or getattr(detector, "names", None)
     if isinstance(names, Mapping):
         ids = range(max((int(i) for i in names), default=-1) + 1)

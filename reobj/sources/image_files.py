@@ -1,4 +1,4 @@
-"""Image files: which of a folder are the frames, in which order, at which times; reading them.
+"""Image files: selection, order and times of the frames of a folder; reading images.
 
 Start at `list_images`.
 """
@@ -23,11 +23,11 @@ import numpy.typing as npt
 
 from reobj.types import Array, ReobjError
 
-IMAGE_FPS = 30.0  # chosen: image folders have no times; most phones film at 30 Hz
+IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-UNREAD_SUFFIXES = (  # of images that not every OpenCV reads
+UNREAD_SUFFIXES = (  # of images that not every build of OpenCV reads
     *(".heic", ".heif", ".avif", ".gif", ".jxl", ".jp2", ".exr", ".hdr", ".ppm", ".pgm", ".tga"),
-    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw"),  # cameras' own
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw"),  # raw formats
 )
 
 
@@ -36,8 +36,8 @@ class ImageList:
     """The frames of an image folder.
 
     Attributes:
-        files: in order. usual: those of the size, upright, that most of them have by their headers.
-        messages: what of the folder is no frame, for the user.
+        files: in order. usual: those whose header has the most common (upright) size.
+        messages: images that are no frames, for the user.
     """
 
     files: list[Path]
@@ -48,40 +48,41 @@ class ImageList:
 def list_images(source: str) -> ImageList:
     """List the images of a folder, glob or single file in the order of their names.
 
-    What is no picture by its content is left out: of one channel with more than 8 bits, and of one
-    channel or called a mask, depth or the like beside pictures of the same numbers.
+    Left out are images of one channel with more than 8 bits (depth), and images of one channel or
+    with a name such as mask or depth beside colour images of the same numbers.
 
     Returns:
-        no files for what is a video, or is not there.
+        an empty list for videos and missing files.
     Raises:
-        ReobjError: no images; two kinds of them that cannot be told apart; too many sizes.
+        ReobjError: no images; two kinds of images, either of which may be the frames; or too many
+            sizes.
     """
     path = Path(source)
     if path.is_file():
         suffix = path.suffix.lower()
-        if suffix in UNREAD_SUFFIXES and suffix != ".gif":  # which is read as a video
+        if suffix in UNREAD_SUFFIXES and suffix != ".gif":  # .gif is read as a video
             raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
         return _sized(source, [path] if suffix in IMAGE_SUFFIXES else [], {path: header(path)}, [])
     if not path.is_dir() and not re.search(r"[*?\[]", source):
         return ImageList([], [], [])
-    found = [p for p in _paths(path) if not p.name.startswith(".")]
-    files = [p for p in found if p.suffix.lower() in IMAGE_SUFFIXES]
-    others = Counter(p.suffix for p in found if p.suffix.lower() in UNREAD_SUFFIXES)
+    paths = [p for p in _paths(path) if not p.name.startswith(".")]
+    files = [p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES]
+    others = Counter(p.suffix for p in paths if p.suffix.lower() in UNREAD_SUFFIXES)
     messages = [
         f"{n} {suffix} files are not read; convert them to .jpg" for suffix, n in others.items()
     ]
     if not files:
-        beside = sorted(p.name for p in found if p.is_dir())[:9]
-        more = [f"its folders are {', '.join(beside)}"] if beside and path.is_dir() else []
-        what = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
-        raise ReobjError("; ".join([f"{source}: {what}", *messages, *more]))
+        folders = sorted(p.name for p in paths if p.is_dir())[:9]
+        more = [f"its folders are {', '.join(folders)}"] if folders and path.is_dir() else []
+        fault = f"no images there (looked for {' '.join(IMAGE_SUFFIXES)})"
+        raise ReobjError("; ".join([f"{source}: {fault}", *messages, *more]))
     headers = {p: header(p) for p in files}
-    files, left_out = _pictures(files, headers, source if path.is_dir() else "")
+    files, left_out = _only_pictures(files, headers, source if path.is_dir() else "")
     return _sized(source, files, headers, messages + left_out)
 
 
 def _paths(path: Path) -> list[Path]:
-    """List a folder, or the matches of a glob in a folder whose own name may look like one."""
+    """List a folder, or the matches of a glob in a folder whose name may have glob characters."""
     if path.is_dir():
         return list(path.iterdir())
     if path.parent.is_dir():
@@ -92,8 +93,8 @@ def _paths(path: Path) -> list[Path]:
 def _sized(
     source: str, files: list[Path], headers: dict[Path, Header | None], messages: list[str]
 ) -> ImageList:
-    """Put files in order, and find the size of most."""
-    sizes = Counter(found.size for p in files if (found := headers[p]) is not None)
+    """Sort files, and select those of the most common size."""
+    sizes = Counter(head.size for p in files if (head := headers[p]) is not None)
     size, most = max(sizes.items(), key=lambda item: (item[1], math.prod(item[0])),
                      default=((0, 0), 0))  # fmt: skip
     if 2 * most < sizes.total():
@@ -104,26 +105,27 @@ def _sized(
     by_name = dict(zip(files, (p.name for p in files), strict=True))
     order = {name: k for k, name in enumerate(sorted_names(by_name.values()))}
     files = sorted(files, key=lambda p: (order[p.name], str(p)))
-    usual = [p for p in files if (found := headers[p]) is not None and found.size == size]
+    usual = [p for p in files if (head := headers[p]) is not None and head.size == size]
     return ImageList(files, usual, messages)
 
 
 # ---- Which images are frames ---------------------------------------------------------------------
 
-# Words in the names of what lies beside pictures (7-Scenes, ScanNet, 3D Scanner App, NeRFCapture,
-# DAVIS, Replica, Hypersim, Record3D)
+# Words in the names of other images (7-Scenes, ScanNet, 3D Scanner App, NeRFCapture, DAVIS,
+# Replica, Hypersim, Record3D)
 NO_PICTURE = frozenset(
     "depth depthmap disp disparity conf confidence mask masks matte alpha seg segm segmentation "
     "semantic semantics label labels instance instances panoptic normal normals thumb thumbs "
     "thumbnail preview ir infrared flow albedo uncertainty".split()
 )
 A_PICTURE = frozenset("color colour rgb image img frame photo".split())
-SIDE_BY_SIDE = 3  # images of each of two kinds; chosen: with fewer, equal numbers are chance
+# Images of each of two kinds from which equal numbers count; chosen: fewer may agree by chance
+SIDE_BY_SIDE = 3
 
 
 @dataclass(slots=True)
 class _Kind:
-    """Images whose names differ in their numbers only."""
+    """Images whose names differ only in their numbers."""
 
     files: list[Path]
     words: set[str]
@@ -131,22 +133,22 @@ class _Kind:
     color: bool
 
     def shares(self, other: _Kind, least: Callable[[int, int], int]) -> bool:
-        """Tell whether more than half of the smaller (min) or larger (max) have equal numbers."""
+        """Test whether more than half of the smaller (min) or larger (max) kind shares numbers."""
         count = least(len(self.numbers), len(other.numbers))
         return () not in self.numbers and 2 * len(self.numbers & other.numbers) > count
 
     def is_named_picture(self, other: _Kind) -> bool:
-        """Tell whether the names call these pictures by a word that those of others have not."""
+        """Test whether these names have a word for pictures that the other names lack."""
         return bool((self.words - other.words) & A_PICTURE)
 
 
-def _pictures(
+def _only_pictures(
     files: list[Path], headers: dict[Path, Header | None], folder: str
 ) -> tuple[list[Path], list[str]]:
-    """Separate pictures from depth maps, masks and the like.
+    """Separate pictures from depth maps, masks etc.
 
     Args:
-        folder: the source where it is one, "" for a glob: that says which kind is meant.
+        folder: the source if it is a folder, "" for a glob, which selects a kind by itself.
     Returns:
         the pictures, and messages.
     """
@@ -193,23 +195,23 @@ def _left_out(files: Sequence[Path], why: str) -> str:
 
 
 def _kinds(files: Sequence[Path], headers: dict[Path, Header | None]) -> list[_Kind]:
-    """Group images by their names without the numbers; a copy, a(1).jpg, is as its original."""
+    """Group images by their names without numbers; copies, a(1).jpg, belong to the original."""
     groups: dict[str, list[tuple[Path, str]]] = {}
     for path in files:
         stem = re.sub(r"\s*\(\d+\)$", "", path.stem.casefold())
         groups.setdefault(re.sub(r"\d+", "#", stem) + path.suffix.lower(), []).append((path, stem))
     kinds = []
-    for text, mine in groups.items():
-        numbers = {tuple(map(int, re.findall(r"\d+", stem))) for _, stem in mine}
-        known = [h for path, _ in mine if (h := headers[path]) is not None]
+    for text, members in groups.items():
+        numbers = {tuple(map(int, re.findall(r"\d+", stem))) for _, stem in members}
+        known = [h for path, _ in members if (h := headers[path]) is not None]
         color = 2 * sum(h.channels == 1 for h in known) <= len(known)
         words = set(re.split(r"[^a-z]+", text.rpartition(".")[0]))
-        kinds.append(_Kind([path for path, _ in mine], words, numbers, color))
+        kinds.append(_Kind([path for path, _ in members], words, numbers, color))
     return kinds
 
 
 def _glob_of(name: str) -> str:
-    """Write a glob of all names that differ from one in their numbers."""
+    """Return a glob of all names that differ from this one only in their numbers."""
     return re.sub(r"\d+", "*", glob.escape(name))
 
 
@@ -219,7 +221,7 @@ def _glob_of(name: str) -> str:
 def by_number(name: str) -> tuple[Any, ...]:
     """Return a key that sorts names by the numbers in them, image2 before image10.
 
-    Copies come after their original: a.jpg, a(1).jpg. Case does not count.
+    Copies follow the original: a.jpg, a(1).jpg. Case is ignored.
     """
     stem, dot, suffix = name.rpartition(".")
     stem, suffix = (stem, suffix) if dot else (name, "")
@@ -229,7 +231,7 @@ def by_number(name: str) -> tuple[Any, ...]:
 
 
 def sorted_names(names: Iterable[str]) -> list[str]:
-    """Sort names by the numbers in them, those that are decimal numbers by their value."""
+    """Sort names by the numbers in them, decimal numbers by their value."""
     names = list(names)
     if (values := _decimals(names)) is None:
         return sorted(names, key=by_number)
@@ -237,73 +239,74 @@ def sorted_names(names: Iterable[str]) -> list[str]:
     return [names[k] for k in order]
 
 
-DECIMAL = re.compile(r"(.*?)((?:(?<![^_= ])-)?\d+(?:\.(\d+))?)")  # a minus is no hyphen of a word
+DECIMAL = re.compile(r"(.*?)((?:(?<![^_= ])-)?\d+(?:\.(\d+))?)")  # excludes hyphens after a word
 
 
 def _decimals(names: Sequence[str]) -> list[float] | None:
-    """Read the numbers at the end of names that are else equal; None if that is not all of them."""
-    found = [DECIMAL.fullmatch(Path(name).stem.casefold()) for name in names]
-    known = [match for match in found if match is not None]
+    """Read the numbers at the end of otherwise equal names; None if the names differ elsewhere."""
+    matches = [DECIMAL.fullmatch(Path(name).stem.casefold()) for name in names]
+    known = [match for match in matches if match is not None]
     if not known or len(known) < len(names) or len({match[1] for match in known}) > 1:
         return None
-    parts = [match[3] for match in known if match[3]]
-    # 1.8, 1.9, 1.10 are two counters: decimals of unequal length do not end in 0 (but 10.0)
-    if len(set(map(len, parts))) > 1 and any(len(p) > 1 and p.endswith("0") for p in parts):
+    digits = [match[3] for match in known if match[3]]
+    # 1.8, 1.9, 1.10 are two counters: decimals of unequal length do not end in 0 (except 10.0)
+    if len(set(map(len, digits))) > 1 and any(len(d) > 1 and d.endswith("0") for d in digits):
         return None
     return [float(match[2]) for match in known]
 
 
 # Names that are time stamps (TUM: 1305031102.175304.png)
-STAMPS_PER_S = (1.0, 1e3, 1e6, 1e9)  # s, ms, us, ns
-EPOCH_S = (946684800.0, 4102444800.0)  # 2000 to 2100, in s since 1970
-FRAME_STEPS_S = (1 / 240, 10.0)  # between two images: the fastest phones; photos one by one
-LEAST_STAMP = 1e9  # whole numbers below are counters (chosen: s since 1970 have ten digits)
+STAMPS_PER_S = (1.0, 1e3, 1e6, 1e9)  # units per s: s, ms, us, ns
+EPOCH_S = (946684800.0, 4102444800.0)  # s since 1970 of plausible dates: 2000 to 2100
+FRAME_STEPS_S = (1 / 240, 10.0)  # s, plausible frame intervals: fastest phones to single photos
+LEAST_STAMP = 1e9  # lower whole numbers are counters; chosen: s since 1970 have ten digits
 
 
 def times_of_names(names: Sequence[str]) -> Array | None:
-    """Read the times of images (F,) in s from names that are time stamps; None if they are none.
+    """Read the times of images (F,) in s from names that are time stamps; None for other names.
 
-    The last number of every name counts if it has a decimal point, or at least ten digits. Its
-    unit, s, ms, us or ns, is the one in which the images have a plausible rate, a plausible date
-    since 1970 first.
+    The time stamp is the last number of a name and has a decimal point or at least ten digits. Its
+    unit, s, ms, us or ns, is the one that gives a plausible frame rate, if possible with a
+    plausible date.
     """
     words = [re.findall(r"\d+(?:\.\d+)?", Path(name).stem)[-1:] for name in names]
     if not words or not all(words):
         return None
-    decimals, points = _decimals(names), ["." in word for (word,) in words]
+    decimals = _decimals(names)
+    points = ["." in word for (word,) in words]
     numbers = np.array(decimals or [float(word) for (word,) in words])
     if not (all(points) or (decimals and any(points)) or numbers.min() >= LEAST_STAMP):
         return None
     steps = np.diff(numbers)
     if (steps <= 0).any():
         return None
-    found = []
+    units = []  # plausible ones: (no date, |log| of the rate over the usual one, units per s)
     for per_s in STAMPS_PER_S:
         step_s = float(np.median(steps)) / per_s if len(steps) else 1 / IMAGE_FPS
         first_s = float(numbers[0]) / per_s
         dated = EPOCH_S[0] < first_s < EPOCH_S[1]
-        clock = dated or (first_s < EPOCH_S[0] and len(steps) > 0)  # or since it was switched on
+        clock = dated or (first_s < EPOCH_S[0] and len(steps) > 0)  # or time since power-on
         if clock and FRAME_STEPS_S[0] <= step_s <= FRAME_STEPS_S[1]:
-            found.append((not dated, abs(math.log(step_s * IMAGE_FPS)), per_s))
-    return numbers / min(found)[2] if found else None
+            units.append((not dated, abs(math.log(step_s * IMAGE_FPS)), per_s))
+    return numbers / min(units)[2] if units else None
 
 
 # ---- Reading -------------------------------------------------------------------------------------
 
-PIXELS_MAX = 1 << 28  # of an image; chosen: above the 200 megapixels of phones; 800 MB as BGR
+PIXELS_MAX = 1 << 28  # pixels of an image; chosen: above the 200 megapixels of phones; 800 MB (BGR)
 
 
 def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | None:
-    """Read an image file as OpenCV's `flags` say; None if it is no image.
+    """Read an image file with OpenCV's `flags`; None if it is no image.
 
     Raises:
-        ReobjError: it claims more than PIXELS_MAX pixels: a small file may hold gigabytes.
+        ReobjError: the header declares more than PIXELS_MAX pixels (decompression bomb).
     """
     try:
         data = np.fromfile(path, np.uint8)
-        claimed = header_of(data.tobytes())
-        if claimed is not None and (pixels := math.prod(claimed.size)) > PIXELS_MAX:
-            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are taken")
+        declared = header_of(data.tobytes())
+        if declared is not None and (pixels := math.prod(declared.size)) > PIXELS_MAX:
+            raise ReobjError(f"{path}: {pixels} pixels, at most {PIXELS_MAX} are allowed")
         image = cv2.imdecode(data, flags) if len(data) else None
     except (OSError, cv2.error):
         return None
@@ -312,9 +315,9 @@ def read_image(path: Path, flags: int = cv2.IMREAD_COLOR) -> npt.NDArray[Any] | 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What an image file says of itself: (w, h) in px, upright; channels without alpha; bits each.
+    """Header of an image file: (w, h) in px, upright; channels without alpha; bits of each.
 
-    Of palettes, which masks have and photos have not, one channel.
+    Images with a palette have one channel: masks use palettes, photos do not.
     """
 
     size: tuple[int, int]
@@ -322,23 +325,24 @@ class Header:
     bits: int = 8
 
 
-HEADER_BYTES = (1 << 12, 1 << 17)  # read at first; chosen: without and with a photo's thumbnail
+# Bytes of the first and second read; chosen: headers without and with a photo's thumbnail
+HEADER_BYTES = (1 << 12, 1 << 17)
 
 
 def header(path: Path) -> Header | None:
-    """Read the header of an image file; None if there is none that is known."""
+    """Read the header of an image file; None for unknown formats."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         data = b""
         for count in (*HEADER_BYTES, -1):
             data += file.read(count)
-            found = header_of(data)
-            if found is not None and min(found.size) > 0:
-                return found
+            head = header_of(data)
+            if head is not None and min(head.size) > 0:
+                return head
     return None
 
 
 def header_of(data: bytes) -> Header | None:
-    """Read the header of an image of IMAGE_SUFFIXES; None if it is cut off, or of another kind."""
+    """Read the header of an image of IMAGE_SUFFIXES; None if truncated or of another format."""
     with contextlib.suppress(struct.error, IndexError):
         if data.startswith(b"\x89PNG"):
             width, height, bits, kind = struct.unpack_from(">IIBB", data, 16)
@@ -350,7 +354,8 @@ def header_of(data: bytes) -> Header | None:
             return _jpeg_header(data)
         if data[:4] in (b"II*\0", b"MM\0*"):
             tags = _tiff_tags(data)
-            channels, bits = tags.get(277, 1), tags.get(258, 1)
+            channels = tags.get(277, 1)
+            bits = tags.get(258, 1)
             bits = bits if channels == 1 else 8
             return Header(_upright((tags.get(256, 0), tags.get(257, 0)), tags), channels, bits)
         if data[8:15] == b"WEBPVP8":
@@ -359,30 +364,31 @@ def header_of(data: bytes) -> Header | None:
 
 
 def _upright(size: tuple[int, int], tags: dict[int, int]) -> tuple[int, int]:
-    """Turn (w, h) as EXIF's orientation, tag 274, says: 5 to 8 are quarter turns."""
+    """Rotate (w, h) by EXIF's orientation, tag 274: 5 to 8 are quarter turns."""
     return size[::-1] if 5 <= tags.get(274, 1) <= 8 else size
 
 
 def _jpeg_header(data: bytes) -> Header:
-    """Read the first start of frame, which follows other segments, EXIF among them."""
-    at, tags = 2, dict[int, int]()
+    """Read the first start-of-frame segment, and the EXIF segment before it."""
+    at = 2
+    tags = dict[int, int]()
     while data[at] == 0xFF and not (
         0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in JPEG_OTHER
     ):
         length = struct.unpack_from(">H", data, at + 2)[0]
         if data[at + 4 : at + 10] == b"Exif\0\0":
-            with contextlib.suppress(struct.error, IndexError):  # not needed for a picture
+            with contextlib.suppress(struct.error, IndexError):  # EXIF is optional
                 tags = _tiff_tags(data[at + 10 : at + 2 + length])
         at += 2 + length
     bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
     return Header(_upright((width, height), tags), channels, bits)
 
 
-JPEG_OTHER = (0xC4, 0xC8, 0xCC)  # tables among the markers of frames
+JPEG_OTHER = (0xC4, 0xC8, 0xCC)  # markers within the range of start-of-frame markers: tables
 
 
 def _tiff_tags(data: bytes) -> dict[int, int]:
-    """Read the tags of the first directory that are one number."""
+    """Read the tags of the first directory whose value is a single number."""
     order = "<" if data[:1] == b"I" else ">"
     (start,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, start)
@@ -393,12 +399,13 @@ def _tiff_tags(data: bytes) -> dict[int, int]:
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
-    """Return (w, h): of the canvas, of a lossless or of a lossy picture."""
+    """Return (w, h) of an extended, lossless or lossy WebP image."""
     if data[15:16] == b"X":
         width, height = (int.from_bytes(data[i : i + 3], "little") + 1 for i in (24, 27))
     elif data[15:16] == b"L":
         (bits,) = struct.unpack_from("<I", data, 21)
-        width, height = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        width = (bits & 0x3FFF) + 1
+        height = (bits >> 14 & 0x3FFF) + 1
     else:
         width, height = (side & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
     return width, height

@@ -1,4 +1,4 @@
-"""Frames without images: what stands for a video where only detections and poses are at hand."""
+"""Frames without images: the substitute for a video where only detections and poses are given."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ NO_IMAGE: Any = None
 
 
 class ImagelessVideo(Video):
-    """Iterate over frames that have a number, a time and perhaps a name, but no image.
+    """Iterate over frames with a number, a time and perhaps a name, but without an image.
 
-    What needs a picture is not possible: detectors, appearance, a reconstruction of the cameras,
-    the overlay, pictures on the page. Tracking by motion and known cameras, ellipsoids and all
-    files are.
+    Supports tracking by motion and given cameras, 3D objects and all files; not detectors,
+    appearance, reconstruction, overlay video and pictures in the viewer.
 
     Args:
-        source: the file or folder of poses that names the frames.
-        size: (w, h) of the images that the detections were made on, px.
-        times_s: (F,) of the frames by number. None: by their names, or else 30 Hz.
+        source: file or folder of poses that defines the frames.
+        size: (w, h) of the images of the detections, px.
+        times_s: (F,) of the frames by number. None: from their names, else 30 Hz.
         names: (F,) of the images by number, "" where unknown, or [].
-        count: F, where there are neither times nor names.
+        count: F, if there are neither times nor names.
     """
 
     has_images = False
@@ -44,27 +43,35 @@ class ImagelessVideo(Video):
         names: Sequence[str] = (),
         count: int = 0,
     ) -> None:
-        self.source, self.config = str(source), config or InputConfig()
+        self.source = str(source)
+        self.config = config or InputConfig()
         self.fingerprint = source_fingerprint(source)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
         self.size = self.working_size = (int(size[0]), int(size[1]))
         self.scale = self.pixel_aspect = 1.0
-        self.names, self.files = list(names), []
+        self.names = list(names)
+        self.files = []
         given = times_of_names(self.names) if times_s is None else np.asarray(times_s, np.float64)
-        self.times_s, self.times_are_known = given, given is not None
+        self.times_s = given
+        self.times_are_known = given is not None
         self.frame_count = max(len(self.names), count, 0 if given is None else len(given))
         if given is not None and len(given) < self.frame_count:
-            what = f"{len(given)} times of {self.frame_count} frames"
-            raise ReobjError(f"{self.source}: {what}; expected one each")
-        self._clock, self._announced, self.fps = None, self.frame_count, IMAGE_FPS
+            counts = f"{len(given)} times of {self.frame_count} frames"
+            raise ReobjError(f"{self.source}: {counts}; expected one each")
+        self._clock = None
+        self._announced = self.frame_count
+        self.fps = IMAGE_FPS
         if given is not None and len(given) > 1:
             self.fps = 1 / max(float(np.median(np.diff(given))), 1e-3)
-        self.is_live, self.read, self.dropped = False, 0, 0
-        self.skipped, self.messages = [], []
+        self.is_live = False
+        self.read = 0
+        self.dropped = 0
+        self.skipped = []
+        self.messages = []
 
     def facts(self) -> dict[str, Any]:
-        """Return the arguments that make the same frames again, as JSON takes them."""
+        """Return the arguments to make the same frames again, as JSON values."""
         times_s = None if self.times_s is None else self.times_s.tolist()
         return {"size": self.size, "times_s": times_s, "names": self.names,
                 "count": self.frame_count}  # fmt: skip

@@ -1,6 +1,6 @@
 """Folders of YOLO labels: a text file an image, `class cx cy w h [conf] [id]` or polygons.
 
-All numbers but the class, the confidence and the identity are shares of the image.
+Coordinates are fractions of the image size.
 """
 
 from __future__ import annotations
@@ -19,35 +19,34 @@ from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections
 from reobj.sources.video import Video
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, xyxy_from_cxcywh
 
-LABEL_FOLDERS = ("labels", "obj_train_data")  # of datasets: YOLO's, and CVAT's export of YOLO 1.1
+LABEL_FOLDERS = ("labels", "obj_train_data")  # of YOLO datasets, and of CVAT's export of YOLO 1.1
 NO_LABELS = ("classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt",
              "readme.dataset.txt", "readme.roboflow.txt", "requirements.txt")  # fmt: skip
 NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml", "dataset.yml")
 
 
 def label_files(path: Path) -> list[Path]:
-    """List the label files of a folder, or of the folders of labels of a dataset in it."""
-    own = [p for p in path.glob("*.txt") if p.name.lower() not in NO_LABELS]
-    if not own or any((path / name).is_dir() for name in LABEL_FOLDERS):
-        own = [p for p in path.rglob("*.txt") if p.name.lower() not in NO_LABELS]
-        own = [p for p in own if set(LABEL_FOLDERS) & set(p.relative_to(path).parts[:-1])]
-    if not own:
+    """List the label files of a folder, or of the label folders of a dataset in it."""
+    files = [p for p in path.glob("*.txt") if p.name.lower() not in NO_LABELS]
+    if not files or any((path / name).is_dir() for name in LABEL_FOLDERS):
+        files = [p for p in path.rglob("*.txt") if p.name.lower() not in NO_LABELS]
+        files = [p for p in files if set(LABEL_FOLDERS) & set(p.relative_to(path).parts[:-1])]
+    if not files:
         raise ReobjError(f"{path}: a folder without label files; expected YOLO's NAME.txt, one an "
                          "image, in it or in its folder labels/")  # fmt: skip
-    return sorted(own)
+    return sorted(files)
 
 
 def names_file(path: Path) -> Path | None:
-    """Find the class names of a folder of labels: in it, or in one of two folders above."""
-    folder = path.resolve()
-    for place in (folder, *folder.parents[:2]):
+    """Find the file of class names of a folder of labels: in it, or in one of two folders above."""
+    labels = path.resolve()
+    for folder in (labels, *labels.parents[:2]):
         for name in NAME_FILES:
-            if (place / name).is_file():
-                return place / name
-        found = sorted(p for p in place.glob("*") if p.suffix.lower() in YAML_SUFFIXES)
-        for other in found:
-            if any(line.startswith("names") for line in read_lines(other)):
-                return other
+            if (folder / name).is_file():
+                return folder / name
+        for file in sorted(p for p in folder.glob("*") if p.suffix.lower() in YAML_SUFFIXES):
+            if any(line.startswith("names") for line in read_lines(file)):
+                return file
     return None
 
 
@@ -56,26 +55,29 @@ def read_label_folder(
 ) -> RecordedDetections:
     """Read a folder of YOLO labels.
 
-    NAME.txt belongs to the image of that name; of a video, NAME_N.txt to its N-th frame (from 1, as
-    ultralytics counts, where NAME is that of the video).
+    NAME.txt belongs to the image of that name; NAME_N.txt to frame N of a video (from 1, as in
+    ultralytics, if NAME is that of the video).
 
     Args:
-        names: class names by number; (): those beside the labels, else COCO's.
-        first: number of the first frame as the user says it, "": found out.
+        names: class names by number; (): from a file beside the labels, else COCO's.
+        first: number of the first frame, "": inferred.
     """
     files = label_files(path)
     messages = [f"a folder of YOLO labels: {len(files)} files"]
     of_video = re.compile(re.escape(Path(video.source).stem) + r"_\d+")
-    ours = [] if video.names else [f for f in files if of_video.fullmatch(f.stem)]
-    if ours and len(ours) < len(files):
-        messages.append(f"{len(files) - len(ours)} files of other names than the video's left out")
-        files = ours
+    video_files = [] if video.names else [f for f in files if of_video.fullmatch(f.stem)]
+    if video_files and len(video_files) < len(files):
+        count = len(files) - len(video_files)
+        messages.append(f"{count} files of other names than the video's left out")
+        files = video_files
     if not names and (beside := names_file(path)) is not None:
         names = load_class_names(beside)
         messages.append(f"class names of {beside.name}")
     elif not names:
         messages.append("no class names beside it: class numbers are taken as COCO's 80")
-    rows, lines, of_file = list[list[float]](), list[str](), list[int]()
+    rows = list[list[float]]()
+    lines = list[str]()
+    of_file = list[int]()
     for at, file in enumerate(files):
         for number, line in enumerate(read_lines(file), 1):
             if cells := line.split():
@@ -86,8 +88,8 @@ def read_label_folder(
             raise ReobjError(f"{path}: more than {LINES_MAX} boxes; take fewer frames")
     box, score, identity = _columns(rows)
     stems = [str(file.relative_to(path)) for file in files]
-    usual = 1 if ours else None
-    frame, text = frames_of_names(stems, video, str(path), first, usual, not ours)
+    usual = 1 if video_files else None
+    frame, text = frames_of_names(stems, video, str(path), first, usual, not video_files)
     messages += [text] if text else []
     scaled = xyxy_from_cxcywh(box) * np.tile(np.array(video.size, np.float64), 2)
     return RecordedDetections(
@@ -108,21 +110,24 @@ def _row(cells: Sequence[str], where: str) -> list[float]:
     if len(row) < 5 or not np.isfinite(row).all() or row[0] % 1 or not 0 <= row[0] < 1 << 31:
         raise ReobjError(f"{where}: {' '.join(cells)[:60]!r}, expected class cx cy w h [conf] [id] "
                          "or class x1 y1 x2 y2 ...")  # fmt: skip
-    places = row[1:5] if len(row) < 8 else row[1 : len(row) - 2]
-    if np.abs(places).max() > NORMALISED_MAX:
-        raise ReobjError(f"{where}: {max(places, key=abs):g} is no share of the image; expected "
-                         "numbers of 0..1, not pixels")  # fmt: skip
+    coordinates = row[1:5] if len(row) < 8 else row[1 : len(row) - 2]
+    if np.abs(coordinates).max() > NORMALISED_MAX:
+        raise ReobjError(f"{where}: {max(coordinates, key=abs):g} is no fraction of the image "
+                         "size; expected numbers of 0..1, not pixels")  # fmt: skip
     return row
 
 
 def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
     """Split rows into boxes (N, 4) cx, cy, w, h, scores (N,) and identities (N,), -1: none.
 
-    Up to seven numbers are a box, with a confidence (at most 1) and an identity (whole), where not
-    every seventh is a share: then they are triangles. More are polygons, with the same at the end.
+    Rows of up to seven numbers are boxes with optional confidence (at most 1) and identity (whole);
+    if a seventh number is not whole, rows of seven are triangles. Longer rows are polygons, also
+    with optional confidence and identity.
     """
     count = len(rows)
-    box, score, identity = np.zeros((count, 4)), np.ones(count), np.full(count, -1, np.int64)
+    box = np.zeros((count, 4))
+    score = np.ones(count)
+    identity = np.full(count, -1, np.int64)
     seventh = [row[6] for row in rows if len(row) == 7]
     triangles = any(value % 1 for value in seventh)
     for i, row in enumerate(rows):
@@ -130,7 +135,8 @@ def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
         rest = row[5:] if not polygon else _tail(row)
         if polygon:
             corners = np.reshape(row[1 : len(row) - len(rest)], (-1, 2))
-            low, high = corners.min(0), corners.max(0)
+            low = corners.min(0)
+            high = corners.max(0)
             box[i] = *(low + high) / 2, *(high - low)
         else:
             box[i] = row[1:5]
@@ -143,7 +149,7 @@ def _columns(rows: Sequence[Sequence[float]]) -> tuple[Array, Array, IntArray]:
 
 
 def _tail(row: Sequence[float]) -> Sequence[float]:
-    """Return what follows the corners of a polygon: nothing, [conf], [id] or [conf, id]."""
+    """Return the numbers after the corners of a polygon: [], [conf], [id] or [conf, id]."""
     if len(row) % 2 == 0:
         return row[-1:]
     return row[-2:] if row[-1] > NORMALISED_MAX and row[-1] % 1 == 0 else []

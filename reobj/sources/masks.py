@@ -1,7 +1,7 @@
 """Masks as run lengths: encode, decode, COCO's compressed strings and polygons.
 
-Run lengths go down the columns of the image (COCO's order) and start with the length of the zeros
-at the top left; a mask without any pixel has none (`NO_RUNS`) and counts as "no mask".
+Run lengths follow the columns of the image (COCO's order) and start with a run of zeros. A mask
+without pixels has none (`NO_RUNS`) and means "no mask".
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
     return np.asarray(cv2.transpose(flat.view(np.uint8).reshape(size))).view(bool)
 
 
-RUN_BITS = 35  # seven characters: any uint32 with its sign; endless ones take quadratic time
+# Bits of a run length: seven characters, any signed uint32; longer ones would take quadratic time
+RUN_BITS = 35
 
 
 def coco_runs(text: str) -> Counts:
     """Decode COCO's compressed run lengths (maskApi.c of pycocotools, rleFrString).
 
-    Five bits a character, low ones first, 32 where more follow, the last of a number with its sign;
-    from the fourth run on the difference to the last but one.
+    Each character holds five bits, lowest first; flag 0x20: more follow; 0x10 of the last: sign.
+    From the fourth run on a number is the difference to the last run but one.
     """
     runs: list[int] = []
     value = shift = 0
@@ -58,7 +59,7 @@ def coco_runs(text: str) -> Counts:
     return np.array(runs, np.uint32)
 
 
-POLYGON_BITS = 4  # sub-pixel bits of cv2.fillPoly; chosen: 1/16 px, finer than any annotation
+POLYGON_BITS = 4  # sub-pixel bits of cv2.fillPoly, 1/16 px; chosen: finer than any annotation
 
 
 def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Counts:
@@ -69,7 +70,7 @@ def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Cou
             f"a polygon with corners that are not finite, or beyond {COORDINATE_MAX:g}"
         )
     canvas = np.zeros(size[::-1], np.uint8)
-    for ring in rings:  # for OpenCV the centre of the first pixel is (0, 0), here (0.5, 0.5)
+    for ring in rings:  # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
         corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)
         cv2.fillPoly(canvas, [corners], 1, shift=POLYGON_BITS)
     return rle_encode(canvas > 0)

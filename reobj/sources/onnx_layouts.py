@@ -1,6 +1,6 @@
 """Layouts of ONNX detectors: how each family is recognised, fed and decoded.
 
-Nothing is run here: `OnnxDetector` does. LAYOUTS lists the families, the rest is what they share.
+LAYOUTS lists the families. `OnnxDetector` runs the models.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from reobj.sources.recorded import NORMALISED_MAX
 from reobj.sources.weights import IMAGENET_MEAN, IMAGENET_STD
 from reobj.types import Array, BoolArray, Image, IntArray, xyxy_from_cxcywh
 
-MAX_CANDIDATES = 1000  # best detections that are decoded fully and enter NMS (NanoDet: 1000)
-YOLO_STRIDES = (8, 16, 32)  # input px a cell, by level (YOLOX, YOLOv8, YOLO11)
-GFL_STRIDES = (8, 16, 32, 64)  # of NanoDet-Plus and PicoDet
-GFL_BINS = 8  # distances from 0 to 7 strides (both: reg_max 7)
+MAX_CANDIDATES = 1000  # detections that are decoded fully and enter NMS, by score (NanoDet: 1000)
+YOLO_STRIDES = (8, 16, 32)  # input px per cell, by level (YOLOX, YOLOv8, YOLO11)
+GFL_STRIDES = (8, 16, 32, 64)  # same of NanoDet-Plus and PicoDet
+GFL_BINS = 8  # bins of a distance, 0 to 7 strides (NanoDet-Plus, PicoDet: reg_max 7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +40,9 @@ class Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Hold decoded outputs: boxes in px of the image, and a function that makes masks of rows.
+    """Decoded outputs: boxes in px of the image.
 
-    `masks` decodes those of K chosen rows, (K, H, W); None: the model has none.
+    `masks` decodes the masks of K rows, (K, H, W); None: the model has no masks.
     """
 
     xyxy: Array
@@ -53,7 +53,7 @@ class Decoded:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Hold the outputs of a trial run, the number of inputs and the (w, h) that was fed."""
+    """Outputs of a trial run, the number of inputs and the input's (w, h)."""
 
     outputs: list[Any]
     inputs: int
@@ -61,7 +61,7 @@ class Trial:
 
     @property
     def rows(self) -> tuple[int, int]:
-        """Return the (rows, columns) of a single output, masks aside; of several (0, 0)."""
+        """Return the (rows, columns) of a single output, besides masks; (0, 0) for several."""
         first, *others = (output.shape for output in self.outputs)
         single = len(first) == 3 and all(len(shape) == 4 for shape in others)
         return (first[1], first[2]) if single else (0, 0)
@@ -73,14 +73,14 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Describe a family of detectors: how it is recognised, fed and decoded.
+    """Family of detectors: how it is recognised, fed and decoded.
 
     Attributes:
-        fit: "stretch" the image to the input, or keep its aspect and pad: "corner" (image at the
-            top left) or "centre".
-        rgb: channel order that the network was trained with. mean, std: of the pixels, 0..255, in
-            that order. nms: its boxes need NMS.
-        first: label of the first class. classes: number of classes (0: outputs do not tell).
+        fit: "stretch" the image to the input, or keep its aspect ratio and pad: "corner" (image at
+            the top left) or "centre".
+        rgb: channel order of the network. mean, std: of the pixels, 0..255, in that order.
+        nms: its boxes need NMS.
+        first: label of the first class. classes: number of classes (0: unknown from the outputs).
     """
 
     name: str
@@ -95,16 +95,17 @@ class Layout:
     classes: Callable[[Trial], int] = lambda trial: 0
 
 
-PAD_VALUE = 114  # grey of the borders around a padded image (YOLOX, Ultralytics)
+PAD_VALUE = 114  # grey level of the borders of a padded image (YOLOX, Ultralytics)
 
 
 def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geometry]:
-    """Resize an image into a network's input of (w, h), as `Layout.fit` says."""
+    """Resize an image to a network's input of (w, h); fit: see `Layout`."""
     height, width = image.shape[:2]
     w, h = size
     if fit != "stretch":
         ratio = min(size[0] / width, size[1] / height)
-        w, h = max(round(width * ratio), 1), max(round(height * ratio), 1)
+        w = max(round(width * ratio), 1)
+        h = max(round(height * ratio), 1)
     left, top = ((size[0] - w) // 2, (size[1] - h) // 2) if fit == "centre" else (0, 0)
     canvas = np.full((size[1], size[0], 3), PAD_VALUE, np.uint8)
     canvas[top : top + h, left : left + w] = cv2.resize(image, (w, h))
@@ -113,7 +114,8 @@ def fit_image(image: Image, size: tuple[int, int], fit: str) -> tuple[Image, Geo
 
 def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[Array, Array]:
     """List the cells of all levels, row by row: x, y (A, 2) and stride (A, 1)."""
-    cells, stride = [], []
+    cells = []
+    stride = []
     for s in strides:
         y, x = np.mgrid[: math.ceil(size[1] / s), : math.ceil(size[0] / s)]
         cells.append(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
@@ -127,10 +129,12 @@ def _best_class(scores: Array) -> tuple[Array, IntArray]:
 
 
 def _pick_outputs(outs: list[Any]) -> tuple[Array, Array, IntArray]:
-    """Find the outputs of a model that ends with its own selection.
+    """Find boxes, scores and labels among the outputs of a model with its own selection.
 
     Returns:
-        boxes (N, 4), scores (N,), integer labels (N,); StopIteration if one is missing.
+        boxes (N, 4), scores (N,), integer labels (N,).
+    Raises:
+        StopIteration: one of them is missing.
     """
     boxes = next(o for o in outs if o.ndim in (2, 3) and o.shape[-1] == 4).reshape(-1, 4)
     flat = [o.ravel() for o in outs if o.ndim < 3 and o.size == len(boxes)]
@@ -139,7 +143,8 @@ def _pick_outputs(outs: list[Any]) -> tuple[Array, Array, IntArray]:
     return boxes.astype(np.float64), scores.astype(np.float64), labels.astype(np.int64)
 
 
-RAW_YOLOX_MAX = 8.0  # median |x, y| of raw outputs is below 2, of decoded ones half the image
+# Median |x, y| below which YOLOX outputs are raw (below 2), not decoded (half the image, px)
+RAW_YOLOX_MAX = 8.0
 
 
 def _decode_yolox(outs: list[Any], geometry: Geometry) -> Decoded:
@@ -159,7 +164,7 @@ def _decode_yolox(outs: list[Any], geometry: Geometry) -> Decoded:
 def _decode_yolo(outs: list[Any], geometry: Geometry) -> Decoded:
     """Decode columns of centre, size, class scores[, mask coefficients]; and mask prototypes.
 
-    A mask is where the sum of the prototypes, weighted by the coefficients, is positive (YOLACT,
+    A mask is the region of positive sums of the prototypes, weighted by the coefficients (YOLACT,
     Bolya et al. 2019).
     """
     rows = outs[0][0].T  # (A, 4 + C [+ 32])
@@ -171,7 +176,8 @@ def _decode_yolo(outs: list[Any], geometry: Geometry) -> Decoded:
 
     def masks(chosen: IntArray) -> BoolArray:
         maps = np.tensordot(rows[chosen, end:], proto, 1)  # (K, h, w)
-        scale, pad = ratio * geometry.scale, ratio * geometry.pad
+        scale = ratio * geometry.scale
+        pad = ratio * geometry.pad
         return _paste(maps, boxes[chosen], geometry.image_size, scale, pad, 0.0)
 
     return Decoded(boxes, score, label, masks if len(proto) else None)
@@ -185,13 +191,15 @@ def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
     then bins by level, distances from the cell's centre.
     """
     if len(outs) == 1:
-        levels, center = len(GFL_STRIDES), 0.0
+        levels = len(GFL_STRIDES)
+        center = 0.0
         scores, bins = np.split(outs[0][0], [-4 * GFL_BINS], 1)
     else:
-        levels, center = len(outs) // 2, 0.5
-        scores, bins = (np.concatenate(part, 1)[0] for part in (outs[:levels], outs[levels:]))
+        levels = len(outs) // 2
+        center = 0.5
+        scores, bins = (np.concatenate(half, 1)[0] for half in (outs[:levels], outs[levels:]))
     score, label = _best_class(scores)
-    keep = np.argsort(-score, kind="stable")[:MAX_CANDIDATES]  # the rest is not worth its bins
+    keep = np.argsort(-score, kind="stable")[:MAX_CANDIDATES]  # saves the time of the other bins
     cells, stride = (v[keep] for v in _grid(geometry.input_size, GFL_STRIDES[:levels]))
     logits = bins[keep].reshape(-1, 4, GFL_BINS).astype(np.float64)
     weight = np.exp(logits - logits.max(2, keepdims=True))
@@ -201,7 +209,7 @@ def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
     return Decoded(geometry.to_image(boxes), score[keep], label[keep])
 
 
-RCNN_MASK = (28, 28)  # (w, h) of the masks of Mask R-CNN, each of which covers its box
+RCNN_MASK = (28, 28)  # (w, h) of the masks of Mask R-CNN, relative to the box
 
 
 def _decode_with_nms(outs: list[Any], geometry: Geometry) -> Decoded:
@@ -213,7 +221,8 @@ def _decode_with_nms(outs: list[Any], geometry: Geometry) -> Decoded:
     maps = [o[:, 0] for o in outs if o.ndim == 4]  # (N, h, w) probabilities
 
     def masks(chosen: IntArray) -> BoolArray:
-        low, high = boxes[chosen, :2], boxes[chosen, 2:]
+        low = boxes[chosen, :2]
+        high = boxes[chosen, 2:]
         ratio = np.array(RCNN_MASK) / np.maximum(high - low, 1e-6)  # (K, 2)
         return _paste(maps[0][chosen], boxes[chosen], geometry.image_size, ratio, -low * ratio, 0.5)
 
@@ -248,14 +257,14 @@ def _paste(maps: Any, boxes: Array, size: tuple[int, int], ratio: Array, offset:
 
 
 def _has_nms(trial: Trial) -> bool:
-    """Tell whether there are boxes (.., N, 4), integer labels and scores of the same N."""
+    """Test whether the outputs have boxes (.., N, 4), integer labels and scores of the same N."""
     with contextlib.suppress(StopIteration):
         return len(_pick_outputs(trial.outputs)) == 3
     return False
 
 
-CAFFE_MEAN = (102.9801, 115.9465, 122.7717)  # BGR, of ImageNet (maskrcnn-benchmark, ONNX zoo)
-LAYOUTS: tuple[Layout, ...] = (  # the first that accepts a model reads it
+CAFFE_MEAN = (102.9801, 115.9465, 122.7717)  # BGR, 0..255, of ImageNet (maskrcnn-benchmark)
+LAYOUTS: tuple[Layout, ...] = (  # the first that accepts a model is used
     Layout("DEIM, D-FINE, RT-DETR (labels, boxes, scores)",
             lambda t: t.inputs == 2 and _has_nms(t),  # the second is the image size: no scaling
             lambda outs, geometry: Decoded(*_pick_outputs(outs)), nms=False),

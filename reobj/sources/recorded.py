@@ -1,6 +1,6 @@
-"""Detections of a whole video as arrays, and the npz format that holds them with their masks.
+"""Detections of a video as arrays, and the npz format for them and their masks.
 
-Other formats are read in `detection_files`; what is wrong with the content is checked there too.
+`detection_files` reads the other formats and validates the content of all.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from reobj.types import CLASS_MAX, Array, BoolArray, Detections, IntArray, Reobj
 
 @dataclass(slots=True)
 class RecordedDetections:
-    """Hold the detections of a video as a struct of arrays, ready to be asked frame by frame.
+    """Detections of a video as a struct of arrays; `at` returns those of a frame.
 
     Attributes:
-        frame: (N,) source frame numbers, ascending once read.
+        frame: (N,) source frame numbers, ascending once validated.
         xyxy: (N, 4) px of the source. score: (N,) in [0, 1]. class_id: (N,) index into class_names.
         runs: run lengths of the N masks (see `masks`), empty where there is none.
-        size, working_size: (w, h) of the masks, and of the frames that `at` answers for.
-        line: (N,) where each stands in the file, counted in `unit`s, or as text; for messages.
-        messages: what was dropped or assumed, for the user.
-        identity: (N,) as the file has it, or empty.
-        looked: frames that the detector was run on, ascending; None: all.
+        size, working_size: (w, h) of the masks, and of the frames of `at`.
+        line: (N,) position in the file, a number of `unit`s or text; for messages.
+        messages: about dropped rows and assumptions, for the user.
+        identity: (N,) as in the file, or empty.
+        looked: frames on which the detector was run, ascending; None: all.
     """
 
     frame: IntArray
@@ -56,24 +56,26 @@ class RecordedDetections:
         return len(self.frame)
 
     def select(self, rows: IntArray) -> None:
-        """Keep the rows (n,), in their order."""
+        """Select rows (n,), in this order."""
         self.identity = self.identity[rows] if len(self.identity) else self.identity
         for name in ("frame", "xyxy", "score", "class_id", "line"):
             setattr(self, name, getattr(self, name)[rows])
         self.runs = [self.runs[row] for row in rows]
 
     def fingerprint(self) -> str:
-        """Hash what `at` answers with, whatever the file looks like."""
+        """Hash the detections, independently of the format of the file."""
         digest = hashlib.sha256(repr((self.class_names, self.size)).encode())
-        own: list[npt.NDArray[Any]] = [self.frame, self.xyxy, self.score, self.class_id]
-        for values in own + list(self.runs):
+        arrays: list[npt.NDArray[Any]] = [self.frame, self.xyxy, self.score, self.class_id]
+        for values in arrays + list(self.runs):
             digest.update(repr(values.shape).encode() + np.ascontiguousarray(values).tobytes())
         return digest.hexdigest()[:16]
 
     def at(self, frame_index: int) -> Detections:
-        """Return the detections of a frame in px of the working size; decodes its masks."""
+        """Return the detections of a frame, with masks, in px of the working size."""
         low, high = np.searchsorted(self.frame, [frame_index, frame_index + 1])
-        rows, runs, masks = slice(low, high), self.runs[low:high], None
+        rows = slice(low, high)
+        runs = self.runs[low:high]
+        masks = None
         ratio = np.tile(np.divide(self.working_size, self.size), 2)  # (4,)
         if any(map(len, runs)):
             decoded = (rle_decode(counts, self.size) for counts in runs)
@@ -82,11 +84,11 @@ class RecordedDetections:
 
 
 def _resized_mask(mask: BoolArray, size: tuple[int, int]) -> BoolArray:
-    """Resize an (H, W) mask to (w, h): pixels of which at least half is covered."""
+    """Resize an (H, W) mask to (w, h): pixels that are covered by at least half."""
     if mask.shape == size[::-1]:
         return mask
-    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return np.asarray(share >= 0.5)
+    covered = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(covered >= 0.5)
 
 
 def pack_detections(
@@ -99,16 +101,17 @@ def pack_detections(
         done (F,) the frames, and the run lengths of the masks: those of row i are
         mask_counts[mask_offsets[i] : mask_offsets[i + 1]].
     """
-    parts = [Detections.empty(), *(found for _, found in frames)]
+    parts = [Detections.empty(), *(detections for _, detections in frames)]
     runs = [NO_RUNS]
-    for found in parts:
-        expected = (len(found), size[1], size[0])
-        if found.masks is None:
-            runs += [NO_RUNS] * len(found)
-        elif found.masks.shape != expected:
-            raise ReobjError(f"masks are {found.masks.shape}, expected (D, H, W) = {expected}")
+    for detections in parts:
+        masks = detections.masks
+        expected = (len(detections), size[1], size[0])
+        if masks is None:
+            runs += [NO_RUNS] * len(detections)
+        elif masks.shape != expected:
+            raise ReobjError(f"masks are {masks.shape}, expected (D, H, W) = {expected}")
         else:
-            runs += map(rle_encode, found.masks)
+            runs += map(rle_encode, masks)
     return {
         "frame": np.repeat([i for i, _ in frames], [len(d) for _, d in frames]).astype(np.int64),
         "xyxy": np.concatenate([d.xyxy for d in parts]).astype(np.float64),
@@ -131,68 +134,70 @@ def write_detections_npz(
     """Write detections to an npz file for `read_detections`.
 
     Args:
-        frames: (frame number of the source, Detections) pairs of all frames that the detector was
-            run on, also those without a detection; boxes and masks in its pixels.
+        frames: (frame number of the source, Detections) pairs of all frames on which the detector
+            was run, including those without detections; boxes and masks in pixels of the source.
         class_names: by class id. image_size: (w, h) of the source.
     """
     save_npz(Path(path), pack_detections(list(frames), class_names, image_size))
 
 
-NORMALISED_MAX = 1.5  # px; chosen: boxes wholly below are shares of the image, some a bit outside
+# Coordinates up to this are fractions of the image size; chosen: boxes may extend a little outside
+NORMALISED_MAX = 1.5
 KINDS = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_names": "U",
          "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
 
 
-SIZES = {
+SIZES = {  # most values of each array
     "frame": LINES_MAX,
     "done": LINES_MAX,
     "class_names": CLASS_MAX,
-    "mask_counts": NPZ_MAX // 4,
-}  # as uint32
+    "mask_counts": NPZ_MAX // 4,  # uint32
+}
 
 
 def npz_image_size(path: Path) -> tuple[int, int]:
-    """Return the (w, h) of the images that an npz file of detections was made for."""
-    found = np.asarray(load_npz(path)[0].get("image_size", ()))
-    if found.shape != (2,) or found.dtype.kind not in "iu" or (found < 1).any():
-        text = f"array image_size is {found.shape} of {found.dtype}"
+    """Return the (w, h) of the images of an npz file of detections."""
+    size = np.asarray(load_npz(path)[0].get("image_size", ()))
+    if size.shape != (2,) or size.dtype.kind not in "iu" or (size < 1).any():
+        text = f"array image_size is {size.shape} of {size.dtype}"
         raise ReobjError(f"{path}: {text}, expected (w, h) in whole pixels")
-    return int(found[0]), int(found[1])
+    return int(size[0]), int(size[1])
 
 
 def read_npz(
     path: Path, size: tuple[int, int], working_size: tuple[int, int], sealed: bool = False
 ) -> tuple[RecordedDetections, IntArray]:
-    """Read our own format, as `pack_detections` makes it, for a video of (w, h) `size`.
+    """Read the format of `pack_detections` for a video of (w, h) `size`.
 
     Args:
-        sealed: as of `load_npz`.
+        sealed: as in `load_npz`.
     Returns:
-        The detections, unchecked, and the numbers of the frames that were `done`, also those
-        without a detection (where the file does not say: the frame of every detection).
+        the detections, not validated, and the numbers of the frames that were `done`, including
+        those without detections (default: the frame of every detection).
     """
     data, _ = load_npz(path, sealed)
     for key, most in SIZES.items():
         if key in data and data[key].size > most:
-            raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are taken")
+            raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are allowed")
     count = len(np.atleast_1d(data.get("frame", ())))
     data.setdefault("mask_counts", NO_RUNS)
     data.setdefault("mask_offsets", np.zeros(count + 1, np.int64))
     shapes = {"frame": (count,), "xyxy": (count, 4), "score": (count,), "class_id": (count,),
               "class_names": (-1,), "image_size": (2,), "mask_offsets": (count + 1,)}  # fmt: skip
-    for key, shape in shapes.items():
-        found = data[key].shape if key in data else "missing"
-        if found != shape and (key != "class_names" or found == "missing"):
-            raise ReobjError(f"{path}: array {key} is {found}, expected shape {shape}")
+    for key, expected in shapes.items():
+        shape = data[key].shape if key in data else "missing"
+        if shape != expected and (key != "class_names" or shape == "missing"):
+            raise ReobjError(f"{path}: array {key} is {shape}, expected shape {expected}")
     for key, kinds in KINDS.items():
         if data[key].dtype.kind not in kinds and data[key].size:
             raise ReobjError(f"{path}: array {key} is of {data[key].dtype}, expected {kinds}")
     if data["class_names"].ndim != 1:
         raise ReobjError(f"{path}: array class_names is {data['class_names'].shape}, expected (C,)")
-    offsets, runs = data["mask_offsets"].astype(np.int64), data["mask_counts"]
+    offsets = data["mask_offsets"].astype(np.int64)
+    runs = data["mask_counts"]
     ordered = (np.diff(offsets, prepend=0) >= 0).all() and offsets[-1:].max(initial=0) <= runs.size
     if runs.ndim != 1 or not ordered or (runs < 0).any():
-        raise ReobjError(f"{path}: mask_counts and mask_offsets do not fit each other")
+        raise ReobjError(f"{path}: mask_counts and mask_offsets are inconsistent")
     if (made_for := tuple(data["image_size"].tolist())) != size:
         turned = ": made on frames that were not turned upright?" if made_for == size[::-1] else ""
         text = f"made for images of {made_for} px, but the video is {size} px"
@@ -208,7 +213,7 @@ def read_npz(
 
 
 def _frames_done(data: dict[str, Any], path: Path) -> IntArray | None:
-    """Return the frames, ascending, that a file says were looked at; None: it does not say."""
+    """Return the frames, ascending, on which the detector was run; None: not in the file."""
     if "done" not in data:
         return None
     done = np.asarray(data["done"])
@@ -217,20 +222,20 @@ def _frames_done(data: dict[str, Any], path: Path) -> IntArray | None:
     return np.unique(done).astype(np.int64)
 
 
-SAME_SHAPE_PX = 1.0  # sides of resized images are rounded to whole pixels
+SAME_SHAPE_PX = 1.0  # px, tolerance of the aspect ratio: sides of resized images are rounded
 
 
 def scale_to(
     size: tuple[int, int], made_for: Array, used: Any, where: str, messages: list[str]
 ) -> Array:
-    """Return the factors (N, 4) from the images that boxes were made for to those of the video.
+    """Return the factors (N, 4) from the images of the boxes to those of the video.
 
     Args:
-        size: (w, h) of the video, (0, 0): unknown, then nothing is scaled.
-        made_for: (N, 2) of each box's image, 0: unknown. used: (N,)
-            whether the box belongs to a frame.
+        size: (w, h) of the video, (0, 0): unknown, no scaling.
+        made_for: (N, 2) size of each box's image, 0: unknown. used: (N,) the box belongs to a
+            frame.
     Raises:
-        ReobjError: images of another shape.
+        ReobjError: images of another aspect ratio.
     """
     scale = np.ones((len(made_for), 4))
     sizes = np.unique(made_for[used & (made_for > 0).all(1)], axis=0)
@@ -241,7 +246,7 @@ def scale_to(
         if abs(w * size[1] / size[0] - h) > SAME_SHAPE_PX:
             turned = (h, w) == size
             why = ": made on frames that were not turned upright?" if turned else ": other images?"
-            raise ReobjError(f"{where}: {text}{why} Detect on the frames of this video")
+            raise ReobjError(f"{where}: {text}{why} Run the detector on the frames of this video")
         rows = (made_for == (w, h)).all(1)
         scale[rows] = np.tile([size[0] / w, size[1] / h], 2)
         messages.append(f"{text}: boxes are scaled")

@@ -1,7 +1,7 @@
 """Detections and tracks in text tables: MOTChallenge, KITTI tracking, CSV with a header.
 
 Start at `read_table` and `read_mot_rows`. Cells are separated by commas, semicolons, tabs or
-spaces; where a comma separates no cells it may be the decimal point.
+spaces; a comma that is no separator may be the decimal point.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from reobj.files import read_lines, shortened
 from reobj.sources.class_names import check_length
-from reobj.sources.image_files import EPOCH_S
+from reobj.sources.image_files import EPOCH_S, STAMPS_PER_S
 from reobj.sources.image_frames import frames_of_names, frames_of_numbers
 from reobj.sources.masks import NO_RUNS
 from reobj.sources.recorded import RecordedDetections
@@ -40,7 +40,7 @@ from reobj.types import (
 MOT_COLUMNS = ("frame", "id", "x1", "y1", "w", "h", "score", "class", "extra", "z")
 KITTI_COLUMNS = ("frame", "id", "class", "truncated", "occluded", "alpha", "x1", "y1", "x2", "y2",
                  "3d h", "3d w", "3d l", "3d x", "3d y", "3d z", "yaw", "score")  # fmt: skip
-ALIASES: dict[str, tuple[str, ...]] = {  # of columns, the first that is there and not empty counts
+ALIASES: dict[str, tuple[str, ...]] = {  # names of columns; the first one with values is used
     "frame": ("frame", "frame_id", "frame_index", "frame_number", "frame_idx", "frame_no",
               "frame_num", "frame_nr", "frameid", "framenumber"),
     "image": ("file_name", "filename", "image_name", "image_path", "image_id", "imageid", "image",
@@ -66,20 +66,20 @@ ALIASES: dict[str, tuple[str, ...]] = {  # of columns, the first that is there a
               "class", "class_id", "cls", "category_id", "label_id", "coco80_class"),
 }  # fmt: skip
 BOXES = (("x1", "y1", "x2", "y2"), ("x1", "y1", "w", "h"), ("cx", "cy", "w", "h"))
-OPTIONAL = ("id", "score", "class")  # columns without any value count as missing
-WHOLE_MAX = 2.0**53  # of frame and identity; beyond, a float skips whole numbers
-NO_CELLS = ("", "nan", "none", "null", "na")  # what pandas and others write for no value
+OPTIONAL = ("id", "score", "class")  # roles whose empty columns count as missing
+WHOLE_MAX = 2.0**53  # largest frame and identity; above it not every integer is a float64
+NO_CELLS = ("", "nan", "none", "null", "na")  # missing values of pandas and others
 
 
 @dataclass(slots=True)
 class Table:
-    """Hold the cells of a table by what their columns mean.
+    """Cells of a table by the role of their column.
 
     Attributes:
         path: of the file. kind: "MOT", "KITTI" or "CSV".
-        cells: N texts by role, a key of ALIASES, or a name of MOT_COLUMNS or KITTI_COLUMNS.
-        line: (N,) where each row stands, in `unit`s. header: names of the columns, [] without.
-        comma: it may be the decimal point. messages: for the user.
+        cells: N texts by role: a key of ALIASES, or a name of MOT_COLUMNS or KITTI_COLUMNS.
+        line: (N,) position of each row, in `unit`s. header: names of the columns, () without.
+        comma: may be the decimal point. messages: for the user.
     """
 
     path: Path
@@ -92,14 +92,14 @@ class Table:
     messages: list[str] = field(default_factory=list)
 
     def where(self, row: int) -> str:
-        """Say where a row stands."""
+        """Return the position of a row, for messages."""
         return f"{self.path}, {self.unit} {self.line[row]}"
 
-    def rows(self, keep: BoolArray) -> None:
+    def select(self, keep: BoolArray) -> None:
         """Keep some of the N rows."""
-        kept = np.flatnonzero(keep)
-        self.cells = {role: [own[i] for i in kept] for role, own in self.cells.items()}
-        self.line = self.line[kept]
+        rows = np.flatnonzero(keep)
+        self.cells = {role: [cells[i] for i in rows] for role, cells in self.cells.items()}
+        self.line = self.line[rows]
 
     def numbers(self, role: str) -> Array:
         """Convert a column to finite numbers (N,); an error names the line."""
@@ -146,7 +146,7 @@ def _are_numbers(cells: Sequence[str]) -> bool:
 
 
 def _separator(line: str) -> str:
-    """Find what separates the cells of a line: of ; tab and comma the one that makes most."""
+    """Infer the separator of a line: the most frequent of ; tab and comma, or a space."""
     best = max(";\t,", key=line.count)
     data = line.lstrip()[:1] in tuple("+-.0123456789")
     if len(line.split()) > line.count(best) + 1 and (data or best not in line):
@@ -154,8 +154,8 @@ def _separator(line: str) -> str:
     return best
 
 
-def _is_remark(line: str) -> bool:
-    """Tell whether a line begins with # and is no header."""
+def _is_comment(line: str) -> bool:
+    """Test whether a line begins with # and is no header."""
     if line[:1] != "#":
         return False
     words = set(re.split(r"[^a-z0-9]+", line.lower())) | set(re.split(r"\W+", line.lower()))
@@ -165,7 +165,7 @@ def _is_remark(line: str) -> bool:
 def _rows(path: Path) -> tuple[list[list[str]], list[int], str]:
     """Split a file into rows of cells, the lines on which they end, and the separator."""
     lines = read_lines(path)
-    lines = ["\n" if _is_remark(line) else line for line in lines]
+    lines = ["\n" if _is_comment(line) else line for line in lines]
     first = next((line for line in lines if line.strip()), "")
     separator = _separator(first)
     if separator == " ":
@@ -178,16 +178,16 @@ def _rows(path: Path) -> tuple[list[list[str]], list[int], str]:
             raise ReobjError(f"{path}, line {reader.line_num}: no table ({error})") from error
     kept = [([cell.strip() for cell in cells], i) for cells, i in split]
     kept = [(cells, i) for cells, i in kept if any(cells)]
-    if kept and kept[0][0][0] == "#":  # of a header, apart from its first name
+    if kept and kept[0][0][0] == "#":  # of a header, separated from its first name
         kept[0][0].pop(0)
     return [cells for cells, _ in kept], [i for _, i in kept], separator
 
 
 def read_cells(path: Path) -> Table:
-    """Read the cells of a text table, whatever its kind.
+    """Read the cells of a text table of any kind.
 
     Raises:
-        ReobjError: a row of another length than the first one, or a header that names no box.
+        ReobjError: a row has another length than the first one, or a header has no box columns.
     """
     rows, lines, separator = _rows(path)
     first = rows[0] if rows else []
@@ -199,15 +199,22 @@ def read_cells(path: Path) -> Table:
     expected = "6 to 10 (frame, id, left, top, w, h, score)"
     count = len(first)
     if not _is_number(first[0]):
-        table.kind, table.header = "CSV", _header(first)
-        columns, count, rows, lines = table.header, len(table.header), rows[1:], lines[1:]
+        table.kind = "CSV"
+        table.header = _header(first)
+        columns = table.header
+        count = len(table.header)
+        rows = rows[1:]
+        lines = lines[1:]
         table.line = table.line[1:]
         expected = str(count)
     elif count > 1 and not any(cells[-1] for cells in rows):  # each line ends in a separator
-        rows, count = [cells[:-1] for cells in rows], count - 1
+        rows = [cells[:-1] for cells in rows]
+        count = count - 1
         expected = str(count) if 6 <= count <= len(MOT_COLUMNS) else expected
     elif len(first) in (17, 18) and not _is_number(first[2]):
-        table.kind, columns, expected = "KITTI", KITTI_COLUMNS, str(count)
+        table.kind = "KITTI"
+        columns = KITTI_COLUMNS
+        expected = str(count)
     elif 6 <= count <= len(MOT_COLUMNS):
         expected = str(count)
     for cells, line in zip(rows, lines, strict=True):
@@ -219,7 +226,7 @@ def read_cells(path: Path) -> Table:
 
 
 def _header(cells: Sequence[str]) -> tuple[str, ...]:
-    """Read the names of columns: without remarks in brackets and after a semicolon; distinct."""
+    """Normalise the names of columns: without text in brackets or after a semicolon; distinct."""
     text = re.sub(r"\(.*?\)|\[.*?\]", "", ",".join(cells)).split(";")[0].lower()
     names = [re.sub(r"[\s.-]+", "_", name.strip()) for name in text.lstrip("# ").split(",")]
     if "x0" in names and "y0" in names:  # corners counted from 0
@@ -232,15 +239,15 @@ def _by_role(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str
     """Find the columns of a CSV by their names."""
     cells = {}
     for role, names in ALIASES.items():
-        own = [name for name in names if name in by_name]
-        filled = [name for name in own if not all(map(_is_empty, by_name[name]))]
-        used = filled or (own if role not in OPTIONAL else [])
+        present = [name for name in names if name in by_name]
+        filled = [name for name in present if not all(map(_is_empty, by_name[name]))]
+        used = filled or (present if role not in OPTIONAL else [])
         if used:
             cells[role] = by_name[used[0]]
-    when = any(role in cells for role in ("frame", "image", "time"))
-    if not when or not any(all(role in cells for role in roles) for roles in BOXES):
+    has_frame = any(role in cells for role in ("frame", "image", "time"))
+    if not has_frame or not any(all(role in cells for role in roles) for roles in BOXES):
         missing = [role for role in ("x1", "y1", "x2", "y2") if role not in cells]
-        missing = ["frame"] * (not when) + missing
+        missing = ["frame"] * (not has_frame) + missing
         text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
         example = "expected one such as frame,x1,y1,x2,y2,score,class"
         raise ReobjError(f"{path}, line 1: {text}: {example}")
@@ -252,10 +259,7 @@ def _is_empty(cell: str) -> bool:
 
 
 def table_of_records(path: Path, records: Any) -> Table | None:
-    """Make the table of a JSON list of flat objects, as supervision's JSONSink writes it.
-
-    None: it is something else.
-    """
+    """Convert a JSON list of flat objects (supervision's JSONSink) to a table; None: other data."""
     flat = isinstance(records, list) and all(isinstance(record, dict) for record in records)
     if not flat or not any({"x_min", "xmin", "x1"} & record.keys() for record in records[:1]):
         return None
@@ -267,7 +271,7 @@ def table_of_records(path: Path, records: Any) -> Table | None:
     return Table(path, "CSV", cells, np.arange(len(records)), "entry", header)
 
 
-# ---- What the cells mean -------------------------------------------------------------------------
+# ---- Columns -------------------------------------------------------------------------------------
 
 
 def read_mot_rows(path: Path) -> Array:
@@ -277,15 +281,15 @@ def read_mot_rows(path: Path) -> Array:
         (N, 6 to 10) frame (from 1), id, left, top, w, h[, score[, class or x[, y[, z]]]]; of an
         empty file (0, 10).
     Raises:
-        ReobjError: names the line that has another number of columns or is no number.
+        ReobjError: a line with another number of columns, or with a cell that is no number.
     """
     table = read_cells(path)
     if table.kind != "MOT":
         raise ReobjError(f"{path}, line 1: no MOTChallenge file; expected frame,id,left,top,w,h")
     rows = np.stack([table.numbers(role) for role in table.cells], 1)  # (N, 6 to 10)
     table.whole("frame"), table.whole("id")
-    if (far := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
-        row = int(far.argmax())
+    if (too_large := (np.abs(rows[:, 2:6]) > COORDINATE_MAX).any(1)).any():
+        row = int(too_large.argmax())
         text = f"box {rows[row, 2:6]}, expected at most {COORDINATE_MAX:g} px"
         raise ReobjError(f"{table.where(row)}: {text}")
     return rows
@@ -297,8 +301,8 @@ def read_table(
     """Read the detections of a text table.
 
     Args:
-        names: class names by number, () where they are not given.
-        first: number of the first frame as the user says it, "": found out.
+        names: class names by number, (): not given.
+        first: number of the first frame, "": inferred.
     """
     return recorded_table(read_cells(path), names, video, first)
 
@@ -306,9 +310,11 @@ def read_table(
 def recorded_table(
     table: Table, names: Sequence[str], video: Video, first: str = ""
 ) -> RecordedDetections:
-    """Make the detections of a table of any kind."""
+    """Convert a table of any kind to detections."""
     _drop_rows(table)
-    xyxy, count, mot = _boxes(table), len(table.line), table.kind == "MOT"
+    xyxy = _boxes(table)
+    count = len(table.line)
+    mot = table.kind == "MOT"
     if mot and (table.numbers("id") % 1 != 0).any():
         raise ReobjError(f"{table.path}: the second column is no identity. If this is no MOT file: "
                          "CSV needs a header such as frame,x1,y1,x2,y2,score,class")  # fmt: skip
@@ -316,20 +322,20 @@ def recorded_table(
     score = table.numbers("score") if "score" in table.cells else np.ones(count)
     classes = _mot_classes(table, score, names) if mot else _text_classes(table, names)
     frame = _frames(table, video, first)
-    found = RecordedDetections(
+    recorded = RecordedDetections(
         frame, xyxy, score, classes[0], [NO_RUNS] * count, tuple(classes[1]), video.size,
         video.working_size, table.line, table.unit, table.messages, identity,
     )  # fmt: skip
-    return _without_ignored(found) if mot else found
+    return _without_ignored(recorded) if mot else recorded
 
 
 def _drop_rows(table: Table) -> None:
-    """Leave out, and count, rows that stand for no box or that the format says to ignore."""
+    """Drop, and count, rows without a box and rows that the format marks as ignored."""
     if table.kind == "KITTI":
         keep = np.array([name != "DontCare" for name in table.cells["class"]], bool)
         if not keep.all():
             table.messages.append(f"{(~keep).sum()} rows DontCare left out")
-            table.rows(keep)
+            table.select(keep)
     roles = [role for role in ("x1", "y1", "x2", "y2", "w", "h", "cx", "cy") if role in table.cells]
     none = np.ones(len(table.line), bool)
     for role in roles:
@@ -338,12 +344,12 @@ def _drop_rows(table: Table) -> None:
     if none.any():
         first = f"{table.unit} {table.line[none][0]}"
         table.messages.append(f"{none.sum()} rows without a box left out, the first at {first}")
-        table.rows(~none)
+        table.select(~none)
 
 
 def _boxes(table: Table) -> Array:
     """Return the boxes (N, 4), corners."""
-    roles = next(own for own in BOXES if all(role in table.cells for role in own))
+    roles = next(roles for roles in BOXES if all(role in table.cells for role in roles))
     box = np.stack([table.numbers(role) for role in roles], 1)
     if roles[0] == "cx":
         return xyxy_from_cxcywh(box)
@@ -359,17 +365,18 @@ def _identities(table: Table) -> IntArray:
     return table.whole("id")
 
 
-USUAL_FIRST = {"MOT": 1, "KITTI": 0, "CSV": 0}  # number of the first frame
+USUAL_FIRST = {"MOT": 1, "KITTI": 0, "CSV": 0}  # conventional number of the first frame
 
 
 def _frames(table: Table, video: Video, first: str) -> IntArray:
     """Return the frames of the source (N,), -1: none."""
     if "frame" in table.cells and _are_numbers(table.cells["frame"]):
         usual = USUAL_FIRST[table.kind]
-        if any(name.startswith("bb_") for name in table.header):  # MOTChallenge's own names
+        if any(name.startswith("bb_") for name in table.header):  # names of MOTChallenge
             usual = 1
         numbers = table.whole("frame")
-        count, where = video.frame_count, str(table.path)
+        count = video.frame_count
+        where = str(table.path)
         frame, text = frames_of_numbers(numbers, count, first, usual, False, where)
     elif "frame" in table.cells or "image" in table.cells:
         names = table.cells["frame" if "frame" in table.cells else "image"]
@@ -381,7 +388,7 @@ def _frames(table: Table, video: Video, first: str) -> IntArray:
 
 
 def image_names_of(table: Table) -> list[str]:
-    """Return the distinct names of images in a table, [] where it has numbers or times."""
+    """Return the distinct names of images in a table, [] if it has numbers or times."""
     if "frame" in table.cells or "image" not in table.cells:
         return []
     names = list(dict.fromkeys(table.cells["image"]))
@@ -389,9 +396,10 @@ def image_names_of(table: Table) -> list[str]:
 
 
 def seconds(table: Table) -> Array:
-    """Return the times (N,) of a table in s: in the unit that the column names, or that dates are.
+    """Return the times (N,) of a table in s.
 
-    Numbers that are no date since 1970 in s, ms, us or ns are s.
+    The unit is that in the name of the column; else the one of s, ms, us and ns in which the times
+    are plausible dates since 1970; else s.
     """
     values = table.numbers("time")
     named = [name for name in ALIASES["time"] if name in table.header]
@@ -399,15 +407,15 @@ def seconds(table: Table) -> Array:
     per_s = next((units[name[-2:]] for name in named[:1] if name[-3:-2] == "_"
                   and name[-2:] in units), 0.0)  # fmt: skip
     if not per_s and len(values):
-        dated = [u for u in (1.0, 1e3, 1e6, 1e9) if EPOCH_S[0] < values.min() / u < EPOCH_S[1]]
+        dated = [u for u in STAMPS_PER_S if EPOCH_S[0] < values.min() / u < EPOCH_S[1]]
         per_s = dated[0] if dated else 1.0
     return values / (per_s or 1.0)
 
 
 def _frames_at(time_s: Array, video: Video, path: Path) -> IntArray:
-    """Find the frames at times (N,) in s, -1 where none is within half a frame interval."""
+    """Find the frames nearest to times (N,) in s, -1 if none is within half a frame interval."""
     if video.times_s is None:
-        raise ReobjError(f"{path}, line 1: no column frame; time stamps are of use only where the "
+        raise ReobjError(f"{path}, line 1: no column frame; time stamps can be used only if the "
                          "names of the images are time stamps too")  # fmt: skip
     half = 0.5 * float(np.median(np.diff(video.times_s))) if len(video.times_s) > 1 else 0.0
     after = np.searchsorted(video.times_s, time_s).clip(max=len(video.times_s) - 1)  # (N,)
@@ -421,7 +429,7 @@ def _frames_at(time_s: Array, video: Video, path: Path) -> IntArray:
 
 
 def _text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[str]]:
-    """Read a column of class names or of numbers from 0; empty cells and -1 are no class."""
+    """Read a column of class names or of numbers from 0; empty cells and -1: no class."""
     cells = table.cells.get("class", [""] * len(table.line))
     blank = np.array([_is_empty(cell) or cell == "-1" for cell in cells], bool)
     filled = [cell for cell, none in zip(cells, blank.tolist(), strict=True) if not none]
@@ -450,7 +458,7 @@ def _text_classes(table: Table, names: Sequence[str]) -> tuple[IntArray, list[st
 
 
 def _whole_numbers(cells: Sequence[str]) -> IntArray | None:
-    """Convert cells such as 56 or 56.0 to numbers from 0 (N,); None if they are names."""
+    """Convert cells such as 56 or 56.0 to numbers (N,); None if they are names."""
     if not all(re.fullmatch(r"[0-9]{1,18}(\.0*)?", cell) for cell in cells):
         return None
     return np.array([int(cell.partition(".")[0]) for cell in cells], np.int64)
@@ -459,7 +467,7 @@ def _whole_numbers(cells: Sequence[str]) -> IntArray | None:
 def _with_unnamed(
     class_id: IntArray, blank: BoolArray, names: list[str], table: Table
 ) -> tuple[IntArray, list[str]]:
-    """Call rows without a class (N,) `object`, and count them."""
+    """Name the class of rows without one, `blank` (N,), `object`, and count them."""
     if blank.any():
         class_id = np.where(blank, len(names), class_id)
         names = [*names, "object"]
@@ -468,12 +476,12 @@ def _with_unnamed(
 
 
 def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntArray, list[str]]:
-    """Read the class numbers of MOT rows; what the column holds is measured.
+    """Read the class numbers of MOT rows; the content of the column is inferred.
 
-    Numbers count from 1 in the order of the names, from 0 where a 0 fits the names; -1 is no
-    class. Boxmot's older results (1, class from 0, score in the last three of nine columns) are
-    recognised: their scores replace `score` in place. Numbers that cannot be of classes are world
-    coordinates (columns 8 to 10 of MOTChallenge's detections).
+    Numbers count from 1 in the order of the names, or from 0 if a 0 is consistent with the names;
+    -1: no class. Older results of boxmot (1, class from 0, score in the last three of nine columns)
+    are recognised: their scores replace `score` in place. Other numbers are world coordinates
+    (columns 8 to 10 of MOTChallenge's detections).
     """
     count = len(score)
     number = table.numbers("class") if "class" in table.cells else np.full(count, -1.0)
@@ -487,9 +495,11 @@ def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntA
     if number.max() > CLASS_MAX:
         text = f"class number {table.cells['class'][int(number.argmax())]}"
         raise ReobjError(f"{table.path}: {text}, expected at most {CLASS_MAX}")
-    kind, first = number.astype(np.int64), 1
+    kind = number.astype(np.int64)
+    first = 1
     if _is_boxmot(table, score, kind):
-        score[:], first = table.numbers("extra"), 0
+        score[:] = table.numbers("extra")
+        first = 0
         table.messages.append(
             "columns 7 to 9 are taken as 1, class from 0, score, as boxmot writes them"
         )
@@ -513,14 +523,14 @@ def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntA
 IGNORED = -2  # class of rows that are left out
 
 
-VISIBLE_ROWS = 20  # chosen: of this many true boxes at least one is wholly visible
+VISIBLE_ROWS = 20  # rows; chosen: of as many true boxes at least one has visibility 1
 
 
 def _is_boxmot(table: Table, score: Array, number: IntArray) -> bool:
-    """Tell whether the last column is a score: all scores are 1, and no value of it is 0 or 1.
+    """Test whether the last column is a score: all scores are 1, and no value of it is 0 or 1.
 
-    In MOTChallenge's ground truth it is the visibility, which is 1 where nothing is in front;
-    identities and classes count from 1 there.
+    In MOTChallenge's ground truth it is the visibility, 1 for boxes that are not occluded, and
+    identities and classes count from 1.
     """
     if "extra" not in table.cells or "z" in table.cells or (score != 1).any():
         return False
@@ -532,11 +542,11 @@ def _is_boxmot(table: Table, score: Array, number: IntArray) -> bool:
     return bool(no_truth or as_written or len(extra) >= VISIBLE_ROWS)
 
 
-def _without_ignored(found: RecordedDetections) -> RecordedDetections:
-    """Leave out, and count, the regions that are to be ignored."""
-    ignored = found.class_id == IGNORED
+def _without_ignored(recorded: RecordedDetections) -> RecordedDetections:
+    """Drop, and count, ignored regions."""
+    ignored = recorded.class_id == IGNORED
     if ignored.any():
         text = f"{ignored.sum()} rows of class 0 and score 0 (ignored regions) left out"
-        found.messages.append(text)
-        found.select(np.flatnonzero(~ignored))
-    return found
+        recorded.messages.append(text)
+        recorded.select(np.flatnonzero(~ignored))
+    return recorded

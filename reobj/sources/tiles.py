@@ -1,8 +1,8 @@
-"""Detection in overlapping tiles: small things are larger in what the network is fed.
+"""Detection in overlapping tiles, which enlarge small objects at the network's input.
 
-Start at `detect_in_tiles`. Weighted box fusion stands here in a few lines: the package
-ensemble-boxes gives the same boxes (a test compares), but knows no masks and brings numba, llvmlite
-and pandas, 290 MB, for a function that is plain numpy.
+Start at `detect_in_tiles`. Weighted box fusion is implemented here: the package ensemble-boxes
+gives the same boxes (a test compares), but lacks masks and depends on numba, llvmlite and pandas,
+290 MB, for a function that is plain numpy.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 
 from reobj.types import Array, Detections, Image, IntArray, ReobjError, box_iou
 
-MAX_TILES = 8  # a side; chosen: each tile costs a run of the network a frame
-# Of a tile's side, with its neighbour (SAHI: .2): what is smaller is whole in one of them
+MAX_TILES = 8  # tiles per side; chosen: each one costs a run of the network per frame
+# Overlap of neighbouring tiles over their side: smaller objects are complete in one tile (SAHI: .2)
 TILE_OVERLAP = 0.25
-CUT = 0.01  # of a tile's side: boxes that come so near to an edge inside the image are cut off
-FUSION_IOU = 0.55  # above it boxes of a class are one (Solovyev et al.)
+CUT = 0.01  # tile sides, distance to an edge inside the image below which a box counts as cut
+FUSION_IOU = 0.55  # IoU above which boxes of a class are fused (Solovyev et al.)
 
 
 def parse_tiles(text: str) -> tuple[int, int]:
@@ -27,8 +27,8 @@ def parse_tiles(text: str) -> tuple[int, int]:
     >>> parse_tiles("3x2")
     (3, 2)
     """
-    found = re.fullmatch(r"(\d+)x(\d+)", text or "1x1")
-    columns, rows = (int(n) for n in found.groups()) if found else (0, 0)
+    match = re.fullmatch(r"(\d+)x(\d+)", text or "1x1")
+    columns, rows = (int(n) for n in match.groups()) if match else (0, 0)
     if not (1 <= columns <= MAX_TILES and 1 <= rows <= MAX_TILES):
         expected = f"COLUMNSxROWS of 1 to {MAX_TILES}, such as 2x2"
         raise ReobjError(f"--detector-tiles {text!r}: expected {expected}")
@@ -50,13 +50,13 @@ def tile_boxes(size: tuple[int, int], grid: tuple[int, int]) -> IntArray:
 def weighted_box_fusion(xyxy: Array, score: Array, class_id: IntArray) -> tuple[Array, IntArray]:
     """Fuse boxes of a class that overlap into their mean, weighted by the scores.
 
-    Ref: Solovyev et al., Image and Vision Computing 2021. The score of a fused box is the best one,
-    not the mean over the views: that a tile does not show a thing says nothing about it.
+    Ref: Solovyev et al., Image and Vision Computing 2021. The score of a fused box is the highest,
+    not the mean over the views: most tiles do not show the object.
 
     Args:
         xyxy: (N, 4). score, class_id: (N,).
     Returns:
-        boxes (K, 4), best score first; (K,) the row of the best box of each.
+        boxes (K, 4), by descending score; row (K,) of the best box of each.
     """
     fused = np.empty_like(xyxy)  # (N, 4), of which the first K count
     groups: list[list[int]] = []
@@ -76,31 +76,33 @@ def weighted_box_fusion(xyxy: Array, score: Array, class_id: IntArray) -> tuple[
 def detect_in_tiles(
     detect: Callable[[Image], Detections], image: Image, grid: tuple[int, int]
 ) -> Detections:
-    """Detect in the whole image and in its tiles, and fuse what was found; best first.
+    """Detect in the whole image and in its tiles, and fuse the boxes; best first.
 
-    Boxes that an edge of their tile cuts are left out: the whole image or the next tile has all of
-    the object. A mask is that of the best box.
+    Boxes cut by an edge of their tile are dropped: the object is complete in the whole image or in
+    the next tile. The mask of fused boxes is that of the best one.
     """
     height, width = image.shape[:2]
     tiles = np.vstack([[0, 0, width, height], tile_boxes((width, height), grid)])  # (V, 4)
-    found = []
+    per_tile = []
     for tile in tiles:
         x1, y1, x2, y2 = tile.tolist()
-        own = detect(np.ascontiguousarray(image[y1:y2, x1:x2]))
-        inside = np.array([x1 > 0, y1 > 0, x2 < width, y2 < height])  # edges that may cut
+        detections = detect(np.ascontiguousarray(image[y1:y2, x1:x2]))
+        xyxy = detections.xyxy
+        inside = np.array([x1 > 0, y1 > 0, x2 < width, y2 < height])  # edges inside the image
         margin = CUT * np.array([x2 - x1, y2 - y1])
-        gap = np.hstack([own.xyxy[:, :2], (x2 - x1, y2 - y1) - own.xyxy[:, 2:]])  # (D, 4) to edges
-        found.append(own[~((gap <= np.tile(margin, 2)) & inside).any(1)])
-    view = np.repeat(np.arange(len(tiles)), [len(own) for own in found])  # (N,)
+        gap = np.hstack([xyxy[:, :2], (x2 - x1, y2 - y1) - xyxy[:, 2:]])  # (D, 4) to the edges
+        per_tile.append(detections[~((gap <= np.tile(margin, 2)) & inside).any(1)])
+    view = np.repeat(np.arange(len(tiles)), [len(detections) for detections in per_tile])  # (N,)
     xyxy, score, class_id = (
-        np.concatenate([getattr(own, n) for own in found]) for n in ("xyxy", "score", "class_id")
+        np.concatenate([getattr(detections, name) for detections in per_tile])
+        for name in ("xyxy", "score", "class_id")
     )
     boxes, best = weighted_box_fusion(xyxy + tiles[view][:, [0, 1, 0, 1]], score, class_id)
     masks = None
-    if any(own.masks is not None for own in found):
+    if any(detections.masks is not None for detections in per_tile):
         masks = np.zeros((len(best), height, width), bool)
-        row = best - np.searchsorted(view, view[best])  # (K,) in its own view
+        row = best - np.searchsorted(view, view[best])  # (K,) in the view
         for k, v in enumerate(view[best].tolist()):
             x1, y1, x2, y2 = tiles[v].tolist()
-            masks[k, y1:y2, x1:x2] = found[v].masks[row[k]]
+            masks[k, y1:y2, x1:x2] = per_tile[v].masks[row[k]]
     return Detections(boxes, score[best], class_id[best], masks)

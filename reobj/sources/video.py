@@ -1,6 +1,6 @@
-"""Frames of a video file, an image folder, a camera or a stream, with what can be wrong with them.
+"""Frames of a video file, an image folder, a camera or a stream, and checks of the source.
 
-What is in the frames is not asked here. Start at `Video`; `resized` and `shrunk` scale images.
+Start at `Video`; `resized` and `shrunk` scale images.
 """
 
 from __future__ import annotations
@@ -43,71 +43,76 @@ from reobj.types import Array, Frame, Image, ReobjError, log, option, without_se
 
 @dataclass(frozen=True, slots=True)
 class InputConfig:
-    """Choose the frames to read, which keep their numbers in the source whatever is left out."""
+    """Frames to read; they keep their numbers in the source."""
 
     every: int = option(1, "read every N-th frame", "--every")
-    start: int = option(0, "number of the first frame to read (0-based)", "--start")
-    stop: int = option(0, "number of the frame to stop before (0: read to the end)", "--stop")
+    start: int = option(0, "first frame to read (0-based)", "--start")
+    stop: int = option(0, "frame before which to stop (0-based; 0: read to the end)", "--stop")
     max_size: int = option(
-        0, "shrink frames whose longer side has more pixels to this (0: never)", "--max-size"
-    )
+        0, "downscale frames to this longer side, px (0: off); saves time on large videos",
+        "--max-size",
+    )  # fmt: skip
     reconnect: int = option(
-        0, "times to connect again to a live source that ended, after 1, 2, 4, ... 30 s"
+        0, "reconnection attempts after a live source ends, after 1, 2, 4, ... 30 s"
     )
 
 
 STREAM_URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
-MAX_UNREADABLE = 64  # frames in a row; chosen: 2 s without a picture, then the video has ended
-MISSING_SHARE = 0.02  # of the announced frames; chosen: containers often announce a few too many
-ROUNDING_S = 1e-3  # containers round times to a ms
-NO_TIME_S = 1e9  # chosen: beyond 30 years; FFmpeg's AV_NOPTS_VALUE is -9e18 units
-SQUARE = 0.01  # that pixels may be wider than high, or higher; chosen: 1 px in 100 is not seen
-LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: one to work on next and the newest one
-LIVE_POLL_S = 0.5  # chosen: longer than the reading thread takes to say that it ends
-LIVE_TIMEOUT_S = 2.0  # chosen: no frame for so long, and a live source has ended
-OPEN_TIMEOUT_S = 5.0  # chosen: cameras answer within 2 s; OpenCV's own is 30 s
-RECONNECT_S = (1.0, 30.0)  # chosen: before the first attempt, twice as long before each, at most
+MAX_UNREADABLE = 64  # consecutive frames after which a video has ended; chosen: 2 s
+MISSING_SHARE = (
+    0.02  # tolerated fraction of missing frames; chosen: containers count a few too many
+)
+ROUNDING_S = 1e-3  # s, resolution of the times in containers
+NO_TIME_S = 1e9  # s, larger times are invalid; chosen: 30 years; AV_NOPTS_VALUE is -9e18 units
+SQUARE = 0.01  # tolerated deviation of a pixel's aspect ratio from 1; chosen: not visible
+LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: the next one and the newest one
+LIVE_POLL_S = 0.5  # s; chosen: longer than the reading thread takes to signal its end
+LIVE_TIMEOUT_S = 2.0  # s without a frame after which a live source has ended (chosen)
+OPEN_TIMEOUT_S = 5.0  # s; chosen: cameras answer within 2 s; OpenCV's default is 30 s
+RECONNECT_S = (1.0, 30.0)  # s before the first attempt, doubled for each next one; maximum (chosen)
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Times (F,) in s of a file's frames, all of them if complete; known: the file has times."""
+    """Times (F,) in s of a file's frames.
+
+    complete: of all frames, not only of those before `config.stop`. known: the file has times.
+    """
 
     times_s: Array
     complete: bool
     known: bool
 
 
-MEASURED: dict[tuple[str, str, int], Clock] = {}  # by path, fingerprint and frame to stop before
+# Clocks of this process by path, fingerprint and frame to stop before
+MEASURED: dict[tuple[str, str, int], Clock] = {}
 
 
 class Video:
     """Iterate over the frames of a video file, image folder, glob, camera index or stream URL.
 
-    Iterating yields `Frame`s, and may be done again unless the source is live. Frame numbers count
-    the frames of the source from 0: images in the order of the numbers in their names, frames of a
-    file as they are stored; those that cannot be read are counted. A live source is read as fast
-    as it delivers: frames that come while the caller works are counted and dropped, except for the
-    `LIVE_QUEUE` newest ones.
+    Iteration yields `Frame`s and may be repeated unless the source is live. Frame numbers count the
+    frames of the source from 0, including unreadable ones: images in the order of the numbers in
+    their names, frames of a file as stored. Frames that a live source delivers while the caller is
+    busy are counted and dropped, except for the `LIVE_QUEUE` newest ones.
 
     Attributes:
-        source: what was given, of a URL only scheme, host and path.
-        fingerprint: changes with the source or its files; does not tell what a URL hides.
+        source: as given; of a URL only scheme, host and path.
+        fingerprint: hash of the source or its files, without the secrets of a URL.
         files, names: paths and file names of images by frame number, [] for videos.
-        times_s: (F,) of images whose names are time stamps, else None: they come at 30 Hz.
-        times_are_known: the times of the frames are measured; False: only their order is known,
-            and an even rate is assumed.
-        has_images: False where frames have none (`ImagelessVideo`).
+        times_s: (F,) of images whose names are time stamps, else None (assumed: 30 Hz).
+        times_are_known: the times of the frames are measured; False: a constant rate is assumed.
+        has_images: False for frames without images (`ImagelessVideo`).
         is_live: a camera or stream, which cannot be read twice.
-        read, dropped: wanted frames of a live source so far, and those of them never yielded.
+        read, dropped: requested frames of a live source so far, and those never yielded.
         size: (w, h) of the source in px, after rotation by its metadata.
-        working_size: (w, h) of the frames that are yielded, px; scale: working px per native px.
-        fps: mean rate of the frames, Hz. frame_count: frames that can be decoded (0: unknown, of
-            a live source). Both are measured, of a file once, by decoding it up to `config.stop`
-            when they are first asked for, unless it was read before.
+        working_size: (w, h) of the yielded frames, px; scale: working px per native px.
+        fps: mean frame rate, Hz. frame_count: frames that can be decoded (0: unknown, of a live
+            source). Both are measured on first access by decoding a file once, up to
+            `config.stop`, unless it was read before.
         pixel_aspect: width over height of a pixel; 1: square.
-        skipped: numbers of the frames, in the last iteration, that could not be read or had
-            another size. messages: warnings for the user, each once.
+        skipped: numbers of the frames of the last iteration that were unreadable or of another
+            size. messages: warnings for the user, without repetition.
     """
 
     has_images = True
@@ -115,7 +120,8 @@ class Video:
     def __init__(self, source: str | Path | int, config: InputConfig | None = None) -> None:
         check_versions()
         guard_forks()
-        self._address, self.config = str(source), config or InputConfig()
+        self._address = str(source)
+        self.config = config or InputConfig()
         self.source = without_secrets(self._address)
         if self.config.every < 1 or min(dataclasses.astuple(self.config)) < 0:
             raise ReobjError("--every must be at least 1; --start, --stop, --max-size at least 0")
@@ -150,8 +156,9 @@ class Video:
 
     @property
     def expected(self) -> int:
-        """Count the frames that an iteration yields, about: as announced before it was measured."""
-        clock, count = self._clock, self._announced
+        """Approximate number of frames of an iteration; as announced until it is measured."""
+        clock = self._clock
+        count = self._announced
         count = len(clock.times_s) if clock is not None and clock.complete else count
         stop = min(self.config.stop or count, count or self.config.stop)
         return max(math.ceil((stop - self.config.start) / self.config.every), 0)
@@ -165,18 +172,20 @@ class Video:
 
     @functools.cached_property
     def fps(self) -> float:
-        announced, times_s = self._announced_fps, self.times_s
+        announced = self._announced_fps
+        times_s = self.times_s
         if not self.files and not self.is_live and self.times_are_known:
             times_s = self._measured().times_s
         if times_s is None or len(times_s) < 2:
             return self._assumed_fps
-        steps, seconds = len(times_s) - 1, float(np.ptp(times_s))
+        steps = len(times_s) - 1
+        seconds = float(np.ptp(times_s))
         same = abs(steps / announced - seconds) <= ROUNDING_S
         return announced if same else steps / seconds
 
     @property
     def _assumed_fps(self) -> float:
-        """Return the rate where nothing measures it: as announced, unless no camera has it."""
+        """Frame rate without measured times: as announced, unless implausible."""
         announced = self._announced_fps
         return announced if announced <= 1 / FRAME_STEPS_S[0] else IMAGE_FPS
 
@@ -194,7 +203,8 @@ class Video:
             numbers = range(self.config.start, stop, self.config.every)
             times_s = np.arange(stop) / IMAGE_FPS if self.times_s is None else self.times_s
             decoded = ((i, float(times_s[i]), read_image(self.files[i])) for i in numbers)
-        unreadable, other_size = list[int](), list[int]()
+        unreadable = list[int]()
+        other_size = list[int]()
         for index, time_s, image in decoded if self.is_live else one_ahead(decoded):
             if image is None or (image.shape[1], image.shape[0]) != self.size:
                 (unreadable if image is None else other_size).append(index)
@@ -215,15 +225,14 @@ class Video:
             self.messages.append(text)
 
     def _from_capture(self) -> Iterator[tuple[int, float, Image | None]]:
-        """Decode a file: yield number, time in s and image of the wanted frames.
-
-        The image is None if it cannot be read.
-        """
-        start, every, raw_s = self.config.start, self.config.every, list[float]()
+        """Decode a file: yield number, time in s and image (None: unreadable) of its frames."""
+        start = self.config.start
+        every = self.config.every
+        raw_s = list[float]()
         capture = self._open()
         for index, seconds in enumerate(self._grabbed(capture)):
             if not seconds > max(raw_s[-1:], default=-math.inf):
-                self._measured()  # from here on times depend on all that follow
+                self._measured()  # correcting this time needs all later ones
             raw_s.append(seconds)
             if index >= start and (index - start) % every == 0:
                 ok, image = (False, None) if math.isnan(seconds) else capture.retrieve()
@@ -235,8 +244,8 @@ class Video:
     def _grabbed(self, capture: Any) -> Iterator[float]:
         """Decode the frames before `config.stop` one by one; yield their times in s, NaN: none.
 
-        Frames that cannot be decoded are held back until a later one can: at the end of the file
-        they do not exist.
+        Undecodable frames count only if a later one can be decoded: at the end of the file they do
+        not exist.
         """
         index = failed = 0
         while failed < MAX_UNREADABLE and not 0 < self.config.stop <= index:
@@ -246,13 +255,14 @@ class Video:
             for _ in range(failed):
                 index += 1
                 yield math.nan
-            index, failed = index + 1, 0
-            # Right after the grab this is the frame's true time, also at a variable rate.
+            index = index + 1
+            failed = 0
+            # After the grab this is the frame's presentation time, also at a variable rate
             seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             yield seconds if abs(seconds) < NO_TIME_S else math.nan
 
     def _measured(self) -> Clock:
-        """Return the times of the frames, of which a file is decoded once in a process."""
+        """Return the times of the frames; a file is decoded once per process."""
         if self._clock is None:
             for stop in (0, self.config.stop):
                 self._clock = self._clock or MEASURED.get(self._key(stop))
@@ -264,14 +274,14 @@ class Video:
         return os.path.abspath(self._address), self.fingerprint, stop
 
     def _keep(self, raw_s: Sequence[float]) -> Clock:
-        """Make times of those that the container gives, and say what is wrong with them."""
+        """Correct the times of the container, with warnings, and store them."""
         complete = not 0 < self.config.stop <= len(raw_s)
         fps = self._assumed_fps
         times_s, restarts, known = settled_times(np.array(raw_s), 1 / fps)
         if restarts:
-            self._warn(f"its clock begins again {restarts} time(s): counted on from there")
+            self._warn(f"its clock restarts {restarts} time(s): times are continued from there")
         if not known:
-            self._warn(f"it holds no times: {fps:g} frames a second are assumed")
+            self._warn(f"it has no times: {fps:g} frames a second are assumed")
         if complete and not self._is_url and (text := self._missing_end(times_s)):
             self._warn(text)
         self._clock = Clock(times_s, complete, known)
@@ -280,30 +290,34 @@ class Video:
         return self._clock
 
     def _missing_end(self, times_s: Array) -> str:
-        """Say what is missing at the end of a file; "": nothing that can be known.
+        """Describe missing frames at the end of a file; "": none, or no evidence.
 
-        What a container announces is no evidence alone: Matroska's duration is that of the sound
-        too, and some announce a rate that no frame has. But in a file of pictures alone most bytes
-        are those of its frames.
+        The container's metadata alone are no evidence: Matroska's duration includes the audio, and
+        the announced rate may be wrong. But in a file without audio most bytes are those of the
+        frames.
         """
-        read, last_s = len(times_s), float(times_s[-1])
+        read = len(times_s)
+        last_s = float(times_s[-1])
         if self._announced - read <= max(1.0, MISSING_SHARE * self._announced):
             return ""
-        what, stored = f"{read} frames up to {last_s:.2f} s can be read", Path(self._address)
-        if lost := missing_bytes(stored):
-            return f"the file ends early: {lost} bytes are missing at its end; {what}"
+        readable = f"{read} frames up to {last_s:.2f} s can be read"
+        file = Path(self._address)
+        if lost := missing_bytes(file):
+            return f"the file ends early: {lost} bytes are missing at its end; {readable}"
         _, stored_s, size = self._packets()
         if stored_s - last_s > max(1 / self._announced_fps, MISSING_SHARE * stored_s):
-            return f"the file is damaged: {what}, frames up to {stored_s:.2f} s are stored"
-        total = stored.stat().st_size
-        if 2 * size < total and holds_pictures_only(stored):
-            return f"the file is damaged: {what}, {size} of its {total} bytes"
+            return f"the file is damaged: {readable}, frames up to {stored_s:.2f} s are stored"
+        total = file.stat().st_size
+        if 2 * size < total and holds_pictures_only(file):
+            return f"the file is damaged: {readable}, {size} of its {total} bytes"
         return ""
 
     def _packets(self) -> tuple[int, float, int]:
-        """Count the frames that a file stores, undecoded; also time in s of the last, and bytes."""
+        """Return the number of stored frames, also undecodable ones, last time in s, and bytes."""
         capture = self._open([cv2.CAP_PROP_FORMAT, -1])
-        count, last_s, size = 0, 0.0, 0
+        count = 0
+        last_s = 0.0
+        size = 0
         while capture.grab():
             count += 1
             last_s = max(last_s, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
@@ -314,22 +328,23 @@ class Video:
     def _from_live(self) -> Iterator[tuple[int, float, Image | None]]:
         """Yield number, time in s since the start and image of the newest frames of a live source.
 
-        Where it ends, connect again as often as the config says; the frames are counted on.
+        When it ends, reconnect up to `config.reconnect` times; frame numbers continue.
         """
-        capture, self._opened = self._opened or self._open(), None
+        capture = self._opened or self._open()
+        self._opened = None
         self.read = self.dropped = self._seen = attempts = 0
         began = time.monotonic()
         while capture is not None:
             before = self._seen
             yield from self._from_connection(capture, began)
-            attempts = attempts if self._seen == before else 0  # in a row without a frame
+            attempts = attempts if self._seen == before else 0  # consecutive, without a frame
             capture = None
             while capture is None and attempts < self.config.reconnect:
                 if 0 < self.config.stop <= self._seen:
                     break
                 wait_s = min(RECONNECT_S[0] * 2.0 ** min(attempts, 9), RECONNECT_S[1])
                 attempts += 1
-                log.warning("%s: ended; connecting again in %g s", self.source, wait_s)
+                log.warning("%s: ended; reconnecting in %g s", self.source, wait_s)
                 time.sleep(wait_s)
                 with contextlib.suppress(ReobjError):
                     capture = self._open()
@@ -339,10 +354,11 @@ class Video:
     ) -> Iterator[tuple[int, float, Image | None]]:
         """Yield the newest frames until a connection ends.
 
-        A thread reads all frames, so that the driver's own queue never fills with old ones.
+        A thread reads all frames, so that the driver's queue does not fill with old ones.
         """
         frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_QUEUE)
-        stopped, self._came = threading.Event(), time.monotonic()
+        stopped = threading.Event()
+        self._last_frame_s = time.monotonic()
         thread = threading.Thread(
             target=self._read_live, args=(capture, frames, stopped, began), daemon=True
         )
@@ -352,16 +368,17 @@ class Video:
                 yield item
         finally:
             stopped.set()
-            hangs = time.monotonic() - self._came > LIVE_TIMEOUT_S
+            hangs = time.monotonic() - self._last_frame_s > LIVE_TIMEOUT_S
             thread.join(0.0 if hangs else LIVE_TIMEOUT_S / 2)
-            if not thread.is_alive():  # else it hangs in the driver; the process may still end
+            if not thread.is_alive():  # else it hangs in the driver; a daemon thread may be left
                 capture.release()
 
     def _next_live(
         self, frames: queue.Queue[tuple[int, float, Image] | None]
     ) -> tuple[int, float, Image] | None:
         """Wait for a frame of a live source; None at its end, or where the driver hangs."""
-        while time.monotonic() - self._came < LIVE_TIMEOUT_S + LIVE_POLL_S or not frames.empty():
+        timeout_s = LIVE_TIMEOUT_S + LIVE_POLL_S
+        while time.monotonic() - self._last_frame_s < timeout_s or not frames.empty():
             with contextlib.suppress(queue.Empty):
                 return frames.get(timeout=LIVE_POLL_S)
         self._warn(f"no frame came for {LIVE_TIMEOUT_S:g} s: taken as its end")
@@ -384,31 +401,32 @@ class Video:
                 if not ok:
                     time.sleep(0.01)
                     continue
-                if stopped.is_set():  # the driver hung; another connection counts now
+                if stopped.is_set():  # the driver hung, and a new connection is in use
                     break
-                self._came = last = time.monotonic()
-                at, self._seen = self._seen, self._seen + 1
+                self._last_frame_s = last = time.monotonic()
+                at = self._seen
+                self._seen += 1
                 if at < self.config.start or (at - self.config.start) % self.config.every:
                     continue
                 self.read += 1
                 if frames.full():
-                    with contextlib.suppress(queue.Empty):  # the tracker was faster
+                    with contextlib.suppress(queue.Empty):  # the tracker took it first
                         frames.get_nowait()
                         self.dropped += 1
-                frames.put((at, last - began, image))  # this thread alone puts: there is room
+                frames.put((at, last - began, image))  # no other thread puts: it does not block
         finally:
-            while not stopped.is_set():  # None ends the iteration, after the frames that wait
+            while not stopped.is_set():  # None ends the iteration, after the waiting frames
                 with contextlib.suppress(queue.Full):
                     frames.put(None, timeout=0.1)
                     break
 
     def _open(self, params: Sequence[int] = ()) -> Any:
-        """Open the source with OpenCV, which turns frames upright by the file's rotation tag."""
+        """Open the source with OpenCV, which rotates frames by the file's rotation tag."""
         if any("\ud800" <= letter <= "\udfff" for letter in self._address):  # OpenCV crashes
-            raise ReobjError(f"{self.source!r}: this name is no UTF-8; rename the file")
+            raise ReobjError(f"{self.source!r}: the name is not UTF-8; rename the file")
         if not self.is_live and not self._is_url and not Path(self.source).is_file():
             raise ReobjError(f"{self.source}: no such file or folder")
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages name no file, ours do
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its messages do not name the file
         is_camera = self.is_live and self._address.isdecimal()
         with quiet_opencv():
             if self._is_url:
@@ -418,24 +436,25 @@ class Video:
                 capture = cv2.VideoCapture(self._address, cv2.CAP_ANY, [*timeouts, *params])
             elif is_camera:
                 capture = cv2.VideoCapture(int(self._address))
-            else:  # the whole path: FFmpeg takes 12:30.mp4 for a protocol
+            else:  # absolute path: FFmpeg reads the name 12:30.mp4 as a protocol
                 path = os.path.abspath(self._address)
                 capture = cv2.VideoCapture(path, cv2.CAP_FFMPEG if params else cv2.CAP_ANY, params)
         if not capture.isOpened():
-            what = "video (damaged, or no video)"
+            kind = "video (damaged, or no video)"
             if self.is_live:
-                what = "camera (is it connected?)" if is_camera else "stream (is it there?)"
-            raise ReobjError(f"{self.source}: cannot be opened as a {what}")
+                kind = "camera (is it connected?)" if is_camera else "stream (is it there?)"
+            raise ReobjError(f"{self.source}: cannot be opened as a {kind}")
         return capture
 
     def _probe(self, usual: Sequence[Path]) -> tuple[tuple[int, int], float, int]:
-        """Read the first readable frame, of images the first of the `usual` ones.
+        """Read the first readable frame; of images: the first of the `usual` ones.
 
         Returns:
-            (w, h) in px, frame rate in Hz, and number of frames (0: unknown), both as announced.
+            (w, h) in px, announced frame rate in Hz and number of frames (0: unknown).
         """
         images: Iterator[Image | None] = map(read_image, [*usual, *self.files])
-        fps, count = IMAGE_FPS, len(self.files)
+        fps = IMAGE_FPS
+        count = len(self.files)
         if not self.files:
             capture = self._open()
             images = (capture.read()[1] for _ in range(MAX_UNREADABLE))
@@ -443,32 +462,32 @@ class Video:
             pixels = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
             if pixels > PIXELS_MAX:
                 raise ReobjError(f"{self.source}: frames of {pixels:.0f} pixels, at most "
-                                 f"{PIXELS_MAX} are taken")  # fmt: skip
+                                 f"{PIXELS_MAX} are allowed")  # fmt: skip
             if not self._address.isdecimal():
                 count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-            self.is_live = self.is_live and not count  # a URL may be that of a file
+            self.is_live = self.is_live and not count  # the URL of a file is not live
             self._opened = capture if self.is_live else None
         image = next((image for image in images if image is not None), None)
         if image is None:
-            raise ReobjError(f"{self.source}: not one frame can be decoded")
+            raise ReobjError(f"{self.source}: no frame can be decoded")
         if not self.files and not self.is_live:
             self._check_pixels(capture)
         return (image.shape[1], image.shape[0]), fps if 0 < fps < math.inf else IMAGE_FPS, count
 
     def _check_pixels(self, capture: Any) -> None:
-        """Set the shape of the pixels, and say that it is not square."""
+        """Set the aspect ratio of the pixels; warn if they are not square."""
         wide, high = (round(capture.get(p)) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
         turned = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
         wide, high = (high, wide) if turned else (wide, high)
         if wide > 0 and high > 0 and abs(wide / high - 1) > SQUARE:
             self.pixel_aspect = wide / high
-            self._warn(f"its pixels are {wide}:{high}, not square, as it says: boxes are in stored "
-                       "pixels, cameras have two focal lengths; where that is wrong, correct its "
-                       "sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
+            self._warn(f"its pixels are {wide}:{high}, not square, by its metadata: boxes are in "
+                       "stored pixels, cameras have two focal lengths; if that is wrong, correct "
+                       "its sample aspect ratio (ffmpeg -i IN -vf setsar=1 OUT)")  # fmt: skip
 
 
 def resized(image: Image, size: Sequence[int]) -> Image:
-    """Resize to (w, h) by averaging pixels; by halves first: 4 times as fast on large frames."""
+    """Resize to (w, h) by area averaging; halving first is 4 times as fast on large frames."""
     while image.shape[1] >= 2 * size[0] and image.shape[0] >= 2 * size[1]:
         half = (image.shape[1] // 2, image.shape[0] // 2)
         image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
@@ -481,26 +500,27 @@ def shrunk(image: Image, size_px: int) -> Image:
     return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
 
 
-HASH_ROUNDS = 100_000  # chosen: .05 s, once a run, and for every guess at a password
+HASH_ROUNDS = 100_000  # rounds; chosen: .05 s, once per run and per guess of a password
 
 
 def source_fingerprint(source: Any) -> str:
     """Hash names, sizes and times of a file, a folder's files or a glob's matches.
 
     Returns:
-        16 hex digits; of a camera its number; of a URL what may be shown of it, and a slow hash of
-        the rest: two queries of a server are two sources.
+        16 hex digits; of a camera its number; of a URL its public part and a slow hash of it all:
+        two queries of a server are two sources.
     """
-    text, path = str(source), Path(str(source))
+    text = str(source)
+    path = Path(str(source))
     if STREAM_URL.match(text):
-        shown = without_secrets(text)
-        rest = hashlib.pbkdf2_hmac("sha256", text.encode(), shown.encode(), HASH_ROUNDS)
-        return shown if shown == text else f"{shown} {rest.hex()[:16]}"
-    if path.is_file():  # also one whose name looks like a glob: det[1].txt
+        public = without_secrets(text)
+        digest = hashlib.pbkdf2_hmac("sha256", text.encode(), public.encode(), HASH_ROUNDS)
+        return public if public == text else f"{public} {digest.hex()[:16]}"
+    if path.is_file():  # first: the name may contain glob characters, det[1].txt
         files = [path]
     else:
-        found = path.iterdir() if path.is_dir() else map(Path, glob.glob(text))
-        files = sorted(p for p in found if p.is_file())
+        matches = path.iterdir() if path.is_dir() else map(Path, glob.glob(text))
+        files = sorted(p for p in matches if p.is_file())
     if not files:
         return text
     facts = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
@@ -511,7 +531,7 @@ Item = TypeVar("Item")
 
 
 def one_ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """Make the next item, which is never None, in a thread while the last one is used."""
+    """Compute the next item (not None) in a thread while the caller uses the last one."""
     with ThreadPoolExecutor(1) as pool:
         ahead = pool.submit(next, items, None)
         while (item := ahead.result()) is not None:

@@ -1,6 +1,6 @@
-"""Weights: the table of known files, their download, and onnxruntime sessions on them.
+"""Weights: the table of known files, their download, and onnxruntime sessions.
 
-What a network computes is the business of the rooms that run it. Start at `model_path`.
+Start at `model_path`.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from reobj.files import LockedError, Progress, atomic, locked
 from reobj.types import ReobjError, log
 
 # Mean and standard deviation of the pixels of ImageNet, RGB, 0..255 (torchvision: .485, .456, .406
-# and .229, .224, .225, times 255): what most published networks were trained with.
-IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
+# and .229, .224, .225, times 255), as used to train most published networks
+IMAGENET_MEAN = (123.675, 116.28, 103.53)
+IMAGENET_STD = (58.395, 57.12, 57.375)
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """Describe a file of pre-trained weights.
+    """File of pre-trained weights.
 
     Attributes:
-        name, file, alias: each names it on the command line. role: "detector" or "backbone".
-        url: where to download it, pinned at a commit; "": it comes along in reobj/models.
-        digest: of the whole file, as hex: sha256 (64 digits), or git blob id (40 digits: what git
-            itself knows the file by). size: bytes; 0: unknown.
+        name, file, alias: names of the weights on the command line. role: "detector" or "backbone".
+        url: of the download, pinned at a commit; "": bundled in reobj/models.
+        digest: of the file, hex: sha256 (64 digits) or git blob id (40 digits). size: bytes; 0:
+            unknown.
         note: for the table; AP on 164 images of COCO val2017, ms an image with one thread.
-        layout: of a detector, how the name of its layout in `onnx_layouts` begins.
+        layout: prefix of the name of a detector's layout in `onnx_layouts`.
     """
 
     name: str
@@ -54,7 +55,7 @@ class Weights:
         return "sha256" if len(self.digest) == 64 else "git blob id"
 
     def digest_of(self, path: Path) -> str:
-        """Hash a file the way that `digest` was made."""
+        """Hash a file with the algorithm of `digest`."""
         with path.open("rb") as file:
             if self.digest_kind == "sha256":
                 return hashlib.file_digest(file, "sha256").hexdigest()
@@ -63,7 +64,7 @@ class Weights:
 
     @property
     def fallback(self) -> str:
-        """Name the detector to take instead, as the end of an error message; "": none."""
+        """Suggest a smaller detector, as the end of an error message; "": none."""
         other = self.role == "detector" and self.alias != FAST
         return f"; or take the small detector: --detector {FAST}" if other else ""
 
@@ -73,7 +74,7 @@ _DEIM = _GITHUB + "Kazuhito00/DEIMv2-ONNX-Sample/raw/f88d4382abca74edb26ed4c7f46
 _YOLOX = (_GITHUB + "Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
           "3d4f1119d0694200671c08069ecb847aa0d8495a/")  # fmt: skip
 _PICODET = _GITHUB + "hpc203/picodet-onnxruntime/raw/dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/"
-FAST = "fast"  # alias of the detector that is named where the default one is not to be had
+FAST = "fast"  # alias of the detector that errors suggest where the default one is not available
 WEIGHTS: tuple[Weights, ...] = (
     Weights("deimv2-n", "detector", "deimv2_hgnetv2_n_coco.onnx",
             _DEIM + "model/deimv2_hgnetv2_n_coco.onnx",
@@ -100,13 +101,13 @@ WEIGHTS: tuple[Weights, ...] = (
             "Apache-2.0", "COCO, AP 33.5, 46 ms", "PicoDet"),
     Weights("reobj", "backbone", "reobj.onnx", "",
             "a8abc894869a29b63c244aaeff0a96bd9521fc3146bd2a1f4ac495b2bcfc39a5", 392965,
-            "MIT", "ours, comes along: foreground and background, trained with its head"),
+            "MIT", "ours, bundled: foreground and background, trained with its head"),
 )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class ModelRow:
-    """Tell whether a known file is here: `state` "verified", "changed" or "missing"."""
+    """State of a known file on this machine: "verified", "changed" or "missing"."""
 
     weights: Weights
     state: str
@@ -122,24 +123,24 @@ def _model_folders() -> list[Path]:
         cache = home / "Library" / "Caches"
     else:
         cache = os.environ.get("XDG_CACHE_HOME") or home / ".cache"
-    own = os.environ.get("REOBJ_MODELS")
-    return [*([Path(own).expanduser()] if own else []), Path(cache) / "reobj_track"]
+    chosen = os.environ.get("REOBJ_MODELS")
+    return [*([Path(chosen).expanduser()] if chosen else []), Path(cache) / "reobj_track"]
 
 
 def own_models() -> Path:
-    """Return the folder of the weights that come along with the package."""
+    """Return the folder of the bundled weights."""
     return Path(__file__).resolve().parents[1] / "models"
 
 
 def _find_model(*files: str) -> Path | None:
-    """Return the first of the files that is in a folder of weights."""
+    """Return the first of the files that exists in a folder of weights."""
     folders = [*_model_folders(), own_models()]
     paths = (folder / file for folder in folders for file in files)
     return next((path for path in paths if path.is_file()), None)
 
 
 def known_weights(name: str | Path) -> Weights | None:
-    """Look a name up in the table; None: it is not there, or is a file that exists."""
+    """Look up a name in the table; None for other names and for existing files."""
     if Path(name).expanduser().is_file():
         return None
     return next((w for w in WEIGHTS if str(name) in (w.name, w.file, w.alias or w.name)), None)
@@ -149,7 +150,8 @@ def list_models() -> list[ModelRow]:
     """List all known weights with their state on this machine; reads and hashes the files."""
     rows = []
     for weights in WEIGHTS:
-        path, state = _find_model(weights.file), "missing"
+        path = _find_model(weights.file)
+        state = "missing"
         if path is not None:
             state = "verified" if weights.digest_of(path) == weights.digest else "changed"
         rows.append(ModelRow(weights, state, path))
@@ -160,32 +162,33 @@ def model_path(name_or_path: str | Path, offline: bool = False) -> Path:
     """Find a file of weights, or download it.
 
     Args:
-        name_or_path: an existing file, taken as it is; a name of the table, whose file is verified
-            or downloaded; or another file in a folder of weights, with or without ".onnx".
+        name_or_path: an existing file, which is not verified; a name of the table, whose file is
+            verified or downloaded; or another file in a folder of weights, with or without ".onnx".
         offline: never download.
     Raises:
-        ReobjError: unknown, changed, or not to be had; says what to do.
+        ReobjError: an unknown name, a changed file, or a failed download.
     """
-    path, name = Path(name_or_path).expanduser(), str(name_or_path)
+    path = Path(name_or_path).expanduser()
+    name = str(name_or_path)
     if path.is_file():
         return path
     weights = known_weights(name)
-    found = _find_model(*([weights.file] if weights else [name, name + ".onnx"]))
-    if found is None:
+    file = _find_model(*([weights.file] if weights else [name, name + ".onnx"]))
+    if file is None:
         if weights is not None:
             return _fetch(weights, offline)
         known = ", ".join(w.name for w in WEIGHTS)
         raise ReobjError(f"model {name}: no such file, nor one of the known names ({known})")
-    if weights is not None and (digest := weights.digest_of(found)) != weights.digest:
+    if weights is not None and (digest := weights.digest_of(file)) != weights.digest:
         raise ReobjError(
-            f"{found}: {weights.digest_kind} is {digest}, expected {weights.digest}: delete the "
+            f"{file}: {weights.digest_kind} is {digest}, expected {weights.digest}: delete the "
             "file to fetch it again, or give its path instead of its name to use it as it is"
         )
-    return found
+    return file
 
 
 def _fetch(weights: Weights, offline: bool) -> Path:
-    """Download weights into the first writable folder; keep the file only if its digest fits."""
+    """Download weights into the first writable folder; keep the file if its digest matches."""
     missing = f"model {weights.name} is not in {' nor '.join(map(str, _model_folders()))},"
     by_hand = f"put it at {_model_folders()[0] / weights.file}, or set REOBJ_MODELS to its folder"
     if offline:
@@ -202,11 +205,11 @@ def _fetch(weights: Weights, offline: bool) -> Path:
 
 
 DOWNLOAD_LOCK = ".lock"  # in the folder of weights
-DOWNLOAD_WAIT_S = 600.0  # chosen: 100 MB at 1.3 Mbit/s
+DOWNLOAD_WAIT_S = 600.0  # s, longest wait for another process; chosen: 100 MB at 1.3 Mbit/s
 
 
 def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> Path:
-    """Download weights to `target` unless another process has done so meanwhile."""
+    """Download weights to `target`, unless another process has done so."""
     if target.is_file() and weights.digest_of(target) == weights.digest:
         return target
     expected = f"{weights.digest_kind} {weights.digest}"
@@ -234,7 +237,7 @@ def _fetch_alone(weights: Weights, target: Path, missing: str, by_hand: str) -> 
 
 
 def _writable_folder() -> Path:
-    """Return the first folder for downloads that can be written; makes it."""
+    """Return the first writable folder for downloads; make it if necessary."""
     for folder in _model_folders():
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -244,28 +247,28 @@ def _writable_folder() -> Path:
     raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
 
 
-DOWNLOAD_CHUNK = 1 << 16  # bytes; chosen: small enough for a moving progress line
+DOWNLOAD_CHUNK = 1 << 16  # bytes; chosen: small enough for a smooth progress line
 DOWNLOAD_MAX = 100_000_000  # bytes of a file of unknown size; chosen: several times the largest
-DOWNLOAD_TIMEOUT_S = 30  # chosen: no byte for so long, and the connection counts as cut
+DOWNLOAD_TIMEOUT_S = 30  # s without data after which the connection is cut (chosen)
 
 
-WEB_PAGES = ("text/html", "application/xhtml+xml")  # what captive portals answer with
+WEB_PAGES = ("text/html", "application/xhtml+xml")  # answers of captive portals
 
 
 class StaysEncrypted(urllib.request.HTTPRedirectHandler):
-    """Follow redirects, but never from an encrypted connection to one that is not."""
+    """Follow redirects, but not from an encrypted to an unencrypted connection."""
 
     def redirect_request(
         self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, to: Any
     ) -> Any:
-        """Return the request that follows a redirect."""
+        """Return the request for a redirect."""
         if req.full_url.startswith("https:") and not to.startswith("https:"):
             raise ConnectionError(f"redirected to {to}, which is not encrypted")
         return super().redirect_request(req, fp, code, msg, headers, to)
 
 
 def _download(weights: Weights, part: Path) -> None:
-    """Write the file behind the URL to `part`; a connection cut early is an error."""
+    """Download the file to `part`; an incomplete download is an error."""
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
     opener = urllib.request.build_opener(StaysEncrypted)
     with (
@@ -274,7 +277,8 @@ def _download(weights: Weights, part: Path) -> None:
     ):
         if response.headers.get_content_type() in WEB_PAGES:
             raise ConnectionError("a web page came instead: must you log in to this network first?")
-        size, done = weights.size or min(response.length or 0, DOWNLOAD_MAX), 0
+        size = weights.size or min(response.length or 0, DOWNLOAD_MAX)
+        done = 0
         with Progress("fetch kB", size // 1000) as progress:
             while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
                 file.write(chunk)
@@ -284,8 +288,7 @@ def _download(weights: Weights, part: Path) -> None:
                 raise ConnectionError(f"connection cut after {done} of {size} bytes")
 
 
-# onnxruntime's providers by what users call them, and the packages that bring them
-DEVICES = {
+DEVICES = {  # onnxruntime's provider of each device, and the package that has it
     "cpu": ("CPUExecutionProvider", "onnxruntime"),
     "cuda": ("CUDAExecutionProvider", "onnxruntime-gpu"),
     "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu"),
@@ -300,7 +303,7 @@ def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
     """Make an onnxruntime session on a device of DEVICES (threads 0: all cores).
 
     Raises:
-        ReobjError: the device is unknown, or this onnxruntime cannot use it; or no model.
+        ReobjError: the device is unknown or not supported by this onnxruntime; or no ONNX model.
     """
     if device not in DEVICES:
         raise ReobjError(f"--device {device}: unknown; known are {', '.join(DEVICES)}")
@@ -309,26 +312,26 @@ def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
     except ImportError as error:
         raise ReobjError("ONNX models need onnxruntime: pip install onnxruntime") from error
     provider, package = DEVICES[device]
-    if provider not in (here := onnxruntime.get_available_providers()):
-        have = ", ".join(name for name, (own, _) in DEVICES.items() if own in here)
+    if provider not in (available := onnxruntime.get_available_providers()):
+        have = ", ".join(name for name, (known, _) in DEVICES.items() if known in available)
         raise ReobjError(f"--device {device}: this onnxruntime has {have} only; {provider} comes "
                          f"with {package} (in place of onnxruntime)")  # fmt: skip
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    options.log_severity_level = 3  # errors only: its warnings are about how the model was exported
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # spare the cores
+    options.log_severity_level = 3  # errors only: warnings concern the export of the model
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # no busy waiting
     try:
-        providers = list(dict.fromkeys([provider, DEVICES["cpu"][0]]))  # what it lacks: on the CPU
+        providers = list(dict.fromkeys([provider, DEVICES["cpu"][0]]))  # CPU for missing operators
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
         reason = str(error).partition("\n")[0]
         raise ReobjError(f"{path}: onnxruntime cannot load it: {reason}") from error
-    if session.get_providers()[0] != provider:  # it falls back by itself, with a line on stderr
+    if session.get_providers()[0] != provider:  # onnxruntime falls back, with a line on stderr
         raise ReobjError(f"--device {device}: {provider} did not start: its driver or libraries "
                          "are missing, or of another version")  # fmt: skip
     return session
 
 
 def onnx_metadata(session: Any) -> dict[str, Any]:
-    """Read what `examples/train_embedding.py` wrote into a model file; {} for other models."""
+    """Read the metadata of `examples/train_embedding.py` in a model file; {} for other models."""
     return dict(json.loads(session.get_modelmeta().custom_metadata_map.get("reobj", "{}")))

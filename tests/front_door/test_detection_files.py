@@ -352,7 +352,7 @@ def test_yolo_labels_of_a_video(
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("56 100 80 40 40\n", "is no share of the image"),
+        ("56 100 80 40 40\n", "is no fraction of the image size"),
         ("56 .5 .5 .2\n", "expected class cx cy w h"),
         ("chair .5 .5 .2 .2\n", "expected numbers"),
         ("56 .5 .5 .2 nan\n", "expected class cx cy w h"),
@@ -486,7 +486,7 @@ def test_csv_from_1_that_does_not_show_it(tmp_path: Path, tracked: Callable[...,
         (csv("frame,x1,y1,x2,y2,class", "{f},1,2,30,40," + "b" * 131000),
          "det.csv, line 2: a class name of 131000 characters, at most 200"),
         (csv("frame,x1,y1,x2,y2,score", "{f},{x1},{y1},nan,{y2},.9"), "'nan' is no finite"),
-        (csv("filename,x1,y1,x2,y2", "a/img.jpg,1,2,30,40"), "mean no frame of the video"),
+        (csv("filename,x1,y1,x2,y2", "a/img.jpg,1,2,30,40"), "match no frame of the video"),
     ],
 )  # fmt: skip
 def test_tables_that_cannot_be_meant(

@@ -502,7 +502,7 @@ def test_a_film_in_a_folder_that_is_no_utf8(
     """OpenCV 5.0 ends the process there."""
     out = Path(shutil.copytree(made, tmp_path / os.fsdecode(b"\xff")))
     assert rt.main(["objects", str(out)]) == 0
-    assert "a film needs a folder whose name is UTF-8" in capsys.readouterr().err
+    assert "the overlay needs a folder whose name is UTF-8" in capsys.readouterr().err
     assert (out / "scene.html").exists() and not list(out.glob(".part*"))
 
 

@@ -115,7 +115,7 @@ def test_frames_are_counted_and_timed_as_they_are_decoded(what: str, tmp_path: P
         assert video.times_are_known == (what != "bare H.264")
         kept = rt.read_detections(tmp_path / "d.txt", video)
         assert len(kept) == count and kept.messages == []
-        said = {"the clock begins again": "clock begins again 1 time", "bare H.264": "no times"}
+        said = {"the clock begins again": "clock restarts 1 time", "bare H.264": "no times"}
         assert len(video.messages) == (what in said) and said.get(what, "") in str(video.messages)
         video_module_cache_cleared()
     late = rt.Video(path, rt.InputConfig(start=count - 2))

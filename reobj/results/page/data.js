@@ -1,5 +1,5 @@
 "use strict";
-// What the page shows: JSON of write_scene in scene.py. All text enters through text nodes.
+// Data of the page: JSON of write_scene in scene.py. Text enters through text nodes only.
 const $ = (id) => document.getElementById(id);
 const S = JSON.parse($("data").textContent);
 const bytes = (b64) => Uint8Array.from(atob(b64), (c) => c.charCodeAt(0));
@@ -48,7 +48,7 @@ const withSigma = (value, sigma, unitName) => {
 const sizeText = (o) => o.sides.length
   ? `${o.sides.map(([side]) => side).join(" × ")} ${o.size_m ? "m" : "units"}` : "";
 
-// ---- The part that is shown, in its level frame: z up, 0 on the floor, metres where known ----
+// ---- The selected component in its level frame: z up, 0 on the floor, metres if known ----
 const state = { part: -1, step: -1, selected: null, hidden: new Set(), measured: [] };
 let objects = S.objects;                         // as the edits have them
 let here, solid, steps, cams, posed, level;      // of the part: objects, with a solid, steps, cameras

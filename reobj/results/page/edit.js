@@ -1,4 +1,4 @@
-// Corrections by hand: kept as a list, shown at once, saved as edits.json (docs/scene.md).
+// Manual corrections: a list, shown immediately, saved as edits.json (docs/scene.md).
 const pending = [], takenBack = new Set();       // edits made here; numbers of earlier ones undone
 let saved = true;
 
@@ -14,7 +14,7 @@ const edits = {
   delete: (o) => ({ do: "delete", object: refOf(o) }),
 };
 
-// ---- What the edits make of the objects; solids are fitted again by `objects OUT --edits` ----
+// ---- Objects after the edits; `objects OUT --edits` fits their solids again ----
 function stepsOf(visits) {                       // first, last, first, last ... position seen
   const runs = [];
   S.steps.frame.forEach((frame, step) => {
@@ -81,7 +81,7 @@ function edit(made) {
   pending.push(made);
   saved = false;
   replay();
-  hint(both ? `both are seen in ${both} frames at once: is it one thing? (u: undo)` : "");
+  hint(both ? `both are seen in ${both} frames at once: are they one object? (u: undo)` : "");
 }
 function undo() {
   if (!pending.pop()) return;
@@ -100,7 +100,7 @@ const said = (e) => ({
 function fillEdits() {
   const bar = $("edits"), earlier = S.edits.map((e, i) => el("li",
     { className: takenBack.has(i) ? "undone" : "dim" }, `${said(e)} (applied) `,
-    el("button", { title: "take back; seen after the next fit", onclick: () => {
+    el("button", { title: "undo; visible after the next fit", onclick: () => {
       takenBack[takenBack.has(i) ? "delete" : "add"](i);
       saved = false;
       fillEdits();
@@ -124,9 +124,9 @@ function save() {
   saved = true;
   $("saved").replaceChildren(el("h2", {}, "edits.json"),
     el("p", {}, "The browser has put edits.json among your downloads. Apply it to the output "
-      + "folder (here OUT); objects, solids and this page are then made again:"),
+      + "folder (here OUT), which makes objects, solids and this page again:"),
     el("p", {}, el("code", {}, "reobj-track objects OUT --edits edits.json")),
-    el("p", { className: "dim" }, "The corrections stay with OUT: later fits make them again."),
+    el("p", { className: "dim" }, "OUT keeps the corrections: later fits apply them again."),
     el("div", { className: "act" }, el("button", { className: "main",
       onclick: () => $("saved").close() }, "OK")));
   $("saved").showModal();
@@ -151,13 +151,13 @@ function editButtons(o) {
   const act = el("div", { className: "act" }), form = renameForm(o);
   form.hidden = true;
   act.append(
-    el("button", { title: "it is the same thing as another object", onclick: () => {
+    el("button", { title: "it is the same as another object", onclick: () => {
       state.merging = o;
       hint(`click the object that is the same as ${o.class} ${o.id} (Esc: none)`);
     } }, "Merge with …"),
     el("button", { onclick: () => { form.hidden = false; form.querySelector("input").select(); } },
       "Rename …"),
-    el("button", { title: "it is nothing (Delete)", onclick: () => edit(edits.delete(o)) },
+    el("button", { title: "false positive (Delete)", onclick: () => edit(edits.delete(o)) },
       "Delete"));
   return [el("h3", {}, "Correct it"), act, form];
 }
@@ -167,10 +167,10 @@ function visitRows(o) {
     el("span", {}, `${visit[0]}–${visit[1]}`), el("span", {},
       el("button", { onclick: () => goTo(S.steps.frame.findLastIndex((f) => f <= visit[2])) }, "show"),
       ...(o.visits.length > 1 ? [" ", el("button",
-        { title: "this visit alone shows another thing", onclick: () => edit(edits.split(o, [visit])) },
+        { title: "this visit alone shows another object", onclick: () => edit(edits.split(o, [visit])) },
         "split off")] : []),
       ...(i > 0 && i < o.visits.length - 1 ? [" ", el("button",
-        { title: "this visit and all later ones show another thing",
+        { title: "this visit and all later ones show another object",
           onclick: () => edit(edits.split(o, o.visits.slice(i))) }, "split here")] : []))));
   return [el("h3", {}, `Visits (${o.visits.length}), frames`), ...rows];
 }

@@ -57,7 +57,7 @@ function fillList() {
   const doubtful = here.filter((o) => o.status === "doubtful").length;
   $("notes").replaceChildren(
     ...(doubtful ? [el("p", { className: "dim" }, `${doubtful} doubtful object`
-      + `${doubtful > 1 ? "s" : ""}, less likely there than not: `, el("button", { onclick: () => {
+      + `${doubtful > 1 ? "s" : ""}, more likely absent than present: `, el("button", { onclick: () => {
         $("doubtful").checked = !$("doubtful").checked;
         $("doubtful").onchange();
       } }, "show or hide"))] : []),
@@ -71,14 +71,14 @@ function evidence(link) {
     .join(" and ");
   const names = [...new Set(link.tracklets)].map((t) => `${t} (object ${owners(t)})`).join(", ");
   if (link.place_iou === null) {
-    return (link.kind === "split" ? `split: ${names} told from the rest`
-      : `merge of tracklets ${names}`) + ` by appearance alone (likeness ${link.appearance_log_odds})`;
+    return (link.kind === "split" ? `split: ${names} from the rest`
+      : `merge of tracklets ${names}`) + ` by appearance alone (log odds ${link.appearance_log_odds})`;
   }
   if (link.kind === "split") {
-    return `split: parts of tracklets ${names} show different places (overlap ${link.place_iou})`;
+    return `split: parts of tracklets ${names} are at different 3D positions (overlap ${link.place_iou})`;
   }
-  return `merge of tracklets ${names}: overlap of places ${link.place_iou}, likeness ${link.appearance_log_odds}`
-    + (link.kept ? "" : "; tried and undone: the joint solid does not explain the boxes of both");
+  return `merge of tracklets ${names}: overlap in 3D ${link.place_iou}, log odds of the appearance ${link.appearance_log_odds}`
+    + (link.kept ? "" : "; undone: one solid does not fit the boxes of both");
 }
 
 function facts(o) {

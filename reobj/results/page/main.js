@@ -1,4 +1,4 @@
-// Start: the part that is shown, buttons, keys, mouse and fingers.
+// Start: the selected component, buttons, keys, mouse and fingers.
 const press = (id, on) => $(id).setAttribute("aria-pressed", String(Boolean(on)));
 function hint(text) {
   $("hint").textContent = text;
@@ -36,15 +36,15 @@ const KEYS = [
   ["Space", "play, stop", () => play()],
   ["ArrowLeft", "a step back", () => onward(-1)],
   ["ArrowRight", "a step on", () => onward(1)],
-  ["r", "Reset: the whole room", () => VIEWS.reset()],
+  ["r", "Reset: the whole scene", () => VIEWS.reset()],
   ["1", "Top: from above", () => VIEWS.top()],
   ["2", "Front: from the side", () => VIEWS.front()],
   ["f", "Follow the moving camera", () => setFollow(!state.follow)],
   ["a", "ride along: look through the camera", () => setRide(!state.ride)],
   ["m", "measure", () => setMeasure(!state.measuring)],
-  ["Delete", "delete the chosen object", () => state.selected && edit(edits.delete(state.selected))],
+  ["Delete", "delete the selected object", () => state.selected && edit(edits.delete(state.selected))],
   ["u", "undo a correction", undo],
-  ["Escape", "leave: merging, measuring, riding, the chosen object", leave],
+  ["Escape", "end merging, measuring, riding; deselect", leave],
   ["?", "this help", () => $("help").open ? $("help").close() : $("help").showModal()],
 ];
 const IN_2D = ["Space", "ArrowLeft", "ArrowRight", "Delete", "u", "Escape", "?"];
@@ -93,7 +93,7 @@ $("doubtful").onchange = () => {
 };
 $("help").append(el("h2", {}, "Keys, mouse, fingers"),
   el("p", {}, "Drag turns; right button, shift or two fingers move; wheel or pinch zooms. A click "
-    + "on an object chooses it, a double click turns about it."),
+    + "on an object selects it, a double click orbits it."),
   el("dl", {}, ...KEYS.flatMap(([key, text]) => [el("dt", {}, el("kbd", {},
     { ArrowLeft: "←", ArrowRight: "→", Escape: "Esc" }[key] || key)), el("dd", {}, text)])),
   el("p", { className: "dim" }, "Sizes are width × depth × height, along the object's own axes "
@@ -101,7 +101,7 @@ $("help").append(el("h2", {}, "Keys, mouse, fingers"),
   el("div", { className: "act" }, el("button", { className: "main",
     onclick: () => $("help").close() }, "Close")));
 
-// ---- A click is a press and a release at one place ----
+// ---- A click: press and release at the same position ----
 let pressed = null;
 canvas.addEventListener("pointerdown", (e) => {
   $("show").open = false;
@@ -127,7 +127,7 @@ dark.addEventListener("change", () => {
 // ---- Start ----
 document.title = $("title").textContent = `${S.title}: ${S.objects.filter(
   (o) => o.status !== "doubtful").length} objects`
-  + (S.parts.length > 1 ? ` in ${S.parts.length} parts` : "");
+  + (S.parts.length > 1 ? ` in ${S.parts.length} components` : "");
 $("part").append(...S.parts.map(({ name }, value) => el("option", { value }, name)));
 $("part").hidden = S.parts.length < 2;
 $("doubtful").checked = S.doubtful;
@@ -136,7 +136,7 @@ objects = S.objects.map((o) => ({ ...o, ids: [o.id] }));
 if (S.why_flat || !prepare()) {
   document.body.classList.add("flat");
   $("view").prepend(el("p", { id: "why" }, `No 3D view: ${S.why_flat || "no WebGL here"}. Below: `
-    + "when each identity is seen; click one for its pictures."));
+    + "when each object is seen; click one for its pictures."));
 }
 for (const id of ["follow", "ride", "measure"]) press(id, false);
 enter(0);

@@ -4,7 +4,7 @@ function setMeasure(on) {
   state.measured = [];
   press("measure", on);
   document.body.classList.toggle("measuring", on);
-  hint(on ? "click two places on solids or points" : "");
+  hint(on ? "click two points on solids or sparse points" : "");
   redraw();
 }
 

@@ -23,7 +23,7 @@ function prepare() {                             // false where there is no WebG
   return true;
 }
 
-// ---- What is drawn ----
+// ---- Objects and points ----
 const BOX = [[-1, -1], [1, -1], [1, 1], [-1, 1]];
 const ring = (n, f) => [...Array(n).keys()].flatMap((i) =>
   [i, i + 1].map((k) => f(Math.cos(2 * Math.PI * k / n), Math.sin(2 * Math.PI * k / n)))).flat();
@@ -177,7 +177,7 @@ function fillScene() {                           // everything of the part
   fillSolids();
 }
 
-// ---- Where one looks from ----
+// ---- Viewpoint ----
 function heading() {                             // level direction in which the cameras look most
   const sum = posed.reduce((s, c) => add(s, c.forward), [0, 0, 0]);
   const flat = [sum[0], sum[1], 0];
