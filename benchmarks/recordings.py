@@ -334,9 +334,9 @@ LEAST, MOST = ("idf1", "found", "solids", "cameras"), ("false", "cm", "off", "mb
 def floors_of(figures: Figures) -> Figures:
     """Return the bounds that figures like these must keep.
 
-    Half a pixel in the boxes, another order of sums on another processor, moves one or two objects
-    (examples/real_rooms.py --noises): so one object in ten and at least one, IDF1 .03, a camera in
-    twenty, half of an error and a bit, half of the memory.
+    Half a pixel of box noise, or another order of sums on another processor, changes one or two
+    objects (benchmarks/real_rooms.py --noises). The margins: one object in ten and at least one,
+    IDF1 .03, one camera in twenty, half of an error and a constant, half of the memory.
     """
     if figures["exit"]:
         return {}

@@ -28,6 +28,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import glob
 import hashlib
 import json
 import os
@@ -35,15 +36,13 @@ import shlex
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
-from reobj.files import atomic
-from reobj.sources.video import source_fingerprint
 
 ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = ("path", "out", "detections", "poses", "tracks", "options", "command")
@@ -105,13 +104,28 @@ def make_item(row: dict[str, str], folder: Path, results: Path) -> Item:
     given = [part for k in FILES if k in paths for part in (f"--{k}", paths[k])]
     argv = (row.get("command", "run"), paths["path"], "-o", out, *given,
             *shlex.split(row.get("options", "")))  # fmt: skip
-    inputs = {k: source_fingerprint(path) for k, path in paths.items()}
+    inputs = {k: fingerprint(Path(path)) for k, path in paths.items()}
     text = json.dumps([rt.__version__, inputs, argv])
     return Item(name, paths["path"], out, argv, hashlib.sha256(text.encode()).hexdigest())
 
 
+def fingerprint(path: Path) -> list[tuple[str, int, int]]:
+    """List name, size and time of a file, of a folder's files, or of the matches of a pattern."""
+    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path)))
+    files = [path] if path.is_file() else sorted(p for p in found if p.is_file())
+    return [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yield a temporary path that replaces `path` when the block ends without an exception."""
+    part = path.with_name(f".part-{path.name}")
+    yield part
+    part.replace(path)
+
+
 def finished(item: Item) -> dict[str, Any] | None:
-    """What a finished video's marker says; None if it has none, or one of other options."""
+    """Return the result of a finished video; None if its files, options or version changed."""
     try:
         marker = json.loads((Path(item.out) / MARKER).read_text())
     except (OSError, ValueError):
@@ -124,8 +138,6 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
     """Run one video in a worker, unless a worker that was killed since has finished it."""
     sys.path.insert(0, root)
     import reobj_track as rt
-    from reobj.files import atomic
-    from reobj.types import without_secrets
 
     if done := finished(item):
         return done
@@ -145,9 +157,8 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
         return {"status": "failed", "error": last[-1].removeprefix("error: ")}
     result = {"status": "done", "error": "", "seconds": round(time.monotonic() - started, 1)}
     result |= facts(rt.Result.load(out))
-    argv = list(map(without_secrets, item.argv))
-    with atomic(out / MARKER) as part:
-        part.write_text(json.dumps({"key": item.key, "argv": argv, "result": result}))
+    with replaced(out / MARKER) as part:
+        part.write_text(json.dumps({"key": item.key, "result": result}))
     return result
 
 
@@ -234,7 +245,7 @@ class Batch:
                      "attempts": self.attempts[item.name]}  # fmt: skip
             row = known | self.rows.get(item.name, {})
             rows.append({k: row.get(k) for k in SUMMARY})
-        with atomic(self.results / "summary.csv") as part, part.open("w", newline="") as file:
+        with replaced(self.results / "summary.csv") as part, part.open("w", newline="") as file:
             writer = csv.DictWriter(file, SUMMARY, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)

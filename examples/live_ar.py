@@ -8,7 +8,7 @@
 The device is simulated from a recording (video file or folder, poses in any format that `run`
 takes, detections from a file or an ONNX detector); nothing looks ahead. Printed: what a frame
 costs (median and 95th percentile) in the tracker, which embeds and fits too, and with the detector.
-Written: OUT/tracks.txt (MOTChallenge), OUT/live_objects.json and OUT/objects.ply (ellipsoids).
+Written: OUT/tracks.txt (MOTChallenge) and OUT/live_objects.json (ellipsoids).
 """
 
 from __future__ import annotations
@@ -25,9 +25,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
 import reobj_track as rt
-from reobj.files import atomic
-from reobj.results.folder import write_mot
-from reobj.results.ply import write_ply
 
 ROOM = Path(__file__).resolve().parent / "room"
 
@@ -76,13 +73,11 @@ def facts(tracker: rt.Tracker, seconds: list[tuple[float, float]]) -> str:
     )
 
 
-def objects_of(
-    tracker: rt.Tracker, names: tuple[str, ...]
-) -> tuple[quadrics.Ellipsoids, list[dict[str, Any]]]:
-    """Ellipsoids of the objects of known place, and one entry each for the JSON file."""
+def objects_of(tracker: rt.Tracker, names: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Make the JSON entries of the objects whose ellipsoid is known."""
     known = np.flatnonzero(tracker.places.known[: len(tracker.last_seen)])
     solids, _ = quadrics.Ellipsoids.from_dual_quadrics(tracker.places.dual_q[known])
-    entries = [
+    return [
         {
             "id": int(i) + 1,
             "category": names[tracker.identity_class[i]],
@@ -94,7 +89,15 @@ def objects_of(
         }
         for k, i in enumerate(known)
     ]
-    return solids, entries
+
+
+def write_mot(path: Path, tracks: rt.Tracks) -> None:
+    """Write MOTChallenge rows: frame (from 1), id, left, top, width, height, score, -1, -1, -1."""
+    size = tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]
+    rows = np.column_stack(
+        [tracks.frame + 1, tracks.track_id, tracks.xyxy[:, :2], size, tracks.score]
+    )
+    np.savetxt(path, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -124,12 +127,10 @@ def main(argv: list[str] | None = None) -> int:
     except rt.ReobjError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    solids, entries = objects_of(tracker, tuple(detect.class_names))
+    objects = objects_of(tracker, tuple(detect.class_names))
     args.out.mkdir(parents=True, exist_ok=True)
     write_mot(args.out / "tracks.txt", tracks)
-    with atomic(args.out / "live_objects.json") as part:
-        part.write_text(json.dumps(entries, indent=1))
-    write_ply(args.out / "objects.ply", solids, [e["id"] for e in entries])
+    (args.out / "live_objects.json").write_text(json.dumps(objects, indent=1))
     print(f"{len(seconds)} frames: {facts(tracker, seconds)}")
     return 0
 

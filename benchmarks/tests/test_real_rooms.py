@@ -1,4 +1,4 @@
-"""examples/real_rooms.py: its scores on hand-made results, and a whole run of a simulated walk."""
+"""benchmarks/real_rooms.py: scores of hand-made results, and a whole run of a simulated walk."""
 
 from __future__ import annotations
 

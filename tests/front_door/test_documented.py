@@ -86,8 +86,8 @@ LONG = {  # scripts that take long, or data that is not here: their words are co
 
 
 def long_script(command: str) -> str | None:
-    """The example that a command calls, if it is one of those that take long."""
-    found = re.search(r"python examples/(\w+)\.py", command)
+    """Name the script that a command calls, if it is one of those that take long."""
+    found = re.search(r"python benchmarks/(\w+)\.py", command)
     every = {name for names in LONG.values() for name in names}
     return found[1] if found and found[1] in every else None
 
@@ -98,7 +98,7 @@ def long_script(command: str) -> str | None:
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder of a reader, in a checkout."""
-    for path in (*ROOT.glob("*.*"), ROOT / "examples", ROOT / "reobj"):
+    for path in (*ROOT.glob("*.*"), *(ROOT / n for n in ("benchmarks", "examples", "reobj"))):
         (tmp_path / path.name).symlink_to(path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -372,7 +372,7 @@ SHOWN = {
     TOOL + "run phone.mp4 -o out --detector mine.onnx --set detect.class_names=names.txt": Shown(
         mine, detected, f"--every 6 --stop 120 {SUPPLIED} {QUICKLY}"
     ),
-    "python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
+    "python benchmarks/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
         output, nothing, "", {"OUT...": "out", "gt.txt...": "gt.txt"}, "out"
     ),
     "python examples/live_ar.py -o OUT": Shown(recording, nothing, "--frames 20", NAMED),
@@ -393,15 +393,20 @@ def all_documented() -> list[tuple[str, str]]:
     return [(c, page_name(p)) for p in PAGES for c in commands_of(p)]
 
 
-SCRIPTS = [p.stem for p in sorted((ROOT / "examples").glob("*.py")) if "__main__" in p.read_text()]
+SCRIPTS = {
+    path.stem: path
+    for folder in ("examples", "benchmarks")
+    for path in sorted((ROOT / folder).glob("*.py"))
+    if "__main__" in path.read_text()
+}
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_example_says_how_it_is_used(
+def test_every_script_says_how_it_is_used(
     script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """And knows the flags that the docs call it with."""
-    path = ROOT / "examples" / f"{script}.py"
+    path = SCRIPTS[script]
     monkeypatch.setattr(sys, "argv", [str(path), "--help"])
     monkeypatch.syspath_prepend(path.parent)
     with pytest.raises(SystemExit) as ended:

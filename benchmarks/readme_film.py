@@ -3,7 +3,7 @@
 
     python reobj_track.py run examples/room/room.mp4 -o OUT \
         --detections examples/room/detections.npz
-    python examples/readme_film.py OUT -o docs/img/room.webp
+    python benchmarks/readme_film.py OUT -o docs/img/room.webp
 
 Takes every 4th frame of OUT's overlay, 480 pixels wide: below 1 MB for the example clip.
 """

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Measure re-identification: Rank-k, mAP, twins, by view angle and by time gap.
 
-    python examples/rank_k.py --rooms 900 901 902 903 904 --recording redkitchen_7scenes \\
+    python benchmarks/rank_k.py --rooms 900 901 902 903 904 --recording redkitchen_7scenes \\
         --models mobilenetv2_feat --person osnet_x0_25_msmt17 -o OUT
 
 writes OUT/rank_k.csv, by_bin.csv, counts.csv, cost.csv and plots, and prints Markdown tables.

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Compare identities on the same detections: ours, DeepSORT and today's trackers.
 
-    python examples/compare_deepsort.py --peers build/peers --rooms reporting --mot mot -o OUT
-    python examples/compare_deepsort.py --peers build/peers --rooms choosing --tune -o OUT
+    python benchmarks/compare_deepsort.py --peers build/peers --rooms reporting --mot mot -o OUT
+    python benchmarks/compare_deepsort.py --peers build/peers --rooms choosing --tune -o OUT
 
 Writes OUT/compare.html (all of it on one page), compare.csv, compare_*.png; prints Markdown tables.
 The same settings for all sequences; every tracker's rows are the detections it gave an identity to,

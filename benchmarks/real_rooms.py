@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Score the whole chain on recordings of rooms whose objects are known, in one table.
 
-    python examples/real_rooms.py DATA -o OUT --choosing [--only NAME...] [--seeds 901 902]
-    python examples/real_rooms.py DATA -o OUT --choosing --without all --noises 3 # one by one
-    python examples/real_rooms.py DATA -o OUT --choosing --docs docs   # fills in docs/tracking.md
+    python benchmarks/real_rooms.py DATA -o OUT --choosing [--only NAME...] [--seeds 901 902]
+    python benchmarks/real_rooms.py DATA -o OUT --choosing --without all --noises 3 # one by one
+    python benchmarks/real_rooms.py DATA -o OUT --choosing --docs docs   # fills in docs/tracking.md
 
 DATA holds hololens_kitchen, redkitchen_7scenes, office_loop, livingroom13 and studio_room; the
 example clip and rendered rooms (of --seeds, made by render_room.py) need none. All of these but
@@ -69,7 +69,7 @@ from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
 from reobj.views import Views
 
-ROOM = Path(__file__).resolve().parent / "room"
+ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
 YOLO, FEMTO, RECORDED = "detections_yolov8s.csv", "detections_femto.csv", "detections.npz"
 TRUE = "true_boxes.csv"
 DETECTOR = rt.DetectConfig(model="deimv2-femto")  # the default one cannot be had everywhere

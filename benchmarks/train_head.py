@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Train a head for a frozen backbone of `reobj_track.py`, such as MobileNetV2's ImageNet weights.
 
-    python examples/train_head.py -o OUT --backbone mobilenetv2_feat --rooms 1008:1193 ...
+    python benchmarks/train_head.py -o OUT --backbone mobilenetv2_feat --rooms 1008:1193 ...
 
 writes OUT/mobilenetv2_feat_head.onnx, two vectors an object from the cells of one pass over the
 frame, or with --crops OUT/SETUP/crops_mobilenetv2_feat_head.onnx, re-OBJ's ConvBlock on two masked

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Train and test re-OBJ's four setups on one recording, in three folds of its objects.
 
-    python examples/reobj_folds.py redkitchen_7scenes --backbone resnet50v2_gluon_s3.onnx \\
+    python benchmarks/reobj_folds.py redkitchen_7scenes --backbone resnet50v2_gluon_s3.onnx \\
         --choosing -o OUT
 
 prints Rank-1, 5, 10, 20 of full, fg, bg and concat, not trained and trained, and writes them with

@@ -1,8 +1,8 @@
 """Make a priors.json from a folder of CAD meshes or from a table of sizes.
 
 Usage:
-    python examples/build_priors.py MESHES/ -o priors.json --up y   # MESHES/<category>/*.obj
-    python examples/build_priors.py sizes.csv -o priors.json        # category, w, d, h in metres
+    python examples/own_priors.py MESHES/ -o priors.json --up y   # MESHES/<category>/*.obj
+    python examples/own_priors.py sizes.csv -o priors.json        # category, w, d, h in metres
 
 Meshes (obj, ply, glb, stl, off) must be in metres (--scale multiplies) and stand upright: --up
 names the vertical axis (up y: w = x, d = z; up z: w = x, d = y). Sizes are modelled as log-normal,

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Ellipsoids of real objects beside the true ones: by solver and category, and by tracker.
 
-    python examples/real_solids.py solvers FOLDER... -o OUT [--choosing] [--picture FILE]
-    python examples/real_solids.py identities FOLDER... -o OUT --peers build/peers [--own-cameras]
+    python benchmarks/real_solids.py solvers FOLDER... -o OUT [--choosing] [--picture FILE]
+    python benchmarks/real_solids.py identities FOLDER... -o OUT --peers build/peers [--own-cameras]
 
 What was used for choosing (splits.json) is left out; --choosing shows it, marked.
 

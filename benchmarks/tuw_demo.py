@@ -1,7 +1,7 @@
 """The LfD authors' own demo (TUW: 6 objects, 8 views) with LfD and with fit_objects.
 
 Usage:
-    python examples/tuw_demo.py FOLDER [-o docs]
+    python benchmarks/tuw_demo.py FOLDER [-o docs]
 
 FOLDER holds bounding_boxes.npy (8, 24), camera_poses.npy (32, 3), intrinsics.npy (3, 3) and gt.npy
 (6, 4, 4) of IIT-PAVIS/LfD, Data/Aldoma (MIT; data after Aldoma et al., IROS 2014). The data is not

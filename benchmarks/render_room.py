@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Render hand-held videos of furnished rooms with exact ground truth, on the CPU.
 
-    python examples/render_room.py -o DIR --seed 0 --frames 240
+    python benchmarks/render_room.py -o DIR --seed 0 --frames 240
 
 writes `room.mp4`, `detections.npz` (detector-like boxes with masks), `gt_mot.txt`,
 `gt_objects.json`, `poses.txt` (TUM) and `camera.txt` (COLMAP). Needs numpy and OpenCV only; same

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Time the tracker alone and measure whether identities survive a long absence, ours and others.
 
-    python examples/benchmark.py                      # ours only
-    python examples/benchmark.py --peers build/peers  # with peers, each set in a venv made there
-    python examples/benchmark.py --embedding VIDEO... # what the embedding adds to the detector
+    python benchmarks/benchmark.py                      # ours only
+    python benchmarks/benchmark.py --peers build/peers  # with peers, each set in a venv made there
+    python benchmarks/benchmark.py --embedding VIDEO... # what the embedding adds to the detector
 
 Streams are synthetic and seeded, the same for every tracker: 500 frames of 1920x1080, boxes and
 ready-made embeddings, camera motion compensation off, nothing but the tracker's own update timed.

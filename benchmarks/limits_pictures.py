@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Make the pictures of docs/limits.md from the example clip, whose truth is known.
 
-    python examples/limits_pictures.py -o docs/img        # needs matplotlib; about a minute
+    python benchmarks/limits_pictures.py -o docs/img        # needs matplotlib; about a minute
 
 limits_views.png   a table and its chairs from above, from 6, 24 and all frames, and the truth
 limits_hidden.jpg  a chair that is only seen behind the table: truth, detection, fitted solid
@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 
-ROOM = Path(__file__).resolve().parent / "room"
+ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
 CAMERA = "492.756788421,492.756788421,320,240"
 K = np.array([[492.756788421, 0, 320], [0, 492.756788421, 240], [0, 0, 1]])
 Entry = dict[str, Any]

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Compare the files of `run` by two checkouts of reobj_track, byte for byte.
 
-    python examples/same_results.py OLD_CHECKOUT NEW_CHECKOUT -o OUT [--data FOLDER...]
+    python benchmarks/same_results.py OLD_CHECKOUT NEW_CHECKOUT -o OUT [--data FOLDER...]
 
 Runs both checkouts on examples/room and on every FOLDER (with `images/` and
 `detections_yolov8s.csv`), each with its defaults, and compares every file of the output folders but

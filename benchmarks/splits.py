@@ -34,7 +34,7 @@ def usable(kind: str, name: str, choosing: bool, tune: bool = False) -> bool:
     if held_out(kind, name) != tune or (choosing and not tune):
         return True
     why = "is for reporting" if tune else "is not for reporting; --choosing shows it, marked"
-    print(f"left out (examples/splits.json): {name} {why}", file=sys.stderr)
+    print(f"left out (benchmarks/splits.json): {name} {why}", file=sys.stderr)
     return False
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Show the worst identity errors of runs beside the truth, each with its likely cause.
 
-    python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg [--classes chair,cup]
+    python benchmarks/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg [--classes chair,cup]
 
 An error is a true object that carries, for some frames, an identity that does not stand for it
 (`identity_map`): either a second identity of its own (split), or the identity of another object

@@ -1,7 +1,7 @@
 """How far the metric scale that size priors give lies from the truth, and whether its sigma holds.
 
 Usage:
-    python examples/scale_table.py DATA [--choosing] [-o docs]
+    python benchmarks/scale_table.py DATA [--choosing] [-o docs]
 
 Recordings with metric poses are scaled by a random factor and handed to `quadrics.fit_objects` with
 metric=False; its `Scale` must undo the factor. No detector and no picture is needed: rooms of

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Train the embedding of `reobj_track.py`: one small backbone pass a frame, two parts an object.
 
-    python examples/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
+    python benchmarks/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
 
 writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`; the checkpoint of the
 best validation, OUT/best.pt), OUT/last.pt (go on with --resume), OUT/log.csv and OUT/curves.png.

@@ -1,7 +1,7 @@
 """Measure quadrics.py on synthetic scenes with known truth: tables and plot of docs/quadrics.md.
 
 Usage:
-    python examples/synthetic_quadrics.py [--quick] [--only NAME ...] [-o docs]
+    python benchmarks/synthetic_quadrics.py [--quick] [--only NAME ...] [-o docs]
 
 Prints each table and, with -o, writes it between its markers in docs/quadrics.md.
 

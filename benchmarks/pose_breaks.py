@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
 """Break good recordings, reconstruct their cameras, and count what passes as good.
 
-    python examples/pose_breaks.py -o OUT [--data FOLDER] [--cases 216] [--jobs 2] [--only KIND...]
-    python examples/pose_breaks.py -o OUT mirrored_half-009      # these cases; pictures are kept
+    python benchmarks/pose_breaks.py -o OUT [--data FOLDER] [--cases 216] [--jobs 2]
+        [--only KIND...]
+    python benchmarks/pose_breaks.py -o OUT mirrored_half-009      # these cases; pictures are kept
 
 Writes OUT/results.jsonl, a line for every case; a second call goes on from there. What is cut from
 the recordings, and the poses of whole recordings that have no truth, are made once and kept
@@ -416,7 +417,7 @@ SMALL = rr.RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, li
 
 
 def rendered(seed: int, path: str, frames: int, plan: str = "home", today: int = 0) -> Recording:
-    """Describe a clip of examples/render_room.py, small; a turn is one on the spot exactly."""
+    """Describe a clip of benchmarks/render_room.py, small; a turn is one on the spot exactly."""
     shake_m = 0.0 if path == "turn" else SMALL.shake_m
     room = replace(SMALL, seed=seed, path=path, frames=frames, plan=plan, shake_m=shake_m)
     return Recording(room=room, today=today, plan="" if plan == "varied" else plan)
