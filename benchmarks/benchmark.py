@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Time the tracker alone and measure whether identities survive a long absence, ours and others.
+"""Time the update of our tracker and of others, and measure re-identification after long absences.
 
-    python benchmarks/benchmark.py                      # ours only
-    python benchmarks/benchmark.py --peers build/peers  # with peers, each set in a venv made there
-    python benchmarks/benchmark.py --embedding VIDEO... # what the embedding adds to the detector
+    python benchmarks/benchmark.py                      # our tracker only
+    python benchmarks/benchmark.py --peers build/peers  # also others, in venvs made there
+    python benchmarks/benchmark.py --embedding VIDEO... # cost of the embedding
 
-Streams are synthetic and seeded, the same for every tracker: 500 frames of 1920x1080, boxes and
-ready-made embeddings, camera motion compensation off, nothing but the tracker's own update timed.
+The streams are synthetic, seeded and the same for every tracker: 500 frames of 1920x1080 with boxes
+and precomputed embeddings. Camera motion compensation is off; only the tracker's update is timed.
   steady    objects cross the picture and are replaced; misses, occlusions, low scores, clutter
   revisit   every object vanishes for 200-260 frames and returns at least 400 px away
   hard      revisit with look-alikes, noisier embeddings and an appearance shifted at the return

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Change operators and constants of the core one at a time: do the tests notice?
+"""Mutation testing: change operators and constants one at a time and count what no test detects.
 
     python benchmarks/mutate.py -o OUT [--count 250] [--seed 0] [--only FILE...] [--jobs 2]
 
-A copy of the checkout is changed, never the checkout. First the tests of FILES run once, traced:
-which lines of the core does each execute, and how long does it take? Then, for each changed place
-(drawn by the seed among the lines that some test executes, alike over the modules), the tests that
-execute its line run until one fails: the change is killed. Tests longer than --longest seconds are
-left out. Prints the share of killed changes of each module, and those that survived;
-OUT/mutants.json holds them all. What survives may be the same program (`<` for `<=` where equality
-never happens), a tuning constant, or a hole in the tests: only reading decides.
+A copy of the checkout is changed, never the checkout. First the tests of FILES run once with a
+tracer that records the lines executed by each test and its run time. Mutants are drawn by the seed
+among the covered lines, equally over the modules. For each mutant, the tests that cover its line
+run until one fails: the mutant is killed. Tests longer than --longest seconds are left out. Prints
+the fraction of killed mutants by module and the survivors; OUT/mutants.json lists all of them. A
+survivor may be an equivalent program (`<` for `<=` where equality never occurs), a tuning constant,
+or a gap in the tests; this needs reading.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Make README's moving picture of the overlay of a run: docs/img/room.webp.
+"""Make README's animated overlay, docs/img/room.webp, from the output folder of a run.
 
     python reobj_track.py run examples/room/room.mp4 -o OUT \
         --detections examples/room/detections.npz
     python benchmarks/readme_film.py OUT -o docs/img/room.webp
 
-Takes every 4th frame of OUT's overlay, 480 pixels wide: below 1 MB for the example clip.
+Uses every 4th frame of OUT's overlay, 480 pixels wide: below 1 MB for the example clip.
 """
 
 from __future__ import annotations

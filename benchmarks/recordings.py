@@ -1,22 +1,23 @@
 #!/usr/bin/env python3
-"""Run the command line on every recording with images, and hold the figures against floors.
+"""Run the command line on every recording with images and check the scores against thresholds.
 
     python benchmarks/recordings.py DATA [-o OUT] [--only NAME...] [--long] [--jobs 2]
         [--write-floors]
 
 Every row is one command, as a user types it, in a process of its own: with the small detector
-(--detector fast, weights in REOBJ_MODELS) and with recorded boxes, with the tool's own cameras and
-with supplied ones. benchmarks/truth.py compares the output files with the truth. The exit code is 1
-when a command fails or a figure misses its floor in recordings.json beside this file; seconds are
-only printed. --write-floors writes them anew from this run, with the margins of `floors_of`.
+(--detector fast, weights in REOBJ_MODELS) or recorded boxes, and with reconstructed or supplied
+cameras. benchmarks/truth.py compares the output files with the ground truth. The exit code is 1
+if a command fails or a score misses its threshold in recordings.json beside this file; run times
+are only printed. --write-floors derives new thresholds from this run with the margins of
+`floors_of`.
 
     IDF1     boxes of tracks.txt; overlap .5 (.4 on office_loop, livingroom13 and studio_room, .3 on
              hololens_kitchen, whose truth is of whole objects)
-    found    true objects that some listed object shows, of those that are long enough in view;
+    found    true objects matched by a listed object, of those that are in view for long enough;
              bonsai, apple, teddybear: true objects of the classes whose number is known
-    false    listed objects of annotated classes that show none, or one that is listed already
-    solids   true objects with a solid of their class in reach (.35 m, or a third of the longest
-             side), of all those annotated in 3D; cm: median error of their centres
+    false    listed objects of annotated classes that match no true object, or one already matched
+    solids   true objects with a shape of their class within .35 m, or a third of the longest side,
+             of all those annotated in 3D; cm: median error of their centres
     cameras  frames with a pose, of those read; off: median error of the centres, own cameras after
              a similarity, in % of the extent of the path
     MB       peak memory of the largest process of the command

@@ -1,6 +1,6 @@
-"""Scenes with labelled detections, for the measures of re-identification (rank_k.py).
+"""Load scenes with labelled detections for the re-identification benchmark (rank_k.py).
 
-Rendered rooms, recordings with annotated or clustered identities, ScanNet and Matterport3D.
+Sources: rendered rooms, recordings with annotated or clustered identities, ScanNet, Matterport3D.
 """
 
 from __future__ import annotations

@@ -10,12 +10,13 @@ seed, same bytes (the video file itself depends on the codec of the OpenCV build
 
 How it works:
   1. `make_room`: a seeded floor plan (`--plan varied --path tour`: another room, other sets of
-     twins, another look and walk for every seed, as training needs); furniture from textured
-     parallelograms, discs, spheres and frustums ("patches"); procedural textures in one atlas;
-     light baked by marching through voxels.
+     identical instances, another look and walk for every seed, for training); furniture made of
+     textured parallelograms, discs, spheres and frustums ("patches"); procedural textures in one
+     atlas; light baked by ray marching through voxels.
   2. `camera_path`: a smooth walk with hand shake that leaves its first view and returns.
-  3. `render`: per patch, 1/z, s/z, t/z are linear in the pixel (quads) or follow from a root of ray
-     and quadric (round parts); z-buffer at twice the size, then one texture and one light look-up.
+  3. `render`: per patch, 1/z, s/z, t/z are linear in the pixel (quads) or follow from the
+     intersection of ray and quadric (round patches); z-buffer at twice the resolution, then one
+     texture and one light look-up.
   4. `photograph`: motion blur along the true image flow, exposure drift, vignette, sensor noise.
   5. `ground_truth`, `simulate_detections`, writers.
 

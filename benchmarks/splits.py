@@ -1,6 +1,7 @@
-"""What may be reported and what was chosen on: `splits.json`, obeyed by the scripts that report.
+"""Data splits: `splits.json` lists data for reporting and data used for choosing.
 
-What is not named for reporting is left out, with a line on stderr; --choosing shows it, marked.
+Scripts that report leave out all data not listed for reporting, with a line on stderr; --choosing
+includes it, marked.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train the embedding of `reobj_track.py`: one small backbone pass a frame, two parts an object.
+"""Train the embedding of `reobj_track.py`: one backbone pass a frame, two vectors an object.
 
     python benchmarks/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
 
@@ -7,24 +7,24 @@ writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`; th
 best validation, OUT/best.pt), OUT/last.pt (go on with --resume), OUT/log.csv and OUT/curves.png.
 Needs `pip install torch matplotlib onnx`; the GPU is used when there is one.
 
-What it learns from; every source may be given several times:
-  --rooms A:B           seeds of rendered rooms with sets of identical twins (render_room.py
+Training data; every source may be given several times:
+  --rooms A:B           seeds of rendered rooms with sets of identical instances (render_room.py
                         `--plan varied --path tour`), rendered on the fly into --cache.
-  --sparse IMAGES=DIR   self-supervision of poses: a COLMAP model of the images, such as `sparse/`
+  --sparse IMAGES=DIR   self-supervision from poses: a COLMAP model of the images, such as `sparse/`
                         of an output folder of `run`. A ball around a 3D point is a pseudo-object:
-                        the views that observe the point show the same place from another side.
+                        the views that observe the point show it from different directions.
   --tracks IMAGES=FILE  `tracks.txt` of `run` (MOTChallenge): identity by 3D object. Masks
                         are those of the detector (OUT/cache, or a detections .npz beside FILE).
   --scannet DIR         a scene in ScanNet's or Matterport3D's layout, as reid_scenes.py reads it.
 Validation: --val-rooms A:B, --val-sparse.
 
-Method: each step takes several scenes and several views of each, and changes every picture as
-phones do (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of
-masks half of the time). Triplet loss on cosines of (foreground, background) together and of each
-alone; for every anchor and positive the negative is the soft maximum of all (mostly an identical
-twin elsewhere in the room), with --loss triplet semi-hard (the nearest of those further than the
-positive), or with --loss hardest the nearest of all of the batch. From --hard-after on negatives
-are of the same scene only, and semi-hard ones become the nearest.
+Method: each step takes several scenes and several views of each, and augments every image
+(colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of masks half of
+the time). Triplet loss on cosines of (foreground, background) together and of each alone. For every
+anchor and positive the negative is the soft maximum over all (mostly an identical instance
+elsewhere in the room); with --loss triplet it is semi-hard (the nearest of those further away than
+the positive), with --loss hardest the nearest of the batch. After --hard-after steps negatives are
+from the same scene only, and semi-hard ones become the nearest.
 Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
 al., MobileNetV2, CVPR 2018 (inverted residual); Izmailov et al., UAI 2018 (--average).
 

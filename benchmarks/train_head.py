@@ -3,14 +3,14 @@
 
     python benchmarks/train_head.py -o OUT --backbone mobilenetv2_feat --rooms 1008:1193 ...
 
-writes OUT/mobilenetv2_feat_head.onnx, two vectors an object from the cells of one pass over the
-frame, or with --crops OUT/SETUP/crops_mobilenetv2_feat_head.onnx, re-OBJ's ConvBlock on two masked
-crops an object (use: `--embed mobilenetv2_feat` or `--embed crops`, with `--set embed.head=FILE`),
-beside checkpoints, log and curves as of `train_embedding.py`, whose sources, augmentation, loss and
-validation these are. What the backbone shows of every scene is computed once and kept in the cache.
+writes OUT/mobilenetv2_feat_head.onnx (two vectors an object from the cells of one pass over the
+frame) or, with --crops, OUT/SETUP/crops_mobilenetv2_feat_head.onnx (re-OBJ's ConvBlock on two
+masked crops an object), with checkpoints, log and curves. Use them with `--embed mobilenetv2_feat`
+or `--embed crops`, and `--set embed.head=FILE`. Sources, augmentation, loss and validation are
+those of `train_embedding.py`. The backbone's features of every scene are computed once and cached.
 As published, the maps of foreground and background are concatenated and merged by one ConvBlock;
---merge rows gives each crop a block of its own and joins their rows, as in the weights that come
-along. `reobj_folds.py` trains and tests re-OBJ's setups on one recording.
+--merge rows gives each crop a block of its own and concatenates the two embeddings, as in the
+bundled weights. `reobj_folds.py` trains and tests re-OBJ's setups on one recording.
 Ref: Bansal et al., re-OBJ, ICIAP 2019 (ConvBlock).
 """
 

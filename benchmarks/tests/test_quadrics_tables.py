@@ -1,4 +1,4 @@
-"""benchmarks/synthetic_quadrics.py and tuw_demo.py: tables of docs/quadrics.md."""
+"""benchmarks/synthetic_quadrics.py and tuw_demo.py: tables are written, faults are errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import tuw_demo
 def test_a_table_is_written_between_its_markers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = tmp_path / "quadrics.md"
+    page = tmp_path / "RESULTS.md"
     page.write_text("head\n<!-- table cuboids -->\nold\n<!-- end cuboids -->\ntail\n")
     assert synthetic_quadrics.main(["--quick", "--only", "cuboids", "-o", str(tmp_path)]) == 0
     text = page.read_text()
