@@ -659,14 +659,19 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
     parser.add_argument(
-        "--rooms", default="", metavar="SEEDS", help="e.g. 1,v900; or `reporting`, `choosing`"
+        "--rooms",
+        default="",
+        metavar="SEEDS",
+        help="seeds, e.g. 1,v900; or `reporting`, `choosing`",
     )
-    parser.add_argument("--recordings", type=Path, nargs="*", default=[], help="folders")
+    parser.add_argument(
+        "--recordings", type=Path, nargs="*", default=[], help="folders of recordings"
+    )
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
-    parser.add_argument("--every", type=int, default=1, help="use every n-th frame: wide steps")
+    parser.add_argument("--every", type=int, default=1, help="use every n-th frame")
     add_choosing(parser)
     parser.add_argument("--tune", action="store_true", help="find the best settings of the peers")
-    parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")
+    parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to replace")
     parser.add_argument("-o", "--out", type=Path, required=True)
     return parser
 

@@ -229,9 +229,9 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path, nargs="+", help="output folders of run or track")
-    parser.add_argument("--gt", type=Path, nargs="+", required=True, help="their truths (MOT)")
+    parser.add_argument("--gt", type=Path, nargs="+", required=True, help="their truth (MOT)")
     parser.add_argument("-o", "--image", type=Path, required=True, help="picture to write")
-    parser.add_argument("--classes", default="", help="only these")
+    parser.add_argument("--classes", default="", help="comma-separated class names (default: all)")
     parser.add_argument("--limit", type=int, default=8, help="errors shown")
     args = parser.parse_args()
     if len(args.gt) != len(args.out):

@@ -826,12 +826,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("names", nargs="*", help="only these cases, e.g. turn-003; files are kept")
+    parser.add_argument("names", nargs="*", help="only these cases, e.g. turn-003; keep files")
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--cache", type=Path, help="clips and references (default OUT/cache)")
-    parser.add_argument("--cases", type=int, default=216, help="broken ones (default 216)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--cases", type=int, default=216, help="corrupted cases (default 216)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once (default 2)")
     parser.add_argument("--only", nargs="*", default=[], choices=[*KINDS, "issue", "good"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_CASES} cases, own data only")

@@ -896,25 +896,25 @@ def build_parser() -> argparse.ArgumentParser:
     add("--depth", type=Path, nargs="*", default=[], metavar="DIR")
     add("--scannet", type=Path, nargs="*", default=[], metavar="DIR")
     add("--detect", default="", metavar="MODEL",
-        help="a detector's boxes, associated with the labelled ones, instead of these")  # fmt: skip
+        help="use a detector's boxes, associated with the labelled ones")  # fmt: skip
     add("--pictures", type=int, default=0, metavar="N",
         help="draw N queries of each set with their best five matches")  # fmt: skip
-    add("--cache", type=Path, default=Path("build/rank_k"), help="for rendered rooms")
+    add("--cache", type=Path, default=Path("build/rank_k"), help="folder for rendered rooms")
     add("--every", type=int, default=6, help="use every n-th frame (default %(default)s)")
     add("--away", type=int, default=30, help="frames that count as away (default %(default)s)")
     add("--models", nargs="*", default=["reobj"], help="appearance models (default %(default)s)")
-    add("--person", nargs="*", default=[], help="networks for the plain box (DeepSORT's way)")
+    add("--person", nargs="*", default=[], help="networks for the plain box, as in DeepSORT")
     add("--calibrate", type=int, nargs="*", default=[], metavar="SEED",
-        help="fit the constants of the probability on these rooms, print them")  # fmt: skip
+        help="fit the constants of the match probability to these rooms, print them")  # fmt: skip
     add("--blocks", type=Path, metavar="DIR",
         help="ConvBlocks of single crops: DIR of train_head.py --crops --setups")  # fmt: skip
     add_choosing(parser)
     add("--no-crops", action="store_true", help="leave out the slow crop references")
     add("--weight", type=float, default=rt.TrackerConfig().foreground_weight,
-        help="share of the foreground in concat (default %(default)s)")  # fmt: skip
+        help="weight of the foreground in concat (default %(default)s)")  # fmt: skip
     add("--views", type=int, default=0, help="ScanNet: images of each instance (0: all)")
-    add("--min-mask", type=int, default=0, help="ScanNet: pixels of a scored mask")
-    add("--min-side", type=float, default=0, help="ScanNet: side of a scored box")
+    add("--min-mask", type=int, default=0, help="ScanNet: minimum pixels of a mask")
+    add("--min-side", type=float, default=0, help="ScanNet: minimum side of a box, px")
     return parser
 
 

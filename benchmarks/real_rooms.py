@@ -883,14 +883,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("data", type=Path, help="folder of the recordings")
     add("-o", "--out", type=Path, required=True, help="folder for the runs and the tables")
     text = "\n".join(f"{c.name:<14} {', '.join(c.title)}" for c in CASES)
-    add("--only", nargs="+", default=[], metavar="NAME", help=f"beginnings of names:\n{text}")
+    add("--only", nargs="+", default=[], metavar="NAME", help=f"prefixes of names:\n{text}")
     add("--seeds", nargs="*", type=int, default=[], help="also rooms rendered with these seeds")
-    text = "leave these out in turn: all, " + ", ".join(WITHOUT)
+    text = "mechanisms to turn off one after the other: all, " + ", ".join(WITHOUT)
     add("--without", nargs="+", default=[], metavar="NAME", help=text)
     add_choosing(parser)
     text = "fill in FOLDER/RESULTS.md and draw the picture in FOLDER/img"
     add("--results", "--docs", type=Path, metavar="FOLDER", help=text)
-    text = "make the objects N times, of boxes half a pixel off, and give means"
+    text = "estimate the objects N times with box noise of half a pixel, print means"
     add("--noises", type=int, default=0, metavar="N", help=text)
     add("--jobs", type=int, default=1, help="processes at once")
     args = parser.parse_args(argv)

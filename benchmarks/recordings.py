@@ -398,11 +398,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add: Callable[..., Any] = parser.add_argument
     add("data", type=Path, help="folder of the recordings")
-    add("-o", "--out", type=Path, help="keep the output folders here (default: nowhere)")
-    add("--only", nargs="+", default=[], metavar="NAME", help="beginnings of names")
-    add("--long", action="store_true", help="also what CI leaves out, as it takes a minute each")
+    add("-o", "--out", type=Path, help="keep the output folders here (default: delete them)")
+    add("--only", nargs="+", default=[], metavar="NAME", help="prefixes of names")
+    add("--long", action="store_true", help="also the runs that CI leaves out (a minute each)")
     add("--jobs", type=int, default=2, help="commands at once")
-    add("--write-floors", action="store_true", help="the floors anew, of the cases that are run")
+    add(
+        "--write-floors",
+        action="store_true",
+        help="replace the thresholds of these runs",
+    )
     args = parser.parse_args(argv)
     floors = json.loads(FLOORS.read_text()) if FLOORS.exists() else {}
     every = CASES + LONG if args.long else CASES

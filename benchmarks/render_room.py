@@ -2960,7 +2960,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add: Callable[..., Any] = parser.add_argument
     add("-o", "--out", type=Path, required=True, help="folder to write to")
-    add("--seed", type=int, default=base.seed, help="decides everything random")
+    add("--seed", type=int, default=base.seed, help="random seed")
     add("--frames", type=int, default=base.frames)
     add(
         "--size",
@@ -2972,7 +2972,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--path",
         choices=PATHS,
         default=base.path,
-        help="how the camera moves: " + "; ".join(f"{k}: {v}" for k, v in PATHS.items()),
+        help="camera path: " + "; ".join(f"{k}: {v}" for k, v in PATHS.items()),
     )
     add(
         "--plan",
@@ -2987,7 +2987,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--shutter",
         type=float,
         default=base.shutter,
-        help="motion blur as a share of the frame interval",
+        help="motion blur as a fraction of the frame interval",
     )
     add("--texels", type=float, default=base.texels_per_m, help="texture resolution per metre")
     add("--crf", type=int, help="write H.264 of this quality with PyAV (pip install av), e.g. 26")

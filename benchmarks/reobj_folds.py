@@ -183,7 +183,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("-o", "--out", type=Path, required=True)
     add("--backbone", default="mobilenetv2_feat", help="ONNX file or name (default %(default)s)")
     add("--every", type=int, default=20, help="use every n-th frame (default %(default)s)")
-    add("--away", type=int, default=30, help="frames between query and gallery")
+    add("--away", type=int, default=30, help="minimum frames between query and gallery")
     add("--folds", type=int, default=3)
     add_choosing(parser)
     add("--width", type=int, default=64,
@@ -191,7 +191,12 @@ def build_parser() -> argparse.ArgumentParser:
     add("--loss", choices=te.LOSSES, default="hardest", help="the negative (default %(default)s)")
     add("--steps", type=int, default=150)
     add("--rate", type=float, default=3e-4, help="learning rate (AdamW, cosine)")
-    add("--repeats", type=int, default=3, help="trainings of each setup and fold, other seeds")
+    add(
+        "--repeats",
+        type=int,
+        default=3,
+        help="trainings of each setup and fold, with different seeds",
+    )
     return parser
 
 

@@ -27,14 +27,14 @@ def held_out(kind: str, name: str) -> bool:
 
 
 def usable(kind: str, name: str, choosing: bool, tune: bool = False) -> bool:
-    """Tell whether a sequence may be used, and say on stderr if not.
+    """Return whether a sequence may be used; if not, print the reason on stderr.
 
     Args:
-        choosing: also what is not held out. tune: only what is not held out, whatever `choosing`.
+        choosing: include sequences that are not held out. tune: only these, whatever `choosing`.
     """
     if held_out(kind, name) != tune or (choosing and not tune):
         return True
-    why = "is for reporting" if tune else "is not for reporting; --choosing shows it, marked"
+    why = "is for reporting" if tune else "is not for reporting; --choosing includes it, marked"
     print(f"left out (benchmarks/splits.json): {name} {why}", file=sys.stderr)
     return False
 
@@ -46,7 +46,7 @@ def marked(kind: str, name: str, title: str = "") -> str:
 
 def add_choosing(parser: argparse.ArgumentParser) -> None:
     """Add the option --choosing."""
-    text = "also what was used for choosing (splits.json), marked"
+    text = "include data used for choosing (splits.json), marked"
     parser.add_argument("--choosing", action="store_true", help=text)
 
 

@@ -424,7 +424,7 @@ def build_parser() -> argparse.ArgumentParser:
     add: Callable[..., Any] = parser.add_argument
     add("--backbone", required=True, help="name or ONNX file of the frozen backbone")
     add("--crops", action="store_true", help="for two crops an object (re-OBJ's ConvBlock)")
-    add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="of --crops")
+    add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="setups of --crops")
     add("--merge", choices=("maps", "rows"), default="maps",
         help="of two crops: their maps, by one ConvBlock, or the rows of a block each")  # fmt: skip
     add("--width", type=int, default=64,

@@ -1,4 +1,4 @@
-"""benchmarks/synthetic_quadrics.py and tuw_demo.py: tables are written, faults are errors."""
+"""benchmarks/synthetic_quadrics.py and tuw_demo.py: tables and errors."""
 
 from __future__ import annotations
 
