@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Change operators and constants of the core one at a time: do the tests notice?
+"""Mutation testing: change operators and constants one at a time and count what no test detects.
 
     python benchmarks/mutate.py -o OUT [--count 250] [--seed 0] [--only FILE...] [--jobs 2]
 
-A copy of the checkout is changed, never the checkout. First the tests of FILES run once, traced:
-which lines of the core does each execute, and how long does it take? Then, for each changed place
-(drawn by the seed among the lines that some test executes, alike over the modules), the tests that
-execute its line run until one fails: the change is killed. Tests longer than --longest seconds are
-left out. Prints the share of killed changes of each module, and those that survived;
-OUT/mutants.json holds them all. What survives may be the same program (`<` for `<=` where equality
-never happens), a tuning constant, or a hole in the tests: only reading decides.
+A copy of the checkout is changed, never the checkout. First the tests run once with a tracer that
+records the lines executed by each test and its run time. Mutants are drawn by the seed among the
+covered lines, equally over the modules. For each mutant, the tests that cover its line
+run until one fails: the mutant is killed. Tests longer than --longest seconds are left out. Prints
+the fraction of killed mutants by module and the survivors; OUT/mutants.json lists all of them. A
+survivor may be an equivalent program (`<` for `<=` where equality never occurs), a tuning constant,
+or a gap in the tests; this needs reading.
 """
 
 from __future__ import annotations
@@ -34,19 +34,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-CORE = (
-    "reobj_track.py", "quadrics.py", "reobj/frame_lookup.py", "reobj/appearance/*.py",
-    "reobj/objects/*.py", "reobj/tracking/*.py",
-    "reobj/poses/supplied/*.py", "reobj/results/overlay.py",
-    "reobj/results/evaluation.py", "reobj/sources/*.py",
-)  # fmt: skip
-FILES = (
-    "front_door", "test_tracker", "test_association", "test_api", "test_quadrics", "test_overlay",
-    "test_evaluation", "test_detection_files", "test_video", "test_readers", "test_frame_lookup",
-    "test_linking", "test_gaps", "test_places", "test_reid", "test_assignment",
-    "test_camera_motion", "test_crops", "test_embedding", "test_occlusion", "test_sampling",
-    "test_mapping", "test_run", "test_consistency", "test_types", "test_objects",
-)  # fmt: skip
+SOURCES = ("reobj_track.py", "quadrics.py", "reobj/**/*.py")
+UNTRACED = ("test_batch.py", "test_docs.py", "test_wheel.py")  # they run other processes
 Lines = dict[str, set[int]]  # by file
 
 
@@ -54,7 +43,7 @@ Lines = dict[str, set[int]]  # by file
 
 
 class Tracer:
-    """A pytest plugin: lines of the core by test, and the seconds of each test."""
+    """A pytest plugin that records the source lines and the seconds of each test."""
 
     def __init__(self, root: Path, files: Sequence[str]) -> None:
         self.names = {str(root / name): name for name in files}
@@ -62,7 +51,7 @@ class Tracer:
         self.by_test: dict[str, tuple[float, dict[str, list[int]]]] = {}
 
     def trace(self, frame: Any, event: str, arg: Any) -> Any:
-        """Trace the lines of the core, and nothing of other files."""
+        """Trace the lines of the source files and no others."""
         name = self.names.get(frame.f_code.co_filename)
         if name is None:
             return None
@@ -107,10 +96,7 @@ def trace_tests(copy_of: Path, files: Sequence[str], names: Sequence[str], out: 
     def child() -> None:
         os.chdir(copy_of)
         tracer = Tracer(copy_of, files)
-        tests = [f"tests/{n}" if (copy_of / "tests" / n).is_dir() else f"tests/{n}.py"
-                 for n in names]  # fmt: skip
-        there = [t for t in tests if (copy_of / t).exists()]
-        run_pytest(["--maxfail=1000", *there], [tracer])
+        run_pytest(["--maxfail=1000", *(f"tests/{name}" for name in names)], [tracer])
         (out / "lines.json").write_text(json.dumps(tracer.by_test))
 
     process = multiprocessing.get_context("fork").Process(target=child)
@@ -280,6 +266,12 @@ def copy_checkout(folder: Path) -> Path:
     return folder
 
 
+def names_of_tests(root: Path) -> list[str]:
+    """List the test files and the folders of test files in tests/."""
+    found = [p for p in sorted((root / "tests").iterdir()) if p.name not in UNTRACED]
+    return [p.name for p in found if p.match("test_*.py") or any(p.glob("test_*.py"))]
+
+
 def tests_by_line(by_test: dict[str, Any], longest_s: float) -> dict[tuple[str, int], list[str]]:
     """Return the tests that execute each line, the shortest first."""
     tests_of: dict[tuple[str, int], list[str]] = defaultdict(list)
@@ -298,25 +290,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add: Callable[..., Any] = parser.add_argument
     add("-o", "--out", type=Path, required=True, help="folder for the copy, lines and results")
-    add("--count", type=int, default=250, help="changes in all")
+    add("--count", type=int, default=250, help="number of mutants")
     add("--seed", type=int, default=0)
-    add("--only", nargs="+", default=[], metavar="FILE", help="files of the core, as in the report")
-    add("--tests", nargs="+", default=FILES, metavar="NAME", help="test files and folders")
-    add("--longest", type=float, default=8.0, help="seconds of the longest test that is used")
-    add("--seconds", type=float, default=30.0, help="of the tests of a change, the shortest first")
-    add("--jobs", type=int, default=1, help="changes at once")
+    add("--only", nargs="+", default=[], metavar="FILE", help="source files, as in the report")
+    add("--tests", nargs="+", metavar="NAME", help="files and folders of tests/ (default: all)")
+    add("--longest", type=float, default=8.0, help="leave out tests longer than this (s)")
+    add("--seconds", type=float, default=30.0, help="test time a mutant, shortest tests first (s)")
+    add("--jobs", type=int, default=1, help="mutants at once")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     root = copy_checkout(args.out.resolve() / "copy")
     sys.dont_write_bytecode = True
-    files = [str(p.relative_to(root)) for glob in CORE for p in sorted(root.glob(glob))]
+    files = [str(p.relative_to(root)) for glob in SOURCES for p in sorted(root.glob(glob))]
     import cv2  # noqa: F401  loaded once, before the forks
     import pytest  # noqa: F401
     import scipy.optimize
     import scipy.spatial.transform  # noqa: F401
 
     if not (args.out / "lines.json").exists():
-        trace_tests(root, files, args.tests, args.out.resolve())
+        trace_tests(root, files, args.tests or names_of_tests(root), args.out.resolve())
     if not (by_test := json.loads((args.out / "lines.json").read_text())):
         raise SystemExit(f"error: no test ran: python -m pytest in {root} says why")
     tests_of = tests_by_line(by_test, args.longest)

@@ -1,22 +1,23 @@
 #!/usr/bin/env python3
-"""Run the command line on every recording with images, and hold the figures against floors.
+"""Run the command line on every recording with images and check the scores against thresholds.
 
     python benchmarks/recordings.py DATA [-o OUT] [--only NAME...] [--long] [--jobs 2]
         [--write-floors]
 
 Every row is one command, as a user types it, in a process of its own: with the small detector
-(--detector fast, weights in REOBJ_MODELS) and with recorded boxes, with the tool's own cameras and
-with supplied ones. benchmarks/truth.py compares the output files with the truth. The exit code is 1
-when a command fails or a figure misses its floor in recordings.json beside this file; seconds are
-only printed. --write-floors writes them anew from this run, with the margins of `floors_of`.
+(--detector fast, weights in REOBJ_MODELS) or recorded boxes, and with reconstructed or supplied
+cameras. benchmarks/truth.py compares the output files with the ground truth. The exit code is 1
+if a command fails or a score misses its threshold in recordings.json beside this file; run times
+are only printed. --write-floors derives new thresholds from this run with the margins of
+`floors_of`.
 
     IDF1     boxes of tracks.txt; overlap .5 (.4 on office_loop, livingroom13 and studio_room, .3 on
              hololens_kitchen, whose truth is of whole objects)
-    found    true objects that some listed object shows, of those that are long enough in view;
+    found    true objects matched by a listed object, of those that are in view for long enough;
              bonsai, apple, teddybear: true objects of the classes whose number is known
-    false    listed objects of annotated classes that show none, or one that is listed already
-    solids   true objects with a solid of their class in reach (.35 m, or a third of the longest
-             side), of all those annotated in 3D; cm: median error of their centres
+    false    listed objects of annotated classes that match no true object, or one already matched
+    solids   true objects with a shape of their class within .35 m, or a third of the longest side,
+             of all those annotated in 3D; cm: median error of their centres
     cameras  frames with a pose, of those read; off: median error of the centres, own cameras after
              a similarity, in % of the extent of the path
     MB       peak memory of the largest process of the command
@@ -334,9 +335,9 @@ LEAST, MOST = ("idf1", "found", "solids", "cameras"), ("false", "cm", "off", "mb
 def floors_of(figures: Figures) -> Figures:
     """Return the bounds that figures like these must keep.
 
-    Half a pixel in the boxes, another order of sums on another processor, moves one or two objects
-    (examples/real_rooms.py --noises): so one object in ten and at least one, IDF1 .03, a camera in
-    twenty, half of an error and a bit, half of the memory.
+    Half a pixel of box noise, or another order of sums on another processor, changes one or two
+    objects (benchmarks/real_rooms.py --noises). The margins: one object in ten and at least one,
+    IDF1 .03, one camera in twenty, half of an error and a constant, half of the memory.
     """
     if figures["exit"]:
         return {}
@@ -397,11 +398,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add: Callable[..., Any] = parser.add_argument
     add("data", type=Path, help="folder of the recordings")
-    add("-o", "--out", type=Path, help="keep the output folders here (default: nowhere)")
-    add("--only", nargs="+", default=[], metavar="NAME", help="beginnings of names")
-    add("--long", action="store_true", help="also what CI leaves out, as it takes a minute each")
+    add("-o", "--out", type=Path, help="keep the output folders here (default: delete them)")
+    add("--only", nargs="+", default=[], metavar="NAME", help="prefixes of names")
+    add("--long", action="store_true", help="also the runs that CI leaves out (a minute each)")
     add("--jobs", type=int, default=2, help="commands at once")
-    add("--write-floors", action="store_true", help="the floors anew, of the cases that are run")
+    add(
+        "--write-floors",
+        action="store_true",
+        help="replace the thresholds of these runs",
+    )
     args = parser.parse_args(argv)
     floors = json.loads(FLOORS.read_text()) if FLOORS.exists() else {}
     every = CASES + LONG if args.long else CASES

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Many videos: run a manifest of them on Ray, restart what fails, skip what is finished.
+"""Run a list of videos on Ray: retry crashed workers, skip finished videos.
 
     pip install ".[batch]"
     python examples/batch.py videos.csv -o results                  # all cores of this machine
@@ -12,15 +12,15 @@ The manifest is a CSV with a header, or JSONL; paths are relative to it:
     kitchen.mp4,kitchen.json,,--every 2
     office.mp4,,office_colmap/,--classes chair,tv
 
-`path` is needed; `out` (default: its stem) is the folder under -o; `detections`, `poses` and
-`tracks` are handed to `run`, as are `options`; `command` may say `track`. A video is finished when
-its folder holds a `batch.json` made from the same files, options and version; all others are run,
-and those that were killed in the middle go on from their cache. A crash of a worker is tried again
-(--retries), bad input is not. On a cluster the files must lie on storage that all nodes share.
+`path` is required; `out` (default: its stem) is the folder under -o; `detections`, `poses`,
+`tracks` and `options` are passed to `run`; `command` may be `track`. A video is finished if its
+folder contains a `batch.json` made from the same files, options and version. All others are run;
+interrupted ones resume from their cache. A video whose worker crashed is run again (--retries), bad
+input is not. On a cluster all nodes must share the storage of the files.
 
-Written: results/NAME/..., as `run` does, with its messages in batch.log; results/batch.log, a line
-an event; results/summary.csv, a line a video. Exit code: 0 all finished, 1 some failed, 2 bad
-manifest, 130 interrupted.
+Written: the output of `run` in results/NAME with its messages in batch.log; results/batch.log, one
+line per event; results/summary.csv, one row per video. Exit code: 0 all finished, 1 some failed, 2
+bad manifest, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import glob
 import hashlib
 import json
 import os
@@ -35,15 +36,13 @@ import shlex
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
-from reobj.files import atomic
-from reobj.sources.video import source_fingerprint
 
 ROOT = Path(__file__).resolve().parent.parent
 COLUMNS = ("path", "out", "detections", "poses", "tracks", "options", "command")
@@ -66,7 +65,7 @@ class Item:
 
 
 def read_manifest(manifest: Path, results: Path) -> list[Item]:
-    """Items of a CSV or JSONL manifest; ReobjError names the line that is wrong."""
+    """Read a CSV or JSONL manifest; a ReobjError names the invalid line."""
     try:
         text = manifest.read_text(encoding="utf-8-sig")
         lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
@@ -105,13 +104,28 @@ def make_item(row: dict[str, str], folder: Path, results: Path) -> Item:
     given = [part for k in FILES if k in paths for part in (f"--{k}", paths[k])]
     argv = (row.get("command", "run"), paths["path"], "-o", out, *given,
             *shlex.split(row.get("options", "")))  # fmt: skip
-    inputs = {k: source_fingerprint(path) for k, path in paths.items()}
+    inputs = {k: fingerprint(Path(path)) for k, path in paths.items()}
     text = json.dumps([rt.__version__, inputs, argv])
     return Item(name, paths["path"], out, argv, hashlib.sha256(text.encode()).hexdigest())
 
 
+def fingerprint(path: Path) -> list[tuple[str, int, int]]:
+    """List name, size and time of a file, of a folder's files, or of the matches of a pattern."""
+    found = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path)))
+    files = [path] if path.is_file() else sorted(p for p in found if p.is_file())
+    return [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+
+
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yield a temporary path that replaces `path` when the block ends without an exception."""
+    part = path.with_name(f".part-{path.name}")
+    yield part
+    part.replace(path)
+
+
 def finished(item: Item) -> dict[str, Any] | None:
-    """What a finished video's marker says; None if it has none, or one of other options."""
+    """Return the result of a finished video; None if its files, options or version changed."""
     try:
         marker = json.loads((Path(item.out) / MARKER).read_text())
     except (OSError, ValueError):
@@ -124,13 +138,11 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
     """Run one video in a worker, unless a worker that was killed since has finished it."""
     sys.path.insert(0, root)
     import reobj_track as rt
-    from reobj.files import atomic
-    from reobj.types import without_secrets
 
     if done := finished(item):
         return done
     out, started = Path(item.out), time.monotonic()
-    (out / "cache").mkdir(parents=True, exist_ok=True)  # the sign that the folder is ours
+    (out / "cache").mkdir(parents=True, exist_ok=True)  # marks an output folder of the tool
     (out / MARKER).unlink(missing_ok=True)
     (out / "cache" / "worker.pid").write_text(str(os.getpid()))
     sys.argv = ["reobj_track.py", *item.argv]
@@ -145,14 +157,13 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
         return {"status": "failed", "error": last[-1].removeprefix("error: ")}
     result = {"status": "done", "error": "", "seconds": round(time.monotonic() - started, 1)}
     result |= facts(rt.Result.load(out))
-    argv = list(map(without_secrets, item.argv))
-    with atomic(out / MARKER) as part:
-        part.write_text(json.dumps({"key": item.key, "argv": argv, "result": result}))
+    with replaced(out / MARKER) as part:
+        part.write_text(json.dumps({"key": item.key, "result": result}))
     return result
 
 
 def call(rt: Any, argv: Sequence[str]) -> int:
-    """Exit code of the command; a traceback goes into the log before it goes to the driver."""
+    """Run the command and return its exit code; log a traceback before the driver gets it."""
     try:
         return int(rt.main(list(argv)))
     except SystemExit as stop:  # argparse: unknown option
@@ -163,7 +174,7 @@ def call(rt: Any, argv: Sequence[str]) -> int:
 
 
 def facts(found: rt.Result) -> dict[str, Any]:
-    """The figures of a finished folder that the summary shows."""
+    """Collect the figures of a finished folder for the summary."""
     status = [o.status for o in found.objects]
     return {
         "frames": len(set(found.tracks.frame.tolist())),
@@ -176,7 +187,7 @@ def facts(found: rt.Result) -> dict[str, Any]:
 
 
 class Batch:
-    """The driver: hands items to Ray, counts attempts, keeps the log and the summary."""
+    """The driver: submits items to Ray, counts attempts, writes the log and the summary."""
 
     def __init__(self, items: Sequence[Item], results: Path, retries: int) -> None:
         self.items, self.results, self.retries = items, results, retries
@@ -185,14 +196,14 @@ class Batch:
         results.mkdir(parents=True, exist_ok=True)
 
     def say(self, event: str, item: Item | None = None, text: str = "") -> None:
-        """One line in batch.log and on stderr."""
+        """Write a line to batch.log and stderr."""
         line = f"{time.strftime('%H:%M:%S')} {event:<9}{item.name if item else ''} {text}".rstrip()
         print(line, file=sys.stderr)
         with (self.results / "batch.log").open("a") as file:
             file.write(line + "\n")
 
     def skip_finished(self) -> list[Item]:
-        """Note the finished items; returns the others."""
+        """Record the finished items and return the others."""
         for item in self.items:
             if done := finished(item):
                 self.rows[item.name] = done | {"status": "skipped"}
@@ -201,7 +212,7 @@ class Batch:
         return left
 
     def run(self, ray: Any, left: Sequence[Item], cpus: int) -> None:
-        """Run the items; an item whose worker dies is handed out again, `retries` times."""
+        """Run the items; an item whose worker dies is submitted again up to `retries` times."""
         task = ray.remote(run_item).options(num_cpus=cpus, max_retries=0)
         running: dict[Any, Item] = {}
 
@@ -227,26 +238,26 @@ class Batch:
             self.say(result["status"], item, result["error"] or f"{result['seconds']} s")
 
     def write_summary(self) -> None:
-        """One row a video, in the manifest's order; those without a result are `missing`."""
+        """Write one row per video, in the manifest's order; without a result it is `missing`."""
         rows = []
         for item in self.items:
             known = {"name": item.name, "path": item.path, "out": item.out, "status": "missing",
                      "attempts": self.attempts[item.name]}  # fmt: skip
             row = known | self.rows.get(item.name, {})
             rows.append({k: row.get(k) for k in SUMMARY})
-        with atomic(self.results / "summary.csv") as part, part.open("w", newline="") as file:
+        with replaced(self.results / "summary.csv") as part, part.open("w", newline="") as file:
             writer = csv.DictWriter(file, SUMMARY, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
 
 
 def connect(address: str, workers: int, cpus: int) -> Any:
-    """Start a local Ray with room for so many workers, or join a cluster."""
+    """Start a local Ray for this number of workers, or join a cluster."""
     try:
         import ray
     except ImportError:
         raise rt.ReobjError('Ray is not installed: pip install "reobj-track[batch]"') from None
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would send some
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage statistics are sent
     quiet = {"include_dashboard": False, "logging_level": "ERROR", "log_to_driver": False}
     if address == "local":
         ray.init("local", num_cpus=workers * cpus, object_store_memory=10**8, **quiet)
@@ -259,7 +270,7 @@ def connect(address: str, workers: int, cpus: int) -> Any:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the batch; returns its exit code."""
+    """Run the batch and return its exit code."""
     text = (__doc__ or "").splitlines()
     parser = argparse.ArgumentParser(
         description=text[0],

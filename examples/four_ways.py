@@ -4,8 +4,8 @@
     python examples/four_ways.py                 # all four; the supervision one if it is installed
     python examples/four_ways.py --frames 240
 
-The first three decide online and give the same identities; the last one is the whole chain, which
-may join and split tracks after the video, and returns objects.
+The first three decide identities online, with the same result. The last one runs the whole
+pipeline, which may merge and split tracks after the video, and also returns 3D objects.
 """
 
 from __future__ import annotations
@@ -29,45 +29,48 @@ Identities = list[npt.NDArray[np.int64]]  # of every frame
 
 
 def loop(video: rt.Video) -> Identities:
-    """1. The loop: `rt.track` yields every frame with the tracks that were decided in it."""
-    found = []
+    """1. The loop: `rt.track` yields every frame with its tracks."""
+    identities = []
     for _frame, tracks in rt.track(video, DETECTIONS):
-        found.append(tracks.track_id)  # beside it: xyxy, score, class_id, detection_index
-    return found
+        identities.append(tracks.track_id)  # also xyxy, score, class_id, detection_index
+    return identities
 
 
 def arrays(video: rt.Video) -> Identities:
-    """2. Arrays, a frame at a time: (N, 6) x1 y1 x2 y2 score class in, (M, 8) with ids out."""
+    """2. Arrays, frame by frame: in (N, 6) x1 y1 x2 y2 score class, out (M, 8) with identities."""
     detect = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
     tracker = rt.Tracker(embedder=rt.Embedder())
-    found = []
+    identities = []
     for frame in video:
-        known = detect(frame)
-        rows = np.column_stack([known.xyxy, known.score, known.class_id])  # (N, 6)
-        out = tracker.update(rows, frame.image).to_array()  # (M, 8)
-        found.append(out[:, 4].astype(np.int64))
-    return found
+        detections = detect(frame)
+        rows = np.column_stack([detections.xyxy, detections.score, detections.class_id])  # (N, 6)
+        tracked = tracker.update(rows, frame.image).to_array()  # (M, 8)
+        identities.append(tracked[:, 4].astype(np.int64))
+    return identities
 
 
 def supervision(video: rt.Video) -> Identities:
-    """3. supervision's Detections in, the tracked ones out with `tracker_id`, masks and data."""
+    """3. supervision's Detections in; out the tracked ones with `tracker_id`, masks and data."""
     import supervision as sv
 
     detect = rt.open_detections(video, rt.DetectConfig(), DETECTIONS)
     tracker = rt.Tracker(embedder=rt.Embedder())
-    found = []
+    identities = []
     for frame in video:
-        known = detect(frame)
+        detections = detect(frame)
         given: Any = sv.Detections(
-            xyxy=known.xyxy, mask=known.masks, confidence=known.score, class_id=known.class_id
+            xyxy=detections.xyxy,
+            mask=detections.masks,
+            confidence=detections.score,
+            class_id=detections.class_id,
         )
         tracked: Any = tracker.update(given, frame.image).to_supervision(given)
-        found.append(np.asarray(tracked.tracker_id, np.int64))
-    return found
+        identities.append(np.asarray(tracked.tracker_id, np.int64))
+    return identities
 
 
 def chain(video: rt.Video) -> Identities:
-    """4. The whole chain: identities, cameras and one solid for each object, typed."""
+    """4. The whole pipeline: identities, cameras and the shape of each object."""
     config = rt.Config(input=video.config, output=rt.OutputConfig(overlay="none", scene=False))
     with tempfile.TemporaryDirectory() as out:
         result = rt.run(video.source, out, config, detections=DETECTIONS)
@@ -84,7 +87,7 @@ WAYS: tuple[Callable[[rt.Video], Identities], ...] = (loop, arrays, supervision,
 
 
 def main() -> int:
-    """Run every way and print what it found."""
+    """Run the four ways and print their numbers of boxes and identities."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--frames", type=int, default=60, help="frames of the clip (default: 60)")
     args = parser.parse_args()

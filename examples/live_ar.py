@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Live identities for an AR device: poses arrive with the frames, ellipsoids get better as it goes.
+"""Live identities for an AR device: poses arrive with the frames, ellipsoids improve over time.
 
     python examples/live_ar.py -o OUT                       # the example clip
     python examples/live_ar.py VIDEO --poses POSES --camera fx,fy,cx,cy --detections DET -o OUT
-    python examples/live_ar.py ... --state room.npz         # go on where the last session ended
+    python examples/live_ar.py ... --state room.npz         # resume the last session
 
 The device is simulated from a recording (video file or folder, poses in any format that `run`
-takes, detections from a file or an ONNX detector); nothing looks ahead. Printed: what a frame
-costs (median and 95th percentile) in the tracker, which embeds and fits too, and with the detector.
-Written: OUT/tracks.txt (MOTChallenge), OUT/live_objects.json and OUT/objects.ply (ellipsoids).
+takes, detections from a file or an ONNX detector); no frame is read ahead. Printed: the time per
+frame (median and 95th percentile) of the tracker, embedding and fits included, and with detector.
+Written: OUT/tracks.txt (MOTChallenge) and OUT/live_objects.json (ellipsoids).
 """
 
 from __future__ import annotations
@@ -25,9 +25,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import quadrics
 import reobj_track as rt
-from reobj.files import atomic
-from reobj.results.folder import write_mot
-from reobj.results.ply import write_ply
 
 ROOM = Path(__file__).resolve().parent / "room"
 
@@ -35,7 +32,7 @@ ROOM = Path(__file__).resolve().parent / "room"
 def live(
     args: argparse.Namespace, video: rt.Video, detect: rt.DetectionSource
 ) -> tuple[rt.Tracker, rt.Tracks, list[tuple[float, float]]]:
-    """Track frame by frame; also the seconds of each frame, in detector and in tracker."""
+    """Track frame by frame; also return the seconds of each frame in detector and tracker."""
     poses = rt.read_poses(args.poses, video, camera=args.camera)
     pose_of = dict(zip(poses.frame.tolist(), poses.cam_from_world, strict=True))
     embedder = None if args.embed == "none" else rt.Embedder(args.embed)
@@ -53,7 +50,7 @@ def live(
         tracker.update(
             detections,
             frame.image,
-            cam_from_world=pose_of.get(frame.index),  # None: the device lost itself
+            cam_from_world=pose_of.get(frame.index),  # None: the device lost tracking
             camera=poses.camera,
         )
         seconds.append((detected - started, time.perf_counter() - detected))
@@ -67,22 +64,20 @@ def live(
 
 
 def facts(tracker: rt.Tracker, seconds: list[tuple[float, float]]) -> str:
-    """What is known, and what a frame costs."""
+    """Format the numbers of objects and the time per frame."""
     ms = 1e3 * np.array(seconds)  # (F, 2)
     (track, track95), (both, both95) = (np.percentile(x, (50, 95)) for x in (ms[:, 1], ms.sum(1)))
     return (
-        f"{len(tracker.state.last_seen)} objects, {tracker.places.known.sum()} of known place; "
+        f"{len(tracker.state.last_seen)} objects, {tracker.places.known.sum()} with an ellipsoid; "
         f"tracker {track:.1f} ms (95 %: {track95:.1f}), with detector {both:.1f} ({both95:.1f})"
     )
 
 
-def objects_of(
-    tracker: rt.Tracker, names: tuple[str, ...]
-) -> tuple[quadrics.Ellipsoids, list[dict[str, Any]]]:
-    """Ellipsoids of the objects of known place, and one entry each for the JSON file."""
+def objects_of(tracker: rt.Tracker, names: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Make the JSON entries of the objects whose ellipsoid is known."""
     known = np.flatnonzero(tracker.places.known[: len(tracker.state.last_seen)])
     solids, _ = quadrics.Ellipsoids.from_dual_quadrics(tracker.places.dual_q[known])
-    entries = [
+    return [
         {
             "id": int(i) + 1,
             "category": names[tracker.state.identity_class[i]],
@@ -94,25 +89,35 @@ def objects_of(
         }
         for k, i in enumerate(known)
     ]
-    return solids, entries
+
+
+def write_mot(path: Path, tracks: rt.Tracks) -> None:
+    """Write MOTChallenge rows: frame (from 1), id, left, top, width, height, score, -1, -1, -1."""
+    size = tracks.xyxy[:, 2:] - tracks.xyxy[:, :2]
+    rows = np.column_stack(
+        [tracks.frame + 1, tracks.track_id, tracks.xyxy[:, :2], size, tracks.score]
+    )
+    np.savetxt(path, rows, ("%d", "%d", *["%.2f"] * 4, "%.4f,-1,-1,-1"), ",")
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the simulated device."""
+    """Track the recording as a device would and write the results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("video", nargs="?", type=Path, default=ROOM / "room.mp4")
     parser.add_argument("--poses", type=Path, default=ROOM / "poses.txt")
-    parser.add_argument("--camera", default="492.7568,492.7568,320,240", help="as run has it")
+    parser.add_argument("--camera", default="492.7568,492.7568,320,240", help="as for run")
     parser.add_argument("--detections", type=Path, default=ROOM / "detections.npz")
-    parser.add_argument("--detector", help="ONNX detector in place of recorded detections")
+    parser.add_argument("--detector", help="ONNX detector instead of recorded detections")
     parser.add_argument(
-        "--embed", default="reobj", help="appearance: a model, as of `run`; none: place only"
+        "--embed", default="reobj", help="appearance model, as for run; none: 3D positions only"
     )
-    parser.add_argument("--frames", type=int, default=0, help="stop after so many (0: all)")
+    parser.add_argument("--frames", type=int, default=0, help="stop after N frames (0: all)")
     parser.add_argument(
-        "--state", type=Path, help="state of the tracker: read, and written at the end"
+        "--state",
+        type=Path,
+        help="file of the tracker state: read if it exists, then written",
     )
     parser.add_argument("-o", "--out", type=Path, required=True)
     args = parser.parse_args(argv)
@@ -124,12 +129,10 @@ def main(argv: list[str] | None = None) -> int:
     except rt.ReobjError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    solids, entries = objects_of(tracker, tuple(detect.class_names))
+    objects = objects_of(tracker, tuple(detect.class_names))
     args.out.mkdir(parents=True, exist_ok=True)
     write_mot(args.out / "tracks.txt", tracks)
-    with atomic(args.out / "live_objects.json") as part:
-        part.write_text(json.dumps(entries, indent=1))
-    write_ply(args.out / "objects.ply", solids, [e["id"] for e in entries])
+    (args.out / "live_objects.json").write_text(json.dumps(objects, indent=1))
     print(f"{len(seconds)} frames: {facts(tracker, seconds)}")
     return 0
 

@@ -165,7 +165,7 @@ def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     """As a reader does: in a checkout, one block after the other."""
     need(page)
     prepare, check = PAGES[page]
-    for path in (*ROOT.glob("*.*"), ROOT / "examples", ROOT / "reobj"):
+    for path in (*ROOT.glob("*.*"), *(ROOT / n for n in ("benchmarks", "examples", "reobj"))):
         (tmp_path / path.name).symlink_to(path)
     prepare(tmp_path)
     env = os.environ | {"STEPS": "3", "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import os
 import subprocess
-import sys
 import venv
 from pathlib import Path
 
@@ -508,30 +507,6 @@ def test_command_line_prints_a_table_and_refuses_other_files(
     assert rt.main(["eval", str(files[0]), "--gt", str(tmp_path / "bad.txt")]) == 2
     error = capsys.readouterr().err
     assert "bad.txt, line 1: " in error and len(error.splitlines()) == 1
-
-
-def test_failure_gallery_names_the_error_and_its_cause(tmp_path: Path) -> None:
-    """One object, away for 5 frames, comes back at the border under a second identity."""
-    frames = [*range(10), *range(15, 19)]
-    (tmp_path / "images").mkdir()
-    for i in range(20):
-        cv2.imwrite(str(tmp_path / "images" / f"{i:04d}.png"), np.full((48, 64, 3), 90, np.uint8))
-    x = np.where(np.array(frames) < 15, 20.0, 0.0)
-    gt = [[f + 1, 1, a, 9, 20, 30, 1] for f, a in zip(frames, x, strict=True)]
-    det = [[f + 1, -1, a, 9, 20, 30, 0.9] for f, a in zip(frames, x, strict=True)]
-    gt_file, out = write(tmp_path / "gt.txt", np.array(gt)), tmp_path / "out"
-    images, boxes_file = str(tmp_path / "images"), str(write(tmp_path / "det.txt", np.array(det)))
-    assert rt.main(["track", images, "--detections", boxes_file, "-o", str(out)]) == 0
-    text = (out / "tracks.txt").read_text().splitlines()
-    text[10:] = [",".join([line.split(",")[0], "2", *line.split(",")[2:]]) for line in text[10:]]
-    (out / "tracks.txt").write_text("\n".join(text))
-    command = [sys.executable, ROOT / "examples" / "failure_gallery.py", out, "--gt", gt_file]
-    command += ["-o", tmp_path / "gallery.png"]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True)
-    error = "object 1: a second identity (id 2, right 1), 4 frames from 16"
-    assert f"| {error} | out of view for 5 frames; cut by the border |" in done.stdout
-    picture = cv2.imread(str(tmp_path / "gallery.png"))
-    assert picture is not None and picture.shape[1] == 900
 
 
 # ---- Objects in 3D ----

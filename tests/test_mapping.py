@@ -13,7 +13,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pose_accuracy
 import pytest
 from pose_worlds import DotWorld, ate_percent, textured_room
 from test_consistency import fundamental
@@ -438,31 +437,6 @@ def test_two_rooms_come_as_two_components(tmp_path):
     assert set(second.names) == {f"{i:03d}.jpg" for i in range(10)}
     assert ate_percent(first.cam_from_world, truth_of(first, np.r_[truth[:10], truth])) < 1.0
     assert len({*first.cameras, *second.cameras}) == 1
-
-
-# ---- Experiment of examples/pose_accuracy.py -----------------------------------------------------
-
-
-@pytest.mark.parametrize("noise_px, used", [(0, 4), (150, 0)])
-def test_objects_as_landmarks_never_worsen_the_points(walk, noise_px, used):
-    rng = np.random.default_rng(0)
-    model = pycolmap.Reconstruction(str(walk[2] / "sparse"))
-    longest = sorted(model.points3D.values(), key=lambda p: -p.track.length())[:4]
-    objects = [
-        {
-            model.image(e.image_id).name: np.tile(
-                model.image(e.image_id).point2D(e.point2D_idx).xy + rng.normal(0, noise_px, 2), 2
-            )
-            + np.array([-20, -15, 20, 15])
-            for e in point.track.elements
-        }
-        for point in longest
-    ]
-    adjusted, alone, together, count = pose_accuracy.refine_together(model, objects)
-    assert count == used and (adjusted is model) == (used == 0)
-    if used:
-        assert together <= 1.001 * alone and adjusted.num_points3D() == model.num_points3D()
-    assert pose_accuracy.refine_together(model, [])[0] is model
 
 
 SLEEPER = """

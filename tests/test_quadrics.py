@@ -16,8 +16,8 @@ import time
 from dataclasses import fields
 from pathlib import Path
 
-import build_priors
 import numpy as np
+import own_priors
 import pytest
 import synthetic_quadrics as syn
 from simulated import chair_solids, walk
@@ -225,9 +225,11 @@ def test_lfd_needs_three_views() -> None:
 def demo():
     if not DEMO.exists():
         pytest.skip(f"the LfD authors' demo data is not at {DEMO}")
-    import tuw_demo
-
-    return tuw_demo.load(DEMO)
+    boxes = np.load(DEMO / "bounding_boxes.npy").reshape(8, 6, 4)
+    cam_from_world = np.load(DEMO / "camera_poses.npy").reshape(8, 4, 3).transpose(0, 2, 1)
+    truth, real = q.Ellipsoids.from_dual_quadrics(np.load(DEMO / "gt.npy"))
+    assert real.all()
+    return boxes, np.load(DEMO / "intrinsics.npy") @ cam_from_world, truth
 
 
 def test_published_lfd_demo(demo) -> None:
@@ -1284,7 +1286,7 @@ def test_garbled_priors_are_named(tmp_path: Path) -> None:
     assert q.load_priors(path).index(["chair"]).tolist() == [-1]
 
 
-def test_build_priors_from_meshes_and_table(tmp_path: Path) -> None:
+def test_own_priors_from_meshes_and_table(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     rng = np.random.default_rng(24)
     sizes = np.exp(rng.normal(np.log([0.5, 0.6, 0.9]), 0.1, (30, 3)))  # w, d, h
@@ -1294,7 +1296,7 @@ def test_build_priors_from_meshes_and_table(tmp_path: Path) -> None:
         trimesh.creation.box(extents=(w, h, d)).export(folder / f"{k}.ply")
     (folder / "broken.ply").write_text("not a mesh")
     out = tmp_path / "priors.json"
-    assert build_priors.main([str(tmp_path / "meshes"), "-o", str(out), "--up", "y"]) == 0
+    assert own_priors.main([str(tmp_path / "meshes"), "-o", str(out), "--up", "y"]) == 0
     priors = q.load_priors(out)
     assert np.allclose(priors.log_mean[0], np.log(sizes).mean(0), atol=1e-3)
     assert np.allclose(
@@ -1302,23 +1304,10 @@ def test_build_priors_from_meshes_and_table(tmp_path: Path) -> None:
     )
     table = tmp_path / "sizes.csv"
     table.write_text("category,w,d,h\n" + "".join(f"stool,{w},{d},{h}\n" for w, d, h in sizes))
-    assert build_priors.main([str(table), "-o", str(out), "--support", "cylinder"]) == 0
+    assert own_priors.main([str(table), "-o", str(out), "--support", "cylinder"]) == 0
     assert np.allclose(q.load_priors(out).log_mean[0], np.log(sizes).mean(0), atol=1e-3)
     table.write_text("category,w\nstool,1\n")
-    assert build_priors.main([str(table), "-o", str(out)]) == 2
-
-
-def test_example_scripts_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = tmp_path / "quadrics.md"
-    page.write_text("head\n<!-- table cuboids -->\nold\n<!-- end cuboids -->\ntail\n")
-    assert syn.main(["--quick", "--only", "cuboids", "-o", str(tmp_path)]) == 0
-    text = page.read_text()
-    assert "% boxes)" in text and "old" not in text and text.endswith("tail\n")
-    assert "cuboids" in capsys.readouterr().out
-    import tuw_demo
-
-    assert tuw_demo.main([str(tmp_path)]) == 2
-    assert "gt.npy" in capsys.readouterr().err
+    assert own_priors.main([str(table), "-o", str(out)]) == 2
 
 
 # ---- House rules ---------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""examples/real_rooms.py: its scores on hand-made results, and a whole run of a simulated walk."""
+"""benchmarks/real_rooms.py: scores of hand-made results, and a whole run of a simulated walk."""
 
 from __future__ import annotations
 
@@ -358,8 +358,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_whole_table_of_a_simulated_walk(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], noises: int
 ) -> None:
-    (tmp_path / "tracking.md").write_text("<!-- table left out -->\n<!-- end left out -->\n")
-    args = [str(data), "-o", str(tmp_path), "--only", "kitchen-true", "--docs", str(tmp_path)]
+    (tmp_path / "RESULTS.md").write_text("<!-- table left out -->\n<!-- end left out -->\n")
+    args = [str(data), "-o", str(tmp_path), "--only", "kitchen-true", "--results", str(tmp_path)]
     shaken = ["--noises", str(noises)]
     assert rr.main([*args, "--choosing", "--without", "alternation", *shaken]) == 0
     made = json.loads((tmp_path / "left_out.json").read_text())
@@ -376,14 +376,14 @@ def test_whole_table_of_a_simulated_walk(
     for name, score in (("nothing", whole), ("alternation", without)):
         (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
         assert rr.short(score["idf1"]) in line and "| 3 | 0 | 0 | 3 of 3 |" in line
-    assert text in (tmp_path / "tracking.md").read_text()
+    assert text in (tmp_path / "RESULTS.md").read_text()
     assert len(list((tmp_path / "poses-hololens_kitchen").glob("*.pose.txt"))) == FRAMES
 
 
 def test_tables_of_recordings_are_as_recorded(tmp_path: Path) -> None:
     args = [str(tmp_path), "-o", str(tmp_path / "out"), "--choosing", "--noises", "2"]
     with pytest.raises(SystemExit) as stop:
-        rr.main([*args, "--docs", str(tmp_path)])
+        rr.main([*args, "--results", str(tmp_path)])
     assert stop.value.code == 2 and not (tmp_path / "out").exists()
 
 

@@ -1,4 +1,4 @@
-"""examples/real_solids.py: what is counted, a simulated room, and a folder as of ScanNet."""
+"""benchmarks/real_solids.py: what is counted, a simulated room, and a folder as of ScanNet."""
 
 from __future__ import annotations
 

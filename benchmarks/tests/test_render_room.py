@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +146,7 @@ def test_path_stays_in_the_room(room, kind: str) -> None:
 
 def viewing(room, **changes) -> tuple[np.ndarray, np.ndarray]:
     """Centres (F, 3) and viewing directions (F, 3) of a path."""
-    poses = rr.camera_path(room, rr.replace(SMALL, **changes))
+    poses = rr.camera_path(room, replace(SMALL, **changes))
     return -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3]), poses[:, 2, :3]
 
 
@@ -166,10 +167,9 @@ def test_table_is_photographed_once_round_in_steps_of_28_cm(room) -> None:
 
 
 def test_photos_are_not_blurred_by_their_steps(room) -> None:
-    config = rr.replace(SMALL, path="table", frames=40, noise=0.0)
+    config = replace(SMALL, path="table", frames=40, noise=0.0)
     still, moving = (
-        next(rr.render_clip(room, rr.replace(config, shutter=shutter))).image
-        for shutter in (0.0, 0.9)
+        next(rr.render_clip(room, replace(config, shutter=shutter))).image for shutter in (0.0, 0.9)
     )
     np.testing.assert_array_equal(still, moving)
 
@@ -321,7 +321,7 @@ def varied():
 
 
 def test_varied_rooms_differ_and_repeat(varied) -> None:
-    again, other = rr.make_room(VARIED), rr.make_room(rr.replace(VARIED, seed=6))
+    again, other = rr.make_room(VARIED), rr.make_room(replace(VARIED, seed=6))
     assert rr.objects_json(again, VARIED) == rr.objects_json(varied, VARIED)
     np.testing.assert_array_equal(again.light, varied.light)
     assert all(np.array_equal(a, b) for a, b in zip(varied.atlas, again.atlas, strict=True))
@@ -373,6 +373,6 @@ def test_the_committed_room_is_still_what_its_seed_gives() -> None:
 
 @pytest.mark.parametrize("change", [{"plan": "castle"}, {"path": "flight"}])
 def test_unknown_plan_or_path_is_refused(change: dict[str, str], room) -> None:
-    config = rr.replace(SMALL, **change)
+    config = replace(SMALL, **change)
     with pytest.raises(ValueError, match="unknown"):
         rr.camera_path(room if "path" in change else rr.make_room(config), config)

@@ -1,4 +1,4 @@
-"""examples/reobj_folds.py: the published map, the folds, and a run on a small recording."""
+"""benchmarks/reobj_folds.py: the published map, the folds, and a run on a small recording."""
 
 from __future__ import annotations
 

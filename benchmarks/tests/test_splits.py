@@ -1,4 +1,4 @@
-"""examples/splits.json: what may be reported, and that the scripts obey it."""
+"""benchmarks/splits.json: what may be reported, and that the scripts obey it."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import compare_deepsort
+import pose_accuracy
 import pytest
+import rank_k
+import real_rooms
+import real_solids
+import scale_table
+from benchmark import TUNED
+from splits import SPLITS, held_out, marked, room_name, split_name
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "examples"))
-import compare_deepsort  # noqa: E402
-import pose_accuracy  # noqa: E402
-import rank_k  # noqa: E402
-import real_rooms  # noqa: E402
-import real_solids  # noqa: E402
-import scale_table  # noqa: E402
-from benchmark import TUNED  # noqa: E402
-from splits import SPLITS, held_out, marked, room_name, split_name  # noqa: E402
 
 
 def test_nothing_is_for_both() -> None:
@@ -29,8 +28,9 @@ def test_nothing_is_for_both() -> None:
 
 
 def test_no_room_of_the_reports_was_trained_on_or_named_elsewhere() -> None:
-    """By the commands in the documents and in the examples: lists and ranges of seeds."""
-    texts = [p.read_text() for p in [*ROOT.glob("docs/*.md"), *ROOT.glob("examples/*.py")]]
+    """By the commands in the docs and the scripts: lists and ranges of seeds."""
+    pages = [*ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")]
+    texts = [p.read_text() for p in [*pages, *ROOT.glob("benchmarks/*.py")]]
     words = r"--(?:rooms|seeds?|calibrate|val-rooms)((?:[ ,]v?\d+)+)"
     lists = (found for t in texts for found in re.findall(words, t))
     named = {int(n) for found in lists for n in re.findall(r"\d+", found)}
@@ -70,7 +70,7 @@ def test_what_may_not_be_used_is_left_out(
     args = compare_deepsort.make_parser().parse_args(["--rooms", "0", *words, "-o", str(tmp_path)])
     assert [s.name for s in compare_deepsort.wanted(args)] == used
     said = capsys.readouterr().err
-    assert re.findall(r"left out \(examples/splits.json\): (\w+) is", said) == left_out
+    assert re.findall(r"left out \(benchmarks/splits.json\): (\w+) is", said) == left_out
 
 
 def test_every_peer_has_a_setting_within_its_sweep() -> None:
@@ -119,7 +119,7 @@ def test_every_script_leaves_out_what_it_may_not_use(
         code = error.code
     assert code not in (0, None)
     left_out = {"901": "v901", "2001": "2001"}.get(words[1], RECORDING)
-    assert f"left out (examples/splits.json): {left_out} is " in capsys.readouterr().err
+    assert f"left out (benchmarks/splits.json): {left_out} is " in capsys.readouterr().err
     assert not (tmp_path / "out" / "work").exists() and not list(tmp_path.glob("out/*"))
 
 

@@ -1,8 +1,9 @@
-"""Every command and every piece of Python in README and docs/ is run, or named here with a reason.
+"""Every documented command and every piece of Python in README and docs/ is run, or listed here.
 
 The blocks of `sh` and `python` in the tutorials are run by tests/test_docs.py. All other commands
-are here: as they are written, in a folder where the files that they name lie ready, and with some
-words more (`more`) that make them quick. A command that is new in the docs fails until it is here.
+are here: as they are written, in a folder with the files that they name, and with further options
+(`more`) that make them quick. Commands of benchmarks/ take long or need data: their options are
+compared with --help. A new command in the docs fails until it is listed here.
 """
 
 from __future__ import annotations
@@ -42,7 +43,11 @@ from front_door.room import (
     true_objects,
 )
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    ROOT / "benchmarks" / "README.md",
+]
 PROGRAMS = r"(?:[A-Z_]+=\S+ )?(?:python |reobj-track |pip |mkdocs |git clone|curl |wget )"
 
 
@@ -72,24 +77,18 @@ ELSEWHERE = {
     "pip install torch matplotlib onnx": ".ci/run installs them with the extras",
     "pip install 'reobj-track[video]'": "an extra of pyproject.toml, checked below",
     "pip install 'reobj-track[viewer]'": "an extra of pyproject.toml, checked below",
+    "python -m pytest benchmarks/tests": "it takes minutes",
     "python reobj_track.py --options": "test_commands.py",
     "python reobj_track.py models": "test_commands.py",
     "python reobj_track.py objects out --solver lfd": "test_commands.py, with all solvers",
     "python reobj_track.py objects out --edits edits.json": "below, of OUT",
 }  # fmt: skip
-LONG = {  # scripts that take long, or data that is not here: their words are compared with --help
-    "appearance.md": ("rank_k", "train_embedding", "train_head", "benchmark"),
-    "poses.md": ("pose_accuracy", "pose_breaks"),
-    "quadrics.md": ("synthetic_quadrics", "tuw_demo", "scale_table"),
-    "tracking.md": ("benchmark", "compare_deepsort", "real_rooms"),
-}
 
 
-def long_script(command: str) -> str | None:
-    """The example that a command calls, if it is one of those that take long."""
-    found = re.search(r"python examples/(\w+)\.py", command)
-    every = {name for names in LONG.values() for name in names}
-    return found[1] if found and found[1] in every else None
+def benchmark_of(command: str) -> str | None:
+    """Name the script of benchmarks/ that a command calls."""
+    found = re.search(r"python benchmarks/(\w+)\.py", command)
+    return found[1] if found else None
 
 
 # ---- The files that a reader has lying there ----
@@ -98,7 +97,7 @@ def long_script(command: str) -> str | None:
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder of a reader, in a checkout."""
-    for path in (*ROOT.glob("*.*"), ROOT / "examples", ROOT / "reobj"):
+    for path in (*ROOT.glob("*.*"), *(ROOT / n for n in ("benchmarks", "examples", "reobj"))):
         (tmp_path / path.name).symlink_to(path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -372,7 +371,7 @@ SHOWN = {
     TOOL + "run phone.mp4 -o out --detector mine.onnx --set detect.class_names=names.txt": Shown(
         mine, detected, f"--every 6 --stop 120 {SUPPLIED} {QUICKLY}"
     ),
-    "python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
+    "python benchmarks/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
         output, nothing, "", {"OUT...": "out", "gt.txt...": "gt.txt"}, "out"
     ),
     "python examples/live_ar.py -o OUT": Shown(recording, nothing, "--frames 20", NAMED),
@@ -382,26 +381,36 @@ SHOWN = {
 def test_every_command_in_the_docs_is_run_or_has_a_reason() -> None:
     """A command that is new, and an entry whose command has gone."""
     known = {*ELSEWHERE, *SHOWN}
-    unknown = {c: p for c, p in DOCUMENTED.items() if c not in known and not long_script(c)}
-    assert unknown == {}, "run them in SHOWN, or name them in ELSEWHERE or LONG"
+    unknown = {c: p for c, p in DOCUMENTED.items() if c not in known and not benchmark_of(c)}
+    assert unknown == {}, "run them in SHOWN, or list them in ELSEWHERE"
     assert known - set(DOCUMENTED) == set()
-    called = {(Path(p).name, s) for c, p in all_documented() if (s := long_script(c))}
-    assert called >= {(page, s) for page, names in LONG.items() for s in names}
+    assert {b for c in DOCUMENTED if (b := benchmark_of(c))} <= set(SCRIPTS)
+
+
+def test_the_list_of_benchmarks_is_whole() -> None:
+    listed = {benchmark_of(c) for c in commands_of(ROOT / "benchmarks" / "README.md")}
+    assert listed - {None} == {n for n, p in SCRIPTS.items() if p.parent.name == "benchmarks"}
 
 
 def all_documented() -> list[tuple[str, str]]:
-    return [(c, page_name(p)) for p in PAGES for c in commands_of(p)]
+    results = [p for p in [ROOT / "benchmarks" / "RESULTS.md"] if p.exists()]
+    return [(c, page_name(p)) for p in [*PAGES, *results] for c in commands_of(p)]
 
 
-SCRIPTS = [p.stem for p in sorted((ROOT / "examples").glob("*.py")) if "__main__" in p.read_text()]
+SCRIPTS = {
+    path.stem: path
+    for folder in ("examples", "benchmarks")
+    for path in sorted((ROOT / folder).glob("*.py"))
+    if "__main__" in path.read_text()
+}
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_example_says_how_it_is_used(
+def test_every_script_says_how_it_is_used(
     script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """And knows the flags that the docs call it with."""
-    path = ROOT / "examples" / f"{script}.py"
+    path = SCRIPTS[script]
     monkeypatch.setattr(sys, "argv", [str(path), "--help"])
     monkeypatch.syspath_prepend(path.parent)
     with pytest.raises(SystemExit) as ended:
@@ -413,7 +422,7 @@ def test_every_example_says_how_it_is_used(
     assert said.startswith("usage:") and f"{script}.py" in said
     listed = set(re.findall(r"--[\w-]+", said))
     for command, page in all_documented():
-        if long_script(command) == script:
+        if benchmark_of(command) == script:
             flags = set(re.findall(r"(?<=\s)\[?(--[\w-]+)", command))
             assert flags <= listed, f"{page}: {command}"
 

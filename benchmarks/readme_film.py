@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Make README's moving picture of the overlay of a run: docs/img/room.webp.
+"""Make README's animated overlay, docs/img/room.webp, from the output folder of a run.
 
     python reobj_track.py run examples/room/room.mp4 -o OUT \
         --detections examples/room/detections.npz
-    python examples/readme_film.py OUT -o docs/img/room.webp
+    python benchmarks/readme_film.py OUT -o docs/img/room.webp
 
-Takes every 4th frame of OUT's overlay, 480 pixels wide: below 1 MB for the example clip.
+Uses every 4th frame of OUT's overlay, 480 pixels wide: below 1 MB for the example clip.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("out", type=Path, help="output folder of a run, with its overlay")
     add("-o", "--output", type=Path, default=Path("docs/img/room.webp"))
     add("--every", type=int, default=4, help="take every N-th frame")
-    add("--width", type=int, default=480, help="of the picture, px")
-    add("--quality", type=int, default=50, help="of WebP, 1 to 100")
+    add("--width", type=int, default=480, help="width of the picture, px")
+    add("--quality", type=int, default=50, help="WebP quality, 1 to 100")
     args = parser.parse_args(argv)
     (overlay,) = args.out.glob("overlay.*")
     video = rt.Video(overlay, rt.InputConfig(every=args.every, max_size=args.width))

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Time the tracker alone and measure whether identities survive a long absence, ours and others.
+"""Time the update of our tracker and of others, and measure re-identification after long absences.
 
-    python examples/benchmark.py                      # ours only
-    python examples/benchmark.py --peers build/peers  # with peers, each set in a venv made there
-    python examples/benchmark.py --embedding VIDEO... # what the embedding adds to the detector
+    python benchmarks/benchmark.py                      # our tracker only
+    python benchmarks/benchmark.py --peers build/peers  # also others, in venvs made there
+    python benchmarks/benchmark.py --embedding VIDEO... # cost of the embedding
 
-Streams are synthetic and seeded, the same for every tracker: 500 frames of 1920x1080, boxes and
-ready-made embeddings, camera motion compensation off, nothing but the tracker's own update timed.
+The streams are synthetic, seeded and the same for every tracker: 500 frames of 1920x1080 with boxes
+and precomputed embeddings. Camera motion compensation is off; only the tracker's update is timed.
   steady    objects cross the picture and are replaced; misses, occlusions, low scores, clutter
   revisit   every object vanishes for 200-260 frames and returns at least 400 px away
   hard      revisit with look-alikes, noisier embeddings and an appearance shifted at the return
@@ -541,11 +541,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
     parser.add_argument("--only", default="", help="names of trackers, comma-separated")
-    parser.add_argument("--runs", type=int, default=2, help="timed runs, the better one counts")
+    parser.add_argument("--runs", type=int, default=2, help="timed runs; the fastest counts")
     parser.add_argument("--revisit", default="50", help="numbers of objects, e.g. 10,50,200, or ''")
-    parser.add_argument("--seeds", type=int, default=1, help="random scenes of each number")
+    parser.add_argument("--seeds", type=int, default=1, help="random scenes for each number")
     parser.add_argument("--embedding", nargs="+", metavar="VIDEO", help="time the embedding only")
-    parser.add_argument("--frames", type=int, default=0, help="of these videos (0: all)")
+    parser.add_argument("--frames", type=int, default=0, help="frames of each video (0: all)")
     parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.embedding:

@@ -1,20 +1,20 @@
 #!/usr/bin/env python3
-"""Ellipsoids of real objects beside the true ones: by solver and category, and by tracker.
+"""Compare ellipsoids of real objects with the true ones, by solver and category, and by tracker.
 
-    python examples/real_solids.py solvers FOLDER... -o OUT [--choosing] [--picture FILE]
-    python examples/real_solids.py identities FOLDER... -o OUT --peers build/peers [--own-cameras]
+    python benchmarks/real_solids.py solvers FOLDER... -o OUT [--choosing] [--picture FILE]
+    python benchmarks/real_solids.py identities FOLDER... -o OUT --peers build/peers [--own-cameras]
 
-What was used for choosing (splits.json) is left out; --choosing shows it, marked.
+Recordings used for choosing (splits.json) are left out; --choosing includes them, marked.
 
-`solvers` (the thesis's figs 4.3-4.5): every box has the identity of the true object that it shows;
-SfMO, PSfMO, LfD and `fit_objects` ("solids") then have the same boxes and the same true cameras.
-Prints O3D by category, writes OUT/solvers.md, .csv and .png.
+`solvers` (the thesis's figs 4.3-4.5): every box has the identity of its true object; SfMO, PSfMO,
+LfD and `fit_objects` ("solids") get the same boxes and the same true cameras. Prints O3D by
+category, writes OUT/solvers.md, .csv and .png.
 
-`identities` (the thesis's figs 5.5-5.13): the same boxes, cameras and fit, but identities by SORT
+`identities` (the thesis's figs 5.5-5.13): the same boxes, cameras and fit, with identities by SORT
 and DeepSORT (in a venv that is made in --peers), by our tracker frame by frame, without and with
-re-identification, by the whole chain and by the truth. Prints what they make of the objects, writes
-OUT/identities.md and .csv, and pictures from above, OUT/identities_FOLDER.png, and over a frame of
-a video, OUT/before_after_FOLDER.jpg.
+re-identification, by the whole pipeline and by the truth. Prints the scores of the objects, writes
+OUT/identities.md and .csv, views from above, OUT/identities_FOLDER.png, and overlays on a video
+frame, OUT/before_after_FOLDER.jpg.
 
 FOLDER holds either of
   images/ or room.mp4; detections_yolov8s.csv or detections.npz (or the file of --boxes; `true`: the
@@ -24,12 +24,12 @@ FOLDER holds either of
   SensReader, instance-filt/, SCENE.aggregation.json, SCENE_vh_clean_2.0.010000.segs.json and
   SCENE_vh_clean_2.ply (needs trimesh). Truth: the upright box of least ground around an instance.
 
-What is counted. True objects are those of COCO's classes with boxes. An identity shows one of them
-if in half of its frames it overlaps it (IoU >= .5) and has its class. The solid of a true object is
-that of the identity with most of its frames; any other solid that shows it is a duplicate.
-    O3D        volume IoU of ellipsoids, summed over true objects (0 without a solid), over the
-               number of true objects and duplicates
-    O3D, 1:1   the same over true objects alone: what duplicates cost is the difference
+Scores. True objects are those of COCO's classes with boxes. An identity matches one of them if it
+overlaps it in half of its frames (IoU >= .5) and has its class. The shape of a true object is that
+of the identity with most of its frames; all other matching shapes are duplicates.
+    O3D        volume IoU of ellipsoids, summed over true objects (0 without a shape), divided by
+               the number of true objects and duplicates
+    O3D, 1:1   the same divided by the number of true objects: without the cost of duplicates
     centre     median distance of the centres of the objects found
 Ref: Gay, Del Bue et al., PSfMO, ICCV 2017; Rubino, Crocco, Del Bue, LfD, PAMI 2018.
 """

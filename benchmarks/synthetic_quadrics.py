@@ -1,13 +1,14 @@
-"""Measure quadrics.py on synthetic scenes with known truth: tables and plot of docs/quadrics.md.
+"""Measure quadrics.py on synthetic scenes with known truth.
 
 Usage:
-    python examples/synthetic_quadrics.py [--quick] [--only NAME ...] [-o docs]
+    python benchmarks/synthetic_quadrics.py [--quick] [--only NAME ...] [-o benchmarks]
 
-Prints each table and, with -o, writes it between its markers in docs/quadrics.md.
+Prints each table. With -o FOLDER, writes it between its markers in FOLDER/RESULTS.md and the plot
+to FOLDER/img.
 
-All experiments are seeded. Boxes are the exact bounds of the projected solid (ellipsoid: dual
-conic; cuboid: corners; cylinder: rims), each edge moved by Gaussian noise of a share of the box's
-width or height.
+All experiments are seeded. Boxes are the exact bounds of the projected shape (ellipsoid: dual
+conic; cuboid: corners; cylinder: rims). Gaussian noise with a standard deviation proportional to
+the box's width or height moves each edge.
 """
 
 from __future__ import annotations
@@ -692,7 +693,7 @@ TABLES: dict[str, Callable[[int], str]] = {
 
 
 def write_table(page: Path, name: str, text: str) -> None:
-    """Replace what stands between the markers of a table in a markdown page."""
+    """Replace the text between the markers of a table in a Markdown page."""
     old = page.read_text(encoding="utf-8")
     begin, end = f"<!-- table {name} -->", f"<!-- end {name} -->"
     if begin not in old or end not in old:
@@ -707,7 +708,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--quick", action="store_true", help="fewer trials: a smoke test")
     parser.add_argument("--only", nargs="+", choices=list(TABLES), default=list(TABLES))
-    parser.add_argument("-o", type=Path, metavar="DOCS", help="folder with quadrics.md to fill in")
+    parser.add_argument("-o", type=Path, metavar="FOLDER", help="fill in FOLDER/RESULTS.md")
     args = parser.parse_args(argv)
     for name in args.only:
         start = time.perf_counter()
@@ -718,7 +719,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             text = TABLES[name](trials)
         print(f"## {name} ({time.perf_counter() - start:.0f} s)\n\n{text}\n", flush=True)
         if args.o:
-            write_table(args.o / "quadrics.md", name, text)
+            write_table(args.o / "RESULTS.md", name, text)
     return 0
 
 

@@ -1,36 +1,39 @@
 #!/usr/bin/env python3
-"""Score the whole chain on recordings of rooms whose objects are known, in one table.
+"""Score the whole pipeline on recordings with annotated objects, in one table.
 
-    python examples/real_rooms.py DATA -o OUT --choosing [--only NAME...] [--seeds 901 902]
-    python examples/real_rooms.py DATA -o OUT --choosing --without all --noises 3 # one by one
-    python examples/real_rooms.py DATA -o OUT --choosing --docs docs   # fills in docs/tracking.md
+    python benchmarks/real_rooms.py DATA -o OUT --choosing [--only NAME...] [--seeds 901 902]
+    python benchmarks/real_rooms.py DATA -o OUT --choosing --without all --noises 3
+    python benchmarks/real_rooms.py DATA -o OUT --choosing --results benchmarks
 
-DATA holds hololens_kitchen, redkitchen_7scenes, office_loop, livingroom13 and studio_room; the
-example clip and rendered rooms (of --seeds, made by render_room.py) need none. All of these but
-rooms for reporting were used for choosing (splits.json): --choosing shows them, marked. Every
-recording runs at the defaults in a process of its own. OUT keeps what `run` keeps: detections,
-cameras and tracks of an earlier call are used again, so give another OUT once the detector, the
-cameras or the tracker changed; objects are made anew each time. Writes OUT/real_rooms.md and .json,
-with --without OUT/left_out.md and .json. Half a pixel moves a chair or two, so --noises N makes the
-objects N times, of boxes that far off (standard deviation), and gives the means.
+DATA holds hololens_kitchen, redkitchen_7scenes, office_loop, livingroom13 and studio_room. The
+example clip and rendered rooms (--seeds, made by render_room.py) need no data. All of them except
+the rooms for reporting were used for choosing (splits.json); --choosing includes these, marked.
+Every recording runs with the defaults in a process of its own. OUT keeps the cache of `run`:
+detections, cameras and tracks of an earlier call are reused, so use another OUT after a change of
+the detector, the cameras or the tracker; objects are always computed again. --without NAME turns a
+mechanism off. --noises N estimates the objects N times, from boxes with Gaussian noise of half a
+pixel, and prints the means, because this noise alone changes one or two objects. --results FOLDER
+writes the tables between their markers in FOLDER/RESULTS.md. Writes OUT/real_rooms.md and .json;
+with --without, OUT/left_out.md and .json.
 
-What is counted. An object is *listed* if it is not `doubtful`; solids are those of listed objects.
-    IDF1       boxes of listed identities, as in tracks.txt. hololens_kitchen: of six
-               classes at IoU >= .3, its truth is of whole objects; those less visible than .3 need
-               not be found. Lists of objects: at IoU >= .4. The rest: as `eval`, on
-               redkitchen_7scenes of the classes that are annotated completely.
-    found      hololens_kitchen: chairs with a solid of that class within .35 m (a third of the
-               longest side, if that is more), measured over ground and one to one; `eval`: true
-               objects whose identity has a solid; else true objects that some listed object shows
-    doubles    solids in reach of a true chair that another one has; listed objects beyond the first
-    elsewhere  solids of chairs near no chair; listed objects that show nothing of their class.
-               An object shows a true one if in half of its frames it overlaps it (IoU >= .4) and
-               has its class or one that may be taken for it; areas that are not annotated are left
-               out.
-    centre, size   medians over objects found; own cameras are aligned with the true ones first
-    in 2 sigma     sides of these objects whose log is within 2 sigma of the true one's
-    confidence     an object is real if nothing shows a true object better, in 3D
-               (hololens_kitchen) or in 2D; objects of classes that are not annotated do not count
+Columns. An object is *listed* if it is not `doubtful`; only the shapes of listed objects count.
+    IDF1       boxes of listed identities, as in tracks.txt. hololens_kitchen: six classes at
+               IoU >= .3, because its boxes are amodal; objects less visible than .3 are optional.
+               Recordings with object lists: IoU >= .4. Others: as `eval`; on redkitchen_7scenes
+               the completely annotated classes.
+    found      hololens_kitchen: chairs with a shape of that class within .35 m, or a third of the
+               longest side if that is more, horizontally and one to one. Recordings for `eval`:
+               true objects whose identity has a shape. Others: true objects matched by a listed
+               object.
+    doubles    further shapes within that distance of a matched chair; further listed objects of a
+               matched true object
+    elsewhere  shapes of chairs near no true chair; listed objects that match no true object. An
+               object matches a true one if it overlaps it in half of its frames (IoU >= .4) and has
+               its class or a confusable one; areas without annotation are ignored.
+    centre, size   medians over objects found; own cameras are first aligned with the true ones
+    in 2 sigma     sides of these objects whose log is within 2 sigma of the true one
+    confidence     an object is real if no other object matches its true object better, in 3D
+               (hololens_kitchen) or in 2D; classes without annotation are ignored
 """
 
 from __future__ import annotations
@@ -69,7 +72,7 @@ from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
 from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
 
-ROOM = Path(__file__).resolve().parent / "room"
+ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
 YOLO, FEMTO, RECORDED = "detections_yolov8s.csv", "detections_femto.csv", "detections.npz"
 TRUE = "true_boxes.csv"
 DETECTOR = rt.DetectConfig(model="deimv2-femto")  # the default one cannot be had everywhere
@@ -887,18 +890,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("data", type=Path, help="folder of the recordings")
     add("-o", "--out", type=Path, required=True, help="folder for the runs and the tables")
     text = "\n".join(f"{c.name:<14} {', '.join(c.title)}" for c in CASES)
-    add("--only", nargs="+", default=[], metavar="NAME", help=f"beginnings of names:\n{text}")
+    add("--only", nargs="+", default=[], metavar="NAME", help=f"prefixes of names:\n{text}")
     add("--seeds", nargs="*", type=int, default=[], help="also rooms rendered with these seeds")
-    text = "leave these out in turn: all, " + ", ".join(WITHOUT)
+    text = "mechanisms to turn off one after the other: all, " + ", ".join(WITHOUT)
     add("--without", nargs="+", default=[], metavar="NAME", help=text)
     add_choosing(parser)
-    add("--docs", type=Path, help="folder with tracking.md to fill in, and img/ for the picture")
-    text = "make the objects N times, of boxes half a pixel off, and give means"
+    text = "fill in FOLDER/RESULTS.md and draw the picture in FOLDER/img"
+    add("--results", "--docs", type=Path, metavar="FOLDER", help=text)
+    text = "estimate the objects N times with box noise of half a pixel, print means"
     add("--noises", type=int, default=0, metavar="N", help=text)
     add("--jobs", type=int, default=1, help="processes at once")
     args = parser.parse_args(argv)
-    if args.noises and args.docs and not args.without:
-        parser.error("--docs: tables of recordings are as recorded: leave out --noises")
+    if args.noises and args.results and not args.without:
+        parser.error("--results: the tables of recordings have no box noise: leave out --noises")
     rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
     cases, left_out = chosen([*CASES, *rooms], args.only), every_without(args.without)
     used = [s for s in dict.fromkeys(c.split for c in cases) if usable(*s, args.choosing)]
@@ -920,13 +924,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     (args.out / f"{name}.md").write_text(page)
     by_name = {w: dict(zip((c.name for c in cases), of, strict=True)) for w, of in made.items()}
     (args.out / f"{name}.json").write_text(json.dumps(by_name, indent=1))
-    if args.docs:
+    if args.results:
         for title, rows in found.items():
-            write_table(args.docs / "tracking.md", title, rows)
+            write_table(args.results / "RESULTS.md", title, rows)
         if not left_out:
             groups = sure_by_group(cases, made[""])
             drawn = {k: v for k, v in groups.items() if v and k in ("other boxes", DETECTOR.model)}
-            draw_reliability(drawn, args.docs / "img" / "confidence.png")
+            draw_reliability(drawn, args.results / "img" / "confidence.png")
     return 0
 
 

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Make the pictures of docs/limits.md from the example clip, whose truth is known.
+"""Draw the pictures of docs/limits.md from the example clip, which has ground truth.
 
-    python examples/limits_pictures.py -o docs/img        # needs matplotlib; about a minute
+    python benchmarks/limits_pictures.py -o docs/img        # needs matplotlib; about a minute
 
 limits_views.png   a table and its chairs from above, from 6, 24 and all frames, and the truth
-limits_hidden.jpg  a chair that is only seen behind the table: truth, detection, fitted solid
+limits_hidden.jpg  a chair that is always occluded by the table: truth, detection, fitted shape
 limits_turn.jpg    a camera that turns on the spot
 
-It prints the figures that the page quotes; two more, without a picture: what becomes of a chair
-that is carried away while it is out of sight, and what is said to a camera that only turns.
+It also prints the figures that the page quotes, the result for a chair that is carried away while
+out of view, and the message for a camera that only rotates.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import reobj_track as rt
 
-ROOM = Path(__file__).resolve().parent / "room"
+ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
 CAMERA = "492.756788421,492.756788421,320,240"
 K = np.array([[492.756788421, 0, 320], [0, 492.756788421, 240], [0, 0, 1]])
 Entry = dict[str, Any]

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 """Measure the cameras: reconstruct clips with known poses and print one table row each.
 
-    python examples/pose_accuracy.py -o OUT [--choosing] [--data FOLDER] [--set FIELD=VALUE]...
+    python benchmarks/pose_accuracy.py -o OUT [--choosing] [--data FOLDER] [--set FIELD=VALUE]...
         [NAME...]
 
-Clips: the recordings of FOLDER that are there, examples/room, and every folder of
-`examples/render_room.py` given with --room. Those that were used for choosing (splits.json: all but
-some rooms) are left out; --choosing shows them, marked. Nothing is tuned to a clip: all run with
-the defaults (but for --set, which changes a field of PosesConfig for an experiment). Each runs in a
-process of its own, so that its memory can be told.
+Clips: the recordings of FOLDER that are there, examples/room, and every folder made by
+`benchmarks/render_room.py` and given with --room. Clips that were used for choosing (splits.json:
+all but some rooms) are left out; --choosing includes them, marked. All clips run with the defaults;
+--set changes a field of PosesConfig for an experiment. Each clip runs in a process of its own, so
+that its memory can be measured.
 
 Columns: frames with a pose; error of the camera centres after a similarity alignment (Umeyama, PAMI
 1991) as median, root mean square and largest, in % of the diagonal of the path's bounding box, and
@@ -32,7 +32,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -84,75 +84,6 @@ def clips(data: Path, rooms: list[Path]) -> dict[str, Clip]:
         camera = ",".join((room / "camera.txt").read_text().split()[4:])
         found[room.name] = Clip(room / "room.mp4", room / "poses.txt", camera, True)
     return {name: clip for name, clip in found.items() if clip.source.exists()}
-
-
-def refine_together(
-    model: Any, objects: Sequence[dict[str, Array]], loss_px: float = 0.5
-) -> tuple[Any, float, float, int]:
-    """Adjust the cameras of a COLMAP model with the objects as landmarks beside its points: each
-    object is one more point, seen in the centres of its boxes.
-
-    Args:
-        model: pycolmap.Reconstruction with one camera; only its points are adjusted in place.
-        objects: per object image name -> box (4,) xyxy, pixels of the model's camera.
-    Returns:
-        the model adjusted with the objects, or the given one where that would worsen the points'
-        reprojection error; the points' mean reprojection error (px) without and with the objects;
-        number of objects used (0: refused).
-    """
-    import pycolmap as pc
-
-    joint = pc.Reconstruction()
-    adjust(model, loss_px)
-    joint.add_camera_with_trivial_rig(model.camera(1))
-    seen: list[list[tuple[int, Array]]] = [[] for _ in objects]
-    for i in model.reg_image_ids():
-        old = model.image(i)
-        mine = [(o, boxes[old.name]) for o, boxes in enumerate(objects) if old.name in boxes]
-        centers = [np.asarray((box[:2] + box[2:]) / 2, np.float64) for _, box in mine]
-        for row, ((o, _), xy) in enumerate(zip(mine, centers, strict=True), len(old.points2D)):
-            seen[o].append((i, np.r_[row, xy]))
-        xys = np.array([*(p.xy for p in old.points2D), *centers]).reshape(-1, 2)
-        image = pc.Image(name=old.name, keypoints=xys, camera_id=1, image_id=i)
-        joint.add_image_with_trivial_frame(image, old.cam_from_world())
-    for point in model.points3D.values():
-        joint.add_point3D(point.xyz, point.track, point.color)
-    added = []
-    for views in (v for v in seen if len(v) >= 3):
-        rays = np.array([np.r_[joint.camera(1).cam_from_img(at[1:]), 1] for _, at in views])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        cams = np.array([joint.image(i).cam_from_world().matrix() for i, _ in views])
-        track = pc.Track([pc.TrackElement(i, int(at[0])) for i, at in views])
-        turn, shift = cams[:, :, :3], cams[:, :, 3]
-        # the point nearest to all rays: sum_i R_i' (I - d_i d_i') (R_i X + t_i) = 0
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # (n, 3, 3)
-        normal = np.einsum("nji,njk,nkl->il", turn, across, turn)
-        point = np.linalg.solve(normal, -np.einsum("nji,njk,nk->i", turn, across, shift))
-        added.append(joint.add_point3D(point, track, np.zeros(3, np.uint8)))
-    adjust(joint, loss_px)
-    for object_point in added:
-        joint.delete_point3D(object_point)
-    error = []
-    for one in (model, joint):
-        one.update_point_3d_errors()
-        error.append(float(one.compute_mean_reprojection_error()))
-    better = bool(added) and error[1] <= 1.001 * error[0]
-    return joint if better else model, error[0], error[1], len(added) if better else 0
-
-
-def adjust(model: Any, loss_px: float) -> None:
-    """Bundle adjustment of cameras and points with a robust loss; intrinsics stay."""
-    import pycolmap as pc
-
-    options, chosen = pc.BundleAdjustmentOptions(), pc.BundleAdjustmentConfig()
-    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
-    options.ceres.loss_function_type = pc.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = loss_px
-    options.ceres.solver_options.function_tolerance = 1e-6
-    options.ceres.solver_options.num_threads = 1
-    for i in model.reg_image_ids():
-        chosen.add_image(i)
-    pc.create_default_bundle_adjuster(options, chosen, model).solve()
 
 
 def main() -> int:

@@ -1,13 +1,13 @@
 """Make a priors.json from a folder of CAD meshes or from a table of sizes.
 
 Usage:
-    python examples/build_priors.py MESHES/ -o priors.json --up y   # MESHES/<category>/*.obj
-    python examples/build_priors.py sizes.csv -o priors.json        # category, w, d, h in metres
+    python examples/own_priors.py MESHES/ -o priors.json --up y   # MESHES/<category>/*.obj
+    python examples/own_priors.py sizes.csv -o priors.json        # category, w, d, h in metres
 
 Meshes (obj, ply, glb, stl, off) must be in metres (--scale multiplies) and stand upright: --up
 names the vertical axis (up y: w = x, d = z; up z: w = x, d = y). Sizes are modelled as log-normal,
-as in quadrics.py; axis ratios (log w/h, log d/h) follow from the same samples. What sizes are
-scored on must not be among them: the prior would know the answer.
+as in quadrics.py; axis ratios (log w/h, log d/h) follow from the same samples. Objects on which
+sizes are evaluated must not be among them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ log = logging.getLogger("build_priors")
 
 
 def read_meshes(folder: Path, up: str, scale: float) -> dict[str, Array]:
-    """Sizes (n, 3) w, d, h of every category folder; unreadable meshes are named and left out."""
+    """Read sizes (n, 3) w, d, h of each category folder; warn of unreadable meshes."""
     import trimesh
 
     sizes: dict[str, list[Array]] = {}
@@ -52,7 +52,7 @@ def read_meshes(folder: Path, up: str, scale: float) -> dict[str, Array]:
 
 
 def read_table(path: Path, scale: float) -> dict[str, Array]:
-    """Sizes (n, 3) of each category of a CSV with columns category, w, d, h."""
+    """Read sizes (n, 3) of each category of a CSV with columns category, w, d, h."""
     sizes: dict[str, list[list[float]]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         for number, row in enumerate(csv.DictReader(file), start=2):
@@ -69,7 +69,7 @@ def read_table(path: Path, scale: float) -> dict[str, Array]:
 
 
 def prior_entry(wdh: Array, support: str, source: str) -> dict[str, Any]:
-    """One category of priors.json from its samples (n, 3).
+    """Make the entry of a category in priors.json from its samples (n, 3).
 
     `mean` is the geometric mean: the median of the log-normal that quadrics.py uses.
     """

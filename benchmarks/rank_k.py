@@ -1,35 +1,35 @@
 #!/usr/bin/env python3
-"""Measure re-identification: Rank-k, mAP, twins, by view angle and by time gap.
+"""Measure re-identification: Rank-k and mAP, also of look-alikes, by view angle and time gap.
 
-    python examples/rank_k.py --rooms 900 901 902 903 904 --recording redkitchen_7scenes \\
+    python benchmarks/rank_k.py --rooms 900 901 902 903 904 --recording redkitchen_7scenes \\
         --models mobilenetv2_feat --person osnet_x0_25_msmt17 -o OUT
 
 writes OUT/rank_k.csv, by_bin.csv, counts.csv, cost.csv and plots, and prints Markdown tables.
 
-Every labelled detection is a query; its gallery are the labelled detections of *other* frames.
+Every labelled detection is a query; its gallery is the labelled detections of *other* frames.
 Protocols:
   open    gallery: every scene of the set, every class (the thesis's Rank-k).
-  class   gallery: same class, same scene; also where only one instance of the class is there.
-  twins   as `class`, only queries whose gallery holds another instance of the class.
+  class   gallery: same class, same scene; includes classes with a single instance.
+  twins   as `class`, only queries whose gallery contains another instance of the class.
   single  as `twins`, but one random view of each object in the gallery (mean of 10 draws): the
-          single-shot protocol of re-identification, and what a tracker meets after one short visit.
+          single-shot protocol of re-identification, as after one short visit.
   same    rendered rooms: as `twins`, but only objects of one model (they look identical).
 Gaps: `any` other frame; `away`: more than `--away` frames (default 30, the frames for which a
-tracker coasts): what is nearer in time is bridged by motion and needs no re-identification.
-Rank-k is the share of queries with a right one among the k nearest; mAP the mean average precision.
-The interval is the 95 % bootstrap over identities. By bin: the gallery are all same-class objects
-in those frames that show the queried object from such an angle, or after such a gap.
+track survives without detections); a tracker bridges shorter gaps by motion.
+Rank-k is the fraction of queries with a correct match among the k nearest; mAP the mean average
+precision. The interval is the 95 % bootstrap over identities. By bin: the gallery is all same-class
+objects in those frames that show the queried object from that angle, or after that gap.
 
 Setups (thesis): `fg` object only, `bg` surroundings only, `concat` both (mean of the two cosines),
-`full` the grown crop unmasked. "frame" methods pool one feature map a frame (`Embedder`), "crops"
-send two masked crops an object through the backbone (`CropEmbedder`), "person" is an appearance
-network of DeepSORT's kind on the plain box.
+`full` the enlarged crop without mask. "frame" methods pool one feature map a frame (`Embedder`),
+"crops" methods run the backbone on two masked crops an object (`CropEmbedder`), "person" methods
+run an appearance network of DeepSORT's kind on the plain box.
 
-Scenes (what was used for choosing, by splits.json, is left out; --choosing shows it, marked;
---calibrate wants no others):
+Scenes (those used for choosing, by splits.json, are left out; --choosing includes them, marked;
+--calibrate uses no others):
   --rooms SEED...    rooms of render_room.py (never train on them), rendered once into --cache;
                      one set for each --plan (home: that of examples/room; varied: another room,
-                     other twins and another walk for every seed).
+                     other look-alikes and another walk for every seed).
   --recording DIR... images/ or a video, with gt_mot.txt or gt.txt (MOT), as written by `run` or
                      annotated; poses_c2w.txt and intrinsics.json give view angles where they exist.
   --depth DIR...     the same folder, identities from depth/ and poses: detections_*.csv back-
@@ -38,10 +38,10 @@ Scenes (what was used for choosing, by splits.json, is left out; --choosing show
                      (reid_scenes.py says which files). Options of the CLOVER protocol:
                      --views 8 --min-mask 10000 --min-side 100.
 With --detect MODEL the boxes and masks are those of a detector, each associated with the labelled
-instance of its frame and category that it overlaps with (IoU .5). Views and instances of each class
-(the thesis's tables 3.1 and 3.2) are printed and stand in OUT/counts.csv.
-With --pictures N, OUT/matches_SET_METHOD.jpg shows queries, their best five matches by foreground,
-background and both, and which of them are right.
+instance of its frame and category that it overlaps (IoU .5). The numbers of views and instances of
+each class (the thesis's tables 3.1 and 3.2) are printed and written to OUT/counts.csv.
+With --pictures N, OUT/matches_SET_METHOD.jpg shows queries with their best five matches by
+foreground, background and both, and marks the correct ones.
 """
 
 from __future__ import annotations
@@ -896,25 +896,25 @@ def build_parser() -> argparse.ArgumentParser:
     add("--depth", type=Path, nargs="*", default=[], metavar="DIR")
     add("--scannet", type=Path, nargs="*", default=[], metavar="DIR")
     add("--detect", default="", metavar="MODEL",
-        help="a detector's boxes, associated with the labelled ones, instead of these")  # fmt: skip
+        help="use a detector's boxes, associated with the labelled ones")  # fmt: skip
     add("--pictures", type=int, default=0, metavar="N",
         help="draw N queries of each set with their best five matches")  # fmt: skip
-    add("--cache", type=Path, default=Path("build/rank_k"), help="for rendered rooms")
+    add("--cache", type=Path, default=Path("build/rank_k"), help="folder for rendered rooms")
     add("--every", type=int, default=6, help="use every n-th frame (default %(default)s)")
     add("--away", type=int, default=30, help="frames that count as away (default %(default)s)")
     add("--models", nargs="*", default=["reobj"], help="appearance models (default %(default)s)")
-    add("--person", nargs="*", default=[], help="networks for the plain box (DeepSORT's way)")
+    add("--person", nargs="*", default=[], help="networks for the plain box, as in DeepSORT")
     add("--calibrate", type=int, nargs="*", default=[], metavar="SEED",
-        help="fit the constants of the probability on these rooms, print them")  # fmt: skip
+        help="fit the constants of the match probability to these rooms, print them")  # fmt: skip
     add("--blocks", type=Path, metavar="DIR",
         help="ConvBlocks of single crops: DIR of train_head.py --crops --setups")  # fmt: skip
     add_choosing(parser)
     add("--no-crops", action="store_true", help="leave out the slow crop references")
     add("--weight", type=float, default=rt.TrackerConfig().foreground_weight,
-        help="share of the foreground in concat (default %(default)s)")  # fmt: skip
+        help="weight of the foreground in concat (default %(default)s)")  # fmt: skip
     add("--views", type=int, default=0, help="ScanNet: images of each instance (0: all)")
-    add("--min-mask", type=int, default=0, help="ScanNet: pixels of a scored mask")
-    add("--min-side", type=float, default=0, help="ScanNet: side of a scored box")
+    add("--min-mask", type=int, default=0, help="ScanNet: minimum pixels of a mask")
+    add("--min-side", type=float, default=0, help="ScanNet: minimum side of a box, px")
     return parser
 
 

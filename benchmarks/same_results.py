@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Compare the files of `run` by two checkouts of reobj_track, byte for byte.
+"""Compare the output files of `run` from two checkouts of reobj_track, byte for byte.
 
-    python examples/same_results.py OLD_CHECKOUT NEW_CHECKOUT -o OUT [--data FOLDER...]
+    python benchmarks/same_results.py OLD_CHECKOUT NEW_CHECKOUT -o OUT [--data FOLDER...]
 
-Runs both checkouts on examples/room and on every FOLDER (with `images/` and
-`detections_yolov8s.csv`), each with its defaults, and compares every file of the output folders but
-`cache/` and pycolmap's log. Only the command line that objects.json quotes may differ. Exit code 1
-when anything else does: for changes that must not change a result.
+Runs both checkouts with their defaults on examples/room and on every FOLDER (with `images/` and
+`detections_yolov8s.csv`), and compares every file of the output folders except `cache/` and
+pycolmap's log. Only the command line in objects.json may differ. Exit code 1 if another byte
+differs. Use it for refactorings that must not change a result.
 """
 
 from __future__ import annotations

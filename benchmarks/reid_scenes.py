@@ -1,6 +1,6 @@
-"""Scenes with labelled detections, for the measures of re-identification (rank_k.py).
+"""Load scenes with labelled detections for the re-identification benchmark (rank_k.py).
 
-Rendered rooms, recordings with annotated or clustered identities, ScanNet and Matterport3D.
+Sources: rendered rooms, recordings with annotated or clustered identities, ScanNet, Matterport3D.
 """
 
 from __future__ import annotations
@@ -103,8 +103,10 @@ def room_scene(
 ) -> Scene:
     """A room of render_room.py, sampled widely; rendered once for each version of the renderer."""
     import render_room
+    import rendering
 
-    version = hashlib.sha256(Path(render_room.__file__).read_bytes()).hexdigest()[:8]
+    sources = sorted(Path(rendering.__file__).parent.glob("*.py"))
+    version = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
     folder = cache / f"{plan}_{seed}_{every}_{version}"
     if not (folder / "scene.npz").exists():
         config = render_room.RoomConfig(seed=seed)

@@ -1,26 +1,26 @@
 #!/usr/bin/env python3
 """Train and test re-OBJ's four setups on one recording, in three folds of its objects.
 
-    python examples/reobj_folds.py redkitchen_7scenes --backbone resnet50v2_gluon_s3.onnx \\
+    python benchmarks/reobj_folds.py redkitchen_7scenes --backbone resnet50v2_gluon_s3.onnx \\
         --choosing -o OUT
 
-prints Rank-1, 5, 10, 20 of full, fg, bg and concat, not trained and trained, and writes them with
-what was used to OUT/reobj_folds.md and .csv. Needs `pip install torch onnx`; minutes on one core.
-Without --choosing only a recording that is for reporting (splits.json) is taken.
+prints Rank-1, 5, 10, 20 of full, fg, bg and concat, untrained and trained, and writes them with
+their settings to OUT/reobj_folds.md and .csv. Needs `pip install torch onnx`; minutes on one core.
+Without --choosing only recordings for reporting (splits.json) are accepted.
 
-Every annotated view of an object gives three crops (object alone, surroundings alone, both), each
-of which a frozen backbone turns into a map. A ConvBlock, for concat one for both maps concatenated,
-turns them into an embedding; the four setups are trained alike, by triplets. Three folds: the
-objects of a fold, dealt class by class, are the queries of blocks that were trained on the others.
-The gallery are all views of all objects in frames further than --away (open protocol of rank_k.py).
-"not trained" compares the maps themselves (signed square roots, cosine; concat: the mean of both).
+Every annotated view of an object gives three crops (object, surroundings, both); a frozen backbone
+computes a feature map of each. A ConvBlock (for concat one for both concatenated maps) computes the
+embedding; the four setups are trained alike with a triplet loss. Three folds: the objects of a
+fold, assigned class by class, are the queries for blocks trained on the others. The gallery is all
+views of all objects in frames further away than --away (open protocol of rank_k.py). "not trained"
+compares the maps themselves (signed square roots, cosine; concat: the mean of both).
 
-The published maps have 7x7x512: of an ONNX file that computes such a tensor (ResNet18, ResNet34,
-ResNet50: inside its last block) the last one is taken, else the last of 512 channels, else the
-file's spatial output, from crops of such a size that it has 7x7 places. Which, is printed.
-re-OBJ style: what differs from the paper is the size of the ConvBlock (--width 0 for the published
-one), ellipses in place of masks where there are none, crops whose hidden part is grey with a soft
-edge, unit rows and a soft margin in the loss, objects of one room in place of many scenes.
+The published maps have 7x7x512. The last tensor of this size in the ONNX file is used (ResNet18,
+ResNet34, ResNet50: inside the last block), else the last one with 512 channels, else the file's
+spatial output, with a crop size that gives 7x7 cells. The choice is printed. Differences from the
+paper: the size of the ConvBlock (--width 0 for the published one), ellipses where masks are
+missing, crops whose masked area is grey with a soft edge, unit embeddings and a soft margin in the
+loss, objects of one room instead of many scenes.
 Ref: Bansal et al., re-OBJ, ICIAP 2019; Hermans et al., 2017 (hardest negatives, soft margin).
 """
 
@@ -183,7 +183,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("-o", "--out", type=Path, required=True)
     add("--backbone", default="mobilenetv2_feat", help="ONNX file or name (default %(default)s)")
     add("--every", type=int, default=20, help="use every n-th frame (default %(default)s)")
-    add("--away", type=int, default=30, help="frames between query and gallery")
+    add("--away", type=int, default=30, help="minimum frames between query and gallery")
     add("--folds", type=int, default=3)
     add_choosing(parser)
     add("--width", type=int, default=64,
@@ -191,7 +191,12 @@ def build_parser() -> argparse.ArgumentParser:
     add("--loss", choices=te.LOSSES, default="hardest", help="the negative (default %(default)s)")
     add("--steps", type=int, default=150)
     add("--rate", type=float, default=3e-4, help="learning rate (AdamW, cosine)")
-    add("--repeats", type=int, default=3, help="trainings of each setup and fold, other seeds")
+    add(
+        "--repeats",
+        type=int,
+        default=3,
+        help="trainings of each setup and fold, with different seeds",
+    )
     return parser
 
 

@@ -1,41 +1,42 @@
 #!/usr/bin/env python3
-"""Break good recordings, reconstruct their cameras, and count what passes as good.
+"""Corrupt good recordings, reconstruct their cameras, and count undetected wrong reconstructions.
 
-    python examples/pose_breaks.py -o OUT [--data FOLDER] [--cases 216] [--jobs 2] [--only KIND...]
-    python examples/pose_breaks.py -o OUT mirrored_half-009      # these cases; pictures are kept
+    python benchmarks/pose_breaks.py -o OUT [--data FOLDER] [--cases 216] [--jobs 2]
+        [--only KIND...]
+    python benchmarks/pose_breaks.py -o OUT mirrored_half-009      # these cases; images are kept
 
-Writes OUT/results.jsonl, a line for every case; a second call goes on from there. What is cut from
-the recordings, and the poses of whole recordings that have no truth, are made once and kept
-(--cache, default OUT/cache). Calls public names only. Exit code 1 if a wrong reconstruction passed
-as good, or a good recording was refused or torn.
+Writes OUT/results.jsonl, a line for every case; a second call resumes. Clips of the recordings, and
+the poses of whole recordings without ground truth, are computed once and kept (--cache, default
+OUT/cache). Uses public names only. Exit code 1 if a wrong reconstruction was not detected, or if a
+good recording was refused or split.
 
-Kinds of breaks, in short stretches (24-40 pictures):
-    mirrored_half    from a cut on all pictures are mirrored left to right: two worlds that no
-                     rigid motion joins
+Kinds of corruption, in clips of 24 to 40 images:
+    mirrored_half    all images after a cut are mirrored left to right: two scenes that no rigid
+                     motion aligns
     mirrored_middle  a stretch in the middle is mirrored
-    left_out         pictures are left out where the view turns most
-    permuted         pictures are shuffled: in blocks, or all; blocks in another order
-    two_rooms        two recordings one after the other, or by turns (at one focal length)
-    corridor         rendered rooms in a row that look the same: what is seen again is elsewhere
-    turn             rendered: the camera only turns for a stretch
+    left_out         images are removed where the view turns most
+    permuted         images are shuffled: within blocks, or all; or blocks in another order
+    two_rooms        two recordings one after the other, or interleaved (at one focal length)
+    corridor         rendered rooms in a row that look the same: a revisited view is another room
+    turn             rendered: the camera only rotates for a stretch
     zoomed           a stretch is zoomed: another focal length
-    thin             a stretch is blurred or dark: the sides of it share few points
-and beside them
-    issue            the two breaks that were reported first, whole and at the defaults
-    good             recordings as they are, at the defaults: what registers today must go on to
+    thin             a stretch is blurred or dark: its two sides share few points
+and besides
+    issue            the two failures that were reported first, in full length, with the defaults
+    good             unchanged recordings, with the defaults: they must still be registered
 
-Verdict. Every frame has a true pose and a world that it shows. A part of the result is right if all
-its frames show one world and ONE similarity brings their cameras (centres and orientations) to the
-truth, with the same scale all along; the similarity is the one on which most frames agree. A
-result is
-    whole     right, in one part with (nearly) every frame
-    partly    right, in several parts or with frames that have no pose
+Verdict. Every frame has a true pose and a scene label. A component of the result is right if all
+its frames show one scene and ONE similarity aligns their cameras (centres and orientations) with
+the truth, at the same scale throughout; it is the similarity with the most inlier frames. A result
+is
+    whole     right, in one component with (nearly) every frame
+    partly    right, in several components or with frames without a pose
     refused   without poses
-    said      wrong, but messages name all wrong frames by number
-    passed    wrong otherwise: some part holds frames that do not belong to it, without a word
-So a shuffled set that comes out right is no failure, and neither is a break that is found. A part
-whose true cameras stay in place is judged by its orientations alone. Interpolated frames, which are
-marked, are not judged.
+    said      wrong, but messages list all wrong frames by number
+    passed    wrong otherwise: some component contains wrong frames, without a message
+A shuffled set that is reconstructed correctly is no failure, and neither is a detected corruption.
+A component whose true cameras do not move is judged by its orientations alone. Interpolated frames,
+which are marked, are not judged.
 """
 
 from __future__ import annotations
@@ -416,7 +417,7 @@ SMALL = rr.RoomConfig(width=400, height=300, supersample=1, texels_per_m=200, li
 
 
 def rendered(seed: int, path: str, frames: int, plan: str = "home", today: int = 0) -> Recording:
-    """Describe a clip of examples/render_room.py, small; a turn is one on the spot exactly."""
+    """Describe a clip of benchmarks/render_room.py, small; a turn is one on the spot exactly."""
     shake_m = 0.0 if path == "turn" else SMALL.shake_m
     room = replace(SMALL, seed=seed, path=path, frames=frames, plan=plan, shake_m=shake_m)
     return Recording(room=room, today=today, plan="" if plan == "varied" else plan)
@@ -825,12 +826,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("names", nargs="*", help="only these cases, e.g. turn-003; files are kept")
+    parser.add_argument("names", nargs="*", help="only these cases, e.g. turn-003; keep files")
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--cache", type=Path, help="clips and references (default OUT/cache)")
-    parser.add_argument("--cases", type=int, default=216, help="broken ones (default 216)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--cases", type=int, default=216, help="corrupted cases (default 216)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once (default 2)")
     parser.add_argument("--only", nargs="*", default=[], choices=[*KINDS, "issue", "good"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_CASES} cases, own data only")

@@ -1,7 +1,7 @@
-"""The LfD authors' own demo (TUW: 6 objects, 8 views) with LfD and with fit_objects.
+"""Compare LfD with fit_objects on the demo of LfD's authors (TUW: 6 objects, 8 views).
 
 Usage:
-    python examples/tuw_demo.py FOLDER [-o docs]
+    python benchmarks/tuw_demo.py FOLDER [-o benchmarks]
 
 FOLDER holds bounding_boxes.npy (8, 24), camera_poses.npy (32, 3), intrinsics.npy (3, 3) and gt.npy
 (6, 4, 4) of IIT-PAVIS/LfD, Data/Aldoma (MIT; data after Aldoma et al., IROS 2014). The data is not
@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("-o", type=Path, metavar="DOCS", help="folder with quadrics.md to fill in")
+    parser.add_argument("-o", type=Path, metavar="FOLDER", help="fill in FOLDER/RESULTS.md")
     args = parser.parse_args(argv)
     if not (args.folder / "gt.npy").exists():
         print(f"error: {args.folder} has no gt.npy; see the top of this file", file=sys.stderr)
@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     text = overlap_table(boxes, cams, truth) + "\n\n" + shape_table(boxes, cams)
     print(text)
     if args.o:
-        write_table(args.o / "quadrics.md", "tuw", text)
+        write_table(args.o / "RESULTS.md", "tuw", text)
     return 0
 
 

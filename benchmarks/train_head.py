@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
 """Train a head for a frozen backbone of `reobj_track.py`, such as MobileNetV2's ImageNet weights.
 
-    python examples/train_head.py -o OUT --backbone mobilenetv2_feat --rooms 1008:1193 ...
+    python benchmarks/train_head.py -o OUT --backbone mobilenetv2_feat --rooms 1008:1193 ...
 
-writes OUT/mobilenetv2_feat_head.onnx, two vectors an object from the cells of one pass over the
-frame, or with --crops OUT/SETUP/crops_mobilenetv2_feat_head.onnx, re-OBJ's ConvBlock on two masked
-crops an object (use: `--embed mobilenetv2_feat` or `--embed crops`, with `--set embed.head=FILE`),
-beside checkpoints, log and curves as of `train_embedding.py`, whose sources, augmentation, loss and
-validation these are. What the backbone shows of every scene is computed once and kept in the cache.
+writes OUT/mobilenetv2_feat_head.onnx (two vectors an object from the cells of one pass over the
+frame) or, with --crops, OUT/SETUP/crops_mobilenetv2_feat_head.onnx (re-OBJ's ConvBlock on two
+masked crops an object), with checkpoints, log and curves. Use them with `--embed mobilenetv2_feat`
+or `--embed crops`, and `--set embed.head=FILE`. Sources, augmentation, loss and validation are
+those of `train_embedding.py`. The backbone's features of every scene are computed once and cached.
 As published, the maps of foreground and background are concatenated and merged by one ConvBlock;
---merge rows gives each crop a block of its own and joins their rows, as in the weights that come
-along. `reobj_folds.py` trains and tests re-OBJ's setups on one recording.
+--merge rows gives each crop a block of its own and concatenates the two embeddings, as in the
+bundled weights. `reobj_folds.py` trains and tests re-OBJ's setups on one recording.
 Ref: Bansal et al., re-OBJ, ICIAP 2019 (ConvBlock).
 """
 
@@ -424,7 +424,7 @@ def build_parser() -> argparse.ArgumentParser:
     add: Callable[..., Any] = parser.add_argument
     add("--backbone", required=True, help="name or ONNX file of the frozen backbone")
     add("--crops", action="store_true", help="for two crops an object (re-OBJ's ConvBlock)")
-    add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="of --crops")
+    add("--setups", nargs="*", default=["concat"], choices=CROP_SETUPS, help="setups of --crops")
     add("--merge", choices=("maps", "rows"), default="maps",
         help="of two crops: their maps, by one ConvBlock, or the rows of a block each")  # fmt: skip
     add("--width", type=int, default=64,

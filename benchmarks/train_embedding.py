@@ -1,30 +1,30 @@
 #!/usr/bin/env python3
-"""Train the embedding of `reobj_track.py`: one small backbone pass a frame, two parts an object.
+"""Train the embedding of `reobj_track.py`: one backbone pass a frame, two vectors an object.
 
-    python examples/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
+    python benchmarks/train_embedding.py -o OUT --rooms 1000:1150 --sparse IMAGES=SPARSE ...
 
 writes OUT/reobj.onnx and OUT/reobj_head.onnx (use: `--embed OUT/reobj.onnx`; the checkpoint of the
 best validation, OUT/best.pt), OUT/last.pt (go on with --resume), OUT/log.csv and OUT/curves.png.
 Needs `pip install torch matplotlib onnx`; the GPU is used when there is one.
 
-What it learns from; every source may be given several times:
-  --rooms A:B           seeds of rendered rooms with sets of identical twins (render_room.py
+Training data; every source may be given several times:
+  --rooms A:B           seeds of rendered rooms with sets of identical instances (render_room.py
                         `--plan varied --path tour`), rendered on the fly into --cache.
-  --sparse IMAGES=DIR   self-supervision of poses: a COLMAP model of the images, such as `sparse/`
+  --sparse IMAGES=DIR   self-supervision from poses: a COLMAP model of the images, such as `sparse/`
                         of an output folder of `run`. A ball around a 3D point is a pseudo-object:
-                        the views that observe the point show the same place from another side.
+                        the views that observe the point show it from different directions.
   --tracks IMAGES=FILE  `tracks.txt` of `run` (MOTChallenge): identity by 3D object. Masks
                         are those of the detector (OUT/cache, or a detections .npz beside FILE).
   --scannet DIR         a scene in ScanNet's or Matterport3D's layout, as reid_scenes.py reads it.
 Validation: --val-rooms A:B, --val-sparse.
 
-Method: each step takes several scenes and several views of each, and changes every picture as
-phones do (colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of
-masks half of the time). Triplet loss on cosines of (foreground, background) together and of each
-alone; for every anchor and positive the negative is the soft maximum of all (mostly an identical
-twin elsewhere in the room), with --loss triplet semi-hard (the nearest of those further than the
-positive), or with --loss hardest the nearest of all of the batch. From --hard-after on negatives
-are of the same scene only, and semi-hard ones become the nearest.
+Method: each step takes several scenes and several views of each, and augments every image
+(colour, gamma, white balance, blur, noise, JPEG, jittered boxes, ellipses instead of masks half of
+the time). Triplet loss on cosines of (foreground, background) together and of each alone. For every
+anchor and positive the negative is the soft maximum over all (mostly an identical instance
+elsewhere in the room); with --loss triplet it is semi-hard (the nearest of those further away than
+the positive), with --loss hardest the nearest of the batch. After the fraction --hard-after of the
+steps, negatives are from the same scene only, and semi-hard ones become the nearest.
 Ref: Bansal et al., re-OBJ, ICIAP 2019; Schroff et al., FaceNet, CVPR 2015 (semi-hard); Sandler et
 al., MobileNetV2, CVPR 2018 (inverted residual); Izmailov et al., UAI 2018 (--average).
 
@@ -1213,26 +1213,36 @@ def common_options(description: str | None) -> argparse.ArgumentParser:
     add("--val-rooms", default="", help="A:B, seeds to validate with")
     add("--cache", type=Path, default=Path("rooms_cache"), help="folder of rendered rooms")
     add("--frames", type=int, default=40, help="views of each room")
-    add("--no-render", action="store_true", help="use the cache only, as another process fills it")
+    add("--no-render", action="store_true", help="only use the cache; another process fills it")
     for name in ("--sparse", "--val-sparse", "--tracks"):
         add(name, type=pair, action="append", default=[], metavar="IMAGES=PATH")
     add("--scannet", type=Path, action="append", default=[], metavar="DIR")
     add("--scenes", type=int, default=3, help="scenes a step")
     add("--views", type=int, default=8, help="views of each scene")
     add("--steps", type=int, default=3000)
-    add("--minutes", type=float, default=0.0, help="stop after so many minutes of steps (0: never)")
+    add(
+        "--minutes",
+        type=float,
+        default=0.0,
+        help="stop after N minutes of steps (0: never)",
+    )
     add("--rate", type=float, default=1e-3, help="peak learning rate (AdamW, cosine)")
     add(
         "--average", type=float, default=0.0, metavar="DECAY",
         help="take the moving average of the weights (.9995; 0: the last weights)",
     )  # fmt: skip
-    add("--hard-after", type=float, default=1.0, help="negatives of one scene from this share on")
+    add(
+        "--hard-after",
+        type=float,
+        default=1.0,
+        help="fraction of the steps after which negatives are of the same scene",
+    )
     add("--every", type=int, default=100, help="steps between two rows of the log")
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1)
-    add("--ahead", type=int, default=0, help="batches that a second process makes ahead (0: none)")
+    add("--ahead", type=int, default=0, help="batches that a second process prepares (0: none)")
     add("--loss", choices=LOSSES, default="soft", help="the negative (default %(default)s)")
-    add("--resume", action="store_true", help="go on from OUT/last.pt")
+    add("--resume", action="store_true", help="resume from OUT/last.pt")
     return parser
 
 
@@ -1249,9 +1259,7 @@ def parsed(parser: argparse.ArgumentParser, argv: Sequence[str] | None) -> argpa
 def main(argv: Sequence[str] | None = None) -> int:
     """Train, draw the curves, export."""
     parser = common_options(__doc__)
-    parser.add_argument(
-        "--start", type=Path, help="begin with the weights of this checkpoint (.pt)"
-    )
+    parser.add_argument("--start", type=Path, help="initial weights: a checkpoint (.pt)")
     args = parsed(parser, argv)
     trainer = Trainer(args)
     trainer.run()

@@ -1,24 +1,24 @@
-"""How far the metric scale that size priors give lies from the truth, and whether its sigma holds.
+"""Measure the metric scale from size priors: its error, and the calibration of its sigma.
 
 Usage:
-    python examples/scale_table.py DATA [--choosing] [-o docs]
+    python benchmarks/scale_table.py DATA [--choosing] [-o benchmarks]
 
-Recordings with metric poses are scaled by a random factor and handed to `quadrics.fit_objects` with
-metric=False; its `Scale` must undo the factor. No detector and no picture is needed: rooms of
-render_room.py are drawn as maps of instances, the rest has recorded boxes. DATA holds
-redkitchen_7scenes, hololens_kitchen and tum_fr3_office; "none" leaves the rooms alone. Of the rooms
-those with a plan of their own serve that are for reporting (splits.json); --choosing shows the
-recordings too, and --rooms more rooms, marked.
+Recordings with metric poses are scaled by a random factor and passed to `quadrics.fit_objects` with
+metric=False; its `Scale` must undo the factor. No detector and no images are needed: rooms of
+render_room.py are rendered as instance maps, the recordings have recorded boxes. DATA holds
+redkitchen_7scenes, hololens_kitchen and tum_fr3_office; "none" uses the rooms only. The rooms are
+those of splits.json for reporting that have a plan of their own; --choosing adds the recordings,
+and --rooms more rooms, marked.
 
-Who says which boxes are one object:
-    true     boxes of the objects in the truth: whole, with their hidden parts; redkitchen: as seen
-    seen     rooms: boxes of what is seen of the objects, corners off by 1.2 % of the size
-    given    detections, given to the true object of their class that they overlap by IoU >= .3
+Sources of the assignment of boxes to objects:
+    true     boxes of the true objects: amodal, occluded parts included; redkitchen: visible parts
+    seen     rooms: boxes of the visible parts of objects, corners off by 1.2 % of the size
+    given    detections, assigned to the true object of their class that they overlap (IoU >= .3)
     tracked  detections, `Tracker` with the poses, no appearance: duplicates, wrong classes included
 
-Each recording is asked as a whole, by stretches of its path, and with random halves of its objects
-and of its categories. Variants of one recording share path, objects and categories: they are not
-independent, and nor are rooms of one generator. Seeded: same table every time.
+Each recording is measured as a whole, by stretches of its path, and with random halves of its
+objects and of its categories. Variants of one recording share path, objects and categories, so they
+are not independent; neither are rooms of one generator. Seeded: the table is reproducible.
 """
 
 from __future__ import annotations
@@ -309,7 +309,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("data", help="folder of the recordings, or none")
-    parser.add_argument("-o", type=Path, metavar="DOCS", help="folder with quadrics.md to fill in")
+    parser.add_argument("-o", type=Path, metavar="FOLDER", help="fill in FOLDER/RESULTS.md")
     parser.add_argument("--rooms", type=int, default=10, help="rooms for choosing (--choosing)")
     parser.add_argument("--parts", type=int, default=2, help="variants of each kind a recording")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
@@ -332,7 +332,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     text = table([*head, "sigma %", "error / sigma"], [row.cells() for row in rows])
     print(text + "\n\n" + summary(rows))
     if args.o:
-        write_table(args.o / "quadrics.md", "scales", summary(rows))
+        write_table(args.o / "RESULTS.md", "scales", summary(rows))
     return 0
 
 

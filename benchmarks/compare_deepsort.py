@@ -1,29 +1,31 @@
 #!/usr/bin/env python3
-"""Compare identities on the same detections: ours, DeepSORT and today's trackers.
+"""Compare the identities of our tracker, DeepSORT and current trackers on the same detections.
 
-    python examples/compare_deepsort.py --peers build/peers --rooms reporting --mot mot -o OUT
-    python examples/compare_deepsort.py --peers build/peers --rooms choosing --tune -o OUT
+    python benchmarks/compare_deepsort.py --peers build/peers --rooms reporting --mot mot -o OUT
+    python benchmarks/compare_deepsort.py --peers build/peers --rooms choosing --tune -o OUT
 
-Writes OUT/compare.html (all of it on one page), compare.csv, compare_*.png; prints Markdown tables.
-The same settings for all sequences; every tracker's rows are the detections it gave an identity to,
-never predicted boxes; identities of `whole chain` are decided over the whole video, all others
-frame by frame. Every result is kept in OUT/runs: an interrupted comparison goes on where it
-stopped, and a changed reobj_track.py runs only our own rows again.
+Prints Markdown tables; writes OUT/compare.html (all tables and plots), compare.csv, compare_*.png.
+All sequences use the same settings. A tracker's rows are the detections that it assigned an
+identity to, never predicted boxes. `whole chain` decides identities over the whole video, all
+others frame by frame. Results are kept in OUT/runs: an interrupted comparison resumes, and a change
+of reobj_track.py recomputes only our own rows. --fill FILE renews the tables of a Markdown file.
 
-splits.json says which rooms, recordings and pedestrians are for reporting. What is not is left out;
-with --choosing it is shown, marked. --tune wants the others only:
-it tries one option of every peer after the other (SWEEP) for the best HOTA over all of them and
-writes the best settings to tuned.json beside this file, which the rows `tuned` use.
+splits.json lists the rooms, recordings and pedestrians for reporting. All others are left out;
+--choosing includes them, marked. --tune uses only the others: it varies one option of every peer
+after the other (SWEEP) for the best HOTA over all and writes the best settings to tuned.json beside
+this file, for the rows `tuned`.
 
-Rank-1: share of the returns (a true object in view again after >= 30 frames) whose first detection
-is, by the tracker's appearance alone, most like an earlier view of the same object (of its class).
-Returns: share of these returns that the tracker itself gave the identity of the visits before.
+Rank-1: fraction of the returns (a true object in view again after >= 30 frames) whose first
+detection is nearest, by the tracker's appearance alone, to an earlier view of the same object among
+those of its class. Returns: fraction of these returns to which the tracker itself assigned the
+earlier identity.
 
-Appearance networks (folder REOBJ_MODELS): persons osnet_x0_25_msmt17.onnx, rooms
-mobilenetv2_feat.onnx (ImageNet, as DeepSORT's own embedder), one crop a box; "own embedding" is our
-embedder's. Without images no tracker has appearance, and BoT-SORT no motion of the camera.
-DeepSORT is deep-sort-realtime 1.3.2 (PyPI), whose gallery of a lost track fills up with copies of
-the last view. Pedestrians without recorded detections get the truth, disturbed (`simulated`).
+Appearance networks (folder REOBJ_MODELS): osnet_x0_25_msmt17.onnx for persons and
+mobilenetv2_feat.onnx (ImageNet, as DeepSORT's own embedder) for rooms, one crop a box; "own
+embedding" uses our embedder. Without images no tracker has appearance and BoT-SORT has no camera
+motion. DeepSORT is deep-sort-realtime 1.3.2 (PyPI), whose gallery of a lost track fills up with
+copies of the last view. Pedestrians without recorded detections get the truth with noise
+(`simulated`).
 """
 
 from __future__ import annotations
@@ -657,14 +659,19 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--peers", type=Path, help="folder for the peers' virtual environments")
     parser.add_argument(
-        "--rooms", default="", metavar="SEEDS", help="e.g. 1,v900; or `reporting`, `choosing`"
+        "--rooms",
+        default="",
+        metavar="SEEDS",
+        help="seeds, e.g. 1,v900; or `reporting`, `choosing`",
     )
-    parser.add_argument("--recordings", type=Path, nargs="*", default=[], help="folders")
+    parser.add_argument(
+        "--recordings", type=Path, nargs="*", default=[], help="folders of recordings"
+    )
     parser.add_argument("--mot", type=Path, help="folder with MOT15-train, MOT17-train ...")
-    parser.add_argument("--every", type=int, default=1, help="use every n-th frame: wide steps")
+    parser.add_argument("--every", type=int, default=1, help="use every n-th frame")
     add_choosing(parser)
     parser.add_argument("--tune", action="store_true", help="find the best settings of the peers")
-    parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to renew")
+    parser.add_argument("--fill", type=Path, help="Markdown file whose marked tables to replace")
     parser.add_argument("-o", "--out", type=Path, required=True)
     return parser
 

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Show the worst identity errors of runs beside the truth, each with its likely cause.
+"""Draw the worst identity errors of runs beside the ground truth, each with its likely cause.
 
-    python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg [--classes chair,cup]
+    python benchmarks/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg [--classes chair,cup]
 
-An error is a true object that carries, for some frames, an identity that does not stand for it
-(`identity_map`): either a second identity of its own (split), or the identity of another object
-(taken for). The errors with the most frames come first. For each: the object with its right
-identity, the first frame of the error, and the object that the identity stands for. Thick: the
-object in question, its identity in the colour of the identity; white: the truth. Prints a Markdown
-table with the causes that can be read off boxes, scores and classes.
+An error is a true object that has, for some frames, an identity that is not assigned to it
+(`identity_map`): either a second identity (split), or the identity of another object (confusion).
+The errors with the most frames come first. Each row shows the object with its correct identity, the
+first frame of the error, and the object to which the identity is assigned. Thick boxes: the object
+in question, in the colour of its identity; white boxes: the ground truth. Prints a Markdown table
+with the causes that follow from boxes, scores and classes.
 """
 
 from __future__ import annotations
@@ -229,9 +229,9 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path, nargs="+", help="output folders of run or track")
-    parser.add_argument("--gt", type=Path, nargs="+", required=True, help="their truths (MOT)")
+    parser.add_argument("--gt", type=Path, nargs="+", required=True, help="their truth (MOT)")
     parser.add_argument("-o", "--image", type=Path, required=True, help="picture to write")
-    parser.add_argument("--classes", default="", help="only these")
+    parser.add_argument("--classes", default="", help="comma-separated class names (default: all)")
     parser.add_argument("--limit", type=int, default=8, help="errors shown")
     args = parser.parse_args()
     if len(args.gt) != len(args.out):

@@ -1,6 +1,7 @@
-"""What may be reported and what was chosen on: `splits.json`, obeyed by the scripts that report.
+"""Data splits: `splits.json` lists data for reporting and data used for choosing.
 
-What is not named for reporting is left out, with a line on stderr; --choosing shows it, marked.
+Scripts that report leave out all data not listed for reporting, with a line on stderr; --choosing
+includes it, marked.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ def held_out(kind: str, name: str) -> bool:
 
 
 def usable(kind: str, name: str, choosing: bool, tune: bool = False) -> bool:
-    """Tell whether a sequence may be used, and say on stderr if not.
+    """Return whether a sequence may be used; if not, print the reason on stderr.
 
     Args:
-        choosing: also what is not held out. tune: only what is not held out, whatever `choosing`.
+        choosing: include sequences that are not held out. tune: only these, whatever `choosing`.
     """
     if held_out(kind, name) != tune or (choosing and not tune):
         return True
-    why = "is for reporting" if tune else "is not for reporting; --choosing shows it, marked"
-    print(f"left out (examples/splits.json): {name} {why}", file=sys.stderr)
+    why = "is for reporting" if tune else "is not for reporting; --choosing includes it, marked"
+    print(f"left out (benchmarks/splits.json): {name} {why}", file=sys.stderr)
     return False
 
 
@@ -45,7 +46,7 @@ def marked(kind: str, name: str, title: str = "") -> str:
 
 def add_choosing(parser: argparse.ArgumentParser) -> None:
     """Add the option --choosing."""
-    text = "also what was used for choosing (splits.json), marked"
+    text = "include data used for choosing (splits.json), marked"
     parser.add_argument("--choosing", action="store_true", help=text)
 
 
