@@ -2,33 +2,33 @@
 
     python docs/make_api.py
 
-The site shows the same names with their full docstrings (`site_page`, used by docs/site.py).
+The site shows the same names with their full docstrings (`site_page`, used by docs/site_hooks.py).
 """
 
 from __future__ import annotations
 
 import inspect
 import sys
-import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 PAGE = Path(__file__).parent / "api.md"
-LINE = 88  # characters of a line of a signature
 DEFAULT = 24  # characters of a default value that is shown
-INTERNAL = {"to_json", "from_json", "keep_embeddings", "save_tracked", "load_tracked"}
+INTERNAL = set(
+    "cached cameras_text cells cut flush from_json frozen keep_embeddings load_tracked look maps "
+    "masked run_conv_block save_tracked span_text to_json trained updated write_objects".split()
+)  # methods for the tool itself
 
 HEAD = """# Python reference
 
-Start with `run` and `track`: `import reobj_track as rt`. Names that are not on this page are not
-public. Arguments, shapes and units are in the docstrings (`help(rt.run)`), which the documentation
-site shows in full. Options are listed by `python reobj_track.py --options`, files in
-[input formats](input_formats.md) and [output formats](output_formats.md).
+Start with `run` and `track` (`import reobj_track as rt`). Types, shapes and units are in the
+docstrings (`help(rt.run)`); the documentation site shows them in full. Options:
+`python reobj_track.py --options`. Other names are not public.
 
-`Array`, `IntArray`, `BoolArray`, `Image`, `Floats` are numpy arrays of float64, int64, bool, uint8,
-float32; (N, 4) is a shape; images are BGR, (H, W, 3) uint8; `xyxy` are pixels, the top-left one
-spans [0, 1]; `b_from_a` maps coordinates in a to b. All functions have type hints.
+`Array`, `IntArray`, `BoolArray` are numpy arrays of float64, int64, bool; (N, 4) is a shape; images
+are BGR, (H, W, 3) uint8; `xyxy` are pixels, the top-left one spans [0, 1]; `b_from_a` maps
+coordinates in a to b.
 """
 MIDDLE = """## quadrics
 
@@ -106,7 +106,7 @@ def entry(name: str, value: Any) -> str:
     else:
         head, summary = f"class {signature(name, value)}", first_line(value)
     members = list(methods(value)) if inspect.isclass(value) else []
-    lines = [f"```python\n{wrapped(head)}\n```\n", summary, *([""] if members else []), *members]
+    lines = [f"**`{head}`**\n", summary, *([""] if members else []), *members]
     return "\n".join(lines) + "\n"
 
 
@@ -146,12 +146,6 @@ def parameter_text(parameter: inspect.Parameter) -> str:
         default = "..." if len(default) > DEFAULT or "<" in default else default
         text += f"={default}"
     return text
-
-
-def wrapped(head: str) -> str:
-    """Break a long signature between its parameters."""
-    lines = textwrap.wrap(head, LINE, subsequent_indent="    ", break_long_words=False)
-    return "\n".join(lines)
 
 
 def type_text(annotation: Any) -> str:
