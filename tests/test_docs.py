@@ -26,7 +26,6 @@ import make_api  # noqa: E402
 
 TUTORIALS = ROOT / "docs" / "tutorials"
 ROOM = ROOT / "examples" / "room"
-CODE = ("examples", "benchmarks", "reobj")  # folders that a checkout has
 FOCAL, CENTRE = 492.756788421, (320.0, 240.0)  # COLMAP's: the first pixel's centre is (.5, .5)
 
 
@@ -169,7 +168,7 @@ def test_tutorial(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     """As a reader does: in a checkout, one block after the other."""
     need(page)
     prepare, check = PAGES[page]
-    for path in (*ROOT.glob("*.*"), *(ROOT / name for name in CODE)):
+    for path in (*ROOT.glob("*.*"), *(ROOT / n for n in ("benchmarks", "examples", "reobj"))):
         (tmp_path / path.name).symlink_to(path)
     prepare(tmp_path)
     env = os.environ | {"STEPS": "3", "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}

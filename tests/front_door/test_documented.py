@@ -1,4 +1,4 @@
-"""Every command and every piece of Python in README, docs/ and RESULTS.md is run or listed here.
+"""Every command and every piece of Python in README and docs/ is run, or named here with a reason.
 
 The blocks of `sh` and `python` in the tutorials are run by tests/test_docs.py. All other commands
 are here: as they are written, in a folder where the files that they name lie ready, and with some
@@ -42,11 +42,7 @@ from front_door.room import (
     true_objects,
 )
 
-PAGES = [
-    ROOT / "README.md",
-    *sorted((ROOT / "docs").rglob("*.md")),
-    ROOT / "benchmarks" / "RESULTS.md",
-]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = r"(?:[A-Z_]+=\S+ )?(?:python |reobj-track |pip |mkdocs |git clone|curl |wget )"
 
 
@@ -82,17 +78,16 @@ ELSEWHERE = {
     "python reobj_track.py objects out --edits edits.json": "below, of OUT",
 }  # fmt: skip
 LONG = {  # scripts that take long, or data that is not here: their words are compared with --help
-    "RESULTS.md": (
-        "benchmark", "compare_deepsort", "pose_accuracy", "pose_breaks", "rank_k", "real_rooms",
-        "real_solids", "reobj_folds", "scale_table", "synthetic_quadrics", "train_embedding",
-        "train_head", "tuw_demo",
-    ),
-}  # fmt: skip
+    "appearance.md": ("rank_k", "train_embedding", "train_head", "benchmark"),
+    "poses.md": ("pose_accuracy", "pose_breaks"),
+    "quadrics.md": ("synthetic_quadrics", "tuw_demo", "scale_table"),
+    "tracking.md": ("benchmark", "compare_deepsort", "real_rooms"),
+}
 
 
 def long_script(command: str) -> str | None:
     """The example that a command calls, if it is one of those that take long."""
-    found = re.search(r"python benchmarks/(\w+)\.py", command)
+    found = re.search(r"python examples/(\w+)\.py", command)
     every = {name for names in LONG.values() for name in names}
     return found[1] if found and found[1] in every else None
 
@@ -103,7 +98,7 @@ def long_script(command: str) -> str | None:
 @pytest.fixture
 def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder of a reader, in a checkout."""
-    for path in (*ROOT.glob("*.*"), *(ROOT / n for n in ("examples", "benchmarks", "reobj"))):
+    for path in (*ROOT.glob("*.*"), ROOT / "examples", ROOT / "reobj"):
         (tmp_path / path.name).symlink_to(path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -377,7 +372,7 @@ SHOWN = {
     TOOL + "run phone.mp4 -o out --detector mine.onnx --set detect.class_names=names.txt": Shown(
         mine, detected, f"--every 6 --stop 120 {SUPPLIED} {QUICKLY}"
     ),
-    "python benchmarks/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
+    "python examples/failure_gallery.py OUT... --gt gt.txt... -o gallery.jpg": Shown(
         output, nothing, "", {"OUT...": "out", "gt.txt...": "gt.txt"}, "out"
     ),
     "python examples/live_ar.py -o OUT": Shown(recording, nothing, "--frames 20", NAMED),
