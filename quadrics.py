@@ -24,7 +24,7 @@ Axes of the shape comments: F frames, O objects, V views of one object, E = 4 ed
 (left, top, right, bottom), B problems (object x shape x start) of one batch, L live objects
 (those with a usable box).
 "Solid": the shape with its pose and size. Constants stand beside their use; those without a source
-were chosen on simulated and recorded scenes (docs/quadrics.md, docs/trials.md).
+were chosen on simulated and recorded scenes (docs/quadrics.md, benchmarks/LOG.md).
 
 References:
     [LfD]   Rubino, Crocco, Del Bue: 3D object localisation from multi-view detections. PAMI 2018

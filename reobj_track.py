@@ -382,7 +382,7 @@ class TrackState:
 STATE_VERSION = 8  # of the files of Tracker.save
 
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
-# redkitchen (docs/tracking.md).
+# redkitchen (benchmarks/RESULTS.md).
 GATE_CHI2 = 9.2103  # gate on the centre's squared Mahalanobis distance: chi2 .99, 2 dof
 GATE_IOU = 0.2  # overlap that passes the gate by itself
 MOTION_ONLY_IOU = 0.1  # overlap that every match needs where there is no appearance to compare

@@ -77,7 +77,7 @@ SHORT = rt.PosesConfig(size_px=320)  # for 24-40 pictures, of which all are keyf
 # ---- Verdict ------------------------------------------------------------------------------------
 
 # Error of a centre over the extent of its part's true path. Good recordings stay below .06
-# (docs/poses.md: redkitchen against a Kinect), a wrong loop of the corridor is at .6.
+# (benchmarks/RESULTS.md: redkitchen against a Kinect), a wrong loop of the corridor is at .6.
 MAX_CENTRE = 0.1
 LEAST_EXTENT = 0.05  # of that path over all of its world's: a part that hardly moved (chosen)
 # Local scale within a part over that of most of it. Half as much again bends a straight path by no

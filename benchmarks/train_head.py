@@ -212,7 +212,7 @@ class CropBlock(nn.Module):
     """Maps (N, C, n, n) of one crop to unit rows; two crops have one each, their rows make one.
 
     re-OBJ style, not as published: better by 3 points of Rank-1 on the validation rooms than a
-    block in common, and what comes along (docs/appearance.md).
+    block in common, and what comes along (benchmarks/RESULTS.md).
     """
 
     def __init__(self, channels: int, side: int, width: int, inner: int = 64) -> None:

@@ -64,7 +64,7 @@ class CropEmbedder(Embedder):
     object masked. A backbone turns each crop into a map. A trained ConvBlock turns the two maps,
     stacked in the channels, into one embedding (the bundled one processes each map alone first).
     Without a ConvBlock the maps are flattened (the thesis's "no-train"). A model of
-    `examples/train_embedding.py` has its own head: its cells are pooled from the crops' maps as
+    `benchmarks/train_embedding.py` has its own head: its cells are pooled from the crops' maps as
     `Embedder` pools them from the frame's.
 
     Args:

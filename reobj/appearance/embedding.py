@@ -71,7 +71,7 @@ class Embedder:
     Args:
         model: "reobj" for the bundled weights, or a backbone: a name listed by
             `reobj_track.py models` or an ONNX file with an image input and a spatial output (one of
-            `examples/train_embedding.py` names its head and its layout).
+            `benchmarks/train_embedding.py` names its head and its layout).
         head: trained head (.onnx) of a backbone; "": the bundled one; "none": no head.
         layout: sampling of the map of an untrained backbone.
         threads: of onnxruntime; 0: all cores.
@@ -246,7 +246,7 @@ def _joined_cells(cells: Floats) -> Floats:
 class Backbone:
     """Feature maps from an ONNX network with an image input and a spatial output.
 
-    The metadata ("reobj", JSON) of files of `examples/train_embedding.py` contain the size of the
+    The metadata ("reobj", JSON) of files of `benchmarks/train_embedding.py` contain the size of the
     frame, the sampling layout and the file of the head. These networks take BGR bytes and return
     channels last. Any other network takes RGB normalised as for ImageNet, channels first; a head
     that was trained for it has the same metadata.

@@ -172,8 +172,8 @@ class SimilarityCalibration:
             background (last axis), of different and of same objects (first axis).
     """
 
-    # fitted by `examples/rank_k.py --calibrate` to 12 rendered rooms, with and without masks; the
-    # weights lie between the fits of several embeddings (docs/appearance.md)
+    # fitted by `benchmarks/rank_k.py --calibrate` to 12 rendered rooms, with and without masks; the
+    # weights lie between the fits of several embeddings (benchmarks/RESULTS.md)
     WEIGHTS = (0.55, 0.5)  # of foreground and background
     # mean log similarity of foreground and background: of different, of same objects
     USUAL = ((1.3, 0.65), (1.8, 1.2))
@@ -252,7 +252,7 @@ class SimilarityCalibration:
 
 
 # prior odds that a new track is one given known object rather than a new one: fitted with WEIGHTS
-# (with other embeddings 1.0 to 1.5: docs/appearance.md)
+# (with other embeddings 1.0 to 1.5: benchmarks/RESULTS.md)
 RETURN_ODDS = 1.8
 
 

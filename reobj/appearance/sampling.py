@@ -40,7 +40,7 @@ class SamplingLayout:
             other objects count too; scale 0: no such box.
         foreground_channels: the foreground is pooled from this many first channels only; 0: all.
         neighbours: weight of `neighbour_embedding` in the background of trained models. 0.2 and its
-            distance were chosen on the six videos of docs/tracking.md.
+            distance were chosen on the six videos of benchmarks/RESULTS.md.
         crop_px: side of the crops of `CropEmbedder` (224: ImageNet's).
     """
 

@@ -33,13 +33,13 @@ from reobj.objects.likelihood import (
 )
 from reobj.types import Array, BoolArray, IntArray
 
-# Log odds, chosen on hololens_kitchen and redkitchen (docs/tracking.md).
+# Log odds, chosen on hololens_kitchen and redkitchen (benchmarks/RESULTS.md).
 MISSED = 0.5  # against an object, for each frame in which it is expected and not detected
 NEW_OBJECT = 10.0  # against each object: at least three frames must support it
 # Largest gain by a better box in step 1: else a compromise between two objects is selected first
 MAX_BOX_GAIN = 1.5
 # Log-odds margin over the runner-up that a detection needs to take part in refitting (chosen: 1 and
-# 4 gain less, docs/trials.md)
+# 4 gain less, benchmarks/LOG.md)
 UNAMBIGUOUS_MARGIN = 2.0
 SAME_TRACKLET = 2.5  # for the object of the previous or next detection of the tracklet
 MERGE_DISTANCE = 1.5  # largest distance of centres to merge, over the sum of the mean half widths

@@ -28,7 +28,7 @@ from reobj.tracking.linking import cut_at_gaps
 from reobj.types import Array, BoolArray, IntArray, Tracks, box_iou, class_shares, rows_by
 
 # Least score of untracked detections that give hypotheses (.3 finds 73.5 objects instead of 72, in
-# 1.2 times the time: docs/trials.md)
+# 1.2 times the time: benchmarks/LOG.md)
 HYPOTHESIS_SCORE = 0.4
 DUPLICATE_IOU = 0.6  # boxes of a class that overlap more are duplicates (NMS: .5 to .7)
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import quadrics
 from reobj.types import Array, BoolArray, IntArray, box_area
 
-# Chosen on hololens_kitchen and redkitchen unless a source is given (docs/tracking.md).
+# Chosen on hololens_kitchen and redkitchen unless a source is given (benchmarks/RESULTS.md).
 EDGE_SIGMA = 0.08  # of an edge of a box, over the size of the box
 # Fraction of edges that are occluded (measured on hololens_kitchen's chairs: .29 of the upper ones,
 # .53 of the lower), and of edges that are outliers (as in quadrics.py)
@@ -188,7 +188,7 @@ def _gather(
 
 
 def logit(score: Array) -> Array:
-    """Turn scores into log odds: detectors are roughly calibrated (docs/tracking.md)."""
+    """Turn scores into log odds: detectors are roughly calibrated (benchmarks/RESULTS.md)."""
     score = score.clip(1e-3, 1 - 1e-3)
     return np.asarray(np.log(score / (1 - score)))
 

@@ -87,7 +87,7 @@ def gather_views(
     return Views(frame, boxes, score, img_from_world, size)
 
 
-INSIDE_FRACTION = 0.8  # of the views that observe a point (chosen; .95 is alike: docs/trials.md)
+INSIDE_FRACTION = 0.8  # of the views that observe a point (chosen; .95 is alike: benchmarks/LOG.md)
 POINT_VIEWS = 2  # least number of them (one view gives no depth)
 MIN_POINTS = 5  # per object (chosen: fewer may all belong to another object)
 MAX_POINTS = 100  # per object (chosen: time)

@@ -333,5 +333,5 @@ def onnx_session(path: Path, threads: int = 0, device: str = "cpu") -> Any:
 
 
 def onnx_metadata(session: Any) -> dict[str, Any]:
-    """Read the metadata of `examples/train_embedding.py` in a model file; {} for other models."""
+    """Read the metadata of `benchmarks/train_embedding.py` in a model file; {} for other models."""
     return dict(json.loads(session.get_modelmeta().custom_metadata_map.get("reobj", "{}")))

@@ -21,7 +21,7 @@ CORNER_QUALITY = 0.01  # least strength of a corner over that of the strongest (
 CORNER_SPACING_PX = 12  # between corners of the small image, so that they spread (chosen)
 # nearest corners whose median is the parallax of a point (chosen). IoU of the true boxes with the
 # moved ones, against the transform alone: rendered room v900 .76 -> .82, room 0 at every 4th frame
-# .65 -> .78 (docs/tracking.md)
+# .65 -> .78 (benchmarks/RESULTS.md)
 PARALLAX_CORNERS = 5
 
 

@@ -24,7 +24,7 @@ from reobj.types import (
     unit_rows,
 )
 
-# Chosen on examples/room and redkitchen (docs/tracking.md) unless a source is given.
+# Chosen on examples/room and redkitchen (benchmarks/RESULTS.md) unless a source is given.
 LINK_PROBABILITY = 0.5  # least probability to join by appearance, given the rivals: even odds
 # frames between views of a fragment that show how the appearance of one object varies
 VIEW_GAP = 30
