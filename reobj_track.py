@@ -95,6 +95,7 @@ from reobj.poses.stage import (
     supplied_poses,
     write_supplied_model,
 )
+from reobj.poses.supplied.interpretation import PoseReading
 from reobj.poses.supplied.readers import read_poses
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
@@ -1158,7 +1159,8 @@ def run(
             class_names = tuple(detected.class_names)
         sizes = config.objects
         check_known_size(sizes.known_size, sizes.priors, class_names)
-        poses, models = None, []
+        poses: Poses | None = None
+        models: list[Path] = []
         if readings:
             poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
         elif in_3d and not video.is_live:
@@ -1260,7 +1262,7 @@ def _detect(
         return detect_all(source, job.video, job.workspace)
 
 
-def _supplied_cameras(job: _Job, readings: Sequence[Any], boxes: Tracks) -> Poses:
+def _supplied_cameras(job: _Job, readings: list[PoseReading], boxes: Tracks) -> Poses:
     """Choose between the readings of the user's poses, by the images and boxes."""
     with job.timed("poses"):
         return settled_poses(readings, boxes, job.video, job.config.poses, job.workspace)
@@ -1268,7 +1270,7 @@ def _supplied_cameras(job: _Job, readings: Sequence[Any], boxes: Tracks) -> Pose
 
 def _own_cameras(
     job: _Job, boxes: Tracks, class_names: Sequence[str]
-) -> tuple[Poses, Sequence[Path]]:
+) -> tuple[Poses, list[Path]]:
     """Reconstruct the cameras from the images; moving objects hold no features.
 
     Returns:

@@ -15,7 +15,7 @@ CONFIDENCE = (-1.0, 1.5, 1.8, -1.5)
 USUAL_HIT_RATE = 0.75  # if it should be visible in no frame, as an always truncated table (mean)
 NO_SHAPE = -1.9  # instead of the intercept for identities without a 3D object (8 of 89 were real)
 # Number and least fraction of an object's detections that its score is taken from: most views of a
-# half-occluded object are poor (20 to 40 are alike; all of them, or ten, are worse: benchmarks/LOG.md)
+# half-occluded object are poor (20 to 40 are alike; all, or ten, are worse: benchmarks/LOG.md)
 BEST_DETECTIONS = 30
 BEST_FRACTION = 0.25
 LOW_CONFIDENCE = 0.5  # below it an object is more likely absent than present
