@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""reobj_track: objects of a hand-held video: which detections are the same one, and where each is.
+"""reobj_track: re-identify object instances in a hand-held video and localise them in 3D.
 
     python reobj_track.py run VIDEO -o OUT        # identities, cameras, one 3D ellipsoid per object
     python reobj_track.py run VIDEO -o OUT --detections det.txt --poses colmap_model/
@@ -14,16 +14,16 @@
 How it works (start reading at `run()`, then `track()`, then `Tracker.update()`):
   1. detect    boxes, scores, classes and masks of every frame: an ONNX model, a file, or a callable
   2. poses     keyframes -> pycolmap -> PnP for the frames between; or poses supplied by the user
-  3. predict   constant-velocity Kalman filter, moved along with the camera: by the place in 3D of
-               each object where the frame has a pose, else by the motion of the image
+  3. predict   constant-velocity Kalman filter with camera-motion compensation: by the 3D position
+               of each object where the frame has a pose, else by the motion of the image
   4. associate gate by motion, then one cost from overlap and appearance; high scores first
-  5. embed     one feature map a frame, pooled under each object (foreground) and around it
-  6. recognise objects that come back, by place, and from a gallery that never expires
-  7. link      tracklets that explain the same place in 3D become one object, or are split again
-  8. fit       one solid and its ellipsoid per object from its boxes and a size prior (quadrics.py)
+  5. embed     one feature map per frame, pooled over each object (foreground) and around it
+  6. re-identify objects that return, by 3D position and from a gallery that never expires
+  7. link      associate detections with 3D objects; tracklets are joined or split
+  8. fit       one shape and its ellipsoid per object, from its boxes and a size prior (quadrics.py)
 
-This file is the tool: Kalman filter, association, re-identification, the loop, the command line.
-What it uses lies in the package `reobj`: sources/ (video, detections, weights), appearance/
+This file holds the Kalman filter, association, re-identification, the pipeline and the command
+line. The package `reobj` holds the rest: sources/ (video, detections, weights), appearance/
 (embeddings, gallery), tracking/ (assignment, linking), poses/ (cameras), objects/ (association and
 fit), results/ (files, pages).
 
@@ -345,9 +345,9 @@ class TrackState:
     embedded: IntArray  # (T,) frame of the last embedding, -1: never
     votes: Array  # (T, C) score sums of the classes
     embedding: Floats  # (T, E) running mean of the embeddings
-    ends: Array  # (T, 2, 3) in world, of the span of the viewing ray where the thing is, or NaN
-    size: Array  # (T, 2) width and height in the middle of it, in the unit of the world
-    reach: Array  # (T, 2) px that it may be seen beside its predicted place
+    interval: Array  # (T, 2, 3) ends of the depth interval on the viewing ray, in world, or NaN
+    size: Array  # (T, 2) width and height at its middle, world units
+    uncertainty: Array  # (T, 2) px, of the projected position
 
     def select(self, keep: npt.NDArray[Any]) -> TrackState:
         """Return the chosen tracks."""
@@ -360,12 +360,12 @@ class TrackState:
 
     @property
     def evidence(self) -> Array:
-        """Detections of ordinary score (T,) that those of a track amount to, at least one."""
+        """Sum of a track's scores (T,) in detections of ordinary score, at least one."""
         return np.asarray(np.maximum(self.votes.sum(1) / ORDINARY_SCORE, 1))
 
     @staticmethod
     def spawn(box: Array, tracklet: IntArray, frame: int, config: TrackerConfig) -> TrackState:
-        """Make tentative tracks from boxes cx, cy, w, h (N, 4), at rest; spread as in DeepSORT."""
+        """Make tentative tracks at rest from boxes cx, cy, w, h (N, 4); covariance: DeepSORT."""
         mean = np.stack([box, np.zeros_like(box)], -1)
         scale = _noise_scale(mean)
         position, velocity = 2 * config.std_position * scale, STD_START * scale
@@ -385,42 +385,44 @@ STATE_VERSION = 8  # of the files of Tracker.save
 # Association. Costs lie in [0, 1]; those without a source were chosen on the rendered rooms and
 # redkitchen (benchmarks/RESULTS.md).
 GATE_CHI2 = 9.2103  # gate on the centre's squared Mahalanobis distance: chi2 .99, 2 dof
-GATE_IOU = 0.2  # overlap that passes the gate by itself
-MOTION_ONLY_IOU = 0.1  # overlap that every match needs where there is no appearance to compare
-MOTION_ONLY_SIZE = 2.0  # and the largest ratio of widths or heights then
-LOW_IOU = 0.3  # overlap needed for low scores and for a change of class (ByteTrack: .5)
+GATE_IOU = 0.2  # IoU that passes the gate whatever the distance
+MOTION_ONLY_IOU = 0.1  # minimum IoU of every match without embeddings
+MOTION_ONLY_SIZE = 2.0  # maximum ratio of widths or heights without embeddings
+LOW_IOU = 0.3  # minimum IoU for low scores and for a change of class (ByteTrack: .5)
 MAX_COST = 0.9  # of an accepted match
-DISTANCE_WEIGHT = 0.2  # share of the gated distance in the cost; the rest is 1 - IoU
-AGE_COST = 0.2  # at most, of tracks not seen for AGE_FRAMES; linear before
+DISTANCE_WEIGHT = 0.2  # weight of the gated distance in the cost; the rest is 1 - IoU
+AGE_COST = 0.2  # of tracks not detected for AGE_FRAMES; linear before
 AGE_FRAMES = 10
 UNCONFIRMED_COST = 0.2  # of tentative tracks
 CLASS_COST = 0.2  # where track and detection differ in class; taken off the overlap as evidence
-WEAK_MATCH_COST = 0.5  # from this cost on a match is weak: perhaps an object without a track
-IOU_ODDS = 20.0  # log odds of one object that full overlap is worth ...
-NO_OVERLAP_ODDS = 6.0  # ... and that the appearance must make up for where there is no overlap
-EMBEDDING_MOMENTUM = 0.8  # memory of a track's mean embedding (StrongSORT: .9 every frame)
+WEAK_MATCH_COST = 0.5  # a match of at least this cost may be an object without a track
+IOU_ODDS = 20.0  # log odds for the same object per unit of IoU ...
+NO_OVERLAP_ODDS = 6.0  # ... and log odds against it at IoU 0
+EMBEDDING_MOMENTUM = 0.8  # of a track's mean embedding (StrongSORT: .9 every frame)
 # Re-identification
-JUMP_ODDS = 2.0  # log odds against a return far from where the object's own track still coasts
-JUMP_GATE = 9.0  # far: three times the gate's radius
+JUMP_ODDS = 2.0  # log odds against a return far from the object's own coasting track
+JUMP_GATE = 9.0  # squared distance over the gate's: three times its radius
 # With poses
-PLACE_REFIT = 10  # frames between two fits of the places that have new views
-OUT_OF_VIEW = -1e6  # px, where tracks wait whose place is not in view
-PLACE_IN_VIEW = 0.5  # share of a projected box in the image from which a detection is expected
+MAP_REFIT = 10  # frames between two fits of the ellipsoids that have new views
+OUT_OF_VIEW = -1e6  # px, position of tracks whose ellipsoid is out of view
+EXPECTED_IN_VIEW = 0.5  # fraction of a projected box in the image above which it is expected
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameContext:
-    """One frame as `Tracker.update` got it: made once, passed to every step, never changed.
+    """Inputs of one call of `Tracker.update`, passed to every step and never changed.
 
     Attributes:
-        number: of the call, from 0. looked_at: whether the detector was run on this frame.
-        box: (D, 4) cx, cy, w, h of the detections. lazy: their embeddings, computed on request.
-        cam_from_world: (3, 4), None: no pose. img_from_world: (3, 4), None without pose or camera.
-        points: (N, 3) in world that this frame sees; None: none given.
+        number: index of the frame among the calls, from 0.
+        detector_ran: False if the detector was not run on this frame.
+        box: (D, 4) cx, cy, w, h of the detections, px.
+        lazy: embeddings of the detections, computed on request.
+        cam_from_world: (3, 4), None without a pose.
+        points: (N, 3) sparse points in world that this frame observes, None if not given.
     """
 
     number: int
-    looked_at: bool
+    detector_ran: bool
     image: Image | None
     detections: Detections
     box: Array
@@ -444,25 +446,25 @@ class FrameContext:
 
 @dataclass(slots=True)
 class TrackerState:
-    """All that changes from frame to frame: what `Tracker.save` writes is these fields.
+    """Everything that changes from frame to frame; `Tracker.save` writes exactly these fields.
 
     Attributes:
+        tracks: the live tracks.
+        last_seen: (I,) frame of each identity's last detection. identity_class: (I,) its class.
         frame_number: of the latest frame, -1 before the first.
-        looks: frames on which the detector was run, less one.
+        detector_runs: number of frames on which the detector was run, minus one.
+        component: component of the trajectory that the latest frame belongs to.
+        last_pose: (3, 4) cam_from_world of the previous frame, None without a pose.
         intervals: between frames with detections.
-        last_pose: (3, 4) cam_from_world of the frame before the latest, None: no pose.
-        component: of the trajectory, in whose world the latest frame lies.
-        maps: ellipsoids of the identities in the world of each component.
-        tracks: the live tracks. last_seen: (I,) frame of each identity's last detection.
-        identity_class: (I,) class of each identity.
-        reid_calibration: of views some time apart; match_calibration: of a track and a detection.
+        maps: ellipsoids of the identities, one map per component of the trajectory.
+        reid_calibration: of views some time apart. match_calibration: of a track and a detection.
     """
 
     tracks: TrackState
     last_seen: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     identity_class: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     frame_number: int = -1
-    looks: int = -1
+    detector_runs: int = -1
     next_tracklet: int = 1
     component: int = 0
     last_pose: Array | None = None
@@ -477,16 +479,15 @@ class TrackerState:
 class Tracker:
     """Give every detection of a video the identity of its physical object.
 
-    Call `update` once a frame: with [] where the detector found nothing, with None where it was not
-    run. Identities start at 1, belong to this tracker alone and are never given to
-    another object. An object that was away is recognised by
-    appearance, whatever its place in the image, unless two identities fit about equally well: then
-    it gets a new identity (the linker of `run` decides later, with 3D evidence).
+    Call `update` once per frame: with [] if the detector found nothing, with None if it was not
+    run. Identities start at 1, are unique within this tracker and are never reused. An object that
+    returns is re-identified by appearance anywhere in the image, unless two identities fit about
+    equally well: then it gets a new identity (`run` decides later, with 3D evidence).
 
     Args:
-        config: thresholds; the defaults serve video of static scenes from 5 to 60 frames a second.
-        embedder: computes embeddings where they matter; without one, pass `embeddings=` or track by
-            motion.
+        config: thresholds; the defaults suit video of static scenes at 5 to 60 frames per second.
+        embedder: computes embeddings of ambiguous matches; without one, pass `embeddings=` or
+            track by motion alone.
 
     >>> tracker = Tracker(TrackerConfig(n_init=1))
     >>> tracker.update(Detections.from_array([[10, 10, 50, 90, 0.9, 56]])).track_id
@@ -501,7 +502,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next video starts with identity 1."""
+        """Reset the state: the next video starts with identity 1."""
         none = np.empty(0, np.int64)
         tracks = TrackState.spawn(np.empty((0, 4)), none, 0, self.config)
         self.state = TrackerState(tracks)
@@ -525,21 +526,21 @@ class Tracker:
         Args:
             detections: `Detections`; (N, 6) rows x1, y1, x2, y2, confidence, class; ultralytics'
                 Results or Boxes; supervision's Detections; or a dict of boxes, scores, labels.
-                None: the detector was not run on this frame; tracks are predicted, and none counts
-                as missed.
-            frame: (H, W, 3) uint8 BGR image: camera motion, and the input of the embedder.
-            embeddings: of all detections: an (D, E) array or `Embeddings`, of one width E always.
-            cam_from_world: (3, 4) pose of this frame, with `camera`: objects are known by their
-                place in 3D. NaN: not known.
-            points: (N, 3) in world, seen in this frame: how far away a new track is.
-            part: of the cameras' path; each has a world of its own, and places in it.
-            looked: the detector was run on this frame. None: that depends on the detections; no
-                detection is a frame not looked at only where the frames with detections so far
-                come at a regular interval, or most of them alone.
+                None: the detector was not run on this frame; tracks are predicted, and none is
+                counted as missed.
+            frame: (H, W, 3) uint8 BGR image, for camera motion and the embedder.
+            embeddings: of all detections: a (D, E) array or `Embeddings`; E is constant.
+            cam_from_world: (3, 4) pose of this frame, given with `camera`: objects are then also
+                re-identified by 3D position. NaN: unknown.
+            points: (N, 3) sparse points in world observed in this frame: depth of new tracks.
+            part: component of the trajectory; each has its own world frame.
+            looked: whether the detector was run on this frame. None: inferred. A frame without
+                detections then counts as not run only if the frames with detections come at
+                regular intervals.
         Returns:
-            The detections that belong to a confirmed track; decided once.
+            The detections that belong to a confirmed track; the assignment is final.
         Raises:
-            ReobjError: something that cannot be meant; the tracker stays as it was.
+            ReobjError: invalid input; the state is unchanged.
         """
         state = self.state
         run = detections is not None and looked is not False
@@ -552,7 +553,7 @@ class Tracker:
             state.intervals.add(state.frame_number, len(detections))
         elif run and looked is None:
             run = state.intervals.looked_at(state.frame_number)
-        state.looks += run
+        state.detector_runs += run
         weight = self.config.foreground_weight
         lazy = LazyEmbeddings(given, self.embedder, image, detections, weight)
         box = cxcywh_from_xyxy(detections.xyxy)
@@ -566,11 +567,11 @@ class Tracker:
         return self._latest[self._latest.track_id > 0]
 
     def _track(self, frame: FrameContext) -> Tracks:
-        """Match, start, embed, confirm and end tracks; returns those of this frame."""
+        """Match, start, embed, confirm and retire tracks; return the tracks of this frame."""
         track_of = self._associate(frame)  # (D,) row of the tracks' state, or -1
         self._update_states(frame, track_of)
         track_of = self._spawn(frame, track_of)
-        self._note_spans(frame, track_of)
+        self._update_depth_intervals(frame, track_of)
         self._embed(frame, track_of)
         track_of = self._confirm(frame, track_of)
         tracks = self._report(frame, track_of)
@@ -580,13 +581,13 @@ class Tracker:
 
     @property
     def latest(self) -> Tracks:
-        """Tracks of the latest frame with the tentative ones too, of track_id 0."""
+        """Tracks of the latest frame, including tentative ones (track_id 0)."""
         return self._latest
 
     @property
     def looked(self) -> bool:
         """Whether the detector was run on the latest frame."""
-        return self._frame is not None and self._frame.looked_at
+        return self._frame is not None and self._frame.detector_ran
 
     @property
     def detections(self) -> Detections:
@@ -596,13 +597,13 @@ class Tracker:
     def predicted(self, frames: int = 5) -> Tracks:
         """Return the boxes predicted in the latest frame for identities not detected in it.
 
-        They lie where the track's motion and the camera's lead, perhaps beyond the image's border.
+        Predicted boxes may lie outside the image.
 
         Args:
-            frames: looked at since the last detection, at most; 5 has the best HOTA on
-                benchmark.py's steady stream of 50 objects (none .857, 1 .901, 5 .907, 10 .907).
+            frames: maximum number of frames with detector output since the last detection.
+                5 has the best HOTA on benchmarks/benchmark.py's stream of 50 objects.
         Returns:
-            Tracks of score 0 and detection_index -1, as filled gaps are.
+            Tracks of score 0 and detection_index -1, like interpolated boxes.
         """
         tracks = self.state.tracks
         absent = (tracks.missed > 0) | (not self.looked)
@@ -613,37 +614,37 @@ class Tracker:
         return Tracks(*ids, box, np.zeros(len(t)), tracks.votes[t].argmax(1), none)
 
     def latest_embeddings(self) -> tuple[IntArray, Floats]:
-        """Return which detections of the latest frame were embedded (n,), and their rows (n, E)."""
+        """Return indices (n,) and embeddings (n, E) of the latest frame's embedded detections."""
         lazy = None if self._frame is None else self._frame.lazy
         if lazy is None or lazy.rows is None:
             return np.empty(0, np.int64), np.empty((0, 0), np.float32)
         return np.flatnonzero(lazy.done), lazy.rows[lazy.done]
 
     @property
-    def places(self) -> EllipsoidMap:
-        """Places of the identities in the world of the latest frame."""
+    def ellipsoid_map(self) -> EllipsoidMap:
+        """Ellipsoids of the identities in the world of the latest frame."""
         return self.state.maps[self.state.component]
 
     def _enter(self, component: int) -> None:
-        """Enter the world of another component of the trajectory; no track has a position there."""
+        """Switch to the world of a component of the trajectory; depth intervals become invalid."""
         state = self.state
         if component != state.component:
             state.component = component
             state.last_pose = None
-            state.tracks.ends[:] = np.nan
+            state.tracks.interval[:] = np.nan
             state.maps += [EllipsoidMap() for _ in range(component + 1 - len(state.maps))]
 
     def _predict(self, frame: FrameContext) -> None:
-        """Predict all tracks, then move them by the camera's own motion.
+        """Predict all tracks, then compensate the motion of the camera.
 
-        That is what the image shows, or without an image the known rotation; with a pose, tracks
-        whose place in 3D is known go where that is seen.
+        The motion comes from optical flow, or without an image from the given rotation. With a
+        pose, tracks whose 3D position is known follow its projection instead.
         """
         state, tracks = self.state, self.state.tracks
         tracks.mean, tracks.cov = kalman_predict(tracks.mean, tracks.cov, self.config)
         size = tracks.mean[:, 2:, 0]
         np.maximum(size, 1.0, out=size)  # stays positive
-        tracks.reach[:] = 0
+        tracks.uncertainty[:] = 0
         before = tracks.mean[..., 0].copy()
         pose, camera = frame.cam_from_world, frame.camera
         if frame.image is not None and self.config.camera_motion:
@@ -651,86 +652,88 @@ class Tracker:
             tracks.mean, tracks.cov = warp_states(tracks.mean, tracks.cov, motion)
             tracks.mean[:, :2, 0] += state.camera_motion.parallax(before[:, :2])
             if pose is None:
-                state.last_pose = None  # the tracks are no longer where it saw them
+                state.last_pose = None  # flow moved the tracks away from its projections
         elif pose is not None and camera is not None and state.last_pose is not None:
             rotation = pose[:, :3] @ state.last_pose[:, :3].T
-            turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for what is far
+            turn = camera.K @ rotation @ np.linalg.inv(camera.K)  # exact for distant objects
             tracks.mean, tracks.cov = warp_states(tracks.mean, tracks.cov, turn)
         in_view = np.ones(len(tracks.mean), bool)
         if pose is not None and camera is not None:
-            in_view = self._follow_places(pose, camera, before)
-        if frame.looked_at:
+            in_view = self._follow_projections(pose, camera, before)
+        if frame.detector_ran:
             tracks.missed += in_view | (tracks.missed == 0)
 
-    def _follow_places(self, cam_from_world: Array, camera: Camera, predicted: Array) -> BoolArray:
-        """Move tracks of known place as the image of their ellipsoid or of their span does.
+    def _follow_projections(
+        self, cam_from_world: Array, camera: Camera, predicted: Array
+    ) -> BoolArray:
+        """Move tracks of known 3D position to the projection of ellipsoid or depth interval.
 
         Args:
-            predicted: (T, 4) boxes cx, cy, w, h predicted for a camera at rest.
+            predicted: (T, 4) boxes cx, cy, w, h predicted for a static camera.
         Returns:
-            (T,) True where a detection is to be expected.
+            (T,) True where a detection is expected.
         """
         tracks, K = self.state.tracks, camera.K
         size = (camera.width, camera.height)
         view = K @ cam_from_world  # (3, 4)
         last, self.state.last_pose = self.state.last_pose, cam_from_world
-        known = rows_of(self.places.known, tracks.identity, False)
-        inside = np.isfinite(self.places.project(view, size, PLACE_IN_VIEW)[:, 0])  # (I,)
+        known = rows_of(self.ellipsoid_map.known, tracks.identity, False)
+        inside = np.isfinite(self.ellipsoid_map.project(view, size, EXPECTED_IN_VIEW)[:, 0])  # (I,)
         in_view = ~known | rows_of(inside, tracks.identity, False)
-        tracked = (tracks.identity, tracks.ends, tracks.size, K, size)
-        now, reach = self.places.project_tracks(cam_from_world, *tracked)
-        located = known | np.isfinite(tracks.ends[:, 0, 0])
+        tracked = (tracks.identity, tracks.interval, tracks.size, K, size)
+        now, reach = self.ellipsoid_map.project_tracks(cam_from_world, *tracked)
+        located = known | np.isfinite(tracks.interval[:, 0, 0])
         followed = np.zeros(len(known), bool)
         if last is not None:
-            before, reach_before = self.places.project_tracks(last, *tracked)
+            before, reach_before = self.ellipsoid_map.project_tracks(last, *tracked)
             followed = (tracks.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
             shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
             moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
             tracks.mean[followed, :, 0] = moved[followed]  # (T, 4)
-            tracks.reach[followed] = np.abs(reach - reach_before)[followed]
+            tracks.uncertainty[followed] = np.abs(reach - reach_before)[followed]
         lost = located & (tracks.missed > 0)
         shown = (in_view & np.isfinite(now[:, 0]))[:, None]
         where = np.where(shown, now, [OUT_OF_VIEW, OUT_OF_VIEW, 1, 1])  # matches nothing
         again = TrackState.spawn(where[lost], tracks.tracklet[lost], 0, self.config)
         tracks.mean[lost], tracks.cov[lost] = again.mean, again.cov
-        tracks.reach[lost] = np.abs(reach[lost])
-        tracks.cov[:, :2, 0] += tracks.reach**2
+        tracks.uncertainty[lost] = np.abs(reach[lost])
+        tracks.cov[:, :2, 0] += tracks.uncertainty**2
         return np.asarray(in_view, bool)
 
-    def _note_spans(self, frame: FrameContext, track_of: IntArray) -> None:
-        """Note where the tracks seen now are, by the points in their boxes.
-
-        Identities with an ellipsoid do without.
-        """
+    def _update_depth_intervals(self, frame: FrameContext, track_of: IntArray) -> None:
+        """Estimate depth intervals of matched tracks without an ellipsoid, from points in boxes."""
         pose, camera, points = frame.cam_from_world, frame.camera, frame.points
         if points is None or pose is None or camera is None:
             return
         tracks = self.state.tracks
         rows = np.flatnonzero(track_of >= 0)
-        rows = rows[~rows_of(self.places.known, tracks.identity[track_of[rows]], False)]
+        rows = rows[~rows_of(self.ellipsoid_map.known, tracks.identity[track_of[rows]], False)]
         ends, size = depth_intervals(frame.detections.xyxy[rows], points, pose, camera.K)
-        tracks.ends[track_of[rows]] = ends
+        tracks.interval[track_of[rows]] = ends
         tracks.size[track_of[rows]] = size
 
     def _add_views(self, frame: FrameContext, confirmed: Tracks) -> None:
-        """Keep the boxes of this frame as views of their objects, and fit places now and then.
+        """Add the boxes of this frame as views of their objects; refit ellipsoids periodically.
 
-        At once where at least half of them are due, which is where the camera takes wide steps.
+        Also refit when at least half of the identities in view have enough new views, as after a
+        large camera motion.
         """
         view = frame.img_from_world
         if view is None:
             return
         identity = confirmed.track_id - 1
-        self.places.add(frame.number, identity, confirmed.xyxy, view)
-        due = self.places.due
-        if self.state.looks % PLACE_REFIT == 0 or 2 * due[identity].sum() >= max(len(identity), 1):
-            self.places.refit(frame.image_size)
+        self.ellipsoid_map.add(frame.number, identity, confirmed.xyxy, view)
+        due = self.ellipsoid_map.due
+        if self.state.detector_runs % MAP_REFIT == 0 or 2 * due[identity].sum() >= max(
+            len(identity), 1
+        ):
+            self.ellipsoid_map.refit(frame.image_size)
 
     def _associate(self, frame: FrameContext) -> IntArray:
         """Match detections to tracks: high scores by motion, then the rest by overlap.
 
-        Both times an ambiguous match (a rival costs little more) and a weak one (the detection may
-        be of an object without a track) must agree in appearance.
+        In both rounds an ambiguous match (a rival costs little more) and a weak one (perhaps an
+        object without a track) must agree in appearance.
 
         Returns:
             (D,) row of the track's state, or -1.
@@ -759,16 +762,16 @@ class Tracker:
         return track_of
 
     def _gate(self, frame: FrameContext) -> Pairs:
-        """Compare tracks and detections by motion: which may belong together, and at what cost."""
+        """Gate pairs of tracks and detections by motion, and compute their cost."""
         tracks, detections = self.state.tracks, frame.detections
-        track, reach = tracks.mean[..., 0].T, tracks.reach.T  # (4, T) cx, cy, w, h; (2, T)
+        track, reach = tracks.mean[..., 0].T, tracks.uncertainty.T  # (4, T) cx, cy, w, h; (2, T)
         variance = center_variance(tracks.mean, tracks.cov).T  # (2, T)
         gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
         t, d = touching(track[:2], gate, detections.xyxy)  # (M,) each
         track, seen, reach = track.take(t, 1), frame.box.T.take(d, 1), reach.take(t, 1)  # (4, M)
-        iou, share = iou_within_uncertainty(track, reach, seen)
+        iou, weight = iou_within_uncertainty(track, reach, seen)
         distance = squared_mahalanobis(track[:2] - seen[:2], variance.take(t, 1)) / GATE_CHI2
-        overlap = iou * share
+        overlap = iou * weight
         same_class = tracks.votes.argmax(1)[t] == detections.class_id[d]
         cost = (1 - DISTANCE_WEIGHT) * (1 - overlap)
         cost += DISTANCE_WEIGHT * np.minimum(distance, 1) + CLASS_COST * ~same_class
@@ -776,7 +779,7 @@ class Tracker:
         if not frame.lazy.available:
             growth = np.log(track[2:] / np.maximum(seen[2:], 1e-3))  # (2, M)
             good &= (np.abs(growth) < math.log(MOTION_ONLY_SIZE)).all(0) & (iou >= MOTION_ONLY_IOU)
-        return Pairs(*(x[good] for x in (t, d, cost, iou, share, same_class)))
+        return Pairs(*(x[good] for x in (t, d, cost, iou, weight, same_class)))
 
     def _priority_cost(self) -> Array:
         """Return the extra cost (T,) that lets confirmed tracks just seen choose first."""
@@ -790,7 +793,7 @@ class Tracker:
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
         """Assign at least cost; compare the appearance where it must agree; assign again.
 
-        Ends, as every round compares at least one detection that was not compared before.
+        The loop terminates: every round compares at least one new detection.
 
         Args:
             cost, possible: (M,). priority: added to the cost. must_agree: (M,) pairs whose
@@ -820,12 +823,12 @@ class Tracker:
     def _blend_appearance(
         self, pairs: Pairs, cost: Array, asked: BoolArray, lazy: LazyEmbeddings
     ) -> tuple[Array, BoolArray]:
-        """Blend the appearance of the detections asked for (D,) into the cost.
+        """Blend the appearance of the requested detections (D,) into the cost.
 
-        It is half similar where unknown.
+        Tracks without an embedding count as half similar.
 
         Returns:
-            cost (M,), and pairs (M,) that boxes and appearance together speak against.
+            cost (M,), and the pairs (M,) that boxes and appearance together contradict.
         """
         rows = np.flatnonzero(asked)
         some = np.flatnonzero(asked[pairs.detection])
@@ -846,7 +849,7 @@ class Tracker:
         return cost, against
 
     def _update_states(self, frame: FrameContext, track_of: IntArray) -> None:
-        """Correct the matched tracks; boxes of low score are less certain."""
+        """Update the matched tracks; boxes of low score have a larger measurement noise."""
         rows = np.flatnonzero(track_of >= 0)
         t, tracks = track_of[rows], self.state.tracks
         mean, score = tracks.mean[t], frame.detections.score[rows]
@@ -856,7 +859,7 @@ class Tracker:
         self._count(frame.detections, rows, t)
 
     def _count(self, detections: Detections, rows: IntArray, t: IntArray) -> None:
-        """Count a detection for each of the tracks t, with its vote for a class."""
+        """Reset the missed frames of the tracks t and add the class votes of their detections."""
         tracks = self.state.tracks
         tracks.missed[t] = 0
         classes = detections.class_id[rows]
@@ -878,10 +881,10 @@ class Tracker:
         return track_of
 
     def _embed(self, frame: FrameContext, track_of: IntArray) -> None:
-        """Embed tracks before their confirmation and now and then, and learn what is similar.
+        """Embed tracks before confirmation and periodically; calibrate the similarity.
 
-        Embeddings that ambiguous matches asked for calibrate, but do not enter a track's mean:
-        their box may be half of a neighbour.
+        Embeddings requested by ambiguous matches are used for calibration only, not for a track's
+        mean: their box may cover half of a neighbour.
         """
         lazy = frame.lazy
         if not lazy.available:
@@ -890,7 +893,8 @@ class Tracker:
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
         soon = (tracks.identity[t] < 0) & (tracks.evidence[t] >= self.config.n_init - 1)
-        due = soon | (self.state.looks % max(1, self.config.embed_every) == 0)  # all in one pass
+        periodic = self.state.detector_runs % max(1, self.config.embed_every) == 0
+        due = soon | periodic  # one pass of the network
         self._calibrate_matches(frame, track_of, rows[lazy.done[rows] | due])
         rows = rows[due]
         t = track_of[rows]
@@ -909,7 +913,7 @@ class Tracker:
             self._add_to_gallery(frame, embedding[old], t[old], class_id)
 
     def _calibrate_matches(self, frame: FrameContext, track_of: IntArray, rows: IntArray) -> None:
-        """Show the calibration of matches every track with its own and the others' detections."""
+        """Calibrate matches: own detections are the same object, those of other tracks are not."""
         tracks, lazy = self.state.tracks, frame.lazy
         rows = rows[(tracks.embedded[track_of[rows]] >= 0) & (tracks.identity[track_of[rows]] >= 0)]
         if len(rows):
@@ -920,7 +924,7 @@ class Tracker:
     def _add_to_gallery(
         self, frame: FrameContext, embedding: Floats, t: IntArray, class_id: IntArray
     ) -> None:
-        """Add embeddings (n, E) of tracks t to the gallery, and calibrate with its first views."""
+        """Add embeddings (n, E) of tracks t to the gallery; calibrate against its first views."""
         state = self.state
         identity, gallery = state.tracks.identity[t], state.gallery
         if len(gallery.count):
@@ -938,10 +942,10 @@ class Tracker:
         return viewing_rays(xyxy_from_cxcywh(self.state.tracks.mean[t, :, 0]), view)
 
     def _confirm(self, frame: FrameContext, track_of: IntArray) -> IntArray:
-        """Give tracks that were seen often enough an identity: a known one, or a new one.
+        """Assign an identity, known or new, to tracks with enough detections.
 
-        A return has an appearance to show for it and needs one detection less. Where nothing is
-        known yet, one detection is enough (as in SORT's first frames).
+        A re-identified track needs one detection less, as its appearance agrees. The first tracks
+        of a video need only one detection (as in SORT).
         """
         state, tracks = self.state, self.state.tracks
         needed = self.config.n_init if len(state.last_seen) else 1
@@ -951,16 +955,16 @@ class Tracker:
         state.last_seen[tracks.identity[seen_now]] = frame.number
         if not len(ready):
             return track_of
-        returning = self._recognise(frame, ready)  # (n,) identity or -1
-        sure = (returning >= 0) | (tracks.evidence[ready] >= needed)
-        ready, returning = ready[sure], returning[sure]
+        returning = self._reidentify(frame, ready)  # (n,) identity or -1
+        confirmed = (returning >= 0) | (tracks.evidence[ready] >= needed)
+        ready, returning = ready[confirmed], returning[confirmed]
         fresh, back = ready[returning < 0], ready[returning >= 0]
         ids = len(state.last_seen) + np.arange(len(fresh))
         state.last_seen = np.append(state.last_seen, np.zeros(len(fresh), np.int64))
         state.identity_class = np.append(state.identity_class, tracks.votes[fresh].argmax(1))
-        came_back = np.zeros(len(state.last_seen) + 1, bool)  # the last one: of no identity
-        came_back[returning[returning >= 0]] = True
-        stale = came_back[tracks.identity]  # their tracks that still coast
+        returned = np.zeros(len(state.last_seen) + 1, bool)  # the last entry: no identity (-1)
+        returned[returning[returning >= 0]] = True
+        stale = returned[tracks.identity]  # coasting tracks of identities that returned
         tracks.identity[back], tracks.identity[fresh] = returning[returning >= 0], ids
         state.last_seen[tracks.identity[ready]] = frame.number
         seen = ready[tracks.embedded[ready] >= 0]
@@ -973,14 +977,14 @@ class Tracker:
         state.tracks = tracks.select(~stale)
         return np.asarray(renumber[track_of], np.int64)
 
-    def _recognise(self, frame: FrameContext, ready: IntArray) -> IntArray:
-        """Recognise known identities in tracks about to be confirmed, (n,) identity or -1.
+    def _reidentify(self, frame: FrameContext, ready: IntArray) -> IntArray:
+        """Re-identify tracks about to be confirmed: identity (n,), or -1.
 
-        Appearance and place, where known, must make it probable, also in view of the other
-        candidates. Never gated by overlap, aspect ratio or pixel distance: the camera may return
-        from anywhere; but a track that still coasts says where its object should be.
-        An identity that was seen while the newcomer was already in view is another object, and so
-        is one whose place in 3D is not here. Things that move have no place: no ellipsoid fits.
+        A match needs a sufficient probability from appearance and, where known, 3D position,
+        relative to the other candidates. It is not gated by overlap, aspect ratio or pixel
+        distance, as the camera may return from anywhere; a coasting track of the identity far away
+        counts against it. Identities seen since the new track started, and those whose ellipsoid
+        projects elsewhere, are excluded. Moving objects have no ellipsoid.
         """
         state, tracks = self.state, self.state.tracks
         result = np.full(len(ready), -1, np.int64)
@@ -988,31 +992,32 @@ class Tracker:
         if not len(identity) or not self.config.remember:
             return result
         box = tracks.mean[ready, :, 0]
-        iou, share = self.places.overlap(box, identity, frame.img_from_world, frame.image_size)
-        at_known_place = iou * share > LOW_IOU
+        view, size = frame.img_from_world, frame.image_size
+        iou, weight = self.ellipsoid_map.overlap(box, identity, view, size)
+        at_projection = iou * weight > LOW_IOU
         rays = self._viewing_rays(frame, ready)
         logit = state.reid_calibration.logit(
             *state.gallery.parts(tracks.embedding[ready], identity, rays)
         )
-        logit[at_known_place & np.isinf(logit)] = 0  # no appearance: the place decides
-        logit += np.where(at_known_place, share * (IOU_ODDS * iou - NO_OVERLAP_ODDS), 0)
-        logit -= JUMP_ODDS * self._far_from_own_track(frame, ready, identity)
+        logit[at_projection & np.isinf(logit)] = 0  # without appearance the position decides
+        logit += np.where(at_projection, weight * (IOU_ODDS * iou - NO_OVERLAP_ODDS), 0)
+        logit -= JUMP_ODDS * self._far_from_coasting_track(frame, ready, identity)
         possible = state.last_seen[identity] < tracks.first[ready][:, None]
         possible &= state.identity_class[identity] == tracks.votes[ready].argmax(1)[:, None]
         logit[~possible | (iou == 0)] = -np.inf
         probability = match_probability(logit)
         good = probability >= self.config.return_probability
-        row, column = np.nonzero(good | (at_known_place & (logit > 0)))
+        row, column = np.nonzero(good | (at_projection & (logit > 0)))
         taken = assign(row, column, 1 - probability[row, column])
         result[row[taken]] = identity[column[taken]]
         return result
 
-    def _far_from_own_track(
+    def _far_from_coasting_track(
         self, frame: FrameContext, ready: IntArray, identity: IntArray
     ) -> BoolArray:
-        """Mark (n, I) where the identity's own track still coasts, far from the newcomer.
+        """Mark (n, I) where the identity's own track still coasts far from the new track.
 
-        Only of identities without a place in 3D: that tells more.
+        Identities with an ellipsoid are not marked: its projection is the better evidence.
         """
         tracks = self.state.tracks
         row = np.full(len(self.state.last_seen), -1)
@@ -1020,10 +1025,11 @@ class Tracker:
         row[tracks.identity[coasting]] = coasting
         row = row[identity]  # (I,)
         center, variance = tracks.mean[:, :2, 0].T, center_variance(tracks.mean, tracks.cov).T
-        away = center[:, ready, None] - center[:, None, row]  # (2, n, I)
-        far = squared_mahalanobis(away, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
-        placed = rows_of(self.places.known, identity, False) & (frame.img_from_world is not None)
-        return np.asarray(far & (row >= 0) & ~placed, bool)
+        offset = center[:, ready, None] - center[:, None, row]  # (2, n, I)
+        far = squared_mahalanobis(offset, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
+        has_view = frame.img_from_world is not None
+        located = rows_of(self.ellipsoid_map.known, identity, False) & has_view
+        return np.asarray(far & (row >= 0) & ~located, bool)
 
     def _report(self, frame: FrameContext, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""
@@ -1049,16 +1055,16 @@ class Tracker:
             self.state.tracks = tracks.select(stays)
 
     def save(self, path: str | Path) -> None:
-        """Write the whole state, without the embedder, as an .npz file.
+        """Write the state, without the embedder, as an .npz file.
 
-        What `load` reads goes on exactly as this tracker does.
+        A tracker that `load` reads continues exactly as this one does.
         """
         arrays = state_arrays(self.state, "state")
         save_npz(Path(path), arrays, version=STATE_VERSION, config=dataclasses.asdict(self.config))
 
     @classmethod
     def load(cls, path: str | Path, embedder: Embedder | None = None) -> Tracker:
-        """Read a tracker that `save` wrote; embedder: as the saved one had."""
+        """Read a tracker that `save` wrote; embedder: the same as that of the saved tracker."""
         try:
             arrays, facts = load_npz(Path(path), sealed=True)
             if facts["version"] != STATE_VERSION:
@@ -1083,18 +1089,18 @@ def track(
     *,
     poses: Poses | None = None,
 ) -> Iterator[tuple[Frame, Tracks]]:
-    """Track a video as it is read: yields each frame with the tracks decided in it.
+    """Track a video frame by frame (online).
 
     Args:
-        video: a `Video`, or what makes one: file, folder of images, glob, camera index, stream URL.
+        video: a `Video`, or its source: file, folder of images, glob, camera index, stream URL.
         detector: function image -> detections (`OnnxDetector`, your own), a file of recorded
-            detections, or a `DetectionSource`; default: the default detector. A function that
-            returns None did not look at the frame.
-        tracker: default: one with our embedder.
-        poses: known cameras of the video; objects are then known by their place in 3D too.
+            detections, or a `DetectionSource`; default: the default detector. A function returns
+            None for frames that it skips.
+        tracker: default: a `Tracker` with the bundled embedder.
+        poses: cameras of the video, if known; objects are then also re-identified by 3D position.
     Yields:
-        Frame, and its Tracks in pixels of the frame's image. Online: without what `run` decides
-        after the video. `tracker.latest` has the tentative tracks of the frame too.
+        Frame, and its Tracks in pixels of the frame's image. Decisions that `run` takes after the
+        video are not included. `tracker.latest` has the tentative tracks of the frame too.
 
     >>> for frame, tracks in track("room.mp4", "det.txt"):  # doctest: +SKIP
     ...     print(frame.index, tracks.track_id)
@@ -1126,19 +1132,20 @@ def run(
     overwrite: bool = False,
     show: bool = False,
 ) -> Result:
-    """Run the chain on a video: detect, track, poses, objects; write the output folder's files.
+    """Run the pipeline on a video (detect, poses, track, fit) and write the output folder.
 
     Args:
-        source: video file, folder of images, glob, camera index or URL of a stream (Ctrl-C ends a
-            live one: its files are written); None: no images, only detections and poses.
-        out: output folder; results of earlier stages found there are used again.
-        detections: recorded ones, or a callable image -> detections; default: config.detect.model.
-        tracks: file of identities that take the place of detector, tracker and linker.
-        in_3d: False for identities only, in 2D. show: live in rerun's viewer.
+        source: video file, folder of images, glob, camera index or stream URL (Ctrl-C ends a live
+            source and writes its files); None: no images, only detections and poses.
+        out: output folder; cached results of earlier stages in it are used again.
+        detections: file of recorded detections, or a callable image -> detections; default:
+            config.detect.model.
+        tracks: file of identities, instead of detector, tracker and linker.
+        in_3d: False for 2D identities only. show: show progress in rerun's viewer.
     Returns:
-        Result; if the reconstruction fails, without cameras and ellipsoids, and with a warning.
+        Result; if the reconstruction fails, it has a warning and no cameras and ellipsoids.
     Raises:
-        ReobjError: for input that cannot be used, with what to do.
+        ReobjError: invalid input; the message says what to do.
     """
     config = config or Config()
     if config.threads:
@@ -1164,7 +1171,7 @@ def run(
         if readings:
             poses = _supplied_cameras(job, readings, boxes if tracks else _tracklets(boxes))
         elif in_3d and not video.is_live:
-            poses, models = _own_cameras(job, boxes, class_names)
+            poses, models = _reconstructed_cameras(job, boxes, class_names)
         if not tracks:
             result = _track_video(job, detected, poses, viewer)
         workspace.save_last(result, poses, models)
@@ -1212,10 +1219,10 @@ def _last_config(out: str | Path) -> Config:
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """What every stage of `run` reads: the video, the output folder, the options.
+    """Inputs of every stage of `run`.
 
     Attributes:
-        seconds: that each stage took, added by the stage.
+        seconds: wall time of each stage, added by the stage.
     """
 
     video: Video
@@ -1225,19 +1232,19 @@ class _Job:
 
     @property
     def runtime(self) -> tuple[int, bool, str]:
-        """Return threads, offline and device, as networks are opened with."""
+        """Return the options of networks: threads, offline, device."""
         return self.config.threads, self.config.offline, self.config.device
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Note the seconds of a stage that ends without an exception."""
+        """Measure the wall time of a stage; nothing is stored after an exception."""
         started = time.monotonic()
         yield
         self.seconds[stage] = time.monotonic() - started
 
 
 def _check_objects(config: ObjectsConfig) -> None:
-    """Refuse what the fit could not use, before minutes are spent on what comes first."""
+    """Validate the options of the fit before the earlier stages take minutes."""
     load_size_priors(config.priors)
     if config.up:
         parse_up(config.up)
@@ -1248,11 +1255,11 @@ def _check_objects(config: ObjectsConfig) -> None:
 def _detect(
     job: _Job, detections: str | Path | Callable[[Image], Any] | None, in_3d: bool
 ) -> tuple[DetectionSource, Tracks]:
-    """Open the detections; where cameras are wanted, detect in all frames of a recorded video.
+    """Open the detections; if cameras are estimated, detect in all frames of a recorded video.
 
     Returns:
-        the source, and its boxes: cameras are estimated without moving objects, and checked with
-        boxes; empty where the frames are read one by one.
+        the source, and the boxes of all frames (empty if they are detected frame by frame): the
+        reconstruction leaves out moving objects, and supplied poses are checked with boxes.
     """
     opened = open_detections(job.video, job.config.detect, detections, *job.runtime)
     source = keep_detections(opened, job.video, job.workspace)
@@ -1263,15 +1270,15 @@ def _detect(
 
 
 def _supplied_cameras(job: _Job, readings: list[PoseReading], boxes: Tracks) -> Poses:
-    """Choose between the readings of the user's poses, by the images and boxes."""
+    """Choose the interpretation of the user's poses that agrees with images and boxes."""
     with job.timed("poses"):
         return settled_poses(readings, boxes, job.video, job.config.poses, job.workspace)
 
 
-def _own_cameras(
+def _reconstructed_cameras(
     job: _Job, boxes: Tracks, class_names: Sequence[str]
 ) -> tuple[Poses, list[Path]]:
-    """Reconstruct the cameras from the images; moving objects hold no features.
+    """Reconstruct the cameras from the images without features on moving objects.
 
     Returns:
         poses, and the folders of the COLMAP models.
@@ -1285,7 +1292,7 @@ def _own_cameras(
 def _track_video(
     job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | None = None
 ) -> Result:
-    """Track all frames, or take the tracks from the cache; a live source is never cached."""
+    """Track all frames, or load the tracks from the cache; live sources are not cached."""
     video, config = job.video, job.config
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
@@ -1304,7 +1311,7 @@ def _track_video(
 
 
 def _tracklets(boxes: Tracks) -> Tracks:
-    """Track detections by motion alone, to check cameras that nothing may rest on yet."""
+    """Track detections by motion alone, to check supplied poses before they are used."""
     tracker, steps = Tracker(), []
     rows = rows_by(boxes.frame)
     for own in rows:
@@ -1316,7 +1323,7 @@ def _tracklets(boxes: Tracks) -> Tracks:
 def _given_tracks(
     path: str | Path, video: Video, config: DetectConfig, before: Result | None
 ) -> Result:
-    """Make a result of identities in a file; nothing may join, split or renumber them."""
+    """Build a result from identities in a file; they are never joined, split or renumbered."""
     known = (None, ()) if before is None else (before.tracks, before.class_names)
     tracks, class_names, messages = read_tracks(path, video, config, *known)
     return Result(
@@ -1325,7 +1332,7 @@ def _given_tracks(
 
 
 def _finish(job: _Job, result: Result) -> Result:
-    """Link tracklets, fit one shape an object, and write all files of the output folder."""
+    """Link tracklets, fit one shape per object, and write the output folder."""
     with job.timed("objects"):
         result = _fit_objects(job, result)
     result.seconds |= job.seconds
@@ -1339,7 +1346,7 @@ def _finish(job: _Job, result: Result) -> Result:
 
 
 def _fit_objects(job: _Job, result: Result) -> Result:
-    """Link and fit; then fill gaps of the tracks by our own shapes, whatever solver is chosen."""
+    """Link and fit; gaps of tracks are filled with the default solver's shapes."""
     config = job.config
     result.edits = result.edits or kept_edits(job.workspace.out)
     with Progress("objects"):
@@ -1354,7 +1361,7 @@ def _fit_objects(job: _Job, result: Result) -> Result:
 
 
 def _warnings(config: Config, result: Result) -> list[str]:
-    """Collect what the user should know of the cameras, the objects and the options."""
+    """Collect warnings about cameras, objects and options."""
     poses = result.poses
     of_cameras = [] if poses is None else [*poses.messages, *components_message(poses)]
     tracker, moving = config.tracker, config.objects.moving_classes
@@ -1365,7 +1372,7 @@ def _warnings(config: Config, result: Result) -> list[str]:
 
 
 def _write(job: _Job, result: Result) -> None:
-    """Write all files; pictures last, so that the results are there whatever becomes of them."""
+    """Write all files; pictures come last, so that a fault in drawing loses no result."""
     workspace, output = job.workspace, job.config.output
     models = workspace.last_models()
 

@@ -68,21 +68,21 @@ def facts(tracker: rt.Tracker, seconds: list[tuple[float, float]]) -> str:
     ms = 1e3 * np.array(seconds)  # (F, 2)
     (track, track95), (both, both95) = (np.percentile(x, (50, 95)) for x in (ms[:, 1], ms.sum(1)))
     return (
-        f"{len(tracker.state.last_seen)} objects, {tracker.places.known.sum()} with an ellipsoid; "
+        f"{len(tracker.state.last_seen)} objects, {tracker.ellipsoid_map.known.sum()} with an ellipsoid; "
         f"tracker {track:.1f} ms (95 %: {track95:.1f}), with detector {both:.1f} ({both95:.1f})"
     )
 
 
 def objects_of(tracker: rt.Tracker, names: tuple[str, ...]) -> list[dict[str, Any]]:
     """Make the JSON entries of the objects whose ellipsoid is known."""
-    known = np.flatnonzero(tracker.places.known[: len(tracker.state.last_seen)])
-    solids, _ = quadrics.Ellipsoids.from_dual_quadrics(tracker.places.dual_q[known])
+    known = np.flatnonzero(tracker.ellipsoid_map.known[: len(tracker.state.last_seen)])
+    solids, _ = quadrics.Ellipsoids.from_dual_quadrics(tracker.ellipsoid_map.dual_q[known])
     return [
         {
             "id": int(i) + 1,
             "category": names[tracker.state.identity_class[i]],
             "last_frame": int(tracker.state.last_seen[i]),
-            "views": int((tracker.places.frame[i] >= 0).sum()),
+            "views": int((tracker.ellipsoid_map.frame[i] >= 0).sum()),
             "center_in_world": solids.center_in_world[k].round(4).tolist(),
             "half_axes": solids.half_axes[k].round(4).tolist(),
             "world_from_obj": solids.world_from_obj[k].round(6).tolist(),

@@ -701,11 +701,11 @@ def test_from_another_side_other_surroundings_say_nothing(turn_deg: int, known: 
 def test_a_frame_without_pose_changes_no_place() -> None:
     tracker = rt.Tracker()
     walk(tracker, PAST)
-    places = tracker.places.dual_q.copy()
-    assert tracker.places.known.sum() == 2
+    places = tracker.ellipsoid_map.dual_q.copy()
+    assert tracker.ellipsoid_map.known.sum() == 2
     for _ in range(20):
         tracker.update(rt.Detections.empty(), cam_from_world=np.full((3, 4), np.nan), camera=CAMERA)
-    np.testing.assert_array_equal(tracker.places.dual_q, places)
+    np.testing.assert_array_equal(tracker.ellipsoid_map.dual_q, places)
 
 
 def points_on_balls(scale: float) -> np.ndarray:
@@ -749,7 +749,7 @@ def test_a_new_part_of_the_path_knows_no_place_of_another() -> None:
     """
     tracker = rt.Tracker()
     walk(tracker, PAST)
-    first = tracker.places
+    first = tracker.ellipsoid_map
     assert first.known.sum() == 2
     turn = Rotation.from_euler("xyz", [40, 70, -20], degrees=True).as_matrix()
     for x in np.linspace(0.5, 0.1, 21):
@@ -758,12 +758,12 @@ def test_a_new_part_of_the_path_knows_no_place_of_another() -> None:
         found, _ = balls_seen(pose)
         tracks = tracker.update(found, cam_from_world=other, camera=CAMERA, part=1)
         assert tracks.track_id.tolist() == [1, 2] and tracks.tracklet_id.tolist() == [1, 2]
-    assert tracker.places is not first and tracker.places.known.sum() == 2
-    assert not np.allclose(tracker.places.ends[:2], first.ends[:2], atol=0.1)
+    assert tracker.ellipsoid_map is not first and tracker.ellipsoid_map.known.sum() == 2
+    assert not np.allclose(tracker.ellipsoid_map.ends[:2], first.ends[:2], atol=0.1)
     before = first.frame.copy()
     found, _ = balls_seen(pose_at(0.1))
     tracks = tracker.update(found, cam_from_world=pose_at(0.1), camera=CAMERA)
-    assert tracks.track_id.tolist() == [1, 2] and tracker.places is first
+    assert tracks.track_id.tolist() == [1, 2] and tracker.ellipsoid_map is first
     assert (first.frame != before).sum() <= 2  # nothing of the other part came into it
 
 
@@ -1057,7 +1057,7 @@ def test_tracks_follow_their_places_through_a_jerky_camera() -> None:
     """The camera jumps to and fro by more than a ball's width; no track is lost for a frame."""
     tracker = rt.Tracker()
     walk(tracker, PAST)
-    assert tracker.places.known.sum() == 2
+    assert tracker.ellipsoid_map.known.sum() == 2
     tracklets = tracker.latest.tracklet_id.tolist()
     for i in range(12):
         pose = pose_at(0.5 - 0.5 * (i % 2))
@@ -1304,7 +1304,7 @@ def test_the_first_turn_after_loading_counts(tmp_path: Path) -> None:
 
 def test_reset_forgets_everything() -> None:
     tracker = filled()
-    assert tracker.places.known.any() and tracker.state.gallery.count.any()
+    assert tracker.ellipsoid_map.known.any() and tracker.state.gallery.count.any()
     tracker.reset()
     mine, fresh = everything(tracker.state), everything(rt.Tracker().state)
     for name, value in fresh.items():
