@@ -67,8 +67,9 @@ def facts(tracker: rt.Tracker, seconds: list[tuple[float, float]]) -> str:
     """Format the numbers of objects and the time per frame."""
     ms = 1e3 * np.array(seconds)  # (F, 2)
     (track, track95), (both, both95) = (np.percentile(x, (50, 95)) for x in (ms[:, 1], ms.sum(1)))
+    located = tracker.ellipsoid_map.known.sum()
     return (
-        f"{len(tracker.state.last_seen)} objects, {tracker.ellipsoid_map.known.sum()} with an ellipsoid; "
+        f"{len(tracker.state.last_seen)} objects, {located} with an ellipsoid; "
         f"tracker {track:.1f} ms (95 %: {track95:.1f}), with detector {both:.1f} ({both95:.1f})"
     )
 

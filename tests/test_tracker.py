@@ -583,7 +583,7 @@ def test_a_restored_tracker_goes_on_as_if_it_had_never_stopped(posed: bool, tmp_
     for one, other in zip(whole[33:], rows_of_clip(second, frames[33:], posed), strict=True):
         np.testing.assert_array_equal(one, other)
     second.save(tmp_path / "again.npz")
-    assert sum(len(w) for w in whole[33:]) > 300 and second.places.known.any() == posed
+    assert sum(len(w) for w in whole[33:]) > 300 and second.ellipsoid_map.known.any() == posed
 
 
 @pytest.mark.parametrize("options", [{}, {"n_init": 1, "coast_frames": 7}])
