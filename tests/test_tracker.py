@@ -740,7 +740,11 @@ def test_twins_keep_their_identities_over_steps_wider_than_their_boxes(scale: fl
         seen.append(dict(zip(which[tracks.detection_index], tracks.track_id, strict=True)))
         alone.update(found, embeddings=view)
     assert seen == [{0: 1, 1: 2}] * len(seen)
-    assert len(alone.last_seen) != 2 or len(alone.latest) < 2 or alone.state.tracklet.max() > 2
+    assert (
+        len(alone.state.last_seen) != 2
+        or len(alone.latest) < 2
+        or alone.state.tracks.tracklet.max() > 2
+    )
 
 
 def test_a_new_part_of_the_path_knows_no_place_of_another() -> None:

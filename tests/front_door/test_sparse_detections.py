@@ -89,7 +89,7 @@ def test_a_saved_tracker_goes_on_as_the_other_does(tmp_path: Path) -> None:
     tracker.save(tmp_path / "state.npz")
     again = rt.Tracker.load(tmp_path / "state.npz")
     assert feed(again, range(13, 60)) == feed(tracker, range(13, 60))
-    assert again.frame_number == 59 and again.state.identity.tolist() == [0, 1]
+    assert again.state.frame_number == 59 and again.state.tracks.identity.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(
