@@ -402,7 +402,7 @@ def test_parts_come_back_when_loaded(
     found = rt.Result.load(parted_folder)
     assert found.world.to_json() == parted.world.to_json()
     assert [o.to_json() for o in found.objects] == [o.to_json() for o in parted.objects]
-    assert [w for w in found.warnings if "2 parts" in w]
+    assert [w for w in found.warnings if "2 components" in w]
     np.testing.assert_array_equal(found.poses.part, parted.poses.part)
     found.save(tmp_path)
     for name in ("objects.json", "poses.txt", "poses_part1.txt", "cache/last-poses.npz"):
