@@ -257,7 +257,7 @@ def test_every_part_has_its_own_scale(tmp_path, walk):
     for name in NUMBERS[5:]:
         (folder / name).unlink()
     lacking = add(given, folder)
-    assert not lacking.metric and "scale of part 1 stays unknown" in lacking.messages[0]
+    assert not lacking.metric and "scale of component 1 stays unknown" in lacking.messages[0]
     np.testing.assert_array_equal(lacking.cam_from_world, given.cam_from_world)
 
 

@@ -160,7 +160,7 @@ def test_failures_are_no_crash_and_say_what_helps(tmp_path, images, message):
 
 
 def test_empty_video_and_live_camera_are_refused(tmp_path):
-    with pytest.raises(rt.ReobjError, match="no frame"):
+    with pytest.raises(rt.ReobjError, match="no readable frame"):
         rt.estimate_poses(FakeVideo([]), config(), tmp_path)
     video = blank(3)
     video.is_live = True

@@ -108,16 +108,16 @@ TABLE = np.array([0, 0, 0.74])
         (table_top(), ORBIT, 1.0, "may be a table top"),
         (table_top() * 4, ORBIT * 4, 0.25, "may be a table top"),  # not metric
         (table_top(), ORBIT, None, "scale is unknown"),
-        (room(on_floor=0, table=False, wrong=0), cameras(), 1.0, "no .*plane|points lie"),
+        (room(on_floor=0, table=False, wrong=0), cameras(), 1.0, "no plane|points lie|no near"),
         (room(), cameras(9.0), 1.0, "m below the cameras"),
         (room(), cameras(), 0.1, "m below the cameras"),  # a doll's house
         (room()[:50], cameras(), 1.0, "50 points, 100 are needed"),
         (room() + HIGHER, cameras(), 1.0, "0 points below the cameras"),
         (room(), np.empty((0, 3)), 1.0, "are needed"),
-        (np.random.default_rng(0).normal(0, 2, (3000, 3)), cameras(), 1.0, "level"),
+        (np.random.default_rng(0).normal(0, 2, (3000, 3)), cameras(), 1.0, "plane"),
     ],
 )
-def test_no_floor_is_told_where_there_is_none(points, centres, metres, reason):
+def test_where_there_is_no_floor_none_is_found(points, centres, metres, reason):
     floor, why = find_floor(points, UP, centres, metres)
     assert floor is None
     assert any(part in why for part in reason.split("|")), why

@@ -637,7 +637,7 @@ def test_missing_unknown_and_without_intrinsics(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(rt.ReobjError, match=r"no images\.bin"):
         read(tmp_path / "empty")
-    with pytest.raises(rt.ReobjError, match="unknown; known are auto, colmap"):
+    with pytest.raises(rt.ReobjError, match="unknown; expected auto, colmap"):
         read(tmp_path, fmt="xyz")
     with pytest.raises(rt.ReobjError, match="no frame"):
         read(as_record3d(tmp_path, some_cameras()), blank(0))

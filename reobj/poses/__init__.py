@@ -1,1 +1,1 @@
-"""poses of reobj_track."""
+"""Camera poses: reconstructed from a video, or supplied by other tools and checked."""

@@ -329,12 +329,12 @@ def test_the_larger_model_or_the_named_one(tmp_path: Path) -> None:
         rt.read_poses(tmp_path / "w", source)
 
 
-def test_a_folder_says_what_it_was_taken_for(tmp_path: Path) -> None:
+def test_the_format_of_a_folder_is_reported(tmp_path: Path) -> None:
     names = [f"{i:04d}.jpg" for i in ALL]
     transforms(tmp_path / "transforms.json", ALL, names)
     model(tmp_path / "sparse" / "0", ALL, names)
     poses = rt.read_poses(tmp_path, rt.Video(folder_of(tmp_path)))
-    assert any("read as transforms; --pose-format chooses" in text for text in poses.messages)
+    assert any("read as transforms; it also has" in text for text in poses.messages)
     assert poses.reading == "transforms, frames by file names"
 
 
