@@ -74,8 +74,8 @@ def draw_tracks(
 
     Args:
         labels: text of each identity; scale: image pixels per pixel of the tracks.
-        positions: index of the position of each identity's label in the previous frame, updated here, so
-            that labels jump less.
+        positions: index of the position of each identity's label in the previous frame, updated
+            here, so that labels jump less.
         thin: identities whose solid is drawn too.
     """
     boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
