@@ -226,7 +226,7 @@ BAD_TRACKS = {
         "</track></annotations>",
         "no annotations of CVAT",
     ),
-    "detections": ("a.txt", "1,-1,10,10,20,20,.9,-1,-1,-1\n", "not every box has an identity"),
+    "detections": ("a.txt", "1,-1,10,10,20,20,.9,-1,-1,-1\n", "no box has an identity"),
     "twice": ("a.txt", "1,4,10,10,20,20\n1,4,99,10,20,20\n", "identity 4 has 2 boxes in frame 0"),
     "missing": ("a.txt", None, "no such file"),
 }

@@ -47,24 +47,24 @@ TINY = 1e-12  # least score of a pair, and least union
 _Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), IoU (g, p)
 
 
-def _frame_steps(truth: LabelledBoxes, found: LabelledBoxes) -> list[_Step]:
+def _frame_steps(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[_Step]:
     """Compute the IoU of truth and result in each frame.
 
     Returns:
         for every frame with boxes, ascending: rows of the truth (g,) and of the result (p,), and
         their IoU (g, p), 0 for different classes.
     """
-    frames = np.union1d(truth.frame, found.frame)
+    frames = np.union1d(truth.frame, predicted.frame)
     rows = []
-    for boxes in (truth, found):
+    for boxes in (truth, predicted):
         order = np.argsort(boxes.frame, kind="stable")
         rows.append(np.split(order, np.searchsorted(boxes.frame[order], frames[1:])))
     steps = []
     for g, p in zip(*rows, strict=True):
         a = truth.name[g][:, None]
-        b = found.name[p][None]
+        b = predicted.name[p][None]
         same = (a == b) | (a == "") | (b == "")
-        steps.append((g, p, np.where(same, box_iou(truth.xyxy[g], found.xyxy[p]), 0.0)))
+        steps.append((g, p, np.where(same, box_iou(truth.xyxy[g], predicted.xyxy[p]), 0.0)))
     return steps
 
 
@@ -75,17 +75,17 @@ def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
     return rows[positive], columns[positive]
 
 
-def drop_ignored(truth: LabelledBoxes, found: LabelledBoxes) -> LabelledBoxes:
+def drop_ignored(truth: LabelledBoxes, predicted: LabelledBoxes) -> LabelledBoxes:
     """Drop results matched to an ignored true box, as MOTChallenge does."""
-    keep = np.ones(len(found), bool)
-    for g, p, iou in _frame_steps(truth, found) if (truth.role == IGNORED).any() else ():
+    keep = np.ones(len(predicted), bool)
+    for g, p, iou in _frame_steps(truth, predicted) if (truth.role == IGNORED).any() else ():
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
         keep[p[b]] &= truth.role[g[a]] != IGNORED
-    return found[keep]
+    return predicted[keep]
 
 
 def _numbered(
-    truth: LabelledBoxes, found: LabelledBoxes
+    truth: LabelledBoxes, predicted: LabelledBoxes
 ) -> tuple[IntArray, IntArray, list[_Step], IntArray, IntArray]:
     """Number the identities of truth and result.
 
@@ -95,12 +95,12 @@ def _numbered(
     """
     truth = truth[truth.role == SCORED]
     gt_ids, gt, gt_size = np.unique(truth.identity, return_inverse=True, return_counts=True)
-    ids, pr, pr_size = np.unique(found.identity, return_inverse=True, return_counts=True)
-    steps = [(gt[g], pr[p], iou) for g, p, iou in _frame_steps(truth, found)]
+    ids, pr, pr_size = np.unique(predicted.identity, return_inverse=True, return_counts=True)
+    steps = [(gt[g], pr[p], iou) for g, p, iou in _frame_steps(truth, predicted)]
     return gt_ids, ids, steps, gt_size, pr_size
 
 
-def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
+def score_tracks(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, float]:
     """Compute HOTA, CLEAR MOT and identity scores as TrackEval does, and further scores.
 
     Returns:
@@ -110,10 +110,10 @@ def score_tracks(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]
         identity of the object.
     Ref: Luiten et al., IJCV 2021; Bernardin & Stiefelhagen, 2008; Ristani et al., 2016.
     """
-    found = drop_ignored(truth, found)
-    gt_ids, ids, steps, gt, pr = _numbered(truth, found)
+    predicted = drop_ignored(truth, predicted)
+    gt_ids, ids, steps, gt, pr = _numbered(truth, predicted)
     result = _hota(steps, gt, pr) | _clear(steps, gt, pr) | _identity(steps, gt, pr)
-    result |= _returns(truth, found)
+    result |= _returns(truth, predicted)
     return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
 
 
@@ -140,14 +140,14 @@ def _visit_of_object(truth: LabelledBoxes, visit: IntArray) -> IntArray:
     return np.asarray(visit + (visit.max(initial=0) + 1) * number, np.int64)
 
 
-def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, IntArray]:
+def matched_rows(truth: LabelledBoxes, predicted: LabelledBoxes) -> tuple[IntArray, IntArray]:
     """Match truth and result frame by frame at IoU >= .5, with the largest total IoU.
 
     Returns:
         rows (M,) of the SCORED true boxes and of the result.
     """
     pairs = [np.empty((2, 0), np.int64)]
-    for g, p, iou in _frame_steps(truth, found):
+    for g, p, iou in _frame_steps(truth, predicted):
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
         pairs.append(np.stack([g[a], p[b]]))
     rows = np.concatenate(pairs, 1)
@@ -155,17 +155,17 @@ def matched_rows(truth: LabelledBoxes, found: LabelledBoxes) -> tuple[IntArray, 
     return rows[0][scored], rows[1][scored]
 
 
-def _returns(truth: LabelledBoxes, found: LabelledBoxes) -> dict[str, float]:
+def _returns(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, float]:
     """Count returns of true objects, and the rate whose main identity is that of an earlier visit.
 
     Visits without a match are left out.
     """
     visit = visits(truth)
-    g, p = matched_rows(truth, found)
+    g, p = matched_rows(truth, predicted)
     known: dict[int, set[int]] = {}
     kept = []
     for rows in rows_by(_visit_of_object(truth, visit)[g]):
-        ids, votes = np.unique(found.identity[p[rows]], return_counts=True)
+        ids, votes = np.unique(predicted.identity[p[rows]], return_counts=True)
         before = known.setdefault(int(truth.identity[g[rows[0]]]), set())
         kept += [int(ids[votes.argmax()]) in before] if before else []
         before.add(int(ids[votes.argmax()]))
@@ -176,7 +176,7 @@ QUERY_FRAMES = 10  # first frames of a return, whose boxes are queries; chosen: 
 
 
 def return_ranks(
-    truth: LabelledBoxes, found: LabelledBoxes, embedding: npt.NDArray[Any]
+    truth: LabelledBoxes, predicted: LabelledBoxes, embedding: npt.NDArray[Any]
 ) -> IntArray:
     """Rank the correct object by cosine similarity for the first views of every return.
 
@@ -185,12 +185,12 @@ def return_ranks(
     box. Rank-k is the rate of ranks <= k.
 
     Args:
-        embedding: (N, E) unit rows for the rows of `found`, NaN: not embedded.
+        embedding: (N, E) unit rows for the rows of `predicted`, NaN: not embedded.
     Returns:
         (Q,) ranks from 1.
     """
     visit = visits(truth)
-    g, p = matched_rows(truth, found)
+    g, p = matched_rows(truth, predicted)
     use = np.isfinite(embedding[p]).all(1)
     g = g[use]
     p = p[use]
@@ -292,9 +292,9 @@ def _identity(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> d
     }
 
 
-def identity_map(truth: LabelledBoxes, found: LabelledBoxes) -> dict[int, int | None]:
+def identity_map(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[int, int | None]:
     """Map every true identity to one of the result, one to one by common frames, or to None."""
-    gt_ids, ids, steps, *_ = _numbered(truth, found)
+    gt_ids, ids, steps, *_ = _numbered(truth, predicted)
     a, b, _ = _identity_pairs(steps, (len(gt_ids), len(ids)))
     pairs: dict[int, int | None] = dict.fromkeys(gt_ids.tolist())
     return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
@@ -366,7 +366,7 @@ def evaluate(
     if out.name == TRACKS_FILE and (out.parent / LAST_TRACKS).exists():
         out = out.parent
     notes: list[str] = []
-    found = read_result(out, notes)
+    predicted = read_result(out, notes)
     if (out / LAST_TRACKS).exists():
         workspace = Workspace.open(out)
         tracked = workspace.load_last()
@@ -379,27 +379,27 @@ def evaluate(
         check_counts(
             read, Path(gt), "none lies in a frame that was read (--start, --stop, --every)"
         )
-        truth, found = _looked_at(read, found, tracked.looked, notes)
+        truth, predicted = _looked_at(read, predicted, tracked.looked, notes)
         check_counts(truth, Path(gt), "none lies in a frame that the detector was run on")
-    truth, found, named = with_common_names(truth, found, notes)
-    unknown = set(classes) - set(truth.name) - set(found.name)
+    truth, predicted, named = with_common_names(truth, predicted, notes)
+    unknown = set(classes) - set(truth.name) - set(predicted.name)
     if unknown:
         raise ReobjError(
             f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor in the result"
         )
     names_scored = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
     if classes:
-        truth, found = _of_classes(truth, found, classes, named)
+        truth, predicted = _of_classes(truth, predicted, classes, named)
         check_counts(truth, Path(gt), f"none is of {', '.join(classes)}")
-    scores = {"all": score_tracks(truth, found)}
+    scores = {"all": score_tracks(truth, predicted)}
     if named and len(names_scored) > 1:
         for name in names_scored:
-            scores[name] = score_tracks(*_of_classes(truth, found, [name], named))
+            scores[name] = score_tracks(*_of_classes(truth, predicted, [name], named))
     result: dict[str, Any] = {"version": __version__, "gt": str(gt), "tracks": scores}
     result["ranks"] = score_appearance(tracked, truth) if tracked is not None else {}
     result["messages"] = notes
     if solids is not None:
-        pairs = identity_map(truth, found)
+        pairs = identity_map(truth, predicted)
         poses = Path(truth_poses) if truth_poses else None
         result["objects"] = score_objects(Result.load(out), Path(solids), poses, pairs)
     return result
@@ -409,31 +409,33 @@ TRACKS_FILE = "tracks.txt"  # of an output folder
 
 
 def _of_classes(
-    truth: LabelledBoxes, found: LabelledBoxes, classes: Sequence[str], named: bool
+    truth: LabelledBoxes, predicted: LabelledBoxes, classes: Sequence[str], named: bool
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
     """Select the boxes of some classes.
 
     If the result has no classes (not `named`), true boxes of other classes become IGNORED.
     """
-    true_rows, found_rows = (np.isin(boxes.name, [*classes, ""]) for boxes in (truth, found))
+    true_rows, predicted_rows = (
+        np.isin(boxes.name, [*classes, ""]) for boxes in (truth, predicted)
+    )
     if named:
-        return truth[true_rows], found[found_rows]
+        return truth[true_rows], predicted[predicted_rows]
     role = np.where(true_rows | (truth.role != SCORED), truth.role, IGNORED)
-    return dataclasses.replace(truth, role=role), found
+    return dataclasses.replace(truth, role=role), predicted
 
 
 def _looked_at(
-    truth: LabelledBoxes, found: LabelledBoxes, looked: IntArray | None, notes: list[str]
+    truth: LabelledBoxes, predicted: LabelledBoxes, looked: IntArray | None, notes: list[str]
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
     """Select the frames on which the detector was run (None: all)."""
     if looked is None:
-        return truth, found
+        return truth, predicted
     kept = truth[np.isin(truth.frame - 1, looked)]
     notes.append(
         f"{len(truth) - len(kept)} of {len(truth)} true boxes do not count: they lie in frames "
         f"on which the detector was not run (it was run on {len(looked)})"
     )
-    return kept, found[np.isin(found.frame - 1, looked)]
+    return kept, predicted[np.isin(predicted.frame - 1, looked)]
 
 
 def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
@@ -449,9 +451,9 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
     identity = np.arange(len(tracks))
     names = np.array([*tracked.class_names, ""])[tracks.class_id]  # -1: unknown
     role = np.full(len(tracks), SCORED)
-    found = LabelledBoxes(tracks.frame + 1, identity, tracks.xyxy, names, role)
+    predicted = LabelledBoxes(tracks.frame + 1, identity, tracks.xyxy, names, role)
     fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
-    rank = return_ranks(truth, found, unit_rows(fused))
+    rank = return_ranks(truth, predicted, unit_rows(fused))
     shares = {f"rank{k}": float((rank <= k).mean()) for k in (1, 5, 20, 50)} if len(rank) else {}
     return {"queries": len(rank), **shares}
 

@@ -372,7 +372,7 @@ def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
     known = {k: terms.get(k, 0.0) for k in NERF_MODELS[model]}
     pinhole = {"f", "fx", "fy", "cx", "cy", "k"}
     if any(v for k, v in values.items() if k not in known and k not in pinhole):
-        log.warning("%s: nerfstudio has no %s cameras: further distortion parameters are left out",
+        log.warning("%s: nerfstudio has no %s cameras: the rest of the distortion is left out",
                     path, camera.model)  # fmt: skip
     K = camera.K
     facts = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}

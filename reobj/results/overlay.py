@@ -65,7 +65,7 @@ def draw_tracks(
     tracks: Tracks,
     labels: dict[int, str],
     scale: float,
-    places: dict[int, int] | None = None,
+    positions: dict[int, int] | None = None,
     thin: frozenset[int] = frozenset(),
 ) -> None:
     """Draw the boxes and identities of one frame's rows, in place; interpolated boxes are dashed.
@@ -74,8 +74,8 @@ def draw_tracks(
 
     Args:
         labels: text of each identity; scale: image pixels per pixel of the tracks.
-        places: position (index) of each identity's label in the previous frame, updated here, so
-            that labels jump less.
+        positions: index of the position of each identity's label in the previous frame, updated
+            here, so that labels jump less.
         thin: identities whose solid is drawn too.
     """
     boxes = (tracks.xyxy * scale).round().astype(int)  # (N, 4)
@@ -83,10 +83,10 @@ def draw_tracks(
     scores = tracks.score.tolist()
     for obj, box, score in zip(ids, boxes, scores, strict=True):
         _draw_box(image, box, object_color(obj), 1 if obj in thin else 2, dashed=score == 0)
-    places = {} if places is None else places
+    positions = {} if positions is None else positions
     texts = [labels.get(obj, str(obj)) for obj in ids]
     sizes = np.array([_text_size(text) for text in texts], int).reshape(-1, 2)
-    spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), places)
+    spots = place_labels(ids, sizes, boxes, (image.shape[1], image.shape[0]), positions)
     for obj, text, spot in zip(ids, texts, spots, strict=True):
         if spot is not None:
             _draw_label(image, text, spot, object_color(obj))
@@ -126,13 +126,13 @@ def place_labels(
     sizes: IntArray,
     boxes: IntArray,
     image_size: tuple[int, int],
-    places: dict[int, int],
+    positions: dict[int, int],
 ) -> list[tuple[int, int] | None]:
     """Choose a position for each label at its box, inside the image and free of other labels.
 
     Args:
         sizes: (N, 2) of the labels, boxes: (N, 4), both pixels.
-        places: index of the last position of each identity's label; updated here.
+        positions: index of the last position of each identity's label; updated here.
     Returns:
         top-left corner of each label, None where no position is free.
     """
@@ -140,22 +140,22 @@ def place_labels(
     spots: list[tuple[int, int] | None] = []
     limit = np.array(image_size)
     for obj, size, box in zip(ids, sizes, boxes, strict=True):
-        corners = _label_places(box, size).clip(0, np.maximum(limit - size, 0))  # (P, 2)
+        corners = _label_corners(box, size).clip(0, np.maximum(limit - size, 0))  # (P, 2)
         free = (  # left of, above, right of or below all others
             (corners[:, None] >= taken[:, 2:]) | (corners[:, None] + size <= taken[:, :2])
         ).any(2).all(1)  # fmt: skip
-        order = [places.get(obj, 0), *range(len(corners))]
-        place = next((k for k in order if free[k]), None)
+        order = [positions.get(obj, 0), *range(len(corners))]
+        position = next((k for k in order if free[k]), None)
         spots.append(None)
-        if place is not None:
-            places[obj] = place
-            x, y = corners[place].tolist()
-            taken = np.concatenate([taken, [[x, y, *(corners[place] + size)]]])
+        if position is not None:
+            positions[obj] = position
+            x, y = corners[position].tolist()
+            taken = np.concatenate([taken, [[x, y, *(corners[position] + size)]]])
             spots[-1] = (x, y)
     return spots
 
 
-def _label_places(box: IntArray, size: IntArray) -> IntArray:
+def _label_corners(box: IntArray, size: IntArray) -> IntArray:
     """List the top-left corners (14, 2) of a label at a box, best first."""
     x1, y1, x2, y2 = box.tolist()
     w, h = size.tolist()
@@ -414,7 +414,7 @@ class Overlay:
         self.measured = {o.id for o in result.located if o.status == "ok"}
         self.labels = {o.id: f"{o.id} {cut(o.class_name, LABEL_MAX)}" for o in result.objects}
         self.outlines = _project_all(result, self.scale, self.layers)
-        self.places: dict[int, int] = {}
+        self.label_positions: dict[int, int] = {}
         self.cameras = _cameras(result) if "solids" in self.layers else {}
         self.legend = _legend(result, self.layers)
         self.trails: dict[int, list[tuple[int, Array]]] = {}  # by identity: frame, position
@@ -429,7 +429,7 @@ class Overlay:
         if "trails" in self.layers:
             self._draw_trails(image, rows)
         thin = self._draw_solids(image, frame.index, seen)
-        draw_tracks(image, rows, self.labels, self.scale, self.places, thin)
+        draw_tracks(image, rows, self.labels, self.scale, self.label_positions, thin)
         if self.legend and self.writer.count < LEGEND_S * self.fps:
             draw_legend(image, self.legend)
         self.writer.write(image)

@@ -34,10 +34,10 @@ def implausible(
             objects, often many. new_score: least score at which a track starts.
     """
     still = [o for o in result.objects if o.status != "doubtful" and o.class_name not in moving]
-    found = [_few_cameras(result), _nothing_measured(result, still)]
+    texts = [_few_cameras(result), _nothing_measured(result, still)]
     if not result.identities_given:  # given identities are not questioned
-        found += [_one_class(result, still), _unexplained(result, high_score, new_score)]
-    return [text for text in found if text]
+        texts += [_one_class(result, still), _unexplained(result, high_score, new_score)]
+    return [text for text in texts if text]
 
 
 def _few_cameras(result: Result) -> str:

@@ -132,7 +132,7 @@ def _jpeg(image: Image, size_px: int) -> str:
     return base64.b64encode(data.tobytes()).decode()
 
 
-def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int) -> IntArray:
+def diverse_rows(tracks: Tracks, obj: Object, poses: Poses | None, count: int) -> IntArray:
     """Choose diverse views of one object: (n,) rows of the tracks, n <= count.
 
     First the best box (large, high score), then repeatedly the box farthest from the chosen ones in
@@ -141,17 +141,17 @@ def diverse_rows(tracks: Tracks, found: Object, poses: Poses | None, count: int)
     Args:
         poses: of the object's component.
     """
-    rows = np.flatnonzero(tracks.track_id == found.id)
+    rows = np.flatnonzero(tracks.track_id == obj.id)
     if not len(rows):
         return rows
     frame = tracks.frame[rows]
     box = tracks.xyxy[rows]
     quality = tracks.score[rows] * (box[:, 2:] - box[:, :2]).clip(0).prod(1) ** 0.5  # (N,)
     feature = 2 * (frame / max(int(tracks.frame.max(initial=0)), 1))[:, None]  # (N, 1)
-    if poses is not None and found.center is not None:
+    if poses is not None and obj.center is not None:
         at, known = place_of(poses, frame)
         eye = invert_rigid(poses.cam_from_world[at])[:, :, 3]  # (N, 3)
-        ray = np.where(known[:, None], eye - found.center, np.nan)
+        ray = np.where(known[:, None], eye - obj.center, np.nan)
         ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), np.finfo(float).tiny)
         feature = np.hstack([feature, np.nan_to_num(ray)])  # (N, 4)
         quality = np.where(np.isfinite(ray[:, 0]), quality, 0.01 * quality)  # without a pose: last
@@ -179,8 +179,8 @@ def page_text() -> str:
     folder = Path(__file__).with_name("page")
     text = (folder / "page.html").read_text(encoding="utf-8")
 
-    def text_of(found: re.Match[str]) -> str:
-        return (folder / found[1]).read_text(encoding="utf-8").strip()
+    def text_of(match: re.Match[str]) -> str:
+        return (folder / match[1]).read_text(encoding="utf-8").strip()
 
     return re.sub(r"@\{([\w.]+)\}", text_of, text)
 
@@ -295,7 +295,7 @@ def _scene_part(number: int, part: Result, thin: int) -> dict[str, Any]:
 
 
 def _scene_object(
-    found: Object, origin: Array, tracks: Tracks, steps: IntArray, pictures: Pictures
+    obj: Object, origin: Array, tracks: Tracks, steps: IntArray, pictures: Pictures
 ) -> dict[str, Any]:
     """Collect the data of an object for the viewer.
 
@@ -303,7 +303,7 @@ def _scene_object(
     last, first, last ...), and its visits, each with its best box, the reference of edits (first,
     last, frame, x1, y1, x2, y2).
     """
-    rows_of_object = tracks[tracks.track_id == found.id]
+    rows_of_object = tracks[tracks.track_id == obj.id]
     seen = np.isin(steps, rows_of_object.frame)
     runs = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
     runs[1::2] -= 1
@@ -315,14 +315,14 @@ def _scene_object(
         best = rows[detected.score[rows].argmax()]
         box = detected.xyxy[best].round(1).tolist()
         visits.append([*detected.frame[rows[[0, -1]]].tolist(), int(detected.frame[best]), *box])
-    return found.to_json() | {
-        "center": None if found.center is None else (found.center - origin).tolist(),
-        "cov": "" if found.cov is None else base64_text(found.cov, "<f4"),
-        "color": object_color(found.id)[::-1],
-        "sides": sides(found),
+    return obj.to_json() | {
+        "center": None if obj.center is None else (obj.center - origin).tolist(),
+        "cov": "" if obj.cov is None else base64_text(obj.cov, "<f4"),
+        "color": object_color(obj.id)[::-1],
+        "sides": sides(obj),
         "seen": runs.tolist(),
         "visits": sorted(visits),
-        "crops": pictures.crops[found.id],
+        "crops": pictures.crops[obj.id],
     }
 
 

@@ -69,23 +69,23 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
         )
     truth = _true_cameras(truth_poses, poses)  # (F, 3, 4)
     use = poses.known & np.isfinite(truth[:, :, 3]).all(1)
-    ours = invert_rigid(poses.cam_from_world[use])  # (f, 3, 4)
+    estimated = invert_rigid(poses.cam_from_world[use])  # (f, 3, 4)
     truth = truth[use]
     similarity = None
     if use.sum() >= 3:  # Umeyama, PAMI 1991
-        similarity = _similarity(ours[:, :, 3], truth[:, :, 3])
+        similarity = _similarity(estimated[:, :, 3], truth[:, :, 3])
     if similarity is None:
         raise ReobjError(f"{truth_poses}: {use.sum()} poses in common; 3 or more are needed")
     scale, rotation, _ = similarity
-    residual = rotation @ ours[:, :, :3] @ truth[:, :, :3].swapaxes(1, 2)  # (f, 3, 3)
+    residual = rotation @ estimated[:, :, :3] @ truth[:, :, :3].swapaxes(1, 2)  # (f, 3, 3)
     cosine = (np.trace(residual, axis1=1, axis2=2) - 1) / 2  # of its angle
     solids = result.of_part(0).ellipsoids().center_in_world  # (S, 3)
     if not len(solids) or not np.median(cosine) > math.cos(math.radians(SAME_AXES_DEG)):
         return similarity
-    distance = float(np.median(np.linalg.norm(solids[:, None] - ours[:, :, 3], axis=2)))
+    distance = float(np.median(np.linalg.norm(solids[:, None] - estimated[:, :, 3], axis=2)))
     points = [
         np.concatenate([cams[:, :, 3], *(cams[:, :, 3] + d * cams[:, :, k] for k in range(3))])
-        for cams, d in ((ours, distance), (truth, scale * distance))
+        for cams, d in ((estimated, distance), (truth, scale * distance))
     ]  # (4 f, 3) each: centres, and points on the camera axes at the distance of the objects
     return _similarity(*points) or similarity
 
@@ -95,9 +95,9 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
 SAME_AXES_DEG = 10.0
 
 
-def _similarity(ours: Array, truth: Array) -> tuple[float, Array, Array] | None:
+def _similarity(estimated: Array, truth: Array) -> tuple[float, Array, Array] | None:
     """Estimate scale, rotation and translation from points (N, 3) to points; None: degenerate."""
-    similarity = import_pycolmap().estimate_sim3d(ours, truth)
+    similarity = import_pycolmap().estimate_sim3d(estimated, truth)
     if similarity is None:
         return None
     rotation = np.asarray(similarity.rotation.matrix(), np.float64)
@@ -123,9 +123,9 @@ def _true_cameras(path: Path, poses: Poses) -> Array:
         rows = matrix_rows(path)[0][frame, :3]
         return np.where((frame == poses.frame)[:, None, None], rows, np.nan)
     if table.shape[1] != 8:
-        found = f"{table.shape[1]} columns"
+        columns = f"{table.shape[1]} columns"
         raise ReobjError(
-            f"{path}: {found}; expected TUM rows of 8 numbers, or 12 or 16 numbers a line"
+            f"{path}: {columns}; expected TUM rows of 8 numbers, or 12 or 16 numbers a line"
         )
     table = table[np.argsort(table[:, 0], kind="stable")]
     after = np.searchsorted(table[:, 0], poses.time_s).clip(max=len(table) - 1)  # (F,)
@@ -157,17 +157,19 @@ def score_objects(
         from the scale; `scale_error`: relative error of our metres per unit.
     """
     ids, truth = read_true_solids(solids)
-    located, ours, scale_errors = _solids_in_truth(result, truth_poses)
+    located, estimated, scale_errors = _solids_in_truth(result, truth_poses)
     row_of = {o.id: row for row, o in enumerate(located)}
     rows = [i for i, t in enumerate(ids) if pairs.get(t) in row_of]  # of the truth
     if not rows:
         return {"true": len(pairs), "found": 0, "o3d_all": 0.0}
     our_rows = np.array([row_of[pairs[ids[i]] or 0] for i in rows])
-    found = ours[our_rows]
+    fitted = estimated[our_rows]
     true = truth[np.array(rows)]
-    o3d = quadrics.volume_overlap(found, true)  # (n,)
-    error = np.linalg.norm(found.center_in_world - true.center_in_world, axis=1)  # (n,) truth units
-    size = np.abs(np.log(found.half_axes.prod(1) / true.half_axes.prod(1))) / 3  # (n,) mean side
+    o3d = quadrics.volume_overlap(fitted, true)  # (n,)
+    error = np.linalg.norm(
+        fitted.center_in_world - true.center_in_world, axis=1
+    )  # (n,) truth units
+    size = np.abs(np.log(fitted.half_axes.prod(1) / true.half_axes.prod(1))) / 3  # (n,) mean side
     each = [
         {"id": ids[i], "object": located[j].id, "class": located[j].class_name, "o3d": a,
          "center_error": b}
@@ -181,7 +183,7 @@ def score_objects(
         "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
         "center_error_median": float(np.median(error)),
         "size_error_median": float(np.expm1(np.median(size))),
-        "sizes_inside": share_inside(sizes_in_sigma(located, our_rows, found, true)),
+        "sizes_inside": share_inside(sizes_in_sigma(located, our_rows, fitted, true)),
         "scale_error": scale_errors[0],
         **({"part_scale_errors": scale_errors} if len(scale_errors) > 1 else {}),
         "objects": each,
@@ -189,20 +191,23 @@ def score_objects(
 
 
 def sizes_in_sigma(
-    objects: Sequence[Object], rows: IntArray, found: quadrics.Ellipsoids, goal: quadrics.Ellipsoids
+    objects: Sequence[Object],
+    rows: IntArray,
+    fitted: quadrics.Ellipsoids,
+    true: quadrics.Ellipsoids,
 ) -> Array:
     """Return the errors (n, 3) of log sides along the true axes in sigma; NaN without a sigma.
 
     Args:
-        rows: (n,) of the objects. found, goal: their ellipsoids and the true ones, in one world.
+        rows: (n,) of the objects. fitted, true: their ellipsoids and the true ones, in one world.
     """
-    cosine = np.abs(goal.world_from_obj.swapaxes(1, 2) @ found.world_from_obj)  # (n, true, own)
+    cosine = np.abs(true.world_from_obj.swapaxes(1, 2) @ fitted.world_from_obj)  # (n, true, own)
     orders = quadrics.AXIS_ORDERS
     best = orders[cosine[:, np.arange(3), orders].sum(2).argmax(1)]  # (n, 3) own axis of each true
     none = np.full((9, 9), np.nan)
     cov = [none if (of := objects[row].cov) is None else of for row in rows.tolist()]
     variance = np.einsum("nii->ni", np.array(cov, np.float64))[:, 3:6]
-    error = np.log(np.take_along_axis(found.half_axes, best, 1) / goal.half_axes)
+    error = np.log(np.take_along_axis(fitted.half_axes, best, 1) / true.half_axes)
     return np.asarray(error / np.sqrt(np.take_along_axis(variance, best, 1)), np.float64)
 
 
@@ -235,11 +240,11 @@ def _solids_in_truth(
         except ReobjError as error:
             faults[k] = error
             continue
-        ours = part.ellipsoids()
+        estimated = part.ellipsoids()
         objects += part.located
-        centers.append(ours.center_in_world @ (scale * turn).T + shift)
-        half_axes.append(scale * ours.half_axes)
-        axes.append(turn @ ours.world_from_obj)
+        centers.append(estimated.center_in_world @ (scale * turn).T + shift)
+        half_axes.append(scale * estimated.half_axes)
+        axes.append(turn @ estimated.world_from_obj)
         if part.world.scale is not None and part.world.scale.value:
             scale_errors[k] = abs(part.world.scale.value / scale - 1)
     if len(faults) == len(parts):

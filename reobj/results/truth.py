@@ -85,15 +85,15 @@ def read_truth(
     notes = [] if notes is None else notes
     if path.suffix.lower() in (".xml", ".zip"):
         video: Any = SimpleNamespace(size=size, working_size=size, names=[], frame_count=0)
-        found = read_cvat(path, video)
-        if not len(found.identity):
+        recorded = read_cvat(path, video)
+        if not len(recorded.identity):
             raise ReobjError(
                 f"{path}: boxes of images, without identities; expected CVAT for video"
             )
-        names = np.array(found.class_names, str)[found.class_id]
+        names = np.array(recorded.class_names, str)[recorded.class_id]
         role = np.full(len(names), SCORED)
-        truth = LabelledBoxes(found.frame + 1, found.identity, found.xyxy, names, role)
-        notes += found.messages
+        truth = LabelledBoxes(recorded.frame + 1, recorded.identity, recorded.xyxy, names, role)
+        notes += recorded.messages
     elif path.suffix.lower() == ".json":
         truth = _read_coco_video(path)
     elif _is_kitti(path):
@@ -118,11 +118,11 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
         role = np.full(len(tracks), SCORED)
         ids = tracks.track_id
         frame = tracks.frame + 1
-        found = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
+        predicted = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
     else:
-        found = labelled(_from_one(read_mot_rows(out), out, notes))
-    _check_identities(found, out)
-    return found
+        predicted = labelled(_from_one(read_mot_rows(out), out, notes))
+    _check_identities(predicted, out)
+    return predicted
 
 
 MOT_PEDESTRIAN = 1  # class of MOTChallenge that counts
@@ -337,7 +337,7 @@ def check_counts(truth: LabelledBoxes, path: Path, left_out: str = "") -> None:
 
 
 def with_common_names(
-    truth: LabelledBoxes, found: LabelledBoxes, notes: list[str]
+    truth: LabelledBoxes, predicted: LabelledBoxes, notes: list[str]
 ) -> tuple[LabelledBoxes, LabelledBoxes, bool]:
     """Bring the class names of truth and result together.
 
@@ -347,19 +347,19 @@ def with_common_names(
     Returns:
         truth, result, and whether classes are compared.
     """
-    our_names = sorted(set(found.name.tolist()) - set(UNNAMED))
+    our_names = sorted(set(predicted.name.tolist()) - set(UNNAMED))
     true_names = sorted(set(truth.name[truth.role == SCORED].tolist()) - set(UNNAMED))
     ours_of = {_normalised(name): name for name in our_names}
     renamed = {name: ours_of.get(_normalised(name), name) for name in set(truth.name.tolist())}
     names = np.array([renamed[name] for name in truth.name.tolist()], str)
     truth = dataclasses.replace(truth, name=names)
-    if not true_names or not len(found) or {renamed[n] for n in true_names} & set(our_names):
-        return truth, found, True
+    if not true_names or not len(predicted) or {renamed[n] for n in true_names} & set(our_names):
+        return truth, predicted, True
     why = "the result has no classes"
     if our_names:
         why = f"no class in common (truth: {shortened(true_names)}; result: {shortened(our_names)})"
     notes.append(f"{why}: boxes match whatever their class")
-    return truth, dataclasses.replace(found, name=np.full(len(found), "")), False
+    return truth, dataclasses.replace(predicted, name=np.full(len(predicted), "")), False
 
 
 def _normalised(name: str) -> str:

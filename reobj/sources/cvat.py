@@ -62,8 +62,8 @@ def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
     messages = [f"{n} {kind} taken as their bounding boxes" for kind, n in sorted(bounded.items())]
     messages += [f"{skeletons} skeletons left out"] if skeletons else []
     if isinstance(frames[0], str):
-        frame, text = frames_of_names([str(f) for f in frames], video, str(path), first, None, True)
-        messages += [text] if text else []
+        frame, note = frames_of_names([str(f) for f in frames], video, str(path), first, None, True)
+        messages += [note] if note else []
     else:
         frame = np.array(frames, np.int64) - int(first or 0)
     names, class_id = np.unique(labels, return_inverse=True)

@@ -416,7 +416,10 @@ def test_no_box_of_a_file_is_left_out_by_itself(
         (mot(tail=".9,57") + "2,1,200,100,40,40,.9,-1\n", "1 boxes without a class are called"),
         (mot(tail=".9,57") + "2,1,200,100,40,40,0,0\n", "ignored regions"),
         (mot(tail=".9,1.25"), "column 8 holds no class numbers"),
-        (mot(tail=".9,57") + "99,1,200,100,40,40,.9,57\n", "1 boxes of frames that the video has"),
+        (
+            mot(tail=".9,57") + "99,1,200,100,40,40,.9,57\n",
+            "1 boxes of frames that the video lacks",
+        ),
         (kitti(), "1 rows DontCare left out"),
         (TABLES["frames without boxes"], "1 rows without a box left out"),
         (TABLES["numbers from 1"], "are taken as counted from 1"),

@@ -147,7 +147,7 @@ def track(images: Path, boxes: Path, out: Path, *more: str) -> list[str]:
 def test_track_names_both_in_the_frames_looked_at(images: Path, tmp_path: Path, n: int) -> None:
     warnings = track(images, mot(tmp_path / "det.txt", range(0, FRAMES, n)), tmp_path / "out")
     (said,) = warnings
-    assert f"1 frame in {n} (0, {n}, {2 * n}, " in said and "not looked at" in said
+    assert f"1 frame in {n} (0, {n}, {2 * n}, " in said and "not run on the others" in said
     rows = np.loadtxt(tmp_path / "out/tracks.txt", delimiter=",")
     last = (FRAMES - 1) // n * n + 1  # from 1
     first = -(-10 // n) * n + 1
