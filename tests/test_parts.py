@@ -36,9 +36,9 @@ from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.files import part_path
 from reobj.objects.description import components_message
 from reobj.poses.floor import Floor
+from reobj.results.evaluation_3d import score_objects
 from reobj.results.overlay import Overlay
 from reobj.results.scene import Pictures, write_scene
-from reobj.results.solids import score_objects
 from reobj.schema import validate_objects
 from reobj.types import Embeddings
 
