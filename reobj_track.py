@@ -100,20 +100,20 @@ from reobj.poses.supplied.readers import read_poses
 from reobj.results.edits import kept_edits, read_edits
 from reobj.results.evaluation import evaluate, score_report
 from reobj.results.export import EXPORTS, Viewer, export
-from reobj.results.folder import CONFIG_FILE, MODEL, copy_models, replaced, write_trajectories
 from reobj.results.overlay import film_layers
 from reobj.results.plausibility import implausible
-from reobj.results.result import (
-    Object,
-    Part,
-    Result,
-    VideoInfo,
-    World,
+from reobj.results.result import Object, Part, Result, VideoInfo, World
+from reobj.results.saving import (
+    CONFIG_FILE,
+    MODEL,
+    copy_models,
+    replaced,
+    validate_objects,
+    write_trajectories,
 )
 from reobj.results.scene import write_pictures
 from reobj.results.stages import collect_tracks, detect_all, detections_key, keep_detections
 from reobj.results.workspace import Workspace
-from reobj.schema import validate_objects
 from reobj.sources.detection_files import DetectConfig, read_detections, read_tracks
 from reobj.sources.detectors import DetectionSource, OnnxDetector, open_detections
 from reobj.sources.looked import Intervals
@@ -1174,9 +1174,8 @@ def run(
             poses, models = _reconstructed_cameras(job, boxes, class_names)
         if not tracks:
             result = _track_video(job, detected, poses, viewer)
-        workspace.save_last(result, poses, models)
-        result.poses, result.seconds = poses, job.seconds
-        result = _finish(job, result)
+        warnings = [*result.warnings, *workspace.save_last(result, poses, models)]
+        result = _finish(job, dataclasses.replace(result, poses=poses, warnings=warnings))
         if viewer is not None:
             viewer.show(result.without_doubtful(), Path("rerun"), images=not viewer.followed)
             viewer.close()
@@ -1189,25 +1188,29 @@ def refit(
     tracks: str | Path | None = None,
     edits: str | Path | None = None,
 ) -> Result:
-    """Link and fit again what OUT holds, by default with its last options.
+    """Link and fit the tracks of an output folder again, by default with its last options.
 
-    tracks: file of identities instead; edits: of corrections, instead of those that OUT keeps.
+    Args:
+        tracks: file of identities that replace the tracks.
+        edits: file of corrections that replace those of the folder.
     """
     if tracks and edits:
         raise ReobjError("--tracks replaces all identities, --edits corrects them: one at a time")
     with Workspace.open(out) as workspace:
-        result = workspace.load_last()
-        video = workspace.video() if tracks else workspace.video_or_facts(result)
-        result.edits = read_edits(edits) if edits else None
+        last = workspace.load_last()
+        video, warnings = (workspace.video(), []) if tracks else workspace.video_or_frames(last)
+        corrections = read_edits(edits) if edits else None
         config = dataclasses.replace(config or _last_config(out), input=video.config)
         _check_objects(config.objects)
-        size, priors = config.objects.known_size, config.objects.priors
-        check_known_size(size, priors, result.class_names)
+        sizes = config.objects
+        check_known_size(sizes.known_size, sizes.priors, last.class_names)
+        result = last
         if tracks:
-            poses = result.poses
-            result = _given_tracks(tracks, video, config.detect, result)
-            workspace.save_last(result, poses, workspace.last_models())
-            result.poses = poses
+            result = _given_tracks(tracks, video, config.detect, last)
+            warnings = workspace.save_last(result, last.poses, workspace.last_models())
+        result = dataclasses.replace(
+            result, poses=last.poses, edits=corrections, warnings=[*result.warnings, *warnings]
+        )
         return _finish(_Job(video, workspace, config), result)
 
 
@@ -1335,29 +1338,29 @@ def _finish(job: _Job, result: Result) -> Result:
     """Link tracklets, fit one shape per object, and write the output folder."""
     with job.timed("objects"):
         result = _fit_objects(job, result)
-    result.seconds |= job.seconds
-    result.warnings += _warnings(job.config, result)
+    warnings = [*result.warnings, *_warnings(job.config, result)]
+    result = dataclasses.replace(result, warnings=warnings, out=job.workspace.out)
     with job.timed("write"):
-        _write(job, result)
-    result.seconds |= job.seconds
+        result = _write(job, result)
     for warning in result.warnings:
         log.warning(warning)
-    return result
+    return dataclasses.replace(result, seconds=job.seconds)
 
 
 def _fit_objects(job: _Job, result: Result) -> Result:
     """Link and fit; gaps of tracks are filled with the default solver's shapes."""
     config = job.config
-    result.edits = result.edits or kept_edits(job.workspace.out)
+    edits = result.edits or kept_edits(job.workspace.out)
     with Progress("objects"):
-        result = link_and_fit(result, config.objects)
+        fitted = link_and_fit(dataclasses.replace(result, edits=edits), config.objects)
     gap = 0 if result.identities_given else config.output.fill_gaps
-    filled = fill(result, job.video.size, gap)
-    result = solve_again(result, config.objects)
-    result.tracks, result.out = filled, job.workspace.out
-    detected = np.flatnonzero(result.tracks.detection_index >= 0)  # rows that were not filled in
-    result.embedding_row = detected[result.embedding_row]
-    return result
+    tracks = fill(fitted, job.video.size, gap)
+    detected = np.flatnonzero(tracks.detection_index >= 0)  # rows that were not filled in
+    return dataclasses.replace(
+        solve_again(fitted, config.objects),
+        tracks=tracks,
+        embedding_row=detected[fitted.embedding_row],
+    )
 
 
 def _warnings(config: Config, result: Result) -> list[str]:
@@ -1371,8 +1374,12 @@ def _warnings(config: Config, result: Result) -> list[str]:
     return [*of_cameras, *of_objects, *of_sizes]
 
 
-def _write(job: _Job, result: Result) -> None:
-    """Write all files; pictures come last, so that a fault in drawing loses no result."""
+def _write(job: _Job, result: Result) -> Result:
+    """Write all files; pictures last, so that a failure of theirs loses no results.
+
+    Returns:
+        the result, with a warning for each picture that could not be made.
+    """
     workspace, output = job.workspace, job.config.output
     models = workspace.last_models()
 
@@ -1385,9 +1392,11 @@ def _write(job: _Job, result: Result) -> None:
     stale = (MODEL,) if models is not None or result.poses is None else ()
     result.save(workspace.out, output.doubtful, write_more, stale)
     shown = (output.overlay, output.scene, output.doubtful)
-    if faults := write_pictures(result, workspace.out, job.video, *shown):
-        result.warnings += faults
+    failures = write_pictures(result, workspace.out, job.video, *shown)
+    if failures:
+        result = dataclasses.replace(result, warnings=[*result.warnings, *failures])
         result.write_objects(workspace.out / "objects.json")
+    return result
 
 
 # ---- Command line ------------------------------------------------------------------------------

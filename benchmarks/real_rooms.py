@@ -68,7 +68,7 @@ import reobj_track as rt
 from reobj.objects.confidence import LOW_CONFIDENCE
 from reobj.objects.fit import link_and_fit
 from reobj.objects.observations import Views
-from reobj.results.solids import align_with_truth, share_inside, sizes_in_sigma
+from reobj.results.evaluation_3d import align_with_truth, share_inside, sizes_in_sigma
 from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
 

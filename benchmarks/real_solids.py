@@ -64,8 +64,8 @@ from synthetic_quadrics import table
 import quadrics
 import reobj_track as rt
 from reobj.files import atomic, load_json
+from reobj.results.evaluation_3d import MIN_HALF_AXIS, align_with_truth, read_true_solids
 from reobj.results.overlay import draw_ellipses, draw_tracks
-from reobj.results.solids import MIN_HALF_AXIS, align_with_truth, read_true_solids
 from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, Image, IntArray, box_iou, rows_by
 

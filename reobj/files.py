@@ -516,6 +516,15 @@ def numbers(values: Array, size: float = math.inf) -> list[float]:
     return [min(a, b, key=lambda text: abs(text - v)) for v, a, b in pairs]
 
 
+def significant(values: Array, size: float = math.inf) -> Array:
+    """Round an array to six significant digits, as in objects.json.
+
+    Args:
+        size: of the object at these coordinates, as in `numbers`.
+    """
+    return np.array(numbers(values, size), np.float64).reshape(np.shape(values))
+
+
 def base64_text(values: npt.NDArray[Any], kind: str) -> str:
     """Encode an array's bytes, C order, as the dtype `kind` ("<f4"), in base64 for HTML pages."""
     return base64.b64encode(np.asarray(values, kind).tobytes()).decode()

@@ -308,13 +308,6 @@ class LinkEvent:
     appearance_log_odds: float
     kept: bool
 
-    @staticmethod
-    def from_json(entry: dict[str, Any]) -> LinkEvent:
-        """Read an entry of objects.json's links; before 0.2 the log odds were called `look`."""
-        log_odds = entry.get("appearance_log_odds", entry.get("look", 0.0))
-        tracklets = tuple(entry["tracklets"])
-        return LinkEvent(entry["kind"], tracklets, entry["place_iou"], log_odds, entry["kept"])
-
 
 # ---- Detections of other libraries --------------------------------------------------------------
 

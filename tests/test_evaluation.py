@@ -24,8 +24,8 @@ from reobj.results.evaluation import (
     score_tracks,
     visits,
 )
+from reobj.results.evaluation_3d import read_true_solids, score_objects
 from reobj.results.result import VideoInfo
-from reobj.results.solids import read_true_solids, score_objects
 from reobj.results.truth import ABSENT, IGNORED, SCORED, LabelledBoxes, labelled, read_truth
 from reobj.results.workspace import Workspace
 from reobj.types import Embeddings

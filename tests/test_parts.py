@@ -36,10 +36,10 @@ from reobj.cameras import invert_rigid, read_sparse_model, write_colmap
 from reobj.files import part_path
 from reobj.objects.description import components_message
 from reobj.poses.floor import Floor
+from reobj.results.evaluation_3d import score_objects
 from reobj.results.overlay import Overlay
+from reobj.results.saving import validate_objects
 from reobj.results.scene import Pictures, write_scene
-from reobj.results.solids import score_objects
-from reobj.schema import validate_objects
 from reobj.types import Embeddings
 
 CENTERS = chair_solids().center_in_world
@@ -317,7 +317,7 @@ def test_a_part_without_objects(empty: int, tmp_path: Path) -> None:
     assert result.world.parts[empty].scale is None is not result.world.parts[1 - empty].scale
     assert (result.fits.scale.source == "none") == (empty == 0) == (result.world.scale is None)
     result.save(tmp_path)
-    assert f"part {empty}: " in rt.Result.load(tmp_path).summary()
+    assert f"component {empty}: " in rt.Result.load(tmp_path).summary()
 
 
 def test_no_object_at_all(tmp_path: Path) -> None:
@@ -425,7 +425,7 @@ def test_parts_are_those_of_the_cameras(parted_folder: Path, tmp_path: Path) -> 
     data = json.loads((parted_folder / "objects.json").read_text())
     data["world"]["parts"].append(data["world"]["parts"][0])
     (tmp_path / "out/objects.json").write_text(json.dumps(data))
-    with pytest.raises(rt.ReobjError, match="3 parts of a path that has 2; is damaged"):
+    with pytest.raises(rt.ReobjError, match="3 components of a trajectory that has 2; is damaged"):
         rt.Result.load(tmp_path / "out")
 
 
@@ -439,7 +439,7 @@ def test_an_objects_json_without_parts_loads(chairs: rt.Result, tmp_path: Path) 
     found = rt.Result.load(tmp_path)
     assert [o.part for o in found.objects] == [0, 0, 0] and found.world.parts == ()
     assert found.poses.part_count == 1 and found.of_part(0) is found
-    assert "part" not in found.summary() and "scale: 1.0" in found.summary()
+    assert "component" not in found.summary() and "scale: 1.0" in found.summary()
 
 
 def test_files_of_parts_of_an_earlier_run_go(parted: rt.Result, tmp_path: Path) -> None:
@@ -507,16 +507,14 @@ def test_poses_command_writes_a_file_for_each_part(
     assert "the trajectory has 2 components" in capsys.readouterr().err
 
 
-def test_the_summary_has_a_line_for_each_part(parted: rt.Result) -> None:
+def test_the_summary_has_a_line_for_each_component(parted: rt.Result) -> None:
     lines = parted.summary().splitlines()
-    assert (
-        "cameras: 61 of 64 frames (pycolmap) in 2 parts, each in a frame and scale of its own"
-        in lines
-    )
-    first, second = (line for line in lines if line.startswith("part "))
-    assert first.startswith("part 0: frames 0-39; 38 of 40 frames; 3 objects; scale ")
-    assert second.startswith("part 1: frames 40-63; 23 of 24 frames; 3 objects; scale ")
-    assert sum("ok, part 1" in line for line in lines) == 3
+    cameras = "cameras: 61 of 64 frames (pycolmap) in 2 components"
+    assert f"{cameras}, each with its own frame and scale" in lines
+    first, second = (line for line in lines if line.startswith("component "))
+    assert first.startswith("component 0: frames 0-39; 38 of 40 frames; 3 objects; scale ")
+    assert second.startswith("component 1: frames 40-63; 23 of 24 frames; 3 objects; scale ")
+    assert sum("ok, component 1" in line for line in lines) == 3
     assert not [line for line in lines if line.startswith("scale")]
 
 

@@ -25,7 +25,7 @@ from reobj.files import load_cached
 from reobj.options import parse_known_size, parse_up, read_config, with_option
 from reobj.poses.intrinsics import parse_camera
 from reobj.results.edits import apply_edits, read_edits
-from reobj.results.solids import read_true_solids
+from reobj.results.evaluation_3d import read_true_solids
 from reobj.results.truth import read_truth
 from reobj.results.workspace import Workspace
 from reobj.sources.imageless import ImagelessVideo

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from simulated import CHAIR, CUP, chair_solids, fitted, tracks_of, walk, with_co
 
 import quadrics
 import reobj_track as rt
-from reobj.results.folder import write_mot
 from reobj.results.ply import write_ply
-from reobj.results.result import VideoInfo, sides
-from reobj.schema import validate_objects
+from reobj.results.report import sides
+from reobj.results.result import VideoInfo
+from reobj.results.saving import validate_objects, write_mot
+from reobj.results.stages import tracked_embeddings
 
 
 def copy_of(result: rt.Result, **changes: object) -> rt.Result:
@@ -318,10 +320,37 @@ def test_validate_misses_nothing_that_must_be_there(saved: Path, key: str) -> No
     assert key in validate_objects(saved / "objects.json")[0]
 
 
-def test_validate_refuses_what_is_no_json(tmp_path: Path) -> None:
+def test_validate_names_file_and_path_in_every_line(saved: Path) -> None:
+    data = json.loads((saved / "objects.json").read_text())
+    data["objects"][0]["id"] = "one"
+    data["objects"][1]["views"] = -1
+    data["objects"][2]["score"] = float("nan")
+    (saved / "objects.json").write_text(json.dumps(data))
+    for path in (saved, saved / "objects.json"):
+        lines = validate_objects(path)
+        assert [line.rpartition(": ")[0] for line in lines] == [
+            f"{saved / 'objects.json'}: $.objects[{k}].{name}"
+            for k, name in enumerate(("id", "views", "score"))
+        ]
+
+
+def test_validate_refuses_invalid_json(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text("{")
     with pytest.raises(rt.ReobjError, match="not valid JSON"):
         validate_objects(tmp_path / "x.json")
+
+
+def test_validate_names_the_missing_package(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "jsonschema", None)
+    assert rt.main(["objects", str(saved), "--validate"]) == 2
+    advice = "jsonschema is not installed: pip install 'reobj-track[validate]'"
+    assert capsys.readouterr().err == f"error: {advice}\n"
+    rt.Result.load(saved)  # needs no jsonschema
+
+
+# ---- Damaged folders ----
 
 
 @pytest.mark.parametrize(
@@ -330,9 +359,30 @@ def test_validate_refuses_what_is_no_json(tmp_path: Path) -> None:
         (lambda d: d["objects"][0].update(id=2), "two objects of one id"),
         (lambda d: d["objects"][1].update(quat_wxyz=[0, 0, 0, 0]), "quat_wxyz of object 2 is not"),
         (lambda d: d["objects"][1].update(quat_wxyz=[1, 1, 0, 0]), "quat_wxyz of object 2 is not"),
-        (lambda d: d["objects"][2].update(part=1), "object 3 is of part 1, which is not there"),
-        (lambda d: d["objects"][2].update(center=["x"] * 3), r"objects\[2\].center\[0\]: 'x', exp"),
-        (lambda d: d.update(video=None), r"\$.video: None, expected object"),
+        (
+            lambda d: d["objects"][2].update(part=1),
+            "object 3 is in component 1, which does not exist",
+        ),
+        (
+            lambda d: d["objects"][2].update(center=["x"] * 3),
+            r"objects\[2\].center: expected 3 finite",
+        ),
+        (lambda d: d["objects"][0].update(center=None), "object 1 is ok without a shape"),
+        (lambda d: d["objects"][0].update(size=[1, 0, 1]), r"\[0\].size: expected positive"),
+        (lambda d: d["objects"][0].update(cov=[[1.0] * 9] * 8), r"\[0\].cov: expected 9 x 9"),
+        (lambda d: d["objects"][0].update(frames=[[1]]), r"\[0\].frames: expected pairs"),
+        (lambda d: d["objects"][0].update(views=1.5), r"\[0\].views: 1.5, expected an integer"),
+        (lambda d: d["objects"][0].update(views=True), r"\[0\].views: True, expected an integer"),
+        (lambda d: d["objects"][0].update(id=0), r"\[0\].id: 0, expected an integer > 0"),
+        (lambda d: d["objects"][0].update(classes={"a": "b"}), r"\[0\].classes.a: 'b', expected"),
+        (lambda d: d["objects"][0].pop("status"), r"objects\[0\]: 'status' is missing"),
+        (
+            lambda d: d["video"].update(fps=float("nan")),
+            r"\$.video.fps: nan, expected a number > 0",
+        ),
+        (lambda d: d["world"].update(links=[0]), r"\$.world.links\[0\]: 0, expected an object"),
+        (lambda d: d.update(version=2), "expected format reobj-objects, version 1"),
+        (lambda d: d.update(video=None), r"\$.video: None, expected an object"),
     ],
 )
 def test_what_does_not_fit_together_is_not_loaded(saved: Path, change: Any, fault: str) -> None:
@@ -352,8 +402,8 @@ def embedded_result() -> rt.Result:
     row = np.arange(6, dtype=np.float32).reshape(2, 3)
     embedded = [(np.array([2, 0]), row), (np.empty(0, np.int64), np.empty((0, 0), np.float32)),
                 (np.array([1, 9]), row + 6)]  # fmt: skip
-    result.keep_embeddings([0, 1, 2], embedded, 2)
-    return result
+    embeddings, row = tracked_embeddings(result.tracks, [0, 1, 2], embedded, 2)
+    return copy_of(result, embeddings=embeddings, embedding_row=row)
 
 
 def test_embeddings_belong_to_their_rows() -> None:
@@ -367,12 +417,13 @@ def test_embeddings_belong_to_their_rows() -> None:
 
 
 def test_without_a_width_all_is_foreground() -> None:
-    result = fitted(tracks_of(walk(2)), None)
-    result.keep_embeddings([0], [(np.array([1]), np.ones((1, 3), np.float32))], 0)
-    assert result.embeddings.foreground.shape == (1, 3)
-    assert result.embeddings.background.shape == (1, 0)
-    result.keep_embeddings([0, 1], [(np.empty(0, np.int64), np.empty((0, 0), np.float32))] * 2, 0)
-    assert result.embeddings.foreground.shape == (0, 0) and len(result.embedding_row) == 0
+    tracks = tracks_of(walk(2))
+    embedded = [(np.array([1]), np.ones((1, 3), np.float32))]
+    embeddings, _ = tracked_embeddings(tracks, [0], embedded, 0)
+    assert embeddings.foreground.shape == (1, 3) and embeddings.background.shape == (1, 0)
+    nothing = [(np.empty(0, np.int64), np.empty((0, 0), np.float32))] * 2
+    embeddings, row = tracked_embeddings(tracks, [0, 1], nothing, 0)
+    assert embeddings.foreground.shape == (0, 0) and len(row) == 0
 
 
 def test_tracked_is_read_as_it_was(tmp_path: Path) -> None:

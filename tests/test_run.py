@@ -26,10 +26,10 @@ import quadrics
 import reobj
 import reobj_track as rt
 from reobj.poses import stage
-from reobj.results import stages as stages_room
+from reobj.results import stages as stages_module
+from reobj.results.saving import validate_objects
 from reobj.results.stages import detect_all
 from reobj.results.workspace import Workspace
-from reobj.schema import validate_objects
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 12
@@ -386,9 +386,9 @@ def test_masks_are_not_kept_while_tracking(
 ) -> None:
     """Those of a minute of video would be gigabytes."""
     kept: list[rt.Detections] = []
-    untracked = stages_room._untracked
+    untracked = stages_module._untracked
     monkeypatch.setattr(
-        stages_room, "_untracked", lambda *args: (kept.extend(args[2]), untracked(*args))[1]
+        stages_module, "_untracked", lambda *args: (kept.extend(args[2]), untracked(*args))[1]
     )
 
     def masked(image: np.ndarray) -> rt.Detections:

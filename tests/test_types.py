@@ -335,13 +335,6 @@ def test_a_class_is_voted_by_the_sum_of_scores() -> None:
     np.testing.assert_allclose(shares[:, [5, 7]], [[0.4, 0.6], [1, 0], [0, 0]])
 
 
-def test_link_events_survive_json() -> None:
-    entry = {"kind": "join", "tracklets": [1, 4], "place_iou": None, "kept": True}
-    for name in ("appearance_log_odds", "look"):  # the second: before 0.2
-        event = rt.LinkEvent.from_json(entry | {name: 2.5})
-        assert event == rt.LinkEvent("join", (1, 4), None, 2.5, True)
-
-
 # ---- Small helpers ----
 
 

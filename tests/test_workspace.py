@@ -15,7 +15,7 @@ import pytest
 from simulated import fitted, tracks_of, walk
 
 import reobj_track as rt
-from reobj.results.folder import copy_models, replaced
+from reobj.results.saving import copy_models, replaced
 from reobj.results.workspace import Workspace
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -120,7 +120,7 @@ def test_a_run_that_failed_does_not_claim_the_folder(video: rt.Video, tmp_path: 
 
 HOLD = """
 import os, sys, time
-from reobj.results.folder import copy_models, replaced
+from reobj.results.saving import copy_models, replaced
 from reobj.results.workspace import Workspace
 with Workspace(sys.argv[1]):
     print("held", flush=True)

@@ -9,14 +9,14 @@ import numpy as np
 
 import quadrics
 from reobj.cameras import Poses, quat_wxyz_from_matrix
-from reobj.files import numbers, rounded, shortened
+from reobj.files import numbers, rounded, shortened, significant
 from reobj.objects.categories import name_of
 from reobj.objects.confidence import with_low_confidence
 from reobj.objects.config import ObjectsConfig
 from reobj.objects.likelihood import CLASS_KEPT
 from reobj.objects.observations import Views
 from reobj.poses.floor import floor_of
-from reobj.results.result import Object, Part, World, significant
+from reobj.results.result import Object, Part, World
 from reobj.types import Array, LinkEvent, Tracks, object_classes, rows_by
 
 

@@ -17,8 +17,8 @@ from scipy.optimize import linear_sum_assignment
 
 from reobj import __version__
 from reobj.files import wrapped
+from reobj.results.evaluation_3d import score_objects
 from reobj.results.result import Result
-from reobj.results.solids import score_objects
 from reobj.results.truth import (
     IGNORED,
     SCORED,

@@ -24,11 +24,12 @@ import numpy.typing as npt
 
 import quadrics
 from reobj.cameras import Camera, Poses, invert_rigid, place_of, undistort_boxes
-from reobj.files import Progress, atomic, base64_text, rounded
+from reobj.files import Progress, atomic, base64_text, rounded, significant
 from reobj.poses.floor import NOISE
 from reobj.results.origin import centred
 from reobj.results.overlay import Overlay, film_layers
-from reobj.results.result import Object, Result, World, sides, significant
+from reobj.results.report import sides
+from reobj.results.result import Object, Result, World
 from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video, shrunk
 from reobj.types import (

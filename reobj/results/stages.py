@@ -1,10 +1,10 @@
-"""The first stages of a run in its output folder: all detections, then the tracks of the video."""
+"""Stages of a run before the objects: detections of all frames, then tracks; both are cached."""
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,16 @@ from reobj.results.result import Result, VideoInfo
 from reobj.results.workspace import Workspace
 from reobj.sources.detectors import DetectionCache, DetectionSource
 from reobj.sources.video import Video
-from reobj.types import Array, Detections, Floats, Frame, IntArray, ReobjError, Tracks
+from reobj.types import Array, Detections, Embeddings, Floats, Frame, IntArray, ReobjError, Tracks
 
 
 def detections_key(source: DetectionSource, video: Video) -> tuple[Any, ...]:
-    """Return what the detections of a video depend on."""
+    """Return the cache key of the detections of a video."""
     return (video.fingerprint, video.config, source.key)
 
 
 def keep_detections(source: DetectionSource, video: Video, workspace: Workspace) -> DetectionSource:
-    """Return a source that keeps what is slow to detect in the output folder, for later runs."""
+    """Return a source that caches the detections of a slow detector in the output folder."""
     if video.is_live:
         return source
     folder = workspace.path("detections", *detections_key(source, video)).with_suffix("")
@@ -34,20 +34,20 @@ def keep_detections(source: DetectionSource, video: Video, workspace: Workspace)
 def detect_all(
     source: DetectionSource, video: Video, workspace: Workspace
 ) -> tuple[DetectionSource, Tracks]:
-    """Find the objects of all frames of a video, before anything is known of its cameras.
+    """Detect objects in all frames of a video; the cameras are not needed.
 
     Returns:
-        the source, which answers from what was found: nothing is detected twice, whatever the
-        detector; and all detections as rows without identities, in native pixels.
+        the source, which returns these detections from now on, so that no frame is detected twice;
+        all detections as rows without identities, in native pixels.
     """
     if source.recorded is not None:
-        own = source.recorded
-        return source, _rows(own.frame, own.xyxy, own.score, own.class_id)
+        recorded = source.recorded
+        return source, _rows(recorded.frame, recorded.xyxy, recorded.score, recorded.class_id)
     path = workspace.path("boxes", *detections_key(source, video))
     if source.key and (cached := load_cached(path, lambda p: load_npz(p, sealed=True))):
-        found, _ = cached
-        return source, _rows(*(found[n] for n in ("frame", "xyxy", "score", "class_id")))
-    if source.cache is None:  # it cannot be known again: for this run only
+        columns, _ = cached
+        return source, _rows(*(columns[name] for name in COLUMNS))
+    if source.cache is None:  # without a key it is not recognised in a later run
         folder = workspace.cache / "detections-once"
         shutil.rmtree(folder, ignore_errors=True)
         source = dataclasses.replace(source, cache=DetectionCache(folder, video.working_size))
@@ -56,45 +56,76 @@ def detect_all(
     try:
         with Progress("detect", video.expected) as progress:
             for frame in video:
-                found_now = source(frame)
-                frames += [frame.index] * len(found_now)
-                steps.append((found_now.xyxy / video.scale, found_now.score, found_now.class_id))
+                detected = source(frame)
+                frames += [frame.index] * len(detected)
+                steps.append((detected.xyxy / video.scale, detected.score, detected.class_id))
                 progress.step()
     finally:
         source.flush()
-    columns = [np.concatenate(column) for column in zip(*steps, strict=True)] if steps else []
-    rows = _rows(np.array(frames, np.int64), *columns) if steps else Tracks.empty()
+    rows = Tracks.empty()
+    if steps:
+        xyxy, score, class_id = (np.concatenate(column) for column in zip(*steps, strict=True))
+        rows = _rows(np.array(frames, np.int64), xyxy, score, class_id)
     if source.key:
-        save_npz(path, {n: getattr(rows, n) for n in ("frame", "xyxy", "score", "class_id")})
+        save_npz(path, {name: getattr(rows, name) for name in COLUMNS})
     return source, rows
 
 
+COLUMNS = ("frame", "xyxy", "score", "class_id")  # of detections as rows
+
+
 def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tracks:
-    """Make rows of detections, of no identity."""
-    none = np.zeros(len(frame), np.int64)
-    return Tracks(frame, none, none, xyxy, score, class_id, none - 1)
+    """Make rows of detections without identities."""
+    zeros = np.zeros(len(frame), np.int64)
+    return Tracks(frame, zeros, zeros, xyxy, score, class_id, zeros - 1)
 
 
 def _untracked(
     tracks: Tracks, frames: list[int], detected: list[Detections], scale: float
 ) -> Tracks:
-    """Make rows, of no tracklet, of the detections (of each frame) that no row of the tracks is."""
-    index = np.concatenate([np.arange(len(found)) for found in detected])
-    frame = np.repeat(np.asarray(frames, np.int64), [len(found) for found in detected])
-    columns = [
-        np.concatenate([getattr(d, n) for d in detected]) for n in ("xyxy", "score", "class_id")
-    ]
-    columns[0] = columns[0] / scale
-    known = set(zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True))
-    free = [key not in known for key in zip(frame.tolist(), index.tolist(), strict=True)]
-    rows = _rows(frame, *columns)
-    return dataclasses.replace(rows, detection_index=index)[np.array(free, bool)]
+    """Make rows, without tracklets, of the detections that are in no row of the tracks."""
+    index = np.concatenate([np.arange(len(detections)) for detections in detected])
+    frame = np.repeat(np.asarray(frames, np.int64), [len(detections) for detections in detected])
+    xyxy = np.concatenate([detections.xyxy for detections in detected]) / scale
+    score = np.concatenate([detections.score for detections in detected])
+    class_id = np.concatenate([detections.class_id for detections in detected])
+    tracked = set(zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True))
+    free = [key not in tracked for key in zip(frame.tolist(), index.tolist(), strict=True)]
+    rows = dataclasses.replace(_rows(frame, xyxy, score, class_id), detection_index=index)
+    return rows[np.array(free, bool)]
+
+
+def tracked_embeddings(
+    tracks: Tracks,
+    frames: Sequence[int],
+    embedded: Sequence[tuple[IntArray, Floats]],
+    foreground_width: int,
+) -> tuple[Embeddings, IntArray]:
+    """Select the tracker's embeddings of detections that are in the tracks.
+
+    Args:
+        frames: source frame numbers. embedded: for each, detection indices (n,) and their fused
+            rows (n, E). foreground_width: columns of the foreground (0: all).
+    Returns:
+        n embeddings, and their rows (n,) in the tracks.
+    """
+    keys = zip(tracks.frame.tolist(), tracks.detection_index.tolist(), strict=True)
+    row_of = {key: row for row, key in enumerate(keys)}
+    row = np.array([
+        row_of.get((frame, detection), -1)
+        for frame, (index, _) in zip(frames, embedded, strict=True)
+        for detection in index.tolist()
+    ], np.int64)  # fmt: skip
+    blocks = [block for _, block in embedded if block.size] or [np.empty((0, 0), np.float32)]
+    fused = np.concatenate(blocks)[row >= 0].astype(np.float16)
+    width = foreground_width or fused.shape[1]
+    return Embeddings(fused[:, :width], fused[:, width:]), row[row >= 0]
 
 
 def collect_tracks(
     steps: Iterator[tuple[Frame, Tracks]], tracker: Any, video: Video, source: DetectionSource
 ) -> Result:
-    """Collect what a tracker decides in a video, with its embeddings and what the user should know.
+    """Run a tracker over a video and collect its tracks, embeddings and warnings.
 
     Args:
         steps: the running `track(video, source, tracker)`.
@@ -124,32 +155,39 @@ def collect_tracks(
         why = "--start/--stop/--every leave none, or the file is damaged"
         raise ReobjError(f"{video.source}: no frame could be read ({why})")
     tracks = Tracks.concatenate(frames, found, video.scale)
-    result = Result(tracks, tuple(source.class_names), VideoInfo.of(video))
-    result.untracked = _untracked(tracks, frames, detected, video.scale)
-    if not all(looked):
-        result.looked = np.array(frames, np.int64)[np.array(looked, bool)]
-    result.keep_embeddings(frames, embedded, tracker.state.gallery.foreground_width)
-    result.warnings += [*source.messages, *video.messages]
+    untracked = _untracked(tracks, frames, detected, video.scale)
+    foreground_width = tracker.state.gallery.foreground_width
+    embeddings, embedding_row = tracked_embeddings(tracks, frames, embedded, foreground_width)
+    warnings = [*source.messages, *video.messages]
     if video.is_live:
-        result.warnings += [
+        warnings += [
             f"live: {video.read} frames came, {video.dropped} of them were dropped to keep up",
             "a live source cannot be read twice: identities only; record it for 3D",
         ]
-    if not len(result.tracks):
-        score = result.untracked.score
-        result.warnings.append(f"no object was tracked: {_why_none(score, sum(looked), tracker)}")
-    return result
+    if not len(tracks):
+        reason = _why_none(untracked.score, sum(looked), tracker)
+        warnings.append(f"no object was tracked: {reason}")
+    return Result(
+        tracks,
+        tuple(source.class_names),
+        VideoInfo.of(video),
+        embeddings=embeddings,
+        embedding_row=embedding_row,
+        untracked=untracked,
+        looked=None if all(looked) else np.array(frames, np.int64)[np.array(looked, bool)],
+        warnings=warnings,
+    )
 
 
 def _why_none(score: Array, looked: int, tracker: Any) -> str:
-    """Say why nothing was tracked.
+    """Explain why nothing was tracked.
 
     Args:
-        score: of all detections. looked: frames that the detector was run on.
+        score: of all detections. looked: number of frames that the detector was run on.
     """
     least = tracker.config.new_score
     if not looked:
-        return "the detector was run on no frame (it gave None each time)"
+        return "the detector was run on no frame (it returned None each time)"
     if not len(score):
         return f"no detections in the {looked} frames that the detector was run on"
     if score.max() < least:

@@ -1,7 +1,4 @@
-"""Output folder: bound to one video, with the stages' results kept under a hash of their inputs.
-
-What the files of a result hold is the business of result.py; what a stage computes, of its room.
-"""
+"""Output folder: bound to one video; caches the results of the stages by a hash of their inputs."""
 
 from __future__ import annotations
 
@@ -10,6 +7,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +24,15 @@ from reobj.files import (
     writing,
 )
 from reobj.results.edits import EDITS
-from reobj.results.folder import LAST_POSES, check_results, remove_stale
-from reobj.results.result import Result, load_last_poses, written_by
-from reobj.schema import faults
+from reobj.results.entries import decode
+from reobj.results.result import Result
+from reobj.results.saving import (
+    LAST_POSES,
+    check_results,
+    load_last_poses,
+    remove_stale,
+    written_by,
+)
 from reobj.sources.imageless import ImagelessVideo
 from reobj.sources.video import InputConfig, Video
 from reobj.types import COORDINATE_MAX, ReobjError
@@ -36,43 +40,37 @@ from reobj.types import COORDINATE_MAX, ReobjError
 LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
 SOURCE = "cache/source.json"
 LOCK = "cache/lock"
+COUNT_MAX = 2**31 - 1  # frames, options of the input; int32 of OpenCV
 
 
-_COUNT = {"type": "integer", "minimum": 0, "maximum": 2**31 - 1}
-SOURCE_SCHEMA: dict[str, Any] = {
-    "type": "object",
-    "required": ["source", "input"],
-    "properties": {
-        "source": {"type": "string"},
-        "input": {"type": "object", "additionalProperties": _COUNT},
-        "frames": {
-            "type": ["object", "null"],
-            "required": ["size"],
-            "properties": {
-                "size": {
-                    "type": "array",
-                    "items": {"type": "integer", "minimum": 1, "maximum": COORDINATE_MAX},
-                    "minItems": 2,
-                    "maxItems": 2,
-                },
-                "times_s": {"type": ["array", "null"], "items": {"type": "number"}},
-                "names": {"type": "array", "items": {"type": "string"}},
-                "count": _COUNT,
-            },
-        },
-    },
-}  # of SOURCE
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    """Frames of a video without images: the arguments of `ImagelessVideo`."""
+
+    size: list[int]
+    times_s: list[float] | None = None
+    names: list[str] = field(default_factory=list)
+    count: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Binding:
+    """Content of SOURCE that is read back."""
+
+    source: str
+    input: dict[str, int]
+    frames: _Frames | None = None
 
 
 class Workspace:
-    """Keep the results of a video's stages in an output folder.
+    """Output folder of a video, with a cache of the results of its stages.
 
-    Every stage keeps its result in OUT/cache under a hash of its inputs and options: a killed run
-    resumes, a changed option recomputes what depends on it. A context: whoever writes into the
-    folder enters it, and is the only one to do so until it leaves or its process ends.
+    Every stage saves its result in OUT/cache under a hash of its inputs and options: a killed run
+    resumes, a changed option recomputes what depends on it. As a context manager it holds a lock,
+    which a process needs to write into the folder.
 
     Attributes:
-        out: the folder. cache: OUT/cache, made here; it may be deleted, then all is computed again.
+        out: the folder. cache: OUT/cache, made here; if it is deleted, all is computed again.
 
     Raises:
         ReobjError: the folder is a file, or holds something else and `overwrite` is False; a
@@ -87,7 +85,7 @@ class Workspace:
             raise ReobjError(f"{out}: is a file; -o wants a folder")
         if foreign and not overwrite:
             what = "is not empty and not made by reobj_track"
-            raise ReobjError(f"{out}: {what}; choose another -o, or say --overwrite")
+            raise ReobjError(f"{out}: {what}; choose another -o, or add --overwrite")
         if foreign and (out / "sparse").exists():
             raise ReobjError(f"{out}: a sparse/ of its own would be lost; choose another -o")
         self._held = contextlib.ExitStack()
@@ -108,7 +106,7 @@ class Workspace:
 
     @staticmethod
     def open(out: str | Path) -> Workspace:
-        """Open a folder that an earlier run made."""
+        """Open the output folder of an earlier run."""
         if not (Path(out) / "cache").is_dir():
             raise ReobjError(
                 f"{out}: no output folder of reobj_track; make one with `run` or `track`"
@@ -119,10 +117,11 @@ class Workspace:
         """Bind the folder to one video, so that results of two videos never mix.
 
         Raises:
-            ReobjError: it is bound to another video, or that one was changed since, and `overwrite`
-                is False; with it the other's results are removed.
+            ReobjError: it is bound to another video, or to an earlier version of this one, and
+                `overwrite` is False; otherwise the earlier results are removed.
         """
-        path, source = self.out / SOURCE, Path(str(video.source))
+        path = self.out / SOURCE
+        source = Path(str(video.source))
         fingerprint = {
             "source": str(source.absolute()) if source.exists() else str(video.source),
             "content": video.fingerprint,
@@ -134,11 +133,11 @@ class Workspace:
             old = old if isinstance(old, dict) else {}
             if old.get("content") != fingerprint["content"]:
                 if not overwrite and self._has_results():
-                    what = f"holds the results of {old.get('source', 'another video')}"
-                    what += f", not of {video.source}"
+                    found = f"{old.get('source', 'another video')}, not of {video.source}"
                     if old.get("source") == fingerprint["source"]:
-                        what = f"holds the results of {video.source} as it was before it changed"
-                    raise ReobjError(f"{self.out}: {what}; choose another -o, or say --overwrite")
+                        found = f"{video.source} as it was before it changed"
+                    advice = "choose another -o, or add --overwrite"
+                    raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
                 remove_stale(self.out)
                 for name in ("tracks.txt", "objects.json", EDITS, LAST_TRACKS, LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
@@ -146,100 +145,122 @@ class Workspace:
             part.write_text(json.dumps(fingerprint))
 
     def _has_results(self) -> bool:
-        """True unless no run came so far as to write one: what is in the cache does not mix."""
+        """Check for results of a run; cached stages are keyed by their video and do not count."""
         shown = [p for p in self.out.iterdir() if p != self.cache and p.name != PART_RESULTS]
         return bool(shown) or any((self.out / name).exists() for name in (LAST_TRACKS, LAST_POSES))
 
     @property
     def source(self) -> tuple[str, InputConfig]:
         """The video that the folder is bound to, and the options that it was read with."""
-        facts = self._binding()
+        binding = self._read_binding()
         try:
-            return str(facts["source"]), InputConfig(**facts["input"])
+            return binding.source, InputConfig(**binding.input)
         except TypeError as error:  # an option of another version
             raise ReobjError(f"{self.out / SOURCE}: {written_by(self.out)} ({error})") from error
 
     def video(self) -> Video:
-        """Open the video that the folder is bound to, read as it was."""
+        """Open the video that the folder is bound to, with the options of that run."""
         source, config = self.source
-        if not (frames := self._binding().get("frames")):
+        frames = self._read_binding().frames
+        if frames is None:
             return Video(source, config)
-        more = {k: frames[k] for k in ("times_s", "names", "count") if k in frames}
-        return ImagelessVideo(source, frames["size"], config, **more)
+        return ImagelessVideo(
+            source,
+            frames.size,
+            config,
+            times_s=frames.times_s,
+            names=frames.names,
+            count=frames.count,
+        )
 
-    def video_or_facts(self, result: Result) -> Video:
-        """Open the video; where it was moved or deleted since, its frames without images.
+    def video_or_frames(self, result: Result) -> tuple[Video, list[str]]:
+        """Open the video, or its frames without images if it was moved or deleted since.
 
         Args:
-            result: of the folder, with its poses; takes the warning.
+            result: of the folder, with its poses.
+        Returns:
+            the video; warnings.
         """
         try:
-            return self.video()
+            return self.video(), []
         except ReobjError as error:
             if not (self.out / SOURCE).is_file():
                 raise
             source, config = self.source
-            info, poses = result.video, result.poses
-            last = result.tracks.frame if poses is None else poses.frame
-            count = int(last.max(initial=-1)) + 1
-            video = ImagelessVideo(source, (info.width, info.height), config, count=count)
-            video.fps = info.fps
-            result.warnings.append(f"no film, and a page without pictures: {error}")
-            return video
+            frame = result.tracks.frame if result.poses is None else result.poses.frame
+            size = (result.video.width, result.video.height)
+            count = int(frame.max(initial=-1)) + 1
+            video = ImagelessVideo(source, size, config, count=count)
+            video.fps = result.video.fps
+            return video, [f"no overlay video, and a viewer without pictures: {error}"]
 
-    def _binding(self) -> dict[str, Any]:
+    def _read_binding(self) -> _Binding:
         """Read what `bind` wrote."""
         path = self.out / SOURCE
-        facts: dict[str, Any] = load_json(path)
-        for fault in faults(facts, SOURCE_SCHEMA):
-            raise ReobjError(f"{path}: {fault}; {written_by(self.out)}")
-        return facts
+        try:
+            binding: _Binding = decode(_Binding, load_json(path))
+        except ReobjError as error:
+            fault = str(error).removeprefix(f"{path}: ")
+            raise ReobjError(f"{path}: {fault}; {written_by(self.out)}") from error
+        frames = binding.frames
+        counts = [*binding.input.values(), 0 if frames is None else frames.count]
+        right_size = frames is None or (
+            len(frames.size) == 2 and 1 <= min(frames.size) <= max(frames.size) <= COORDINATE_MAX
+        )
+        if max(counts) > COUNT_MAX or not right_size:
+            raise ReobjError(f"{path}: a number is out of range; {written_by(self.out)}")
+        return binding
 
     def path(self, stage: str, *key: Any) -> Path:
-        """Return the file for a stage's result under a key: its inputs and options.
+        """Return the cache file of a stage's result.
 
         Args:
-            key: strings and configs; with the version of this package they make the name.
+            key: inputs and options of the stage: strings and configs. The file name is their hash,
+                with that of the version of this package.
         """
         text = json.dumps([__version__, key], sort_keys=True, default=dataclasses.asdict)
         return self.cache / f"{stage}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.npz"
 
     def save_last(
         self, tracked: Result, poses: Poses | None, models: Sequence[Path] | None = None
-    ) -> None:
-        """Keep the latest tracks and poses for `objects OUT`, `eval` and `export`.
+    ) -> list[str]:
+        """Save the latest tracks and poses for `objects OUT`, `eval` and `export`.
 
-        Given identities take the place of earlier corrections, which are removed.
+        Given identities replace earlier corrections, which are removed.
 
         Args:
-            models: folders of COLMAP models in the cache, one of each part, for `last_models`.
+            models: folders of COLMAP models in the cache, one a component, for `last_models`.
+        Returns:
+            warnings.
         """
+        warnings = []
         tracked.save_tracked(self.out / LAST_TRACKS)
-        if tracked.identities_given and (self.out / EDITS).exists():
-            (self.out / EDITS).unlink()
-            tracked.warnings.append(f"{self.out / EDITS} removed: the given identities replace it")
+        edits = self.out / EDITS
+        if tracked.identities_given and edits.exists():
+            edits.unlink()
+            warnings.append(f"{edits} removed: the given identities replace it")
         if poses is None:
             (self.out / LAST_POSES).unlink(missing_ok=True)
         else:
             names = None if models is None else [path.name for path in models]
             save_poses(self.out / LAST_POSES, poses, models=names)
+        return warnings
 
     def last_models(self) -> list[Path] | None:
-        """Return the COLMAP models that belong in the folder; None if they are there already."""
+        """Return the COLMAP models to copy to the folder; None if they were copied already."""
         path = self.out / LAST_POSES
         names = load_npz(path)[1].get("models") if path.is_file() else None
         return None if names is None else [self.cache / Path(name).name for name in names]
 
     @property
     def last_tracks(self) -> Result | None:
-        """The latest tracks as the tracker had them, before linking; None if there are none."""
+        """The latest tracks of the tracker, before linking; None if there are none."""
         path = self.out / LAST_TRACKS
         return Result.load_tracked(path) if path.exists() else None
 
     def load_last(self) -> Result:
-        """Return the latest tracks as the tracker had them, before linking, with the poses."""
+        """Return the latest tracks of the tracker, before linking, with the latest poses."""
         tracked = self.last_tracks
         if tracked is None:
             raise ReobjError(f"{self.out}: no tracks here; make them first with `run` or `track`")
-        tracked.poses = load_last_poses(self.out)
-        return tracked
+        return dataclasses.replace(tracked, poses=load_last_poses(self.out))

@@ -326,7 +326,7 @@ def test_a_video_that_is_gone_costs_pictures_only(
     (out / "cache/source.json").write_text(json.dumps(facts | {"source": str(gone)}))
     assert rt.main(["objects", str(out), "--known-size", "chair=2m"]) == 0
     (warning,) = [w for w in capsys.readouterr().err.splitlines() if str(gone) in w]
-    assert warning.startswith("warning: no film, and a page without pictures: ")
+    assert warning.startswith("warning: no overlay video, and a viewer without pictures: ")
     assert (out / "scene.html").exists() and not list(out.glob("overlay.*"))
     assert (out / "sparse/images.txt").read_bytes() == (made / "sparse/images.txt").read_bytes()
     assert rt.main(["objects", str(out), "--tracks", str(out / "tracks.txt")]) == 2

@@ -1,0 +1,304 @@
+"""Entries of objects.json as data: objects, their world, components of the trajectory, video."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import quadrics
+from reobj.files import rounded, shortened
+from reobj.poses.floor import Floor
+from reobj.sources.video import Video
+from reobj.types import Array, LinkEvent, ReobjError, visible_name
+
+EVIDENCE_DIGITS = 4  # of overlaps and log odds in the links; chosen: a box is measured to 1 in 100
+_JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Object:
+    """One physical object; lengths in world units, None where no shape was fitted.
+
+    Attributes:
+        id: identity in the tracks, from 1. class_name: with the largest sum of scores.
+        score: mean of the boxes.
+        status: "ok", "prior_dominated" (some size depends mainly on the category's prior),
+            "doubtful" (probably a false positive), "rejected" (no shape), "tracked" (2D: no
+            cameras). reason: for the status.
+        confidence: probability that it is a real, separate object; None without cameras.
+        classes: probabilities of the two most likely. support: "box", "cylinder" or "ellipsoid".
+        center, half_axes: (3,) of the ellipsoid; quat_wxyz: (4,) world_from_obj.
+        size: (3,) full extents of the shape along its own axes; size_m: the same in metres, None
+            where the scale is unknown; size_rel_sigma: (3,) relative standard deviation.
+        cov: (9, 9) of center, log half axes, rotation vector in object axes.
+        views: frames with a pose in which it was detected; dropped_boxes: outliers among them.
+        frames_seen: frames in which it was detected.
+        parallax_deg: largest angle between two of its viewing rays.
+        reprojection_iou_median: IoU of the projected shape with the boxes.
+        tracklet_ids: its unbroken tracks; visits: first and last frame of each, by time.
+        part: component of the trajectory (`Poses.part`), whose world and units its lengths are in.
+    """
+
+    id: int
+    class_name: str
+    score: float
+    status: str
+    reason: str
+    support: str | None = None
+    center: Array | None = None
+    half_axes: Array | None = None
+    quat_wxyz: Array | None = None
+    size: Array | None = None
+    size_m: Array | None = None
+    size_rel_sigma: Array | None = None
+    cov: Array | None = None
+    views: int = 0
+    frames_seen: int = 0
+    parallax_deg: float | None = None
+    dropped_boxes: int = 0
+    reprojection_iou_median: float | None = None
+    tracklet_ids: list[int] = field(default_factory=list)
+    visits: list[list[int]] = field(default_factory=list)
+    part: int = 0
+    confidence: float | None = None
+    classes: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def located(self) -> bool:
+        """True if a shape was fitted and the object is not doubtful."""
+        return self.status in ("ok", "prior_dominated")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of objects.json."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {_JSON_KEYS.get(k, k): _plain(v) for k, v in values.items()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A connected component of the trajectory, with a world and a scale of its own.
+
+    Attributes:
+        spans: first and last frame of each unbroken run of its frames; frames: their number.
+        registered_frames, interpolated_frames: frames with an estimated, an interpolated pose.
+        up_in_world, up_source, scale, floor, floor_reason: as in `World`.
+    """
+
+    spans: list[list[int]]
+    frames: int
+    registered_frames: int
+    interpolated_frames: int = 0
+    up_in_world: Array | None = None
+    up_source: str = "none"
+    scale: quadrics.Scale | None = None
+    floor: Floor | None = None
+    floor_reason: str = ""
+
+    @property
+    def span_text(self) -> str:
+        """Frames of the component, for messages: "frames 0-99, 130"."""
+        return "frames " + shortened([str(a) if a == b else f"{a}-{b}" for a, b in self.spans])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """Units, gravity and scale of the objects' world, and how their tracklets were linked.
+
+    If the trajectory has several components, this is the world of the largest one.
+
+    Attributes:
+        units: "m", "arbitrary", or None without cameras. source: of the poses.
+        reading: format of supplied poses, and the rule that found their frames.
+        registered_frames, interpolated_frames: frames with an estimated, an interpolated pose;
+            frames: all frames of all components.
+        up_in_world: (3,) unit vector against gravity; up_source: how it was determined.
+        scale: metres per unit, its relative sigma and source; None without a fit.
+        links: joins and splits of tracklets with their evidence.
+        parts: components of the trajectory, the largest first; () without cameras.
+        floor: the plane of the floor; None if it was not found, then floor_reason says why.
+    """
+
+    units: str | None = None
+    source: str = "none"
+    registered_frames: int = 0
+    interpolated_frames: int = 0
+    frames: int = 0
+    up_in_world: Array | None = None
+    up_source: str = "none"
+    scale: quadrics.Scale | None = None
+    links: tuple[LinkEvent, ...] = ()
+    parts: tuple[Part, ...] = ()
+    floor: Floor | None = None
+    floor_reason: str = ""
+    reading: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the `world` of objects.json."""
+        values = _world_json(self) | {"parts": [_world_json(part) for part in self.parts]}
+        links = [dataclasses.asdict(event) for event in self.links]
+        for link in links:
+            link["place_iou"] = rounded(link["place_iou"], EVIDENCE_DIGITS)
+            link["appearance_log_odds"] = rounded(link["appearance_log_odds"], EVIDENCE_DIGITS)
+        return values | {"links": links}
+
+    @staticmethod
+    def from_json(entry: dict[str, Any]) -> World:
+        """Read the `world` of objects.json."""
+        world: World = decode(World, entry, "$.world")
+        return world
+
+
+def _world_json(world: World | Part) -> dict[str, Any]:
+    """Convert the fields of a world for JSON, except its links and components."""
+    values = {f.name: _plain(getattr(world, f.name)) for f in dataclasses.fields(world)}
+    if world.scale is not None:
+        values["scale"] = {
+            "metres_per_unit": world.scale.value,
+            "rel_sigma": world.scale.rel_sigma,
+            "source": world.scale.source,
+        }
+    if world.floor is not None:
+        values["floor"] = {k: _plain(v) for k, v in dataclasses.asdict(world.floor).items()}
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """Convert an array to nested lists; return any other value unchanged."""
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+@dataclass(frozen=True, slots=True)
+class VideoInfo:
+    """Path of a result's video, without password; native size in pixels; frame rate in Hz."""
+
+    path: str
+    width: int
+    height: int
+    fps: float
+
+    @staticmethod
+    def of(video: Video) -> VideoInfo:
+        """Describe an opened video."""
+        return VideoInfo(str(video.source), *video.size, video.fps)
+
+
+# ---- From JSON ---------------------------------------------------------------------------------
+
+SHAPES = {  # of the arrays, by the name of their field
+    "center": (3,), "half_axes": (3,), "quat_wxyz": (4,), "size": (3,), "size_m": (3,),
+    "size_rel_sigma": (3,), "cov": (9, 9), "up_in_world": (3,), "normal": (3,), "middle": (3,),
+}  # fmt: skip
+FRAME_PAIRS = ("visits", "spans")  # fields that are lists of [first frame, last frame]
+POSITIVE = ("id", "width", "height", "fps", "metres_per_unit", "half_axes", "size", "size_m")
+EARLIER_KEYS = {"appearance_log_odds": "look"}  # of version 0.1
+NUMBER_MAX = 1e12  # of lengths; products of a few stay within the range of doubles
+INTEGER_MAX = 2**53  # the largest up to which JSON parsers that use doubles are exact
+SHOWN = 60  # characters of a file's own text in messages
+
+
+def decode(kind: Any, value: Any, at: str = "$", name: str = "") -> Any:
+    """Convert a JSON value to a type: a dataclass, or the type of a field of our dataclasses.
+
+    Missing fields get their default; unknown keys are ignored.
+
+    Args:
+        at: JSON path of the value, for messages. name: of the field that it belongs to.
+    Raises:
+        ReobjError: the value has another type or shape, or a number is out of range.
+    """
+    if isinstance(kind, types.UnionType):  # T | None
+        kind, _ = typing.get_args(kind)
+        return None if value is None else decode(kind, value, at, name)
+    if kind == Array:
+        return _decode_array(value, at, name)
+    if dataclasses.is_dataclass(kind):
+        return _decode_record(kind, value, at)
+    if kind is quadrics.Scale:
+        names = {"metres_per_unit": float, "rel_sigma": float | None, "source": str}
+        entry = _checked(value, dict, at)
+        return quadrics.Scale(*(decode(k, entry.get(n), f"{at}.{n}", n) for n, k in names.items()))
+    origin = typing.get_origin(kind)
+    if origin in (list, tuple):
+        item = typing.get_args(kind)[0]
+        values = [decode(item, v, f"{at}[{k}]") for k, v in enumerate(_checked(value, list, at))]
+        if name in FRAME_PAIRS and any(len(pair) != 2 for pair in values):
+            raise ReobjError(f"{at}: expected pairs of frames")
+        return origin(values)
+    if origin is dict:
+        item = typing.get_args(kind)[1]
+        pairs = _checked(value, dict, at).items()
+        return {k: decode(item, v, f"{at}.{k[:SHOWN]}") for k, v in pairs}
+    if kind in (int, float):
+        return _decode_number(kind, value, at, name)
+    return _checked(value, kind, at)
+
+
+def _decode_record(kind: Any, value: Any, at: str) -> Any:
+    """Convert a JSON object to a dataclass."""
+    entry = _checked(value, dict, at)
+    hints = typing.get_type_hints(kind)
+    if kind is LinkEvent:
+        hints["appearance_log_odds"] = float | None  # infinity is written as null
+    values: dict[str, Any] = {}
+    for f in dataclasses.fields(kind):
+        key = _JSON_KEYS.get(f.name, f.name)
+        if key not in entry:
+            key = EARLIER_KEYS.get(key, key)
+        if key in entry:
+            values[f.name] = decode(hints[f.name], entry[key], f"{at}.{key}", f.name)
+        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            raise ReobjError(f"{at}: {key!r} is missing")
+    if kind is Object:
+        values["class_name"] = visible_name(values["class_name"])
+    return kind(**values)
+
+
+def _decode_array(value: Any, at: str, name: str) -> Array:
+    """Convert nested lists of numbers to the array of a field."""
+    shape = SHAPES[name]
+    try:
+        array = np.array(_checked(value, list, at))
+    except ValueError:  # lists of different lengths
+        array = np.empty(0)
+    if array.shape != shape or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise ReobjError(f"{at}: expected {' x '.join(map(str, shape))} finite numbers")
+    if name != "cov" and np.abs(array).max() > NUMBER_MAX:
+        raise ReobjError(f"{at}: expected numbers of at most {NUMBER_MAX:g}")
+    if name in POSITIVE and array.min() <= 0:
+        raise ReobjError(f"{at}: expected positive numbers")
+    return array.astype(np.float64)
+
+
+def _decode_number(kind: type, value: Any, at: str, name: str) -> int | float:
+    """Check an integer, which is never negative, or a finite number."""
+    types_of = int if kind is int else int | float
+    low = -NUMBER_MAX if kind is float else 0
+    high = NUMBER_MAX if kind is float else INTEGER_MAX
+    right = isinstance(value, types_of) and not isinstance(value, bool) and low <= value <= high
+    if not right or (name in POSITIVE and value <= 0):
+        expected = "an integer" if kind is int else "a number"
+        sign = " > 0" if name in POSITIVE else " >= 0" if kind is int else ""
+        raise ReobjError(f"{at}: {_shown(value)}, expected {expected}{sign}")
+    return typing.cast(float, value)
+
+
+EXPECTED = {list: "a list", dict: "an object", str: "a text", bool: "true or false"}
+
+
+def _checked(value: Any, kind: type, at: str) -> Any:
+    """Return a value of the Python type, or raise."""
+    if not isinstance(value, kind):
+        raise ReobjError(f"{at}: {_shown(value)}, expected {EXPECTED[kind]}")
+    return value
+
+
+def _shown(value: Any) -> str:
+    """Format a value for a message, however large it is."""
+    if isinstance(value, list | dict):
+        return EXPECTED[type(value)]
+    return repr(value[:SHOWN] if isinstance(value, str) else value)
