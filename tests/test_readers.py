@@ -639,7 +639,7 @@ def test_missing_unknown_and_without_intrinsics(tmp_path):
         read(tmp_path / "empty")
     with pytest.raises(rt.ReobjError, match="unknown; expected auto, colmap"):
         read(tmp_path, fmt="xyz")
-    with pytest.raises(rt.ReobjError, match="no frame"):
+    with pytest.raises(rt.ReobjError, match="no readable frame"):
         read(as_record3d(tmp_path, some_cameras()), blank(0))
 
 
