@@ -2452,7 +2452,7 @@ class _Posterior:
 
 
 def _posterior(fit: _Fit, spec: _Spec, data: _Data, boxes: Array, cfg: FitConfig) -> _Posterior:
-    """Compute the covariance of the fits to `boxes` (F, L, 4), and how far it rests on the prior."""
+    """Compute the covariance of the fits to `boxes` (F, L, 4), and the prior's weight in it."""
     wide = _curved_covariance(fit, data, spec) + fit.spread
     # the noise level is itself estimated: Student's 95 % region for three parameters
     wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
