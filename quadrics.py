@@ -2423,7 +2423,7 @@ def fit_objects(
 def _solve_passes(
     data: _Data, given: _Given, world: _World, cfg: FitConfig
 ) -> tuple[_Fit, _Spec, _World]:
-    """Fit once; where that determines a scale, which the poses lack, fit again with it."""
+    """Fit; if the poses lack a scale and the fits determine one, fit again with it."""
     spec = _prior_spec(given, world)
     fit = _fit_all(data, spec, cfg)
     if world.scale_source != "none":
@@ -2452,7 +2452,7 @@ class _Posterior:
 
 
 def _posterior(fit: _Fit, spec: _Spec, data: _Data, boxes: Array, cfg: FitConfig) -> _Posterior:
-    """Compute the covariance of the fits to `boxes` (F, L, 4) and the prior's part in it."""
+    """Compute the covariance of the fits to `boxes` (F, L, 4), and the prior's weight in it."""
     wide = _curved_covariance(fit, data, spec) + fit.spread
     # the noise level is itself estimated: Student's 95 % region for three parameters
     wide *= (1.0 + 3.5 / (OBJECT_NOISE_DOF + _free_dof(fit, spec, data)))[:, None, None]
