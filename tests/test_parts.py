@@ -557,7 +557,7 @@ def test_the_page_holds_every_part(parted_folder: Path) -> None:
     data = json.loads(text.split('id="data">')[1].split("</script>")[0])
     assert data["steps"]["part"] == [0] * 40 + [1] * 24
     assert [p["name"] for p in data["parts"]] == [
-        "part 0: frames 0-39; 3 objects", "part 1: frames 40-63; 3 objects",
+        "component 0: frames 0-39; 3 objects", "component 1: frames 40-63; 3 objects",
     ]  # fmt: skip
     assert [p["facts"].split(" · ")[0] for p in data["parts"]] == [
         "cameras of 38 of 40 frames", "cameras of 23 of 24 frames",
