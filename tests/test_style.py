@@ -50,7 +50,7 @@ def test_docstrings_begin_with_a_line_that_is_a_sentence(module: str) -> None:
 def test_nothing_runs_at_import(module: str) -> None:
     """Only imports, definitions, constants and the __main__ guard stand at module level.
 
-    An import may depend on the platform.
+    An import may depend on the platform, or be for type checkers only.
     """
     allowed = (
         ast.Import,
@@ -62,8 +62,9 @@ def test_nothing_runs_at_import(module: str) -> None:
     )
     nodes = list[ast.stmt]()
     for node in tree_of(module).body[1:]:
-        by_platform = isinstance(node, ast.If) and "sys.platform" in ast.unparse(node.test)
-        nodes += [*node.body, *node.orelse] if by_platform else [node]
+        condition = ast.unparse(node.test) if isinstance(node, ast.If) else ""
+        conditional = "sys.platform" in condition or condition == "TYPE_CHECKING"
+        nodes += [*node.body, *node.orelse] if isinstance(node, ast.If) and conditional else [node]
     others = [
         ast.unparse(node)[:60]
         for node in nodes

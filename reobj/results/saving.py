@@ -306,8 +306,8 @@ def validate_objects(path: Path) -> list[str]:
     types = Draft202012Validator.TYPE_CHECKER.redefine("number", _is_finite)
     validator = validators.extend(Draft202012Validator, type_checker=types)(objects_schema())
     lines = []
-    for error in validator.iter_errors(load_json(path)):
-        fault = cut(f"{error.json_path}: {error.message}", MESSAGE_SHOWN)
+    for found in validator.iter_errors(load_json(path)):
+        fault = cut(f"{found.json_path}: {found.message}", MESSAGE_SHOWN)
         lines.append(f"{path}: {printable(fault)}")
     return sorted(lines)
 
