@@ -68,7 +68,7 @@ import reobj_track as rt
 from reobj.objects.confidence import LOW_CONFIDENCE
 from reobj.objects.fit import link_and_fit
 from reobj.objects.observations import Views
-from reobj.results.evaluation_3d import align_with_truth, share_inside, sizes_in_sigma
+from reobj.results.evaluation_3d import align_with_truth, fraction_within_2_sigma, sizes_in_sigma
 from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
 
@@ -641,7 +641,7 @@ def score_solids(truth_folder: Path, folder: Path) -> Figures:
         "elsewhere": matched.elsewhere,
         "centre_m": median(matched.center_error),
         "size_error": median(matched.size_error),
-        "inside": share_inside(matched.in_sigma),
+        "inside": fraction_within_2_sigma(matched.in_sigma),
         "sure": sure_of_solids(true, placed, truth, every, rt.Result.load(folder).objects),
     }
 

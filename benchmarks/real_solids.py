@@ -64,7 +64,7 @@ from synthetic_quadrics import table
 import quadrics
 import reobj_track as rt
 from reobj.files import atomic, load_json
-from reobj.results.evaluation_3d import MIN_HALF_AXIS, align_with_truth, read_true_solids
+from reobj.results.evaluation_3d import MIN_HALF_AXIS, align_with_truth, read_true_objects
 from reobj.results.overlay import draw_ellipses, draw_tracks
 from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
 from reobj.types import Array, Image, IntArray, box_iou, rows_by
@@ -167,7 +167,7 @@ def recording(folder: Path, work: Path, boxes: str = "") -> Recording:
         names = [classes.get(str(i), "") for i in range(max(map(int, classes)) + 1)]
     truth = read_truth(truth_file, names, MIN_VISIBLE if whole else 0.0)
     truth = truth[np.isin(truth.name, rt.COCO_NAMES)]
-    ids, solids = read_true_solids(first_of(folder, "objects_gt.json", "gt_objects.json"))
+    ids, solids = read_true_objects(first_of(folder, "objects_gt.json", "gt_objects.json"))
     category = {int(truth.identity[r[0]]): str(truth.name[r[0]]) for r in rows_by(truth.identity)}
     keep = np.isin(ids, list(category))
     if (folder / "poses_c2w.txt").exists():

@@ -24,7 +24,7 @@ from reobj.results.evaluation import (
     score_tracks,
     visits,
 )
-from reobj.results.evaluation_3d import read_true_solids, score_objects
+from reobj.results.evaluation_3d import read_true_objects, score_objects
 from reobj.results.result import VideoInfo
 from reobj.results.truth import ABSENT, IGNORED, SCORED, LabelledBoxes, labelled, read_truth
 from reobj.results.workspace import Workspace
@@ -695,7 +695,7 @@ def test_true_solids_in_both_forms(tmp_path: Path) -> None:
     box = {"id": 1, "center": [1, 2, 3], "size": [2.0, 4.0, 0.0], "R": R, "visible_part": {
         "center": [1, 2, 4], "size": [2.0, 1.0, 0.0], "R": R}}  # fmt: skip
     (tmp_path / "o.json").write_text(json.dumps({"objects": [box, TRUE]}))
-    ids, solids = read_true_solids(tmp_path / "o.json")
+    ids, solids = read_true_objects(tmp_path / "o.json")
     assert ids == [1, 4]
     np.testing.assert_allclose(solids.center_in_world, [[1, 2, 4], TRUE["center"]])
     np.testing.assert_allclose(solids.half_axes, [[1, 0.5, 0.005], [0.2, 0.3, 0.4]])
@@ -706,4 +706,4 @@ def test_true_solids_in_both_forms(tmp_path: Path) -> None:
 def test_bad_true_solids(tmp_path: Path, text: str) -> None:
     (tmp_path / "o.json").write_text(text)
     with pytest.raises(rt.ReobjError, match=r"o\.json"):
-        read_true_solids(tmp_path / "o.json")
+        read_true_objects(tmp_path / "o.json")

@@ -25,7 +25,7 @@ from reobj.files import load_cached
 from reobj.options import parse_known_size, parse_up, read_config, with_option
 from reobj.poses.intrinsics import parse_camera
 from reobj.results.edits import apply_edits, read_edits
-from reobj.results.evaluation_3d import read_true_solids
+from reobj.results.evaluation_3d import read_true_objects
 from reobj.results.truth import read_truth
 from reobj.results.workspace import Workspace
 from reobj.sources.imageless import ImagelessVideo
@@ -191,7 +191,7 @@ FILES: dict[str, tuple[str, Callable[..., Any], Callable[..., None]]] = {
     "priors.json": (PRIORS, lambda p, v: quadrics.load_priors(p), priors_make_sense),
     "images.txt": (COLMAP, read_colmap, poses_make_sense),
     "edits.json": (EDITS, read_applied_edits, edits_make_sense),
-    "gt_objects.json": (TRUTH, lambda p, v: read_true_solids(p), truth_makes_sense),
+    "gt_objects.json": (TRUTH, lambda p, v: read_true_objects(p), truth_makes_sense),
     "source.json": (SOURCE, read_bound, frames_make_sense),
     "config.toml": (TOML, lambda p, v: read_config(rt.Config(), p), lambda found, v: None),
     "gt.txt": (MOT.replace(",-1,1", ",3,1"), lambda p, v: read_truth(p, ["chair"], 0.0),

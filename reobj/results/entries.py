@@ -276,14 +276,17 @@ def _decode_array(value: Any, at: str, name: str) -> Array:
 
 def _decode_number(kind: type, value: Any, at: str, name: str) -> int | float:
     """Check an integer, which is never negative, or a finite number."""
-    types_of = int if kind is int else int | float
-    low = -NUMBER_MAX if kind is float else 0
-    high = NUMBER_MAX if kind is float else INTEGER_MAX
-    right = isinstance(value, types_of) and not isinstance(value, bool) and low <= value <= high
-    if not right or (name in POSITIVE and value <= 0):
-        expected = "an integer" if kind is int else "a number"
-        sign = " > 0" if name in POSITIVE else " >= 0" if kind is int else ""
-        raise ReobjError(f"{at}: {_shown(value)}, expected {expected}{sign}")
+    if kind is int:
+        valid = isinstance(value, int) and 0 <= value <= INTEGER_MAX
+        expected = "an integer >= 0"
+    else:
+        valid = isinstance(value, int | float) and abs(value) <= NUMBER_MAX
+        expected = "a number"
+    if name in POSITIVE:
+        valid = valid and value > 0
+        expected = "an integer > 0" if kind is int else "a number > 0"
+    if not valid or isinstance(value, bool):
+        raise ReobjError(f"{at}: {_shown(value)}, expected {expected}")
     return typing.cast(float, value)
 
 

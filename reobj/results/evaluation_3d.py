@@ -1,4 +1,4 @@
-"""Evaluation in 3D: ellipsoids against true solids, after an alignment of the cameras.
+"""Evaluation in 3D: ellipsoids against true objects, after an alignment of the cameras.
 
 Start at `score_objects`. Writes no files.
 """
@@ -23,7 +23,7 @@ from reobj.types import Array, IntArray, ReobjError, log
 MIN_HALF_AXIS = 0.005  # world units of the truth, m: sheets count as 1 cm thick (chosen)
 
 
-def read_true_solids(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
+def read_true_objects(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:
     """Read ids and ellipsoids of a gt_objects.json: `half_axes`, or extents `size` with axes `R`.
 
     The `visible_part` of an object, if given, is the truth: no camera saw the rest.
@@ -79,10 +79,10 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     scale, rotation, _ = similarity
     residual = rotation @ estimated[:, :, :3] @ truth[:, :, :3].swapaxes(1, 2)  # (f, 3, 3)
     cosine = (np.trace(residual, axis1=1, axis2=2) - 1) / 2  # of its angle
-    solids = result.of_part(0).ellipsoids().center_in_world  # (S, 3)
-    if not len(solids) or not np.median(cosine) > math.cos(math.radians(SAME_AXES_DEG)):
+    centers = result.of_part(0).ellipsoids().center_in_world  # (S, 3)
+    if not len(centers) or not np.median(cosine) > math.cos(math.radians(SAME_AXES_DEG)):
         return similarity
-    distance = float(np.median(np.linalg.norm(solids[:, None] - estimated[:, :, 3], axis=2)))
+    distance = float(np.median(np.linalg.norm(centers[:, None] - estimated[:, :, 3], axis=2)))
     points = [
         np.concatenate([cams[:, :, 3], *(cams[:, :, 3] + d * cams[:, :, k] for k in range(3))])
         for cams, d in ((estimated, distance), (truth, scale * distance))
@@ -156,8 +156,8 @@ def score_objects(
         object without an ellipsoid; `sizes_inside`: fraction of the sides within 2 sigma, apart
         from the scale; `scale_error`: relative error of our metres per unit.
     """
-    ids, truth = read_true_solids(solids)
-    located, estimated, scale_errors = _solids_in_truth(result, truth_poses)
+    ids, truth = read_true_objects(solids)
+    located, estimated, scale_errors = _ellipsoids_in_truth(result, truth_poses)
     row_of = {o.id: row for row, o in enumerate(located)}
     rows = [i for i, t in enumerate(ids) if pairs.get(t) in row_of]  # of the truth
     if not rows:
@@ -183,7 +183,7 @@ def score_objects(
         "o3d_all": float(o3d.sum() / max(len(pairs), 1)),
         "center_error_median": float(np.median(error)),
         "size_error_median": float(np.expm1(np.median(size))),
-        "sizes_inside": share_inside(sizes_in_sigma(located, our_rows, fitted, true)),
+        "sizes_inside": fraction_within_2_sigma(sizes_in_sigma(located, our_rows, fitted, true)),
         "scale_error": scale_errors[0],
         **({"part_scale_errors": scale_errors} if len(scale_errors) > 1 else {}),
         "objects": each,
@@ -211,16 +211,16 @@ def sizes_in_sigma(
     return np.asarray(error / np.sqrt(np.take_along_axis(variance, best, 1)), np.float64)
 
 
-def share_inside(in_sigma: Array) -> float | None:
+def fraction_within_2_sigma(in_sigma: Array) -> float | None:
     """Return the fraction of errors within 2 sigma; None if all are NaN."""
     known = in_sigma[np.isfinite(in_sigma)]
     return float((np.abs(known) < 2).mean()) if len(known) else None
 
 
-def _solids_in_truth(
+def _ellipsoids_in_truth(
     result: Result, truth_poses: Path | None
 ) -> tuple[list[Object], quadrics.Ellipsoids, list[float | None]]:
-    """Transform the solids to the world of the truth; each component is aligned separately.
+    """Transform the ellipsoids to the world of the truth; each component is aligned separately.
 
     Returns:
         the located objects of the components that can be aligned and their ellipsoids; of every
