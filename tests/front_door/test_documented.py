@@ -77,6 +77,7 @@ ELSEWHERE = {
     "pip install torch matplotlib onnx": ".ci/run installs them with the extras",
     "pip install 'reobj-track[video]'": "an extra of pyproject.toml, checked below",
     "pip install 'reobj-track[viewer]'": "an extra of pyproject.toml, checked below",
+    "pip install 'reobj-track[validate]'": "an extra of pyproject.toml, checked below",
     "python -m pytest benchmarks/tests": "it takes minutes",
     "python reobj_track.py --options": "test_commands.py",
     "python reobj_track.py models": "test_commands.py",

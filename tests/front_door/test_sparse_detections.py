@@ -209,7 +209,7 @@ def test_a_function_that_returns_none_did_not_look(images: Path, tmp_path: Path)
     ]
     assert result.looked is not None and result.looked.tolist() == list(range(0, FRAMES, 4))
     nothing = rt.run(images, tmp_path / "none", config, detections=lambda image: None)
-    assert "run on no frame (it gave None each time)" in nothing.warnings[-1]
+    assert "run on no frame (it returned None each time)" in nothing.warnings[-1]
 
 
 def test_a_cache_knows_the_frames_that_nobody_looked_at(images: Path, tmp_path: Path) -> None:
