@@ -1315,12 +1315,14 @@ def _track_video(
 
 def _tracklets(boxes: Tracks) -> Tracks:
     """Track detections by motion alone, to check supplied poses before they are used."""
-    tracker, steps = Tracker(), []
-    rows = rows_by(boxes.frame)
-    for own in rows:
-        tracker.update(Detections(boxes.xyxy[own], boxes.score[own], boxes.class_id[own]))
-        steps.append(tracker.latest)
-    return Tracks.concatenate([int(boxes.frame[own[0]]) for own in rows], steps)
+    tracker = Tracker()
+    tracks_of_frames = list[Tracks]()
+    rows_of_frames = rows_by(boxes.frame)
+    for rows in rows_of_frames:
+        tracker.update(Detections(boxes.xyxy[rows], boxes.score[rows], boxes.class_id[rows]))
+        tracks_of_frames.append(tracker.latest)
+    frames = [int(boxes.frame[rows[0]]) for rows in rows_of_frames]
+    return Tracks.concatenate(frames, tracks_of_frames)
 
 
 def _given_tracks(

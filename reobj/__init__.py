@@ -1,3 +1,3 @@
-"""Rooms of reobj_track: what the tool uses; start reading at reobj_track.py."""
+"""Modules used by reobj_track.py: sources, appearance, tracking, poses, objects, results."""
 
 __version__ = "0.2.0"

@@ -210,7 +210,7 @@ class MapperSearch:
         Args:
             limit: of centre_sigma, where the focal length is given or the matches give the same.
         """
-        sure = list[Component]()
+        accepted = list[Component]()
         for component in components:
             agrees = self.focal.source is FocalSource.GIVEN or (
                 self.focal.source is FocalSource.MATCHES
@@ -218,10 +218,10 @@ class MapperSearch:
             )
             most = limit if agrees else SURE_CENTRE_SIGMA
             if not component.problem and component.centre_sigma <= most:
-                sure.append(component)
-        registered = sum(component.registered for component in sure)
+                accepted.append(component)
+        registered = sum(component.registered for component in accepted)
         matched = sum(map(len, self.pairs.inliers))
-        return registered >= GOOD_REGISTERED and _explained(sure) >= GOOD_EXPLAINED * matched
+        return registered >= GOOD_REGISTERED and _explained(accepted) >= GOOD_EXPLAINED * matched
 
     def _components(self, mapper: str, keep_intrinsics: bool) -> list[Component]:
         """Run a mapper and measure the consistent components of its models, largest first.
