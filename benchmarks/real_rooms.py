@@ -46,6 +46,7 @@ import multiprocessing
 import resource
 import shutil
 import sys
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -257,15 +258,16 @@ def measure(case: Case, data: Path, out: Path, without: str = "", seed: int = 0)
     """Run and score a case; else the objects of a run are made again.
 
     Args:
-        without: a mechanism. seed: of the noise of the boxes; 0: as recorded.
+        without: a mechanism, or several joined by " + ". seed: of the noise of the boxes; 0: as
+            recorded.
     """
     if not without and not seed:
         return run_case(case, data, out) | score_case(case, data, out, out / case.name)
-    if without:
-        leave_out(without)
+    for name in filter(None, without.split(" + ")):
+        leave_out(name)
     if seed:
         shake(seed)
-    folder = out / f"{case.name}-{without}-{seed}".replace(" ", "-")
+    folder = out / f"{case.name}-{zlib.crc32(without.encode()):08x}-{seed}"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(out / case.name, folder)
     result = rt.refit(folder, configured(case, data, out))

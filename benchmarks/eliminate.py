@@ -1,0 +1,143 @@
+#!/usr/bin/env python3
+"""Backward elimination: which mechanisms of the object stage can go together?
+
+    python benchmarks/eliminate.py DATA -o OUT --choosing [--seeds 911 912 ...] [--noises 2]
+
+Starts from all mechanisms of `real_rooms.py --without`. In each step the mechanism whose removal
+costs the least is removed as well, until a loss exceeds its noise. The cost of a removal is the
+mean loss of IDF1 over recordings and box noises, plus its loss of found objects and its gain of
+false ones (duplicates and elsewhere), each as a fraction of the true ones. Its noise is two
+standard errors of these paired differences against the full set. Evaluations are lazy: a mechanism
+is measured again only while its earlier cost makes it a candidate for the next step, because costs
+rarely fall as others are removed. OUT/elimination.json keeps every evaluation, so that an
+interrupted run resumes; OUT/elimination.md is the curve.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from real_rooms import CASES, RECORDED, WITHOUT, Case, chosen, measure, write_poses
+from splits import add_choosing, usable
+
+Figures = dict[str, Any]
+
+
+class Evaluations:
+    """Figures of sets of removed mechanisms, measured once and kept in a file."""
+
+    def __init__(self, path: Path, run: Callable[[str], list[list[Figures]]]) -> None:
+        self.path = path
+        self.run = run
+        self.known: dict[str, list[list[Figures]]] = {}
+        if path.exists():
+            self.known = json.loads(path.read_text())
+
+    def __call__(self, removed: Sequence[str]) -> list[list[Figures]]:
+        """Return the figures by case and noise without some mechanisms."""
+        key = " + ".join(sorted(removed))
+        if key not in self.known:
+            self.known[key] = self.run(key)
+            self.path.write_text(json.dumps(self.known))
+        return self.known[key]
+
+
+def losses(full: list[list[Figures]], reduced: list[list[Figures]]) -> np.ndarray:
+    """Return the loss of each run (n,) of `reduced` against the same run of `full`."""
+    found = []
+    for before, after in zip(full, reduced, strict=True):
+        true = max(before[0].get("found") or 0, 1)
+        for a, b in zip(before, after, strict=True):
+            false_a, false_b = (
+                sum(f.get(k) or 0 for k in ("doubles", "elsewhere")) for f in (a, b)
+            )
+            objects = ((a.get("found") or 0) - (b.get("found") or 0) + false_b - false_a) / true
+            found.append((a.get("idf1") or 0) - (b.get("idf1") or 0) + objects)
+    return np.array(found)
+
+
+def noise(loss: np.ndarray) -> float:
+    """Return two standard errors of the mean of paired differences (n,)."""
+    return float(2 * loss.std(ddof=1) / np.sqrt(len(loss)))
+
+
+def eliminate(evaluate: Evaluations, names: Sequence[str]) -> list[tuple[str, float, float]]:
+    """Remove mechanisms greedily; returns the curve: name, cost of the set, its noise.
+
+    The last row is the removal that exceeded its noise, and was not made.
+    """
+    full = evaluate([])
+    cost = {name: -np.inf for name in names}  # of the set with it, when last measured
+    measured_with = dict.fromkeys(names, -1)  # number of removed mechanisms then
+    removed: list[str] = []
+    curve = []
+    while cost:
+        name = min(cost, key=lambda one: cost[one])
+        loss = losses(full, evaluate([*removed, name]))
+        cost[name] = float(loss.mean())
+        if measured_with[name] < len(removed) and name != min(cost, key=lambda one: cost[one]):
+            measured_with[name] = len(removed)
+            continue
+        curve.append((name, cost[name], noise(loss)))
+        print(f"{len(curve)}: {name}: cost {cost[name]:+.4f}, noise {noise(loss):.4f}", flush=True)
+        if cost[name] > noise(loss):
+            break
+        removed.append(name)
+        del cost[name]
+    return curve
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, eliminate, and write the curve."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    add: Callable[..., Any] = parser.add_argument
+    add("data", type=Path, help="folder of the recordings")
+    add("-o", "--out", type=Path, required=True, help="folder for runs, evaluations and the curve")
+    add("--only", nargs="+", default=[], metavar="NAME", help="prefixes of the names of recordings")
+    add("--seeds", nargs="*", type=int, default=[], help="also rooms rendered with these seeds")
+    add("--noises", type=int, default=2, metavar="N", help="box noises of half a pixel each")
+    add("--jobs", type=int, default=2, help="processes at once")
+    add_choosing(parser)
+    args = parser.parse_args(argv)
+    rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
+    cases = [c for c in chosen([*CASES, *rooms], args.only) if usable(*c.split, args.choosing)]
+    if not cases:
+        raise SystemExit("error: nothing left to score")
+    args.out.mkdir(parents=True, exist_ok=True)
+    for folder in {case.data for case in cases if case.supplied}:
+        write_poses(args.data / folder, args.out / f"poses-{folder}")
+    context = multiprocessing.get_context("spawn")  # memory and patches end with a process
+    with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
+
+        def run(key: str) -> list[list[Figures]]:
+            seeds = range(1, args.noises + 1)
+            tasks = [
+                [pool.submit(measure, c, args.data, args.out, key, seed) for seed in seeds]
+                for c in cases
+            ]
+            print(f"evaluated without: {key or 'nothing'}", file=sys.stderr)
+            return [[task.result() for task in of_case] for of_case in tasks]
+
+        whole = [pool.submit(measure, case, args.data, args.out) for case in cases]
+        for task in whole:  # leaves in OUT what the others need
+            task.result()
+        curve = eliminate(Evaluations(args.out / "elimination.json", run), list(WITHOUT))
+    rows = [f"| {name} | {cost:+.4f} | {noise_:.4f} |" for name, cost, noise_ in curve]
+    page = "\n".join(["| removed as well | cost of the set | noise |", "|---|---|---|", *rows])
+    (args.out / "elimination.md").write_text(page + "\n")
+    print(page)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
