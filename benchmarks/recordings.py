@@ -97,10 +97,10 @@ def red(boxes: str, poses: str, every: int) -> Case:
 
 C2W = "poses_c2w.txt"
 CASES = [
-    kitchen(YOLO, C2W, 3),
+    kitchen(YOLO, C2W, 5),
     kitchen(FAST, C2W, 12),
     red(YOLO, C2W, 5),
-    red(FAST, C2W, 8),
+    red(FAST, C2W, 16),
     Case("office_loop", "office_loop/images", FAST, every=2, stop=120),
     Case("office_loop", "office_loop/images", YOLO, stop=120),
     Case("bonsai_mip360", "bonsai_mip360/images", FAST, every=6),
