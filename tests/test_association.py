@@ -487,6 +487,33 @@ def test_pursuit_takes_in_turn_what_adds_most() -> None:
     assert len(few.evidence.row) < len(seen.row) and made._select_greedily(few).tolist() == expected
 
 
+def test_the_gain_of_a_merge_is_that_of_all_rows_of_both() -> None:
+    """By loops: of each object its rows' log odds, and in every frame one hit at its best row."""
+    three = chairs()
+    made, found = association_of(three, walk(12))
+    rng = np.random.default_rng(1)
+    label = found.label.copy()
+    label[rng.random(len(label)) < 0.3] = 0  # several rows of an object in one frame
+    strong, weak = np.array([0, 1]), np.array([2, 0])
+    fitted = three[[0, 1]]
+    seen = made._unassigned(fitted).evidence
+    view = made.detections.view
+    expected = -made._unassigned(fitted).costs()
+    for k in range(2):
+        best: dict[int, tuple[float, int]] = {}
+        rows = [n for n in range(len(seen.row)) if seen.obj[n] == k]
+        rows = [n for n in rows if label[seen.row[n]] in (strong[k], weak[k])]
+        for n in rows:
+            frame = int(view[seen.row[n]])
+            best[frame] = max(best.get(frame, (-np.inf, -n)), (float(seen.existence[n]), -n))
+        for n in rows:
+            frame = int(view[seen.row[n]])
+            hit = association.MISSED * seen.expected[frame, k] * (best[frame][1] == -n)
+            expected[k] += max(seen.existence[n] + hit, 0.0)
+    assert any(np.bincount(view[label == 0]) > 1)
+    np.testing.assert_allclose(made._joint_gains(label, strong, weak, fitted), expected)
+
+
 def test_pursuit_chooses_what_is_there() -> None:
     three = chairs()
     away = dataclasses.replace(
