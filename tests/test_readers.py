@@ -294,6 +294,13 @@ BY_TIME = (as_tum, as_euroc, as_orbslam3, as_arkitscenes)
 WITHOUT_CAMERA = (as_tum, as_seven_scenes, as_kitti, as_replica, as_orbslam3)
 
 
+@pytest.mark.parametrize("options", [{}, {"fmt": "splatting"}])
+def test_a_folder_with_cameras_json_stands_for_the_file(tmp_path, options):
+    assert as_splatting(tmp_path, some_cameras()).is_file()
+    poses = read(tmp_path, **options)
+    np.testing.assert_allclose(poses.cam_from_world, some_cameras(), atol=1e-9)
+
+
 @pytest.mark.parametrize("write, metric, up", FORMATS, ids=lambda v: getattr(v, "__name__", None))
 def test_any_format_can_be_declared_metric(tmp_path, write, metric, up):
     path, camera = write(tmp_path, some_cameras()), CAMERA if write in WITHOUT_CAMERA else ""
