@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import reobj_track as rt
-from reobj.sources import cvat, recorded, tables
+from reobj.sources import coco, cvat, recorded, tables
 from reobj.sources.recorded import RecordedDetections
 
 SHARED = Path(os.environ.get("REOBJ_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -486,3 +486,15 @@ def test_a_column_of_times_finds_images_named_by_their_times(tmp_path: Path) -> 
     cv2.imwrite(str(counted / "0001.png"), np.zeros((48, 64, 3), np.uint8))
     with pytest.raises(rt.ReobjError, match=r"det\.csv, line 1: no column frame; time stamps"):
         rt.read_detections(path, rt.Video(counted))
+
+
+@pytest.mark.parametrize("value", [True, "7", 1.5, 1 << 53, -(1 << 53)])
+@pytest.mark.parametrize("holder", ["entry", "attributes"])
+def test_identities_of_coco_are_whole_numbers(value: object, holder: str) -> None:
+    entry: dict[str, object] = {"track_id": value}
+    if holder == "attributes":
+        entry = {"attributes": entry}
+    with pytest.raises(rt.ReobjError, match=r"entry 3: track_id .*, expected a whole number"):
+        coco._identity(entry, "entry 3")
+    assert coco._identity({"instance_id": (1 << 53) - 1}, "") == (1 << 53) - 1
+    assert coco._identity({}, "") == -1
