@@ -57,7 +57,9 @@ Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-ELLIPSOID, BOX, CYLINDER = 0, 1, 2
+ELLIPSOID = 0
+BOX = 1
+CYLINDER = 2
 BY_CATEGORY, BY_EVIDENCE = -1, -2  # codes of a shape that the caller leaves open
 SUPPORTS = ("ellipsoid", "box", "cylinder")  # names of the shapes, index = code
 # Row k marks the axes under the same root as axis k in the support function

@@ -270,7 +270,8 @@ def kalman_predict(mean: Array, cov: Array, config: TrackerConfig) -> tuple[Arra
     """
     scale = _noise_scale(mean)  # (T, 4)
     p01, p11 = cov[..., 1], cov[..., 2]  # (T, 4) each
-    new_mean, new_cov = mean.copy(), cov.copy()
+    new_mean = mean.copy()
+    new_cov = cov.copy()
     new_mean[..., 0] += mean[..., 1]
     new_cov[..., 0] = cov[..., 0] + 2 * p01 + p11 + (config.std_position * scale) ** 2
     new_cov[..., 1] += p11
@@ -291,7 +292,8 @@ def kalman_update(mean: Array, cov: Array, box: Array, noise: Array) -> tuple[Ar
     p00, p01 = cov[..., 0], cov[..., 1]  # (T, 4), as all below
     innovation_var, residual = p00 + noise**2, box - mean[..., 0]  # S, y
     gain, velocity_gain = p00 / innovation_var, p01 / innovation_var  # K
-    new_mean, new_cov = mean.copy(), cov.copy()
+    new_mean = mean.copy()
+    new_cov = cov.copy()
     new_mean[..., 0] += gain * residual
     new_mean[..., 1] += velocity_gain * residual
     new_cov[..., :2] *= (1 - gain)[..., None]
@@ -368,10 +370,12 @@ class TrackState:
         """Make tentative tracks at rest from boxes cx, cy, w, h (N, 4); covariance: DeepSORT."""
         mean = np.stack([box, np.zeros_like(box)], -1)
         scale = _noise_scale(mean)
-        position, velocity = 2 * config.std_position * scale, STD_START * scale
+        position = 2 * config.std_position * scale
+        velocity = STD_START * scale
         cov = np.stack([position**2, 0 * scale, velocity**2], -1)
         zero = np.zeros(len(box), np.int64)
-        none, nothing = np.zeros((len(box), 1)), np.zeros((len(box), 0), np.float32)
+        none = np.zeros((len(box), 1))
+        nothing = np.zeros((len(box), 0), np.float32)
         return TrackState(
             mean, cov, tracklet, zero - 1, zero, zero + frame, zero - 1, none, nothing,
             np.full((len(box), 2, 3), np.nan), np.full((len(box), 2), np.nan), 0 * box[:, :2],
@@ -609,7 +613,8 @@ class Tracker:
         absent = (tracks.missed > 0) | (not self.looked)
         t = np.flatnonzero((tracks.identity >= 0) & absent & (tracks.missed <= frames))
         t = t[tracks.mean[t, 0, 0] > OUT_OF_VIEW / 2]
-        box, none = xyxy_from_cxcywh(tracks.mean[t, :, 0]), np.full(len(t), -1)
+        box = xyxy_from_cxcywh(tracks.mean[t, :, 0])
+        none = np.full(len(t), -1)
         ids = (np.full(len(t), self.state.frame_number), tracks.identity[t] + 1, tracks.tracklet[t])
         return Tracks(*ids, box, np.zeros(len(t)), tracks.votes[t].argmax(1), none)
 
@@ -640,13 +645,15 @@ class Tracker:
         The motion comes from optical flow, or without an image from the given rotation. With a
         pose, tracks whose 3D position is known follow its projection instead.
         """
-        state, tracks = self.state, self.state.tracks
+        state = self.state
+        tracks = self.state.tracks
         tracks.mean, tracks.cov = kalman_predict(tracks.mean, tracks.cov, self.config)
         size = tracks.mean[:, 2:, 0]
         np.maximum(size, 1.0, out=size)  # stays positive
         tracks.uncertainty[:] = 0
         before = tracks.mean[..., 0].copy()
-        pose, camera = frame.cam_from_world, frame.camera
+        pose = frame.cam_from_world
+        camera = frame.camera
         if frame.image is not None and self.config.camera_motion:
             motion = state.camera_motion(frame.image)
             tracks.mean, tracks.cov = warp_states(tracks.mean, tracks.cov, motion)
@@ -673,10 +680,12 @@ class Tracker:
         Returns:
             (T,) True where a detection is expected.
         """
-        tracks, K = self.state.tracks, camera.K
+        tracks = self.state.tracks
+        K = camera.K
         size = (camera.width, camera.height)
         view = K @ cam_from_world  # (3, 4)
-        last, self.state.last_pose = self.state.last_pose, cam_from_world
+        last = self.state.last_pose
+        self.state.last_pose = cam_from_world
         known = rows_of(self.ellipsoid_map.known, tracks.identity, False)
         inside = np.isfinite(self.ellipsoid_map.project(view, size, EXPECTED_IN_VIEW)[:, 0])  # (I,)
         in_view = ~known | rows_of(inside, tracks.identity, False)
@@ -687,7 +696,8 @@ class Tracker:
         if last is not None:
             before, reach_before = self.ellipsoid_map.project_tracks(last, *tracked)
             followed = (tracks.missed == 0) & np.isfinite(now[:, 0] + before[:, 0])
-            shift, growth = now[:, :2] - before[:, :2], (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
+            shift = now[:, :2] - before[:, :2]
+            growth = (now[:, 2:] / before[:, 2:]).clip(0.5, 2)
             moved = np.concatenate([predicted[:, :2] + shift, predicted[:, 2:] * growth], 1)
             tracks.mean[followed, :, 0] = moved[followed]  # (T, 4)
             tracks.uncertainty[followed] = np.abs(reach - reach_before)[followed]
@@ -695,14 +705,17 @@ class Tracker:
         shown = (in_view & np.isfinite(now[:, 0]))[:, None]
         where = np.where(shown, now, [OUT_OF_VIEW, OUT_OF_VIEW, 1, 1])  # matches nothing
         again = TrackState.spawn(where[lost], tracks.tracklet[lost], 0, self.config)
-        tracks.mean[lost], tracks.cov[lost] = again.mean, again.cov
+        tracks.mean[lost] = again.mean
+        tracks.cov[lost] = again.cov
         tracks.uncertainty[lost] = np.abs(reach[lost])
         tracks.cov[:, :2, 0] += tracks.uncertainty**2
         return np.asarray(in_view, bool)
 
     def _update_depth_intervals(self, frame: FrameContext, track_of: IntArray) -> None:
         """Estimate depth intervals of matched tracks without an ellipsoid, from points in boxes."""
-        pose, camera, points = frame.cam_from_world, frame.camera, frame.points
+        pose = frame.cam_from_world
+        camera = frame.camera
+        points = frame.points
         if points is None or pose is None or camera is None:
             return
         tracks = self.state.tracks
@@ -738,10 +751,13 @@ class Tracker:
         Returns:
             (D,) row of the track's state, or -1.
         """
-        config, tracks = self.config, self.state.tracks
-        detections, lazy = frame.detections, frame.lazy
+        config = self.config
+        tracks = self.state.tracks
+        detections = frame.detections
+        lazy = frame.lazy
         pairs = self._gate(frame)
-        t, d = pairs.track, pairs.detection
+        t = pairs.track
+        d = pairs.detection
         score = detections.score[d]
         priority = self._priority_cost()[t]
         first = score >= config.high_score  # (M,), as all below
@@ -763,7 +779,8 @@ class Tracker:
 
     def _gate(self, frame: FrameContext) -> Pairs:
         """Gate pairs of tracks and detections by motion, and compute their cost."""
-        tracks, detections = self.state.tracks, frame.detections
+        tracks = self.state.tracks
+        detections = frame.detections
         track, reach = tracks.mean[..., 0].T, tracks.uncertainty.T  # (4, T) cx, cy, w, h; (2, T)
         variance = center_variance(tracks.mean, tracks.cov).T  # (2, T)
         gate = np.maximum(np.sqrt(GATE_CHI2 * variance), track[2:] / 2 + reach)  # distance, overlap
@@ -801,7 +818,8 @@ class Tracker:
         Returns:
             pairs that are matched, their numbers; pairs refused by appearance (M,).
         """
-        t, d = pairs.track, pairs.detection
+        t = pairs.track
+        d = pairs.detection
         refused = np.zeros(len(cost), bool)
         tracks = self.state.tracks
         compared = np.full(len(lazy.done), not (lazy.available and tracks.embedding.shape[1]))
@@ -851,8 +869,10 @@ class Tracker:
     def _update_states(self, frame: FrameContext, track_of: IntArray) -> None:
         """Update the matched tracks; boxes of low score have a larger measurement noise."""
         rows = np.flatnonzero(track_of >= 0)
-        t, tracks = track_of[rows], self.state.tracks
-        mean, score = tracks.mean[t], frame.detections.score[rows]
+        t = track_of[rows]
+        tracks = self.state.tracks
+        mean = tracks.mean[t]
+        score = frame.detections.score[rows]
         growth = (np.maximum(1 - score, 0.05) / 0.2) ** SCORE_NOISE  # (n,) 1 at .8
         noise = STD_MEASURE * _noise_scale(mean) * growth[:, None]
         tracks.mean[t], tracks.cov[t] = kalman_update(mean, tracks.cov[t], frame.box[rows], noise)
@@ -868,7 +888,8 @@ class Tracker:
 
     def _spawn(self, frame: FrameContext, track_of: IntArray) -> IntArray:
         """Start a tentative track at every unmatched detection of sufficient score."""
-        state, detections = self.state, frame.detections
+        state = self.state
+        detections = frame.detections
         rows = np.flatnonzero((track_of < 0) & (detections.score >= self.config.new_score))
         if not len(rows):
             return track_of
@@ -914,7 +935,8 @@ class Tracker:
 
     def _calibrate_matches(self, frame: FrameContext, track_of: IntArray, rows: IntArray) -> None:
         """Calibrate matches: own detections are the same object, those of other tracks are not."""
-        tracks, lazy = self.state.tracks, frame.lazy
+        tracks = self.state.tracks
+        lazy = frame.lazy
         rows = rows[(tracks.embedded[track_of[rows]] >= 0) & (tracks.identity[track_of[rows]] >= 0)]
         if len(rows):
             own = tracks.embedding[track_of[rows]]
@@ -926,7 +948,8 @@ class Tracker:
     ) -> None:
         """Add embeddings (n, E) of tracks t to the gallery; calibrate against its first views."""
         state = self.state
-        identity, gallery = state.tracks.identity[t], state.gallery
+        identity = state.tracks.identity[t]
+        gallery = state.gallery
         if len(gallery.count):
             gallery.reserve(len(state.last_seen), embedding.shape[1])
             first = gallery.rows[identity, 0] * (gallery.count[identity, None] > 1)
@@ -947,7 +970,8 @@ class Tracker:
         A re-identified track needs one detection less, as its appearance agrees. The first tracks
         of a video need only one detection (as in SORT).
         """
-        state, tracks = self.state, self.state.tracks
+        state = self.state
+        tracks = self.state.tracks
         needed = self.config.n_init if len(state.last_seen) else 1
         young = (tracks.identity < 0) & (tracks.missed == 0)
         ready = np.flatnonzero(young & (tracks.evidence >= min(needed, self.config.n_init - 1)))
@@ -957,15 +981,18 @@ class Tracker:
             return track_of
         returning = self._reidentify(frame, ready)  # (n,) identity or -1
         confirmed = (returning >= 0) | (tracks.evidence[ready] >= needed)
-        ready, returning = ready[confirmed], returning[confirmed]
-        fresh, back = ready[returning < 0], ready[returning >= 0]
+        ready = ready[confirmed]
+        returning = returning[confirmed]
+        fresh = ready[returning < 0]
+        back = ready[returning >= 0]
         ids = len(state.last_seen) + np.arange(len(fresh))
         state.last_seen = np.append(state.last_seen, np.zeros(len(fresh), np.int64))
         state.identity_class = np.append(state.identity_class, tracks.votes[fresh].argmax(1))
         returned = np.zeros(len(state.last_seen) + 1, bool)  # the last entry: no identity (-1)
         returned[returning[returning >= 0]] = True
         stale = returned[tracks.identity]  # coasting tracks of identities that returned
-        tracks.identity[back], tracks.identity[fresh] = returning[returning >= 0], ids
+        tracks.identity[back] = returning[returning >= 0]
+        tracks.identity[fresh] = ids
         state.last_seen[tracks.identity[ready]] = frame.number
         seen = ready[tracks.embedded[ready] >= 0]
         if len(seen):
@@ -986,13 +1013,15 @@ class Tracker:
         counts against it. Identities seen since the new track started, and those whose ellipsoid
         projects elsewhere, are excluded. Moving objects have no ellipsoid.
         """
-        state, tracks = self.state, self.state.tracks
+        state = self.state
+        tracks = self.state.tracks
         result = np.full(len(ready), -1, np.int64)
         identity = np.flatnonzero(state.last_seen < tracks.first[ready].max(initial=0))  # (I,)
         if not len(identity) or not self.config.remember:
             return result
         box = tracks.mean[ready, :, 0]
-        view, size = frame.img_from_world, frame.image_size
+        view = frame.img_from_world
+        size = frame.image_size
         iou, weight = self.ellipsoid_map.overlap(box, identity, view, size)
         at_projection = iou * weight > LOW_IOU
         rays = self._viewing_rays(frame, ready)
@@ -1024,7 +1053,8 @@ class Tracker:
         coasting = np.flatnonzero((tracks.identity >= 0) & (tracks.missed > 0))
         row[tracks.identity[coasting]] = coasting
         row = row[identity]  # (I,)
-        center, variance = tracks.mean[:, :2, 0].T, center_variance(tracks.mean, tracks.cov).T
+        center = tracks.mean[:, :2, 0].T
+        variance = center_variance(tracks.mean, tracks.cov).T
         offset = center[:, ready, None] - center[:, None, row]  # (2, n, I)
         far = squared_mahalanobis(offset, variance[:, None, row]) > JUMP_GATE * GATE_CHI2
         has_view = frame.img_from_world is not None
@@ -1033,7 +1063,8 @@ class Tracker:
 
     def _report(self, frame: FrameContext, track_of: IntArray) -> Tracks:
         """Return the tracked detections of this frame, tentative ones with track_id 0."""
-        tracks, detections = self.state.tracks, frame.detections
+        tracks = self.state.tracks
+        detections = frame.detections
         rows = np.flatnonzero(track_of >= 0)
         t = track_of[rows]
         return Tracks(
@@ -1048,7 +1079,8 @@ class Tracker:
 
     def _retire(self) -> None:
         """Drop tracks that coasted too long; their identities stay in the gallery."""
-        tracks, config = self.state.tracks, self.config
+        tracks = self.state.tracks
+        config = self.config
         tentative = np.minimum(tracks.evidence, config.n_init)
         stays = tracks.missed <= np.where(tracks.identity < 0, tentative, config.coast_frames)
         if not stays.all():
@@ -1160,7 +1192,8 @@ def run(
         readings = supplied_poses(video, config.poses) if in_3d else []
         if tracks:
             result = _given_tracks(tracks, video, config.detect, workspace.last_tracks)
-            boxes, class_names = result.tracks, result.class_names
+            boxes = result.tracks
+            class_names = result.class_names
         else:
             detected, boxes = _detect(job, detections, in_3d)
             class_names = tuple(detected.class_names)
@@ -1296,7 +1329,8 @@ def _track_video(
     job: _Job, source: DetectionSource, poses: Poses | None, viewer: Viewer | None = None
 ) -> Result:
     """Track all frames, or load the tracks from the cache; live sources are not cached."""
-    video, config = job.video, job.config
+    video = job.video
+    config = job.config
     poses = poses if poses is not None and poses.known.any() else None
     setup = (config.embed, config.tracker, config.device, poses_key(poses))
     path = job.workspace.path("tracks", *detections_key(source, video), *setup)
@@ -1369,7 +1403,8 @@ def _warnings(config: Config, result: Result) -> list[str]:
     """Collect warnings about cameras, objects and options."""
     poses = result.poses
     of_cameras = [] if poses is None else [*poses.messages, *components_message(poses)]
-    tracker, moving = config.tracker, config.objects.moving_classes
+    tracker = config.tracker
+    moving = config.objects.moving_classes
     of_objects = implausible(result, tracker.high_score, moving, tracker.new_score)
     located = [o.class_name for o in result.located]
     of_sizes = unused_sizes(config.objects.known_size, config.objects.priors, located)
@@ -1382,7 +1417,8 @@ def _write(job: _Job, result: Result) -> Result:
     Returns:
         the result, with a warning for each picture that could not be made.
     """
-    workspace, output = job.workspace, job.config.output
+    workspace = job.workspace
+    output = job.config.output
     models = workspace.last_models()
 
     def write_more(folder: Path) -> None:
@@ -1493,7 +1529,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _main(words: Sequence[str]) -> int:
     """Parse the words and run the command; an exception becomes a message and an exit code."""
-    parser, args = _parser(), None
+    parser = _parser()
+    args = None
     try:
         if (text := short_help(parser, words)) is not None:
             say(text)

@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real_rooms import CASES, RECORDED, WITHOUT, Case, chosen, measure, write_poses
-from splits import add_choosing, usable
+from real_rooms import WITHOUT, add_cases, measure, prepared_cases
 
 Figures = dict[str, Any]
 
@@ -101,21 +100,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     add: Callable[..., Any] = parser.add_argument
-    add("data", type=Path, help="folder of the recordings")
-    add("-o", "--out", type=Path, required=True, help="folder for runs, evaluations and the curve")
-    add("--only", nargs="+", default=[], metavar="NAME", help="prefixes of the names of recordings")
-    add("--seeds", nargs="*", type=int, default=[], help="also rooms rendered with these seeds")
+    add_cases(parser)
     add("--noises", type=int, default=2, metavar="N", help="box noises of half a pixel each")
     add("--jobs", type=int, default=2, help="processes at once")
-    add_choosing(parser)
     args = parser.parse_args(argv)
-    rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
-    cases = [c for c in chosen([*CASES, *rooms], args.only) if usable(*c.split, args.choosing)]
-    if not cases:
-        raise SystemExit("error: nothing left to score")
-    args.out.mkdir(parents=True, exist_ok=True)
-    for folder in {case.data for case in cases if case.supplied}:
-        write_poses(args.data / folder, args.out / f"poses-{folder}")
+    cases = prepared_cases(args)
     context = multiprocessing.get_context("spawn")  # memory and patches end with a process
     with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
 

@@ -164,7 +164,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
         "quadrics.HUBER_HIDDEN": quadrics.HUBER,
         "quadrics.HIDDEN_CAP": quadrics.OUTLIER_CAP,
     },
-    "edges behind nearer things": {"reobj.objects.occlusion._occluded_by_nearer": all_visible},
+    "edges behind nearer objects": {"reobj.objects.occlusion._occluded_by_nearer": all_visible},
     "edges above the floor": {"reobj.objects.occlusion.ABOVE_FLOOR": np.inf},
     "widening": {f"{ASSOCIATION}.WIDENING_ROUNDS": 0},
     "limit of a box": {f"{LIKELIHOOD}.MAX_BOX_EXISTENCE": 8.0},
@@ -883,20 +883,40 @@ def chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
     return found
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run, score, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+def add_cases(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that choose recordings and the folder of their runs."""
     add: Callable[..., Any] = parser.add_argument
     add("data", type=Path, help="folder of the recordings")
     add("-o", "--out", type=Path, required=True, help="folder for the runs and the tables")
     text = "\n".join(f"{c.name:<14} {', '.join(c.title)}" for c in CASES)
     add("--only", nargs="+", default=[], metavar="NAME", help=f"prefixes of names:\n{text}")
     add("--seeds", nargs="*", type=int, default=[], help="also rooms rendered with these seeds")
+    add_choosing(parser)
+
+
+def prepared_cases(args: argparse.Namespace) -> list[Case]:
+    """Return the chosen cases that may be used; write the poses that they are supplied with."""
+    rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
+    cases = chosen([*CASES, *rooms], args.only)
+    used = [s for s in dict.fromkeys(c.split for c in cases) if usable(*s, args.choosing)]
+    cases = [case for case in cases if case.split in used]
+    if not cases:
+        raise SystemExit("error: nothing left to score")
+    args.out.mkdir(parents=True, exist_ok=True)
+    for folder in {case.data for case in cases if case.supplied}:
+        write_poses(args.data / folder, args.out / f"poses-{folder}")
+    return cases
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run, score, and print the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    add: Callable[..., Any] = parser.add_argument
+    add_cases(parser)
     text = "mechanisms to turn off one after the other: all, " + ", ".join(WITHOUT)
     add("--without", nargs="+", default=[], metavar="NAME", help=text)
-    add_choosing(parser)
     text = "fill in FOLDER/RESULTS.md and draw the picture in FOLDER/img"
     add("--results", "--docs", type=Path, metavar="FOLDER", help=text)
     text = "estimate the objects N times with box noise of half a pixel, print means"
@@ -905,14 +925,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if args.noises and args.results and not args.without:
         parser.error("--results: the tables of recordings have no box noise: leave out --noises")
-    rooms = [Case(f"rendered-{s}", "", RECORDED, seed=s) for s in args.seeds]
-    cases, left_out = chosen([*CASES, *rooms], args.only), every_without(args.without)
-    used = [s for s in dict.fromkeys(c.split for c in cases) if usable(*s, args.choosing)]
-    if not (cases := [case for case in cases if case.split in used]):
-        raise SystemExit("error: nothing left to score")
-    args.out.mkdir(parents=True, exist_ok=True)
-    for folder in {case.data for case in cases if case.supplied}:
-        write_poses(args.data / folder, args.out / f"poses-{folder}")
+    left_out = every_without(args.without)
+    cases = prepared_cases(args)
     context = multiprocessing.get_context("spawn")  # memory and patches end with a process
     with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
         made = {"": scores(pool, cases, args.data, args.out)}  # leaves in OUT what the others need

@@ -100,11 +100,14 @@ def entry(name: str, value: Any) -> str:
     if name in CONSTANTS:
         head, summary = CONSTANTS[name]
     elif not inspect.isclass(value):
-        head, summary = signature(name, value, result=True), first_line(value)
+        head = signature(name, value, result=True)
+        summary = first_line(value)
     elif issubclass(value, Exception):
-        head, summary = f"class {name}({value.__bases__[0].__name__})", first_line(value)
+        head = f"class {name}({value.__bases__[0].__name__})"
+        summary = first_line(value)
     else:
-        head, summary = f"class {signature(name, value)}", first_line(value)
+        head = f"class {signature(name, value)}"
+        summary = first_line(value)
     members = list(methods(value)) if inspect.isclass(value) else []
     lines = [f"**`{head}`**\n", summary, *([""] if members else []), *members]
     return "\n".join(lines) + "\n"

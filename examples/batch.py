@@ -141,7 +141,8 @@ def run_item(item: Item, root: str) -> dict[str, Any]:
 
     if done := finished(item):
         return done
-    out, started = Path(item.out), time.monotonic()
+    out = Path(item.out)
+    started = time.monotonic()
     (out / "cache").mkdir(parents=True, exist_ok=True)  # marks an output folder of the tool
     (out / MARKER).unlink(missing_ok=True)
     (out / "cache" / "worker.pid").write_text(str(os.getpid()))
@@ -190,7 +191,9 @@ class Batch:
     """The driver: submits items to Ray, counts attempts, writes the log and the summary."""
 
     def __init__(self, items: Sequence[Item], results: Path, retries: int) -> None:
-        self.items, self.results, self.retries = items, results, retries
+        self.items = items
+        self.results = results
+        self.retries = retries
         self.rows: dict[str, dict[str, Any]] = {}
         self.attempts = {item.name: 0 for item in items}
         results.mkdir(parents=True, exist_ok=True)

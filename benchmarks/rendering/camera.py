@@ -42,8 +42,11 @@ def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array
     """Where the walk passes: time (K,) in 0..1, camera x, y (K, 2), what it looks at (K, 3)."""
     w, d, _ = room.size_m
     dining = (-w / 2 + 1.75, -0.9, 0.62)
-    books, desk, couch = (0.3, -d / 2, 0.95), (w / 2 - 0.5, -0.5, 0.85), (0.6, d / 2 - 0.6, 0.62)
-    side, corner = (-w / 2 + 0.3, d / 2 - 1.5, 0.8), (w / 2 - 0.4, d / 2 - 0.4, 0.9)
+    books = (0.3, -d / 2, 0.95)
+    desk = (w / 2 - 0.5, -0.5, 0.85)
+    couch = (0.6, d / 2 - 0.6, 0.62)
+    side = (-w / 2 + 0.3, d / 2 - 1.5, 0.8)
+    corner = (w / 2 - 0.4, d / 2 - 0.4, 0.9)
     keys = [
         (0.00, (0.05, 0.85), dining),
         (0.08, (0.85, 0.45), dining),
@@ -69,7 +72,8 @@ def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array
     elif kind == "tour":
         keys = tour_keys(room, seed)
     elif kind == "turn":
-        stop, (first, last) = (1.0, -0.2), TURNS_FROM_TO
+        stop = (1.0, -0.2)
+        (first, last) = TURNS_FROM_TO
         keys = [(0.00, (0.05, 0.85), dining), (0.15, (0.85, 0.45), dining), (first, stop, dining)]
         keys += [((first + last) / 2, stop, couch), (last, stop, desk)]
         keys += [(0.85, (0.5, -0.9), desk), (1.00, (-0.4, -1.1), desk)]
@@ -86,7 +90,8 @@ def path_keys(room: Room, kind: str, seed: int = 0) -> tuple[Array, Array, Array
 def smooth(values: Array, sigma: float) -> Array:
     """Gaussian filter along the first axis of (F, C), ends mirrored in value."""
     reach = max(1, int(3 * sigma))
-    head, tail = 2 * values[:1] - values[reach:0:-1], 2 * values[-1:] - values[-2 : -reach - 2 : -1]
+    head = 2 * values[:1] - values[reach:0:-1]
+    tail = 2 * values[-1:] - values[-2 : -reach - 2 : -1]
     padded = np.concatenate([head, values, tail])
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     columns = [np.convolve(column, kernel / kernel.sum(), "valid") for column in padded.T]
@@ -97,7 +102,8 @@ def hand_shake(rng: Rng, seconds: Array) -> Array:
     """(F, 6) smooth unrest of about unit size: steps, sway, tremble."""
     wave = np.zeros((len(seconds), 6))
     for low, high, size in ((0.15, 0.5, 0.8), (0.7, 1.2, 0.6), (1.6, 2.2, 0.5)):
-        rates, phases = rng.uniform(low, high, 6), rng.uniform(0, 2 * np.pi, 6)
+        rates = rng.uniform(low, high, 6)
+        phases = rng.uniform(0, 2 * np.pi, 6)
         wave += size * np.sin(2 * np.pi * rates * seconds[:, None] + phases)
     return wave
 
@@ -119,11 +125,12 @@ def table_path(room: Room, config: RoomConfig) -> Array:
     if not tables:
         raise ValueError("path 'table' needs a room with a dining table")
     space, at = max(((limit - np.abs(t[:2])).min(), -i) for i, t in enumerate(tables))
-    target, radius = tables[-at], space - WALL_MARGIN_M
+    target = tables[-at]
+    radius = space - WALL_MARGIN_M
     low, high = EYE_RANGE_M
 
     def way(waves: float) -> tuple[Array, Array]:
-        """Fine points (N, 3) of the way with so many waves, and the length (N,) up to each."""
+        """Dense points (N, 3) of the path with some waves, and the arc length (N,) of each."""
         turn = np.linspace(0, 2 * np.pi, 20000)
         up = 0.5 * (high + low + (high - low) * np.sin(waves * turn))
         xy = target[:2] + radius * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -131,7 +138,8 @@ def table_path(room: Room, config: RoomConfig) -> Array:
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         return points, np.concatenate([[0.0], np.cumsum(steps)])
 
-    fewest, most = 0.0, float(config.frames)
+    fewest = 0.0
+    most = float(config.frames)
     for _ in range(40):  # the length grows with the waves
         middle = (fewest + most) / 2
         longer = way(middle)[1][-1] > STEP_M * (config.frames - 1)
@@ -174,7 +182,8 @@ def look_along(centers_in_world: Array, yaw: Array, pitch: Array, roll: Array) -
     )
     right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], -1)
     down = np.cross(forward, right)
-    c, s = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    c = np.cos(roll)[:, None]
+    s = np.sin(roll)[:, None]
     rotation = np.stack(
         [c * right + s * down, c * down - s * right, forward], 1
     )  # (F, 3, 3) rows x, y, z

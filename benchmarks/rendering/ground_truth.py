@@ -20,7 +20,7 @@ class FrameTruth:
     visible_px: npt.NDArray[np.int64]  # (O,) pixels of each object in the instance map
     visible_xyxy: Array  # (O, 4) tight box of those pixels
     amodal_xyxy: Array  # (O, 4) box of the whole object, hidden and cut parts too
-    solid_xyxy: Array  # (O, 4) box of the solid (box, cylinder, ellipsoid) that stands for it
+    solid_xyxy: Array  # (O, 4) box of the annotated shape (box, cylinder, ellipsoid)
     visibility: Array  # (O,) visible pixels / pixels of the whole silhouette
 
 
@@ -108,7 +108,8 @@ def ground_truth(
     count = len(room.objects)
     pixels, visible = visible_boxes(instance, count)
     center = -cam_from_world[:, :3].T @ cam_from_world[:, 3]
-    amodal, solid = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
+    amodal = np.full((count, 4), np.nan)
+    solid = np.full((count, 4), np.nan)
     visibility = np.zeros(count)
     for truth in room.objects:
         spread, depth = project_points(solid_outline(truth, center), K, cam_from_world)

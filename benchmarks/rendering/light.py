@@ -49,7 +49,10 @@ def voxelize(
 
 def light_samples(surfaces: Surfaces) -> tuple[Array, Array, list[slice]]:
     """Points and normals of all light-map texels, patch after patch (N = sum of w h)."""
-    points, normals, slices, start = [], [], [], 0
+    points = []
+    normals = []
+    slices = []
+    start = 0
     for i in range(len(surfaces.kind)):
         w, h = surfaces.light_rect[i, 2:].astype(int)
         s, t = (v.ravel() for v in np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h))

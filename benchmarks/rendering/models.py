@@ -52,13 +52,15 @@ class Place:
 
 def rotation_z(yaw_rad: float) -> Array:
     """(3, 3) rotation about z."""
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    c = np.cos(yaw_rad)
+    s = np.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def rotation_x(angle_rad: float) -> Array:
     """(3, 3) rotation about x."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    c = np.cos(angle_rad)
+    s = np.sin(angle_rad)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
@@ -66,7 +68,8 @@ def quad(
     origin: npt.ArrayLike, right: npt.ArrayLike, down: npt.ArrayLike, texture: str, **options: Any
 ) -> Part:
     """Parallelogram from its top left corner and two edges (m)."""
-    a, b = np.asarray(right, float), np.asarray(down, float)
+    a = np.asarray(right, float)
+    b = np.asarray(down, float)
     into = np.cross(a, b)
     frame = np.stack(
         [a, b, into / np.linalg.norm(into), np.asarray(origin, float)], axis=1
@@ -125,7 +128,8 @@ def disc(
     """Horizontal circle, seen from above or from below."""
     x, y, z = center
     sign = 1.0 if up else -1.0
-    corner, down = (x - radius, y + sign * radius, z), (0.0, -2 * sign * radius, 0.0)
+    corner = (x - radius, y + sign * radius, z)
+    down = (0.0, -2 * sign * radius, 0.0)
     return quad(corner, (2 * radius, 0, 0), down, texture, kind=DISC, **options)
 
 
@@ -262,7 +266,8 @@ def plant_model(rng: Rng, height: float) -> Model:
     """Leaves (ellipses) around stems in a conical pot."""
     parts = upright((0, 0, 0), 0.30, (0.12, 0.16), "pot", "soil")
     for _ in range(64):
-        turn, lift = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1)
+        turn = rng.uniform(0, 2 * np.pi)
+        lift = rng.uniform(0, 1)
         reach = 0.05 + 0.27 * np.sin(np.pi * (0.15 + 0.75 * lift)) * rng.uniform(0.6, 1.0)
         center = np.array(
             [reach * np.cos(turn), reach * np.sin(turn), 0.36 + (height - 0.45) * lift]

@@ -27,7 +27,7 @@ from rendering.models import (
 
 
 def dining_places(config: RoomConfig, rng: Rng, center: tuple[float, float]) -> list[Place]:
-    """Table in the middle, up to four chairs around it, things on top."""
+    """Table in the middle, up to four chairs around it, objects on top."""
     x, y = center
     turn = float(rng.uniform(-0.12, 0.12))
     seats = [(-0.36, -0.72, np.pi), (0.38, -0.70, np.pi), (-0.37, 0.71, 0.0), (0.36, 0.73, 0.0)]
@@ -52,7 +52,9 @@ def dining_places(config: RoomConfig, rng: Rng, center: tuple[float, float]) -> 
 
 def desk_places(rng: Rng, size: tuple[float, float, float]) -> list[Place]:
     """Desk on the +x wall, screens facing the room, two chairs of the same kind as at the table."""
-    x, y, z = size[0] / 2 - 0.40, -0.55 + float(rng.uniform(-0.15, 0.15)), 0.73
+    x = size[0] / 2 - 0.40
+    y = -0.55 + float(rng.uniform(-0.15, 0.15))
+    z = 0.73
     face = -np.pi / 2  # the front looks along -x
     places = [Place("desk", (x, y, 0.0), face)]
     places += [
@@ -82,7 +84,8 @@ def desk_places(rng: Rng, size: tuple[float, float, float]) -> list[Place]:
 
 def lounge_places(rng: Rng, size: tuple[float, float, float]) -> list[Place]:
     """Couch on the +y wall, coffee table, plants, toys."""
-    x, y = 0.55 + float(rng.uniform(-0.15, 0.15)), size[1] / 2 - 0.5
+    x = 0.55 + float(rng.uniform(-0.15, 0.15))
+    y = size[1] / 2 - 0.5
     places = [
         Place("couch", (x, y, 0.0)),
         Place("coffee", (x + 0.05, y - 1.0, 0.0), float(rng.uniform(-0.1, 0.1))),
@@ -108,7 +111,8 @@ def lounge_places(rng: Rng, size: tuple[float, float, float]) -> list[Place]:
 
 def shelf_places(size: tuple[float, float, float]) -> list[Place]:
     """On the sideboard of the -x wall and on top of the bookcase of the -y wall."""
-    x, y = -size[0] / 2 + 0.26, size[1] / 2 - 1.75
+    x = -size[0] / 2 + 0.26
+    y = size[1] / 2 - 1.75
     side = -np.pi / 2 + np.pi  # the front looks along +x
     places = [Place("vase", (x, y + 0.45, 0.8)), Place("stood0", (x - 0.05, y + 0.05, 0.8), side)]
     places += [
@@ -119,7 +123,7 @@ def shelf_places(size: tuple[float, float, float]) -> list[Place]:
 
 
 def limit_places(places: list[Place], config: RoomConfig) -> list[Place]:
-    """Keep the first so many of each counted kind."""
+    """Keep at most the given number of each counted kind."""
     left = {
         "chair": config.chairs,
         "monitor": config.monitors,
@@ -142,7 +146,8 @@ def limit_places(places: list[Place], config: RoomConfig) -> list[Place]:
 def room_shell(size: tuple[float, float, float]) -> list[Part]:
     """Walls, floor, ceiling (inward), without furniture."""
     w, d, h = size
-    x, y = w / 2, d / 2
+    x = w / 2
+    y = d / 2
     down = (0.0, 0.0, -h)
     return [
         quad((-x, y, h), (w, 0, 0), down, "wall_north"),
@@ -259,7 +264,8 @@ def clutter(size: tuple[float, float, float]) -> list[Part]:
                 )
             )
     parts += box((0.09 - w / 2, -0.9, 2.32), (0.03, 2.7, 0.03), "case_wood")
-    x, y = -0.95, d / 2 - 0.4
+    x = -0.95
+    y = d / 2 - 0.4
     parts += upright((x, y, 0), 0.03, (0.15, 0.15), "plastic", "plastic")
     parts += [
         frustum((x, y, 0.03), 1.45, (0.013, 0.013), "plastic"),
@@ -295,7 +301,8 @@ def clutter(size: tuple[float, float, float]) -> list[Part]:
 
 def turned(places: Sequence[Place], yaw_rad: float, x: float, y: float) -> list[Place]:
     """Turn a group about the origin and move it there."""
-    turn, at = rotation_z(yaw_rad), np.array([x, y, 0.0])
+    turn = rotation_z(yaw_rad)
+    at = np.array([x, y, 0.0])
     spots = [turn @ np.asarray(place.position) + at for place in places]
     return [
         Place(
@@ -306,7 +313,7 @@ def turned(places: Sequence[Place], yaw_rad: float, x: float, y: float) -> list[
 
 
 def varied_group(config: RoomConfig, rng: Rng) -> list[Place]:
-    """A table with chairs, a desk or a lounge around the origin; some things missing."""
+    """A table with chairs, a desk or a lounge around the origin; some furniture missing."""
     kind = rng.choice(3, p=[0.4, 0.4, 0.2])
     if kind == 0:
         group = dining_places(config, rng, (0.0, 0.0))
@@ -335,7 +342,8 @@ def varied_plan(
     walls of this seed's choice.
     """
     w, d, h = size
-    columns, rows = max(int((w - 0.6) / 2.5), 1), max(int((d - 0.6) / 2.3), 1)
+    columns = max(int((w - 0.6) / 2.5), 1)
+    rows = max(int((d - 0.6) / 2.3), 1)
     plan: list[Place] = []
     for cell in rng.permutation(columns * rows)[: max(2, columns * rows - int(rng.integers(2)))]:
         x = (cell % columns + 0.5) / columns * (w - 0.8) - (w - 0.8) / 2
@@ -379,7 +387,7 @@ def varied_models(rng: Rng, models: dict[str, Model]) -> dict[str, Model]:
     models = models | {"chair": chairs[first], "chair2": chairs[second]}
     return {
         name: stretched(model, rng.uniform(0.87, 1.15) * rng.uniform(0.93, 1.07, 3))
-        if name not in ("table", "desk", "coffee")  # things stand on them
+        if name not in ("table", "desk", "coffee")  # objects stand on them
         else stretched(model, (*rng.uniform(0.9, 1.2, 2), 1.0))
         for name, model in models.items()
     }

@@ -37,8 +37,10 @@ def patch_windows(
     right_below = (homogeneous[..., :2] > depth[..., None] * np.array(size)).all(1)  # (S, 2)
     outside = np.any(left_above | right_below, axis=1) | (depth < NEAR_M).all(1)  # (S,)
     pixels = homogeneous[..., :2] / np.maximum(depth, NEAR_M)[..., None]  # (S, 8, 2)
-    low, high = np.floor(pixels.min(1)) - 1, np.ceil(pixels.max(1)) + 1
-    low[crossing], high[crossing] = 0, size
+    low = np.floor(pixels.min(1)) - 1
+    high = np.ceil(pixels.max(1)) + 1
+    low[crossing] = 0
+    high[crossing] = size
     windows = np.concatenate([np.clip(low, 0, size), np.clip(high, 0, size)], 1).astype(np.int64)
     windows[outside] = 0
     return np.asarray(windows)
@@ -115,7 +117,8 @@ def draw_round(
     rows, cols = np.nonzero(1 / depth > layers.inverse_depth[y0:y1, x0:x1])
     k = depth[rows, cols]
     x, y, z = (o[i] + k * d[rows, cols, i] for i in range(3))
-    s, t = np.arctan2(y, x) / (2 * np.pi) + 0.5, (z_high - z) / (z_high - z_low)
+    s = np.arctan2(y, x) / (2 * np.pi) + 0.5
+    t = (z_high - z) / (z_high - z_low)
     store(layers, index, (rows + y0, cols + x0), (1 / k, s, t))
 
 
@@ -189,9 +192,11 @@ def shade_layers(
     room: Room, layers: Layers, K: Array, cam_from_world: Array
 ) -> npt.NDArray[np.float32]:
     """Linear colours (H, W, 3) of all samples: texture times baked light."""
-    surfaces, shape = room.surfaces, layers.patch.shape
+    surfaces = room.surfaces
+    shape = layers.patch.shape
     patch = np.maximum(layers.patch, 0).ravel()
-    s, t = layers.s.ravel(), layers.t.ravel()
+    s = layers.s.ravel()
+    t = layers.t.ravel()
     rect = surfaces.texture_rect.astype(np.float32)[patch]  # (N, 4)
     factor, power = texel_rates(surfaces, K, cam_from_world)
     depth_log = -np.log2(np.maximum(layers.inverse_depth.ravel(), 1e-3))

@@ -100,10 +100,13 @@ def rooms_in_a_row(room: Room, count: int) -> Room:
     w, d, h = room.size_m
     x = room.surfaces.corners_in_world[..., 0]  # (S, 8)
     west, east = ((np.abs(x - side * w / 2) < JOIN_M).all(1) for side in (-1, 1))  # (S,)
-    surfaces, objects, outlines = [], [], []
+    surfaces = []
+    objects = []
+    outlines = []
     for copy in range(count):
         keep = ~((east & (copy < count - 1)) | (west & (copy > 0)))
-        shift, first = np.array([(copy - (count - 1) / 2) * w, 0.0, 0.0]), copy * len(room.objects)
+        shift = np.array([(copy - (count - 1) / 2) * w, 0.0, 0.0])
+        first = copy * len(room.objects)
         part = {name: getattr(room.surfaces, name)[keep] for name in Surfaces.__slots__}
         part["world_from_patch"] = part["world_from_patch"] + np.pad(
             shift[:, None], ((0, 0), (3, 0))
@@ -131,7 +134,7 @@ def object_windows(
     rng: Rng,
     twin_groups: Sequence[int],
 ) -> list[list[float]]:
-    """Texture pieces of all parts; twins get the very same: only the place tells them apart."""
+    """Texture pieces of all parts; identical instances share them and differ by position only."""
     windows: list[list[float]] = []
     known: dict[tuple[int, int], list[float]] = {}
     seen = 0

@@ -71,9 +71,12 @@ def pack(
     for index in sorted(range(len(sizes)), key=lambda i: (-sizes[i][1], i)):
         w, h = (-(-side // grid) * grid for side in sizes[index])
         if x + w > width:
-            x, y, shelf = 0, y + shelf, 0
+            x = 0
+            y = y + shelf
+            shelf = 0
         places[index] = (x, y)
-        x, shelf = x + w, max(shelf, h)
+        x = x + w
+        shelf = max(shelf, h)
     return places, y + shelf
 
 
@@ -127,19 +130,23 @@ def quadric_of(part: Part) -> list[float]:
     """Coefficients a, b, c and z limits of x^2 + y^2 + a z^2 + b z + c = 0 in the patch's frame."""
     if part.kind == SPHERE:
         return [1.0, 0.0, -1.0, -1.0, 1.0]
-    r0, slope = part.radii[0], part.radii[1] - part.radii[0]
+    r0 = part.radii[0]
+    slope = part.radii[1] - part.radii[0]
     return [-(slope**2), -2 * r0 * slope, -(r0**2), 0.0, 1.0]
 
 
 def patch_corners(part: Part) -> Array:
     """(8, 3) corners of a parallelepiped around the patch, in the patch's own coordinates."""
     if part.kind in (QUAD, DISC):
-        low, high = np.zeros(3), np.array([1.0, 1.0, 0.0])
+        low = np.zeros(3)
+        high = np.array([1.0, 1.0, 0.0])
     elif part.kind == SPHERE:
-        low, high = -np.ones(3), np.ones(3)
+        low = -np.ones(3)
+        high = np.ones(3)
     else:
         r = max(part.radii)
-        low, high = np.array([-r, -r, 0.0]), np.array([r, r, 1.0])
+        low = np.array([-r, -r, 0.0])
+        high = np.array([r, r, 1.0])
     picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(8, 3)
     return np.where(picks == 0, low, high)
 
@@ -194,10 +201,12 @@ def surface_points(
     angle = 2 * np.pi * (s - 0.5)
     if kind == SPHERE:
         z = 1 - 2 * t
-        ring, slope = np.sqrt(np.maximum(1 - z**2, 0)), z
+        ring = np.sqrt(np.maximum(1 - z**2, 0))
+        slope = z
     else:
         z = 1 - t
-        ring, slope = radii[0] + (radii[1] - radii[0]) * z, np.full_like(s, radii[0] - radii[1])
+        ring = radii[0] + (radii[1] - radii[0]) * z
+        slope = np.full_like(s, radii[0] - radii[1])
     local = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], -1)  # (N, 3)
     flat = np.ones_like(s) if kind == FRUSTUM else ring
     gradient = np.stack([flat * np.cos(angle), flat * np.sin(angle), slope], -1) @ np.linalg.inv(
@@ -210,7 +219,8 @@ def surface_points(
 def part_outline(part: Part) -> Array:
     """(96, 3) points whose convex hull is that of the part (round rims to 1e-3 of the radius)."""
     turn = np.arange(48) * 2 * np.pi / 48
-    c, s = np.cos(turn), np.sin(turn)
+    c = np.cos(turn)
+    s = np.sin(turn)
     if part.kind == QUAD:
         local = np.tile(patch_corners(part), (12, 1))
     elif part.kind == DISC:

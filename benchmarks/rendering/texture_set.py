@@ -74,7 +74,9 @@ def make_textures(
     scale = config.texels_per_m
     w, d, h = (int(v * scale) for v in size)
     textures = wall_textures(rng, (w, d, h))
-    oak, walnut, pale = (70.0, 115.0, 165.0), (42.0, 68.0, 104.0), (150.0, 185.0, 210.0)
+    oak = (70.0, 115.0, 165.0)
+    walnut = (42.0, 68.0, 104.0)
+    pale = (150.0, 185.0, 210.0)
     tones = {
         "chair_wood": oak,
         "table_wood": walnut,

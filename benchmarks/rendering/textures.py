@@ -19,7 +19,8 @@ def fractal_noise(
     total = np.zeros((height, width), np.float32)
     weights = np.sqrt(np.asarray(cells)) / np.sqrt(np.asarray(cells)).sum()
     for cell, weight in zip(cells, weights, strict=True):
-        rows, cols = max(2, int(height / cell)), max(2, int(width / cell))
+        rows = max(2, int(height / cell))
+        cols = max(2, int(width / cell))
         grid = rng.standard_normal((rows, cols)).astype(np.float32)
         total += np.float32(weight) * cv2.resize(
             grid, (width, height), interpolation=cv2.INTER_CUBIC
@@ -72,8 +73,11 @@ def wallpaper(rng: Rng, height: int, width: int, base: Color) -> Image:
     stripes = 0.03 * np.sign(np.sin(np.arange(width) / 24.0))
     image = shade(base, stripes[None, :] + 0.05 * fractal_noise(rng, height, width, (5, 30, 160)))
     for _ in range(height * width // 2600):
-        x, y, turn = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0, 360)
-        size, tint = rng.uniform(5, 15), rng.uniform(0.68, 1.14)
+        x = rng.uniform(0, width)
+        y = rng.uniform(0, height)
+        turn = rng.uniform(0, 360)
+        size = rng.uniform(5, 15)
+        tint = rng.uniform(0.68, 1.14)
         color = (np.asarray(base) * tint * rng.uniform(0.93, 1.07, 3)).tolist()
         for leaf in range(int(rng.integers(2, 6))):
             angle = turn + leaf * rng.uniform(40, 75)
@@ -86,11 +90,14 @@ def wallpaper(rng: Rng, height: int, width: int, base: Color) -> Image:
 def bricks(rng: Rng, height: int, width: int, base: Color) -> Image:
     """Old brick wall with a tone of its own for each brick."""
     image = shade((150, 158, 165), 0.08 * fractal_noise(rng, height, width, (3, 15, 90)))
-    row_h, brick_w, joint = 26, 76, 3
+    row_h = 26
+    brick_w = 76
+    joint = 3
     for row in range(-(-height // row_h)):
         shift = (row % 2) * brick_w // 2 + int(rng.integers(-5, 6))
         for col in range(-1, width // brick_w + 2):
-            x, y = col * brick_w + shift, row * row_h
+            x = col * brick_w + shift
+            y = row * row_h
             color = np.asarray(base) * rng.uniform(0.7, 1.2) * rng.uniform(0.93, 1.07, 3)
             cut = int(rng.integers(0, 3))
             cv2.rectangle(
@@ -130,9 +137,12 @@ def planks(rng: Rng, height: int, width: int, base: Color) -> Image:
     for y in range(0, height, board_h):
         x = -int(rng.integers(0, 300))
         while x < width:
-            length, rows = int(rng.integers(220, 460)), min(board_h, height - y)
-            x0, x1 = max(x, 0), max(0, min(x + length, width))
-            v, u = int(rng.integers(0, 1024 - board_h)), int(rng.integers(0, 1024 - 460))
+            length = int(rng.integers(220, 460))
+            rows = min(board_h, height - y)
+            x0 = max(x, 0)
+            x1 = max(0, min(x + length, width))
+            v = int(rng.integers(0, 1024 - board_h))
+            u = int(rng.integers(0, 1024 - 460))
             piece = stock[v : v + rows, u : u + x1 - x0] * rng.uniform(0.78, 1.15)
             image[y : y + rows, x0:x1] = to_image(piece)
             cv2.line(image, (x0, y), (x0, y + rows), (25, 35, 45), 1)
@@ -146,7 +156,8 @@ def planks(rng: Rng, height: int, width: int, base: Color) -> Image:
 
 def fabric(rng: Rng, height: int, width: int, base: Color, motif: bool = False) -> Image:
     """Woven cloth, with seams; optionally with a scattered print."""
-    rows, cols = np.arange(height)[:, None], np.arange(width)[None, :]
+    rows = np.arange(height)[:, None]
+    cols = np.arange(width)[None, :]
     weave = 0.06 * np.sin(rows * 1.9) * np.sin(cols * 1.9)
     image = shade(base, weave + 0.1 * fractal_noise(rng, height, width, (2, 5, 20, 90)))
     for _ in range(height * width // 900 if motif else 0):
@@ -251,7 +262,8 @@ def art_abstract(rng: Rng, image: npt.NDArray[Any]) -> None:
 def art_landscape(rng: Rng, image: npt.NDArray[Any]) -> None:
     """Sky, sun and rows of hills with trees."""
     height, width = image.shape[:2]
-    top, bottom = np.asarray(random_color(rng, 120, 220)), np.asarray(random_color(rng, 180, 250))
+    top = np.asarray(random_color(rng, 120, 220))
+    bottom = np.asarray(random_color(rng, 180, 250))
     ramp = np.linspace(0, 1, height)[:, None, None]
     image[:] = top * (1 - ramp) + bottom * ramp
     sun = (int(rng.uniform(0.2, 0.8) * width), int(rng.uniform(0.12, 0.35) * height))
@@ -319,7 +331,10 @@ def screen(rng: Rng, height: int, width: int) -> Image:
     """A desktop: background picture, an editor window, a chart."""
     image = np.zeros((height, width, 3), np.float32)
     art_landscape(rng, image)
-    x, y, w, h = width // 14, height // 10, int(width * 0.5), int(height * 0.74)
+    x = width // 14
+    y = height // 10
+    w = int(width * 0.5)
+    h = int(height * 0.74)
     cv2.rectangle(image, (x, y), (x + w, y + h), (45, 38, 34), -1)
     cv2.rectangle(image, (x, y), (x + w, y + 12), (110, 100, 92), -1)
     for line in range(y + 22, y + h - 4, 9):
@@ -328,7 +343,8 @@ def screen(rng: Rng, height: int, width: int) -> Image:
             right = min(left + int(rng.integers(8, 46)), x + w - 6)
             cv2.line(image, (left, line), (right, line), random_color(rng, 130, 250), 3)
             left = right + 7
-    x2, y2 = int(width * 0.63), int(height * 0.2)
+    x2 = int(width * 0.63)
+    y2 = int(height * 0.2)
     cv2.rectangle(image, (x2, y2), (width - width // 20, int(height * 0.7)), (240, 240, 240), -1)
     for bar in range(7):
         top = int(height * 0.66 - rng.uniform(0.05, 0.4) * height)
@@ -359,7 +375,8 @@ def keys(rng: Rng, height: int, width: int) -> Image:
 def label(rng: Rng, height: int, width: int, base: Color, paper: Color) -> Image:
     """A printed label around a bottle, a can or a cup: twice, front and back."""
     image = plain(rng, height, width, base).astype(np.float32)
-    top, bottom = int(0.2 * height), int(0.82 * height)
+    top = int(0.2 * height)
+    bottom = int(0.82 * height)
     cv2.rectangle(image, (0, top), (width, bottom), paper, -1)
     for half in (0, width // 2):
         center = (half + width // 4, (top + bottom) // 2)
@@ -397,7 +414,8 @@ def book_row(rng: Rng, height: int, width: int) -> Image:
     image = np.full((height, width, 3), 22.0, np.float32)
     x = 0
     while x < width:
-        w, h = int(rng.integers(7, 22)), int(rng.uniform(0.68, 0.98) * height)
+        w = int(rng.integers(7, 22))
+        h = int(rng.uniform(0.68, 0.98) * height)
         color = random_color(rng, 40, 220)
         cv2.rectangle(image, (x, height - h), (x + w - 2, height), color, -1)
         for _ in range(2):
@@ -416,15 +434,18 @@ def book_row(rng: Rng, height: int, width: int) -> Image:
 
 def rug(rng: Rng, height: int, width: int) -> Image:
     """A carpet: borders, a field of motifs, worn places."""
-    base, other = random_color(rng, 70, 140), random_color(rng, 150, 220)
+    base = random_color(rng, 70, 140)
+    other = random_color(rng, 150, 220)
     image = np.ascontiguousarray(
         shade(base, 0.12 * fractal_noise(rng, height, width, (2, 8, 40, 200)))
     )
     for inset, color in ((10, other), (22, random_color(rng)), (46, other)):
         cv2.rectangle(image, (inset, inset), (width - inset, height - inset), color, 5)
     for _ in range(170):
-        x, y = int(rng.uniform(55, width - 55)), int(rng.uniform(55, height - 55))
-        size, color = int(rng.integers(4, 20)), random_color(rng, 60, 230)
+        x = int(rng.uniform(55, width - 55))
+        y = int(rng.uniform(55, height - 55))
+        size = int(rng.integers(4, 20))
+        color = random_color(rng, 60, 230)
         if rng.random() < 0.5:
             diamond = np.array(
                 [[x - size, y], [x, y - size], [x + size, y], [x, y + size]], np.int32
@@ -442,11 +463,14 @@ def panels(
     image = wood(rng, height, width, base, contrast).astype(np.float32)
     for row in range(rows):
         for col in range(columns):
-            x0, x1 = col * width // columns, (col + 1) * width // columns - 1
-            y0, y1 = row * height // rows, (row + 1) * height // rows - 1
+            x0 = col * width // columns
+            x1 = (col + 1) * width // columns - 1
+            y0 = row * height // rows
+            y1 = (row + 1) * height // rows - 1
             cv2.rectangle(image, (x0, y0), (x1, y1), (20, 24, 28), 2)
             inset = min(x1 - x0, y1 - y0) // 8
-            dark, light = [0.6 * c for c in base], [min(255, 1.25 * c) for c in base]
+            dark = [0.6 * c for c in base]
+            light = [min(255, 1.25 * c) for c in base]
             cv2.rectangle(
                 image, (x0 + inset, y0 + inset), (x1 - inset, y1 - inset), dark, 3, cv2.LINE_AA
             )
@@ -486,7 +510,8 @@ def leaf(rng: Rng, height: int, width: int) -> Image:
 def clock_face(rng: Rng, height: int, width: int) -> Image:
     """Dial with marks and hands."""
     image = plain(rng, height, width, (225, 232, 236)).astype(np.float32)
-    center, radius = (width // 2, height // 2), min(height, width) // 2
+    center = (width // 2, height // 2)
+    radius = min(height, width) // 2
     cv2.circle(image, center, radius - 5, (35, 35, 40), 11, cv2.LINE_AA)
     for hour in range(12):
         ray = np.array([np.sin(hour * np.pi / 6), -np.cos(hour * np.pi / 6)])

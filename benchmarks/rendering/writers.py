@@ -139,7 +139,8 @@ class VideoSink:
     def __init__(self, path: Path, config: RoomConfig, crf: int | None = None) -> None:
         self._stream: Any = None
         if crf is None:
-            code, size = cv2.VideoWriter.fourcc(*"mp4v"), (config.width, config.height)
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            size = (config.width, config.height)
             self._file: Any = cv2.VideoWriter(str(path), code, config.fps, size)
             if not self._file.isOpened():
                 raise OSError(f"{path}: this OpenCV cannot write MPEG-4 video")
@@ -152,7 +153,8 @@ class VideoSink:
         options = {"crf": str(crf), "preset": "veryslow", "threads": "1"}
         rate = Fraction(config.fps).limit_denominator(1000)
         self._stream = self._file.add_stream("libx264", rate=rate, options=options)
-        self._stream.width, self._stream.height = config.width, config.height
+        self._stream.width = config.width
+        self._stream.height = config.height
         self._stream.pix_fmt = "yuv420p"
 
     def write(self, image: Image) -> None:

@@ -122,7 +122,8 @@ class CropEmbedder(Embedder):
         Returns:
             crops (N, S, S, 3), and (N, S, S) the pixels on the object.
         """
-        side, (height, width) = self.layout.crop_px, frame.shape[:2]
+        side = self.layout.crop_px
+        (height, width) = frame.shape[:2]
         low, high = self._windows(detections.xyxy[rows], frame.shape[:2])
         pad = max(0, int(-low.min()), int((high - [width, height]).max()))
         wide = cv2.copyMakeBorder(frame, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=(0, 0, 0))

@@ -63,7 +63,7 @@ class Association:
 
     Attributes:
         shapes: of O objects. label: (N,) object of each detection, or -1.
-        evidence: of these objects. size_log_odds: (O,) by the categories.
+        evidence: of the objects. size_log_odds: (O,) by the categories.
     """
 
     shapes: Shapes

@@ -114,7 +114,8 @@ def _sphere_mesh(detail: int) -> tuple[Array, npt.NDArray[np.int64]]:
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], 2).reshape(-1, 2)
         edges, edge_of = np.unique(edges, axis=0, return_inverse=True)
         middle = points[edges].sum(1)  # (E, 3)
-        (a, b, c), (ab, bc, ca) = faces.T, len(points) + edge_of.reshape(-1, 3).T
+        (a, b, c) = faces.T
+        (ab, bc, ca) = len(points) + edge_of.reshape(-1, 3).T
         points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
         faces = np.array([(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)])  # (4, 3, T)
         faces = faces.transpose(2, 0, 1).reshape(-1, 3)

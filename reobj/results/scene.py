@@ -50,7 +50,7 @@ SCENE_CROPS = 8  # crops of an object
 SCENE_MAX_CROPS = 480  # crops of all objects
 SCENE_CROP_PX = 112  # px, longer side of a crop
 SCENE_FRAMES = 60  # video frames, behind the solids and beside the time slider
-SCENE_FRAME_PX = 640  # px, longer side of these frames
+SCENE_FRAME_PX = 640  # px, longer side of the frames in the page
 JPEG_QUALITY = 60  # WebP needs half the bytes and eight times the time (chosen)
 CROP_MARGIN = 0.1  # box sides, margin of a crop: shows what the object stands on (chosen)
 

@@ -245,7 +245,8 @@ def _paste(maps: Any, boxes: Array, size: tuple[int, int], ratio: Array, offset:
     low = np.clip(np.floor(boxes[:, :2]), 0, size).astype(int)
     high = np.clip(np.ceil(boxes[:, 2:]), 0, size).astype(int)
     for k in np.flatnonzero((high > low).all(1)):
-        (x1, y1), (x2, y2) = low[k].tolist(), high[k].tolist()
+        (x1, y1) = low[k].tolist()
+        (x2, y2) = high[k].tolist()
         shift = ratio[k] * (low[k] + 0.5) + offset[k] - 0.5  # pixel centres on pixel centres
         affine = np.column_stack([np.diag(ratio[k]), shift])  # (2, 3)
         values = cv2.warpAffine(

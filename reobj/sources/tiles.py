@@ -42,7 +42,8 @@ def tile_boxes(size: tuple[int, int], grid: tuple[int, int]) -> IntArray:
         side = length / (count - (count - 1) * TILE_OVERLAP)
         start = np.linspace(0, length - side, count)
         spans.append(np.stack([np.floor(start), np.ceil(start + side)], 1).clip(0, length))
-    (x, y), (columns, rows) = spans, grid
+    (x, y) = spans
+    (columns, rows) = grid
     corners = np.hstack([np.tile(x, (rows, 1)), np.repeat(y, columns, 0)])  # x1, x2, y1, y2
     return corners[:, [0, 2, 1, 3]].astype(np.int64)
 
