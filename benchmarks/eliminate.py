@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real_rooms import WITHOUT, add_cases, measure, prepared_cases
+from real_rooms import WITH_DOUBTFUL, WITHOUT, add_cases, measure, prepared_cases
 
 Figures = dict[str, Any]
 
@@ -101,11 +101,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add: Callable[..., Any] = parser.add_argument
     add_cases(parser)
-    add("--noises", type=int, default=2, metavar="N", help="box noises of half a pixel each")
+    add("--noises", type=int, default=1, metavar="N", help="box noises of half a pixel each")
     add("--jobs", type=int, default=2, help="processes at once")
     args = parser.parse_args(argv)
     cases = prepared_cases(args)
-    context = multiprocessing.get_context("spawn")  # memory and patches end with a process
+    context = multiprocessing.get_context("forkserver")  # memory and patches end with a process
+    context.set_forkserver_preload(["real_rooms"])
     with ProcessPoolExecutor(args.jobs, context, max_tasks_per_child=1) as pool:
 
         def run(key: str) -> list[list[Figures]]:
@@ -117,7 +118,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"evaluated without: {key or 'nothing'}", file=sys.stderr)
             return [[task.result() for task in of_case] for of_case in tasks]
 
-        whole = [pool.submit(measure, case, args.data, args.out) for case in cases]
+        whole = [
+            pool.submit(measure, case, args.data, args.out)
+            for case in cases
+            if not (args.out / case.name / WITH_DOUBTFUL / "objects.json").exists()
+        ]
         for task in whole:  # leaves in OUT what the others need
             task.result()
         curve = eliminate(Evaluations(args.out / "elimination.json", run), list(WITHOUT))

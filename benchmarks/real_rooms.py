@@ -288,7 +288,7 @@ def shake(seed: int) -> None:
         for name in ("tracks", "untracked"):
             rows = getattr(result, name)
             xyxy = rows.xyxy + rng.normal(0, NOISE_PX, rows.xyxy.shape)
-            setattr(result, name, dataclasses.replace(rows, xyxy=xyxy))
+            result = dataclasses.replace(result, **{name: dataclasses.replace(rows, xyxy=xyxy)})
         return link_and_fit(result, config)
 
     rt.link_and_fit = shaken  # type: ignore[attr-defined]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -282,12 +283,12 @@ def test_embeddings_follow_their_rows(tmp_path: Path) -> None:
     tracks = tracks_of(poses)
     result = unlinked(poses, tracks)
     rows = np.arange(0, len(tracks), 4)
-    result.embedding_row = rows
+    result = dataclasses.replace(result, embedding_row=rows)
     vectors = np.random.default_rng(0).normal(size=(len(rows), 8)).astype(np.float16)
-    result.embeddings = rt.Embeddings(vectors, vectors[:, :0])
+    result = dataclasses.replace(result, embeddings=rt.Embeddings(vectors, vectors[:, :0]))
     box = tracks.xyxy[tracks.track_id == 2][0].tolist()
     edit = {"do": "delete", "object": {"id": 2, "frame": 0, "box": box}}
-    result.edits = read_edits(write(tmp_path / "e.json", edit))
+    result = dataclasses.replace(result, edits=read_edits(write(tmp_path / "e.json", edit)))
     result = link_and_fit(result, rt.ObjectsConfig(link=False))
     kept = tracks.track_id[rows] != 2
     assert len(result.tracks) == 80 and SIZE == (640, 480)
@@ -319,7 +320,7 @@ def test_solids_of_merged_objects_hide_nothing(
     ]
     result = unlinked(poses, tracks)
     path = write(tmp_path / "e.json", {"do": "merge", "object": refs[0], "with": refs[1]})
-    result.edits = read_edits(path)
+    result = dataclasses.replace(result, edits=read_edits(path))
     result = link_and_fit(result, rt.ObjectsConfig())
     assert [o.id for o in result.objects] == [1, 3]
     assert np.isfinite(asked[-1].half_axes).all(1).tolist() == [False, True]

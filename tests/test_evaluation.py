@@ -268,8 +268,9 @@ def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None
     """Two cups, one comes back twice: once like itself, once like the other (Rank-1 .5)."""
     result = cups([0, 0, 40, 80], [1, 2, 1, 1])
     fused = np.array([[1, 1, 0], [1, 0, 1], [1, 0.9, 0.1], [1, 0.1, 0.9]], np.float16)
-    result.embeddings = Embeddings(fused[:, :1], fused[:, 1:])  # the background tells
-    result.embedding_row = np.arange(4)
+    result = dataclasses.replace(
+        result, embeddings=Embeddings(fused[:, :1], fused[:, 1:]), embedding_row=np.arange(4)
+    )
     tracked_folder(tmp_path / "out", result)
     gt = truth_of(tmp_path / "gt.txt", result)
     scores = rt.evaluate(str(tmp_path / "out"), str(gt))
@@ -281,8 +282,11 @@ def test_eval_ranks_the_embeddings_that_the_folder_holds(tmp_path: Path) -> None
 def test_rows_without_an_embedding_are_no_queries(tmp_path: Path) -> None:
     """Only rows 0 and 2 were embedded: nothing else is in the gallery."""
     result = cups([0, 0, 40, 80], [1, 2, 1, 1])
-    result.embeddings = Embeddings(np.eye(2, dtype=np.float16), np.empty((2, 0), np.float16))
-    result.embedding_row = np.array([0, 2])
+    result = dataclasses.replace(
+        result,
+        embeddings=Embeddings(np.eye(2, dtype=np.float16), np.empty((2, 0), np.float16)),
+        embedding_row=np.array([0, 2]),
+    )
     tracked_folder(tmp_path / "out", result)
     ranks = rt.evaluate(tmp_path / "out", truth_of(tmp_path / "gt.txt", result))["ranks"]
     assert ranks["queries"] == 1 and ranks["rank1"] == 1
@@ -560,7 +564,7 @@ def test_errors_are_in_units_of_the_truth(tmp_path: Path) -> None:
     off = TURN @ np.array([0.5, 0, 0])
     (o,) = result.objects
     moved = dataclasses.replace(o, center=o.center + off, half_axes=o.half_axes * [2, 1, 1])
-    result.objects = [moved]
+    result = dataclasses.replace(result, objects=[moved])
     found = score_objects(result, *files, {4: 9})
     assert found["center_error_median"] == pytest.approx(1.0)
     assert found["size_error_median"] == pytest.approx(2 ** (1 / 3) - 1)
@@ -577,7 +581,9 @@ def test_sides_within_two_sigma_along_the_true_axes(tmp_path: Path) -> None:
     cov = np.diag(np.repeat([1.0, 0.1, 1.0], 3) ** 2)
     half = np.roll(o.half_axes, -1) * np.exp([0.19, 0.21, 0.0])
     quat = np.roll(Rotation.from_matrix(turn).as_quat(), 1)
-    result.objects = [dataclasses.replace(o, half_axes=half, quat_wxyz=quat, cov=cov)]
+    result = dataclasses.replace(
+        result, objects=[dataclasses.replace(o, half_axes=half, quat_wxyz=quat, cov=cov)]
+    )
     assert score_objects(result, *files, {4: 9})["sizes_inside"] == pytest.approx(2 / 3)
 
 
@@ -590,7 +596,9 @@ def test_objects_that_the_identities_do_not_say_are_not_found(
 
 def test_rejected_objects_are_not_found(tmp_path: Path) -> None:
     result, *files = half_sized(tmp_path)
-    result.objects = [dataclasses.replace(result.objects[0], status="rejected")]
+    result = dataclasses.replace(
+        result, objects=[dataclasses.replace(result.objects[0], status="rejected")]
+    )
     assert score_objects(result, *files, {4: 9}) == {"true": 1, "found": 0, "o3d_all": 0.0}
 
 
@@ -627,11 +635,15 @@ def straight(tmp_path: Path, form: str, turned: np.ndarray) -> float:
     cam_from_world = np.concatenate(
         [ours[:, :, :3].swapaxes(1, 2), -ours[:, :, :3].swapaxes(1, 2) @ ours[:, :, 3:]], 2
     )
-    result.poses = dataclasses.replace(result.poses, cam_from_world=cam_from_world)
+    result = dataclasses.replace(
+        result, poses=dataclasses.replace(result.poses, cam_from_world=cam_from_world)
+    )
     truth = TRUE | {"center": [0.0, 0.2, 3.0]}
     solids.write_text(json.dumps({"objects": [truth]}))
     mine = 0.5 * TURN @ np.array(truth["center"]) + SHIFT
-    result.objects = [dataclasses.replace(result.objects[0], center=mine)]
+    result = dataclasses.replace(
+        result, objects=[dataclasses.replace(result.objects[0], center=mine)]
+    )
     c2w = np.tile(np.eye(4), (12, 1, 1))
     c2w[:, :3, :3], c2w[:, :3, 3] = turn @ turned, centers
     np.savetxt(path, c2w.reshape(12, 16))
@@ -684,7 +696,7 @@ def test_3d_needs_cameras(tmp_path: Path) -> None:
     result, solids, path = half_sized(tmp_path)
     with pytest.raises(rt.ReobjError, match="give --gt-poses"):
         score_objects(result, solids, None, {4: 9})
-    result.poses = None
+    result = dataclasses.replace(result, poses=None)
     with pytest.raises(rt.ReobjError, match="no cameras, so there is no evaluation"):
         score_objects(result, solids, path, {4: 9})
 

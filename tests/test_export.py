@@ -278,7 +278,9 @@ def test_csv_holds_the_objects(room: Path, tmp_path: Path) -> None:
 def test_csv_runs_no_formula(tmp_path: Path, chairs: rt.Result, name: str, cell: str) -> None:
     result = dataclasses.replace(chairs)
     found = [dataclasses.replace(chairs.objects[0], class_name=name, reason=name)]
-    result.objects = [dataclasses.replace(o, center=-np.abs(o.center)) for o in found]
+    result = dataclasses.replace(
+        result, objects=[dataclasses.replace(o, center=-np.abs(o.center)) for o in found]
+    )
     EXPORTS["csv"][1](result, tmp_path / "a.csv")
     with (tmp_path / "a.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)

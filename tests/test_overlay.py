@@ -413,10 +413,13 @@ def solid_pixels(
 def test_solids_lie_where_the_objects_are(chairs: rt.Result, tmp_path: Path, layers: str) -> None:
     """The first object is rejected: the others keep their own places and colours."""
     result = dataclasses.replace(chairs)
-    result.objects = [
-        dataclasses.replace(chairs.objects[0], status="rejected"),
-        *chairs.objects[1:],
-    ]
+    result = dataclasses.replace(
+        result,
+        objects=[
+            dataclasses.replace(chairs.objects[0], status="rejected"),
+            *chairs.objects[1:],
+        ],
+    )
     pictures, _ = solid_pixels(result, tmp_path, 2, layers)
     poses = walk()
     kind = "box" if layers == "solids" else "ellipsoid"
@@ -438,7 +441,7 @@ def test_ellipses_of_large_videos_are_shrunk(chairs: rt.Result, tmp_path: Path) 
     small = walk(1).camera
     large = rt.Camera("PINHOLE", 1920, 1440, tuple(3 * p for p in small.params))
     result = dataclasses.replace(chairs, poses=dataclasses.replace(chairs.poses, camera=large))
-    result.tracks = rt.Tracks.empty()
+    result = dataclasses.replace(result, tracks=rt.Tracks.empty())
     video = rt.Video(frames(tmp_path / "f", 1, (1920, 1440)))
     (picture,), _ = overlay_of(result, video, tmp_path / "o.mp4", "ellipses")
     assert picture.shape == (960, 1280, 3)
@@ -452,11 +455,13 @@ def test_ellipses_of_large_videos_are_shrunk(chairs: rt.Result, tmp_path: Path) 
 
 def test_priors_are_drawn_only_while_the_object_is_seen(chairs: rt.Result, tmp_path: Path) -> None:
     result = dataclasses.replace(chairs)
-    result.objects = [dataclasses.replace(o, status="prior_dominated") for o in chairs.objects]
+    result = dataclasses.replace(
+        result, objects=[dataclasses.replace(o, status="prior_dominated") for o in chairs.objects]
+    )
     pictures, bare = solid_pixels(result, tmp_path, 1)
     assert np.abs(pictures[0].astype(int) - 127).max() < 8
     seen = chairs.tracks[(chairs.tracks.frame == 0) & (chairs.tracks.track_id == 2)]
-    bare.tracks = seen
+    bare = dataclasses.replace(bare, tracks=seen)
     video = rt.Video(tmp_path / "f")
     (picture,), _ = overlay_of(bare, video, tmp_path / "o.mp4")
     middle = chairs.tracks.xyxy[1].reshape(2, 2).mean(0)
@@ -525,7 +530,9 @@ def test_the_legend_tells_what_is_there(chairs: rt.Result, tmp_path: Path) -> No
     assert kinds(chairs, "solids") == ["box", "solid", "thin"]
     assert kinds(chairs, "boxes") == ["box"]
     flat = dataclasses.replace(chairs, poses=None, fits=None)
-    flat.objects = [dataclasses.replace(o, status="tracked") for o in chairs.objects]
+    flat = dataclasses.replace(
+        flat, objects=[dataclasses.replace(o, status="tracked") for o in chairs.objects]
+    )
     assert kinds(flat, "solids,trails") == ["box", "trail"]
     gap = dataclasses.replace(chairs.tracks, score=chairs.tracks.score * 0)
     assert kinds(dataclasses.replace(flat, tracks=gap), "boxes") == ["box", "dashed"]
@@ -604,7 +611,9 @@ def test_thin_lines_are_thinner() -> None:
 
 def test_long_class_names_are_cut(chairs: rt.Result, tmp_path: Path) -> None:
     result = dataclasses.replace(chairs)
-    result.objects = [dataclasses.replace(o, class_name="b" * 5000) for o in chairs.objects]
+    result = dataclasses.replace(
+        result, objects=[dataclasses.replace(o, class_name="b" * 5000) for o in chairs.objects]
+    )
     overlay = Overlay(result, tmp_path / "o.mp4", rt.Video(frames(tmp_path / "f", 1, SIZE)))
     overlay.close(False)
     assert overlay.labels[1] == f"1 {'b' * 21}..."

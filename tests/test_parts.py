@@ -140,7 +140,9 @@ def test_what_comes_into_view_while_the_cameras_are_lost_is_of_the_next_part() -
     """Frames 38 to 40 have no pose; the third chair is seen from frame 39 on, of part 0."""
     given = unlinked()
     third = given.tracks.detection_index == 2
-    given.tracks = given.tracks[~third | (given.tracks.frame >= BREAK - 1)]
+    given = dataclasses.replace(
+        given, tracks=given.tracks[~third | (given.tracks.frame >= BREAK - 1)]
+    )
     objects = finished(given).objects
     assert [(o.part, o.status != "rejected") for o in objects] == [(0, True)] * 2 + [(1, True)] * 3
     assert sorted(o.visits[0][0] for o in objects) == [0, 0, BREAK - 1, BREAK, BREAK]
@@ -151,8 +153,12 @@ def test_embeddings_stay_with_their_rows(monkeypatch: pytest.MonkeyPatch) -> Non
     given = unlinked()
     row = np.arange(0, len(given.tracks), 7)  # of the tracks that were embedded
     frame = given.tracks.frame[row]
-    given.embeddings = Embeddings(frame[:, None] + 0.0, -frame[:, None] - 0.0)
-    given.embedding_row, seen = row, []
+    given = dataclasses.replace(
+        given,
+        embeddings=Embeddings(frame[:, None] + 0.0, -frame[:, None] - 0.0),
+        embedding_row=row,
+    )
+    seen = []
 
     def noted(tracks: rt.Tracks, names: Any, embeddings: Embeddings, rows: Any, *a: Any, **k: Any):
         np.testing.assert_array_equal(embeddings.foreground[:, 0], tracks.frame[rows])
@@ -175,7 +181,7 @@ def test_a_tracklet_is_once_in_a_frame(every: int) -> None:
     tracklet = np.where(late, np.array([0, 1, 3])[chair], chair + 1)
     table = with_columns(table, tracklet_id=tracklet, track_id=tracklet)
     given = unlinked(poses, table[tracklet > 0])
-    given.untracked = table[tracklet == 0]
+    given = dataclasses.replace(given, untracked=table[tracklet == 0])
     tracks = finished(given).tracks
     for column in (tracks.track_id, tracks.tracklet_id):
         assert len(set(zip(tracks.frame.tolist(), column.tolist(), strict=True))) == len(tracks)
@@ -282,7 +288,7 @@ def test_identities_of_the_user_may_span_parts() -> None:
     given = unlinked(
         poses, with_columns(tracks, track_id=np.array([7, 5, 6])[tracks.detection_index])
     )
-    given.identities_given = True
+    given = dataclasses.replace(given, identities_given=True)
     result = finished(given)
     assert [(o.id, o.part, o.status) for o in result.objects] == [
         (5, 0, "ok"), (6, 1, "ok"), (7, 0, "ok"),
@@ -338,7 +344,7 @@ def test_boxes_that_no_fit_can_use_do_not_choose_the_part() -> None:
     tracks = tracks_in_two_parts(two_parts())
     weak = (tracks.detection_index == 0) & (tracks.frame < BREAK)
     given = unlinked(tracks=with_columns(tracks, score=np.where(weak, 0.01, 0.9)))
-    given.identities_given = True
+    given = dataclasses.replace(given, identities_given=True)
     assert [(o.part, o.status) for o in finished(given).objects] == [
         (1, "ok"),
         (0, "ok"),

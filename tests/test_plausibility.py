@@ -105,7 +105,7 @@ def test_nothing_measured(status: str, count: int, warned: bool) -> None:
         (line,) = said(found)
         assert f"none of the {count} listed objects is measured" in line and "sideways" in line
         assert "--camera" not in line  # these cameras were supplied
-        found.poses = dataclasses.replace(walk(), source="pycolmap")
+        found = dataclasses.replace(found, poses=dataclasses.replace(walk(), source="pycolmap"))
         assert "--camera" in said(found)[0] and "--poses" in said(found)[0]
         found.objects[1] = dataclasses.replace(found.objects[1], parallax_deg=9.9)
         assert len(said(found)) == 1
@@ -172,7 +172,9 @@ def test_the_cause_that_most_unexplained_boxes_have(untracked: rt.Tracks, cause:
     """Another detector is advised only where boxes come and go."""
     found = result({CHAIR: 3, FRIDGE: 3}, status="tracked")
     number = 100 + np.arange(len(untracked))
-    found.untracked = dataclasses.replace(untracked, detection_index=number)
+    found = dataclasses.replace(
+        found, untracked=dataclasses.replace(untracked, detection_index=number)
+    )
     (line,) = implausible(found, HIGH, MOVING, 0.5)
     assert line.startswith(f"{len(number)} of {60 + len(number)} boxes of score 0.4 or more")
     assert cause in line and line.endswith("listed object") == (not cause)

@@ -62,9 +62,8 @@ def test_save_then_load_gives_the_same(chairs: rt.Result, tmp_path: Path) -> Non
     rejected = rt.Object(4, "cup", 0.5, "rejected", "no reason", None, tracklet_ids=[7, 9],
                          visits=[[0, 3], [5, 5]])  # fmt: skip
     before = copy_of(chairs, poses=poses, world=world, warnings=["take care"])
-    before.objects = [*chairs.objects, rejected]
-    before.fits = None
-    before.save(tmp_path)
+    before = dataclasses.replace(before, objects=[*chairs.objects, rejected], fits=None)
+    before = before.save(tmp_path)
     after = rt.Result.load(tmp_path)
     assert after.out == before.out == tmp_path
     assert len(after.objects) == 4
@@ -114,7 +113,7 @@ def test_ellipsoids_of_a_loaded_result_are_those_of_the_fit(chairs: rt.Result, s
 def test_ellipsoids_leave_rejected_objects_out(chairs: rt.Result) -> None:
     result = copy_of(chairs)
     first = dataclasses.replace(result.objects[0], status="rejected")
-    result.objects = [first, *result.objects[1:]]
+    result = dataclasses.replace(result, objects=[first, *result.objects[1:]])
     assert [o.id for o in result.located] == [2, 3]
     np.testing.assert_array_equal(
         result.ellipsoids().center_in_world, chairs.fits.ellipsoids.center_in_world[1:]
@@ -224,7 +223,7 @@ def test_ply_has_the_located_objects_only(chairs: rt.Result, tmp_path: Path) -> 
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh (dev extra)")
     result = copy_of(chairs)
     middle = dataclasses.replace(result.objects[1], status="rejected", center=None)
-    result.objects = [result.objects[0], middle, result.objects[2]]
+    result = dataclasses.replace(result, objects=[result.objects[0], middle, result.objects[2]])
     result.save(tmp_path)
     x = sorted(part.centroid[0] for part in trimesh.load(tmp_path / "objects.ply").split())
     np.testing.assert_allclose(x, [-1.1, 1.1], atol=0.05)
@@ -247,9 +246,9 @@ def test_objects_json_says_what_it_means(saved: Path) -> None:
 
 def test_summary_is_the_table_that_run_prints(chairs: rt.Result, saved: Path) -> None:
     result = copy_of(chairs, out=saved, seconds={"track": 1.25})
-    result.objects = [*chairs.objects[:2], dataclasses.replace(
+    result = dataclasses.replace(result, objects=[*chairs.objects[:2], dataclasses.replace(
         chairs.objects[2], status="rejected", reason="too far", size=None, size_m=None,
-        size_rel_sigma=None)]  # fmt: skip
+        size_rel_sigma=None)])  # fmt: skip
     text = result.summary()
     (w, d, h), size = (side for side, _ in sides(chairs.objects[0])), chairs.objects[0].size_m
     assert re.search(rf"1  chair +40 +1 +{w} x {d} x {h} +\d+ %  ok$", text, re.M)
@@ -276,11 +275,11 @@ def test_the_summary_fits_the_terminal(chairs: rt.Result) -> None:
     """However many objects there are, with reasons, in parts; each reason is said once."""
     reason = "size along x, y rests on the prior"
     result = copy_of(chairs, out=None)
-    result.objects = [
+    result = dataclasses.replace(result, objects=[
         dataclasses.replace(chairs.objects[0], id=i, class_name=f"dining table {i % 40}",
                             status="prior_dominated", reason=reason)
         for i in range(1, 121)
-    ]  # fmt: skip
+    ])  # fmt: skip
     lines = result.summary().splitlines()
     assert max(map(len, lines)) <= 100 and len(lines) < 150
     assert sum(reason in line for line in lines) == 1
@@ -428,7 +427,7 @@ def test_without_a_width_all_is_foreground() -> None:
 
 def test_tracked_is_read_as_it_was(tmp_path: Path) -> None:
     before = embedded_result()
-    before.warnings, before.identities_given = ["dark"], True
+    before = dataclasses.replace(before, warnings=["dark"], identities_given=True)
     before.save_tracked(tmp_path / "a.npz")
     after = rt.Result.load_tracked(tmp_path / "a.npz")
     for f in dataclasses.fields(rt.Tracks):

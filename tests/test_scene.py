@@ -240,7 +240,7 @@ def write_page(folder: Path, in_3d: bool = True, scene: bool = True) -> Path:
     result = fitted(tracks_of_walk(poses), poses if in_3d else None, names=NAMES)
     result.warnings.append("a <b>warning</b>")
     link = rt.LinkEvent("join", (2, 6), 0.123456, 1.98765, True)
-    result.world = dataclasses.replace(result.world, links=(link,))
+    result = dataclasses.replace(result, world=dataclasses.replace(result.world, links=(link,)))
     result.save(folder / "out")
     write_pictures(result, folder / "out", video, overlay="none", scene=scene)
     return folder / "out/scene.html"
@@ -988,7 +988,7 @@ def test_frames_behind_the_solids_have_no_distortion(tmp_path: Path) -> None:
     cv2.polylines(image, [path], False, (255, 255, 255), 3, cv2.LINE_AA, 4)
     poses = dataclasses.replace(poses_of_walk(), camera=lens)
     result = rt.Result(tracks_of_walk(poses_of_walk()), NAMES, VideoInfo("a", WIDTH, HEIGHT, 25.0))
-    result.poses = poses
+    result = dataclasses.replace(result, poses=poses)
     pictures = Pictures(result, VIDEO)
     pictures.take(rt.Frame(0, 0.0, image))
     ((_, text),) = pictures.frames
@@ -1036,7 +1036,7 @@ def test_up_is_guessed_from_level_cameras(tmp_path: Path) -> None:
     """Without objects or poses that tell: the cameras of the walk are level, z is up."""
     poses = dataclasses.replace(poses_of_walk(), up_in_world=None)
     result = rt.Result(tracks_of_walk(poses), NAMES, VideoInfo("a", WIDTH, HEIGHT, 25.0))
-    result.poses, result.world = poses, rt.World("m", "user", 23, 0, 24)
+    result = dataclasses.replace(result, poses=poses, world=rt.World("m", "user", 23, 0, 24))
     write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
     (part,) = data_of(tmp_path / "a.html")["parts"]
     np.testing.assert_allclose(part["up"], [0, 0, 1], atol=0.05)
@@ -1048,7 +1048,9 @@ def test_long_videos_are_thinned(tmp_path: Path) -> None:
     poses = walk(4000)
     tracks = tracks_of(poses, 0.0)
     result = dataclasses.replace(fitted(tracks[tracks.frame < 9], None), poses=poses)
-    result.tracks = tracks[np.isin(tracks.frame, [30, 31, 32, 33, 300])]
+    result = dataclasses.replace(
+        result, tracks=tracks[np.isin(tracks.frame, [30, 31, 32, 33, 300])]
+    )
     write_scene(result, Pictures(result, VIDEO), tmp_path / "a.html", VIDEO)
     data = data_of(tmp_path / "a.html")
     assert data["steps"]["frame"] == list(range(0, 4000, 3))

@@ -41,7 +41,7 @@ def recorded(shift: float = 0.0, mirror: int = 1) -> rt.Result:
     row, item = np.divmod(np.arange(180), 6)
     columns = (boxes.reshape(-1, 4), np.full(180, 0.9), np.full(180, CUP), item)
     result = unlinked(poses, rt.Tracks(poses.frame[row], item + 1, item + 1, *columns))
-    result.identities_given = True
+    result = dataclasses.replace(result, identities_given=True)
     return result
 
 
@@ -91,7 +91,7 @@ def test_the_solvers_differ() -> None:
 
 def test_sfmo_of_three_objects_says_what_it_needs() -> None:
     result = recorded()
-    result.tracks = result.tracks[result.tracks.track_id <= 3]
+    result = dataclasses.replace(result, tracks=result.tracks[result.tracks.track_id <= 3])
     result = solved(result, solver="sfmo")
     assert {o.status for o in result.objects} == {"rejected"}
     assert {o.reason for o in result.objects} == {

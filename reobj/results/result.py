@@ -23,7 +23,7 @@ from reobj.types import Embeddings, IntArray, Tracks
 __all__ = ["Object", "Part", "Result", "VideoInfo", "World"]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Result:
     """Tracks, cameras and objects of a video.
 
@@ -121,7 +121,7 @@ class Result:
         doubtful: bool = False,
         more: Callable[[Path], None] | None = None,
         stale: Sequence[str] = (),
-    ) -> None:
+    ) -> Result:
         """Write tracks.txt, objects.json, and where there are cameras poses.txt and objects.ply.
 
         objects.json includes doubtful objects, tracks.txt only if `doubtful`. Each further
@@ -132,9 +132,12 @@ class Result:
         Args:
             more: writes further files into a given folder; they appear with the others.
             stale: files that are removed if `more` does not write them.
+
+        Returns:
+            The same result with `out`, which `summary` and the evaluation name.
         """
         saving.save(self, Path(out), doubtful, more, stale)
-        self.out = Path(out)
+        return dataclasses.replace(self, out=Path(out))
 
     @classmethod
     def load(cls, out: str | Path) -> Result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -130,7 +131,7 @@ def test_a_label_that_no_prior_knows_keeps_the_category(
     sizes = []
     for edits in (None, read_edits(path)):
         result = unlinked(poses, tracks)
-        result.edits = edits
+        result = dataclasses.replace(result, edits=edits)
         result = link_and_fit(result, ObjectsConfig(link=False))
         found = {o.id: o for o in result.objects}[2]
         sizes.append(np.array(found.size))

@@ -49,7 +49,9 @@ def plain() -> rt.Result:
     poses = walk(FRAMES)
     result = fitted(tracks_of(poses), poses)
     kinds = zip(result.objects, ("box", "cylinder", "ellipsoid"), strict=True)
-    result.objects = [dataclasses.replace(o, support=kind) for o, kind in kinds]
+    result = dataclasses.replace(
+        result, objects=[dataclasses.replace(o, support=kind) for o, kind in kinds]
+    )
     return result
 
 
@@ -98,7 +100,9 @@ def far_away(result: rt.Result) -> rt.Result:
     cams = result.poses.cam_from_world.copy()
     cams[:, :, 3] -= cams[:, :, :3] @ away
     moved = dataclasses.replace(with_poses(result, cams), fits=None)
-    moved.objects = [dataclasses.replace(o, center=o.center + away) for o in result.objects]
+    moved = dataclasses.replace(
+        moved, objects=[dataclasses.replace(o, center=o.center + away) for o in result.objects]
+    )
     return moved
 
 
@@ -192,7 +196,7 @@ def test_every_kind_of_result_is_written_drawn_and_exported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     result, out = kind(plain), tmp_path / "out"
-    result.video = VideoInfo(str(source.source), *SIZE, 30.0)
+    result = dataclasses.replace(result, video=VideoInfo(str(source.source), *SIZE, 30.0))
     result.save(out)
     for doubtful in (False, True):
         assert write_pictures(result, out, source, "solids,ellipses,trails", True, doubtful) == []
@@ -544,7 +548,7 @@ def test_names_that_the_terminal_cannot_show(
     names = (*rt.COCO_NAMES[:56], "桌子", *rt.COCO_NAMES[57:])
     workspace = Workspace(out)
     tracked = workspace.load_last()
-    tracked.class_names = names
+    tracked = dataclasses.replace(tracked, class_names=names)
     workspace.save_last(tracked, tracked.poses)
     assert rt.main(["objects", str(out)]) == 0
     stream.flush()

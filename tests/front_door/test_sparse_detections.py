@@ -267,9 +267,9 @@ def test_solids_are_not_missed_in_frames_that_nobody_looked_at() -> None:
     for looked in (np.arange(0, 40, 4), None):
         given = unlinked(walk())
         keep = given.tracks.frame % 4 == 0
-        given.tracks = given.tracks[keep]
+        given = dataclasses.replace(given, tracks=given.tracks[keep])
         given.tracks.score[:] = 0.35
-        given.looked = looked
+        given = dataclasses.replace(given, looked=looked)
         found = link_and_fit(given, rt.ObjectsConfig()).objects
         sure.append([o.confidence or 0.0 for o in found])
     assert len(sure[0]) == 3
