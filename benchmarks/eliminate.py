@@ -6,7 +6,8 @@
 Starts from all mechanisms of `real_rooms.py --without`. In each step the mechanism whose removal
 costs the least is removed as well, until a loss exceeds its noise. The cost of a removal is the
 mean loss of IDF1 over recordings and box noises, plus its loss of found objects and its gain of
-false ones (duplicates and elsewhere), each as a fraction of the true ones. Its noise is two
+false ones (duplicates and elsewhere), each as a fraction of the true ones, plus that of the overlap
+in 3D where it is measured. Its noise is two
 standard errors of these paired differences against the full set. Evaluations are lazy: a mechanism
 is measured again only while its earlier cost makes it a candidate for the next step, because costs
 rarely fall as others are removed. OUT/elimination.json keeps every evaluation, so that an
@@ -59,7 +60,8 @@ def losses(full: list[list[Figures]], reduced: list[list[Figures]]) -> np.ndarra
                 sum(f.get(k) or 0 for k in ("doubles", "elsewhere")) for f in (a, b)
             )
             objects = ((a.get("found") or 0) - (b.get("found") or 0) + false_b - false_a) / true
-            found.append((a.get("idf1") or 0) - (b.get("idf1") or 0) + objects)
+            others = sum((a.get(k) or 0) - (b.get(k) or 0) for k in ("idf1", "o3d"))
+            found.append(others + objects)
     return np.array(found)
 
 

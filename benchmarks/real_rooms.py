@@ -184,6 +184,19 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "proposals of untracked": {f"{COMPONENT}.HYPOTHESIS_SCORE": np.inf},
     "points in the fit": {"reobj.objects.fit.points_on": nothing},
     "seen through": {f"{COMPONENT}.see_through_ratio": never_seen_through},
+    "duplicate boxes": {f"{COMPONENT}.DUPLICATE_IOU": 2.0},
+    "classes that differ": {f"{ASSOCIATION}.SIMILAR_SIZE": 0.0},
+    "same position": {f"{ASSOCIATION}.SAME_POSITION": 0.0},
+    "limit of a proposal's gain": {f"{ASSOCIATION}.MAX_BOX_GAIN": np.inf},
+    "boxes at the border": {"reobj.objects.hypotheses.BORDER_WEIGHT": 1.0},
+    "heights of standing objects": {"reobj.objects.hypotheses.STANDING_HEIGHTS": (0.0, 1e6)},
+    "quartic size prior": {"quadrics.SIZE_WALL": 1e3},
+    "tie of round objects": {"quadrics.ROUND_LOG": 1e3},
+    "lower part occluded": {"quadrics.OCCLUDED_BELOW": 1e-12},
+    "pooled noise": {"quadrics.OBJECT_NOISE_DOF": 1e-3},
+    "votes of occluded objects": {
+        "quadrics.VOTES": ((0.75, 0.0, 0.0), (0.25, 0.0, quadrics.UNKNOWN_SIZE_LOG))
+    },
 }
 
 
