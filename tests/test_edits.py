@@ -18,7 +18,7 @@ import reobj_track as rt
 from reobj.objects import fit as fitting
 from reobj.objects.fit import link_and_fit
 from reobj.objects.occlusion import occluded_edges
-from reobj.results.edits import EDITS, apply_edits, kept_edits, read_edits
+from reobj.results.edits import apply_edits, kept_edits, read_edits
 from reobj.results.workspace import Workspace
 
 NAMES = ("chair", "cup")
@@ -214,7 +214,7 @@ def test_edits_stay_with_the_folder(folder: Path, tmp_path: Path, capsys: Any) -
         assert "3 corrections by hand applied" in capsys.readouterr().err
     assert rt.main(["objects", str(folder), "--edits", str(write(path))]) == 0  # none any more
     assert [o.id for o in rt.Result.load(folder).objects] == [1, 2, 3, 4, 5, 6]
-    assert not (folder / EDITS).exists()
+    assert not (folder / "edits.json").exists()
 
 
 def test_the_same_edits_make_the_same_files(folder: Path, tmp_path: Path) -> None:
@@ -244,12 +244,12 @@ def test_bad_edits_write_nothing(folder: Path, tmp_path: Path, capsys: Any, bad:
 
 def test_edits_that_fit_no_more_are_left_out_with_a_warning(folder: Path, capsys: Any) -> None:
     lost = {"do": "delete", "object": {"id": 1, "frame": 3, "box": [0, 0, 5, 5]}}
-    write(folder / EDITS, lost)
+    write(folder / "edits.json", lost)
     assert rt.main(["objects", str(folder)]) == 0
     said = capsys.readouterr().err
     assert "edit 1 (delete 1): no object has the box" in said
     assert "no correction of this file was applied" in said
-    assert len(rt.Result.load(folder).objects) == 6 and (folder / EDITS).exists()
+    assert len(rt.Result.load(folder).objects) == 6 and (folder / "edits.json").exists()
     assert '"edits":[]' in (folder / "scene.html").read_text()
 
 
@@ -263,18 +263,18 @@ def test_given_identities_replace_edits(folder: Path, tmp_path: Path, capsys: An
     shutil.copy(folder / "tracks.txt", tmp_path / "tracks.txt")
     assert rt.main(["objects", str(folder), "--tracks", str(tmp_path / "tracks.txt")]) == 0
     assert "edits.json removed" in capsys.readouterr().err
-    assert not (folder / EDITS).exists() and len(rt.Result.load(folder).objects) == 5
+    assert not (folder / "edits.json").exists() and len(rt.Result.load(folder).objects) == 5
     last = write(tmp_path / "e.json", {"do": "delete", "object": box_of(folder, 5)})
     assert rt.main(["objects", str(folder), "--edits", str(last)]) == 0  # upon given identities
     assert len(rt.Result.load(folder).objects) == 4
 
 
 def test_another_video_takes_no_edits_along(folder: Path, tmp_path: Path) -> None:
-    write(folder / EDITS)
+    write(folder / "edits.json")
     (tmp_path / "frames").mkdir()
     cv2.imwrite(str(tmp_path / "frames/0.png"), np.zeros((48, 64, 3), np.uint8))
     Workspace(folder).bind(rt.Video(tmp_path / "frames"), overwrite=True)
-    assert not (folder / EDITS).exists()
+    assert not (folder / "edits.json").exists()
 
 
 def test_embeddings_follow_their_rows(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from simulated import SIZE, chair_solids, fitted, tracks_of, walk
 import quadrics
 import reobj_track as rt
 from reobj.results.overlay import (
-    LEGEND_S,
     Overlay,
     draw_ellipses,
     draw_legend,
@@ -514,7 +513,7 @@ def test_the_legend_is_shown_first(chairs: rt.Result, tmp_path: Path) -> None:
     overlay.close(True)
     pictures, _ = film(overlay.path)
     panel = [picture[-60:-10, 8:20].astype(int).mean() < 90 for picture in pictures]
-    shown = int(LEGEND_S * rate)
+    shown = int(2 * rate)  # 2 s
     assert panel == [True] * shown + [False] * (12 - shown) and shown >= rate
 
 

@@ -1008,11 +1008,10 @@ def test_the_best_picture_comes_first() -> None:
     assert diverse_rows(weak, found, None, 3)[0] != own[7]
 
 
-def test_doubtful_objects_take_no_pictures_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doubtful_objects_take_no_pictures_from_others() -> None:
     result = fitted(tracks_of_walk(poses_of_walk()), None, names=NAMES)
     result.objects[:2] = [dataclasses.replace(o, status="doubtful") for o in result.objects[:2]]
-    monkeypatch.setattr(scene, "SCENE_MAX_CROPS", 18)
-    pictures = Pictures(result, VIDEO)
+    pictures = Pictures(result, VIDEO, max_crops=18)
     of = result.tracks.track_id[pictures.wanted]
     assert np.bincount(of, minlength=5).tolist() == [0, 1, 1, 8, 8]
 

@@ -53,10 +53,6 @@ def make_embedder(
     return Embedder(model, head, None, threads, offline, device)
 
 
-EDGE_SHARE = 1 / 28  # sigma of the masks' soft edge over the crop's side (chosen: 8 px of 224)
-CROP_STRIDE = 32  # of the map taken from crops: 7 x 7 for 224 px, as the last of a ResNet
-
-
 class CropEmbedder(Embedder):
     """Foreground and background embeddings as in re-OBJ: two masked crops of every object.
 
@@ -88,7 +84,8 @@ class CropEmbedder(Embedder):
     ) -> None:
         super().__init__(model, "none", layout, threads, offline, device)
         self.model = f"crops:{model}"
-        self.backbone.use_output_at_stride(CROP_STRIDE, self.layout.crop_px)
+        # stride 32: a map of 7 x 7 for 224 px, as the last of a ResNet
+        self.backbone.use_output_at_stride(32, self.layout.crop_px)
         self.head = None if self.trained else trained_head(self.model, head)
         self.conv_block = onnx_session(self.head, threads, device) if self.head else None
         if self.conv_block is not None:
@@ -151,7 +148,7 @@ class CropEmbedder(Embedder):
         """
         if self.trained:
             return np.concatenate([crops * on_object[..., None], crops * ~on_object[..., None]])
-        edge = self.layout.crop_px * EDGE_SHARE
+        edge = self.layout.crop_px / 28  # sigma of the soft edge: 8 px of 224
         soft = [cv2.GaussianBlur(o.astype(np.float32), (0, 0), edge) for o in on_object]
         grey = np.array(IMAGENET_MEAN[::-1], np.float32)
         fore = (crops - grey) * np.stack(soft)[..., None]

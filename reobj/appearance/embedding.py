@@ -349,9 +349,6 @@ def trained_head(model: str, head: str = "") -> Path | None:
 # ---- Embeddings on request ---------------------------------------------------------------------
 
 
-FLOAT32_MAX = float(np.finfo(np.float32).max)
-
-
 def as_embeddings(
     embeddings: Embeddings | npt.ArrayLike | None, count: int, width: int = 0
 ) -> Embeddings | None:
@@ -372,7 +369,7 @@ def as_embeddings(
         if rows.ndim != 2 or len(rows) != count:
             raise ReobjError(f"embeddings are an array of shape {rows.shape}, expected ({count}, "
                              "E): one row per detection")  # fmt: skip
-        if not np.abs(rows).max(initial=0) <= FLOAT32_MAX:  # False for NaN
+        if not np.abs(rows).max(initial=0) <= np.finfo(np.float32).max:  # False for NaN
             raise ReobjError("embeddings are not finite as float32")
     found = embeddings.foreground.shape[1] + embeddings.background.shape[1]
     if count and (not found or width not in (0, found)):

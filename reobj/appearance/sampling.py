@@ -61,11 +61,9 @@ class SamplingLayout:
     def updated(self, metadata: dict[str, Any]) -> SamplingLayout:
         """Apply the `layout` of a model's metadata, with current names or those of old versions."""
         stated = metadata.get("layout", {})
-        return dataclasses.replace(self, **{_EARLIER_NAMES.get(k, k): v for k, v in stated.items()})
-
-
-_EARLIER_NAMES = {"reach": "min_margin", "wide": "surround_scale",
-                  "wide_reach": "surround_min_margin", "wide_cells": "surround_cells"}  # fmt: skip
+        names = {"reach": "min_margin", "wide": "surround_scale",
+                 "wide_reach": "surround_min_margin", "wide_cells": "surround_cells"}  # fmt: skip
+        return dataclasses.replace(self, **{names.get(k, k): v for k, v in stated.items()})
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,6 @@ from reobj.poses.floor import Floor
 from reobj.sources.video import Video
 from reobj.types import Array, LinkEvent, ReobjError, visible_name
 
-EVIDENCE_DIGITS = 4  # of overlaps and log odds in the links; chosen: a box is measured to 1 in 100
 _JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
 
 
@@ -142,8 +141,8 @@ class World:
         values = _world_json(self) | {"parts": [_world_json(part) for part in self.parts]}
         links = [dataclasses.asdict(event) for event in self.links]
         for link in links:
-            link["place_iou"] = rounded(link["place_iou"], EVIDENCE_DIGITS)
-            link["appearance_log_odds"] = rounded(link["appearance_log_odds"], EVIDENCE_DIGITS)
+            for key in ("place_iou", "appearance_log_odds"):
+                link[key] = rounded(link[key], 4)  # a box is measured to 1 in 100
         return values | {"links": links}
 
     @staticmethod
@@ -189,16 +188,8 @@ class VideoInfo:
 
 # ---- From JSON ---------------------------------------------------------------------------------
 
-SHAPES = {  # of the arrays, by the name of their field
-    "center": (3,), "half_axes": (3,), "quat_wxyz": (4,), "size": (3,), "size_m": (3,),
-    "size_rel_sigma": (3,), "cov": (9, 9), "up_in_world": (3,), "normal": (3,), "middle": (3,),
-}  # fmt: skip
-FRAME_PAIRS = ("visits", "spans")  # fields that are lists of [first frame, last frame]
 POSITIVE = ("id", "width", "height", "fps", "metres_per_unit", "half_axes", "size", "size_m")
-EARLIER_KEYS = {"appearance_log_odds": "look"}  # of version 0.1
 NUMBER_MAX = 1e12  # of lengths; products of a few stay within the range of doubles
-INTEGER_MAX = 2**53  # the largest up to which JSON parsers that use doubles are exact
-SHOWN = 60  # characters of a file's own text in messages
 
 
 def decode(kind: Any, value: Any, at: str = "$", name: str = "") -> Any:
@@ -226,13 +217,13 @@ def decode(kind: Any, value: Any, at: str = "$", name: str = "") -> Any:
     if origin in (list, tuple):
         item = typing.get_args(kind)[0]
         values = [decode(item, v, f"{at}[{k}]") for k, v in enumerate(_checked(value, list, at))]
-        if name in FRAME_PAIRS and any(len(pair) != 2 for pair in values):
+        if name in ("visits", "spans") and any(len(pair) != 2 for pair in values):
             raise ReobjError(f"{at}: expected pairs of frames")
         return origin(values)
     if origin is dict:
         item = typing.get_args(kind)[1]
         pairs = _checked(value, dict, at).items()
-        return {k: decode(item, v, f"{at}.{k[:SHOWN]}") for k, v in pairs}
+        return {k: decode(item, v, f"{at}.{k[:60]}") for k, v in pairs}
     if kind in (int, float):
         return _decode_number(kind, value, at, name)
     return _checked(value, kind, at)
@@ -247,8 +238,8 @@ def _decode_record(kind: Any, value: Any, at: str) -> Any:
     values: dict[str, Any] = {}
     for f in dataclasses.fields(kind):
         key = _JSON_KEYS.get(f.name, f.name)
-        if key not in entry:
-            key = EARLIER_KEYS.get(key, key)
+        if key == "appearance_log_odds" and key not in entry:
+            key = "look"  # its name in version 0.1
         if key in entry:
             values[f.name] = decode(hints[f.name], entry[key], f"{at}.{key}", f.name)
         elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
@@ -260,7 +251,7 @@ def _decode_record(kind: Any, value: Any, at: str) -> Any:
 
 def _decode_array(value: Any, at: str, name: str) -> Array:
     """Convert nested lists of numbers to the array of a field."""
-    shape = SHAPES[name]
+    shape = {"quat_wxyz": (4,), "cov": (9, 9)}.get(name, (3,))
     try:
         array = np.array(_checked(value, list, at))
     except ValueError:  # lists of different lengths
@@ -277,7 +268,8 @@ def _decode_array(value: Any, at: str, name: str) -> Array:
 def _decode_number(kind: type, value: Any, at: str, name: str) -> int | float:
     """Check an integer, which is never negative, or a finite number."""
     if kind is int:
-        valid = isinstance(value, int) and 0 <= value <= INTEGER_MAX
+        # up to 2**53 JSON parsers that use doubles are exact
+        valid = isinstance(value, int) and 0 <= value <= 2**53
         expected = "an integer >= 0"
     else:
         valid = isinstance(value, int | float) and abs(value) <= NUMBER_MAX
@@ -290,18 +282,16 @@ def _decode_number(kind: type, value: Any, at: str, name: str) -> int | float:
     return typing.cast(float, value)
 
 
-EXPECTED = {list: "a list", dict: "an object", str: "a text", bool: "true or false"}
-
-
 def _checked(value: Any, kind: type, at: str) -> Any:
     """Return a value of the Python type, or raise."""
     if not isinstance(value, kind):
-        raise ReobjError(f"{at}: {_shown(value)}, expected {EXPECTED[kind]}")
+        names = {list: "a list", dict: "an object", str: "a text", bool: "true or false"}
+        raise ReobjError(f"{at}: {_shown(value)}, expected {names[kind]}")
     return value
 
 
 def _shown(value: Any) -> str:
     """Format a value for a message, however large it is."""
     if isinstance(value, list | dict):
-        return EXPECTED[type(value)]
-    return repr(value[:SHOWN] if isinstance(value, str) else value)
+        return "a list" if isinstance(value, list) else "an object"
+    return repr(value[:60] if isinstance(value, str) else value)

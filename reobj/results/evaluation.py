@@ -42,7 +42,6 @@ from reobj.types import (
 )
 
 MATCH_IOU = 0.5 - 1e-12  # least IoU of a match, except for HOTA (MOTChallenge: .5, inclusive)
-TINY = 1e-12  # least score of a pair, and least union
 
 _Step = tuple[IntArray, IntArray, Array]  # of a frame: truth (g,), result (p,), IoU (g, p)
 
@@ -71,7 +70,7 @@ def _frame_steps(truth: LabelledBoxes, predicted: LabelledBoxes) -> list[_Step]:
 def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
     """Assign rows to columns with the largest total score, without pairs of score 0."""
     rows, columns = linear_sum_assignment(-score)
-    positive = score[rows, columns] > TINY
+    positive = score[rows, columns] > 1e-12
     return rows[positive], columns[positive]
 
 
@@ -117,13 +116,11 @@ def score_tracks(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, fl
     return result | {"gt_objects": len(gt_ids), "identities": len(ids)}
 
 
-AWAY_FRAMES = 30  # frames without a box after which an object has left; chosen: about a second
-
-
-def visits(truth: LabelledBoxes, away: int = AWAY_FRAMES) -> IntArray:
+def visits(truth: LabelledBoxes, away: int = 30) -> IntArray:
     """Number the visits of each object: (N,) visit of each box, from 0.
 
-    A new visit begins after more than `away` frames without a box of the object.
+    Args:
+        away: a new visit begins after more frames without a box of the object (30: about a second).
     """
     order = np.lexsort((truth.frame, truth.identity))
     new = np.append(True, np.diff(truth.identity[order]) != 0)[: len(order)]
@@ -172,11 +169,11 @@ def _returns(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[str, float]
     return {"returns": len(kept), "returns_kept": sum(kept) / max(len(kept), 1)}
 
 
-QUERY_FRAMES = 10  # first frames of a return, whose boxes are queries; chosen: .3 s
-
-
 def return_ranks(
-    truth: LabelledBoxes, predicted: LabelledBoxes, embedding: npt.NDArray[Any]
+    truth: LabelledBoxes,
+    predicted: LabelledBoxes,
+    embedding: npt.NDArray[Any],
+    query_frames: int = 10,
 ) -> IntArray:
     """Rank the correct object by cosine similarity for the first views of every return.
 
@@ -186,6 +183,7 @@ def return_ranks(
 
     Args:
         embedding: (N, E) unit rows for the rows of `predicted`, NaN: not embedded.
+        query_frames: first frames of a return, whose boxes are queries (10: .3 s).
     Returns:
         (Q,) ranks from 1.
     """
@@ -202,7 +200,7 @@ def return_ranks(
         gallery = gallery[truth.name[g[gallery]] == truth.name[g[rows[0]]]]
         ids, of = np.unique(truth.identity[g[gallery]], return_inverse=True)
         if identity in ids:
-            queries = rows[truth.frame[g[rows]] < start + QUERY_FRAMES]
+            queries = rows[truth.frame[g[rows]] < start + query_frames]
             best = np.full((len(ids), len(queries)), -np.inf)
             np.maximum.at(best, of, embedding[p[gallery]] @ embedding[p[queries]].T)
             ranks.append(1 + (best > best[ids == identity]).sum(0))
@@ -214,8 +212,8 @@ def _hota(steps: Sequence[_Step], gt_size: IntArray, pr_size: IntArray) -> dict[
     align = np.zeros((len(gt_size), len(pr_size)))  # (G, P) soft number of common frames
     for g, p, iou in steps:
         union = iou.sum(0)[None] + iou.sum(1)[:, None] - iou
-        align[g[:, None], p[None]] += iou / np.maximum(union, TINY)
-    align /= np.maximum(gt_size[:, None] + pr_size[None] - align, TINY)  # soft Jaccard index
+        align[g[:, None], p[None]] += iou / np.maximum(union, 1e-12)
+    align /= np.maximum(gt_size[:, None] + pr_size[None] - align, 1e-12)  # soft Jaccard index
     pairs = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
     for g, p, iou in steps:
         a, b = _best_pairs(align[g[:, None], p[None]] * iou)
@@ -300,15 +298,13 @@ def identity_map(truth: LabelledBoxes, predicted: LabelledBoxes) -> dict[int, in
     return pairs | dict(zip(gt_ids[a].tolist(), ids[b].tolist(), strict=True))
 
 
-_COLUMNS = "HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split()
-_COUNTS = ("IDSW", "Frag", "ids_per_object")  # the other columns are rates
-
-
 def score_table(scores: dict[str, dict[str, float]]) -> str:
     """Format one line for each name, rates in per cent."""
-    lines = [f"{'':<14}" + "".join(f"{c[:7]:>8}" for c in _COLUMNS)]
+    counts = ("IDSW", "Frag", "ids_per_object")
+    columns = ("HOTA", "DetA", "AssA", "IDF1", "IDP", "IDR", "MOTA", *counts)
+    lines = [f"{'':<14}" + "".join(f"{c[:7]:>8}" for c in columns)]
     for name, score in scores.items():
-        cells = [score[c] * (1 if c in _COUNTS else 100) for c in _COLUMNS]
+        cells = [score[c] * (1 if c in counts else 100) for c in columns]
         lines.append(f"{name[:14]:<14}" + "".join(f"{cell:8.2f}" for cell in cells))
     return "\n".join(lines)
 
@@ -363,7 +359,7 @@ def evaluate(
     out = Path(out)
     names = COCO_NAMES
     tracked = None
-    if out.name == TRACKS_FILE and (out.parent / LAST_TRACKS).exists():
+    if out.name == "tracks.txt" and (out.parent / LAST_TRACKS).exists():
         out = out.parent
     notes: list[str] = []
     predicted = read_result(out, notes)
@@ -403,9 +399,6 @@ def evaluate(
         poses = Path(truth_poses) if truth_poses else None
         result["objects"] = score_objects(Result.load(out), Path(solids), poses, pairs)
     return result
-
-
-TRACKS_FILE = "tracks.txt"  # of an output folder
 
 
 def _of_classes(

@@ -80,7 +80,8 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     residual = rotation @ estimated[:, :, :3] @ truth[:, :, :3].swapaxes(1, 2)  # (f, 3, 3)
     cosine = (np.trace(residual, axis1=1, axis2=2) - 1) / 2  # of its angle
     centers = result.of_part(0).ellipsoids().center_in_world  # (S, 3)
-    if not len(centers) or not np.median(cosine) > math.cos(math.radians(SAME_AXES_DEG)):
+    # other conventions of the camera axes differ by 90 or 180 deg
+    if not len(centers) or not np.median(cosine) > math.cos(math.radians(10)):
         return similarity
     distance = float(np.median(np.linalg.norm(centers[:, None] - estimated[:, :, 3], axis=2)))
     points = [
@@ -90,11 +91,6 @@ def align_with_truth(result: Result, truth_poses: Path | None) -> tuple[float, A
     return _similarity(*points) or similarity
 
 
-# deg, largest angle between true and estimated camera axes of one convention; others differ by 90
-# or 180 deg (chosen)
-SAME_AXES_DEG = 10.0
-
-
 def _similarity(estimated: Array, truth: Array) -> tuple[float, Array, Array] | None:
     """Estimate scale, rotation and translation from points (N, 3) to points; None: degenerate."""
     similarity = import_pycolmap().estimate_sim3d(estimated, truth)
@@ -102,9 +98,6 @@ def _similarity(estimated: Array, truth: Array) -> tuple[float, Array, Array] | 
         return None
     rotation = np.asarray(similarity.rotation.matrix(), np.float64)
     return float(similarity.scale), rotation, np.asarray(similarity.translation)
-
-
-SAME_TIME_S = 0.02  # s between a frame and its true pose; chosen: half a frame at 25 Hz
 
 
 def _true_cameras(path: Path, poses: Poses) -> Array:
@@ -132,7 +125,7 @@ def _true_cameras(path: Path, poses: Poses) -> Array:
     pair = np.stack([(after - 1).clip(0), after])  # (2, F) the rows before and after
     difference = np.abs(table[pair, 0] - poses.time_s)  # (2, F)
     nearest = np.where(difference[0] <= difference[1], *pair)  # (F,)
-    unmatched = difference.min(0) > SAME_TIME_S
+    unmatched = difference.min(0) > 0.02  # s, half a frame at 25 Hz
     rotation = np.full((len(nearest), 3, 3), np.nan)
     xyzw = table[nearest, 4:]
     valid = np.isfinite(xyzw).all(1) & (np.linalg.norm(xyzw, axis=1) > 0)

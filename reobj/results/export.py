@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from reobj import __version__
 from reobj.cameras import (
+    CV_FROM_GL,
     Camera,
     Poses,
     camera_parameters,
@@ -313,13 +314,6 @@ def _cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
 
 
-NERF_MODELS = {  # nerfstudio's camera models, and their distortion parameters in its order
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
-}
-GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes; OpenGL: x right, y up, z backward
-
-
 def export_nerfstudio(result: Result, path: Path) -> None:
     """Write transforms.json for nerfstudio, with initial points and the images of a video.
 
@@ -349,9 +343,10 @@ def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, fol
     """
     world_from_cam = np.tile(np.eye(4), (len(poses.frame), 1, 1))
     world_from_cam[:, :3] = invert_rigid(poses.cam_from_world)
+    world_from_cam[:, :3, :3] = world_from_cam[:, :3, :3] @ CV_FROM_GL
     files = _image_files(video, poses, path.parent, folder)
     frames = [
-        {"file_path": files[frame], "transform_matrix": (pose @ GL_FROM_CV).tolist()}
+        {"file_path": files[frame], "transform_matrix": pose.tolist()}
         for frame, pose in zip(poses.frame.tolist(), world_from_cam, strict=True)
         if frame in files and np.isfinite(pose).all()
     ]
@@ -367,9 +362,11 @@ def _write_nerfstudio(poses: Poses, origin: Array, video: Video, path: Path, fol
 def _nerf_camera(camera: Camera, path: Path) -> dict[str, Any]:
     """Convert the intrinsics to nerfstudio's; warn about distortion that it does not support."""
     values = dict(zip(camera_parameters(camera.model), camera.params, strict=True))
-    model = "OPENCV_FISHEYE" if camera.model == "OPENCV_FISHEYE" else "OPENCV"
+    fisheye = camera.model == "OPENCV_FISHEYE"
+    model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
+    order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")  # nerfstudio's
     terms = {"k1": values.pop("k", 0.0)} | {k: v for k, v in values.items() if k[0] in "kp"}
-    known = {k: terms.get(k, 0.0) for k in NERF_MODELS[model]}
+    known = {k: terms.get(k, 0.0) for k in order}
     pinhole = {"f", "fx", "fy", "cx", "cy", "k"}
     if any(v for k, v in values.items() if k not in known and k not in pinhole):
         log.warning("%s: nerfstudio has no %s cameras: the rest of the distortion is left out",
@@ -411,8 +408,6 @@ def _image_files(video: Video, poses: Poses, target: Path, folder: Path) -> dict
 
 # ---- rerun -------------------------------------------------------------------------------------
 
-RRD_SIZE_PX = 640  # px, longer side of the images in a recording (chosen: 40 kB a frame)
-
 
 class Viewer:
     """A rerun recording: to a file, or live to its viewer while a video is tracked.
@@ -433,7 +428,8 @@ class Viewer:
         self.rr = rr
         self.video = video
         self.followed = False
-        self.shrink = min(1.0, RRD_SIZE_PX / max(video.width, video.height, 1))
+        # 640 px, longer side of the images: 40 kB a frame
+        self.shrink = min(1.0, 640 / max(video.width, video.height, 1))
         name = visible_name(Path(video.path).name)
         self.rec = rr.RecordingStream("reobj_track", recording_id=name)
         self.rec.set_log_time_enabled(False)  # same result, same timelines

@@ -25,23 +25,6 @@ import cv2
 
 from reobj.types import Image
 
-H264_SIZE_PX = 1280  # px, longest side; larger videos are downscaled (chosen: HD plays everywhere)
-# For OpenCV's encoder, which needs 1.5 bits a pixel: 30 MB a minute (chosen: labels are readable)
-VP8_SIZE_PX = 480  # px, longest side
-VP8_FPS = 15.0  # Hz, highest frame rate
-# x264's default quality; "superfast" needs half the time of "veryfast" and 1.3 times the bytes.
-# Without lookahead: with it, the same frames give different bytes every few runs (PyAV 18.1, one
-# thread, no B-frames).
-H264 = {
-    "preset": "superfast",
-    "crf": "23",
-    "x264-params": "bframes=0:threads=1:rc-lookahead=0:mbtree=0",
-}
-LEAST_FPS = 1.0  # Hz; at lower rates frames are repeated: a frame in WebM lasts at most 4 s
-LEAST_PX = 16  # px of a side: a block of the codecs; OpenCV's VP8 fails below
-KEYFRAME_S = 2  # s between keyframes, to which a player can seek (chosen)
-WEBM_HEAD = 1 << 16  # bytes; contains all before the first frame (FFmpeg: under 1000)
-
 
 def import_av() -> Any:
     """Import PyAV; None if it is missing or has no H.264 encoder."""
@@ -69,10 +52,13 @@ class FilmWriter:
         self.path = path.with_suffix(".webm" if av is None else ".mp4")
         # absolute: FFmpeg reads a folder 12:30/ as a protocol
         self.part = self.path.with_name(f".part-{self.path.name}").absolute()
-        shrink = min(1.0, (VP8_SIZE_PX if av is None else H264_SIZE_PX) / max(size))
-        self.every = 1 if av else max(math.ceil(fps / VP8_FPS - 1e-3), 1)  # 30.0001 fps is 30
-        self.repeat = math.ceil(LEAST_FPS / fps)
-        width, height = (max(int(side * shrink) // 2 * 2, LEAST_PX) for side in size)
+        # Longest side, px: HD plays everywhere. OpenCV's encoder needs 1.5 bits a pixel: at 480 px
+        # and 15 Hz 30 MB a minute, and labels are readable.
+        shrink = min(1.0, (480 if av is None else 1280) / max(size))
+        self.every = 1 if av else max(math.ceil(fps / 15 - 1e-3), 1)  # 30.0001 fps is 30
+        self.repeat = math.ceil(1 / fps)  # at least 1 Hz: a frame in WebM lasts at most 4 s
+        # 16 px are a block of the codecs; OpenCV's VP8 fails below
+        width, height = (max(int(side * shrink) // 2 * 2, 16) for side in size)
         self.size = (width, height)
         self.count = 0
         try:
@@ -146,10 +132,18 @@ class _H264:
         rate = Fraction(fps).limit_denominator(1001)  # such as 30000/1001
         # faststart: the index comes first, so that a browser plays the file while loading it
         self.file = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
-        self.stream = self.file.add_stream("h264", rate=rate, options=H264)
+        # x264's default quality; "superfast" needs half the time of "veryfast" and 1.3 times the
+        # bytes. Without lookahead: with it, the same frames give different bytes every few runs
+        # (PyAV 18.1, one thread, no B-frames).
+        options = {
+            "preset": "superfast",
+            "crf": "23",
+            "x264-params": "bframes=0:threads=1:rc-lookahead=0:mbtree=0",
+        }
+        self.stream = self.file.add_stream("h264", rate=rate, options=options)
         self.stream.width, self.stream.height = size
         self.stream.pix_fmt = "yuv420p"  # the only format that all browsers decode
-        self.stream.gop_size = max(1, round(KEYFRAME_S * fps))
+        self.stream.gop_size = max(1, round(2 * fps))  # a player can seek every 2 s
 
     def write(self, image: Image) -> None:
         # Converted by OpenCV: FFmpeg's result depends on the memory alignment of the image
@@ -189,7 +183,7 @@ class _VP8:
     def close(self) -> None:
         self.writer.release()
         with contextlib.suppress(FileNotFoundError), self.path.open("r+b") as file:
-            head = file.read(WEBM_HEAD)
+            head = file.read(1 << 16)  # all before the first frame; FFmpeg writes under 1000 bytes
             file.seek(0)
             file.write(_with_clock(_with_fixed_uid(head), self.fps, self.count))
 

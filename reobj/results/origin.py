@@ -11,8 +11,6 @@ from reobj.cameras import Poses, invert_rigid
 from reobj.results.result import Result
 from reobj.types import Array
 
-FAR = 100  # extents; float32 has 24 bits: 2 ** -24 of 100 extents is 6e-6 of one
-
 
 def far_origin(poses: Poses | None, points: Array | None = None) -> Array:
     """Return a point (3,) amid the cameras of a world if its origin is far away, else zeros.
@@ -28,7 +26,8 @@ def far_origin(poses: Poses | None, points: Array | None = None) -> Array:
     middle = np.median(eye, 0)
     every = eye if points is None else np.concatenate([eye, points])
     extent = float(np.linalg.norm(every - middle, axis=1).max())
-    if not np.linalg.norm(middle) > FAR * extent > 0:
+    # float32 has 24 bits: 2 ** -24 of 100 extents is 6e-6 of one
+    if not np.linalg.norm(middle) > 100 * extent > 0:
         return np.zeros(3)
     step = 10.0 ** math.floor(math.log10(extent))
     return np.asarray(np.round(middle / step) * step)

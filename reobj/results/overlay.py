@@ -28,10 +28,6 @@ from reobj.sources.image_files import IMAGE_FPS
 from reobj.sources.video import Video
 from reobj.types import Array, BoolArray, Frame, Image, IntArray, ReobjError, Tracks, object_color
 
-LAYERS = ("boxes", "solids", "ellipses", "trails")
-OFF = ("none", "false", "no", "off", "0")
-ON = ("true", "yes", "on", "1")
-
 Color = tuple[int, int, int]
 
 
@@ -41,23 +37,21 @@ def film_layers(text: str) -> frozenset[str]:
     >>> sorted(film_layers("solids, trails"))
     ['boxes', 'solids', 'trails']
     """
+    layers = ("boxes", "solids", "ellipses", "trails")
     words = {word.strip().lower() for word in str(text).split(",")}
-    if len(words) == 1 and words <= {*OFF, ""}:
+    if len(words) == 1 and words <= {"none", "false", "no", "off", "0", ""}:
         return frozenset()
-    words = {"solids" if word in ON else word for word in words}
-    if unknown := sorted(words - set(LAYERS)):
-        close = difflib.get_close_matches(unknown[0], (*LAYERS, "none"), 1, 0)[0]
-        expected = f"{', '.join(LAYERS)} (several with commas) or none; did you mean {close}?"
+    words = {"solids" if word in ("true", "yes", "on", "1") else word for word in words}
+    if unknown := sorted(words - set(layers)):
+        close = difflib.get_close_matches(unknown[0], (*layers, "none"), 1, 0)[0]
+        expected = f"{', '.join(layers)} (several with commas) or none; did you mean {close}?"
         raise ReobjError(f"--set output.overlay={text}: expected {expected}")
     return frozenset(words | {"boxes"})
 
 
 # ---- Boxes and labels --------------------------------------------------------------------------
 
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-FONT_SCALE = 0.45  # readable at 640 px width (chosen)
-LABEL_MAX = 24  # characters of a class name in a label (chosen: 200 px)
-DASH_PX = 6  # px, dashes of interpolated boxes
+FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.45)  # and its scale: readable at 640 px width
 
 
 def draw_tracks(
@@ -99,7 +93,7 @@ def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed:
         return
     corners = np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]])
     for a, b in itertools.pairwise(corners):
-        steps = max(1, int(np.abs(b - a).max() / DASH_PX))
+        steps = max(1, int(np.abs(b - a).max() / 6))  # dashes of 6 px
         points = np.linspace(a, b, steps + 1).round().astype(np.int32)  # (steps + 1, 2)
         dashes = [points[i : i + 2] for i in range(0, steps, 2)]
         cv2.polylines(image, dashes, False, color, thickness, cv2.LINE_AA)
@@ -107,7 +101,7 @@ def _draw_box(image: Image, box: IntArray, color: Color, thickness: int, dashed:
 
 def _text_size(text: str) -> tuple[int, int]:
     """Return the width and height of a label."""
-    (width, height), base = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
+    (width, height), base = cv2.getTextSize(text, *FONT, 1)
     return width + 4, height + base + 2
 
 
@@ -117,8 +111,8 @@ def _draw_label(image: Image, text: str, spot: tuple[int, int], color: Color) ->
     width, height = _text_size(text)
     cv2.rectangle(image, (x, y), (x + width - 1, y + height - 1), color, -1)
     ink = (0,) * 3 if sum(color) > 380 else (255,) * 3  # black on light colours
-    _, base = cv2.getTextSize(text, FONT, FONT_SCALE, 1)
-    cv2.putText(image, text, (x + 2, y + height - base), FONT, FONT_SCALE, ink, 1, cv2.LINE_AA)
+    _, base = cv2.getTextSize(text, *FONT, 1)
+    cv2.putText(image, text, (x + 2, y + height - base), *FONT, ink, 1, cv2.LINE_AA)
 
 
 def place_labels(
@@ -167,8 +161,6 @@ def _label_corners(box: IntArray, size: IntArray) -> IntArray:
 
 # ---- Ellipses ----------------------------------------------------------------------------------
 
-MAX_AXIS = 4  # longer image sides; larger outlines, of objects beside the camera, are not drawn
-
 
 def draw_ellipses(
     image: Image, dual_c: Array, drawn: BoolArray, object_id: Sequence[int], seen: set[int]
@@ -181,8 +173,13 @@ def draw_ellipses(
     """
     for conic, wanted, obj in zip(dual_c, drawn, object_id, strict=True):
         shape = ellipse_of_dual_conic(conic) if wanted else None
-        if shape is not None and max(shape[1]) < MAX_AXIS * max(image.shape):
+        if shape is not None and max(shape[1]) < _max_outline(image):
             cv2.ellipse(image, shape, object_color(obj), 2 if obj in seen else 1, cv2.LINE_AA)
+
+
+def _max_outline(image: Image) -> int:
+    """Return the extent from which outlines, of objects beside the camera, are not drawn, px."""
+    return int(4 * max(image.shape))
 
 
 def ellipse_of_dual_conic(
@@ -208,10 +205,6 @@ def ellipse_of_dual_conic(
 
 
 # ---- Boxes and cylinders in 3D -----------------------------------------------------------------
-
-NEAR = 0.05  # longest half extents, least depth at which an edge of a solid is drawn (chosen)
-BEND = 8  # segments of an edge where the lens distorts (chosen: looks smooth)
-SHIFT = 4  # sub-pixel bits of OpenCV's lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +271,7 @@ def wireframes(ellipsoids: quadrics.Ellipsoids, support: Sequence[str | None]) -
         values = (
             mesh[0] * half @ turn.T + center, mesh[1] + points, mesh[2] + faces, mesh[3],
             np.full(count, k), np.c_[normal, mesh[4][:, 3] + normal @ center],
-            np.full(count, NEAR * half.max()),
+            np.full(count, 0.05 * half.max()),  # nearer edges are not drawn
         )  # fmt: skip
         for column, array in zip(columns, values, strict=True):
             column.append(array)
@@ -359,10 +352,11 @@ def draw_wireframes(
         seen: identities with a box in this frame; other solids are thin, without occluded edges.
     """
     ends, edge, front = frames.segments(cam_from_world)
-    pieces = 1 if camera.model == "PINHOLE" else BEND
+    pieces = 1 if camera.model == "PINHOLE" else 8  # segments of an edge: 8 look smooth
     fraction = np.linspace(0, 1, pieces + 1)[:, None]  # (B + 1, 1)
     line = ends[:, :1] + fraction * (ends[:, 1:] - ends[:, :1])  # (n, B + 1, 3)
     pixels = scale * image_points(camera, line) - 0.5  # OpenCV draws with the pixel's centre at 0
+    shift = 4  # sub-pixel bits of OpenCV's lines
     solids, first = np.unique(frames.solid[edge], return_index=True)  # their edges are consecutive
     stop = np.append(first, len(edge))[1:]  # (S,)
     edges_of = {k: slice(a, b) for k, a, b in zip(solids.tolist(), first, stop, strict=True)}
@@ -371,26 +365,23 @@ def draw_wireframes(
         obj = object_id[k]
         if not drawn[k] or not _fits(pixels[rows], image):
             continue
-        lines = np.round(pixels[rows] * (1 << SHIFT)).astype(np.int32)
+        lines = np.round(pixels[rows] * (1 << shift)).astype(np.int32)
         shown = front[rows]
         color = object_color(obj)
         dim = tuple(int(0.6 * c) for c in color)
         if obj in seen:
-            cv2.polylines(image, list(lines[~shown]), False, dim, 1, cv2.LINE_AA, SHIFT)
+            cv2.polylines(image, list(lines[~shown]), False, dim, 1, cv2.LINE_AA, shift)
         width = 2 if obj in seen else 1
-        cv2.polylines(image, list(lines[shown]), False, color, width, cv2.LINE_AA, SHIFT)
+        cv2.polylines(image, list(lines[shown]), False, color, width, cv2.LINE_AA, shift)
 
 
 def _fits(pixels: Array, image: Image) -> bool:
     """Test whether an outline (n, B, 2) is finite and not too large (object beside the camera)."""
     flat = pixels.reshape(-1, 2)
-    return bool(np.isfinite(flat).all() and np.ptp(flat, 0).max() < MAX_AXIS * max(image.shape))
+    return bool(np.isfinite(flat).all() and np.ptp(flat, 0).max() < _max_outline(image))
 
 
 # ---- The video ---------------------------------------------------------------------------------
-
-LEGEND_S = 2.0  # s that the legend is shown (chosen: long enough to read)
-TRAIL_S = 1.0  # s, length of a trail (chosen)
 
 
 class Overlay:
@@ -412,7 +403,8 @@ class Overlay:
         self.scale = self.size[0] / video.size[0]
         self.tracks = result.tracks
         self.measured = {o.id for o in result.located if o.status == "ok"}
-        self.labels = {o.id: f"{o.id} {cut(o.class_name, LABEL_MAX)}" for o in result.objects}
+        # 24 characters are 200 px
+        self.labels = {o.id: f"{o.id} {cut(o.class_name, 24)}" for o in result.objects}
         self.outlines = _project_all(result, self.scale, self.layers)
         self.label_positions: dict[int, int] = {}
         self.cameras = _cameras(result) if "solids" in self.layers else {}
@@ -430,7 +422,7 @@ class Overlay:
             self._draw_trails(image, rows)
         thin = self._draw_solids(image, frame.index, seen)
         draw_tracks(image, rows, self.labels, self.scale, self.label_positions, thin)
-        if self.legend and self.writer.count < LEGEND_S * self.fps:
+        if self.legend and self.writer.count < 2 * self.fps:  # 2 s are enough to read it
             draw_legend(image, self.legend)
         self.writer.write(image)
 
@@ -454,12 +446,12 @@ class Overlay:
         return frozenset(shown & seen)
 
     def _draw_trails(self, image: Image, rows: Tracks) -> None:
-        """Draw the path of the centre of each box in the last TRAIL_S seconds."""
+        """Draw the path of the centre of each box in the last second."""
         now = self.writer.count
         for obj, box in zip(rows.track_id.tolist(), rows.xyxy * self.scale, strict=True):
             trail = self.trails.setdefault(obj, [])
             trail.append((now, box.reshape(2, 2).mean(0)))
-            trail[:] = [step for step in trail if step[0] >= now - TRAIL_S * self.fps]
+            trail[:] = [step for step in trail if step[0] >= now - self.fps]
             line = np.array([center for _, center in trail]).round().astype(np.int32)  # (n, 2)
             cv2.polylines(image, [line], False, object_color(obj), 2, cv2.LINE_AA)
 
@@ -521,10 +513,6 @@ def _project_all(
 
 # ---- Legend ------------------------------------------------------------------------------------
 
-LEGEND_COLOR = object_color(1)
-LINE_PX = 20  # px, height of a line
-SWATCH_PX = 30  # px, width of the sample beside it
-
 
 def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
     """List the kinds of lines in this video and their meaning."""
@@ -536,27 +524,30 @@ def _legend(result: Result, layers: frozenset[str]) -> list[tuple[str, str]]:
         lines.append(("solid", f"its {name} in 3D, back-projected"))
         lines.append(("thin", f"{name} not detected in this frame"))
     if "trails" in layers:
-        lines.append(("trail", f"its way in the last {TRAIL_S:.0f} s"))
+        lines.append(("trail", "its way in the last 1 s"))
     return lines
 
 
 def draw_legend(image: Image, lines: Sequence[tuple[str, str]]) -> None:
     """Draw a legend on a dark panel at the bottom left, in place."""
-    width = SWATCH_PX + 16 + max(_text_size(text)[0] for _, text in lines)
-    height = LINE_PX * len(lines) + 8
+    line_px = 20  # height of a line
+    sample_px = 30  # width of the sample beside its text
+    color = object_color(1)
+    width = sample_px + 16 + max(_text_size(text)[0] for _, text in lines)
+    height = line_px * len(lines) + 8
     top = max(0, image.shape[0] - height - 6)
     panel = image[top : top + height, 6 : 6 + width]
     panel[:] = panel // 4
     for k, (kind, text) in enumerate(lines):
         x = 12
-        y = top + 4 + LINE_PX * k
-        box = np.array([x, y + 4, x + SWATCH_PX - 8, y + LINE_PX - 5])
+        y = top + 4 + line_px * k
+        box = np.array([x, y + 4, x + sample_px - 8, y + line_px - 5])
         if kind in ("box", "dashed"):
-            _draw_box(image, box, LEGEND_COLOR, 1 + (len(lines) == 1), kind == "dashed")
+            _draw_box(image, box, color, 1 + (len(lines) == 1), kind == "dashed")
         else:
-            middle = y + LINE_PX // 2
+            middle = y + line_px // 2
             thickness = 1 if kind == "thin" else 2
-            cv2.line(image, (x, middle), (x + SWATCH_PX - 8, middle), LEGEND_COLOR, thickness,
+            cv2.line(image, (x, middle), (x + sample_px - 8, middle), color, thickness,
                      cv2.LINE_AA)  # fmt: skip
-        at = (x + SWATCH_PX, y + LINE_PX - 6)
-        cv2.putText(image, text, at, FONT, FONT_SCALE, (255, 255, 255), 1, cv2.LINE_AA)
+        at = (x + sample_px, y + line_px - 6)
+        cv2.putText(image, text, at, *FONT, (255, 255, 255), 1, cv2.LINE_AA)

@@ -20,8 +20,6 @@ SAME_CLASS_MIN = 8
 # deg, parallax of an object seen from around: if its size still rests on the prior, the boxes are
 # inaccurate, and more parallax does not help (redkitchen)
 AROUND_DEG = 10.0
-MEASURABLE_MIN = 3  # objects; chosen: one or two without parallax are normal
-BOXES_MIN = 50  # boxes of high score; chosen: of fewer the majority is chance
 
 
 def implausible(
@@ -59,7 +57,9 @@ def _nothing_measured(result: Result, still: Sequence[Object]) -> str:
     """Warn if there are cameras and objects, but no object is measured or has a large parallax."""
     poses = result.poses
     measured = any(o.status == "ok" or (o.parallax_deg or 0.0) >= AROUND_DEG for o in still)
-    if poses is None or not poses.known.any() or measured or len(still) < MEASURABLE_MIN:
+    if poses is None or not poses.known.any() or measured:
+        return ""
+    if len(still) < 3:  # one or two objects without parallax are normal
         return ""
     cameras = "" if poses.source == "user" else "--camera (intrinsics), --poses, or "
     return (
@@ -94,7 +94,7 @@ def _unexplained(result: Result, high_score: float, new_score: float) -> str:
     strong = Tracks.joined([tracks[~weak], result.untracked[result.untracked.score >= high_score]])
     count = len(_distinct(listed))
     total = len(_distinct(strong))
-    if total < BOXES_MIN or 2 * count >= total:
+    if total < 50 or 2 * count >= total:  # of fewer boxes the majority is chance
         return ""
     text = f"{total - count} of {total} boxes of score {high_score:g} or more"
     text += " belong to no listed object"
@@ -117,17 +117,12 @@ def _unexplained(result: Result, high_score: float, new_score: float) -> str:
     )
 
 
-# Least IoU of two boxes of one object
-DOUBLED_IOU = 0.6  # in the same frame (NMS: .5 to .7)
-SAME_IOU = 0.3  # in consecutive frames, as in the tracker (reobj_track.LOW_IOU)
-
-
 def _doubled(rows: Tracks, others: Tracks) -> BoolArray:
     """Mark rows that overlap a better box of their class in the same frame."""
     doubled = np.zeros(len(rows), bool)
     for group in rows_by(rows.frame):
         same_frame = others[others.frame == rows.frame[group[0]]]
-        same = box_iou(rows.xyxy[group], same_frame.xyxy) > DOUBLED_IOU
+        same = box_iou(rows.xyxy[group], same_frame.xyxy) > 0.6  # NMS: .5 to .7
         same &= rows.class_id[group][:, None] == same_frame.class_id
         doubled[group] = (same & (same_frame.score > rows.score[group][:, None])).any(1)
     return doubled
@@ -141,7 +136,7 @@ def _alone(rows: Tracks, others: Tracks) -> BoolArray:
         at = np.searchsorted(frames, rows.frame[group[0]])
         beside = frames[[k for k in (at - 1, at + 1) if 0 <= k < len(frames)]]
         neighbours = others[np.isin(others.frame, beside)]
-        overlaps = box_iou(rows.xyxy[group], neighbours.xyxy) > SAME_IOU
+        overlaps = box_iou(rows.xyxy[group], neighbours.xyxy) > 0.3  # as in the tracker (LOW_IOU)
         same_class = rows.class_id[group][:, None] == neighbours.class_id
         alone[group] = ~(overlaps & same_class).any(1)
     return alone

@@ -13,8 +13,6 @@ from reobj.results.entries import Object
 if TYPE_CHECKING:
     from reobj.results.result import Result
 
-CLASS_MAX = 40  # characters of a class name in the table (chosen: a line of 120)
-
 
 def summary(result: Result) -> str:
     """Write the report that `run` prints."""
@@ -58,7 +56,7 @@ def _table(result: Result, counted: Sequence[Object]) -> list[str]:
         columns += f"{f'width x depth x height, {unit}':<26} {'sigma':>6}  "
     lines = [columns + "status"]
     for o in counted:
-        name = cut(o.class_name, CLASS_MAX)
+        name = cut(o.class_name, 40)  # for a line of 120 characters
         line = f"{o.id:>6}  {name:<14} {o.frames_seen:>6} {len(o.visits):>6}  "
         if has_sizes:
             line += _size_columns(o, in_metres)

@@ -32,7 +32,7 @@ from reobj.files import (
     save_npz,
     staged,
 )
-from reobj.results.edits import EDITS, write_edits
+from reobj.results.edits import write_edits
 from reobj.results.entries import Object, VideoInfo, World, decode
 from reobj.results.ply import write_ply
 from reobj.sources.tables import read_mot_rows
@@ -41,18 +41,6 @@ from reobj.types import Embeddings, ReobjError, Tracks, printable, without_secre
 if TYPE_CHECKING:
     from reobj.results.result import Result
 
-FORMAT = "reobj-objects"
-FORMAT_VERSION = 1  # of objects.json
-CONVENTIONS = {
-    "pose": "cam_from_world",
-    "camera_axes": "x right, y down, z forward",
-    "quaternion": "wxyz, world_from_obj",
-    "pixels": "centre of the top-left pixel at (0.5, 0.5) (COLMAP)",
-    "frames": "0-based",
-    "size": "full extents of the solid along its own axes",
-    "ellipsoid": "inscribed in a box or cylinder",
-    "cov": "9x9: center, log half axes, rotation vector in object axes",
-}
 LAST_POSES = "cache/last-poses.npz"  # in an output folder
 MODEL = "sparse"  # folder of a COLMAP model
 STALE = (  # files that not every run writes; cameras.csv: before 0.2
@@ -60,12 +48,12 @@ STALE = (  # files that not every run writes; cameras.csv: before 0.2
     LAST_POSES,
 )  # fmt: skip
 CONFIG_FILE = "config.toml"  # options of the last run
-FILES = (*STALE, "tracks.txt", "objects.json", "edits.json", CONFIG_FILE, f"{MODEL}/cameras.txt")
 
 
 def check_results(out: Path) -> None:
     """Check that results can be written into an output folder, before they are computed."""
-    check_places(out, FILES)
+    others = ("tracks.txt", "objects.json", "edits.json", CONFIG_FILE, f"{MODEL}/cameras.txt")
+    check_places(out, (*STALE, *others))
 
 
 @contextlib.contextmanager
@@ -140,7 +128,7 @@ def save(
     stale: Sequence[str],
 ) -> None:
     """Write the files of a result; for the arguments see `Result.save`."""
-    edited = () if result.edits is None else (EDITS,)
+    edited = () if result.edits is None else ("edits.json",)
     with replaced(out, (*STALE, *edited, *stale)) as new:
         write_mot(new / "tracks.txt", (result if doubtful else result.without_doubtful()).tracks)
         write_objects(result, new / "objects.json")
@@ -235,12 +223,21 @@ def write_objects(result: Result, path: Path) -> None:
             versions[name] = version(name)
     tracked = {"tracked_frames": len(np.unique(result.tracks.frame))}
     data = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
+        "format": "reobj-objects",
+        "version": 1,
         "command": " ".join(map(without_secrets, sys.argv)),
         "reobj_track": __version__,
         "versions": versions,
-        "conventions": CONVENTIONS,
+        "conventions": {
+            "pose": "cam_from_world",
+            "camera_axes": "x right, y down, z forward",
+            "quaternion": "wxyz, world_from_obj",
+            "pixels": "centre of the top-left pixel at (0.5, 0.5) (COLMAP)",
+            "frames": "0-based",
+            "size": "full extents of the solid along its own axes",
+            "ellipsoid": "inscribed in a box or cylinder",
+            "cov": "9x9: center, log half axes, rotation vector in object axes",
+        },
         "video": dataclasses.asdict(result.video) | tracked,
         "world": result.world.to_json(),
         "objects": [o.to_json() for o in result.objects],
@@ -262,8 +259,8 @@ def read_objects(path: Path) -> ObjectsFile:
 
 def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     """Describe a contradiction between entries of objects.json, or to the poses; "" if none."""
-    if (entries.format, entries.version) != (FORMAT, FORMAT_VERSION):
-        return f"expected format {FORMAT}, version {FORMAT_VERSION}"
+    if (entries.format, entries.version) != ("reobj-objects", 1):
+        return "expected format reobj-objects, version 1"
     ids = [o.id for o in entries.objects]
     if len(set(ids)) != len(ids):
         return "two objects of one id"
@@ -271,19 +268,17 @@ def _contradiction(entries: ObjectsFile, poses: Poses | None) -> str:
     described = len(entries.world.parts)
     if component_count not in (1, described):
         return f"{described} components of a trajectory that has {component_count}"
+    statuses = ("ok", "prior_dominated", "doubtful", "rejected", "tracked")
     for o in entries.objects:
         shape = (o.center, o.half_axes, o.size, o.quat_wxyz)
-        if o.status not in STATUSES or (o.located and any(value is None for value in shape)):
+        if o.status not in statuses or (o.located and any(value is None for value in shape)):
             return f"object {o.id} is {o.status} without a shape"
-        if o.quat_wxyz is not None and abs(np.linalg.norm(o.quat_wxyz) - 1) > UNIT_TOLERANCE:
+        # rounded to six digits its length is off by 1e-6
+        if o.quat_wxyz is not None and abs(np.linalg.norm(o.quat_wxyz) - 1) > 1e-3:
             return f"quat_wxyz of object {o.id} is not of length 1"
         if o.part >= max(component_count, described):
             return f"object {o.id} is in component {o.part}, which does not exist"
     return ""
-
-
-STATUSES = ("ok", "prior_dominated", "doubtful", "rejected", "tracked")
-UNIT_TOLERANCE = 1e-3  # of a quaternion's length; chosen: rounded to six digits it is off by 1e-6
 
 
 def objects_schema() -> Any:
@@ -307,7 +302,7 @@ def validate_objects(path: Path) -> list[str]:
     validator = validators.extend(Draft202012Validator, type_checker=types)(objects_schema())
     lines = []
     for found in validator.iter_errors(load_json(path)):
-        fault = cut(f"{found.json_path}: {found.message}", MESSAGE_SHOWN)
+        fault = cut(f"{found.json_path}: {found.message}", 200)  # it quotes the value
         lines.append(f"{path}: {printable(fault)}")
     return sorted(lines)
 
@@ -315,9 +310,6 @@ def validate_objects(path: Path) -> list[str]:
 def _is_finite(_: Any, value: Any) -> bool:
     """Check for a number; NaN, which Python's parser accepts, is none in JSON."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-MESSAGE_SHOWN = 200  # characters of an error, as it quotes the value
 
 
 # ---- Tracks before linking ---------------------------------------------------------------------

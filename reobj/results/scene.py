@@ -45,18 +45,11 @@ from reobj.types import (
     rows_by,
 )
 
-# Chosen: the page of a video of three minutes with 50 objects stays below 10 MB
-SCENE_CROPS = 8  # crops of an object
-SCENE_MAX_CROPS = 480  # crops of all objects
-SCENE_CROP_PX = 112  # px, longer side of a crop
-SCENE_FRAMES = 60  # video frames, behind the solids and beside the time slider
-SCENE_FRAME_PX = 640  # px, longer side of the frames in the page
-JPEG_QUALITY = 60  # WebP needs half the bytes and eight times the time (chosen)
-CROP_MARGIN = 0.1  # box sides, margin of a crop: shows what the object stands on (chosen)
-
 
 class Pictures:
     """Collect crops of the objects and whole frames for the viewer while the video is read.
+
+    Their numbers and sizes keep the page of a video of three minutes with 50 objects below 10 MB.
 
     Attributes:
         wanted: rows of the tracks to crop, ascending. whole: numbers of the frames to keep.
@@ -64,18 +57,19 @@ class Pictures:
         frames: [frame number, base64] of whole frames, undistorted.
     """
 
-    def __init__(self, result: Result, video: Video) -> None:
+    def __init__(self, result: Result, video: Video, max_crops: int = 480) -> None:
+        """Choose the crops, at most 8 of an object and `max_crops` of all, and 60 frames."""
         self.tracks = result.tracks
         self.scale = video.scale
         self.crops: dict[int, list[tuple[int, str]]] = {o.id: [] for o in result.objects}
         self.frames: list[tuple[int, str]] = []
         poses = [part.poses for part in result.parts()]
         chosen = [np.empty(0, np.int64)]
-        left = SCENE_MAX_CROPS
+        left = max_crops
         ranked = sorted(result.objects, key=lambda o: -o.frames_seen)
         for doubtful in (False, True):  # low-confidence objects get the remaining crops
             group = [o for o in ranked if (o.status == "doubtful") == doubtful]
-            count = min(max(left // max(len(group), 1), 1), SCENE_CROPS)
+            count = min(max(left // max(len(group), 1), 1), 8)
             rows = [diverse_rows(result.tracks, o, poses[o.part], count) for o in group[:left]]
             chosen = chosen + rows
             left = left - sum(map(len, rows))
@@ -84,7 +78,7 @@ class Pictures:
         cameras = result.poses
         if cameras is not None and cameras.known.any():
             shown = shown[cameras.known[np.searchsorted(cameras.frame, shown)]]
-        self.whole = set(shown[:: math.ceil(len(shown) / SCENE_FRAMES) or 1].tolist())
+        self.whole = set(shown[:: math.ceil(len(shown) / 60) or 1].tolist())
         self.camera = None if cameras is None else cameras.camera
         self.grid: npt.NDArray[np.float32] | None = None  # of undistorted pixels, made once
 
@@ -93,15 +87,15 @@ class Pictures:
         rows = self.wanted[self.tracks.frame[self.wanted] == frame.index]
         height, width = frame.image.shape[:2]
         for obj, box in zip(self.tracks.track_id[rows], self.tracks.xyxy[rows], strict=True):
-            margin = CROP_MARGIN * (box[2:] - box[:2])
+            margin = 0.1 * (box[2:] - box[:2])  # shows what the object stands on
             x1, y1 = ((box[:2] - margin) * self.scale).clip(0).astype(int)
             x2, y2 = np.minimum((box[2:] + margin) * self.scale + 1, (width, height)).astype(int)
             if x1 < x2 and y1 < y2:
-                crop = _jpeg(frame.image[y1:y2, x1:x2], SCENE_CROP_PX)
+                crop = _jpeg(shrunk(frame.image[y1:y2, x1:x2], 112))
                 self.crops[int(obj)].append((frame.index, crop))
         if frame.index in self.whole:
-            image = self._undistorted(shrunk(frame.image, SCENE_FRAME_PX))
-            self.frames.append((frame.index, _jpeg(image, SCENE_FRAME_PX)))
+            image = self._undistorted(shrunk(frame.image, 640))
+            self.frames.append((frame.index, _jpeg(image)))
 
     def _undistorted(self, image: Image) -> Image:
         """Undistort a small picture, so that projected solids coincide with their objects."""
@@ -126,10 +120,9 @@ def _distorted_grid(camera: Camera, width: int, height: int) -> npt.NDArray[np.f
     return np.nan_to_num(distorted, nan=-1.0).reshape(height, width, 2).astype(np.float32)
 
 
-def _jpeg(image: Image, size_px: int) -> str:
-    """Encode a small JPEG picture as base64."""
-    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    data = cv2.imencode(".jpg", shrunk(image, size_px), quality)[1]
+def _jpeg(image: Image) -> str:
+    """Encode a small picture as base64 of a JPEG; WebP: half the bytes, eight times the time."""
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
     return base64.b64encode(data.tobytes()).decode()
 
 
@@ -166,13 +159,10 @@ def diverse_rows(tracks: Tracks, obj: Object, poses: Poses | None, count: int) -
     return np.asarray(rows[chosen], np.int64)
 
 
-SCENE_STEPS = 1500  # most positions of the time slider; longer videos: every n-th frame (chosen)
-
-
 def scene_steps(result: Result) -> IntArray:
-    """List the frames (S,) of the time slider of the viewer."""
+    """List the frames (S,) of the time slider of the viewer: at most 1500, else every n-th."""
     frames = np.unique(result.tracks.frame) if result.poses is None else result.poses.frame
-    return frames[:: math.ceil(len(frames) / SCENE_STEPS) or 1]
+    return frames[:: math.ceil(len(frames) / 1500) or 1]
 
 
 def page_text() -> str:
@@ -202,7 +192,8 @@ def write_scene(
     count = len(np.unique(result.tracks.frame) if poses is None else poses.frame)
     seconds = video.config.every / (video.fps or IMAGE_FPS) * count / max(1, len(steps))
     of_part = np.zeros(len(steps), int) if poses is None else poses.part_of(steps)  # (S,)
-    thin = math.ceil(0 if poses is None else len(poses.points) / SCENE_POINTS) or 1
+    # every n-th point: 20,000 are .4 MB of the page
+    thin = math.ceil(0 if poses is None else len(poses.points) / 20_000) or 1
     parts, origins = zip(*(centred(part) for part in result.parts()), strict=True)
     data = {
         "title": Path(str(video.source)).name,
@@ -242,9 +233,6 @@ def _boxes_in(result: Result, frame: int) -> list[list[float]]:
         [i, *b]
         for i, b in zip(rows.track_id[finite].tolist(), box[finite].round(1).tolist(), strict=True)
     ]
-
-
-SCENE_POINTS = 20000  # most sparse points; else every n-th (chosen: .4 MB of the page)
 
 
 def _scene_cameras(result: Result, steps: IntArray, origins: Array) -> dict[str, Any]:

@@ -43,10 +43,11 @@ def detect_all(
     if source.recorded is not None:
         recorded = source.recorded
         return source, _rows(recorded.frame, recorded.xyxy, recorded.score, recorded.class_id)
+    names = ("frame", "xyxy", "score", "class_id")
     path = workspace.path("boxes", *detections_key(source, video))
     if source.key and (cached := load_cached(path, lambda p: load_npz(p, sealed=True))):
         columns, _ = cached
-        return source, _rows(*(columns[name] for name in COLUMNS))
+        return source, _rows(*(columns[name] for name in names))
     if source.cache is None:  # without a key it is not recognised in a later run
         folder = workspace.cache / "detections-once"
         shutil.rmtree(folder, ignore_errors=True)
@@ -67,11 +68,8 @@ def detect_all(
         xyxy, score, class_id = (np.concatenate(column) for column in zip(*steps, strict=True))
         rows = _rows(np.array(frames, np.int64), xyxy, score, class_id)
     if source.key:
-        save_npz(path, {name: getattr(rows, name) for name in COLUMNS})
+        save_npz(path, {name: getattr(rows, name) for name in names})
     return source, rows
-
-
-COLUMNS = ("frame", "xyxy", "score", "class_id")  # of detections as rows
 
 
 def _rows(frame: IntArray, xyxy: Array, score: Array, class_id: IntArray) -> Tracks:

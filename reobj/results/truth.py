@@ -29,7 +29,6 @@ from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
 SCORED = 0  # counts
 IGNORED = 1  # does not count; boxes of the result that match it are dropped
 ABSENT = 2  # left out
-UNNAMED = ("", "object")  # names of boxes without a class
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,20 +238,22 @@ def _names_of(number: IntArray, stated: Path | None, class_names: Sequence[str])
     return [names.get(str(n), str(n)) for n in number]
 
 
-KITTI_COLUMNS = (17, 18)  # number of columns without and with a score
-
-
 def _is_kitti(path: Path) -> bool:
     """Test whether the first line is a KITTI tracking label: its third word is a class."""
     words = next((line.split() for line in read_lines(path) if line.strip()), [])
-    return len(words) in KITTI_COLUMNS and not re.fullmatch(r"[-+.\deE]+", words[2])
+    return _has_kitti_columns(words) and not re.fullmatch(r"[-+.\deE]+", words[2])
+
+
+def _has_kitti_columns(words: Sequence[str]) -> bool:
+    """Test the number of columns: 17, with a score 18."""
+    return len(words) in (17, 18)
 
 
 def _read_kitti(path: Path, notes: list[str]) -> LabelledBoxes:
     """Read KITTI tracking labels: frame (from 0), id, type, ..., left, top, right, bottom, ..."""
     lines = [(at, line.split()) for at, line in enumerate(read_lines(path), 1) if line.strip()]
     try:
-        if bad := [at for at, words in lines if len(words) not in KITTI_COLUMNS]:
+        if bad := [at for at, words in lines if not _has_kitti_columns(words)]:
             raise ReobjError(f"{path}, line {bad[0]}: expected 17 columns as in KITTI's labels")
         table = np.array([[*words[:2], *words[6:10]] for _, words in lines], np.float64)
     except ReobjError:
@@ -347,8 +348,9 @@ def with_common_names(
     Returns:
         truth, result, and whether classes are compared.
     """
-    our_names = sorted(set(predicted.name.tolist()) - set(UNNAMED))
-    true_names = sorted(set(truth.name[truth.role == SCORED].tolist()) - set(UNNAMED))
+    unnamed = {"", "object"}  # names of boxes without a class
+    our_names = sorted(set(predicted.name.tolist()) - unnamed)
+    true_names = sorted(set(truth.name[truth.role == SCORED].tolist()) - unnamed)
     ours_of = {_normalised(name): name for name in our_names}
     renamed = {name: ours_of.get(_normalised(name), name) for name in set(truth.name.tolist())}
     names = np.array([renamed[name] for name in truth.name.tolist()], str)

@@ -23,7 +23,6 @@ from reobj.files import (
     locked,
     writing,
 )
-from reobj.results.edits import EDITS
 from reobj.results.entries import decode
 from reobj.results.result import Result
 from reobj.results.saving import (
@@ -38,9 +37,6 @@ from reobj.sources.video import InputConfig, Video
 from reobj.types import COORDINATE_MAX, ReobjError
 
 LAST_TRACKS = "cache/last-tracks.npz"  # in an output folder
-SOURCE = "cache/source.json"
-LOCK = "cache/lock"
-COUNT_MAX = 2**31 - 1  # frames, options of the input; int32 of OpenCV
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +51,7 @@ class _Frames:
 
 @dataclass(frozen=True, slots=True)
 class _Binding:
-    """Content of SOURCE that is read back."""
+    """Content of cache/source.json that is read back."""
 
     source: str
     input: dict[str, int]
@@ -80,6 +76,7 @@ class Workspace:
     def __init__(self, out: str | Path, overwrite: bool = False) -> None:
         self.out = out = Path(out)
         self.cache = out / "cache"
+        self._source_file = self.cache / "source.json"
         foreign = out.is_dir() and any(out.iterdir()) and not self.cache.is_dir()
         if out.exists() and not out.is_dir():
             raise ReobjError(f"{out}: is a file; -o wants a folder")
@@ -95,7 +92,7 @@ class Workspace:
     def __enter__(self) -> Workspace:
         check_results(self.out)
         try:
-            self._held.enter_context(locked(self.out / LOCK))
+            self._held.enter_context(locked(self.cache / "lock"))
         except LockedError:
             what = "another run is writing into this folder"
             raise ReobjError(f"{self.out}: {what}; wait for it, or choose another -o") from None
@@ -120,7 +117,7 @@ class Workspace:
             ReobjError: it is bound to another video, or to an earlier version of this one, and
                 `overwrite` is False; otherwise the earlier results are removed.
         """
-        path = self.out / SOURCE
+        path = self._source_file
         source = Path(str(video.source))
         fingerprint = {
             "source": str(source.absolute()) if source.exists() else str(video.source),
@@ -139,7 +136,7 @@ class Workspace:
                     advice = "choose another -o, or add --overwrite"
                     raise ReobjError(f"{self.out}: holds the results of {found}; {advice}")
                 remove_stale(self.out)
-                for name in ("tracks.txt", "objects.json", EDITS, LAST_TRACKS, LAST_POSES):
+                for name in ("tracks.txt", "objects.json", "edits.json", LAST_TRACKS, LAST_POSES):
                     (self.out / name).unlink(missing_ok=True)
         with atomic(path) as part:
             part.write_text(json.dumps(fingerprint))
@@ -156,7 +153,7 @@ class Workspace:
         try:
             return binding.source, InputConfig(**binding.input)
         except TypeError as error:  # an option of another version
-            raise ReobjError(f"{self.out / SOURCE}: {written_by(self.out)} ({error})") from error
+            raise ReobjError(f"{self._source_file}: {written_by(self.out)} ({error})") from error
 
     def video(self) -> Video:
         """Open the video that the folder is bound to, with the options of that run."""
@@ -184,7 +181,7 @@ class Workspace:
         try:
             return self.video(), []
         except ReobjError as error:
-            if not (self.out / SOURCE).is_file():
+            if not self._source_file.is_file():
                 raise
             source, config = self.source
             frame = result.tracks.frame if result.poses is None else result.poses.frame
@@ -196,7 +193,7 @@ class Workspace:
 
     def _read_binding(self) -> _Binding:
         """Read what `bind` wrote."""
-        path = self.out / SOURCE
+        path = self._source_file
         try:
             binding: _Binding = decode(_Binding, load_json(path))
         except ReobjError as error:
@@ -207,7 +204,7 @@ class Workspace:
         right_size = frames is None or (
             len(frames.size) == 2 and 1 <= min(frames.size) <= max(frames.size) <= COORDINATE_MAX
         )
-        if max(counts) > COUNT_MAX or not right_size:
+        if max(counts) >= 2**31 or not right_size:  # int32 of OpenCV
             raise ReobjError(f"{path}: a number is out of range; {written_by(self.out)}")
         return binding
 
@@ -235,7 +232,7 @@ class Workspace:
         """
         warnings = []
         tracked.save_tracked(self.out / LAST_TRACKS)
-        edits = self.out / EDITS
+        edits = self.out / "edits.json"
         if tracked.identities_given and edits.exists():
             edits.unlink()
             warnings.append(f"{edits} removed: the given identities replace it")

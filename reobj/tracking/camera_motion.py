@@ -17,8 +17,6 @@ from reobj.types import Array, Floats, Frame, Image
 
 FLOW_SIZE_PX = 320  # longer side of the image in which corners are followed (chosen, for speed)
 FLOW_CORNERS = 100  # corners followed (chosen, for speed; BoT-SORT: 1000)
-CORNER_QUALITY = 0.01  # least strength of a corner over that of the strongest (as BoT-SORT)
-CORNER_SPACING_PX = 12  # between corners of the small image, so that they spread (chosen)
 # nearest corners whose median is the parallax of a point (chosen). IoU of the true boxes with the
 # moved ones, against the transform alone: rendered room v900 .76 -> .82, room 0 at every 4th frame
 # .65 -> .78 (benchmarks/RESULTS.md)
@@ -129,7 +127,9 @@ def _step(old: Image | None, corners: Floats | None, image: Image) -> _Step:
         fit = _fit_similarity(corners[found, 0], np.asarray(moved)[found, 0])
         fit = fit or _fit_similarity(*_orb_matches(old, gray))
         new_from_old, residual_flow = fit or (new_from_old, residual_flow)
-    good = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, CORNER_QUALITY, CORNER_SPACING_PX)
+    # quality: strength over that of the strongest corner (as BoT-SORT); the distance, px of the
+    # small image, spreads the corners
+    good = cv2.goodFeaturesToTrack(gray, FLOW_CORNERS, qualityLevel=0.01, minDistance=12)
     small_from_image = np.diag([shrink, shrink, 1.0])
     return _Step(
         old,
@@ -141,17 +141,14 @@ def _step(old: Image | None, corners: Floats | None, image: Image) -> _Step:
     )
 
 
-ORB_POINTS = 300  # points of each image that are matched (chosen)
-ORB_FAST_THRESHOLD = 7  # contrast of a corner, of 255 (chosen below OpenCV's 20 for poor texture)
-
-
 def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
     """Match ORB points of two gray images by mutual nearest descriptors, at any distance.
 
     Returns:
         positions (K, 2) in the old and in the new image.
     """
-    orb = cv2.ORB.create(ORB_POINTS, fastThreshold=ORB_FAST_THRESHOLD)
+    # contrast of a corner, of 255: below OpenCV's 20 for poor texture
+    orb = cv2.ORB.create(nfeatures=300, fastThreshold=7)
     (in_old, old_words), (in_new, new_words) = (
         orb.detectAndCompute(image, None) for image in (old, new)
     )
@@ -167,7 +164,6 @@ def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
 # inliers that make a fit: in 450 pairs of frames of different videos at most 7 corners agreed
 FLOW_MIN_INLIERS = 8
 INLIER_PX = 2.0  # largest residual of an inlier in the small image (chosen; OpenCV: 3)
-DEEP_INLIERS = 0.5  # a scene is deep below this fraction of inliers (chosen)
 
 
 def _fit_similarity(old: Floats, new: Floats) -> tuple[Array, Array] | None:
@@ -184,6 +180,6 @@ def _fit_similarity(old: Floats, new: Floats) -> tuple[Array, Array] | None:
     if affine is None or inliers.sum() < FLOW_MIN_INLIERS:
         return None
     residual_flow = np.empty((0, 4))
-    if inliers.mean() < DEEP_INLIERS:
+    if inliers.mean() < 0.5:
         residual_flow = np.c_[old, new - old @ affine[:, :2].T - affine[:, 2]]
     return np.vstack([affine, [0, 0, 1]]), residual_flow

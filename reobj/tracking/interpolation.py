@@ -25,7 +25,6 @@ from reobj.types import (
 )
 
 MIN_END_IOU = 0.3  # overlap of the boxes at both ends; less: too much motion to interpolate
-WINDOW = 10  # frames on either side that the smoother reads; with 40 boxes move by 1.3 px at most
 
 
 def fill_gaps(
@@ -51,7 +50,8 @@ def fill_gaps(
         for i in np.flatnonzero((missed > 0) & (missed <= max_gap)):
             if box_iou(rows.xyxy[i : i + 1], rows.xyxy[i + 1 : i + 2])[0, 0] < MIN_END_IOU:
                 continue
-            window = np.abs(rows.frame - rows.frame[i]) <= (WINDOW + between[i]) * step
+            # 10 frames on either side; with 40 boxes move by 1.3 px at most
+            window = np.abs(rows.frame - rows.frame[i]) <= (10 + between[i]) * step
             at = (rows.frame[window] - rows.frame[window][0]) // step
             box = smooth_boxes(at, rows.xyxy[window])  # (F, 4) of every frame of the window
             frame = rows.frame[i] + step * np.arange(1, between[i] + 1)
