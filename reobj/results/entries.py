@@ -16,6 +16,7 @@ from reobj.poses.floor import Floor
 from reobj.sources.video import Video
 from reobj.types import Array, LinkEvent, ReobjError, visible_name
 
+# keys of objects.json that differ from the names of our fields
 _JSON_KEYS = {"class_name": "class", "tracklet_ids": "tracks", "visits": "frames"}
 
 
@@ -188,6 +189,7 @@ class VideoInfo:
 
 # ---- From JSON ---------------------------------------------------------------------------------
 
+# fields whose numbers are above 0
 POSITIVE = ("id", "width", "height", "fps", "metres_per_unit", "half_axes", "size", "size_m")
 NUMBER_MAX = 1e12  # of lengths; products of a few stay within the range of doubles
 

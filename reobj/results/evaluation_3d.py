@@ -20,7 +20,7 @@ from reobj.poses.supplied.pose_formats import matrix_rows
 from reobj.results.result import Object, Result
 from reobj.types import Array, IntArray, ReobjError, log
 
-MIN_HALF_AXIS = 0.005  # world units of the truth, m: sheets count as 1 cm thick (chosen)
+MIN_HALF_AXIS = 0.005  # m, as the truth: sheets count as 1 cm thick; volume IoU needs a volume
 
 
 def read_true_objects(path: Path) -> tuple[list[int], quadrics.Ellipsoids]:

@@ -15,7 +15,7 @@ import quadrics
 from reobj.files import atomic
 from reobj.types import Array, object_color
 
-CYLINDER_SIDES = 48  # sides of the prism that approximates a cylinder (chosen: looks round)
+CYLINDER_SIDES = 48  # sides of the prism that approximates a cylinder: looks round
 
 
 def write_ply(

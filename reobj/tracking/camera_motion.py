@@ -15,11 +15,11 @@ import numpy as np
 from reobj.sources.video import Video, one_ahead, shrunk
 from reobj.types import Array, Floats, Frame, Image
 
-FLOW_SIZE_PX = 320  # longer side of the image in which corners are followed (chosen, for speed)
-FLOW_CORNERS = 100  # corners followed (chosen, for speed; BoT-SORT: 1000)
-# nearest corners whose median is the parallax of a point (chosen). IoU of the true boxes with the
+FLOW_SIZE_PX = 320  # px, longer side of the image in which corners are followed: for speed
+FLOW_CORNERS = 100  # corners followed: for speed (BoT-SORT: 1000)
+# nearest corners whose median is the parallax of a point. IoU of the true boxes with the
 # moved ones, against the transform alone: rendered room v900 .76 -> .82, room 0 at every 4th frame
-# .65 -> .78 (benchmarks/RESULTS.md)
+# .65 -> .78 (v900: benchmarks/LOG.md)
 PARALLAX_CORNERS = 5
 
 
@@ -163,7 +163,7 @@ def _orb_matches(old: Image, new: Image) -> tuple[Floats, Floats]:
 
 # inliers that make a fit: in 450 pairs of frames of different videos at most 7 corners agreed
 FLOW_MIN_INLIERS = 8
-INLIER_PX = 2.0  # largest residual of an inlier in the small image (chosen; OpenCV: 3)
+INLIER_PX = 2.0  # px, largest residual of an inlier in the small image (OpenCV: 3; not measured)
 
 
 def _fit_similarity(old: Floats, new: Floats) -> tuple[Array, Array] | None:

@@ -24,7 +24,8 @@ from reobj.types import (
     xyxy_from_cxcywh,
 )
 
-MIN_END_IOU = 0.3  # overlap of the boxes at both ends; less: too much motion to interpolate
+# IoU of the boxes at both ends; less: too much motion to interpolate (not measured)
+MIN_END_IOU = 0.3
 
 
 def fill_gaps(
@@ -66,10 +67,11 @@ def fill_gaps(
     return Tracks.joined(tables)
 
 
-MIN_VISIBLE = 0.5  # fraction of the projected object in the image that makes a box (chosen)
-# A camera this near to another has the same view of an object: angle at the object, log ratio of
-# the distances. Chosen on hololens_kitchen, redkitchen and office_loop: up to 25 deg and 2 times
-# the distance are as good where no walls occlude.
+MIN_VISIBLE = 0.5  # fraction of the projected object in the image that makes a box (not measured)
+# A camera this near to another has the same view of an object: angle at the object (rad), log ratio
+# of the distances. Chosen on hololens_kitchen, redkitchen and office_loop: up to 25 deg and 2 times
+# the distance are as good where no walls occlude; without limits the IDF1 of office_loop falls from
+# .420 to .318 (benchmarks/RESULTS.md, "Gaps filled by projection").
 SAME_ANGLE = np.radians(10.0)
 SAME_LOG_DISTANCE = np.log(1.25)
 # Minimum fraction of a detection inside the projected object: it may be half occluded, but not
