@@ -17,9 +17,10 @@ from scipy import sparse
 from reobj.cameras import import_pycolmap
 from reobj.types import Array, BoolArray, IntArray
 
+MIN_TRI_ANGLE_DEG = 1.5  # between rays that triangulate a point (COLMAP's min_tri_angle)
 # Least n - |sum of u|^2 / n of the unit rays u to a point that triangulate it: it is
-# 1 - cos(angle) for two rays (COLMAP's min_tri_angle)
-MIN_RAY_SPREAD = 1 - np.cos(np.radians(1.5))
+# 1 - cos(angle) for two rays
+MIN_RAY_SPREAD = 1 - np.cos(np.radians(MIN_TRI_ANGLE_DEG))
 
 FOCAL_RANGE = (0.4, 2.0)  # plausible focal length over the longer side (chosen: 28-103 deg wide)
 
@@ -139,7 +140,6 @@ class Adjusted:
 # median of the errors: up to .005 .9 %, to .02 2 %, to .03 4 %, above more; kept at the estimate
 # from matches 4 %)
 MAX_FOCAL_SIGMA = 0.03
-MAX_CENTRE_SHIFT = 0.05  # of the principal point when it is freed, over the size (chosen)
 # Log of a ratio up to which two focal lengths are the same (measured where the principal point
 # drifts off, with and without it freed: right .0003, half of the true focal length .12 to .2)
 SAME_FOCAL = 0.05
@@ -187,14 +187,11 @@ def _calibrate(model: Any) -> bool:
     camera.params = start
     _bundle_adjust(model, True, True)
     free = camera.params[0]
-    if (np.abs(camera.params[1:3] / size - 0.5) <= MAX_CENTRE_SHIFT).all():
+    if (np.abs(camera.params[1:3] / size - 0.5) <= 0.05).all():  # else it drifts off
         return True
     camera.params = start
     _bundle_adjust(model, True, False)
     return bool(abs(np.log(camera.params[0] / free)) < SAME_FOCAL)
-
-
-SOFT_L1_PX = 0.5  # scale of the robust loss, pixels of the resized image (chosen)
 
 
 def _bundle_adjust(model: Any, calibrate: bool, free_centre: bool) -> None:
@@ -210,7 +207,7 @@ def _bundle_adjust(model: Any, calibrate: bool, free_centre: bool) -> None:
     options.refine_focal_length = options.refine_extra_params = calibrate
     options.refine_principal_point = free_centre
     options.ceres.loss_function_type = pc.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = SOFT_L1_PX
+    options.ceres.loss_function_scale = 0.5  # px of the resized image
     options.ceres.solver_options.function_tolerance = 1e-6
     options.ceres.solver_options.num_threads = 1  # reproducible
     for i in model.reg_image_ids():
@@ -219,11 +216,6 @@ def _bundle_adjust(model: Any, calibrate: bool, free_centre: bool) -> None:
 
 
 # ---- Covariance ----------------------------------------------------------------------------------
-
-
-CAUCHY_SIGMAS = 2.0  # scale of the robust weight of an observation, in sigmas (chosen)
-MIN_DEPTH = 0.01  # median depths; a point at a camera centre would have no uncertainty (chosen)
-MIN_NOISE_PX = 0.1  # of an observation, pixels of the resized image (chosen: SIFT's best)
 
 
 def relative_sigmas(arrays: ModelArrays, free_camera: bool) -> tuple[float, float]:
@@ -287,14 +279,14 @@ def _weighted_jacobians(arrays: ModelArrays) -> tuple[Array, Array, Array, Array
     unit = np.median(xyz_in_cam[:, 2])
     pose[:, :, 3] /= unit
     X, Y, Z = (xyz_in_cam / unit).T
-    in_front = Z > MIN_DEPTH
+    in_front = Z > 0.01  # a point at a camera centre would have no uncertainty
     Z = np.where(in_front, Z, 1)
     x = X / Z
     y = Y / Z
     zero = np.zeros(len(X))
     residual = xy - focal * np.column_stack([x, y])
-    noise = max(1.4826 * float(np.median(np.abs(residual))), MIN_NOISE_PX)
-    weight = 1 / (1 + (residual**2).sum(1) / (CAUCHY_SIGMAS * noise) ** 2)
+    noise = max(1.4826 * float(np.median(np.abs(residual))), 0.1)  # px: SIFT's best
+    weight = 1 / (1 + (residual**2).sum(1) / (2 * noise) ** 2)  # Cauchy's, scale 2 sigma
     scale = np.where(in_front, np.sqrt(weight) / noise, 0)
     by_shift = focal * np.array([[1 / Z, zero, -x / Z], [zero, 1 / Z, -y / Z]])  # (2, 3, m)
     by_shift = np.moveaxis(by_shift, 2, 0) * scale[:, None, None]

@@ -27,27 +27,26 @@ from reobj.types import Image, ReobjError
 # ---- The files of a job --------------------------------------------------------------------------
 
 
-JOB = "job.json"
-KEYFRAMES = "keyframes.npy"
-
-
 def write_job(folder: Path, job: dict[str, Any], images: Sequence[Image]) -> None:
     """Write a job and its keyframes (K, h, w, 3) BGR into a folder, which is made."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        np.save(folder / KEYFRAMES, np.stack(images))
-    with atomic(folder / JOB) as part:
+        np.save(folder / "keyframes.npy", np.stack(images))
+    with atomic(folder / "job.json") as part:
         part.write_text(json.dumps(job))
 
 
 def read_job(folder: Path) -> tuple[dict[str, Any], npt.NDArray[np.uint8]]:
     """Read a job and its keyframes (K, h, w, 3) BGR, mapped into memory."""
-    job = json.loads((folder / JOB).read_text())
-    images = np.load(folder / KEYFRAMES, mmap_mode="r")
+    job = json.loads((folder / "job.json").read_text())
+    images = np.load(folder / "keyframes.npy", mmap_mode="r")
     return job, images.view(np.ndarray)  # indexing a memmap itself is slow
 
 
 # ---- The process ---------------------------------------------------------------------------------
+
+
+LEFT_OVER_S = 60.0  # for the child of a killed run to end, which it does at once (observed)
 
 
 class Child:
@@ -59,15 +58,17 @@ class Child:
 
     Args:
         module: its main part calls `serve`. log_path: receives the child's stderr; its folder is
-            made.
+            made. wait_s: for the child of a killed run to end.
     Raises:
         ReobjError: the child of another process works in the folder.
     """
 
-    def __init__(self, module: str, folder: Path, log_path: Path) -> None:
+    def __init__(
+        self, module: str, folder: Path, log_path: Path, wait_s: float = LEFT_OVER_S
+    ) -> None:
         self.log_path = log_path
         try:
-            with locked(_lock_of(folder), LEFT_OVER_S):
+            with locked(_lock_of(folder), wait_s):
                 pass
         except LockedError:
             raise ReobjError(
@@ -117,7 +118,7 @@ class Child:
         line: Progress | None = None
         for text in self.process.stdout:
             words = text.decode(errors="replace").split()
-            if words == DONE.split():
+            if words == ["reobj:", "done"]:
                 break
             if len(words) != 4 or words[0] != "reobj:":
                 continue
@@ -137,11 +138,6 @@ class Child:
         return ""
 
 
-DONE = "reobj: done"
-PR_SET_PDEATHSIG = 1  # of Linux' sys/prctl.h
-LEFT_OVER_S = 60.0  # for the child of a killed run to end; chosen: it ends at once (observed)
-
-
 def _lock_of(folder: Path) -> Path:
     """Return the lock file that a child holds: beside its folder, which may be removed."""
     return folder.with_name(f"{folder.name}.lock")
@@ -153,14 +149,15 @@ def serve(job: Callable[[Path], None]) -> None:
     The process ends as soon as stdin does, also in the middle of a job: its parent is gone.
     """
     if sys.platform == "linux":  # at once, also in long calls of COLMAP that hold the interpreter
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        pr_set_pdeathsig = 1  # of sys/prctl.h
+        ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
     folder = Path(sys.argv[1])
     requests = threading.Semaphore(0)
     with locked(_lock_of(folder), LEFT_OVER_S):
         threading.Thread(target=_watch_parent, args=(requests,), daemon=True).start()
         while requests.acquire():
             job(folder)
-            print(DONE, flush=True)
+            print("reobj: done", flush=True)
 
 
 def _watch_parent(requests: threading.Semaphore) -> None:

@@ -30,10 +30,10 @@ from reobj.poses.keyframes import (
 )
 from reobj.poses.localize import beside_mapped, fill_gaps, locate_between
 from reobj.poses.mapping import ADVICE, FOCAL_GUESS
-from reobj.poses.sfm import Mapped, mapping_child, reconstruct
+from reobj.poses.sfm import Mapped, listed, mapping_child, reconstruct
 from reobj.types import Array, BoolArray, IntArray, ReobjError, option
 
-MAX_GAP = 15  # consecutive lost frames that are interpolated (chosen: half a second at 30 Hz)
+MAX_GAP = 15  # consecutive lost frames that are interpolated: half a second at 30 Hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +253,7 @@ def _locate_all(
 # ---- Keyframes -----------------------------------------------------------------------------------
 
 
-MAX_KEYFRAMES = 400  # a longer video has wider steps (chosen: 150 broke a walk of 373 photos)
+MAX_KEYFRAMES = 400  # a longer video has wider steps (measured: 150 broke a walk of 373 photos)
 
 
 def _enough_keyframes(video: ResizedVideo, most: int, line: Progress) -> list[ResizedFrame]:
@@ -336,9 +336,6 @@ def _exif_focal(video: Any) -> float:
 # ---- Messages ------------------------------------------------------------------------------------
 
 
-MAX_NAMED = 5  # breaks, or files, named in a message (chosen)
-
-
 def _breaks(poses: Poses) -> list[str]:
     """Report between which frames the trajectory broke; [] if it did not."""
     rows = np.flatnonzero(poses.known)
@@ -347,11 +344,9 @@ def _breaks(poses: Poses) -> list[str]:
         return []
     ends = zip(poses.frame[rows[last]].tolist(), poses.frame[rows[last + 1]].tolist(), strict=True)
     where = [f"{a} and {b}" for a, b in ends]
-    more = f" and {len(where) - MAX_NAMED} more" if len(where) > MAX_NAMED else ""
     return [
-        f"the reconstruction broke between frames {', '.join(where[:MAX_NAMED])}{more}: no "
-        "consistent model has both sides, even with more keyframes there; more overlap, slower "
-        "rotation, or --camera help"
+        f"the reconstruction broke between frames {listed(where)}: no consistent model has both "
+        "sides, even with more keyframes there; more overlap, slower rotation, or --camera help"
     ]
 
 
@@ -372,8 +367,8 @@ def _lost_frames(poses: Poses, tried: BoolArray, video: Any) -> list[str]:
         numbers = frame[mask].tolist()
         if not numbers:
             continue
-        files = [str(video.names[number]) for number in numbers[:MAX_NAMED]] if video.names else []
-        more = " ..." if files and len(numbers) > MAX_NAMED else ""
+        files = [str(video.names[number]) for number in numbers[:5]] if video.names else []
+        more = " ..." if len(numbers) > len(files) > 0 else ""
         named = f": {', '.join(files)}{more}" if files else ""
         groups.append(f"{spans(numbers, step)} ({len(numbers)}{named}) {reason}")
     if not groups:

@@ -92,33 +92,29 @@ def beside_mapped(keys: IntArray, mapped: IntArray, count: int) -> BoolArray:
     return np.asarray(before | after, bool)
 
 
-MAX_RUN = 1000  # frames held in memory between two keyframes (chosen: .3 GB of 640x480)
-
-
 def _segments(
-    key_rows: IntArray, grays: Iterator[Image]
+    key_rows: IntArray, grays: Iterator[Image], most: int = 1000
 ) -> Iterator[tuple[int, int, list[tuple[int, Image]]]]:
     """Cut the video at the mapped keyframes.
 
+    Args:
+        most: frames of a segment held in memory: .3 GB of 640x480.
     Yields:
         the image of the model before and after (-1: none), and (row, gray image) of both and of all
-        frames between them. The middle of a segment longer than MAX_RUN is left out.
+        frames between them. The middle of a longer segment is left out.
     """
     image_of = {int(row): image for image, row in enumerate(key_rows)}
     before = -1
-    run = deque[tuple[int, Image]](maxlen=MAX_RUN)
+    run = deque[tuple[int, Image]](maxlen=most)
     for row, gray in enumerate(grays):
         run.append((row, gray))
         image = image_of.get(row, -1)
-        if image >= 0 or (before >= 0 and len(run) == MAX_RUN):
+        if image >= 0 or (before >= 0 and len(run) == most):
             yield before, image, list(run)
             before = image
-            run = deque([(row, gray)], maxlen=MAX_RUN)
+            run = deque([(row, gray)], maxlen=most)
     if before >= 0:
         yield before, -1, list(run)
-
-
-PNP_POINTS = 200  # tracked from each keyframe, those with the longest tracks first (chosen)
 
 
 def _track_model_points(
@@ -132,7 +128,7 @@ def _track_model_points(
     """
     seen = np.flatnonzero(model.obs_image == image)
     longest = np.argsort(-model.track_length[model.obs_point[seen]], kind="stable")
-    seen = seen[longest[:PNP_POINTS]]
+    seen = seen[longest[:200]]
     scale = np.array(grays[0].shape[::-1]) / (model.cameras[0].width, model.cameras[0].height)
     # COLMAP has the centre of the first pixel at (.5, .5), OpenCV at (0, 0)
     points = model.obs_point[seen]
@@ -196,8 +192,6 @@ def _detours(cam_from_world: Array) -> BoolArray:
     return detour
 
 
-INTERPOLATED_PX = PNP_ERROR_PX  # the error allowed of an interpolated pose is that of PnP
-SHIFT_POINTS = 200  # whose shift in the image is measured, at least (chosen: time)
 NEAR_GAPS = 2.0  # gap lengths, before and after it, in which the error is measured (chosen)
 
 
@@ -214,9 +208,9 @@ def fill_gaps(
 ) -> tuple[Array, npt.NDArray[np.str_]]:
     """Interpolate the poses of at most `max_gap` consecutive lost frames where the error is small.
 
-    It must be below `INTERPOLATED_PX` (`_interpolation_px`). There is no extrapolation, and no
-    interpolation past a row of `unmapped`, a keyframe that mapping rejected. The rotation is
-    interpolated by slerp and the camera's centre linearly.
+    It must be below `PNP_ERROR_PX`, as that of PnP (`_interpolation_px`). There is no
+    extrapolation, and no interpolation past a row of `unmapped`, a keyframe that mapping rejected.
+    The rotation is interpolated by slerp and the camera's centre linearly.
 
     Args:
         model: whose points the frames see. key_rows: (R,) row of each of its images, ascending.
@@ -239,7 +233,7 @@ def fill_gaps(
         sides = known[: k + 1], known[k + 1 :]
         focal = float(shrink * camera.K[0, 0])
         error = _interpolation_px(sides, time_s, cam_from_world, points, focal, size)
-        if error <= INTERPOLATED_PX:
+        if error <= PNP_ERROR_PX:
             inner = np.arange(a + 1, b, dtype=np.int64)
             filled[inner] = _interpolated(cam_from_world[[a, b]], time_s[[a, b]], time_s[inner])
             status[inner] = "interpolated"
@@ -264,7 +258,7 @@ def _points_around(model: SparseModel, key_rows: IntArray, a: int, b: int) -> Ar
     first = int(np.searchsorted(key_rows, a - margin, "right")) - 1  # one before that, one after
     images = np.arange(max(first, 0), int(np.searchsorted(key_rows, b + margin)) + 1)
     seen = np.unique(model.obs_point[np.isin(model.obs_image, images)])
-    return model.points[seen[:: max(1, len(seen) // SHIFT_POINTS)]]
+    return model.points[seen[:: max(1, len(seen) // 200)]]  # fewer take less time
 
 
 def _interpolation_px(

@@ -38,14 +38,11 @@ ADVICE = (  # where no cause is established
     "what helps: textured objects in view, more overlap, sharp images, moving sideways instead of "
     "only turning, measured intrinsics (--camera)"
 )
-OR_POSES = "or give --poses; 2D identities need no poses"
-MAPPING = "mapping"  # name of the stage, for progress; it uses one core
 
 FOCAL_GUESS = 0.8  # over the longer side, where it cannot be estimated (phones: .72-.85)
 GOOD_REGISTERED = 0.9  # fraction of the keyframes in sound components that ends the search (chosen)
 GOOD_EXPLAINED = 0.9  # and of the verified matches (measured: right .91-1, wrong up to .89)
 PREFERRED = 1.1  # weight of what the global mapper explains (chosen)
-MAX_ROUNDS = 3  # of reconstructions without the images of other focal lengths (chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +63,11 @@ def estimate_focal(pairs: MatchedPairs, size: tuple[int, int], guess: float) -> 
     if value is None:
         return Focal(guess, FocalSource.GUESS)
     return Focal(value, FocalSource.MATCHES)
+
+
+def without_poses(problem: str, advice: str = ADVICE) -> str:
+    """Report that there are no camera poses, why, and what helps."""
+    return f"no camera poses: {problem}; {advice}; or give --poses; 2D identities need no poses"
 
 
 class MapperSearch:
@@ -104,7 +106,7 @@ class MapperSearch:
             models of the components, the largest first ([]: none is sound); messages.
         """
         zooms = list[tuple[int, int, float]]()
-        for _ in range(MAX_ROUNDS):
+        for _ in range(3):  # each without the images of other focal lengths found before
             best, messages = self._best()
             known = [c for c in best if c.focal_source is not FocalSource.GUESS]
             # with little parallax a zoom cannot be observed
@@ -128,7 +130,7 @@ class MapperSearch:
         if not sound:
             problem = best[0].problem if best else "no pair of keyframes initialises a model"
             advice = (best[0].advice if best else "") or ADVICE
-            return [], [f"no camera poses: {problem}; {self._match_counts()}; {advice}; {OR_POSES}"]
+            return [], [without_poses(f"{problem}; {self._match_counts()}", advice)]
         messages = [
             f"the focal length changed between frames {self.frames[a]} and {self.frames[b]} "
             f"(x {ratio:.2f}): only the frames of one focal length have poses; do not zoom"
@@ -300,13 +302,6 @@ def _set_focal(database: Path, focal: float, is_prior: bool) -> None:
         db.update_camera(camera)
 
 
-WEAK_GEOMETRY = {  # COLMAP's options, so that weak parallax is accepted too (chosen)
-    "mapper": {"init_min_tri_angle": 4, "init_min_num_inliers": 40, "abs_pose_min_num_inliers": 15,
-               "abs_pose_min_inlier_ratio": 0.15, "filter_min_tri_angle": 0.5},
-    "triangulation": {"min_angle": 0.5},
-}  # fmt: skip
-
-
 def _run_mapper(
     database: Path, mapper: str, keep_intrinsics: bool, ids: list[int], seed: int
 ) -> list[Any]:
@@ -328,8 +323,12 @@ def _run_mapper(
     options |= {"ba_local_max_refinements": 1}
     options["ba_refine_focal_length"] = not keep_intrinsics
     options["ba_refine_extra_params"] = not keep_intrinsics
-    options |= WEAK_GEOMETRY
+    # weak parallax is accepted too: the models are verified
+    options["mapper"] = {"init_min_tri_angle": 4, "init_min_num_inliers": 40}
+    options["mapper"] |= {"abs_pose_min_num_inliers": 15, "abs_pose_min_inlier_ratio": 0.15}
+    options["mapper"] |= {"filter_min_tri_angle": 0.5}
+    options["triangulation"] = {"min_angle": 0.5}
     count = len(ids)
     done = itertools.count(2)
-    tick = {"next_image_callback": lambda: send_progress(MAPPING, min(next(done), count), count)}
+    tick = {"next_image_callback": lambda: send_progress("mapping", min(next(done), count), count)}
     return list(pc.incremental_mapping(*paths, options=options, **tick).values())

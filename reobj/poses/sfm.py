@@ -23,7 +23,7 @@ import numpy as np
 
 from reobj.cameras import Camera, Poses, import_pycolmap, write_colmap
 from reobj.files import Progress, load_cached, load_json, load_npz, save_npz
-from reobj.poses.child_job import JOB, Child, read_job, serve, write_job
+from reobj.poses.child_job import Child, read_job, serve, write_job
 from reobj.poses.features import (
     MIN_MATCHES,
     choose_pairs,
@@ -33,7 +33,7 @@ from reobj.poses.features import (
     read_pairs,
 )
 from reobj.poses.keyframes import choose_posed_keyframes, path_steps, sharpest_images
-from reobj.poses.mapping import ADVICE, MAPPING, OR_POSES, Focal, MapperSearch, estimate_focal
+from reobj.poses.mapping import Focal, MapperSearch, estimate_focal, without_poses
 from reobj.poses.verification import FocalSource
 from reobj.types import Array, Image, IntArray
 
@@ -95,7 +95,7 @@ def reconstruct(
         problem = "no image has texture that can be tracked (black, blank or blurred)"
         if len(images):
             problem = f"only {len(images)} different views"
-        return Mapped([], [f"no camera poses: {problem}; {ADVICE}; {OR_POSES}"])
+        return Mapped([], [without_poses(problem)])
     scale = np.tile(np.array(images[0].shape[1::-1]) / size, 2)
     boxes = [(xyxy * scale).tolist() for xyxy in moving_boxes]
     job = {
@@ -121,7 +121,7 @@ def reconstruct(
     imports = threading.Thread(target=_import_ahead)
 
     def begin(stage: str, total: int) -> Progress:
-        if stage == MAPPING and imports.ident is None:  # the child uses one core from now on
+        if stage == "mapping" and imports.ident is None:  # the child uses one core from now on
             imports.start()
         return progress(stage, total)
 
@@ -129,7 +129,7 @@ def reconstruct(
     if imports.ident is not None:
         imports.join()
     if not (folder / "messages.json").exists():
-        (folder / JOB).unlink()  # start afresh the next time: its database may be the cause
+        (folder / "job.json").unlink()  # start afresh the next time: its database may be the cause
         return Mapped([], [f"no camera poses: the reconstruction {problem}; give --poses"])
     models = [
         model.replace(work_dir / model.name)
@@ -139,21 +139,18 @@ def reconstruct(
     return Mapped(models, result["messages"], frozenset(result["unmatched"]))
 
 
-LATER = ("onnxruntime", "filterpy.kalman", "av")  # packages of later stages, beside pycolmap
-
-
 def _import_ahead() -> None:
     """Import packages of later stages while this process waits."""
     with contextlib.suppress(ImportError):
         import_pycolmap()  # leaves signals alone, which a plain import does not
-    for name in LATER:
+    for name in ("onnxruntime", "filterpy.kalman", "av"):
         with contextlib.suppress(ImportError):  # optional, or reported where it is needed
             importlib.import_module(name)
 
 
 def _may_continue(folder: Path, job: dict[str, Any]) -> bool:
     """True if the database in the folder serves this job: same camera, images and boxes."""
-    old = load_cached(folder / JOB, load_json)
+    old = load_cached(folder / "job.json", load_json)
     new = json.loads(json.dumps(job))
     if not isinstance(old, dict) or not isinstance(old.get("images"), dict):
         return False
@@ -237,7 +234,6 @@ def triangulate(
 # studio_room .42, hololens_kitchen .14; redkitchen .09, and .003 where its Kinect lost track; ends
 # of stretches that were moved 0 and .04)
 MIN_TIED_SUPPLIED = 0.05
-MAX_NAMED_BREAKS = 5  # in a message (chosen)
 
 
 def _inconsistent(ties: IntArray, frame: IntArray) -> list[str]:
@@ -252,11 +248,16 @@ def _inconsistent(ties: IntArray, frame: IntArray) -> list[str]:
         return []
     runs = np.split(breaks, np.flatnonzero(np.diff(breaks) > 1) + 1)
     where = [f"{frame[run[0]]} and {frame[run[-1] + 1]}" for run in runs]
-    more = f" and {len(where) - MAX_NAMED_BREAKS} more" if len(where) > MAX_NAMED_BREAKS else ""
     return [
-        f"the supplied poses are inconsistent between frames {', '.join(where[:MAX_NAMED_BREAKS])}"
-        f"{more}: matches across do not triangulate; objects seen mostly there are likely misplaced"
+        f"the supplied poses are inconsistent between frames {listed(where)}: matches across do "
+        "not triangulate; objects seen mostly there are likely misplaced"
     ]
+
+
+def listed(names: Sequence[str], most: int = 5) -> str:
+    """Join names for a message; of those beyond `most` only the number."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def _without_points(poses: Poses, reason: str) -> Poses:
@@ -407,15 +408,14 @@ def _resized_camera(job: dict[str, Any], size: tuple[int, int]) -> Any:
     return camera
 
 
-TWO_FOCALS = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
-
-
 def rescale(camera: Any, size: Sequence[int]) -> None:
     """Rescale a `pycolmap.Camera` to (w, h); of another aspect ratio: with two focal lengths."""
     width, height = size
-    if abs(width / camera.width * camera.height - height) > 2 and camera.model.name in TWO_FOCALS:
+    one_focal = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}
+    two_focals = one_focal.get(camera.model.name)
+    if abs(width / camera.width * camera.height - height) > 2 and two_focals:
         focal, x, y, *terms = camera.params
-        camera.model = getattr(import_pycolmap().CameraModelId, TWO_FOCALS[camera.model.name])
+        camera.model = getattr(import_pycolmap().CameraModelId, two_focals)
         most = len(camera.params_info.split(",")) - 4
         camera.params = [focal, focal, x, y, *terms, *[0.0] * (most - len(terms))]
     camera.rescale(*size)
