@@ -51,10 +51,9 @@ def test_one_side_alone_must_be_clearer(monkeypatch, log, sigma, found):
             return np.nan, np.nan
         return (log, sigma) if image == 13 else (0.0, 0.003)
 
-    monkeypatch.setattr(verification, "RESECTED_IMAGES", 1)
     monkeypatch.setattr(verification, "_triangulate", lambda arrays, terms, side: side)
     monkeypatch.setattr(verification, "_log_focal", log_focal)
-    assert [(a, b) for a, b, _ in verification._changes(views)] == [(13, 14)] * found
+    assert [(a, b) for a, b, _ in verification._changes(views, 1)] == [(13, 14)] * found
 
 
 def test_the_focal_length_of_most_images_is_kept():

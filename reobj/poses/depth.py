@@ -20,13 +20,10 @@ import numpy.typing as npt
 
 from reobj.cameras import Camera, Poses, invert_rigid
 from reobj.files import load_json, read_lines
+from reobj.poses.supplied.frame_assignment import STAMP_TOLERANCE_S
 from reobj.sources.image_files import read_image
 from reobj.types import Array, BoolArray, Floats, IntArray, ReobjError
 from reobj.visible_points import VisiblePoints
-
-UNITS_PER_M = 1000.0  # of a depth map's values: mm (ScanNet, 7-Scenes, Record3D; TUM has 5000)
-INVALID = (0, 65535)  # no depth; 65535: 7-Scenes
-MAX_SIDE_PX = 320  # larger maps are read at every 2nd, 3rd ... pixel (chosen: time)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +41,7 @@ class DepthMaps:
     depth_from_color: Array
 
     def read(self, row: int) -> tuple[Floats, Array]:
-        """Read a map, subsampled to MAX_SIDE_PX and without distortion.
+        """Read a map, subsampled to a side of at most 320 px and without distortion.
 
         Returns:
             depth (h, w) in m, 0 where there is none, and K (3, 3) of its pixels.
@@ -56,7 +53,7 @@ class DepthMaps:
                 f"{self.files[row]}: {image.shape[1]}x{image.shape[0]} pixels; expected "
                 f"{size[0]}x{size[1]} as the other maps"
             )
-        step = -(-max(size) // MAX_SIDE_PX)
+        step = -(-max(size) // 320)
         K = self.camera.K
         x, y = np.meshgrid(np.arange(0, size[0], step), np.arange(0, size[1], step))
         xy = np.stack([x, y], -1)  # (h, w, 2)
@@ -68,7 +65,7 @@ class DepthMaps:
         inside: BoolArray = np.all((xy >= 0) & (xy < size), axis=-1)
         xy = np.where(inside[..., None], xy, 0)
         depth = np.where(inside, image[xy[..., 1], xy[..., 0]], 0).astype(np.float32)
-        depth[np.isin(depth, INVALID)] = 0
+        depth[depth == 65535] = 0  # 7-Scenes: none
         # a pixel x of the subsampled map has its centre at step x + .5 of the whole one
         small_from_full = np.array(
             [[1 / step, 0, 0.5 - 0.5 / step], [0, 1 / step, 0.5 - 0.5 / step], [0, 0, 1]]
@@ -117,7 +114,7 @@ def _folder_and_units(text: str) -> tuple[Path, float]:
     """Split FOLDER:UNITS."""
     head, colon, tail = text.rpartition(":")
     folder = Path(text)
-    units = UNITS_PER_M
+    units = 1000.0  # mm: ScanNet, 7-Scenes, Record3D
     if colon and not folder.is_dir():
         with contextlib.suppress(ValueError):
             units = float(tail)
@@ -126,10 +123,6 @@ def _folder_and_units(text: str) -> tuple[Path, float]:
         expected = "FOLDER, or FOLDER:UNITS with units per metre (1000: mm; TUM: 5000)"
         raise ReobjError(f"--depth {text}: no such folder; expected {expected}")
     return folder, units
-
-
-STAMP = re.compile(r"\d+\.\d+")  # a time in s as a file name (TUM)
-MAX_STAMP_S = 0.02  # between an image and its depth map (TUM's own tool: .02)
 
 
 def _rows_of_maps(stems: Sequence[str], frame: IntArray, names: Sequence[str]) -> list[int]:
@@ -143,11 +136,11 @@ def _rows_of_maps(stems: Sequence[str], frame: IntArray, names: Sequence[str]) -
     rows = [row_of.get(_core(stem), -1) for stem in stems]
     if max(rows) >= 0:
         return rows
-    if images and all(STAMP.fullmatch(name) for name in (*images, *stems)):
+    if images and all(re.fullmatch(r"\d+\.\d+", name) for name in (*images, *stems)):  # s (TUM)
         image_s = np.array(images, np.float64)
         map_s = np.array(stems, np.float64)
         nearest = np.abs(image_s - map_s[:, None]).argmin(1)  # (N,)
-        is_close = np.abs(image_s[nearest] - map_s) <= MAX_STAMP_S
+        is_close = np.abs(image_s[nearest] - map_s) <= STAMP_TOLERANCE_S
         return [int(row) for row in np.where(is_close, nearest, -1)]
     numbers = [_last_number(name) for name in images] if images else frame.tolist()
     row_of_number = dict(zip(numbers, range(len(frame)), strict=True))
@@ -242,13 +235,9 @@ def add_depth(poses: Poses, text: str, video: Any) -> Poses:
     return _with_points(poses, maps, video)
 
 
-MAX_MAPS = 60  # maps that are read, evenly spread (chosen: time)
-MIN_MAPS = 3  # with a ratio, to estimate a scale (chosen)
-MIN_RATIOS = 10  # points of a map that give its ratio (chosen)
 # Systematic relative sigma: of the depth camera itself (Khoshelham and Elberink 2012: ~1 %), of its
 # extrinsics and the colour camera's focal length (chosen: redkitchen, 1 to 3 %).
 SENSOR_SIGMA = 0.02
-RUNS = 8  # of the trajectory, whose scatter gives the sigma (chosen)
 MAX_SCALE_SPREAD = 0.2  # relative, between maps; more is a contradiction of the poses (chosen)
 
 
@@ -267,10 +256,10 @@ def depth_scale(poses: Poses, maps: DepthMaps) -> tuple[Array, Array, int] | str
         ratios = [_log_ratio(poses, maps, visible, row) for row in rows]
         logs = np.array([log for log in ratios if log is not None])
         where = "" if poses.part_count == 1 else f" of component {component}"
-        if len(logs) < MIN_MAPS:
+        if len(logs) < 3:  # no median and spread
             return (
                 f"--depth: the scale{where} stays unknown, and no points are added from depth: "
-                f"{len(logs)} of {len(rows)} maps show enough sparse points, {MIN_MAPS} are needed"
+                f"{len(logs)} of {len(rows)} maps show enough sparse points, 3 are needed"
             )
         spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
         if spread > MAX_SCALE_SPREAD:
@@ -280,24 +269,25 @@ def depth_scale(poses: Poses, maps: DepthMaps) -> tuple[Array, Array, int] | str
             )
         used += len(logs)
         scales.append(float(np.exp(np.median(logs))))
-        # errors of neighbouring maps are correlated: runs of them count as one measurement each
-        runs = np.array([np.median(run) for run in np.array_split(logs, min(RUNS, len(logs)))])
+        # errors of neighbouring maps are correlated: 8 runs of them count as one measurement each
+        runs = np.array([np.median(run) for run in np.array_split(logs, min(8, len(logs)))])
         sigma = float(runs.std(ddof=1)) / np.sqrt(len(runs))
         sigmas.append(float(np.hypot(sigma, SENSOR_SIGMA)))
     return np.array(scales), np.array(sigmas), used
 
 
 def _spread_rows(poses: Poses, maps: DepthMaps) -> list[int]:
-    """Choose at most MAX_MAPS rows with a pose and a map, evenly spread."""
+    """Choose at most 60 rows with a pose and a map, evenly spread: all would take long."""
     rows = [row for row in sorted(maps.files) if poses.known[row]]
-    chosen = np.linspace(0, len(rows) - 1, min(len(rows), MAX_MAPS)).round().astype(int)
+    chosen = np.linspace(0, len(rows) - 1, min(len(rows), 60)).round().astype(int)
     return [rows[i] for i in chosen]
 
 
 def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) -> float | None:
     """Return the median log of metres per unit of the points that a map sees; None: too few."""
     points = poses.points[visible.in_frame(row)]
-    if len(points) < MIN_RATIOS:
+    least = 10  # fewer have no stable median
+    if len(points) < least:
         return None
     depth, K = maps.read(row)
     in_color = points @ poses.cam_from_world[row, :, :3].T + poses.cam_from_world[row, :, 3]
@@ -308,7 +298,7 @@ def _log_ratio(poses: Poses, maps: DepthMaps, visible: VisiblePoints, row: int) 
         in_depth = np.exp(log_scale) * in_color @ rotation.T + offset
         measured = _look_up(depth, K, in_depth)
         good = (measured > 0) & (in_depth[:, 2] > 0)
-        if good.sum() < MIN_RATIOS:
+        if good.sum() < least:
             return None
         log_scale += float(np.median(np.log(measured[good] / in_depth[good, 2])))
     return log_scale
@@ -343,10 +333,6 @@ def _scaled(poses: Poses, scale: Array, sigma: Array, used: int) -> Poses:
     )
 
 
-MAP_POINTS = 80  # across a map (chosen)
-MAX_STEP = 0.05  # of depth between neighbouring pixels, relative: beyond is an edge (chosen)
-MAX_POINTS = 20000  # kept after thinning (chosen: as a reconstruction has)
-VOXEL_M = 0.02  # side for one point each; larger where these are too many (chosen)
 AGREE = 0.04  # relative difference of equal depths (chosen: noise and pose errors) ...
 AGREE_M = 0.03  # ... and at least
 # Fraction of the views of points in other maps that see through the point; beyond it maps and poses
@@ -425,10 +411,10 @@ def _compose(c_from_b: Array, b_from_a: Array) -> Array:
 
 
 def _grid_points(depth: Floats, K: Array) -> Array:
-    """Return points (N, 3) of a coarse grid of a map, in its camera; none at edges."""
-    step = max(1, max(depth.shape) // MAP_POINTS)
+    """Return points (N, 3) of a coarse grid of a map, 80 across, in its camera; none at edges."""
+    step = max(1, max(depth.shape) // 80)
     low, high = (f(depth, np.ones((3, 3), np.uint8)) for f in (cv2.erode, cv2.dilate))
-    smooth = (low > 0) & (high - low <= 2 * MAX_STEP * depth)
+    smooth = (low > 0) & (high - low <= 2 * 0.05 * depth)  # 5 % from pixel to pixel
     chosen = np.zeros(depth.shape, bool)
     chosen[step // 2 :: step, step // 2 :: step] = True
     y, x = np.nonzero(chosen & smooth)
@@ -437,9 +423,12 @@ def _grid_points(depth: Floats, K: Array) -> Array:
 
 
 def _thin(points: Array, depth: Array, component: IntArray) -> IntArray:
-    """Choose one point per voxel, that with the least depth; at most MAX_POINTS rows."""
+    """Choose one point per voxel, that with the least depth; at most 20,000 rows.
+
+    So many has a reconstruction.
+    """
     order = np.argsort(depth, kind="stable")
-    size = VOXEL_M
+    size = 0.02  # m, a side of a voxel; larger where the points are too many
     low = points.min(0, initial=0)
     component = component[order]
     while True:
@@ -447,7 +436,7 @@ def _thin(points: Array, depth: Array, component: IntArray) -> IntArray:
         count = cell.max(0, initial=0) + 1
         key = ((component * count[0] + cell[:, 0]) * count[1] + cell[:, 1]) * count[2] + cell[:, 2]
         first = np.unique(key, return_index=True)[1]
-        if len(first) <= MAX_POINTS:
+        if len(first) <= 20000:
             return np.sort(order[first])
         size *= 1.25
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from reobj.cameras import import_pycolmap
+from reobj.poses.bundle import FOCAL_RANGE
 from reobj.poses.child_job import send_progress
 from reobj.types import Array, BoolArray, Floats, Image, IntArray
 
@@ -59,10 +60,7 @@ def extract_features(
         cv2.setNumThreads(threads)
 
 
-SIFT_FEATURES = 1200  # a keyframe, the strongest (chosen: 2000 and 4096 were slower and no better)
-SIFT_CONTRAST = 0.02  # contrast threshold (chosen; OpenCV's default: .04)
-SIFT_CONTRAST_LOW = 0.007  # for plain walls, where that finds fewer than SIFT_FEW (chosen)
-SIFT_FEW = 500  # (chosen)
+SIFT_FEATURES = 1200  # a keyframe, the strongest (measured: 2000 are slower and no better)
 
 
 def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image]:
@@ -78,10 +76,10 @@ def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image
     mask = np.full(gray.shape, 255, np.uint8)
     for x1, y1, x2, y2 in np.maximum(boxes.reshape(-1, 4), 0):
         mask[math.floor(y1) : math.ceil(y2), math.floor(x1) : math.ceil(x2)] = 0
-    for contrast in (SIFT_CONTRAST, SIFT_CONTRAST_LOW):
+    for contrast in (0.02, 0.007):  # OpenCV's default: .04; the second for plain walls
         sift: Any = cv2.SIFT.create(nfeatures=SIFT_FEATURES, contrastThreshold=contrast)
         keypoints, descriptors = sift.detectAndCompute(gray, mask)
-        if len(keypoints) >= SIFT_FEW:
+        if len(keypoints) >= 500:
             break
     if descriptors is None or not len(keypoints):
         return np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8)
@@ -91,10 +89,7 @@ def _root_sift(bgr: Image, boxes: Array) -> tuple[npt.NDArray[np.float32], Image
     return xy, np.minimum(root, 255).astype(np.uint8)
 
 
-MAX_EXHAUSTIVE = 30  # keyframes of which all pairs are matched (chosen: 435 pairs)
-OFFSETS = [1 << k for k in range(12)]  # between paired keyframes (COLMAP: quadratic overlap)
-MATCH_CHUNK = 100  # pairs between two lines of progress (chosen)
-MAX_RATIO = 0.8  # of the angles to the best and the second best (Lowe, IJCV 2004; COLMAP)
+MAX_RATIO = 0.8  # of angles or distances to the best and the second best (Lowe, IJCV 2004; COLMAP)
 MAX_ANGLE = 0.7  # between matching descriptors, radians (COLMAP)
 MIN_MATCHES = 30  # verified matches of a pair that count as evidence (COLMAP registers from 30 on)
 
@@ -105,11 +100,12 @@ def choose_pairs(database: Path, ids: Sequence[int], seed: int) -> list[tuple[in
     Args:
         ids: of the keyframes, in the order of time.
     """
-    if (count := len(ids)) <= MAX_EXHAUSTIVE:
+    if (count := len(ids)) <= 30:  # 435 pairs
         return list(itertools.combinations(ids, 2))
     with contextlib.closing(import_pycolmap().Database.open(str(database))) as db:
         descriptors = [np.asarray(db.read_descriptors(number).data) for number in ids]
-    pairs = {(i, i + offset) for offset in OFFSETS for i in range(count - offset)}
+    offsets = [1 << k for k in range(12)]  # COLMAP: quadratic overlap
+    pairs = {(i, i + offset) for offset in offsets for i in range(count - offset)}
     pairs |= set(_pairs_from_retrieval(descriptors, seed))
     return [(ids[i], ids[j]) for i, j in sorted(pairs)]
 
@@ -136,8 +132,9 @@ def match_pairs(database: Path, pairs: Sequence[tuple[int, int]], seed: int) -> 
             norm = np.linalg.norm(descriptors, axis=1, keepdims=True)
             unit[number] = descriptors / np.maximum(norm, 1e-9)
     with ThreadPoolExecutor(2) as pool:
-        for start in range(0, len(todo), MATCH_CHUNK):
-            chunk = todo[start : start + MATCH_CHUNK]
+        step = 100  # pairs between two lines of progress
+        for start in range(0, len(todo), step):
+            chunk = todo[start : start + step]
             matches = list(pool.map(lambda pair: _matches(unit[pair[0]], unit[pair[1]]), chunk))
             with contextlib.closing(pc.Database.open(str(database))) as db:
                 for pair, match in zip(chunk, matches, strict=True):
@@ -179,8 +176,6 @@ def _distinct(top: Floats, second: Floats) -> BoolArray:
 
 
 RETRIEVED_PAIRS = 6  # with the most similar keyframes, to close loops (chosen)
-VISUAL_WORDS = 64  # of a VLAD vector (the paper: 16-256)
-WORD_SAMPLE = 6000  # descriptors clustered into words, at least (chosen: time)
 
 
 def _pairs_from_retrieval(descriptors: list[Image], seed: int) -> list[tuple[int, int]]:
@@ -191,13 +186,14 @@ def _pairs_from_retrieval(descriptors: list[Image], seed: int) -> list[tuple[int
     Ref: Jegou et al., CVPR 2010.
     """
     features = np.concatenate(descriptors).astype(np.float32)  # (N, 128)
-    sample = features[:: max(1, len(features) // WORD_SAMPLE)]
-    if len(sample) < VISUAL_WORDS:
+    sample = features[:: max(1, len(features) // 6000)]  # to cluster all takes long
+    word_count = 64  # the paper: 16-256
+    if len(sample) < word_count:
         return []
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.1)
     start = cv2.KMEANS_PP_CENTERS
-    words = cv2.kmeans(sample, VISUAL_WORDS, np.empty(0), stop, 1, start)[2]  # (W, 128)
+    words = cv2.kmeans(sample, word_count, np.empty(0), stop, 1, start)[2]  # (W, 128)
     vlad = np.zeros((len(descriptors), *words.shape), np.float32)  # (K, W, 128) sums of residuals
     for sums, rows in zip(vlad, descriptors, strict=True):
         # argmin |d - w|^2 = argmax d'w - |w|^2 / 2
@@ -212,13 +208,10 @@ def _pairs_from_retrieval(descriptors: list[Image], seed: int) -> list[tuple[int
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
 
-POSED_OFFSETS = (1, 2, 4)  # between paired keyframes of supplied poses (chosen)
-NEAR_PAIRS = 4  # with the nearest other keyframes by pose, to close loops (chosen)
-MAX_PAIR_STEPS = 8.0  # largest distance of such a pair, in keyframe steps (chosen)
-
-
 def choose_posed_pairs(steps: Array) -> IntArray:
     """Choose the pairs of K keyframes with supplied poses to match: neighbours in time and in pose.
+
+    In pose, to close loops: the 4 nearest of those up to 8 keyframe steps away.
 
     Args:
         steps: (K, 6) of `keyframes.path_steps`.
@@ -226,15 +219,16 @@ def choose_posed_pairs(steps: Array) -> IntArray:
         (P, 2) rows of the keyframes, the lower one first.
     """
     count = len(steps)
-    pairs = {(i, i + offset) for offset in POSED_OFFSETS for i in range(count - offset)}
+    offsets = (1, 2, 4)
+    pairs = {(i, i + offset) for offset in offsets for i in range(count - offset)}
     distance = np.linalg.norm(steps[:, None] - steps, axis=2)  # (K, K)
     rows = np.arange(count)
-    distance[np.abs(rows[:, None] - rows) <= max(POSED_OFFSETS)] = np.inf
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, :NEAR_PAIRS]  # (K, near)
+    distance[np.abs(rows[:, None] - rows) <= max(offsets)] = np.inf
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :4]  # (K, 4)
     for i, j in zip(
         np.repeat(rows, nearest.shape[1]).tolist(), nearest.ravel().tolist(), strict=True
     ):
-        if distance[i, j] <= MAX_PAIR_STEPS:
+        if distance[i, j] <= 8:
             pairs.add((min(i, j), max(i, j)))
     return np.array(sorted(pairs), np.int64).reshape(-1, 2)
 
@@ -293,7 +287,6 @@ def read_pairs(database: Path) -> MatchedPairs:
     )
 
 
-FOCAL_STEPS = np.geomspace(0.4, 2.0, 161)  # tried, over the longer side (28-103 deg; 1 % apart)
 MIN_FOCAL_PAIRS = 10  # pairs whose epipolar geometry is trusted together (chosen)
 
 
@@ -311,8 +304,9 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
     F = pairs.fundamental[pairs.enough & np.isfinite(pairs.fundamental[:, 0, 0])]  # (P, 3, 3)
     if len(F) < MIN_FOCAL_PAIRS:
         return None
-    K = np.zeros((len(FOCAL_STEPS), 3, 3))
-    K[:, 0, 0] = K[:, 1, 1] = FOCAL_STEPS * max(size)
+    tried = np.geomspace(*FOCAL_RANGE, 161)  # (S,) 1 % apart
+    K = np.zeros((len(tried), 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = tried * max(size)
     K[:, 0, 2] = size[0] / 2
     K[:, 1, 2] = size[1] / 2
     K[:, 2, 2] = 1
@@ -321,4 +315,4 @@ def focal_from_pairs(pairs: MatchedPairs, size: tuple[int, int]) -> float | None
     cost = np.median(1 - s[..., 1] / s[..., 0], 1)  # (S,)
     best = int(cost.argmin())
     is_inside = 0 < best < len(cost) - 1
-    return float(FOCAL_STEPS[best]) if is_inside else None
+    return float(tried[best]) if is_inside else None

@@ -35,8 +35,7 @@ class Floor:
     inliers: int
 
 
-MIN_FLOOR_POINTS = 100  # (chosen)
-MIN_OBSERVATIONS = 3  # of points, if enough are left (chosen: two views may be a false match)
+MIN_FLOOR_POINTS = 100  # points of a component, and of it below the cameras (chosen)
 NOISE = 0.012  # of points along the height, over their distance (chosen: 4 cm at 3 m)
 # Systematic errors, common to all half samples: drift of the cameras, gravity (chosen: 9 mm at 3 m;
 # hololens_kitchen's floor lies .5 deg off its gravity)
@@ -56,7 +55,7 @@ def floor_of(
     if up is None:
         return None, "gravity is unknown"
     views = np.bincount(largest.visibility[:, 1], minlength=len(largest.points))
-    often = views >= MIN_OBSERVATIONS
+    often = views >= 3  # two views may be a false match
     points = largest.points[often] if often.sum() >= MIN_FLOOR_POINTS else largest.points
     centres = invert_rigid(largest.cam_from_world[largest.known])[:, :, 3]
     return find_floor(points, up, centres, metres_per_unit)
@@ -113,14 +112,8 @@ def find_floor(
     return (None, reason) if reason else (floor, "")
 
 
-MIN_INLIERS = 30  # after thinning (chosen)
-MIN_INLIER_RATIO = 0.015  # of the points, after thinning (chosen)
-MIN_EXTENT_RATIO = 0.3  # rms horizontal extent of the inliers over that of all points (chosen)
 MIN_EDGE = 1.5  # density of points on the plane over that shortly above (chosen)
-MAX_SIGMA = 3.0  # of the height, in `noise` (chosen: 11 cm at 3 m)
 CAMERA_HEIGHT_M = (0.3, 2.5)  # of a hand-held camera above a floor (chosen: wide)
-STANDING_M = 1.1  # a camera this high is above a floor, not above a table (chosen) ...
-TABLE_M = 2.5  # ... and a plane this long is not a table (chosen: tables for eight are 2.4 m)
 
 
 def _fault(
@@ -134,17 +127,18 @@ def _fault(
     """Return why a plane is unlikely to be the floor, "" if it is likely."""
     across = local[on_plane, :2]
     low, high = CAMERA_HEIGHT_M
-    if len(across) < max(MIN_INLIERS, MIN_INLIER_RATIO * len(local)):
+    if len(across) < max(30, 0.015 * len(local)):
         return f"only {len(across)} points lie on the lowest plane"
-    if np.var(across, axis=0).sum() < MIN_EXTENT_RATIO**2 * np.var(local[:, :2], axis=0).sum():
+    # rms extent less than .3 of that of all points
+    if np.var(across, axis=0).sum() < 0.3**2 * np.var(local[:, :2], axis=0).sum():
         return "the lowest plane with points is small"
-    if floor.sigma > MAX_SIGMA * noise:
+    if floor.sigma > 3 * noise:  # 11 cm at 3 m
         sigma_m = floor.sigma * metres_per_unit
         return f"its height is uncertain: halves of the room differ by {sigma_m:.2g} m"
     if not low <= height_m <= high:
         return f"the lowest plane is {height_m:.2g} m below the cameras ({low}-{high} m expected)"
     length_m = float(np.ptp(np.percentile(across, (5, 95), axis=0), axis=0).max()) * metres_per_unit
-    if height_m < STANDING_M and length_m < TABLE_M:
+    if height_m < 1.1 and length_m < 2.5:  # tables for eight are 2.4 m long
         size = f"{length_m:.2g} m long, {height_m:.2g} m below the cameras"
         return f"the lowest plane may be a table top: {size}"
     return ""
@@ -163,23 +157,26 @@ def _one_per_voxel(points: Array, size: float) -> Array:
     return points[np.unique(cell, axis=0, return_index=True)[1]]
 
 
-MAX_TILT_DEG = 6.0  # of the floor from `up` (chosen: errors of an estimated direction)
-TILT_STEP_DEG = 1.0  # of the search (chosen: refined later)
-TILT_SIGMA_DEG = 2.0  # prior of `up` (chosen)
-MAX_BELOW = 0.03  # fraction of the points below the floor, outliers (chosen)
+TILT_SIGMA_DEG = 2.0  # prior of `up` (chosen: errors of an estimated direction)
+# Fraction of the points below the floor, outliers (measured: at .05 redkitchen gets a floor that
+# lies .08 m high)
+MAX_BELOW = 0.03
 ABOVE = (4, 10)  # `noise` above a plane: points there count against it (chosen)
 
 
 def _best_level(local: Array, noise: float) -> Array | None:
     """Find the plane with the most points on it minus those shortly above it, and few below.
 
+    The search is to three sigmas of `up`, in steps of a degree: it is refined later.
+
     Args:
         local: (N, 3) across, across, height, from the middle.
     Returns:
         (3,) a, b, c of height = a + b x + c y; None if there is none.
     """
-    steps = np.arange(-MAX_TILT_DEG, MAX_TILT_DEG + 1e-6, TILT_STEP_DEG)
-    tilts = np.array([(b, c) for b in steps for c in steps if math.hypot(b, c) <= MAX_TILT_DEG])
+    most = 3 * TILT_SIGMA_DEG
+    steps = np.arange(-most, most + 1e-6)
+    tilts = np.array([(b, c) for b in steps for c in steps if math.hypot(b, c) <= most])
     best = 0.0
     plane: Array | None = None
     pad = max(ABOVE)
@@ -201,38 +198,29 @@ def _best_level(local: Array, noise: float) -> Array | None:
     return plane
 
 
-ITERATIONS = 10  # of the refinement (chosen)
-CELL = 6.0  # side of the cells that count as one measurement each, in `noise` (chosen)
-INLIER_SIGMAS = 2.5  # largest residual of an inlier (chosen)
-
-
 def _refine(local: Array, plane: Array, noise: float) -> tuple[Array, BoolArray]:
     """Fit a plane to the points on it by robust least squares.
 
-    Each horizontal cell is one measurement, whatever its texture. Objects on the floor are above
-    it, so the noise is estimated from the points below.
+    Each horizontal cell, 6 `noise` wide, is one measurement, whatever its texture. Objects on the
+    floor are above it, so the noise is estimated from the points below.
 
     Returns:
         plane (3,) and the points on it (N,).
     """
     across = np.column_stack([np.ones(len(local)), local[:, :2]])  # (N, 3)
-    cell = np.floor(local[:, :2] / (CELL * noise)).astype(np.int64)
+    cell = np.floor(local[:, :2] / (6 * noise)).astype(np.int64)
     cell_of = np.unique(cell, axis=0, return_inverse=True)[1].ravel()  # (N,)
     on_plane = np.zeros(len(local), bool)
-    for _ in range(ITERATIONS):
+    for _ in range(10):
         residual = local[:, 2] - across @ plane
         below = residual[(residual < 0) & (residual > -3 * noise)]
         sigma = noise
         if len(below) > 5:  # the median of a half-normal distribution is .67 sigma
             sigma = float(np.clip(np.median(-below) / 0.6745, 0.1 * noise, noise))
-        on_plane = np.abs(residual) < INLIER_SIGMAS * sigma
+        on_plane = np.abs(residual) < 2.5 * sigma
         design, height = _cell_means(cell_of[on_plane], across[on_plane], local[on_plane, 2])
         plane = _fit_plane(design, height, plane, sigma)
     return plane, on_plane
-
-
-HALVES = 16  # half samples of the room (chosen: each takes as long as the whole)
-PATCH = 20.0  # side of the patches of half samples, in `noise` (chosen: .8 m at 3 m)
 
 
 def _half_samples(local: Array, noise: float) -> Array:
@@ -244,9 +232,9 @@ def _half_samples(local: Array, noise: float) -> Array:
     """
     rng = np.random.default_rng(0)
     planes = []
-    patch = np.floor(local[:, :2] / (PATCH * noise)).astype(np.int64)
+    patch = np.floor(local[:, :2] / (20 * noise)).astype(np.int64)  # .8 m at 3 m
     patch_of = np.unique(patch, axis=0, return_inverse=True)[1].ravel()  # (N,)
-    for _ in range(HALVES // 2):
+    for _ in range(8):  # each half takes as long as the whole room
         in_first = rng.permutation(patch_of.max() + 1) % 2 == 0
         for half in (local[in_first[patch_of]], local[~in_first[patch_of]]):
             if len(half) and (start := _best_level(half, noise)) is not None:

@@ -18,8 +18,9 @@ from reobj.cameras import Camera, camera_parameters, checked_camera
 from reobj.files import load_json, read_text
 from reobj.types import COORDINATE_MAX, ReobjError
 
-NUMBERS = "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]"  # OpenCV's order
-CAMERA_FORMS = f"{NUMBERS}; MODEL WIDTH HEIGHT PARAMS of COLMAP; or a file"
+CAMERA_FORMS = (  # the numbers in OpenCV's order
+    "fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]; MODEL WIDTH HEIGHT PARAMS of COLMAP; or a file"
+)
 
 
 def parse_camera(text: str, size: tuple[int, int]) -> Camera | None:
@@ -89,7 +90,8 @@ def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
             " expected the same aspect ratio (rotated or cropped video?)"
         )
     camera = checked_camera(camera.resized(size), where)
-    least = MIN_PINHOLE if camera.model in BROWN_LENSES else MIN_FISHEYE
+    is_brown = camera.model in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+    least = 0.4 if is_brown else 0.1  # usual ones have .7 and more, fisheyes of 180 deg .4
     if (ratio := pinhole_ratio(camera)) < least:
         raise ReobjError(
             f"{where}: {camera_line(camera)}: its distortion is invertible for only "
@@ -98,29 +100,25 @@ def fitted_camera(camera: Camera, size: tuple[int, int], where: str) -> Camera:
     return camera
 
 
-BROWN_LENSES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-MIN_PINHOLE = 0.4  # `pinhole_ratio` of such a lens (chosen: usual ones have .7 and more)
-MIN_FISHEYE = 0.1  # of others (chosen: fisheyes of 180 deg have .4)
-TRIED_PX = 16  # pixels along each side (chosen)
-MAX_STRETCH = 3.0  # of a radius by distortion (chosen: beyond what a pinhole image can show)
-
-
-def pinhole_ratio(camera: Camera) -> float:
+def pinhole_ratio(camera: Camera, count: int = 16) -> float:
     """Return the fraction of a camera's pixels whose distortion is plausible.
 
     The distortion must be monotonic along the radius from the image centre to the pixel, and change
-    the radius by a factor of at most MAX_STRETCH.
+    the radius by a factor of at most 3, beyond what a pinhole image can show.
+
+    Args:
+        count: of the pixels tried along each side, and of the steps along the radius.
     """
-    x, y = ((np.arange(TRIED_PX) + 0.5) / TRIED_PX * side for side in (camera.width, camera.height))
+    x, y = ((np.arange(count) + 0.5) / count * side for side in (camera.width, camera.height))
     pixel = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     centre = camera.K[:2, 2]
     ideal = camera.undistort(pixel) - centre
     radius = np.linalg.norm(pixel - centre, axis=1)
     ideal_radius = np.linalg.norm(ideal, axis=1)
     good = np.isfinite(ideal_radius)
-    good &= (ideal_radius < MAX_STRETCH * radius) & (radius < MAX_STRETCH * ideal_radius)
+    good &= (ideal_radius < 3 * radius) & (radius < 3 * ideal_radius)
     ray = np.linalg.solve(camera.K[:2, :2], ideal[good].T).T  # (n, 2)
-    steps = np.linspace(0, 1, TRIED_PX)[:, None, None] * ray  # (TRIED_PX, n, 2)
+    steps = np.linspace(0, 1, count)[:, None, None] * ray  # (count, n, 2)
     rays = np.concatenate([steps, np.ones((*steps.shape[:2], 1))], 2).reshape(-1, 3)
     distorted = np.asarray(camera.to_pycolmap().img_from_cam(rays), np.float64)
     distorted = distorted.reshape(steps.shape)
@@ -206,14 +204,8 @@ def _focal_and_centre(matrix: Any) -> tuple[float, float, float, float]:
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
-# Keys in the wild: COLMAP, nerfstudio and instant-ngp, OpenCV and ROS, Open3D, Record3D, RealSense
-SIZES = (("w", "h"), ("width", "height"), ("image_width", "image_height"))
-FOCALS = (("fx", "fy"), ("fl_x", "fl_y"), ("f", "f"), ("focal", "focal"))
-CENTRES = (("cx", "cy"), ("ppx", "ppy"))
-MATRICES = ("camera_matrix", "K", "intrinsic_matrix", "intrinsics", "intrinsic")
-DISTORTIONS = ("distortion_coefficients", "dist_coeffs", "distortion", "dist", "coeffs", "D")
-BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-FISHEYE = ("k1", "k2", "k3", "k4")
+# Names and keys in the wild, also below: COLMAP, nerfstudio and instant-ngp, OpenCV and ROS,
+# Open3D, Record3D, RealSense
 BROWN_MODELS = (
     "", "NONE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV",
     "PERSPECTIVE", "PLUMB_BOB", "RATIONAL_POLYNOMIAL", "RADTAN", "RADIAL-TANGENTIAL",
@@ -236,8 +228,9 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
         the camera at the size of the data; None without a focal length.
     """
     data = data | next((data[k] for k in ("camera", "intrinsics") if _is_object(data.get(k))), {})
+    sides = (("w", "h"), ("width", "height"), ("image_width", "image_height"))
     size = next(
-        ((image_side(data[w]), image_side(data[h])) for w, h in SIZES if w in data and h in data),
+        ((image_side(data[w]), image_side(data[h])) for w, h in sides if w in data and h in data),
         size,
     )
     model = str(data.get("model", data.get("camera_model", ""))).upper()
@@ -250,9 +243,9 @@ def camera_from_json(data: Any, size: tuple[int, int] | None) -> Camera | None:
         return None
     if data.get("is_fisheye") or model in FISHEYE_MODELS:
         width, height = _sized(size)
-        return Camera("OPENCV_FISHEYE", width, height, (*pinhole, *_terms(data, FISHEYE)))
+        return Camera("OPENCV_FISHEYE", width, height, (*pinhole, *_terms(data, "k1 k2 k3 k4")))
     if model in BROWN_MODELS:
-        return brown_camera(size, *pinhole, *_terms(data, BROWN))
+        return brown_camera(size, *pinhole, *_terms(data, "k1 k2 p1 p2 k3 k4 k5 k6"))
     return _camera_of_names(model, data, pinhole, _sized(size))
 
 
@@ -300,13 +293,15 @@ def _pinhole_of_json(
     data: dict[str, Any], size: tuple[int, int] | None
 ) -> tuple[float, float, float, float] | None:
     """Return fx, fy, cx, cy from the keys or the matrix of an object; None without focal length."""
-    for key in MATRICES:
+    for key in ("camera_matrix", "K", "intrinsic_matrix", "intrinsics", "intrinsic"):
         matrix = data[key].get("data") if _is_object(data.get(key)) else data.get(key)
         if matrix is not None:
             return _focal_and_centre(matrix)
     middle = (0.5 * size[0], 0.5 * size[1]) if size else (math.nan, math.nan)
-    cx, cy = next(((data[x], data[y]) for x, y in CENTRES if x in data), middle)
-    fx, fy = next(((data[x], data.get(y, data[x])) for x, y in FOCALS if x in data), (None, None))
+    centres = (("cx", "cy"), ("ppx", "ppy"))
+    cx, cy = next(((data[x], data[y]) for x, y in centres if x in data), middle)
+    focals = (("fx", "fy"), ("fl_x", "fl_y"), ("f", "f"), ("focal", "focal"))
+    fx, fy = next(((data[x], data.get(y, data[x])) for x, y in focals if x in data), (None, None))
     if fx is None and size and "camera_angle_x" in data:
         angle = float(data["camera_angle_x"])
         if not 0 < angle < math.pi:
@@ -315,9 +310,11 @@ def _pinhole_of_json(
     return None if fx is None or fy is None else (float(fx), float(fy), float(cx), float(cy))
 
 
-def _terms(data: dict[str, Any], names: Sequence[str]) -> list[float]:
-    """Return the distortion in the order of its names, 0 where it is not given."""
-    given: Any = next((data[key] for key in DISTORTIONS if key in data), [])
+def _terms(data: dict[str, Any], order: str) -> list[float]:
+    """Return the distortion in the order of its names, words; 0 where it is not given."""
+    names = order.split()
+    keys = ("distortion_coefficients", "dist_coeffs", "distortion", "dist", "coeffs", "D")
+    given: Any = next((data[key] for key in keys if key in data), [])
     values = np.ravel(given["data"] if _is_object(given) else given).tolist()
     if len(values) > len(names) and any(values[len(names) :]):
         raise ReobjError(f"{len(values)} distortion coefficients; expected {','.join(names)}")

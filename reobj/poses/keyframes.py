@@ -18,8 +18,6 @@ from reobj.files import Progress
 from reobj.sources.video import shrunk
 from reobj.types import Array, BoolArray, Image, IntArray
 
-CACHE_MB = 1000.0  # of gray images kept in memory: 3200 of 640x480 (chosen)
-
 
 @dataclass(frozen=True, slots=True)
 class ResizedFrame:
@@ -39,7 +37,7 @@ class ResizedFrame:
     @property
     def has_texture(self) -> bool:
         """False for an image without points to track, such as a black one."""
-        return len(_corners(self.gray)) >= MIN_CORNERS
+        return len(_corners(self.gray)) >= 20
 
 
 def _square(image: Image, aspect: float) -> Image:
@@ -54,11 +52,13 @@ def _square(image: Image, aspect: float) -> Image:
 class ResizedVideo:
     """A video whose frames have square pixels and a longer side of at most `size_px`.
 
+    Args:
+        cache_mb: of gray images kept in memory: 3200 of 640x480.
     Attributes:
         frames, times_s: numbers and times of the frames, known after `first_pass`.
     """
 
-    def __init__(self, video: Any, size_px: int, cache_mb: float = CACHE_MB) -> None:
+    def __init__(self, video: Any, size_px: int, cache_mb: float = 1000) -> None:
         self.video = video
         self.size_px = size_px
         self.cache_mb = cache_mb
@@ -92,10 +92,6 @@ class ResizedVideo:
         return iter(self.cache) if kept else (frame.gray for frame in self)
 
 
-KLT_WINDOW_PX = 15  # side of the Lucas-Kanade window (chosen; OpenCV's default: 21)
-KLT_ERROR_PX = 1.0  # largest forward-backward error (Kalal et al., ICPR 2010; chosen)
-
-
 def follow_points(
     old: Image, new: Image, xy: Array, and_back: bool = True
 ) -> tuple[Array, BoolArray]:
@@ -103,34 +99,27 @@ def follow_points(
 
     Args:
         old, new: (h, w) gray. xy: (N, 2) in `old`, OpenCV pixels (centre of the first: 0, 0).
-        and_back: require a small forward-backward error.
+        and_back: require a forward-backward error below 1 px (Kalal et al., ICPR 2010).
     Returns:
         xy: (N, 2) in `new`. kept: (N,) True for points that were tracked.
     """
     if not len(xy):
         return xy, np.zeros(0, bool)
     start = xy.astype(np.float32).reshape(-1, 1, 2)
-    window = (KLT_WINDOW_PX,) * 2
+    window = (15, 15)  # px; OpenCV's default: 21
     flow: Any = cv2.calcOpticalFlowPyrLK
     ahead, found, _ = flow(old, new, start, None, winSize=window)
     kept = found[:, 0] > 0
     if and_back:
         back, found_back, _ = flow(new, old, ahead, None, winSize=window)
         error = np.linalg.norm(back - start, axis=2)[:, 0]  # (N,)
-        kept &= (found_back[:, 0] > 0) & (error < KLT_ERROR_PX)
+        kept &= (found_back[:, 0] > 0) & (error < 1)
     return ahead[:, 0].astype(np.float64), kept
 
 
-CORNERS = 150  # tracked from a keyframe (chosen: 300 were slower and no better)
-CORNER_QUALITY = 0.01  # of the best corner's (OpenCV's usual value)
-CORNER_SPACING = 1 / 80  # between two corners, over the longer side (chosen)
-MIN_CORNERS = 20  # with fewer an image counts as textureless (chosen)
-
-
 def _corners(gray: Image) -> Array:
-    """Find the corners (N, 2) of an image that can be tracked."""
-    spacing = max(gray.shape) * CORNER_SPACING
-    found = cv2.goodFeaturesToTrack(gray, CORNERS, CORNER_QUALITY, spacing)
+    """Find the corners (N, 2) of an image that can be tracked: 150, as 300 were no better."""
+    found = cv2.goodFeaturesToTrack(gray, 150, qualityLevel=0.01, minDistance=max(gray.shape) / 80)
     return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
 
@@ -166,7 +155,6 @@ MAX_FLOW = 0.12  # median flow that makes a keyframe, over the width (chosen)
 MIN_FLOW = 0.015  # flow that counts as motion, over the width (chosen: 10 px of 640)
 MIN_CORNERS_LEFT = 0.55  # fraction of the corners below which a keyframe is added (chosen)
 MAX_INTERVAL = 60  # frames after which any motion makes a keyframe (chosen: 2 s)
-SHARP_WINDOW = 0.7  # of the flow threshold: frames beyond compete in sharpness (chosen)
 
 
 def pick_keyframes(
@@ -200,7 +188,7 @@ def pick_keyframes(
             continue
         last = frame
         flow, left = update
-        if flow >= SHARP_WINDOW * wider * max_flow:
+        if flow >= 0.7 * wider * max_flow:
             window.append(frame)
         late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
         if late or flow > wider * max_flow or left < MIN_CORNERS_LEFT**wider:
@@ -221,7 +209,6 @@ def pick_keyframes(
 # ---- Keyframes of supplied poses -----------------------------------------------------------------
 
 
-MAX_POSED_KEYFRAMES = 150  # of supplied poses (chosen: time)
 MIN_KEYFRAMES = 40  # with fewer the steps between them are halved (chosen)
 TURN_STEP_DEG = 8.0  # rotation between keyframes (chosen: an eighth of a usual field of view)
 SPREAD_STEP = 1 / 8  # translation between them, over the rms spread of the path: an orbit's 7 deg
@@ -247,7 +234,7 @@ def choose_posed_keyframes(steps: Array) -> IntArray:
     Args:
         steps: (F, 6) of `path_steps`.
     Returns:
-        rows, ascending; MIN_KEYFRAMES to MAX_POSED_KEYFRAMES of them, or all frames if fewer.
+        rows, ascending; MIN_KEYFRAMES to 150 of them (more take long), or all frames if fewer.
     """
     rows = np.flatnonzero(np.isfinite(steps).all(1))
     length = 1.0
@@ -255,7 +242,7 @@ def choose_posed_keyframes(steps: Array) -> IntArray:
     while len(chosen) < min(MIN_KEYFRAMES, len(rows)) and length > 1e-6:
         length /= 2
         chosen = _rows_apart(steps, rows, length)
-    while len(chosen) > MAX_POSED_KEYFRAMES:
+    while len(chosen) > 150:
         length *= 1.1
         chosen = _rows_apart(steps, rows, length)
     return chosen

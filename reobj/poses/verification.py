@@ -27,7 +27,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
 from reobj.cameras import import_pycolmap
-from reobj.poses.bundle import FOCAL_RANGE, MIN_RAY_SPREAD, ModelArrays
+from reobj.poses.bundle import FOCAL_RANGE, MIN_RAY_SPREAD, MIN_TRI_ANGLE_DEG, ModelArrays
 from reobj.poses.features import MIN_MATCHES, MatchedPairs
 from reobj.types import Array, BoolArray, IntArray
 
@@ -35,15 +35,10 @@ from reobj.types import Array, BoolArray, IntArray
 
 
 EXPLAINED_PX = 4.0  # largest distance from the epipolar line (COLMAP's filter_max_reproj_error)
-MAX_NEIGHBOUR = 4  # keyframes apart, at most, whose matches are checked (chosen)
 # Fraction of the matches that must be one point of the model (measured: right .38-.98, wrong 0)
 MIN_TIED = 0.1
 MIN_BRIDGE = 30  # points that connect two groups (COLMAP registers one image from 30 on)
 MIN_GROUP = 3  # images; fewer with a weak connection are left to be located by PnP
-WEAKEST_CUTS = 3  # whose re-observed points are counted (chosen: time)
-BORDER_IMAGES = 10  # of each side of a cut, those that share the most points (chosen: time)
-NEAR_VIEW_DEG = 30.0  # change of view that SIFT bridges (Lowe 2004, fig. 9)
-NEAR_VIEW_SCALE = 2.0  # change of distance that it bridges (an octave; chosen)
 # Fraction of the points that near views must observe again, and least number: what only farther
 # views share is matched by chance. Measured: right .065-.5, wrong 0-.007; right 31 and more, the
 # last 30 frames of the example mirrored 0.
@@ -146,7 +141,7 @@ def _ties(
     the pair alone must not explain many more of them than the model does.
 
     Args:
-        every: ids in the order of time; pairs with up to 3 images between them are checked.
+        every: ids in the order of time; pairs up to 4 images apart are checked.
     """
     order = {number: k for k, number in enumerate(every)}
     point_of = {}
@@ -157,7 +152,7 @@ def _ties(
         point_of[image_id][arrays.keypoint[mine]] = arrays.point[mine]
     for row, (a, b) in enumerate(pairs.image_ids.tolist()):
         matches = pairs.inliers[row]
-        if len(matches) < MIN_MATCHES or order[b] - order[a] > MAX_NEIGHBOUR:
+        if len(matches) < MIN_MATCHES or order[b] - order[a] > 4:
             continue
         ties[a, b] = False
         if a in point_of and b in point_of:
@@ -224,14 +219,11 @@ def _weak_cut(
             return np.asarray(cuts[cut])
     smaller = np.minimum(cuts.sum(1), (~cuts).sum(1))
     groups = np.flatnonzero(smaller >= MIN_GROUP)
-    for cut in groups[np.argsort(bridge[groups], kind="stable")[:WEAKEST_CUTS]]:
+    for cut in groups[np.argsort(bridge[groups], kind="stable")[:3]]:  # all would take long
         expected, reobserved = _count_reobserved(arrays, rows, np.asarray(cuts[cut]))
         if reobserved < max(MIN_REOBSERVED * expected, MIN_REOBSERVED_COUNT):
             return np.asarray(cuts[cut])
     return None
-
-
-CUTS_AT_ONCE = 50  # whose bridges are counted together (chosen: memory)
 
 
 def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
@@ -246,15 +238,16 @@ def _bridges(arrays: ModelArrays, rows: IntArray, cuts: BoolArray) -> IntArray:
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     rays = [sparse.csc_matrix((u, (entries.row, entries.col)), covisibility.shape) for u in ray.T]
     count = np.zeros(len(cuts), np.int64)
-    for start in range(0, len(cuts), CUTS_AT_ONCE):
-        chunk = cuts[start : start + CUTS_AT_ONCE].astype(float)
+    step = 50  # cuts counted together: memory
+    for start in range(0, len(cuts), step):
+        chunk = cuts[start : start + step].astype(float)
         sides = []
         for side in (chunk, 1 - chunk):
             n = np.asarray(side @ covisibility)  # (c, N)
             length2 = sum(np.asarray(side @ u) ** 2 for u in rays)
             sides.append((n > 0, n - length2 / np.maximum(n, 1) >= MIN_RAY_SPREAD))
         (one, one_deep), (two, two_deep) = sides
-        count[start : start + CUTS_AT_ONCE] = ((one & two_deep) | (two & one_deep)).sum(1)
+        count[start : start + step] = ((one & two_deep) | (two & one_deep)).sum(1)
     return count
 
 
@@ -262,7 +255,9 @@ def _count_reobserved(arrays: ModelArrays, rows: IntArray, side: BoolArray) -> t
     """Count the observations that each side of a cut should have of the other side's points.
 
     Expected is a point that two images of its side see, in an image of the other side that it
-    projects into, from a direction and a distance near those of one of the two.
+    projects into, from a direction and a distance near those of one of the two: SIFT bridges 30 deg
+    (Lowe 2004, fig. 9) and an octave. Of each side the 10 images are counted that share the most
+    points with the other.
 
     Args:
         side: (R,) of `rows`.
@@ -282,7 +277,7 @@ def _count_reobserved(arrays: ModelArrays, rows: IntArray, side: BoolArray) -> t
         xyz = arrays.xyz[points]
         seen = seen[:, points].tocoo()
         there = covisibility[~own][:, points].tocsr()
-        border = np.argsort(-np.asarray(there.sum(1)).ravel(), kind="stable")[:BORDER_IMAGES]
+        border = np.argsort(-np.asarray(there.sum(1)).ravel(), kind="stable")[:10]
         ray = centre[own][seen.row] - xyz[seen.col]  # (m, 3) from a point to a camera that sees it
         length = np.linalg.norm(ray, axis=1)
         for image in border:
@@ -295,8 +290,8 @@ def _count_reobserved(arrays: ModelArrays, rows: IntArray, side: BoolArray) -> t
             other_ray = centre[~own][image] - xyz  # (n, 3)
             other_length = np.linalg.norm(other_ray, axis=1)[seen.col]
             cosine = (ray * other_ray[seen.col]).sum(1) / (length * other_length)
-            is_near = cosine > np.cos(np.radians(NEAR_VIEW_DEG))
-            is_near &= np.abs(np.log(length / other_length)) < np.log(NEAR_VIEW_SCALE)
+            is_near = cosine > np.cos(np.radians(30))
+            is_near &= np.abs(np.log(length / other_length)) < np.log(2)
             inside &= np.bincount(seen.col[is_near], minlength=len(points)) > 0
             expected += int(inside.sum())
             reobserved += int(inside[there[image].indices].sum())
@@ -344,7 +339,6 @@ SIGMA_LIMITS = {
 MIN_PARALLAX_PX = 3.0  # refuse a model with less (chosen; walks have more than 4)
 MIN_POINTS = 100  # refuse a model with fewer (chosen)
 MIN_POINTS_PER_IMAGE = 30  # of the median image; refuse a model with fewer (chosen)
-MIN_TRI_ANGLE_DEG = 1.5  # median; refuse a model with less (chosen; COLMAP's points: 1.5)
 MIN_REGISTERED = 0.5  # fraction of the keyframes that makes a model worth keeping ...
 MIN_COMPONENT_IMAGES = 10  # ... or as many images of a larger video (COLMAP's min_model_size)
 # Two mappers agree if no centre differs by more, over the extent, and no camera by more in
@@ -352,14 +346,9 @@ MIN_COMPONENT_IMAGES = 10  # ... or as many images of a larger video (COLMAP's m
 SAME_CENTRE = 0.05
 SAME_TURN_DEG = 5.0
 SAME_IMAGES = 0.75  # fraction of the component that the other mapper must have (chosen)
-MIN_SAME = 3  # images of a piece of it; fewer have arbitrary poses (chosen)
 # Points that each of two pieces triangulates and that prove how they are joined: they fix rotation,
 # shift and scale (measured: right joins 191 to 386, a mirrored stretch 24, a free scale 0 to 3)
 MIN_JOINT = 100
-
-
-SIDEWAYS = "move the camera sideways around the objects (turning on the spot gives no depth)"
-LENS = "give measured intrinsics (--camera); pixels must be square"
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,10 +395,12 @@ def measured(
     focal = arrays.focal_over_size
     # at a wrong focal length a translation along a wall looks like a rotation
     calibrated = focal_source is FocalSource.MODEL
-    advice = SIDEWAYS if calibrated else ""
-    no_depth = "so depth cannot be estimated"
-    if not calibrated:
-        no_depth = f"if the focal length is {focal:.2f} x the longer side"
+    advice = ""
+    no_depth = f"if the focal length is {focal:.2f} x the longer side"
+    if calibrated:
+        advice = "move the camera sideways around the objects (turning on the spot gives no depth)"
+        no_depth = "so depth cannot be estimated"
+    lens = "give measured intrinsics (--camera); pixels must be square"
     checks = (
         (images < min(MIN_REGISTERED * count, MIN_COMPONENT_IMAGES),
          f"only {images} of {count} keyframes connect", ""),
@@ -421,7 +412,7 @@ def measured(
         (angle_deg < MIN_TRI_ANGLE_DEG,
          f"half of the points are seen from directions within {angle_deg:.1f} deg", advice),
         (arrays.camera.has_bogus_params(*FOCAL_RANGE, 1.0),
-         f"the estimated focal length is {focal:.2f} x the longer side", LENS),
+         f"the estimated focal length is {focal:.2f} x the longer side", lens),
     )  # fmt: skip
     problem, advice = next(((text, advice) for bad, text, advice in checks if bad), ("", ""))
     return Component(
@@ -486,7 +477,7 @@ def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
     One is aligned to the other by the mean of the relative orientations, then scale and shift.
     """
     ids = np.intersect1d(one.ids, other.ids)
-    if len(ids) < MIN_SAME:
+    if len(ids) < 3:  # arbitrary poses
         return np.empty(0, np.int64)
     rows = np.searchsorted(one.ids, ids)
     other_rows = np.searchsorted(other.ids, ids)
@@ -504,14 +495,11 @@ def _same(one: ModelArrays, other: ModelArrays) -> IntArray:
     return rows[: len(ids) if offset <= SAME_CENTRE and turn_deg.max() <= SAME_TURN_DEG else 0]
 
 
-ANGLE_SAMPLE = 2000  # points of which the median angle is taken, at least (chosen: time)
-
-
 def _median_tri_angle_deg(arrays: ModelArrays) -> float:
     """Return the median over points of the widest angle between two rays."""
     if not len(arrays.xyz):
         return 0.0
-    step = max(1, len(arrays.xyz) // ANGLE_SAMPLE)
+    step = max(1, len(arrays.xyz) // 2000)  # a sample: all points take long
     sample = np.flatnonzero(arrays.point % step == 0)
     sample = sample[np.argsort(arrays.point[sample], kind="stable")]
     ray = arrays.xyz[arrays.point[sample]] - arrays.centre[arrays.image[sample]]  # (m, 3)
@@ -519,9 +507,6 @@ def _median_tri_angle_deg(arrays: ModelArrays) -> float:
     starts = np.flatnonzero(np.diff(arrays.point[sample], prepend=-1))
     cosine = [(u @ u.T).min() for u in np.split(ray, starts[1:])]  # of each point
     return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))))
-
-
-MIN_SHARED = 15  # points of a pair of images whose parallax counts (chosen)
 
 
 def _parallax_px(arrays: ModelArrays) -> float:
@@ -539,7 +524,7 @@ def _parallax_px(arrays: ModelArrays) -> float:
         if (b - a) & (b - a - 1) == 0:  # 1, 2, 4, 8 ... keyframes apart
             p, q = (arrays.point[ends[i] : ends[i + 1]] for i in (a, b))
             both, one, other = np.intersect1d(p, q, return_indices=True)
-            if len(both) >= MIN_SHARED:
+            if len(both) >= 15:  # fewer have no stable median
                 u = unit[ends[a] + one]  # (n, 3)
                 v = unit[ends[b] + other]
                 turned = Rotation.align_vectors(v, u)[0].apply(u)
@@ -551,15 +536,11 @@ def _parallax_px(arrays: ModelArrays) -> float:
 
 
 WINDOW = 10  # images on one side whose points are used (chosen: a zoom bends those further off)
-MIN_RESECTED_POINTS = 20  # of these seen in an image (chosen; two determine focal length and pose)
 # Log of the focal length's change that is a zoom (measured, mean of both sides: zoomed by 1.25 to
 # 1.5 .15-.30, right models below .03; one side alone .34-.39, right models up to .12)
 MIN_ZOOM = 0.12
 MIN_ZOOM_ONE_SIDE = 0.24
 MIN_SIGMAS = 5.0  # of that change over its sigma (chosen)
-RESECTED_IMAGES = 2  # on each side of a gap (chosen)
-UNMEASURED = 10.0  # log of a change that cannot be measured: its sides count as different cameras
-RESECTION_STEPS = 8  # Gauss-Newton steps (chosen: focal lengths of a third more need 5)
 
 
 def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int, int, float]]]:
@@ -580,7 +561,7 @@ def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int,
     log = np.zeros(len(ids))
     for k, (start, (_, _, ratio)) in enumerate(zip(starts, changes, strict=True)):
         is_measured = not k or start - starts[k - 1] >= WINDOW  # else each bends the other's images
-        log[start:] += np.log(ratio) if is_measured else UNMEASURED
+        log[start:] += np.log(ratio) if is_measured else 10  # of other cameras
     same = np.abs(log[:, None] - log) < MIN_ZOOM  # (R, R)
     return ids[~same[same.sum(1).argmax()]] if len(ids) else ids, changes
 
@@ -596,11 +577,14 @@ def _is_side_effect(one: tuple[int, int, float], other: tuple[int, int, float]) 
     return bool(adjacent and log * other_log > 0 and abs(log) < abs(other_log))
 
 
-def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
+def _changes(arrays: ModelArrays, resected: int = 2) -> list[tuple[int, int, float]]:
     """List the changes of the focal length between consecutive images.
 
     The images next to each gap are resected from points of the other side. Where only one side can
     be measured, a larger change is required: the noise of its depths biases it.
+
+    Args:
+        resected: images next to a gap, on each side.
     """
     count = len(arrays.ids)
     changes = list[tuple[int, int, float]]()
@@ -613,12 +597,9 @@ def _changes(arrays: ModelArrays) -> list[tuple[int, int, float]]:
         before = range(max(0, k - WINDOW), k)
         after = range(k, min(k + WINDOW, count))
         sides = list[list[list[float]]]()
-        for side, resected, sign in (
-            (before, after[:RESECTED_IMAGES], 1),
-            (after, before[-RESECTED_IMAGES:], -1),
-        ):
+        for side, images, sign in ((before, after[:resected], 1), (after, before[-resected:], -1)):
             points = _triangulate(arrays, terms, side)
-            values = np.array([_log_focal(arrays, image, points) for image in resected])
+            values = np.array([_log_focal(arrays, image, points) for image in images])
             values = values * [sign, 1]
             sides.append(values[np.isfinite(values[:, 0])].tolist())
         if any(sides):
@@ -663,7 +644,7 @@ def _log_focal(arrays: ModelArrays, image: int, points: Array) -> tuple[float, f
     ideal = arrays.ideal[first:last]
     xyz_in_cam = points[arrays.point[first:last]] @ pose[:, :3].T + pose[:, 3]
     in_front = xyz_in_cam[:, 2] > 0  # no NaN
-    if in_front.sum() < MIN_RESECTED_POINTS:
+    if in_front.sum() < 20:  # for 7 unknowns and the variance of the noise
         return np.nan, np.nan
     return _resect(xyz_in_cam[in_front], ideal[in_front] * arrays.focal, arrays.focal)
 
@@ -679,7 +660,7 @@ def _resect(xyz_in_cam: Array, xy: Array, focal: float) -> tuple[float, float]:
     turn = np.eye(3)
     shift = np.zeros(3)
     log = 0.0
-    for _ in range(RESECTION_STEPS):
+    for _ in range(8):  # focal lengths of a third more need 5
         moved = xyz_in_cam @ turn.T + shift
         if (moved[:, 2] <= 0).any():
             return np.nan, np.nan

@@ -25,9 +25,6 @@ from reobj.poses.supplied.pose_formats import (
 )
 from reobj.types import Array, BoolArray, IntArray, ReobjError
 
-MODELS = ("images.bin", "images.txt")  # in the order of preference
-FOLDERS = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))  # the same
-
 
 def find_models(path: Path) -> list[Path]:
     """List the image files of the COLMAP models at a path or below it.
@@ -35,10 +32,10 @@ def find_models(path: Path) -> list[Path]:
     Below a folder without a model: `sparse/N` and `sparse`, else `N`, else `colmap/sparse/N`.
     """
     if path.is_file():
-        named = path if path.name in MODELS else path.parent / MODELS[0]
-        return [named] if named.is_file() else _model_in(path.parent)
+        return [path] if path.name == "images.txt" else _model_in(path.parent)
     models = _model_in(path)
-    for patterns in FOLDERS if not models else ():
+    places = (("sparse", "sparse/*"), ("*",), ("colmap/sparse", "colmap/sparse/*"))
+    for patterns in places if not models else ():
         folders = [folder for pattern in patterns for folder in sorted(path.glob(pattern))]
         folders = [f for f in folders if f.name.isdecimal() or f.name == "sparse"]
         models = models or [model for folder in folders for model in _model_in(folder)]
@@ -46,7 +43,7 @@ def find_models(path: Path) -> list[Path]:
 
 
 def _model_in(folder: Path) -> list[Path]:
-    return [folder / name for name in MODELS if (folder / name).is_file()][:1]
+    return [p for p in (folder / "images.bin", folder / "images.txt") if p.is_file()][:1]
 
 
 def read_colmap(path: Path, size: tuple[int, int]) -> PoseFile:

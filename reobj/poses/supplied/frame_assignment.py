@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from reobj.cameras import invert_rigid
 from reobj.frame_lookup import frames_by_name
+from reobj.sources.image_files import EPOCH_S, LEAST_STAMP, STAMPS_PER_S
 from reobj.types import Array, BoolArray, IntArray, ReobjError
 
 
@@ -166,19 +167,17 @@ def _by_image_numbers(
     return found
 
 
-# Fraction of renumbered k-th frames at the end that may have no pose (chosen)
-MAX_LOST = 0.1
-
-
 def _steps(numbers: int, known: int, count: int) -> list[int]:
     """List the k for which every k-th of `count` frames gives `numbers` frames or few more.
+
+    A tenth of the frames, at the end, may have no pose.
 
     known: how many of the numbers exist; if most are missing, the frames were not renumbered.
     """
     if 2 * known < numbers or numbers < 2:
         return []
     steps = range(2, max(count // (numbers - 1), 1) + 1)
-    most = numbers + MAX_LOST * numbers + 1
+    most = numbers + 0.1 * numbers + 1
     return [k for k in steps if numbers <= -(-count // k) <= most]
 
 
@@ -221,9 +220,6 @@ def _numbers_of_images(images: Sequence[str]) -> IntArray:
 # ---- Time stamps ---------------------------------------------------------------------------------
 
 
-EVEN_TIMES = 0.1  # of a step: largest deviation of times from multiples of it (chosen)
-
-
 def numbers_of_times(stamps_s: Array) -> IntArray:
     """Number times (N,), ascending: as multiples of their step from 0 on, else consecutively."""
     number = _even_numbers(stamps_s)
@@ -235,17 +231,13 @@ def _even_numbers(stamps_s: Array) -> IntArray | None:
     steps = np.diff(stamps_s)
     if len(steps) and stamps_s[0] >= 0:
         number = stamps_s / np.median(steps)
-        even = np.abs(number - number.round()).max() < EVEN_TIMES
+        even = np.abs(number - number.round()).max() < 0.1
         if even and number[-1] < 2 * len(number):  # few are missing: they start at 0
             return np.asarray(number.round(), np.int64)
     return None
 
 
-EPOCH_S = (946684800.0, 4102444800.0)  # 2000 to 2100, in s since 1970
-UNITS = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
-STEP_MIN_S = 1e-3  # between poses (chosen: motion capture at 1 kHz)
-STEP_MAX_S = 10.0  # (chosen: photos taken one by one)
-LEAST_STAMP = 1e9  # whole numbers below are counters (chosen: s since 1970 have ten digits)
+UNITS = tuple(zip(("s", "ms", "us", "ns"), STAMPS_PER_S, strict=True))
 
 
 def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> tuple[str, float]:
@@ -259,16 +251,18 @@ def unit_of_stamps(stamps: Array, end_s: float = 0.0) -> tuple[str, float]:
         end_s: of the video; 0: unknown.
     """
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    least_s = 1e-3  # motion capture at 1 kHz
+    most_s = 10.0  # photos taken one by one
     for unit in UNITS:
         if EPOCH_S[0] < stamps[0] / unit[1] < EPOCH_S[1]:
             return unit
     if end_s > 0 and np.median(stamps) > end_s:
         for unit in UNITS:
             ends = 0.5 < stamps[-1] / unit[1] / end_s < 2
-            if ends and STEP_MIN_S <= step / unit[1] <= STEP_MAX_S:
+            if ends and least_s <= step / unit[1] <= most_s:
                 return unit
     if is_whole(stamps) and stamps[-1] >= LEAST_STAMP:
-        return next((unit for unit in UNITS if step / unit[1] <= STEP_MAX_S), UNITS[0])
+        return next((unit for unit in UNITS if step / unit[1] <= most_s), UNITS[0])
     return UNITS[0]
 
 
@@ -277,9 +271,7 @@ def is_whole(stamps: Array) -> bool:
     return bool((stamps == np.round(stamps)).all())
 
 
-LONE_FRAME_S = 1 / 60  # half a frame interval, where there is only one frame (chosen: 30 Hz)
-STAMP_TOLERANCE_S = 0.02  # between a frame and its pose (default of TUM's associate.py)
-SAME_TIME_S = 5e-4  # times in files and containers are rounded to a ms
+STAMP_TOLERANCE_S = 0.02  # of a frame and its pose or depth map (default of TUM's associate.py)
 STAMP_STEP_S = 0.11  # largest step over which poses are interpolated: 10 Hz, with jitter
 
 
@@ -332,7 +324,7 @@ def rows_by_time(stamps_s: Array, frame: IntArray, time_s: Array) -> IntArray:
         row (F,) of each frame, -1: none.
     """
     steps = np.diff(time_s) / np.maximum(np.diff(frame), 1)
-    half = 0.5 * float(np.median(steps)) if len(steps) else LONE_FRAME_S
+    half = 0.5 * float(np.median(steps)) if len(steps) else 1 / 60  # 30 Hz
     after = np.searchsorted(stamps_s, time_s).clip(1, max(len(stamps_s) - 1, 1))  # (F,)
     pair = np.stack([after - 1, after], 1).clip(max=len(stamps_s) - 1)  # (F, 2)
     offset = np.abs(stamps_s[pair] - time_s[:, None])
@@ -353,7 +345,8 @@ def interpolated(cam_from_world: Array, stamps_s: Array, time_s: Array) -> tuple
     after = np.searchsorted(stamps_s, time_s, side="right").clip(1, len(stamps_s) - 1)
     a = after - 1
     b = after
-    use = (time_s - stamps_s[a] > SAME_TIME_S) & (stamps_s[b] - time_s > SAME_TIME_S)
+    same_s = 5e-4  # times in files and containers are rounded to a ms
+    use = (time_s - stamps_s[a] > same_s) & (stamps_s[b] - time_s > same_s)
     use &= stamps_s[b] - stamps_s[a] <= STAMP_STEP_S
     use &= np.isfinite(cam_from_world[a] + cam_from_world[b]).all((1, 2))
     a = a[use]

@@ -30,6 +30,7 @@ from reobj.cameras import (
     triangulate_rays,
     undistort_boxes,
 )
+from reobj.poses.features import MAX_RATIO
 from reobj.sources.video import shrunk
 from reobj.types import Array, Image, IntArray, Tracks, rows_by
 
@@ -69,6 +70,7 @@ def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> l
     Args:
         data: that give the residuals, for the message.
     """
+    least_px = 1e-3  # residuals are not smaller: rounding of poses in text files
     for one in readings:
         sizes = list[str]()
         is_likeliest = True
@@ -80,8 +82,8 @@ def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> l
             if not count:
                 is_likeliest = False
                 break
-            size = float(np.exp(np.log(residuals).mean()))
-            other_size = float(np.exp(np.log(other_residuals).mean()))
+            size = float(np.exp(np.log(residuals.clip(least_px)).mean()))
+            other_size = float(np.exp(np.log(other_residuals.clip(least_px)).mean()))
             is_likeliest &= count * math.log(other_size / size) > MIN_LOG_RATIO
             sizes.append(f"{size:.2g} px, by {other.rule} {other_size:.2g} px")
         if is_likeliest and sizes:
@@ -90,22 +92,10 @@ def likeliest(readings: Sequence[PoseReading], compare: Compare, data: str) -> l
     return list(readings)
 
 
-LEAST_PX = 1e-3  # residuals are not smaller: rounding of poses in text files (chosen)
-
-
 # ---- By images -----------------------------------------------------------------------------------
 
 
-SIZE_PX = 640  # longer side of the images in which features are matched (as the reconstruction)
-FEATURES = 1000  # SIFT features an image (chosen: time)
-RATIO = 0.8  # of the distances to the nearest and the second descriptor (Lowe, IJCV 2004)
-MIN_COMPARED_MATCHES = 20  # of a pair that is used (chosen)
-PAIRS = 20  # pairs of images by which two readings are compared (chosen: time)
 MIN_PAIRS = 3  # with fewer there is no decision (chosen)
-STEPS = (1, 2, 5, 10)  # frames with a pose between the two of a pair (chosen)
-MAX_TURN_DEG = 30.0  # between the two of a pair: half of a usual field of view (chosen)
-ENOUGH_DEG = 8.0  # difference that counts at most: narrow pairs match better (chosen)
-DIRECTION_WEIGHT = 0.1  # of a translation's direction, relative to the rotation (chosen)
 
 
 def by_images(readings: Sequence[PoseReading], video: Any) -> list[PoseReading]:
@@ -121,7 +111,7 @@ def by_images(readings: Sequence[PoseReading], video: Any) -> list[PoseReading]:
     poses = readings[0].poses
     wanted = set(poses.frame[sorted(rows)].tolist())
     row_of = {frame: row for row, frame in enumerate(poses.frame.tolist())}
-    sift = cv2.SIFT.create(FEATURES)
+    sift = cv2.SIFT.create(1000)  # more take long
     features = {
         row_of[frame.index]: _features(sift, frame.image, poses.camera)
         for frame in video
@@ -134,9 +124,9 @@ def by_images(readings: Sequence[PoseReading], video: Any) -> list[PoseReading]:
         for pair in some:
             if pair not in matches:
                 matches[pair] = _match(*(features.get(row) for row in pair))
-            if len(matches[pair][0]) >= MIN_COMPARED_MATCHES:
+            if len(matches[pair][0]) >= 20:  # fewer have no stable median
                 sizes.append(_epipolar_px(poses, pair, *matches[pair]))
-        return np.array(sizes).clip(LEAST_PX)
+        return np.array(sizes)
 
     def compare(one: Poses, other: Poses) -> tuple[Array, Array]:
         i, j = (next(k for k, r in enumerate(readings) if r.poses is p) for p in (one, other))
@@ -154,31 +144,34 @@ def _pairs_that_differ(one: Poses, other: Poses | None) -> list[tuple[int, int]]
     Args:
         other: None: the pairs of one reading with the widest motion.
     Returns:
-        rows of the poses; [] with fewer than MIN_PAIRS pairs that have poses in both.
+        rows of the poses, at most 20 pairs; [] with fewer than MIN_PAIRS that have poses in both.
     """
+    most = 20  # more take long
     rows = np.flatnonzero(one.known if other is None else one.known & other.known)
-    pairs = np.array([p for s in STEPS for p in zip(rows[:-s], rows[s:], strict=True)], np.int64)
+    steps = (1, 2, 5, 10)
+    pairs = np.array([p for s in steps for p in zip(rows[:-s], rows[s:], strict=True)], np.int64)
     if len(pairs) < MIN_PAIRS:
         return []
     turn, shift = _relative(one, pairs)
     turn_change = turn
     direction_deg = np.zeros(len(pairs))
-    is_near = _angle_deg(turn) < MAX_TURN_DEG
+    max_turn_deg = 30  # half of a usual field of view
+    is_near = _angle_deg(turn) < max_turn_deg
     if other is not None:
         other_turn, other_shift = _relative(other, pairs)
         turn_change = np.swapaxes(turn, 1, 2) @ other_turn
         norm = np.linalg.norm(shift, axis=1) * np.linalg.norm(other_shift, axis=1)
         cosine = (shift * other_shift).sum(1) / np.maximum(norm, 1e-12)
         direction_deg = np.where(norm > 0, np.degrees(np.arccos(cosine.clip(-1, 1))), 0.0)
-        is_near |= _angle_deg(other_turn) < MAX_TURN_DEG  # one of them is right
-    difference_deg = _angle_deg(turn_change) + DIRECTION_WEIGHT * direction_deg
-    score = np.where(is_near, difference_deg.clip(max=ENOUGH_DEG), -1.0)
+        is_near |= _angle_deg(other_turn) < max_turn_deg  # one of them is right
+    difference_deg = _angle_deg(turn_change) + 0.1 * direction_deg
+    score = np.where(is_near, difference_deg.clip(max=8), -1.0)  # narrow pairs match better
     chosen: list[tuple[int, int]] = []
-    apart = len(rows) / (2 * PAIRS)  # so that they are spread over the video
+    apart = len(rows) / (2 * most)  # so that they are spread over the video
     for k in np.argsort(-score, kind="stable").tolist():
         i, j = pairs[k].tolist()
         rank = np.searchsorted(rows, i)
-        if score[k] <= 0 or len(chosen) == PAIRS:
+        if score[k] <= 0 or len(chosen) == most:
             break
         if all(abs(rank - np.searchsorted(rows, c)) >= apart for c, _ in chosen):
             chosen.append((i, j))
@@ -201,7 +194,7 @@ def _angle_deg(turn: Array) -> Array:
 
 def _features(sift: Any, image: Image, camera: Camera) -> tuple[Array, Any]:
     """Find features: viewing rays (n, 3) with z = 1 in the camera (NaN: none), and descriptors."""
-    small = shrunk(image, SIZE_PX)
+    small = shrunk(image, 640)  # as the reconstruction
     points, descriptors = sift.detectAndCompute(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), None)
     if descriptors is None:
         return np.empty((0, 3)), np.empty((0, 128), np.float32)
@@ -216,7 +209,7 @@ def _match(first: Any, second: Any) -> tuple[Array, Array]:
     if first is None or second is None or min(len(first[1]), len(second[1])) < 2:
         return np.empty((0, 3)), np.empty((0, 3))
     nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first[1], second[1], k=2)
-    good = [a for a, b in nearest if a.distance < RATIO * b.distance]
+    good = [a for a, b in nearest if a.distance < MAX_RATIO * b.distance]
     rays = first[0][[m.queryIdx for m in good]], second[0][[m.trainIdx for m in good]]
     finite = np.isfinite(np.column_stack(rays)).all(1)
     return rays[0][finite], rays[1][finite]
@@ -245,22 +238,24 @@ def _epipolar_px(poses: Poses, pair: tuple[int, int], first: Array, second: Arra
 # ---- By tracks -----------------------------------------------------------------------------------
 
 
-MIN_FITTED_VIEWS = 8  # boxes of a track to which an object is fitted (chosen)
-MAX_FITTED_TRACKS = 30  # the longest (chosen: time)
 CORRELATED = 5  # consecutive boxes that count as one: a detector repeats its errors (chosen)
 
 
 def by_tracks(readings: Sequence[PoseReading], tracks: Tracks) -> list[PoseReading]:
-    """Choose a reading by boxes: in the right one each tracklet shows one object."""
-    groups = sorted(rows_by(tracks.tracklet_id), key=len, reverse=True)[:MAX_FITTED_TRACKS]
+    """Choose a reading by boxes: in the right one each tracklet shows one object.
+
+    Objects are fitted to the 30 longest tracklets of at least 8 boxes.
+    """
+    groups = sorted(rows_by(tracks.tracklet_id), key=len, reverse=True)[:30]
+    least = 8
 
     def compare(one: Poses, other: Poses) -> tuple[Array, Array]:
         sizes: tuple[list[float], list[float]] = ([], [])
         for rows in groups:
             (a, known), (b, other_known) = (place_of(p, tracks.frame[rows]) for p in (one, other))
             both = known & other_known
-            uses = [both, both] if both.sum() >= MIN_FITTED_VIEWS else [known, other_known]
-            if min(use.sum() for use in uses) < MIN_FITTED_VIEWS:
+            uses = [both, both] if both.sum() >= least else [known, other_known]
+            if min(use.sum() for use in uses) < least:
                 continue
             pair = [
                 _object_px(poses, pose_rows[use], tracks.xyxy[rows[use]])
@@ -287,17 +282,15 @@ def _object_px(poses: Poses, rows: IntArray, xyxy: Array) -> float:
     inside = (xyxy > 1) & (xyxy < size - 1) & np.isfinite(projected) & np.isfinite(boxes)
     if not inside.any():
         return float(size.max())
-    return max(float(np.median(np.abs(projected - boxes)[inside])), LEAST_PX)
+    return float(np.median(np.abs(projected - boxes)[inside]))
 
 
 # ---- Direction and axes --------------------------------------------------------------------------
 
 
 MIN_CHECKED_TRACKS = 4  # (chosen: three triangulate by chance in a trajectory read backwards)
-MAX_CHECKED_TRACKS = 200  # the longest (chosen: time)
 GOOD_DEG = 1.0  # residual of poses that are certainly right (chosen: 9 px at 500 px focal length)
 MAX_RESIDUAL_RATIO = 0.3  # of a clearly better convention (chosen)
-MAX_NAMED_RATIO = 1.5  # to the best residual, of conventions named beside the best (chosen)
 
 
 def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str | None:
@@ -325,7 +318,7 @@ def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str |
         "quaternions with w last given as ones with w first": _quaternions_rolled(given, 1),
     }  # fmt: skip
     views = [view for track in tracks if (view := _rays_of_track(poses, *track)) is not None]
-    views = sorted(views, key=lambda v: -len(v[0]))[:MAX_CHECKED_TRACKS]
+    views = sorted(views, key=lambda v: -len(v[0]))[:200]  # the longest: all take long
     if len(views) < MIN_CHECKED_TRACKS:
         return None
     residual_deg = {
@@ -336,9 +329,7 @@ def check_poses(poses: Poses, tracks: Sequence[tuple[IntArray, Array]]) -> str |
     best = min(residual_deg.values())
     if as_given < GOOD_DEG or best > min(MAX_RESIDUAL_RATIO * as_given, GOOD_DEG):
         return None  # a better but still bad fit is wrong too, as with poses of other frames
-    likely = " or ".join(
-        text for text, value in residual_deg.items() if value <= MAX_NAMED_RATIO * best
-    )
+    likely = " or ".join(text for text, value in residual_deg.items() if value <= 1.5 * best)
     return (
         f"the poses look like {likely}: {len(views)} tracks triangulate within {best:.1f} deg when "
         f"read that way, {as_given:.1f} deg as they are; check --pose-format and the file's "
@@ -355,27 +346,25 @@ def _quaternions_rolled(cam_from_world: Array, count: int) -> Array:
     return invert_rigid(world_from_cam)
 
 
-MIN_CHECKED_VIEWS = 5  # frames of a track that is used (chosen)
-MAX_CHECKED_VIEWS = 40  # of it, evenly spread (chosen: time)
-
-
 def _rays_of_track(poses: Poses, frame: IntArray, xy: Array) -> tuple[IntArray, Array] | None:
     """Return the viewing rays of a track's centres in the frames with a pose, thinned.
 
     Returns:
-        rows (n,) of the poses and unit rays (n, 3) in camera axes; None if the track is too short.
+        rows (n,) of the poses and unit rays (n, 3) in camera axes, n from 5 to 40; None if the
+        track is too short.
     """
+    least = 5
     rows, known = place_of(poses, frame)
     use = np.flatnonzero(known & np.isfinite(xy).all(1))
-    if len(use) < MIN_CHECKED_VIEWS:
+    if len(use) < least:
         return None
-    spread = np.linspace(0, len(use) - 1, min(len(use), MAX_CHECKED_VIEWS))
+    spread = np.linspace(0, len(use) - 1, min(len(use), 40))
     use = use[np.unique(spread.round().astype(int))]
     ideal = poses.camera.undistort(xy[use])
     finite = np.isfinite(ideal).all(1)
     use = use[finite]
     ideal = ideal[finite]
-    if len(use) < MIN_CHECKED_VIEWS:
+    if len(use) < least:
         return None
     rays = np.column_stack([ideal, np.ones(len(use))]) @ np.linalg.inv(poses.camera.K).T  # (n, 3)
     return rows[use], rays / np.linalg.norm(rays, axis=1, keepdims=True)

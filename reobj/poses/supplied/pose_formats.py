@@ -238,17 +238,15 @@ Z_UP = np.array([0, 0, 1.0])
 # ---- Tables: TUM, ORB-SLAM3, EuRoC, rows of matrices ---------------------------------------------
 
 
-ROWS = "TUM rows t tx ty tz qx qy qz qw, or 12 or 16 numbers (world_from_cam, row by row)"
-
-
 def read_rows(path: Path, size: tuple[int, int]) -> PoseFile:
     """Read a table by its columns: 8 (TUM, ORB-SLAM3, EuRoC), 12 or 16 (matrices), 17 (EuRoC)."""
-    rows, where, header = _table(path, (8, 12, 16, 17), ROWS)
+    expected = "TUM rows t tx ty tz qx qy qz qw, or 12 or 16 numbers (world_from_cam, row by row)"
+    rows, where, header = _table(path, (8, 12, 16, 17), expected)
     if rows.shape[1] in (12, 16):
         return read_matrices(path, size)
     named = _named_columns(header, rows.shape[1])
     text = next(line for line in read_lines(path)[::-1] if line.strip())
-    in_ns = abs(rows[0, 0]) >= LEAST_NS
+    in_ns = abs(rows[0, 0]) >= 1e15  # in us this is the year 2001, in ms 33,658
     if rows.shape[1] == 17 or "_RS_" in header or ("," in text and in_ns and named is None):
         return read_euroc(path, size)
     found = read_tum(path, size)
@@ -257,9 +255,6 @@ def read_rows(path: Path, size: tuple[int, int]) -> PoseFile:
         other = from_quaternions(np.roll(rows[:, 4:], -1, 1), rows[:, 1:4], where)
         return dataclasses.replace(found, w_first=invert_rigid(other)[kept])
     return found
-
-
-LEAST_NS = 1e15  # larger stamps are ns: in us this is the year 2001, in ms 33,658
 
 
 def _table(path: Path, columns: tuple[int, ...], expected: str) -> tuple[Array, list[str], str]:
@@ -300,13 +295,11 @@ def read_tum(path: Path, size: tuple[int, int]) -> PoseFile:
     columns = _named_columns(header, 8) or list(range(1, 8))
     world_from_cam = from_quaternions(rows[:, columns[3:]], rows[:, columns[:3]], where)
     kept, messages = _by_time(rows[:, 0], path)
+    is_ours = "(world_from_cam, seconds, units: " in header  # of `cameras.write_tum`
     return PoseFile(
-        invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], is_ours=OWN_HEADER in header,
+        invert_rigid(world_from_cam)[kept], stamps=rows[kept, 0], is_ours=is_ours,
         metric=not re.search(f"#.*{NO_SCALE}", header), kind="TUM rows", messages=messages,
     )  # fmt: skip
-
-
-OWN_HEADER = "(world_from_cam, seconds, units: "  # of `cameras.write_tum`
 
 
 def _by_time(stamps: Array, path: Path) -> tuple[IntArray, tuple[str, ...]]:
@@ -427,23 +420,21 @@ def read_stray(path: Path, size: tuple[int, int]) -> PoseFile:
     if matrix.is_file():
         K = read_table(matrix, (3,), "3 rows of 3 numbers")[0]
         raise_where([K.shape != (3, 3)], [str(matrix)], "expected 3 rows of 3 numbers")
-        cameras.append(brown_camera(_size_of(K, size, PHONE), K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        cameras.append(brown_camera(_size_of(K, size), K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     return PoseFile(
         invert_rigid(world_from_cam), tuple(cameras), names, metric=True, up_in_world=Y_UP,
         kind="Stray Scanner folder",
     )  # fmt: skip
 
 
-def _size_of(K: Array, size: tuple[int, int], native: tuple[int, int]) -> tuple[int, int]:
-    """Return the size of the images of a matrix K: that of the frames, or the native one.
+def _size_of(K: Array, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the size of the images of a matrix K: that of the frames, or the native one of ARKit.
 
     The principal point is near the middle of the right one.
     """
+    native = (1920, 1440)  # in landscape
     offset = [np.abs(2 * K[:2, 2] / some - 1).max() for some in (size, native)]
     return size if offset[0] <= offset[1] else native
-
-
-PHONE = (1920, 1440)  # pixels of ARKit's video, in landscape
 
 
 def read_record3d(path: Path, size: tuple[int, int]) -> PoseFile:
@@ -605,7 +596,7 @@ def read_scannetpp(path: Path, size: tuple[int, int]) -> PoseFile:
             matrix = data[name].get("aligned_pose", data[name].get("pose"))
             matrices.append(np.array(matrix, np.float64).reshape(4, 4))
             K = np.array(data[name]["intrinsic"], np.float64).reshape(3, 3)
-            cameras.append(brown_camera(_size_of(K, size, PHONE), *K[[0, 1, 0, 1], [0, 1, 2, 2]]))
+            cameras.append(brown_camera(_size_of(K, size), *K[[0, 1, 0, 1], [0, 1, 2, 2]]))
         except (KeyError, TypeError, ValueError, AttributeError):
             expected = "4x4 aligned_pose or pose, and 3x3 intrinsic"
             raise ReobjError(f"{key}: expected {expected}, numbers") from None

@@ -220,16 +220,6 @@ READERS: dict[str, Callable[[Path, tuple[int, int]], PoseFile]] = {
     "splatting": formats.read_splatting,
     "rows": formats.read_rows,  # a table: tum, euroc or matrices, by its columns
 }
-# Files of a folder by which a format is recognised, in the order of preference
-FILES = {
-    "transforms": "transforms.json",
-    "stray": "odometry.csv",
-    "scannetpp": "pose_intrinsic_imu.json",
-    "llff": "poses_bounds.npy",
-    "splatting": "cameras.json",
-    "record3d": "metadata",
-}
-TABLES = ("poses.txt", "groundtruth.txt", "traj.txt", "poses_c2w.txt")  # TUM; Replica; ours
 
 
 def read_pose_file(path: Path, fmt: str, size: tuple[int, int]) -> PoseFile:
@@ -261,7 +251,15 @@ def _recognise(path: Path) -> dict[str, Path]:
     """
     if not path.is_dir():
         return {_format_of_file(path): path}
-    found = {name: path for name, file in FILES.items() if (path / file).is_file()}
+    file_of = {
+        "transforms": "transforms.json",
+        "stray": "odometry.csv",
+        "scannetpp": "pose_intrinsic_imu.json",
+        "llff": "poses_bounds.npy",
+        "splatting": "cameras.json",
+        "record3d": "metadata",
+    }
+    found = {name: path for name, file in file_of.items() if (path / file).is_file()}
     if path.name == "pose" or (path / "pose").is_dir() or any(path.glob("*.pose.txt")):
         found["scannet"] = path
     if formats.arkit_files(path):
@@ -272,7 +270,8 @@ def _recognise(path: Path) -> dict[str, Path]:
         found["colmap"] = path
     if (path / "data.csv").is_file():
         found["euroc"] = path
-    tables = [path / name for name in TABLES if (path / name).is_file()]
+    names = ("poses.txt", "groundtruth.txt", "traj.txt", "poses_c2w.txt")  # TUM; Replica; ours
+    tables = [path / name for name in names if (path / name).is_file()]
     if tables:
         found["rows"] = tables[0]
     return found or {"colmap": path}
