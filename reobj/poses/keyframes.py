@@ -188,7 +188,7 @@ def pick_keyframes(
             continue
         last = frame
         flow, left = update
-        if flow >= 0.7 * wider * max_flow:
+        if flow >= 0.7 * wider * max_flow:  # near the threshold: the sharpest is chosen
             window.append(frame)
         late = frame.row - track.row >= wider * MAX_INTERVAL and flow > MIN_FLOW
         if late or flow > wider * max_flow or left < MIN_CORNERS_LEFT**wider:

@@ -561,7 +561,7 @@ def constant_focal(models: list[ModelArrays]) -> tuple[IntArray, list[tuple[int,
     log = np.zeros(len(ids))
     for k, (start, (_, _, ratio)) in enumerate(zip(starts, changes, strict=True)):
         is_measured = not k or start - starts[k - 1] >= WINDOW  # else each bends the other's images
-        log[start:] += np.log(ratio) if is_measured else 10  # of other cameras
+        log[start:] += np.log(ratio) if is_measured else 10  # as of another camera
     same = np.abs(log[:, None] - log) < MIN_ZOOM  # (R, R)
     return ids[~same[same.sum(1).argmax()]] if len(ids) else ids, changes
 

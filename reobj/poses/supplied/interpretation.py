@@ -164,7 +164,7 @@ def _pairs_that_differ(one: Poses, other: Poses | None) -> list[tuple[int, int]]
         cosine = (shift * other_shift).sum(1) / np.maximum(norm, 1e-12)
         direction_deg = np.where(norm > 0, np.degrees(np.arccos(cosine.clip(-1, 1))), 0.0)
         is_near |= _angle_deg(other_turn) < max_turn_deg  # one of them is right
-    difference_deg = _angle_deg(turn_change) + 0.1 * direction_deg
+    difference_deg = _angle_deg(turn_change) + 0.1 * direction_deg  # directions count less
     score = np.where(is_near, difference_deg.clip(max=8), -1.0)  # narrow pairs match better
     chosen: list[tuple[int, int]] = []
     apart = len(rows) / (2 * most)  # so that they are spread over the video
