@@ -3,15 +3,13 @@
 
     python benchmarks/eliminate.py DATA -o OUT --choosing [--seeds 911 912 ...] [--noises 2]
 
-Starts from all mechanisms of `real_rooms.py --without`. In each step the mechanism whose removal
-costs the least is removed as well, until a loss exceeds its noise. The cost of a removal is the
-mean loss of IDF1 over recordings and box noises, plus its loss of found objects and its gain of
-false ones (duplicates and elsewhere), each as a fraction of the true ones, plus that of the overlap
-in 3D where it is measured. Its noise is two
-standard errors of these paired differences against the full set. Evaluations are lazy: a mechanism
-is measured again only while its earlier cost makes it a candidate for the next step, because costs
-rarely fall as others are removed. OUT/elimination.json keeps every evaluation, so that an
-interrupted run resumes; OUT/elimination.md is the curve.
+Each mechanism of `real_rooms.py --without` is left out alone. Then they are removed together, in
+the order of what that cost: a removal is kept if the loss of the whole set stays within its noise;
+three refusals in a row end the search. The loss of a run is that of IDF1, of found objects and of
+false ones (duplicates and elsewhere), each as a fraction of the true ones, and of the overlap in 3D
+where it is measured, all added. The loss of a set is the mean over recordings and box noises; its
+noise is two standard errors of these paired differences against the full set. OUT/elimination.json
+keeps every evaluation, so that an interrupted run resumes; OUT/elimination.md has the tables.
 """
 
 from __future__ import annotations
@@ -70,30 +68,29 @@ def noise(loss: np.ndarray) -> float:
     return float(2 * loss.std(ddof=1) / np.sqrt(len(loss)))
 
 
-def eliminate(evaluate: Evaluations, names: Sequence[str]) -> list[tuple[str, float, float]]:
-    """Remove mechanisms greedily; returns the curve: name, cost of the set, its noise.
-
-    The last row is the removal that exceeded its noise, and was not made.
-    """
+def eliminate(evaluate: Evaluations, names: Sequence[str]) -> list[tuple[str, str, float, float]]:
+    """Remove mechanisms together; returns rows: what was done, name, loss of the set, its noise."""
     full = evaluate([])
-    cost = {name: -np.inf for name in names}  # of the set with it, when last measured
-    measured_with = dict.fromkeys(names, -1)  # number of removed mechanisms then
+
+    def loss_without(step: str, name: str, removed: Sequence[str]) -> tuple[str, str, float, float]:
+        loss = losses(full, evaluate(removed))
+        row = (step, name, float(loss.mean()), noise(loss))
+        print(f"{step}: {name}: loss {row[2]:+.4f}, noise {row[3]:.4f}", flush=True)
+        return row
+
+    rows = [loss_without("alone", name, [name]) for name in names]
     removed: list[str] = []
-    curve = []
-    while cost:
-        name = min(cost, key=lambda one: cost[one])
-        loss = losses(full, evaluate([*removed, name]))
-        cost[name] = float(loss.mean())
-        if measured_with[name] < len(removed) and name != min(cost, key=lambda one: cost[one]):
-            measured_with[name] = len(removed)
-            continue
-        curve.append((name, cost[name], noise(loss)))
-        print(f"{len(curve)}: {name}: cost {cost[name]:+.4f}, noise {noise(loss):.4f}", flush=True)
-        if cost[name] > noise(loss):
+    refused = 0
+    for _, name, *_ in sorted(rows, key=lambda row: row[2]):
+        step, _, loss, of_noise = loss_without("together", name, [*removed, name])
+        kept = loss <= of_noise
+        rows.append((step if kept else "refused", name, loss, of_noise))
+        refused = 0 if kept else refused + 1
+        if kept:
+            removed.append(name)
+        elif refused == 3:
             break
-        removed.append(name)
-        del cost[name]
-    return curve
+    return rows
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -127,9 +124,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         ]
         for task in whole:  # leaves in OUT what the others need
             task.result()
-        curve = eliminate(Evaluations(args.out / "elimination.json", run), list(WITHOUT))
-    rows = [f"| {name} | {cost:+.4f} | {noise_:.4f} |" for name, cost, noise_ in curve]
-    page = "\n".join(["| removed as well | cost of the set | noise |", "|---|---|---|", *rows])
+        rows = eliminate(Evaluations(args.out / "elimination.json", run), list(WITHOUT))
+    head = ["| removed | mechanism | loss of the set | noise |", "|---|---|---|---|"]
+    page = "\n".join([*head, *(f"| {a} | {b} | {c:+.4f} | {d:.4f} |" for a, b, c, d in rows)])
     (args.out / "elimination.md").write_text(page + "\n")
     print(page)
     return 0
