@@ -101,6 +101,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add: Callable[..., Any] = parser.add_argument
     add_cases(parser)
     add("--noises", type=int, default=1, metavar="N", help="box noises of half a pixel each")
+    text = "mechanisms that may go (all); quote names with spaces"
+    add("--candidates", nargs="+", default=list(WITHOUT), metavar="NAME", help=text)
     add("--jobs", type=int, default=2, help="processes at once")
     args = parser.parse_args(argv)
     cases = prepared_cases(args)
@@ -124,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ]
         for task in whole:  # leaves in OUT what the others need
             task.result()
-        rows = eliminate(Evaluations(args.out / "elimination.json", run), list(WITHOUT))
+        rows = eliminate(Evaluations(args.out / "elimination.json", run), args.candidates)
     head = ["| removed | mechanism | loss of the set | noise |", "|---|---|---|---|"]
     page = "\n".join([*head, *(f"| {a} | {b} | {c:+.4f} | {d:.4f} |" for a, b, c, d in rows)])
     (args.out / "elimination.md").write_text(page + "\n")
