@@ -253,11 +253,12 @@ def truth_of(path: Path, result: rt.Result) -> Path:
 def test_the_report_has_no_class_of_zeros() -> None:
     """What was not found at all is named in one line; a class with any score keeps its own."""
     zero = dict.fromkeys("HOTA DetA AssA IDF1 IDP IDR MOTA IDSW Frag ids_per_object".split(), 0.0)
-    some = zero | {"HOTA": 0.4, "IDF1": 0.5, "IDP": 0.5, "IDR": 0.5}
+    some = zero | {"HOTA": 0.4, "IDF1": 0.5, "IDP": 0.5, "IDR": 0.5, "IDSW": 3}
     names = {f"thing {i}": zero for i in range(20)}
     tracks = {"all": some, "chair": some, "clock": zero, **names}
     lines = score_report({"tracks": tracks, "ranks": {}}).splitlines()
     assert [line.split()[0] for line in lines[1:3]] == ["all", "chair"]
+    assert lines[1].split()[1:] == [f"{v}.00" for v in (40, 0, 0, 50, 50, 50, 0, 3, 0, 0)]
     assert lines[3].startswith("nothing found of: clock, thing 0,")
     assert not any(line.startswith("clock") for line in lines) and max(map(len, lines)) <= 100
     nothing = score_report({"tracks": {"all": zero}, "ranks": {}}).splitlines()
@@ -483,13 +484,17 @@ def test_mot17_distractors_swallow_what_they_match(tmp_path: Path) -> None:
     assert mine["gt_objects"] == 1 and mine["identities"] == 2 and mine["precision"] == 0.5
 
 
-def test_barely_visible_truth_is_ignored(tmp_path: Path) -> None:
-    gt = np.array([[1, 1, 0, 0, 10, 10, 1, 56, 0.9], [1, 2, 50, 0, 10, 10, 1, 56, 0.1]])
-    pr = np.array([[1, i, x, 0, 10, 10, 1, -1, -1, -1] for i, x in ((1, 0), (2, 50))])
+def test_barely_visible_truth_and_that_of_other_classes_are_ignored(tmp_path: Path) -> None:
+    """Two chairs, one of them hidden, and a cup are found by a file without classes."""
+    truth = (1, 0, 56, 0.9), (2, 50, 56, 0.1), (3, 90, 41, 0.9)  # id, x, class, visibility
+    gt = np.array([[1, i, x, 0, 10, 10, 1, kind, seen] for i, x, kind, seen in truth])
+    pr = np.array([[1, i, x, 0, 10, 10, 1, -1, -1, -1] for i, x, *_ in truth])
     files = write(tmp_path / "pr.txt", pr), write(tmp_path / "gt.txt", gt)
-    assert rt.evaluate(*files)["tracks"]["all"]["gt_objects"] == 2
-    strict = rt.evaluate(*files, min_visibility=0.3)["tracks"]["all"]
-    assert strict["gt_objects"] == 1 and strict["precision"] == 1
+    chair = {"classes": ["chair"]}
+    for options, count in (({}, 3), ({"min_visibility": 0.3}, 2), (chair, 2),
+                           (chair | {"min_visibility": 0.3}, 1)):  # fmt: skip
+        found = rt.evaluate(*files, **options)["tracks"]["all"]
+        assert found["gt_objects"] == count and found["precision"] == 1
 
 
 def test_unknown_class_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ IMAGES = ["/data/walk/left/0001.jpg", "/data/walk/left/0002.jpg", "/data/walk/le
         ([r"images\0002.jpg"], [1], "file names"),  # written on Windows
         (["right/0001.jpg", "left/0001.jpg"], [-1, 0], "file names with 1 folders"),
         (["0002.png"], [1], "file names, without suffixes"),
-        (["0002", "0003"], [1, 2], "file names, without suffixes"),
+        (["right/0001", "left/0001"], [-1, 0], "file names with 1 folders, without suffixes"),
         (["0009.jpg"], [-1], ""),
         ([], [], ""),
     ],
@@ -38,5 +38,6 @@ def test_a_name_in_two_unknown_folders_is_refused() -> None:
 def test_folders_are_compared_up_to_the_first(top: str) -> None:
     """Only the outermost folder differs."""
     names = [f"{top}left/images/1.jpg", f"{top}right/images/1.jpg"]
-    found, rule = frames_by_name(names[::-1], ["left/images/1.jpg", "right/images/1.jpg"])
-    assert found.tolist() == [1, 0] and rule == "file names with 2 folders"
+    for given, frames in ((names[::-1], [1, 0]), (names[1:], [1])):
+        found, rule = frames_by_name(given, ["left/images/1.jpg", "right/images/1.jpg"])
+        assert found.tolist() == frames and rule == "file names with 2 folders"
