@@ -104,6 +104,7 @@ def test_mot_rows_as_they_are(tmp_path: Path, text: str, expected: list[list[flo
         ("1,2,3,4,5,6,1,1,1,x\n", "line 1: 'x' is no finite number"),  # the last column too
         ("frame,x1,y1,x2,y2\n0,1,2,3,4\n", "line 1: no MOTChallenge file"),
         ("1," + "2" * 200_000, "line 1: no table"),
+        ('1,2,3,4,5,"6"7\n', "line 1: no table"),
         ("1,2,3,4,5,6\n1.5,2,3,4,5,6\n", "line 2: frame 1.5, expected a whole number"),
         ("1,1e30,3,4,5,6\n", "line 1: id 1e30, expected a whole number"),
         ("1,2,3,4,5,6\n1,2,3,-1e9,5,6\n", "line 2: box .*, expected at most 1e.07 px"),
@@ -185,8 +186,16 @@ def test_datasets_with_their_own_annotations(tmp_path: Path) -> None:
     images = [{"id": 70 + i, "file_name": f"{i}.jpg", "frame_id": 8 - i} for i in range(9)]
     entries = coco_entries(image_id=72, category_id=5, score=0.5, track_id=3)
     data = {"images": images, "categories": [{"id": 5, "name": "wok"}], "annotations": entries}
-    found = read(tmp_path, "vid.json", json.dumps(data), video)
-    assert found.frame.tolist() == [6] and found.identity.tolist() == [3]
+    few = data | {"images": images[1:4]}  # nothing shows that 5 to 7 count from 0
+    both = data | {
+        "videos": [{"id": 1, "name": "a.mp4"}, {"id": 2, "name": "b.mp4"}],
+        "images": [i | {"id": i["id"] + 9 * (v - 1), "video_id": v} for v in (1, 2) for i in images],
+        "annotations": entries + coco_entries(image_id=83, category_id=5),
+    }
+    for whole in (few, both, data):
+        found = read(tmp_path, "vid.json", json.dumps(whole), video)
+        assert found.frame.tolist() == [6] and found.identity.tolist() == [3]
+        assert any("9 images of other" in m for m in found.messages) == (whole is both)
     assert found.class_names == ("wok",) and found.score.tolist() == [0.5]
     for image in images:
         del image["frame_id"]

@@ -142,6 +142,7 @@ TABLES = {
     "mot with tabs": mot("\t"),
     "mot with semicolons": mot(";"),
     "mot with decimal commas": mot(";", "0,9").replace("0;9", "0,9").replace(";20;", ";20,0;"),
+    "mot with spaces and decimal commas": csv("", "{n} 1 {x1},0 {y1},0 {w},0 {h},0 0,9").lstrip(),
     "mot with floats as numpy writes them": mot(tail="9.0e-01,57.0"),
     "mot with CRLF and a byte order mark": "\ufeff" + mot().replace("\n", "\r\n"),
     "mot from 0": mot(first=0),
@@ -152,7 +153,8 @@ TABLES = {
     "boxmot: 1, class from 0, score": mot(tail=f"1,{CHAIR},0.873000"),
     "boxmot's detections, no identity": mot(tail=f"1,{CHAIR},.87", identity=-1),
     "csv": csv("frame,x1,y1,x2,y2,score,class", CSV_ROW),
-    "csv in capitals": csv("Frame,X1,Y1,X2,Y2,Score,Class", CSV_ROW),
+    "csv in capitals, with units": csv(
+        "Frame number, X1 [px], Y1 [px], X2 [px], Y2 [px], Score, Class", CSV_ROW),
     "csv of a spreadsheet": csv("frame;x1;y1;x2;y2;score;class",
                                 "{f};{x1},0;{y1},0;{x2},0;{y2},0;0,9;chair"),
     "pandas' index": csv(",frame,x1,y1,x2,y2,score,class", "{n}," + CSV_ROW),
