@@ -241,6 +241,53 @@ def test_what_moves_stays_as_the_tracker_has_it() -> None:
             assert len(np.unique(found.track_id)) == objects
 
 
+def test_labels_decide_and_spread_in_their_fragments() -> None:
+    """As row by row: rows of fragments that may have a gap, labelled at random.
+
+    Changes of less than three rows are not reported.
+    """
+    rng = np.random.default_rng(4)
+    frame, piece = (x.ravel() for x in np.meshgrid(np.arange(30), np.arange(8), indexing="ij"))
+    keep = (frame >= 12 - piece) & ((frame < 16) | (frame > 22)) & (rng.random(240) < 0.9)
+    keep &= (piece < 7) | (frame < 8)  # the last has three rows at most
+    frame, piece = frame[keep], piece[keep]
+    n = len(frame)
+    label = np.where(rng.random(n) < 0.3, (piece + (frame > 20) + (rng.random(n) < 0.2)) // 2, -1)
+    label[(piece == 2) | (piece == 7)] = -1
+    iou = np.where(rng.random(n) < 0.5, rng.random(n), np.nan)
+    ids, kind = 11 - piece // 3, np.full(n, CHAIR)
+    table = rt.Tracks(frame, ids, piece + 1, rng.random((n, 4)), np.ones(n), kind, piece)
+    found, events = link(table, NAMES, rt.Embeddings.empty(), np.empty(0, np.int64),
+                         label=label, iou=iou)  # fmt: skip
+
+    fragment, expected = piece + 10 * (frame > 20), label.tolist()
+    taken = {(frame[r], label[r]) for r in range(n) if label[r] >= 0}
+    for r in sorted(range(n), key=lambda r: fragment[r]):
+        known = [k for k in range(n) if fragment[k] == fragment[r] and label[k] >= 0]
+        if label[r] < 0 and known:
+            name = label[min(known, key=lambda k: abs(frame[k] - frame[r]))]
+            if (frame[r], name) not in taken:
+                taken.add((frame[r], name))
+                expected[r] = int(name)
+    expected = [100 + ids[r] if expected[r] < 0 else expected[r] for r in range(n)]
+    pairs = set(zip(found.track_id.tolist(), expected, strict=True))
+    assert len(pairs) == len(set(expected)) == len(set(found.track_id.tolist())) > 5
+    told = []
+    for change, whole, part in (("join", expected, ids), ("split", ids, expected)):
+        for group in sorted(set(whole)):
+            rows = [r for r in range(n) if whole[r] == group]
+            for own in sorted({part[r] for r in rows}):
+                some = [r for r in rows if part[r] == own]
+                ious = [iou[r] for r in some if not np.isnan(iou[r])]
+                of = tuple(sorted({int(piece[r]) + 1 for r in (rows if change == "join" else some)}))
+                told.append((change, group, len(some), of, float(np.median(ious)) if ious else None))
+    long = [t for t in told if t[2] >= 3]
+    later = [t for before, t in zip([("", 0), *long], long, strict=False) if t[:2] == before[:2]]
+    assert {t[0] for t in later} == {"join", "split"} and {t[2] for t in told} > {2, 3}
+    assert [(e.kind, e.tracklets, e.place_iou) for e in events] == [(t[0], *t[3:]) for t in later]
+    assert {e.appearance_log_odds for e in events} == {-9.0}
+
+
 # ---- By appearance ----
 
 

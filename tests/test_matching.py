@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,7 +17,9 @@ from reobj.poses.supplied.frame_assignment import (
     _by_stamps,
     interpolated,
     rows_by_time,
+    source_of,
 )
+from reobj.sources.video import InputConfig
 
 
 def source(frame: list[int], time_s: list[float], count: int, timed: bool = True) -> SourceFrames:
@@ -73,6 +77,15 @@ def test_of_fast_frames_a_time_matches_within_half_a_frame() -> None:
     """Every third frame of 100 a second: a neighbour that was not read is another frame."""
     frame = np.array([0, 3, 6])
     assert rows_by_time(np.array([0.004, 0.036, 0.06]), frame, frame / 100).tolist() == [0, -1, 2]
+
+
+def test_a_video_has_as_many_frames_as_were_decoded_if_all_were() -> None:
+    for config, names, count in (
+        (None, (), 9), (InputConfig(), (), 9), (InputConfig(every=2), (), 30),
+        (InputConfig(stop=9), (), 30), (InputConfig(), ("a.png",) * 30, 30),
+    ):  # fmt: skip
+        video = SimpleNamespace(config=config, names=names, frame_count=30)
+        assert source_of(video, np.arange(9), np.arange(9) / 10).count == count
 
 
 def test_numbers_beside_images_that_count_from_elsewhere() -> None:

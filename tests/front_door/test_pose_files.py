@@ -176,9 +176,13 @@ def test_numbers_of_a_video_count_from_0_or_1_as_the_images_show(
 def test_every_kth_frame_numbered_anew(tmp_path: Path, every: int, first: int) -> None:
     frames = ALL[::every]
     names = [f"frame_{i + first:05d}.png" for i in range(len(frames))]
-    poses = rt.read_poses(model(tmp_path / "m", frames, names), rt.Video(film(tmp_path)))
-    assert_right(poses, frames)
-    assert f"one frame in {every}" in poses.reading
+    video = rt.Video(film(tmp_path))
+    unnamed = tmp_path / "kitti.txt"
+    np.savetxt(unnamed, invert_rigid(path_of()[frames]).reshape(-1, 12))
+    for path in (model(tmp_path / "m", frames, names), unnamed):
+        poses = rt.read_poses(path, video, camera="PINHOLE 320 240 290 290 160 120")
+        assert_right(poses, frames)
+        assert f"one frame in {every}" in poses.reading
 
 
 def test_photos_from_0_beside_names_from_1(tmp_path: Path) -> None:
