@@ -189,7 +189,9 @@ def test_datasets_with_their_own_annotations(tmp_path: Path) -> None:
     few = data | {"images": images[1:4]}  # nothing shows that 5 to 7 count from 0
     both = data | {
         "videos": [{"id": 1, "name": "a.mp4"}, {"id": 2, "name": "b.mp4"}],
-        "images": [i | {"id": i["id"] + 9 * (v - 1), "video_id": v} for v in (1, 2) for i in images],
+        "images": [
+            i | {"id": i["id"] + 9 * (v - 1), "video_id": v} for v in (1, 2) for i in images
+        ],
         "annotations": entries + coco_entries(image_id=83, category_id=5),
     }
     for whole in (few, both, data):

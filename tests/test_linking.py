@@ -17,7 +17,7 @@ from reobj.tracking.linking import FRAGMENT_GAP, cut_at_gaps, link
 SIZE = (640, 480)
 CAMERA = rt.Camera("PINHOLE", *SIZE, (520.0, 520.0, 320.0, 240.0))
 NAMES = rt.COCO_NAMES
-PERSON, CHAIR, CUP = 0, 56, 41
+PERSON, BICYCLE, CHAIR, CUP = 0, 1, 56, 41
 
 
 def walk(frames: int = 120, arc_deg: float = 120.0) -> rt.Poses:
@@ -227,16 +227,18 @@ def stacked() -> tuple[rt.Tracks, rt.Poses]:
 
 
 def test_what_moves_stays_as_the_tracker_has_it() -> None:
-    """The same rows as chairs are joined by place and by appearance; as persons they are not."""
+    """The same rows as chairs are joined by place and by appearance; as persons they are not.
+
+    Nor is what does not move joined with what does.
+    """
     poses = walk()
     table = table_of(poses)
     table = table[(table.detection_index == 0) & ((table.frame < 40) | (table.frame >= 80))]
     ids = 1 + (table.frame >= 80)
     for known in ((poses, None), (None, views_of(table, 0 * ids, 0.5))):
-        for kind, objects in ((CHAIR, 1), (PERSON, 2)):
-            rows = dataclasses.replace(
-                table, track_id=ids, tracklet_id=ids, class_id=np.full(len(ids), kind)
-            )
+        for early, late, objects in ((CHAIR, CHAIR, 1), (PERSON, PERSON, 2), (BICYCLE, PERSON, 2)):
+            kind = np.where(ids == 1, early, late)
+            rows = dataclasses.replace(table, track_id=ids, tracklet_id=ids, class_id=kind)
             found, _ = linked(rows, *known, moving=("person", "dog"))
             assert len(np.unique(found.track_id)) == objects
 
@@ -279,8 +281,12 @@ def test_labels_decide_and_spread_in_their_fragments() -> None:
             for own in sorted({part[r] for r in rows}):
                 some = [r for r in rows if part[r] == own]
                 ious = [iou[r] for r in some if not np.isnan(iou[r])]
-                of = tuple(sorted({int(piece[r]) + 1 for r in (rows if change == "join" else some)}))
-                told.append((change, group, len(some), of, float(np.median(ious)) if ious else None))
+                of = tuple(
+                    sorted({int(piece[r]) + 1 for r in (rows if change == "join" else some)})
+                )
+                told.append(
+                    (change, group, len(some), of, float(np.median(ious)) if ious else None)
+                )
     long = [t for t in told if t[2] >= 3]
     later = [t for before, t in zip([("", 0), *long], long, strict=False) if t[:2] == before[:2]]
     assert {t[0] for t in later} == {"join", "split"} and {t[2] for t in told} > {2, 3}
@@ -386,16 +392,22 @@ def test_a_misnamed_piece_does_not_ban_the_return_of_its_tracklet() -> None:
     assert np.unique(found.track_id).tolist() == [1]
 
 
-@pytest.mark.parametrize(("common", "objects"), [(0.0, 3), (0.9, 6)])
-def test_what_similarity_means_is_learnt_from_the_video(common: float, objects: int) -> None:
+@pytest.mark.parametrize(
+    ("common", "kinds", "objects"),
+    [(0.0, [CHAIR] * 3, 3), (0.9, [CHAIR] * 3, 6), (0.0, [CHAIR, CUP, PERSON], 6)],
+)
+def test_what_similarity_means_is_learnt_from_the_video(
+    common: float, kinds: list[int], objects: int
+) -> None:
     """The returns are .8 alike: enough where the chairs side by side are not alike at all, too
-    little where these are .7 alike.
+    little where these are .9 alike, or of several classes: then nothing is learnt from them.
     """
     table = table_of(walk())
     table = table[(table.frame < 40) | (table.frame >= 80)]
     chair = table.detection_index
     ids = 1 + chair + 3 * (table.frame >= 80)
-    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids)
+    kind = np.array(kinds)[chair]
+    table = dataclasses.replace(table, track_id=ids, tracklet_id=ids, class_id=kind)
     own = np.sqrt(common) * np.eye(1, 40) + np.sqrt(1 - common) * np.eye(3, 40, 1)[chair]
     visit = np.eye(6, 40, 10)[ids - 1]  # what changed until the return
     views = np.sqrt(0.8) * own + np.sqrt(0.2) * visit

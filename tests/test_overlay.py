@@ -130,7 +130,8 @@ def test_ellipses_are_drawn_in_place_if_wanted() -> None:
     thin = (image != 127).any(2).sum()
     image = grey()
     draw_ellipses(image, dual_c, np.array([False, True]), ids, {2})
-    assert (image != 127).any(2).sum() > 1.3 * thin  # of an object with a box
+    wide = (image != 127).any(2).sum()
+    assert 1.7 * thin < wide < 2.1 * thin  # of an object with a box
 
 
 def test_huge_ellipses_are_left_out() -> None:

@@ -152,7 +152,7 @@ def as_colmap_binary(folder, cams):
 def model(folder, cams, camera=PINHOLE):
     """Write our own COLMAP text model, with two points that no image observes."""
     points = np.arange(6.0).reshape(2, 3)
-    extra = {"points": points, "colors": np.array([[9, 8, 7], [250, 0, 1]], np.uint8)}
+    extra = {"points": points, "colors": np.array([[9, 8, 7], [255, 0, 1]], np.uint8)}
     extra["camera"] = camera
     write_colmap(folder, dataclasses.replace(supplied(cams), **extra), NAMES[: len(cams)])
     return folder
@@ -433,7 +433,7 @@ def test_colmap_points_come_along_in_the_order_of_their_numbers(tmp_path, write)
         points.write_text("\n".join(reversed(points.read_text().splitlines())) + "\n")
     poses = read(path)
     np.testing.assert_array_equal(poses.points, np.arange(6).reshape(2, 3))
-    np.testing.assert_array_equal(poses.colors, [[9, 8, 7], [250, 0, 1]])
+    np.testing.assert_array_equal(poses.colors, [[9, 8, 7], [255, 0, 1]])
 
 
 @pytest.mark.parametrize("binary", [False, True])
