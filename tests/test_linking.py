@@ -400,7 +400,7 @@ def test_what_similarity_means_is_learnt_from_the_video(
     common: float, kinds: list[int], objects: int
 ) -> None:
     """The returns are .8 alike: enough where the chairs side by side are not alike at all, too
-    little where these are .9 alike, or of several classes: then nothing is learnt from them.
+    little where these are .7 alike, or of several classes: then nothing is learnt from them.
     """
     table = table_of(walk())
     table = table[(table.frame < 40) | (table.frame >= 80)]
