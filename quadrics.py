@@ -706,9 +706,6 @@ def _rays(boxes: Array, cams: _Cameras, index: IntArray) -> tuple[Array, Array]:
 
 # ---- SfMO and PSfMO: affine cameras ---------------------------------------------------------
 
-# Covariance of log(w/h) and log(d/h) of an unknown category
-UNKNOWN_RATIO_COV: Array = 0.5 * np.eye(2) + 0.25
-
 
 @dataclass(frozen=True, slots=True)
 class SfmoResult:
@@ -880,7 +877,7 @@ def _shape_gaussian(priors: Priors, categories: Sequence[str | None]) -> tuple[A
     index = priors.index(categories)
     known = index >= 0
     mean_log = np.zeros((len(index), 2))
-    cov_log = np.tile(UNKNOWN_RATIO_COV, (len(index), 1, 1))
+    cov_log = np.tile(0.5 * np.eye(2) + 0.25, (len(index), 1, 1))  # of an unknown category
     mean_log[known] = priors.ratio_mean[index[known]]
     cov_log[known] = priors.ratio_cov[index[known]]
     node, weight = np.polynomial.hermite_e.hermegauss(5)
@@ -1022,8 +1019,6 @@ def _known_camera_start(
 
 # ---- Levenberg-Marquardt over a batch of solids ---------------------------------------------
 
-NEAR_DEPTH = 1e-3  # longest half axes; a centre of less depth counts as behind the camera
-BEHIND = 12.0  # sigma, constant residual of the edges of a view with the object behind the camera
 SMOOTH = 1e-3  # smooths the kink of |m| in the support function of box and cylinder
 SIZE_WALL = 2.5  # sigma of growth beyond which the size prior is quartic
 SIZE_WALL_RISE = 16.0  # factor of the extra cost: rise * (s^2 - wall^2)^2 / wall^2
@@ -1149,7 +1144,7 @@ def _residuals(
     flat = n_view * n_edge
     normal = edges.normal.reshape(n_prob, flat, 3)
     depth = _depth(state, edges)  # (B, V)
-    near = NEAR_DEPTH * np.exp(state.log_half.max(1))[:, None]  # (B, 1)
+    near = 1e-3 * np.exp(state.log_half.max(1))[:, None]  # (B, 1) less depth counts as behind
     behind = (depth <= near) & edges.used.any(-1)  # (B, V)
     inv_depth = 1.0 / np.where(depth > near, depth, np.inf)  # (B, V), 0 where behind
     half = np.exp(state.log_half)[:, None]  # (B, 1, 3)
@@ -1163,7 +1158,7 @@ def _residuals(
     free = edges.one_sided.reshape(n_prob, flat) & (excess > 0)
     scale[free] = 0.0
     value = scale * excess
-    value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = BEHIND
+    value[np.repeat(behind, n_edge, 1) & edges.used.reshape(n_prob, flat)] = 12.0  # an outlier's
     if not jacobian:
         return value, np.empty(0)
     jac = np.empty((n_prob, flat, 9))
@@ -1345,16 +1340,11 @@ def _minimise(
 # ---- fit_objects: data, priors, starts ------------------------------------------------------
 
 START_OFFSET = 0.5  # box sizes, inlier threshold of the distance of a ray from the centre
-START_CUT_VOTE = 0.3  # weight of the vote of a box that touches the image border
-START_DEPTH_LOG = 0.3  # log, sigma of the depth from a box's extent and a known size
-START_SIZE_LOG = 0.25  # log, sigma of the size from a box's extent and a known depth
-START_CENTER = 0.1  # box sizes, sigma of a box's centre as the image of the object's
 # Points in the boxes of an object: about half lie on it. Chosen on hololens_kitchen and redkitchen,
 # insensitive within .05 to .15, to .3, and 10 to 60 (docs/quadrics.md).
 POINT_REL = 0.08  # sigma of a point's distance, over the usual half width of the category
 POINT_ELSEWHERE = 0.1  # prior odds of a point on another object, uniform in space
 POINTS_WORTH = 20.0  # total weight of an object's points: the errors of neighbours correlate
-ELSEWHERE_M = 1.0  # m, sigma of the height of objects that need not stand on the floor
 STANDING_REL = 0.012  # sigma of the lower side's height over the floor, over the object's height
 # Size of an unknown category: distribution of the 110 indoor categories of priors.json.
 UNKNOWN_SIZE_M = (0.29, 0.25, 0.25)  # m, geometric mean
@@ -1500,7 +1490,7 @@ def _prior_spec(given: _Given, world: _World) -> _Spec:
         stands = known & priors.on_floor[rows]
         standing_sigma = STANDING_REL * 2.0 * np.exp(size_mean[:, 2])
         floor_sigma = np.where(stands, np.hypot(world.floor.sigma, standing_sigma), np.inf)
-        elsewhere = ELSEWHERE_M / np.exp(world.log_scale)
+        elsewhere = 1.0 / np.exp(world.log_scale)  # 1 m, sigma of the height of other objects
         log_odds += np.where(stands, np.log(elsewhere / floor_sigma), 0.0)
     is_point = _finite(points, 2)  # (O, P)
     count = is_point.sum(1, keepdims=True)
@@ -1590,10 +1580,11 @@ def _start_points(data: _Data, spec: _Spec) -> tuple[Array, Array, BoolArray]:
         centres (O, 3), log half axes (O, 3), and inlier (O, S) of the S views.
     """
     seen = data.edges.used.any(-1).astype(np.float64)  # (O, S)
-    weight = seen * np.where(data.edges.one_sided.any(-1), START_CUT_VOTE, 1.0)
+    weight = seen * np.where(data.edges.one_sided.any(-1), 0.3, 1.0)  # less at the image border
     extent = np.maximum(data.extent.mean(-1), 1e-12)  # (O, S)
     common = spec.size_cov.mean((1, 2))  # (O,) variance of the common log size
-    sigma = np.sqrt(common + START_DEPTH_LOG**2)[:, None]  # of log prior depth
+    # of log prior depth: sizes differ, and an extent depends on the direction of the view (.3)
+    sigma = np.sqrt(common + 0.3**2)[:, None]
     # mean extent of a box over all directions is sum(a): E|m_k| = 1 / 2, full size 2 a_k
     prior_depth = np.exp(spec.size_mean).sum(1)[:, None] / extent  # (O, S)
     single = data.cam_center + prior_depth[..., None] * data.ray
@@ -1609,7 +1600,7 @@ def _start_points(data: _Data, spec: _Spec) -> tuple[Array, Array, BoolArray]:
     center, z = _refine_start(data, single, points[row, best], agree, prior_depth, sigma)
     seen_size = (agree * z * extent).sum(1) / np.maximum(agree.sum(1), 1e-12)
     growth = np.log(np.maximum(seen_size, 1e-12)) - np.log(np.exp(spec.size_mean).sum(1))
-    gain = common / (common + START_SIZE_LOG**2)
+    gain = common / (common + 0.25**2)  # sigma of the log size from extents and depths
     log_half = spec.size_mean + (gain * np.clip(growth, -12.0, 12.0))[:, None]
     inlier = (seen > 0) & (distance < 4.0)
     inlier |= (2.0 * inlier.sum(1) < seen.sum(1))[:, None]  # no majority: all views are used
@@ -1633,7 +1624,7 @@ def _refine_start(
     z = np.abs(_ray_misfit(data, center[:, None])[1][:, 0]) + 1e-9  # (O, S)
     count = np.maximum((agree > 0).sum(1), 1)[:, None]
     for _ in range(2):
-        across = agree / (z * START_CENTER * extent) ** 2
+        across = agree / (z * 0.1 * extent) ** 2  # a box's centre is the object's to a tenth of it
         depth = agree / (prior_depth * sigma) ** 2 / count  # the error is common to all views
         info = across[..., None, None] * (np.eye(3) - along) + depth[..., None, None] * along
         target = (info @ (single - center[:, None])[..., None]).sum(1)[..., 0]  # (O, 3)
@@ -1649,15 +1640,11 @@ def _refine_start(
 
 # ---- fit_objects: starts, inliers, evidence -------------------------------------------------
 
-# Log evidence on the first views below the best at which a candidate is dropped (measured on
-# simulated boxes: 3 in 1,000 of the winners on all views were lower)
-BEHIND_LOG = 6.0
 CHUNK = 384  # problems of a batch: they fit the second-level cache of a core
 ROUND_LOG = 0.05  # log, sigma of width / depth of yaw-symmetric categories
 SIZE_WALL_LOG = 0.25  # log, least sigma of which SIZE_WALL is a multiple: a category may be wrong
 NOISE_PRIOR_DOF = 12.0  # residuals, weight of the nominal noise level
 OBJECT_NOISE_DOF = 20.0  # residuals, weight of the pooled noise level in that of one object
-NOISE_RANGE = (0.05, 20.0)  # limits of the noise factor
 VIEW_OUTLIER = 6.0  # sigma^2, largest mean square of a view (chi2 .9999, 4 dof, is 23.5 / 4)
 EDGE_OUTLIER = 5.0  # sigma, residual beyond which an edge is an outlier (occlusion)
 # sigma^2, largest costs of an edge: -2 log(p / 20 sigma / .4), p the probability of an outlier
@@ -1845,7 +1832,7 @@ def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: boo
     total = dof[best].sum()
     pooled = (NOISE_PRIOR_DOF + median * total) / (NOISE_PRIOR_DOF + total)
     variance = (OBJECT_NOISE_DOF * pooled + square) / (OBJECT_NOISE_DOF + dof)
-    fit.noise = np.clip(np.sqrt(variance), *NOISE_RANGE)
+    fit.noise = np.clip(np.sqrt(variance), 0.05, 20.0)
 
 
 def _weighted_median(values: Array, weight: Array) -> float:
@@ -1909,21 +1896,12 @@ def _safe_inverse(hessian: Array) -> Array:
     return np.asarray(inverse * scale[:, :, None] * scale[:, None, :])
 
 
-PROBE = 1.5  # sigma, displacement at which the cost is evaluated
-BEND_WEIGHT = (
-    4.0  # of q q'; its second moment is .75, the 95 % region of nine parameters needs more
-)
-MAX_BEND = 30.0  # sigma, limit of the bend of a principal axis
-MAX_WIDENING = 4.0  # limit of the stretching, as a factor on sigma
-SMOOTH_COV = 0.05  # as SMOOTH, about the variation of m near a kink
-
-
 def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
     """Compute the covariance (B, 9, 9) of a bent posterior, to second order around its mode.
 
     Along each principal axis v of the Laplace covariance the mode is displaced by +-k sigma and the
     other eight directions are re-minimised (one Gauss-Newton step): the path s v + s^2 q / 2. With
-    s ~ N(0, 1) its second moment is v v' + 3/4 q q' (BEND_WEIGHT is more, for the tail); where
+    s ~ N(0, 1) its second moment is v v' + 3/4 q q' (the weight is more, for the tail); where
     the cost along the path grows slower than s^2 (kinks of box and cylinder; points that disagree
     with the boxes), v is stretched. Points have no other effect: they are one-sided bounds.
     Ref: second-order delta method.
@@ -1933,7 +1911,8 @@ def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
     cov = np.empty_like(fit.hessian)
     for rows in _chunks(len(cov), CHUNK // 36):  # 18 displacements of each (size measured)
         batch = (fit.state[rows], _inlier_edges(fit, data, rows), prob[rows])
-        info = _normal_equations(*batch, "huber", SMOOTH_COV).hessian + ROTATION_CAP
+        # the support function is smoothed over about the variation of m near its kink
+        info = _normal_equations(*batch, "huber", 0.05).hessian + ROTATION_CAP
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("bii->bi", info), 1e-30))  # (B, 9)
         value, vector = _eigh(info * scale[:, :, None] * scale[:, None, :])
         axes = scale[:, :, None] * vector / np.sqrt(np.maximum(value, 1e-10))[:, None]  # (B, 9, 9)
@@ -1942,12 +1921,14 @@ def _curved_covariance(fit: _Fit, data: _Data, spec: _Spec) -> Array:
 
 
 def _second_moment(state: _State, edges: _Edges, prob: _Problem, axes: Array) -> Array:
-    """Sum stretched v v' + BEND_WEIGHT q q' over the principal axes v (B, 9, 9 as columns)."""
+    """Sum stretched v v' + 4 q q' over the principal axes v (B, 9, 9 as columns)."""
+    probe = 1.5  # sigma, displacement at which the cost is evaluated
+    bend_weight = 4.0  # 3/4 is the second moment; the 95 % region of nine parameters needs more
     base = _normal_equations(state, edges, prob, "huber").cost
     row = np.arange(18 * len(axes))
     side, i, b = np.unravel_index(row, (2, 9, len(axes)))  # of R = 18 B displaced solids
     basis = axes[b]  # (R, 9, 9)
-    moved = state[b].moved(np.array([-PROBE, PROBE])[side, None] * basis[row, :, i])
+    moved = state[b].moved(np.array([-probe, probe])[side, None] * basis[row, :, i])
     normal = _normal_equations(moved, edges[b], prob[b], "huber")
     hess = basis.transpose(0, 2, 1) @ normal.hessian @ basis + 1e-3 * np.eye(9)  # whitened
     grad = (basis.transpose(0, 2, 1) @ normal.gradient[..., None])[..., 0]
@@ -1955,14 +1936,14 @@ def _second_moment(state: _State, edges: _Edges, prob: _Problem, axes: Array) ->
     hess[row, :, i] = 0.0
     hess[row, i, i] = 1.0
     grad[row, i] = 0.0
-    step = np.clip(-_solve(hess, grad), -MAX_BEND, MAX_BEND)  # (R, 9) whitened
+    step = np.clip(-_solve(hess, grad), -30.0, 30.0)  # (R, 9) whitened
     rise = normal.cost + 2.0 * (grad * step).sum(1)
     rise = rise + np.einsum("bi,bij,bj->b", step, hess, step) - base[b]
-    widen = PROBE**2 / np.maximum(rise, PROBE**2 / MAX_WIDENING**2)
+    widen = probe**2 / np.maximum(rise, probe**2 / 4.0**2)  # at most four times the sigma
     widen = widen.reshape(2, 9, -1, 1).max(0, initial=1.0)  # (9, B, 1)
-    bend = ((basis @ step[..., None]) / PROBE**2).reshape(2, 9, -1, 9).sum(0)  # (9, B, 9)
+    bend = ((basis @ step[..., None]) / probe**2).reshape(2, 9, -1, 9).sum(0)  # (9, B, 9)
     v = axes.transpose(2, 0, 1) * np.sqrt(widen)  # (9, B, 9)
-    moments = v[..., None] * v[..., None, :] + BEND_WEIGHT * bend[..., None] * bend[..., None, :]
+    moments = v[..., None] * v[..., None, :] + bend_weight * bend[..., None] * bend[..., None, :]
     return np.asarray(moments.sum(0))
 
 
@@ -1972,7 +1953,8 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
     fit = _best_starts(few, spec, cfg)
     _refit(fit, few, spec, cfg, "cauchy")
     fit.evidence = _log_evidence(fit, _all_residuals(fit, few), spec, few)
-    fit = fit[fit.evidence >= -BEHIND_LOG - _least(-fit.evidence, fit.obj)]
+    # 3 in 1,000 of the winners on all views are lower than this on the first (simulated boxes)
+    fit = fit[fit.evidence >= -6.0 - _least(-fit.evidence, fit.obj)]
     fit.inlier = data.edges.used[fit.obj]
     _refit(fit, data, spec, cfg, "cauchy")
     for robust in (True, False):
@@ -1993,9 +1975,6 @@ def _fit_all(data: _Data, spec: _Spec, cfg: FitConfig) -> _Fit:
 
 # ---- fit_objects: scale, gravity, report ----------------------------------------------------
 
-CAMERA_ROLL_DEG = 6.0  # deg, sigma of a hand-held camera's roll
-CAMERA_PITCH_DEG = 35.0  # deg, same of its pitch
-CAMERA_UP_VIEWS = 4.0  # most views of a video whose roll is independent
 UPRIGHT_TILT_DEG = 1.5  # deg, sigma of an object's vertical axis where gravity is given
 SCALE_MIN_PARALLAX_DEG = 3.0  # deg, least parallax of an object that votes for the scale
 UNKNOWN_SCALE_LOG = 3.0  # log, prior sigma of the global scale where the poses have none
@@ -2059,9 +2038,10 @@ def camera_up(img_from_world: Array) -> tuple[Array, float]:
     mean = up.mean(0)
     if np.linalg.norm(mean) < 0.3:
         return np.zeros(3), np.inf
-    roll = np.deg2rad(CAMERA_ROLL_DEG)
-    pitch = np.deg2rad(CAMERA_PITCH_DEG)
-    info = min(len(x), CAMERA_UP_VIEWS) * x.T @ x / len(x) / roll**2 + np.eye(3) / pitch**2
+    roll = np.deg2rad(6.0)  # sigma of a hand-held camera's
+    pitch = np.deg2rad(35.0)
+    independent = min(len(x), 4.0)  # views whose rolls do not repeat each other
+    info = independent * x.T @ x / len(x) / roll**2 + np.eye(3) / pitch**2
     best = np.linalg.solve(info, mean / pitch**2)
     best /= np.linalg.norm(best)
     level = np.eye(3) - np.outer(best, best)

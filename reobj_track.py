@@ -252,7 +252,6 @@ class Config:
 # Noise is relative to the box, as in DeepSORT: its mean side for x and y, its own side for w and h
 # (`STD_MEASURE` of `reobj.tracking.box_noise` holds at score .8).
 SCORE_NOISE = 0.25  # it grows with (1 - score) to this power (StrongSORT: 1)
-ORDINARY_SCORE = 0.5  # of a detection that counts once for `n_init` (default of `new_score`)
 
 
 def kalman_predict(mean: Array, cov: Array, config: TrackerConfig) -> tuple[Array, Array]:
@@ -362,8 +361,8 @@ class TrackState:
 
     @property
     def evidence(self) -> Array:
-        """Sum of a track's scores (T,) in detections of ordinary score, at least one."""
-        return np.asarray(np.maximum(self.votes.sum(1) / ORDINARY_SCORE, 1))
+        """Sum of a track's scores (T,) in detections of score .5, `new_score`'s default; at least 1."""
+        return np.asarray(np.maximum(self.votes.sum(1) / 0.5, 1))
 
     @staticmethod
     def spawn(box: Array, tracklet: IntArray, frame: int, config: TrackerConfig) -> TrackState:

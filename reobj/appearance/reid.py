@@ -151,8 +151,6 @@ def _cosine(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> Array:
 # ---- Calibrated similarity ---------------------------------------------------------------------
 
 PRIOR_PAIRS = 10.0  # pseudo-count of the usual mean and spread (chosen)
-LOG_SIMILARITY_AT_1 = 1.03  # -log(1.03 - cosine) is finite, 3.5 at most (chosen)
-USUAL_ANGLE_DEG = 45.0  # between two views of unknown directions (chosen)
 OUTLIERS = 1e-3  # fraction of pairs of either kind that look like the other kind (chosen)
 
 
@@ -186,8 +184,8 @@ class SimilarityCalibration:
 
     @staticmethod
     def log_similarity(cosine: npt.ArrayLike) -> Array:
-        """Compute -log(1.03 - cosine): monotone, steep where two views are nearly equal."""
-        return np.asarray(-np.log(LOG_SIMILARITY_AT_1 - np.minimum(cosine, 1.0)))
+        """Compute -log(1.03 - cosine): monotone, steep for nearly equal views, at most 3.5."""
+        return np.asarray(-np.log(1.03 - np.minimum(cosine, 1.0)))
 
     def add(self, foreground: Array, background: Array, same: bool) -> None:
         """Add the cosines of pairs (N,) of one kind; NaN: unknown."""
@@ -239,7 +237,8 @@ class SimilarityCalibration:
         mean = total / count
         std = np.sqrt((squares / count - mean**2).mean(0).clip(1e-3))  # (2,)
         separation = ((mean[1] - mean[0]) / std).clip(0)
-        angle = np.radians(np.where(np.isnan(view_angle_deg), USUAL_ANGLE_DEG, view_angle_deg))
+        usual_deg = 45.0  # between two views of unknown directions
+        angle = np.radians(np.where(np.isnan(view_angle_deg), usual_deg, view_angle_deg))
         facing = ((1 + np.cos(angle)) / 2, np.cos(angle).clip(0))
         scale = zip(
             (foreground, background), facing, mean.mean(0), std, 1 + separation, strict=True

@@ -73,10 +73,6 @@ def describe_objects(
     return objects
 
 
-# frames with the same detector error, which count as one (chosen: a third of a second)
-CORRELATED_VIEWS = 10
-
-
 def _likeliest_classes(
     rows: Tracks, class_names: Sequence[str], class_count: int
 ) -> dict[str, float]:
@@ -88,7 +84,7 @@ def _likeliest_classes(
         class_count: number of classes that any object of the video may have.
     """
     classes, column = np.unique(rows.class_id, return_inverse=True)
-    votes = np.bincount(column, rows.score) / CORRELATED_VIEWS
+    votes = np.bincount(column, rows.score) / 10  # errors of ten consecutive frames count as one
     log_odds = votes * np.log(CLASS_KEPT / (1 - CLASS_KEPT) * max(class_count - 1, 1))
     probability = np.exp(log_odds - log_odds.max())
     probability /= probability.sum() + (class_count - len(classes)) * np.exp(-log_odds.max())

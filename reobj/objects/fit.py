@@ -441,9 +441,6 @@ def _fit_component(
     return described, fits
 
 
-OF_THE_WORLD = {"scale", "up", "up_source"}  # columns of ObjectFits; the others are per object
-
-
 def join_fits(
     fits: Sequence[quadrics.ObjectFits | None], component_of_object: IntArray, poses: Poses
 ) -> quadrics.ObjectFits | None:
@@ -469,9 +466,10 @@ def join_fits(
     columns["ellipsoids"] = quadrics.Ellipsoids(*arrays)
     reasons = [reason for _, fit in made for reason in fit.reason]
     columns["reason"] = [reasons[i] for i in order]
+    of_the_world = ("scale", "up", "up_source")  # the other columns are per object
     for name in {f.name for f in dataclasses.fields(quadrics.ObjectFits)} - {*columns}:
         values = [getattr(fit, name) for _, fit in made]
-        columns[name] = values[0] if name in OF_THE_WORLD else np.concatenate(values)[order]
+        columns[name] = values[0] if name in of_the_world else np.concatenate(values)[order]
     if fits[0] is None:  # the scale of the largest component is unknown
         none = quadrics.Scale(1.0, np.inf, "none")
         columns |= {"scale": none, "up": np.zeros(3), "up_source": "none"}

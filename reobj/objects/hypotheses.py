@@ -20,7 +20,6 @@ from reobj.types import Array, BoolArray, IntArray
 DEPTHS = np.geomspace(0.4, 1.6, 8)
 BORDER_WEIGHT = 0.3  # of the area of a box at the image border, to choose the best view (chosen)
 STANDING_HEIGHTS = (0.3, 1.8)  # of floor-standing objects, over the usual height (chosen)
-BORDER_PX = 2  # a box this near to the image border is truncated
 
 
 def propose(
@@ -78,8 +77,8 @@ def _best_views(views: Views) -> tuple[IntArray, IntArray]:
         groups (P,) and views (P,).
     """
     box = views.boxes
-    far_border = np.array(views.image_size) - BORDER_PX
-    whole = (box[..., :2] > BORDER_PX).all(-1) & (box[..., 2:] < far_border).all(-1)
+    far_border = np.array(views.image_size) - 2  # px: a box this near to the border is truncated
+    whole = (box[..., :2] > 2).all(-1) & (box[..., 2:] < far_border).all(-1)
     area = (box[..., 2:] - box[..., :2]).prod(-1) * np.where(whole, 1.0, BORDER_WEIGHT)  # (V, G)
     seen = np.isfinite(area)
     third = (3 * (seen.cumsum(0) - 1)) // seen.sum(0).clip(1)

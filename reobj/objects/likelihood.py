@@ -117,7 +117,6 @@ class Evidence:
 
 
 OBJECTS_AT_ONCE = 500  # that are projected together (chosen: memory)
-FRAMES_AT_ONCE = 64  # whose pairs are compared together (chosen: memory)
 
 
 def gather_evidence(
@@ -161,9 +160,10 @@ def _gather(
     score_log_odds = logit(detections.score)
     starts = detections.start_of_view
     found: list[tuple[IntArray, IntArray, Array, Array]] = []
-    for first in range(0, len(cams), FRAMES_AT_ONCE):
+    chunk = 64  # frames whose pairs are compared together, to bound the memory
+    for first in range(0, len(cams), chunk):
         pairs = list[tuple[IntArray, IntArray]]()
-        for v in range(first, min(first + FRAMES_AT_ONCE, len(cams))):
+        for v in range(first, min(first + chunk, len(cams))):
             shown = np.flatnonzero(visible[v] > MIN_VISIBLE)
             rows = slice(starts[v], starts[v + 1])
             i, j = np.nonzero(_overlapping(clipped[v, shown], detections.box[rows]))

@@ -88,7 +88,6 @@ def gather_views(
 
 
 INSIDE_FRACTION = 0.8  # of the views that observe a point (chosen; .95 is alike: benchmarks/LOG.md)
-POINT_VIEWS = 2  # least number of them (one view gives no depth)
 MIN_POINTS = 5  # per object (chosen: fewer may all belong to another object)
 MAX_POINTS = 100  # per object (chosen: time)
 
@@ -144,7 +143,7 @@ def _points_inside_most_boxes(views: Views, poses: Poses) -> tuple[IntArray, Int
     # csr_array: before scipy 1.14 fancy indexing returns a sparse array
     total = np.asarray(sparse.csr_matrix(views_observing)[group, point]).ravel()
     count = views_inside.data
-    mostly = (count >= POINT_VIEWS) & (count >= INSIDE_FRACTION * total)
+    mostly = (count >= 2) & (count >= INSIDE_FRACTION * total)
     return group[mostly], point[mostly]
 
 

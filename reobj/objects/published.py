@@ -180,9 +180,12 @@ def _as_fits(
     )
 
 
-LIMITS = "no priors, no outlier rejection, no uncertainty"
 SOLVERS: dict[str, tuple[Solver, str]] = {
-    "lfd": (_lfd, f"ellipsoids in closed form, in the units of the cameras; {LIMITS}"),
+    "lfd": (
+        _lfd,
+        "ellipsoids in closed form, in the units of the cameras; "
+        "no priors, no outlier rejection, no uncertainty",
+    ),
     "sfmo": (
         _sfmo,
         "shapes from boxes alone, with affine cameras, without metric meaning (size_m is null); "

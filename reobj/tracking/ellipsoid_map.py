@@ -85,8 +85,6 @@ def usual_size(sizes: Array) -> float:
 
 
 MAP_VIEWS = 16  # views kept of every identity (chosen)
-MAP_FIRST_STEP_DEG = 1.0  # between the viewing rays of two views; doubled whenever they are full
-MAP_MIN_VIEWS = 3  # of a fit: fewer boxes leave an ellipsoid undetermined (9 unknowns, 4 a box)
 # longest half axis over the middle one: half-occluded objects give needles that reach behind the
 # camera (95 % of priors.json are below 5.8; IDF1 of redkitchen with poses 79.1 -> 88.4)
 MAP_MAX_ELONGATION = 6.0
@@ -150,7 +148,8 @@ class EllipsoidMap:
     def due(self) -> BoolArray:
         """(I,) identities with enough views for a fit, more than a quarter of them new."""
         count = (self.frame >= 0).sum(1)
-        return np.asarray((count >= MAP_MIN_VIEWS) & (self.fresh > count // 4), bool)
+        # fewer than three boxes leave an ellipsoid undetermined: 9 unknowns, 4 a box
+        return np.asarray((count >= 3) & (self.fresh > count // 4), bool)
 
     def refit(self, image_size: tuple[int, int]) -> bool:
         """Fit the ellipsoids of all identities that are due.
@@ -258,7 +257,7 @@ class EllipsoidMap:
         if extra > 0:
             extra = max(extra, len(self.frame), 16)  # doubling: amortised O(1)
             fills = {"frame": NO_FRAME, "dual_q": np.nan, "rays": np.nan, "ends": np.nan}
-            fills |= {"size": np.nan, "step_deg": MAP_FIRST_STEP_DEG}
+            fills |= {"size": np.nan, "step_deg": 1.0}  # between viewing rays; doubled when full
             for name in self.ARRAYS:
                 old = getattr(self, name)
                 new = np.full((extra, *old.shape[1:]), fills.get(name, 0), old.dtype)

@@ -30,8 +30,6 @@ LINK_PROBABILITY = 0.5  # least probability to join by appearance, given the riv
 VIEW_GAP = 30
 DUPLICATE_IOU = 0.5  # boxes that overlap more may be two boxes of one object
 FRAGMENT_GAP = 5  # frames without a detection after which a tracklet may be another object
-MIN_CHANGED = 3  # detections whose change of identity is reported (chosen: fewer are noise)
-LEAST_LOG_ODDS = -9.0  # reported where appearance is unknown or excludes one object
 
 
 def link(
@@ -233,15 +231,16 @@ class Linker:
     def _changes(self, pieces: IntArray, whole: IntArray, kind: str, iou: Array) -> list[LinkEvent]:
         """List an event for each piece (N,) but the first of the groups of `whole` (N,).
 
-        Changes of fewer than MIN_CHANGED detections are not reported.
+        Changes of fewer than three detections are not reported: they are noise. Log odds are at
+        least -9, also where appearance is unknown or excludes one object.
         """
         events = []
         for rows in rows_by(whole):
-            long = [rows[piece] for piece in rows_by(pieces[rows]) if len(piece) >= MIN_CHANGED]
+            long = [rows[piece] for piece in rows_by(pieces[rows]) if len(piece) >= 3]
             for piece in long[1:]:
                 rest = np.unique(self.fragment[np.setdiff1d(rows, piece)])
                 fragment = np.unique(self.fragment[piece])
-                log_odds = max(float(self.log_odds[np.ix_(rest, fragment)].max()), LEAST_LOG_ODDS)
+                log_odds = max(float(self.log_odds[np.ix_(rest, fragment)].max()), -9.0)
                 ids = np.unique(self.tracks.tracklet_id[rows if kind == "join" else piece]).tolist()
                 finite = iou[piece][np.isfinite(iou[piece])]
                 median_iou = float(np.median(finite)) if len(finite) else None
