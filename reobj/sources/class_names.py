@@ -9,8 +9,6 @@ from pathlib import Path
 from reobj.files import load_json, read_lines
 from reobj.types import CLASS_MAX, CLASS_NAME_MAX, ReobjError, visible_name
 
-YAML_SUFFIXES = (".yaml", ".yml")
-
 
 def load_class_names(path: str | Path) -> tuple[str, ...]:
     """Read class names in the order of their numbers.
@@ -22,10 +20,9 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
         ReobjError: no names, more than CLASS_MAX, or one of more than CLASS_NAME_MAX characters.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix in YAML_SUFFIXES:
+    if is_yaml(path):
         names = _yaml_names(path)
-    elif suffix == ".json":
+    elif path.suffix.lower() == ".json":
         names = _json_names(path)
     else:
         names = [(i, line.strip()) for i, line in enumerate(read_lines(path), 1) if line.strip()]
@@ -34,6 +31,11 @@ def load_class_names(path: str | Path) -> tuple[str, ...]:
     for line, name in names:
         check_length(name, f"{path}, line {line}" if line else str(path))
     return tuple(name for _, name in names)
+
+
+def is_yaml(path: Path) -> bool:
+    """Test whether the suffix of a file is that of YAML."""
+    return path.suffix.lower() in (".yaml", ".yml")
 
 
 def check_length(name: str, where: str) -> None:
@@ -70,17 +72,10 @@ def _json_names(path: Path) -> list[tuple[int, str]]:
     raise ReobjError(f"{path}: expected a list of class names, or a map from numbers to names")
 
 
-NAMES_KEY = re.compile(r"names\s*:(.*)")
-ENTRY = re.compile(  # of a list or map in brackets: [a, 'b c'], {0: a, 1: "b"}
-    r"""\s*(?:['"]?(?P<number>\d+)['"]?\s*:\s+)?(?:'(?P<one>(?:[^']|'')*)'|"(?P<two>[^"]*)"|"""
-    r"""(?P<plain>[^,'"\[\]{}][^,\[\]{}]*))\s*(?:,|$)"""
-)
-
-
 def _yaml_names(path: Path) -> list[tuple[int, str]]:
     """Read (line, name) of the key `names` of a YAML file; other YAML is not parsed."""
     lines = [_without_comment(line) for line in read_lines(path)]
-    at = next((i for i, line in enumerate(lines) if NAMES_KEY.match(line)), None)
+    at = next((i for i, line in enumerate(lines) if re.match(r"names\s*:", line)), None)
     if at is None:
         raise ReobjError(f"{path}: no `names:` in it; expected YOLO's data.yaml, or a text file "
                          "with one class name a line")  # fmt: skip
@@ -110,11 +105,15 @@ def _flow_entries(
     if closing is None or not text.endswith(closing):
         raise ReobjError(f"{path}, line {at + 1}: `names: {text[:40]}`, expected [a, b], "
                          "{0: a, 1: b}, or a line for each name")  # fmt: skip
+    item = re.compile(  # a; 'b c'; 0: a; 1: "b"
+        r"""\s*(?:['"]?(?P<number>\d+)['"]?\s*:\s+)?(?:'(?P<one>(?:[^']|'')*)'|"(?P<two>[^"]*)"|"""
+        r"""(?P<plain>[^,'"\[\]{}][^,\[\]{}]*))\s*(?:,|$)"""
+    )
     content = text[1:-1].strip()
     entries = list[tuple[str, str, int]]()
     position = 0
     while position < len(content):
-        entry = ENTRY.match(content, position)
+        entry = item.match(content, position)
         if entry is None:
             raise ReobjError(f"{path}, line {at + 1}: {content[position : position + 40]!r} in "
                              "`names` cannot be read")  # fmt: skip

@@ -28,8 +28,6 @@ from reobj.sources.recorded import RecordedDetections, scale_to
 from reobj.sources.video import Video
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError
 
-COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # unused among COCO's category ids 1 to 90
-COCO_IDS = tuple(i for i in range(1, 91) if i not in COCO_GAPS)
 Id = int | str
 
 
@@ -248,7 +246,9 @@ def _categories(
     is possible; else COCO's.
     """
     used = list(dict.fromkeys(entry["category_id"] for entry in entries))
-    name_of: dict[Id, str] = dict(zip(COCO_IDS, COCO_NAMES, strict=True))
+    gaps = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # unused among COCO's category ids 1 to 90
+    coco_ids = (i for i in range(1, 91) if i not in gaps)
+    name_of: dict[Id, str] = dict(zip(coco_ids, COCO_NAMES, strict=True))
     if names:
         name_of = dict(enumerate(names))
         text = "category ids are taken as positions in the class names, "

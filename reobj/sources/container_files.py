@@ -53,10 +53,6 @@ def settled_times(raw_s: Array, step_s: float) -> tuple[Array, int, bool]:
             restarts += after != 0 or count - at > 1 / RESTART_SHARE
 
 
-EBML = b"\x1a\x45\xdf\xa3"  # id of the first element of Matroska and WebM (RFC 9559)
-SEGMENT = b"\x18\x53\x80\x67"  # id of the second
-
-
 def missing_bytes(path: Path) -> int:
     """Count the bytes of MP4, Matroska, WebM or AVI boxes that lie beyond the end of the file.
 
@@ -66,7 +62,7 @@ def missing_bytes(path: Path) -> int:
     with contextlib.suppress(OSError, IndexError, struct.error), path.open("rb") as file:
         size = path.stat().st_size
         head = file.read(64)
-        if head.startswith(EBML):
+        if _is_matroska(head):
             return max(0, _matroska_end(head) - size)
         if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
             end = 0
@@ -93,23 +89,25 @@ def missing_bytes(path: Path) -> int:
     return 0
 
 
-HEAD_BYTES = 1 << 16  # bytes; chosen: contains the track headers, which precede the first frame
-
-
 def holds_pictures_only(path: Path) -> bool:
     """Test whether a file is Matroska or WebM without an audio track; other containers: False."""
     with contextlib.suppress(OSError), path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
+        head = file.read(1 << 16)  # contains the track headers, which precede the first frame
         # TrackType (RFC 9559, 5.1.4.1.3): 2 is audio
-        return head.startswith(EBML) and b"\x83\x81\x02" not in head
+        return _is_matroska(head) and b"\x83\x81\x02" not in head
     return False
+
+
+def _is_matroska(head: bytes) -> bool:
+    """Test whether a file begins with the id of the element EBML (RFC 9559), also WebM."""
+    return head.startswith(b"\x1a\x45\xdf\xa3")
 
 
 def _matroska_end(head: bytes) -> int:
     """Return the end of the segment (all but the header), in bytes; 0: unknown."""
-    at, length = _vint(head, len(EBML))
+    at, length = _vint(head, 4)  # of the element EBML
     at += length
-    if head[at : at + 4] != SEGMENT:
+    if head[at : at + 4] != b"\x18\x53\x80\x67":  # id of the segment
         return 0
     start, length = _vint(head, at + 4)
     return start + length if length else 0

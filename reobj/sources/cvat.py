@@ -20,8 +20,7 @@ from reobj.sources.video import Video
 from reobj.types import Array, ReobjError
 
 XML_MAX = 1 << 27  # bytes; chosen: 800,000 boxes; the parser needs ten times as much memory
-CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")
-SHAPES = ("box", "polygon", "polyline", "points", "ellipse", "mask", "cuboid")
+CVAT_BOX = ("xtl", "ytl", "xbr", "ybr")  # attributes of a box
 
 
 def read_cvat(path: Path, video: Video, first: str = "") -> RecordedDetections:
@@ -85,8 +84,8 @@ Shape = tuple[int | str, int, str, ET.Element]  # frame or image, identity, labe
 def _of_tracks(root: ET.Element) -> Iterator[Shape]:
     """Yield the shapes of tracks."""
     for track in root.iter("track"):
-        for shape in track:
-            if shape.tag in SHAPES and shape.attrib.get("outside") != "1":
+        for shape in _shapes(track):
+            if shape.attrib.get("outside") != "1":
                 identity = int(track.attrib["id"]) + 1
                 yield int(shape.attrib["frame"]), identity, track.attrib["label"], shape
 
@@ -94,9 +93,14 @@ def _of_tracks(root: ET.Element) -> Iterator[Shape]:
 def _of_images(root: ET.Element) -> Iterator[Shape]:
     """Yield the shapes of CVAT for images, which have no identities (0)."""
     for image in root.iter("image"):
-        for shape in image:
-            if shape.tag in SHAPES:
-                yield image.attrib["name"], 0, shape.attrib["label"], shape
+        for shape in _shapes(image):
+            yield image.attrib["name"], 0, shape.attrib["label"], shape
+
+
+def _shapes(parent: ET.Element) -> list[ET.Element]:
+    """List the shapes of a track or an image that have a bounding box."""
+    kinds = ("box", "polygon", "polyline", "points", "ellipse", "mask", "cuboid")
+    return [child for child in parent if child.tag in kinds]
 
 
 def _bounds(shape: ET.Element, bounded: Counter[str]) -> Array:

@@ -147,7 +147,6 @@ READERS: dict[str, Reader] = {
     "folder": read_label_folder,
     "table": read_table,
 }
-SUFFIXES = {".npz": "npz", ".json": "json", ".xml": "cvat", ".zip": "cvat"}  # others: table
 
 
 def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> RecordedDetections:
@@ -161,7 +160,8 @@ def _read_json(path: Path, names: Sequence[str], video: Video, first: str) -> Re
 
 def _kind(path: Path) -> str:
     """Return the key of READERS for a file."""
-    return "folder" if path.is_dir() else SUFFIXES.get(path.suffix.lower(), "table")
+    kinds = {".npz": "npz", ".json": "json", ".xml": "cvat", ".zip": "cvat"}
+    return "folder" if path.is_dir() else kinds.get(path.suffix.lower(), "table")
 
 
 def recorded_times(path: Path) -> Array | None:
@@ -248,9 +248,6 @@ def _check_rows(recorded: RecordedDetections, path: Path) -> None:
         check_length(name, f"{path}, class names")
 
 
-PERCENT_MIN = 2.0  # highest score above which scores are percentages; chosen: 2 % is no best score
-
-
 def _check_scores(recorded: RecordedDetections) -> None:
     """Convert scores to [0, 1]: -1 for all, percentages, or clipped; with a message."""
     low = recorded.score.min(initial=0)
@@ -258,7 +255,7 @@ def _check_scores(recorded: RecordedDetections) -> None:
     if len(recorded) and (recorded.score == -1).all():
         recorded.messages.append("scores are all -1: taken as 1")
         recorded.score = -recorded.score
-    elif PERCENT_MIN < high <= 100 and low >= 0:
+    elif 2 < high <= 100 and low >= 0:  # a best score of 2 % is implausible
         recorded.messages.append(
             f"scores from {recorded.score.min():g} to {high:g} are taken as percent"
         )
@@ -285,9 +282,6 @@ def _best_per_frame(
         advice = "raise detect.min_score, or keep the best with --set detect.max_detections=N"
         raise ReobjError(f"{path}: {text}, at most {DETECTIONS_MAX} are allowed; {advice}")
     return rows
-
-
-EDGE_PX = 1.0  # px beyond the image border; chosen: detectors round boxes to whole pixels
 
 
 def _usable(recorded: RecordedDetections, path: Path, frame_count: int) -> BoolArray:
@@ -344,14 +338,11 @@ def _other_reading(xyxy: Array, size: tuple[int, int]) -> str:
         (from_corners, image,
          "all fit it if w and h are the corner x2, y2: name them so, or give sizes"),
     ):  # fmt: skip
-        inside = (box >= -EDGE_PX).all(1) & (box[:, :2] <= box[:, 2:]).all(1)
-        if (inside & (box[:, 2:] <= limit + EDGE_PX).all(1)).all():
+        # Tolerance of 1 px: detectors round boxes to whole pixels
+        inside = (box >= -1).all(1) & (box[:, :2] <= box[:, 2:]).all(1)
+        if (inside & (box[:, 2:] <= limit + 1).all(1)).all():
             return f"{why}; {cause}"
     return ""
-
-
-SAME_BOX = 0.95  # IoU from which a box of a tracks file is an unmoved box of the tracker
-SAME_OBJECT = 0.5  # IoU from which two boxes show the same object (PASCAL VOC)
 
 
 def read_tracks(
@@ -438,10 +429,11 @@ def _with_known(tracks: Tracks, known: Tracks, unnamed: bool) -> Tracks:
         iou = box_iou(tracks.xyxy[rows], same_frame.xyxy)  # (n, m)
         best = iou.argmax(1)
         best_iou = iou.max(1)
-        unmoved = best_iou > SAME_BOX
+        unmoved = best_iou > 0.95  # counts as the tracker's own box
         score[rows[unmoved]] = same_frame.score[best[unmoved]]
-        overlap[rows] = np.where(best_iou >= SAME_OBJECT, best_iou, 0)
-        known_class[rows] = np.where(best_iou >= SAME_OBJECT, same_frame.class_id[best], -1)
+        same_object = best_iou >= 0.5  # as in PASCAL VOC
+        overlap[rows] = np.where(same_object, best_iou, 0)
+        known_class[rows] = np.where(same_object, same_frame.class_id[best], -1)
     if unnamed:
         for rows in rows_by(tracks.track_id):
             voters = rows[known_class[rows] >= 0]

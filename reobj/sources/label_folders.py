@@ -12,25 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from reobj.files import LINES_MAX, read_lines
-from reobj.sources.class_names import YAML_SUFFIXES, load_class_names
+from reobj.sources.class_names import is_yaml, load_class_names
 from reobj.sources.image_frames import frames_of_names
 from reobj.sources.masks import NO_RUNS
 from reobj.sources.recorded import NORMALISED_MAX, RecordedDetections
 from reobj.sources.video import Video
 from reobj.types import COCO_NAMES, Array, IntArray, ReobjError, xyxy_from_cxcywh
 
-LABEL_FOLDERS = ("labels", "obj_train_data")  # of YOLO datasets, and of CVAT's export of YOLO 1.1
-NO_LABELS = ("classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt",
-             "readme.dataset.txt", "readme.roboflow.txt", "requirements.txt")  # fmt: skip
-NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml", "dataset.yml")
-
 
 def label_files(path: Path) -> list[Path]:
     """List the label files of a folder, or of the label folders of a dataset in it."""
-    files = [p for p in path.glob("*.txt") if p.name.lower() not in NO_LABELS]
-    if not files or any((path / name).is_dir() for name in LABEL_FOLDERS):
-        files = [p for p in path.rglob("*.txt") if p.name.lower() not in NO_LABELS]
-        files = [p for p in files if set(LABEL_FOLDERS) & set(p.relative_to(path).parts[:-1])]
+    folders = {"labels", "obj_train_data"}  # of YOLO datasets, and of CVAT's export of YOLO 1.1
+    no_labels = ("classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt",
+                 "readme.dataset.txt", "readme.roboflow.txt", "requirements.txt")  # fmt: skip
+    files = [p for p in path.glob("*.txt") if p.name.lower() not in no_labels]
+    if not files or any((path / name).is_dir() for name in folders):
+        files = [p for p in path.rglob("*.txt") if p.name.lower() not in no_labels]
+        files = [p for p in files if folders & set(p.relative_to(path).parts[:-1])]
     if not files:
         raise ReobjError(f"{path}: a folder without label files; expected YOLO's NAME.txt, one an "
                          "image, in it or in its folder labels/")  # fmt: skip
@@ -40,11 +38,12 @@ def label_files(path: Path) -> list[Path]:
 def names_file(path: Path) -> Path | None:
     """Find the file of class names of a folder of labels: in it, or in one of two folders above."""
     labels = path.resolve()
+    known = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml", "data.yml", "dataset.yml")
     for folder in (labels, *labels.parents[:2]):
-        for name in NAME_FILES:
+        for name in known:
             if (folder / name).is_file():
                 return folder / name
-        for file in sorted(p for p in folder.glob("*") if p.suffix.lower() in YAML_SUFFIXES):
+        for file in sorted(filter(is_yaml, folder.glob("*"))):
             if any(line.startswith("names") for line in read_lines(file)):
                 return file
     return None
