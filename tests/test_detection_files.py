@@ -358,9 +358,17 @@ def test_frames_are_whole_numbers(tmp_path: Path, video: rt.Video, frame: str) -
         read(tmp_path, "a.txt", LINE + f"{frame},-1,10,20,30,40,.9\n", video)
 
 
-@pytest.mark.parametrize("key", ["frame", "class_names", "mask_counts"])
+@pytest.mark.parametrize(
+    ("key", "limit", "size"),
+    [("frame", "LINES_MAX", 1), ("class_names", "CLASS_MAX", 1), ("mask_counts", "NPZ_MAX", 4)],
+)
 def test_npz_of_more_than_is_taken(
-    tmp_path: Path, video: rt.Video, monkeypatch: pytest.MonkeyPatch, key: str
+    tmp_path: Path,
+    video: rt.Video,
+    monkeypatch: pytest.MonkeyPatch,
+    key: str,
+    limit: str,
+    size: int,
 ) -> None:
     """Small numbers of bytes become ints and objects: a GB of them would be tens."""
     path = tmp_path / "a.npz"
@@ -369,9 +377,9 @@ def test_npz_of_more_than_is_taken(
     found = rt.Detections(np.array([[1.0, 2, 30, 40]]), np.ones(1), np.zeros(1, np.int64), mask)
     rt.write_detections_npz(path, [(0, found), (1, found)], ["a", "b"], video.size)
     count = dict(np.load(path))[key].size
-    monkeypatch.setitem(recorded.SIZES, key, count)
+    monkeypatch.setattr(recorded, limit, size * count)
     assert len(rt.read_detections(path, video)) == 2
-    monkeypatch.setitem(recorded.SIZES, key, count - 1)
+    monkeypatch.setattr(recorded, limit, size * (count - 1))
     with pytest.raises(
         rt.ReobjError, match=f"a.npz: {count} {key}, at most {count - 1} are allowed"
     ):

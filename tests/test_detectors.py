@@ -539,11 +539,11 @@ def assert_same(a: rt.Detections | None, b: rt.Detections) -> None:
 
 @pytest.mark.parametrize("masks", [False, True])
 def test_cache_survives_a_kill_between_flushes(tmp_path: Path, masks: bool) -> None:
-    cache = DetectionCache(tmp_path / "c", (32, 24))
+    cache = DetectionCache(tmp_path / "c", (32, 24), file_frames=64)
     for index in range(0, 300, 2):
         cache.put(index, some(index, masks))
         assert_same(cache.get(index), some(index, masks))
-    stored = 150 // detectors.CACHE_FRAMES * detectors.CACHE_FRAMES
+    stored = 150 // 64 * 64
     (tmp_path / "c" / ".part-chunk_000009.npz").write_bytes(b"half")  # a kill while writing
     reopened = DetectionCache(tmp_path / "c", (32, 24))
     assert reopened.get(2 * stored - 2) is not None and reopened.get(2 * stored) is None

@@ -31,6 +31,7 @@ from reobj.sources.onnx_layouts import (
     LAYOUTS,
     MAX_CANDIDATES,
     PAD_VALUE,
+    YOLO_STRIDES,
     Geometry,
     Layout,
     Trial,
@@ -58,7 +59,6 @@ from reobj.types import (
 DYNAMIC_SIDE = 640  # px, longer input side of models with a dynamic size (YOLO11's training size)
 MODEL_DETECTIONS = 100  # most detections of a frame (COCO's maxDets)
 NMS_IOU = 0.6  # IoU above which boxes of a class are duplicates, for models without NMS (NanoDet)
-SIZE_MULTIPLE = 32  # px, input sides are multiples of the largest stride of such models
 
 
 class OnnxDetector:
@@ -169,8 +169,9 @@ class OnnxDetector:
     def _input_size(self, width: int, height: int) -> tuple[int, int]:
         """Return the input (w, h) for an image: the model's, or the image's at DYNAMIC_SIDE."""
         fixed = self._inputs[0][1][:-3:-1]
-        ratio = DYNAMIC_SIDE / max(width, height) / SIZE_MULTIPLE
-        scaled = [max(math.ceil(round(v * ratio, 3)), 1) * SIZE_MULTIPLE for v in (width, height)]
+        stride = max(YOLO_STRIDES)  # sides are multiples of it
+        ratio = DYNAMIC_SIDE / max(width, height) / stride
+        scaled = [max(math.ceil(round(v * ratio, 3)), 1) * stride for v in (width, height)]
         w, h = (a if isinstance(a, int) else b for a, b in zip(fixed, scaled, strict=True))
         return w, h
 
@@ -222,22 +223,23 @@ def nms(xyxy: Array, class_id: IntArray, max_iou: float) -> IntArray:
     return np.sort(np.array(kept, np.int64))
 
 
-CACHE_FRAMES = 64  # frames of a cache file; chosen: a kill loses a few seconds of work at most
-
-
 class DetectionCache:
     """Cache of the detections of a video on disk, from which a killed run resumes.
 
-    A folder of npz files with `CACHE_FRAMES` frames each, written atomically: a kill loses the
-    frames since the last `flush`. Damaged files are removed with a warning.
+    A folder of npz files, written atomically: a kill loses the frames since the last `flush`.
+    Damaged files are removed with a warning.
 
     Args:
         folder: for the cache alone. image_size: (w, h) of the frames and of their masks.
+        file_frames: frames of a file; a kill loses a few seconds of work at most.
     """
 
-    def __init__(self, folder: str | Path, image_size: tuple[int, int]) -> None:
+    def __init__(
+        self, folder: str | Path, image_size: tuple[int, int], file_frames: int = 64
+    ) -> None:
         self.folder = Path(folder)
         self.image_size = image_size
+        self._file_frames = file_frames
         self._stored: dict[int, RecordedDetections] = {}  # by frame
         self._pending: dict[int, Detections] = {}  # by frame, not on disk yet
         self._skipped: set[int] = set()  # frames of this run on which the detector was not run
@@ -271,7 +273,7 @@ class DetectionCache:
             self._skipped.add(index)
             return
         self._pending[index] = detections
-        if len(self._pending) >= CACHE_FRAMES:
+        if len(self._pending) >= self._file_frames:
             self.flush()
 
     def flush(self) -> None:
@@ -423,7 +425,11 @@ def as_source(detector: Any, class_names: Sequence[str] = ()) -> DetectionSource
             text = unnamed_class(int(detections.class_id.max()), len(names))
             raise ReobjError(f"frame {frame.index}: {text}")
         if isinstance(answer, Mapping) and kinds is None and not silent and len(detections):
-            log.warning(ASSUMED_NAMES)
+            log.warning(
+                "the detector has no class names: its numbers are read as COCO's 80 classes, from "
+                "0; torchvision and DETR count 91 from 1: give the names (detect.class_names, or "
+                "an attribute `names` of the function)"
+            )
             silent = True  # one warning is enough
         return detections
 
@@ -441,13 +447,6 @@ def _recorded_source(recorded: RecordedDetections) -> DetectionSource:
     return DetectionSource(
         detect, names, "", recorded.messages, recorded=recorded, always_looks=True
     )
-
-
-ASSUMED_NAMES = (
-    "the detector has no class names: its numbers are read as COCO's 80 classes, from 0; "
-    "torchvision and DETR count 91 from 1: give the names (detect.class_names, or an attribute "
-    "`names` of the function)"
-)
 
 
 def _stated_names(detector: Any) -> tuple[str, ...]:

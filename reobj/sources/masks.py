@@ -34,10 +34,6 @@ def rle_decode(counts: Counts, size: tuple[int, int]) -> BoolArray:
     return np.asarray(cv2.transpose(flat.view(np.uint8).reshape(size))).view(bool)
 
 
-# Bits of a run length: seven characters, any signed uint32; longer ones would take quadratic time
-RUN_BITS = 35
-
-
 def coco_runs(text: str) -> Counts:
     """Decode COCO's compressed run lengths (maskApi.c of pycocotools, rleFrString).
 
@@ -50,16 +46,13 @@ def coco_runs(text: str) -> Counts:
         value |= (byte - 48 & 0x1F) << shift
         shift += 5
         if byte - 48 & 0x20:
-            if shift >= RUN_BITS:
-                raise ValueError(f"a run length of more than {RUN_BITS} bits")
+            if shift >= 35:  # holds any signed uint32; longer ones would take quadratic time
+                raise ValueError("a run length of more than 35 bits")
             continue
         value -= (byte - 48 >> 4 & 1) << shift  # sign
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
         value = shift = 0
     return np.array(runs, np.uint32)
-
-
-POLYGON_BITS = 4  # sub-pixel bits of cv2.fillPoly, 1/16 px; chosen: finer than any annotation
 
 
 def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Counts:
@@ -70,7 +63,8 @@ def polygon_runs(rings: Sequence[Sequence[float]], size: tuple[int, int]) -> Cou
             f"a polygon with corners that are not finite, or beyond {COORDINATE_MAX:g}"
         )
     canvas = np.zeros(size[::-1], np.uint8)
+    bits = 4  # of fractions of a pixel, 1/16 px: finer than annotations
     for ring in rings:  # OpenCV's first pixel has its centre at (0, 0), ours at (0.5, 0.5)
-        corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << POLYGON_BITS)).astype(np.int32)
-        cv2.fillPoly(canvas, [corners], 1, shift=POLYGON_BITS)
+        corners = np.round((np.reshape(ring, (-1, 2)) - 0.5) * (1 << bits)).astype(np.int32)
+        cv2.fillPoly(canvas, [corners], 1, shift=bits)
     return rle_encode(canvas > 0)

@@ -143,17 +143,13 @@ def _pick_outputs(outs: list[Any]) -> tuple[Array, Array, IntArray]:
     return boxes.astype(np.float64), scores.astype(np.float64), labels.astype(np.int64)
 
 
-# Median |x, y| below which YOLOX outputs are raw (below 2), not decoded (half the image, px)
-RAW_YOLOX_MAX = 8.0
-
-
 def _decode_yolox(outs: list[Any], geometry: Geometry) -> Decoded:
     """Decode centre, log size, objectness and class scores of each cell, or of decoded boxes.
 
     Ref: YOLOX (Ge et al. 2021), whose exports are raw or with the decoder included.
     """
     rows = outs[0][0].astype(np.float64)  # (A, 5 + C)
-    if np.median(np.abs(rows[:, :2])) < RAW_YOLOX_MAX:
+    if np.median(np.abs(rows[:, :2])) < 8:  # raw: below 2; decoded: half of the image, px
         cells, stride = _grid(geometry.input_size, YOLO_STRIDES)
         rows[:, :2] = (rows[:, :2] + cells) * stride
         rows[:, 2:4] = np.exp(rows[:, 2:4]) * stride
@@ -209,9 +205,6 @@ def _decode_gfl(outs: list[Any], geometry: Geometry) -> Decoded:
     return Decoded(geometry.to_image(boxes), score[keep], label[keep])
 
 
-RCNN_MASK = (28, 28)  # (w, h) of the masks of Mask R-CNN, relative to the box
-
-
 def _decode_with_nms(outs: list[Any], geometry: Geometry) -> Decoded:
     """Decode boxes, labels, scores[, masks] after the model's own NMS."""
     boxes, scores, labels = _pick_outputs(outs)
@@ -223,7 +216,7 @@ def _decode_with_nms(outs: list[Any], geometry: Geometry) -> Decoded:
     def masks(chosen: IntArray) -> BoolArray:
         low = boxes[chosen, :2]
         high = boxes[chosen, 2:]
-        ratio = np.array(RCNN_MASK) / np.maximum(high - low, 1e-6)  # (K, 2)
+        ratio = np.array(maps[0].shape[:0:-1]) / np.maximum(high - low, 1e-6)  # (K, 2)
         return _paste(maps[0][chosen], boxes[chosen], geometry.image_size, ratio, -low * ratio, 0.5)
 
     return Decoded(boxes, scores, labels, masks if maps else None)
@@ -264,7 +257,6 @@ def _has_nms(trial: Trial) -> bool:
     return False
 
 
-CAFFE_MEAN = (102.9801, 115.9465, 122.7717)  # BGR, 0..255, of ImageNet (maskrcnn-benchmark)
 LAYOUTS: tuple[Layout, ...] = (  # the first that accepts a model is used
     Layout("DEIM, D-FINE, RT-DETR (labels, boxes, scores)",
             lambda t: t.inputs == 2 and _has_nms(t),  # the second is the image size: no scaling
@@ -285,8 +277,9 @@ LAYOUTS: tuple[Layout, ...] = (  # the first that accepts a model is used
             _decode_yolo, "centre",
             classes=lambda t: t.rows[0] - 4 - sum(o.shape[1] for o in t.outputs[1:])),
     Layout("Mask R-CNN",
-            lambda t: _has_nms(t) and any(o.shape[2:] == RCNN_MASK for o in t.outputs),
-            _decode_with_nms, "corner", rgb=False, mean=CAFFE_MEAN, std=(1.0, 1.0, 1.0),
+            lambda t: _has_nms(t) and any(o.shape[2:] == (28, 28) for o in t.outputs),
+            _decode_with_nms, "corner", rgb=False,
+            mean=(102.9801, 115.9465, 122.7717), std=(1.0, 1.0, 1.0),  # as maskrcnn-benchmark
             nms=False, first=1),
     Layout("SSD with built-in NMS", _has_nms, _decode_with_nms, mean=IMAGENET_MEAN,
             std=IMAGENET_STD, nms=False, first=1),

@@ -143,16 +143,6 @@ def write_detections_npz(
 
 # Coordinates up to this are fractions of the image size; chosen: boxes may extend a little outside
 NORMALISED_MAX = 1.5
-KINDS = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_names": "U",
-         "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
-
-
-SIZES = {  # most values of each array
-    "frame": LINES_MAX,
-    "done": LINES_MAX,
-    "class_names": CLASS_MAX,
-    "mask_counts": NPZ_MAX // 4,  # uint32
-}
 
 
 def npz_image_size(path: Path) -> tuple[int, int]:
@@ -176,7 +166,9 @@ def read_npz(
         those without detections (default: the frame of every detection).
     """
     data, _ = load_npz(path, sealed)
-    for key, most in SIZES.items():
+    sizes = {"frame": LINES_MAX, "done": LINES_MAX, "class_names": CLASS_MAX,
+             "mask_counts": NPZ_MAX // 4}  # fmt: skip  # uint32
+    for key, most in sizes.items():
         if key in data and data[key].size > most:
             raise ReobjError(f"{path}: {data[key].size} {key}, at most {most} are allowed")
     count = len(np.atleast_1d(data.get("frame", ())))
@@ -188,7 +180,9 @@ def read_npz(
         shape = data[key].shape if key in data else "missing"
         if shape != expected and (key != "class_names" or shape == "missing"):
             raise ReobjError(f"{path}: array {key} is {shape}, expected shape {expected}")
-    for key, kinds in KINDS.items():
+    dtypes = {"frame": "iu", "xyxy": "fiu", "score": "fiu", "class_id": "iu", "class_names": "U",
+              "image_size": "iu", "mask_counts": "iu", "mask_offsets": "iu"}  # fmt: skip
+    for key, kinds in dtypes.items():
         if data[key].dtype.kind not in kinds and data[key].size:
             raise ReobjError(f"{path}: array {key} is of {data[key].dtype}, expected {kinds}")
     if data["class_names"].ndim != 1:
@@ -222,9 +216,6 @@ def _frames_done(data: dict[str, Any], path: Path) -> IntArray | None:
     return np.unique(done).astype(np.int64)
 
 
-SAME_SHAPE_PX = 1.0  # px, tolerance of the aspect ratio: sides of resized images are rounded
-
-
 def scale_to(
     size: tuple[int, int], made_for: Array, used: Any, where: str, messages: list[str]
 ) -> Array:
@@ -243,7 +234,7 @@ def scale_to(
         return scale
     for w, h in sizes[(sizes != size).any(1)].tolist():
         text = f"made for images of {w:g}x{h:g}, but the video is {size[0]}x{size[1]}"
-        if abs(w * size[1] / size[0] - h) > SAME_SHAPE_PX:
+        if abs(w * size[1] / size[0] - h) > 1:  # px: sides of resized images are rounded
             turned = (h, w) == size
             why = ": made on frames that were not turned upright?" if turned else ": other images?"
             raise ReobjError(f"{where}: {text}{why} Run the detector on the frames of this video")

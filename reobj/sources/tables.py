@@ -65,10 +65,7 @@ ALIASES: dict[str, tuple[str, ...]] = {  # names of columns; the first one with 
     "class": ("class_name", "category_name", "class_label", "label", "name", "category", "type",
               "class", "class_id", "cls", "category_id", "label_id", "coco80_class"),
 }  # fmt: skip
-BOXES = (("x1", "y1", "x2", "y2"), ("x1", "y1", "w", "h"), ("cx", "cy", "w", "h"))
-OPTIONAL = ("id", "score", "class")  # roles whose empty columns count as missing
 WHOLE_MAX = 2.0**53  # largest frame and identity; above it not every integer is a float64
-NO_CELLS = ("", "nan", "none", "null", "na")  # missing values of pandas and others
 
 
 @dataclass(slots=True)
@@ -238,14 +235,15 @@ def _header(cells: Sequence[str]) -> tuple[str, ...]:
 def _by_role(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str]]:
     """Find the columns of a CSV by their names."""
     cells = {}
+    optional = ("id", "score", "class")  # roles whose empty columns count as missing
     for role, names in ALIASES.items():
         present = [name for name in names if name in by_name]
         filled = [name for name in present if not all(map(_is_empty, by_name[name]))]
-        used = filled or (present if role not in OPTIONAL else [])
+        used = filled or (present if role not in optional else [])
         if used:
             cells[role] = by_name[used[0]]
     has_frame = any(role in cells for role in ("frame", "image", "time"))
-    if not has_frame or not any(all(role in cells for role in roles) for roles in BOXES):
+    if not has_frame or not _box_roles(cells):
         missing = [role for role in ("x1", "y1", "x2", "y2") if role not in cells]
         missing = ["frame"] * (not has_frame) + missing
         text = f"no column {', '.join(missing)} in the header {','.join(by_name)}"
@@ -255,7 +253,13 @@ def _by_role(by_name: Mapping[str, list[str]], path: Path) -> dict[str, list[str
 
 
 def _is_empty(cell: str) -> bool:
-    return cell.lower() in NO_CELLS
+    return cell.lower() in ("", "nan", "none", "null", "na")  # as pandas and others write it
+
+
+def _box_roles(cells: Mapping[str, list[str]]) -> tuple[str, ...]:
+    """Return the four roles that give the boxes; () if one is missing."""
+    forms = (("x1", "y1", "x2", "y2"), ("x1", "y1", "w", "h"), ("cx", "cy", "w", "h"))
+    return next((roles for roles in forms if all(role in cells for role in roles)), ())
 
 
 def table_of_records(path: Path, records: Any) -> Table | None:
@@ -349,7 +353,7 @@ def _drop_rows(table: Table) -> None:
 
 def _boxes(table: Table) -> Array:
     """Return the boxes (N, 4), corners."""
-    roles = next(roles for roles in BOXES if all(role in table.cells for role in roles))
+    roles = _box_roles(table.cells)
     box = np.stack([table.numbers(role) for role in roles], 1)
     if roles[0] == "cx":
         return xyxy_from_cxcywh(box)
@@ -365,15 +369,12 @@ def _identities(table: Table) -> IntArray:
     return table.whole("id")
 
 
-USUAL_FIRST = {"MOT": 1, "KITTI": 0, "CSV": 0}  # conventional number of the first frame
-
-
 def _frames(table: Table, video: Video, first: str) -> IntArray:
     """Return the frames of the source (N,), -1: none."""
     if "frame" in table.cells and _are_numbers(table.cells["frame"]):
-        usual = USUAL_FIRST[table.kind]
-        if any(name.startswith("bb_") for name in table.header):  # names of MOTChallenge
-            usual = 1
+        # MOTChallenge counts frames from 1; its names of columns begin with bb_
+        of_mot = table.kind == "MOT" or any(name.startswith("bb_") for name in table.header)
+        usual = 1 if of_mot else 0
         numbers = table.whole("frame")
         count = video.frame_count
         where = str(table.path)
@@ -482,6 +483,9 @@ def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntA
     -1: no class. Older results of boxmot (1, class from 0, score in the last three of nine columns)
     are recognised: their scores replace `score` in place. Other numbers are world coordinates
     (columns 8 to 10 of MOTChallenge's detections).
+
+    Returns:
+        class (N,), -1: an ignored region; and the class names.
     """
     count = len(score)
     number = table.numbers("class") if "class" in table.cells else np.full(count, -1.0)
@@ -517,13 +521,7 @@ def _mot_classes(table: Table, score: Array, names: Sequence[str]) -> tuple[IntA
         known += [f"class {i + first}" for i in range(len(known), most + 1)]
     blank = (kind < first) & ~ignored
     class_id, known = _with_unnamed((kind - first).clip(0), blank, known, table)
-    return np.where(ignored, IGNORED, class_id), known
-
-
-IGNORED = -2  # class of rows that are left out
-
-
-VISIBLE_ROWS = 20  # rows; chosen: of as many true boxes at least one has visibility 1
+    return np.where(ignored, -1, class_id), known
 
 
 def _is_boxmot(table: Table, score: Array, number: IntArray) -> bool:
@@ -539,12 +537,13 @@ def _is_boxmot(table: Table, score: Array, number: IntArray) -> bool:
         return False
     no_truth = (table.numbers("id") < 0).all() or (number == 0).any()
     as_written = all(re.fullmatch(r"0?\.\d{6}", cell) for cell in table.cells["extra"])  # %.6f
-    return bool(no_truth or as_written or len(extra) >= VISIBLE_ROWS)
+    # Of 20 true boxes at least one has visibility 1
+    return bool(no_truth or as_written or len(extra) >= 20)
 
 
 def _without_ignored(recorded: RecordedDetections) -> RecordedDetections:
-    """Drop, and count, ignored regions."""
-    ignored = recorded.class_id == IGNORED
+    """Drop, and count, ignored regions (class -1)."""
+    ignored = recorded.class_id < 0
     if ignored.any():
         text = f"{ignored.sum()} rows of class 0 and score 0 (ignored regions) left out"
         recorded.messages.append(text)

@@ -14,10 +14,8 @@ import numpy as np
 
 from reobj.types import Array, Detections, Image, IntArray, ReobjError, box_iou
 
-MAX_TILES = 8  # tiles per side; chosen: each one costs a run of the network per frame
 # Overlap of neighbouring tiles over their side: smaller objects are complete in one tile (SAHI: .2)
 TILE_OVERLAP = 0.25
-CUT = 0.01  # tile sides, distance to an edge inside the image below which a box counts as cut
 FUSION_IOU = 0.55  # IoU above which boxes of a class are fused (Solovyev et al.)
 
 
@@ -29,8 +27,8 @@ def parse_tiles(text: str) -> tuple[int, int]:
     """
     match = re.fullmatch(r"(\d+)x(\d+)", text or "1x1")
     columns, rows = (int(n) for n in match.groups()) if match else (0, 0)
-    if not (1 <= columns <= MAX_TILES and 1 <= rows <= MAX_TILES):
-        expected = f"COLUMNSxROWS of 1 to {MAX_TILES}, such as 2x2"
+    if not (1 <= columns <= 8 and 1 <= rows <= 8):  # each tile costs a run of the network per frame
+        expected = "COLUMNSxROWS of 1 to 8, such as 2x2"
         raise ReobjError(f"--detector-tiles {text!r}: expected {expected}")
     return columns, rows
 
@@ -90,7 +88,7 @@ def detect_in_tiles(
         detections = detect(np.ascontiguousarray(image[y1:y2, x1:x2]))
         xyxy = detections.xyxy
         inside = np.array([x1 > 0, y1 > 0, x2 < width, y2 < height])  # edges inside the image
-        margin = CUT * np.array([x2 - x1, y2 - y1])
+        margin = 0.01 * np.array([x2 - x1, y2 - y1])  # boxes nearer to an edge count as cut
         gap = np.hstack([xyxy[:, :2], (x2 - x1, y2 - y1) - xyxy[:, 2:]])  # (D, 4) to the edges
         per_tile.append(detections[~((gap <= np.tile(margin, 2)) & inside).any(1)])
     view = np.repeat(np.arange(len(tiles)), [len(detections) for detections in per_tile])  # (N,)
