@@ -752,7 +752,7 @@ def test_a_stream_that_stalls_ends_soon(
     for _ in video:
         last = time.monotonic()
     assert video.read == 9 and last - began < 5
-    assert 0.9 < time.monotonic() - last < 1.0 + video_room.LIVE_POLL_S + 0.5
+    assert 0.9 < time.monotonic() - last < 2.0
     assert "no frame came for 1 s: taken as its end" in video.messages[-1]
 
 

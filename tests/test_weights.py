@@ -98,7 +98,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def here(server: Any) -> list[Path]:
     """Files in the folder of weights, but for its lock."""
-    return sorted(p for p in server.folder.iterdir() if p.name != weights.DOWNLOAD_LOCK)
+    return sorted(p for p in server.folder.iterdir() if p.name != ".lock")
 
 
 # ---- Download ------------------------------------------------------------------------------------
@@ -323,7 +323,7 @@ def test_a_download_waits_for_another_but_not_for_ever(
     server: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(weights, "DOWNLOAD_WAIT_S", 0.2)
-    with locked(server.folder / weights.DOWNLOAD_LOCK):
+    with locked(server.folder / ".lock"):
         with pytest.raises(rt.ReobjError, match=r"\.lock: locked by another process"):
             rt.model_path("toy")
     assert server.asked == [] and rt.model_path("toy") == server.target
@@ -420,7 +420,7 @@ def test_nowhere_to_write(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_table_of_weights() -> None:
     names = [row.name for row in weights.WEIGHTS]
     assert len(set(names)) == len(names) and rt.DetectConfig().model == "deimv2-n" == names[0]
-    fast = weights.known_weights(weights.FAST)
+    fast = weights.known_weights("fast")
     assert fast is not None and fast.name == "deimv2-femto" and weights.known_weights("") is None
     for row in weights.WEIGHTS:
         assert re.fullmatch("[0-9a-f]{64}|[0-9a-f]{40}", row.digest)

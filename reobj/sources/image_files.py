@@ -25,10 +25,6 @@ from reobj.types import Array, ReobjError
 
 IMAGE_FPS = 30.0  # Hz, rate of images without times; chosen: most phones record at 30 Hz
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-UNREAD_SUFFIXES = (  # of images that not every build of OpenCV reads
-    *(".heic", ".heif", ".avif", ".gif", ".jxl", ".jp2", ".exr", ".hdr", ".ppm", ".pgm", ".tga"),
-    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw"),  # raw formats
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +53,21 @@ def list_images(source: str) -> ImageList:
         ReobjError: no images; two kinds of images, either of which may be the frames; or too many
             sizes.
     """
+    unread = (  # of images that not every build of OpenCV reads
+        *(".heic", ".heif", ".avif", ".gif", ".jxl", ".jp2", ".exr", ".hdr", ".ppm", ".pgm"),
+        *(".tga", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw"),
+    )
     path = Path(source)
     if path.is_file():
         suffix = path.suffix.lower()
-        if suffix in UNREAD_SUFFIXES and suffix != ".gif":  # .gif is read as a video
+        if suffix in unread and suffix != ".gif":  # .gif is read as a video
             raise ReobjError(f"{source}: {path.suffix} files are not read; convert it to .jpg")
         return _sized(source, [path] if suffix in IMAGE_SUFFIXES else [], {path: header(path)}, [])
     if not path.is_dir() and not re.search(r"[*?\[]", source):
         return ImageList([], [], [])
     paths = [p for p in _paths(path) if not p.name.startswith(".")]
     files = [p for p in paths if p.suffix.lower() in IMAGE_SUFFIXES]
-    others = Counter(p.suffix for p in paths if p.suffix.lower() in UNREAD_SUFFIXES)
+    others = Counter(p.suffix for p in paths if p.suffix.lower() in unread)
     messages = [
         f"{n} {suffix} files are not read; convert them to .jpg" for suffix, n in others.items()
     ]
@@ -118,9 +118,6 @@ NO_PICTURE = frozenset(
     "semantic semantics label labels instance instances panoptic normal normals thumb thumbs "
     "thumbnail preview ir infrared flow albedo uncertainty".split()
 )
-A_PICTURE = frozenset("color colour rgb image img frame photo".split())
-# Images of each of two kinds from which equal numbers count; chosen: fewer may agree by chance
-SIDE_BY_SIDE = 3
 
 
 @dataclass(slots=True)
@@ -139,7 +136,8 @@ class _Kind:
 
     def is_named_picture(self, other: _Kind) -> bool:
         """Test whether these names have a word for pictures that the other names lack."""
-        return bool((self.words - other.words) & A_PICTURE)
+        pictures = {"color", "colour", "rgb", "image", "img", "frame", "photo"}
+        return bool((self.words - other.words) & pictures)
 
 
 def _only_pictures(
@@ -173,14 +171,15 @@ def _only_pictures(
         elif named and any(not k.words & NO_PICTURE for k in beside):
             messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
             kinds.remove(kind)
+    least = 3  # images of each of two kinds: the numbers of fewer may agree by chance
     for kind in list(kinds) if folder else ():
         rivals = [k for k in kinds if k is not kind and kind.shares(k, max)]
-        rivals = [k for k in rivals if min(len(k.files), len(kind.files)) >= SIDE_BY_SIDE]
+        rivals = [k for k in rivals if min(len(k.files), len(kind.files)) >= least]
         if any(k.is_named_picture(kind) and not kind.is_named_picture(k) for k in rivals):
             messages.append(_left_out(kind.files, "by its name; others have the same numbers"))
             kinds.remove(kind)
     for kind, other in itertools.combinations(kinds if folder else (), 2):
-        if kind.shares(other, max) and min(len(kind.files), len(other.files)) >= SIDE_BY_SIDE:
+        if kind.shares(other, max) and min(len(kind.files), len(other.files)) >= least:
             names = [min((p.name for p in k.files), key=by_number) for k in (kind, other)]
             raise ReobjError(
                 f"{folder}: two kinds of images, {' and '.join(names)}; which are the frames? "
@@ -239,12 +238,10 @@ def sorted_names(names: Iterable[str]) -> list[str]:
     return [names[k] for k in order]
 
 
-DECIMAL = re.compile(r"(.*?)((?:(?<![^_= ])-)?\d+(?:\.(\d+))?)")  # excludes hyphens after a word
-
-
 def _decimals(names: Sequence[str]) -> list[float] | None:
     """Read the numbers at the end of otherwise equal names; None if the names differ elsewhere."""
-    matches = [DECIMAL.fullmatch(Path(name).stem.casefold()) for name in names]
+    decimal = re.compile(r"(.*?)((?:(?<![^_= ])-)?\d+(?:\.(\d+))?)")  # no hyphen after a word
+    matches = [decimal.fullmatch(Path(name).stem.casefold()) for name in names]
     known = [match for match in matches if match is not None]
     if not known or len(known) < len(names) or len({match[1] for match in known}) > 1:
         return None
@@ -325,15 +322,12 @@ class Header:
     bits: int = 8
 
 
-# Bytes of the first and second read; chosen: headers without and with a photo's thumbnail
-HEADER_BYTES = (1 << 12, 1 << 17)
-
-
 def header(path: Path) -> Header | None:
     """Read the header of an image file; None for unknown formats."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         data = b""
-        for count in (*HEADER_BYTES, -1):
+        # Bytes of headers without, and of those with a photo's thumbnail; the whole file
+        for count in (1 << 12, 1 << 17, -1):
             data += file.read(count)
             head = header_of(data)
             if head is not None and min(head.size) > 0:
@@ -372,9 +366,8 @@ def _jpeg_header(data: bytes) -> Header:
     """Read the first start-of-frame segment, and the EXIF segment before it."""
     at = 2
     tags = dict[int, int]()
-    while data[at] == 0xFF and not (
-        0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in JPEG_OTHER
-    ):
+    others = (0xC4, 0xC8, 0xCC)  # within the range of start-of-frame markers: tables
+    while data[at] == 0xFF and not (0xC0 <= data[at + 1] <= 0xCF and data[at + 1] not in others):
         length = struct.unpack_from(">H", data, at + 2)[0]
         if data[at + 4 : at + 10] == b"Exif\0\0":
             with contextlib.suppress(struct.error, IndexError):  # EXIF is optional
@@ -382,9 +375,6 @@ def _jpeg_header(data: bytes) -> Header:
         at += 2 + length
     bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
     return Header(_upright((width, height), tags), channels, bits)
-
-
-JPEG_OTHER = (0xC4, 0xC8, 0xCC)  # markers within the range of start-of-frame markers: tables
 
 
 def _tiff_tags(data: bytes) -> dict[int, int]:

@@ -18,8 +18,6 @@ from reobj.files import shortened
 from reobj.frame_lookup import frames_by_name
 from reobj.types import IntArray, ReobjError
 
-OPTION = "--set detect.first_frame="  # option for files whose numbers are ambiguous
-
 
 class Frames(Protocol):
     """Attributes of a `Video` that are used here."""
@@ -34,16 +32,13 @@ class Frames(Protocol):
         """Number of frames of the source, 0: unknown."""
 
 
-ROBOFLOW = re.compile(r"_(jpe?g|png|bmp|webp|tiff?)\.rf\.[^./\\]+", re.IGNORECASE)
-
-
 def original_name(name: str) -> str:
     """Return the name that an image had before its export by Roboflow; other names unchanged.
 
     >>> original_name("frame_0001_png.rf.3f2a9c.jpg")
     'frame_0001.png'
     """
-    match = ROBOFLOW.search(name)
+    match = re.search(r"_(jpe?g|png|bmp|webp|tiff?)\.rf\.[^./\\]+", name, re.IGNORECASE)
     return f"{name[: match.start()]}.{match[1]}" if match else name
 
 
@@ -92,20 +87,21 @@ def frames_of_numbers(
     """
     if not len(numbers):
         return numbers, ""
+    option = "--set detect.first_frame="
     start = int(first) if first else first_number(numbers, frame_count, listed)
     if start is None and usual is None:
         low = int(numbers.min())
         high = int(numbers.max())
         raise ReobjError(
             f"{where}: numbers {low} to {high} count frames from 0, or from 1 (then the first of "
-            f"them is frame {low - 1}); say which with {OPTION}0 or {OPTION}1"
+            f"them is frame {low - 1}); say which with {option}0 or {option}1"
         )
     begin = start if start is not None else usual or 0
     text = f"frame numbers {int(numbers.min())} to {int(numbers.max())} are taken as "
     text += "0-based" if begin == 0 else "counted from 1"
     unclear = start is None and int(numbers.min()) == 1 and begin == 0
     if unclear:
-        text += f", there is no 0; if they count from 1: {OPTION}1"
+        text += f", there is no 0; if they count from 1: {option}1"
     return numbers - begin, text if unclear or (begin != usual and not first) else ""
 
 

@@ -14,8 +14,6 @@ from reobj.sources.image_files import IMAGE_FPS, times_of_names
 from reobj.sources.video import InputConfig, Video, source_fingerprint
 from reobj.types import Frame, ReobjError
 
-NO_IMAGE: Any = None
-
 
 class ImagelessVideo(Video):
     """Iterate over frames with a number, a time and perhaps a name, but without an image.
@@ -79,6 +77,7 @@ class ImagelessVideo(Video):
     def __iter__(self) -> Iterator[Frame]:
         stop = min(self.config.stop or self.frame_count, self.frame_count)
         times_s = self.times_s
+        no_image: Any = None
         for index in range(self.config.start, stop, self.config.every):
             time_s = index / IMAGE_FPS if times_s is None else float(times_s[index])
-            yield Frame(index, time_s, NO_IMAGE)
+            yield Frame(index, time_s, no_image)

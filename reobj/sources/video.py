@@ -57,16 +57,7 @@ class InputConfig:
     )
 
 
-STREAM_URL = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # rtsp, http, ... addresses
 MAX_UNREADABLE = 64  # consecutive frames after which a video has ended; chosen: 2 s
-MISSING_SHARE = (
-    0.02  # tolerated fraction of missing frames; chosen: containers count a few too many
-)
-ROUNDING_S = 1e-3  # s, resolution of the times in containers
-NO_TIME_S = 1e9  # s, larger times are invalid; chosen: 30 years; AV_NOPTS_VALUE is -9e18 units
-SQUARE = 0.01  # tolerated deviation of a pixel's aspect ratio from 1; chosen: not visible
-LIVE_QUEUE = 2  # frames that wait for the tracker; chosen: the next one and the newest one
-LIVE_POLL_S = 0.5  # s; chosen: longer than the reading thread takes to signal its end
 LIVE_TIMEOUT_S = 2.0  # s without a frame after which a live source has ended (chosen)
 OPEN_TIMEOUT_S = 5.0  # s; chosen: cameras answer within 2 s; OpenCV's default is 30 s
 RECONNECT_S = (1.0, 30.0)  # s before the first attempt, doubled for each next one; maximum (chosen)
@@ -85,7 +76,7 @@ class Clock:
 
 
 # Clocks of this process by path, fingerprint and frame to stop before
-MEASURED: dict[tuple[str, str, int], Clock] = {}
+_measured_clocks: dict[tuple[str, str, int], Clock] = {}
 
 
 class Video:
@@ -94,7 +85,7 @@ class Video:
     Iteration yields `Frame`s and may be repeated unless the source is live. Frame numbers count the
     frames of the source from 0, including unreadable ones: images in the order of the numbers in
     their names, frames of a file as stored. Frames that a live source delivers while the caller is
-    busy are counted and dropped, except for the `LIVE_QUEUE` newest ones.
+    busy are counted and dropped, except for the two newest ones.
 
     Attributes:
         source: as given; of a URL only scheme, host and path.
@@ -129,7 +120,7 @@ class Video:
         self.messages: list[str] = []
         self.read = self.dropped = self._seen = 0
         self._opened: Any = None  # capture of a live source, until it is iterated
-        self._is_url = bool(STREAM_URL.match(self._address))
+        self._is_url = _is_stream_url(self._address)
         self.fingerprint = source_fingerprint(source)
         images = ImageList([], [], []) if self._is_url else list_images(self.source)
         self.files = images.files
@@ -180,7 +171,7 @@ class Video:
             return self._assumed_fps
         steps = len(times_s) - 1
         seconds = float(np.ptp(times_s))
-        same = abs(steps / announced - seconds) <= ROUNDING_S
+        same = abs(steps / announced - seconds) <= 1e-3  # s, resolution of times in containers
         return announced if same else steps / seconds
 
     @property
@@ -259,13 +250,14 @@ class Video:
             failed = 0
             # After the grab this is the frame's presentation time, also at a variable rate
             seconds = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            yield seconds if abs(seconds) < NO_TIME_S else math.nan
+            # Without a time FFmpeg has -9e18 units (AV_NOPTS_VALUE); 1e9 s are 30 years
+            yield seconds if abs(seconds) < 1e9 else math.nan
 
     def _measured(self) -> Clock:
         """Return the times of the frames; a file is decoded once per process."""
         if self._clock is None:
             for stop in (0, self.config.stop):
-                self._clock = self._clock or MEASURED.get(self._key(stop))
+                self._clock = self._clock or _measured_clocks.get(self._key(stop))
         if self._clock is None:
             self._clock = self._keep(list(self._grabbed(self._open())))
         return self._clock
@@ -286,7 +278,7 @@ class Video:
             self._warn(text)
         self._clock = Clock(times_s, complete, known)
         if not self._is_url:
-            MEASURED[self._key(0 if complete else self.config.stop)] = self._clock
+            _measured_clocks[self._key(0 if complete else self.config.stop)] = self._clock
         return self._clock
 
     def _missing_end(self, times_s: Array) -> str:
@@ -298,14 +290,15 @@ class Video:
         """
         read = len(times_s)
         last_s = float(times_s[-1])
-        if self._announced - read <= max(1.0, MISSING_SHARE * self._announced):
+        tolerated = 0.02  # fraction of missing frames: containers count a few too many
+        if self._announced - read <= max(1.0, tolerated * self._announced):
             return ""
         readable = f"{read} frames up to {last_s:.2f} s can be read"
         file = Path(self._address)
         if lost := missing_bytes(file):
             return f"the file ends early: {lost} bytes are missing at its end; {readable}"
         _, stored_s, size = self._packets()
-        if stored_s - last_s > max(1 / self._announced_fps, MISSING_SHARE * stored_s):
+        if stored_s - last_s > max(1 / self._announced_fps, tolerated * stored_s):
             return f"the file is damaged: {readable}, frames up to {stored_s:.2f} s are stored"
         total = file.stat().st_size
         if 2 * size < total and holds_pictures_only(file):
@@ -356,7 +349,8 @@ class Video:
 
         A thread reads all frames, so that the driver's queue does not fill with old ones.
         """
-        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(LIVE_QUEUE)
+        # Two frames wait: the next one for the tracker, and the newest one
+        frames: queue.Queue[tuple[int, float, Image] | None] = queue.Queue(2)
         stopped = threading.Event()
         self._last_frame_s = time.monotonic()
         thread = threading.Thread(
@@ -377,10 +371,11 @@ class Video:
         self, frames: queue.Queue[tuple[int, float, Image] | None]
     ) -> tuple[int, float, Image] | None:
         """Wait for a frame of a live source; None at its end, or where the driver hangs."""
-        timeout_s = LIVE_TIMEOUT_S + LIVE_POLL_S
+        poll_s = 0.5  # longer than the reading thread takes to signal its end
+        timeout_s = LIVE_TIMEOUT_S + poll_s
         while time.monotonic() - self._last_frame_s < timeout_s or not frames.empty():
             with contextlib.suppress(queue.Empty):
-                return frames.get(timeout=LIVE_POLL_S)
+                return frames.get(timeout=poll_s)
         self._warn(f"no frame came for {LIVE_TIMEOUT_S:g} s: taken as its end")
         return None
 
@@ -479,7 +474,7 @@ class Video:
         wide, high = (round(capture.get(p)) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
         turned = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90
         wide, high = (high, wide) if turned else (wide, high)
-        if wide > 0 and high > 0 and abs(wide / high - 1) > SQUARE:
+        if wide > 0 and high > 0 and abs(wide / high - 1) > 0.01:  # less is not visible
             self.pixel_aspect = wide / high
             self._warn(f"its pixels are {wide}:{high}, not square, by its metadata: boxes are in "
                        "stored pixels, cameras have two focal lengths; if that is wrong, correct "
@@ -500,7 +495,9 @@ def shrunk(image: Image, size_px: int) -> Image:
     return resized(image, [max(1, round(side * ratio)) for side in image.shape[1::-1]])
 
 
-HASH_ROUNDS = 100_000  # rounds; chosen: .05 s, once per run and per guess of a password
+def _is_stream_url(address: str) -> bool:
+    """Test whether an address begins with rtsp://, http:// or the like."""
+    return re.match(r"[a-z][a-z0-9+.-]+://", address, re.IGNORECASE) is not None
 
 
 def source_fingerprint(source: Any) -> str:
@@ -512,9 +509,10 @@ def source_fingerprint(source: Any) -> str:
     """
     text = str(source)
     path = Path(str(source))
-    if STREAM_URL.match(text):
+    if _is_stream_url(text):
         public = without_secrets(text)
-        digest = hashlib.pbkdf2_hmac("sha256", text.encode(), public.encode(), HASH_ROUNDS)
+        rounds = 100_000  # .05 s, once per run and per guess of a password
+        digest = hashlib.pbkdf2_hmac("sha256", text.encode(), public.encode(), rounds)
         return public if public == text else f"{public} {digest.hex()[:16]}"
     if path.is_file():  # first: the name may contain glob characters, det[1].txt
         files = [path]

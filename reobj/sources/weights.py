@@ -65,38 +65,37 @@ class Weights:
     @property
     def fallback(self) -> str:
         """Suggest a smaller detector, as the end of an error message; "": none."""
-        other = self.role == "detector" and self.alias != FAST
-        return f"; or take the small detector: --detector {FAST}" if other else ""
+        other = self.role == "detector" and self.alias != "fast"
+        return "; or take the small detector: --detector fast" if other else ""
 
 
-_GITHUB = "https://github.com/"
-_DEIM = _GITHUB + "Kazuhito00/DEIMv2-ONNX-Sample/raw/f88d4382abca74edb26ed4c7f46190ac40da0ea5/"
-_YOLOX = (_GITHUB + "Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
-          "3d4f1119d0694200671c08069ecb847aa0d8495a/")  # fmt: skip
-_PICODET = _GITHUB + "hpc203/picodet-onnxruntime/raw/dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/"
-FAST = "fast"  # alias of the detector that errors suggest where the default one is not available
+_DEIM = ("https://github.com/Kazuhito00/DEIMv2-ONNX-Sample/raw/"
+         "f88d4382abca74edb26ed4c7f46190ac40da0ea5/model/")  # fmt: skip
 WEIGHTS: tuple[Weights, ...] = (
     Weights("deimv2-n", "detector", "deimv2_hgnetv2_n_coco.onnx",
-            _DEIM + "model/deimv2_hgnetv2_n_coco.onnx",
+            _DEIM + "deimv2_hgnetv2_n_coco.onnx",
             "facaa27741d600e993b80f981b86997adbf7d556", 0,
             "Apache-2.0", "default; COCO, AP 43.0 by its authors, not run by us", "DEIM"),
     Weights("deimv2-pico", "detector", "deimv2_hgnetv2_pico_coco.onnx",
-            _DEIM + "model/deimv2_hgnetv2_pico_coco.onnx",
+            _DEIM + "deimv2_hgnetv2_pico_coco.onnx",
             "e049f81944cdb9a4e0fd07de741abadcce9de516", 0,
             "Apache-2.0", "COCO, AP 38.5 by its authors, not run by us", "DEIM"),
     Weights("deimv2-femto", "detector", "deimv2_hgnetv2_femto_coco.onnx",
-            _DEIM + "model/deimv2_hgnetv2_femto_coco.onnx",
+            _DEIM + "deimv2_hgnetv2_femto_coco.onnx",
             "c6ad358f750132b891165e034c2ba507abefc5ebe1c1d2732a0acbcacc47e52c", 4116144,
-            "Apache-2.0", "`--detector fast`; COCO, AP 33.2, 39 ms", "DEIM", FAST),
+            "Apache-2.0", "`--detector fast`; COCO, AP 33.2, 39 ms", "DEIM", "fast"),
     Weights("deimv2-atto", "detector", "deimv2_hgnetv2_atto_coco.onnx",
-            _DEIM + "model/deimv2_hgnetv2_atto_coco.onnx",
+            _DEIM + "deimv2_hgnetv2_atto_coco.onnx",
             "b114aa6610ac7c2bd9b3186ffb001afa872430db957407ef2473f7148d00646e", 2248408,
             "Apache-2.0", "smallest; COCO, AP 25.5, 21 ms", "DEIM"),
-    Weights("yolox-nano", "detector", "yolox_nano_416.onnx", _YOLOX + "model/yolox_nano.onnx",
+    Weights("yolox-nano", "detector", "yolox_nano_416.onnx",
+            "https://github.com/Kazuhito00/YOLOX-ONNX-TFLite-Sample/raw/"
+            "3d4f1119d0694200671c08069ecb847aa0d8495a/model/yolox_nano.onnx",
             "695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14", 3660092,
             "Apache-2.0", "COCO, AP 28.6, 27 ms", "YOLOX"),
     Weights("picodet-s-416", "detector", "picodet_s_416_coco.onnx",
-            _PICODET + "picodet_s_416_coco.onnx",
+            "https://github.com/hpc203/picodet-onnxruntime/raw/"
+            "dfe4d6cd0a18cd4126ee381e81df8a0b1e6ad97b/coco/picodet_s_416_coco.onnx",
             "cdab77bdde16e4f76bec734c4e5791801d1739e4c7ec1995e0e110e04300d0c2", 4040573,
             "Apache-2.0", "COCO, AP 33.5, 46 ms", "PicoDet"),
     Weights("reobj", "backbone", "reobj.onnx", "",
@@ -196,7 +195,7 @@ def _fetch(weights: Weights, offline: bool) -> Path:
                          f"fetch {weights.url} elsewhere and {by_hand}{weights.fallback}"
                          )  # fmt: skip
     target = _writable_folder() / weights.file
-    lock = target.with_name(DOWNLOAD_LOCK)
+    lock = target.with_name(".lock")
     with contextlib.suppress(LockedError), locked(lock):
         return _fetch_alone(weights, target, missing, by_hand)
     log.warning("another process is fetching weights into %s: waiting for it", target.parent)
@@ -204,7 +203,6 @@ def _fetch(weights: Weights, offline: bool) -> Path:
         return _fetch_alone(weights, target, missing, by_hand)
 
 
-DOWNLOAD_LOCK = ".lock"  # in the folder of weights
 DOWNLOAD_WAIT_S = 600.0  # s, longest wait for another process; chosen: 100 MB at 1.3 Mbit/s
 
 
@@ -247,12 +245,7 @@ def _writable_folder() -> Path:
     raise ReobjError(f"cannot write to {tried}: set REOBJ_MODELS to a writable folder")
 
 
-DOWNLOAD_CHUNK = 1 << 16  # bytes; chosen: small enough for a smooth progress line
 DOWNLOAD_MAX = 100_000_000  # bytes of a file of unknown size; chosen: several times the largest
-DOWNLOAD_TIMEOUT_S = 30  # s without data after which the connection is cut (chosen)
-
-
-WEB_PAGES = ("text/html", "application/xhtml+xml")  # answers of captive portals
 
 
 class StaysEncrypted(urllib.request.HTTPRedirectHandler):
@@ -272,15 +265,15 @@ def _download(weights: Weights, part: Path) -> None:
     request = urllib.request.Request(weights.url, headers={"User-Agent": "reobj_track"})
     opener = urllib.request.build_opener(StaysEncrypted)
     with (
-        opener.open(request, timeout=DOWNLOAD_TIMEOUT_S) as response,
+        opener.open(request, timeout=30) as response,  # s without data
         part.open("wb") as file,
     ):
-        if response.headers.get_content_type() in WEB_PAGES:
+        if response.headers.get_content_type() in ("text/html", "application/xhtml+xml"):
             raise ConnectionError("a web page came instead: must you log in to this network first?")
         size = weights.size or min(response.length or 0, DOWNLOAD_MAX)
         done = 0
         with Progress("fetch kB", size // 1000) as progress:
-            while done < (size or DOWNLOAD_MAX) and (chunk := response.read(DOWNLOAD_CHUNK)):
+            while done < (size or DOWNLOAD_MAX) and (chunk := response.read(1 << 16)):
                 file.write(chunk)
                 done += len(chunk)
                 progress.step(done // 1000 - progress.done)

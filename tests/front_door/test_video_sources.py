@@ -128,7 +128,7 @@ def test_frames_are_counted_and_timed_as_they_are_decoded(what: str, tmp_path: P
 def video_module_cache_cleared() -> None:
     from reobj.sources import video
 
-    video.MEASURED.clear()
+    video._measured_clocks.clear()
 
 
 def test_a_part_of_a_file_is_all_that_is_decoded(
