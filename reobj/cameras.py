@@ -80,9 +80,6 @@ def camera_parameters(model: str) -> list[str]:
     return [name.strip() for name in camera.params_info.split(",")]
 
 
-INVERSE_PX = 0.01  # px, largest error of undistorting and distorting a pixel (chosen: negligible)
-
-
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Intrinsics in COLMAP's conventions.
@@ -123,7 +120,7 @@ class Camera:
             rows = rows[ahead]
             back = np.asarray(camera.img_from_cam(ray), np.float64).reshape(-1, 2)
             error = np.abs(back - flat[rows]).max(1, initial=0)  # inf where the terms diverge
-            inverted = error < INVERSE_PX
+            inverted = error < 0.01  # px, negligible
             ray = ray[inverted]
             rows = rows[inverted]
             ideal[rows] = ray[:, :2] / ray[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
@@ -151,19 +148,15 @@ class Camera:
         return Camera(self.model, *size, tuple(camera.params.tolist()))
 
 
-# Plausibility of intrinsics (chosen: wide; from fisheye to telephoto lenses)
-MAX_OFF_CENTRE = 0.2  # image sides, of the principal point from the middle
-PLAUSIBLE_FOCAL = (0.1, 10.0)  # longer image sides, of the focal length
-
-
 def checked_camera(camera: Camera, where: str) -> Camera:
     """Return the camera; refuse intrinsics of images of another size."""
     size = np.array([camera.width, camera.height])
     centre = camera.K[:2, 2]
     focal = camera.K[0, 0]
-    low, high = PLAUSIBLE_FOCAL
-    off_centre = (np.abs(centre - size / 2) > MAX_OFF_CENTRE * size).any()
-    if off_centre or not low < focal / size.max() < high:
+    # Principal points within .2 sides of the middle, focal lengths of .1 to 10 longer sides: wide
+    # limits, from fisheye to telephoto lenses
+    off_centre = (np.abs(centre - size / 2) > 0.2 * size).any()
+    if off_centre or not 0.1 < focal / size.max() < 10:
         raise ReobjError(
             f"{where}: focal length {focal:.0f} px and centre ({centre[0]:.0f}, {centre[1]:.0f}) "
             f"do not fit frames of {size[0]}x{size[1]} as they are read (rotated? resized?)"
@@ -171,7 +164,6 @@ def checked_camera(camera: Camera, where: str) -> Camera:
     return camera
 
 
-RIGID_TOLERANCE = 1e-3  # of R R' from the identity; chosen: float32 poses of devices are at 1e-6
 WORLD_MAX = 1e9  # world units, of a camera's position; chosen: the Earth in cm fits
 
 
@@ -179,9 +171,6 @@ def usable(camera: Camera) -> bool:
     """Test whether a camera has a size, finite parameters and positive focal lengths."""
     sized = min(camera.width, camera.height) > 0 and bool(np.isfinite(camera.params).all())
     return sized and bool((np.diag(camera.K)[:2] > 0).all())
-
-
-PART_MAX = 1000  # components of a trajectory; chosen: a walk of an hour has a few
 
 
 def checked_pose(
@@ -196,7 +185,7 @@ def checked_pose(
     """
     if points is not None and (np.shape(points)[1:] != (3,) or not np.isfinite(points).all()):
         raise ReobjError(f"points of shape {np.shape(points)}, expected (N, 3), finite, in world")
-    if not isinstance(part, int | np.integer) or not 0 <= part <= PART_MAX:
+    if not isinstance(part, int | np.integer) or not 0 <= part <= 1000:  # an hour's walk has a few
         raise ReobjError(f"part {part!r}, expected the number of a component of the trajectory, "
                          "from 0")  # fmt: skip
     if cam_from_world is None:
@@ -208,12 +197,13 @@ def checked_pose(
         return None
     offset = pose[:, 3]
     rotation = pose[:, :3]
-    if (np.abs(offset) > WORLD_MAX).any() or (np.abs(rotation) > 1 + RIGID_TOLERANCE).any():
+    tolerance = 1e-3  # of R R' from the identity; float32 poses of devices are at 1e-6
+    if (np.abs(offset) > WORLD_MAX).any() or (np.abs(rotation) > 1 + tolerance).any():
         raise ReobjError(f"cam_from_world {pose.tolist()}: values too large for a pose; expected "
                          "[R | t]")  # fmt: skip
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     determinant = np.linalg.det(rotation)
-    if error > RIGID_TOLERANCE or determinant < 0:
+    if error > tolerance or determinant < 0:
         raise ReobjError("cam_from_world: the 3x3 block is not a rotation (orthogonality error "
                          f"{error:.2g}, determinant {determinant:.2g}); expected [R | t], x right, "
                          "y down, z forward")  # fmt: skip
@@ -320,11 +310,6 @@ class Poses:
         return np.asarray(np.isfinite(self.cam_from_world).all((1, 2)), bool)
 
 
-_POSE_ARRAYS = (
-    "frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part"
-)  # fmt: skip
-
-
 def save_poses(path: Path, poses: Poses, **more: Any) -> None:
     """Write poses as npz, atomically; `more` goes into its metadata."""
     facts = more | {
@@ -335,13 +320,15 @@ def save_poses(path: Path, poses: Poses, **more: Any) -> None:
         "messages": poses.messages,
         "reading": poses.reading,
     }
-    save_npz(path, {k: getattr(poses, k) for k in _POSE_ARRAYS}, **facts)
+    names = (
+        "frame", "time_s", "cam_from_world", "status", "points", "colors", "visibility", "part"
+    )  # fmt: skip
+    save_npz(path, {name: getattr(poses, name) for name in names}, **facts)
 
 
 def load_poses(path: Path) -> Poses:
     """Read a file of `save_poses`."""
-    data, facts = load_npz(path, sealed=True)
-    arrays = {k: data[k] for k in _POSE_ARRAYS}
+    arrays, facts = load_npz(path, sealed=True)
     camera = Camera(**facts["camera"] | {"params": tuple(facts["camera"]["params"])})
     up = None if facts["up"] is None else np.array(facts["up"])
     return Poses(

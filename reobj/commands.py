@@ -21,13 +21,8 @@ from reobj.options import add_flags, list_options
 from reobj.types import ReobjError, one_line, printable, without_secrets
 
 Command = Callable[[argparse.Namespace], int]
-SHELLS = ("bash", "zsh")  # shtab's script for tcsh does not complete the flags of commands
 TRACKS_HELP = (
     "file of identities, used instead of the tracker: CVAT, COCO, MOT, KITTI, CSV, YOLO labels"
-)
-DETECTIONS_HELP = (
-    "file of detections, used instead of the detector: MOT, KITTI, CSV, COCO JSON, folder of YOLO "
-    "labels, CVAT, npz"
 )
 
 
@@ -165,7 +160,8 @@ def make_parser(
     text = "list all options of --set section.field=value"
     parser.add_argument("--options", action=_ListOptions, nargs=0, const=config, help=text)
     text = "print a shell completion script for `reobj-track` (needs shtab)"
-    parser.add_argument("--completion", action=_Completion, choices=SHELLS, help=text)
+    shells = ("bash", "zsh")  # shtab's script for tcsh does not complete the flags of commands
+    parser.add_argument("--completion", action=_Completion, choices=shells, help=text)
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(command, "run", "identities, cameras and 3D objects of a video, with files to view")
     _add_run(command, "track", "identities only (2D)")
@@ -219,7 +215,8 @@ def _add_run(command: Any, name: str, text: str) -> None:
         help="use a folder that holds other files or results of another video",
     )
     if name != "poses":
-        add("--detections", help=DETECTIONS_HELP)
+        text = "file of detections, used instead of the detector: MOT, KITTI, CSV, COCO JSON, "
+        add("--detections", help=text + "folder of YOLO labels, CVAT, npz")
         add("--tracks", help=TRACKS_HELP)
         add(
             "--show", action="store_true", help="show progress live in rerun's viewer (needs rerun)"

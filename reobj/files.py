@@ -73,7 +73,6 @@ DISK_ERRORS = {  # what to do about each
     errno.EISDIR: "a folder stands where a file should be: move it away",
     errno.EIO: "disk I/O error: check the disk",
 }
-NUMPY_FULL = re.compile(r"\d+ requested and \d+ written")  # numpy's message, without an errno
 
 
 @contextlib.contextmanager
@@ -86,7 +85,8 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        number = errno.ENOSPC if NUMPY_FULL.search(str(error)) else error.errno
+        full = re.search(r"\d+ requested and \d+ written", str(error))  # numpy's, without an errno
+        number = errno.ENOSPC if full else error.errno
         named = Path(os.fsdecode(error.filename or path))
         beside = named.is_relative_to(path.parent) or path.is_relative_to(named)
         if number not in DISK_ERRORS or not beside:
@@ -114,7 +114,7 @@ def locked(path: Path, wait_s: float = 0.0) -> Iterator[None]:
         while not _lock(file.fileno()):
             if time.monotonic() >= until:
                 raise LockedError(f"{path}: locked by another process")
-            time.sleep(LOCK_POLL_S)
+            time.sleep(0.05)  # a person does not notice the delay
         yield
 
 
@@ -122,15 +122,12 @@ class LockedError(ReobjError):
     """A lock is held by another process."""
 
 
-LOCK_POLL_S = 0.05  # s between attempts; chosen: a person does not notice the delay
-
-
 def _lock(handle: int) -> bool:
     """Take the lock of an open file; False if it is held; True where the system has no locks."""
     try:
         _take_lock(handle)
     except OSError as error:
-        return error.errno not in HELD
+        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)  # held
     return True
 
 
@@ -146,10 +143,7 @@ else:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-HELD = (errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
-
-
-PART_RESULTS = ".part-results"
+PART_RESULTS = ".part-results"  # folder of unfinished results, in the output folder
 
 
 @contextlib.contextmanager
@@ -224,9 +218,7 @@ def part_paths(path: Path) -> list[Path]:
 TEXT_MAX = 1 << 28  # characters of a file; chosen: a million detections with masks have 2e8
 LINES_MAX = 2_000_000  # of a table; chosen: an hour at 30 Hz with 18 boxes a frame, 2 GB of memory
 LINE_MAX = 1 << 22  # characters; chosen: the observations of 100,000 points in COLMAP's text
-OTHER_BREAKS = "\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"  # further line breaks of str.splitlines
 JSON_MAX = 1 << 31  # bytes of memory; chosen: two million detections with masks
-JSON_BYTES = {"{": 200, "[": 64, ",": 64}  # bytes of memory per sign, about (sys.getsizeof)
 NPZ_MAX = 1 << 30  # bytes, unpacked; chosen: detections with masks of an hour of video have 7e8
 
 
@@ -249,7 +241,8 @@ def read_text(path: Path, most: int | None = None, errors: str = "strict") -> st
 def read_lines(path: Path) -> list[str]:
     """Read a UTF-8 file of at most LINES_MAX lines, with their ends."""
     text = read_text(path)
-    count = text.count("\n") + sum(map(text.count, OTHER_BREAKS))
+    breaks = "\n\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029"  # as of str.splitlines
+    count = sum(map(text.count, breaks))
     if count > LINES_MAX:
         raise ReobjError(
             f"{path}: {count} lines, at most {LINES_MAX} are allowed; cut it into pieces"
@@ -260,10 +253,15 @@ def read_lines(path: Path) -> list[str]:
     return lines
 
 
+def json_memory(text: str) -> int:
+    """Estimate the bytes of memory that a JSON text takes once it is read (sys.getsizeof)."""
+    return 200 * text.count("{") + 64 * (text.count("[") + text.count(","))
+
+
 def load_json(path: Path) -> Any:
     """Read a JSON file of at most JSON_MAX bytes in memory; an error names the line."""
     text = read_text(path)
-    if (size := sum(text.count(sign) * each for sign, each in JSON_BYTES.items())) > JSON_MAX:
+    if (size := json_memory(text)) > JSON_MAX:
         memory = f"would take {size >> 20} MB of memory, at most {JSON_MAX >> 20} MB are allowed"
         raise ReobjError(f"{path}: {memory}; cut it into pieces")
     if digits := re.search(r"\d{309}", text):
@@ -341,10 +339,6 @@ def load_cached(path: Path, read: Callable[[Path], T]) -> T | None:
         return None
 
 
-REDRAW_S = 0.1  # s between updates; chosen: readable, and rare enough to cost no time
-WINDOW_S = 5.0  # s, period of which the rate is the mean; chosen: changes show soon
-
-
 class Progress:
     """Show one progress line a stage on stderr with rate and time left, if stderr is a terminal.
 
@@ -360,7 +354,7 @@ class Progress:
         self.total = total
         self.done = 0
         self.started = self.shown = time.monotonic()
-        self.marks = [(self.started, 0)]  # time and number of steps, within the last WINDOW_S
+        self.marks = [(self.started, 0)]  # time and number of steps, of the last 5 s
         self.enabled = sys.stderr is not None and sys.stderr.isatty()
 
     def __enter__(self) -> Progress:
@@ -374,12 +368,12 @@ class Progress:
     def step(self, n: int = 1) -> None:
         """Count n more steps."""
         self.done += n
-        if self.enabled and time.monotonic() - self.shown > REDRAW_S:
+        if self.enabled and time.monotonic() - self.shown > 0.1:  # readable, and costs no time
             self._draw()
 
     def _draw(self) -> None:
         self.shown = now = time.monotonic()
-        self.marks = [mark for mark in self.marks if mark[0] >= now - WINDOW_S] or self.marks[-1:]
+        self.marks = [mark for mark in self.marks if mark[0] >= now - 5] or self.marks[-1:]
         then, before = self.marks[0]
         self.marks.append((now, self.done))
         rate = (self.done - before) / (now - then) if now > then else 0.0
@@ -406,14 +400,11 @@ class Progress:
                 total = f"/{self.done} 100 %" if complete else f"/{self.total}" * (self.total > 0)
                 text = f"{self.done}{total}, "
             text += f"{seconds:.1f} s" + ("" if complete else ", not finished")
-            if self.done and seconds > REDRAW_S:  # the rate of a cached stage means nothing
+            if self.done and seconds > 0.1:  # the rate of a cached stage means nothing
                 text += f", {self.done / seconds:.1f}/s"
             self._write(text)
             sys.stderr.write("\n")
         return seconds
-
-
-WORD_MAX = 100  # characters that are compared, in quadratic time; chosen: our words are shorter
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -422,7 +413,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     >>> did_you_mean("chiar", ["cup", "chair"])
     '; did you mean chair?'
     """
-    close = difflib.get_close_matches(word[:WORD_MAX], list(known), 1)
+    close = difflib.get_close_matches(word, list(known), 1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
@@ -444,12 +435,9 @@ def cut(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-PRINT_WIDTH = 100  # columns of printed text
-
-
 def wrapped(text: str) -> list[str]:
     """Wrap a line for the terminal; continuation lines are indented."""
-    return textwrap.wrap(text, PRINT_WIDTH, subsequent_indent="  ", break_long_words=False)
+    return textwrap.wrap(text, 100, subsequent_indent="  ", break_long_words=False)
 
 
 def spans(numbers: Iterable[int], step: int = 1) -> str:

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 import quadrics
-from reobj.files import WORD_MAX, atomic, did_you_mean, load_json, read_text, shortened
+from reobj.files import atomic, did_you_mean, load_json, read_text, shortened
 from reobj.types import Array, ReobjError
 
 C = TypeVar("C")
@@ -80,7 +80,7 @@ def with_option(config: C, name: str, value: Any, where: str = "--set ") -> C:
 
 def _most_similar(name: str, options: Iterable[str]) -> str:
     """Find the option most similar to a wrong name: as a whole, by its field or a word of it."""
-    name = name[:WORD_MAX]
+    name = name[:100]  # longer than our names; the comparison takes quadratic time
 
     def similarity(option: str) -> float:
         field_name = option.rpartition(".")[2]
@@ -93,9 +93,6 @@ def _most_similar(name: str, options: Iterable[str]) -> str:
 # ---- Files of options ----
 
 
-CONFIG_MAX = 1 << 20  # characters of a file; chosen: a thousand times the length of all options
-
-
 def read_config(config: C, path: str | Path) -> C:
     """Apply a TOML file of options, by section; its paths are relative to the working folder.
 
@@ -104,7 +101,8 @@ def read_config(config: C, path: str | Path) -> C:
     """
     path = Path(path)
     try:
-        table = tomllib.loads(read_text(path, CONFIG_MAX, "surrogateescape"))
+        # At most a thousand times the length of all options
+        table = tomllib.loads(read_text(path, 1 << 20, "surrogateescape"))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ReobjError(f"{path}: not valid TOML ({error})") from None
     for key, value in table.items():
@@ -193,18 +191,18 @@ def config_from_args(config: C, args: argparse.Namespace) -> C:
     return config
 
 
-NAME_WIDTH = 32  # columns of the names in the list of options
-LINE_WIDTH = 120  # columns of the list
+def list_options(config: Any, width: int = 120, name_width: int = 32) -> str:
+    """Return the list of all options, one a line: name, default and meaning.
 
-
-def list_options(config: Any) -> str:
-    """Return the list of all options, one a line: name, default and meaning."""
+    Args:
+        width, name_width: columns of the list, and of the names in it.
+    """
     lines = []
     for name, f in every_option(config).items():
         default = str(f.default) if len(str(f.default)) < 12 else f"{str(f.default)[:9]}..."
-        text = textwrap.wrap(f.metadata["help"], LINE_WIDTH - NAME_WIDTH - 1)
-        lines.append(f"{f'{name}={default}':<{NAME_WIDTH}} {text[0]}")
-        lines += [" " * (NAME_WIDTH + 1) + more for more in text[1:]]
+        text = textwrap.wrap(f.metadata["help"], width - name_width - 1)
+        lines.append(f"{f'{name}={default}':<{name_width}} {text[0]}")
+        lines += [" " * (name_width + 1) + more for more in text[1:]]
     return "\n".join(lines)
 
 
@@ -240,9 +238,6 @@ def check_shape(name: str) -> None:
         raise ReobjError(f"--shape {name}: expected one of {', '.join(kinds)}")
 
 
-KNOWN_SIZE_M = (0.001, 1000.0)  # chosen: beyond the objects of a room or a street
-
-
 def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     """Parse 'chair=0.82m,door=2.0m' into heights in metres by category.
 
@@ -250,13 +245,14 @@ def parse_known_size(text: str) -> dict[str | int, tuple[str | int, float]]:
     {'door': ('h', 2.0), 'chair': ('h', 0.82)}
     """
     per_metre = {"m": 1, "cm": 100, "mm": 1000}
+    limits_m = (0.001, 1000.0)  # beyond the objects of a room or a street
     sizes: dict[str | int, tuple[str | int, float]] = {}
     for item in filter(None, (entry.strip() for entry in text.split(","))):
         found = re.fullmatch(r"(.+?)\s*=\s*([0-9]*\.?[0-9]+|[0-9]+\.)\s*(m|cm|mm)", item)
         height_m = float(found[2]) / per_metre[found[3]] if found else 0.0
-        if found is None or not KNOWN_SIZE_M[0] <= height_m <= KNOWN_SIZE_M[1]:
+        if found is None or not limits_m[0] <= height_m <= limits_m[1]:
             expected = "CATEGORY=HEIGHT in m, cm or mm, from {:g} to {:g} m, such as door=2.0m"
-            raise ReobjError(f"--known-size {item!r}: expected {expected.format(*KNOWN_SIZE_M)}")
+            raise ReobjError(f"--known-size {item!r}: expected {expected.format(*limits_m)}")
         sizes[found[1]] = ("h", height_m)
     return sizes
 

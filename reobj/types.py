@@ -31,9 +31,6 @@ class ReobjError(ValueError):
         super().__init__(one_line(text))
 
 
-MESSAGE_MAX = 700  # characters; chosen: our messages are shorter, longer ones quote the input
-
-
 def one_line(text: str) -> str:
     """Make a text that may quote any input safe to print as one line.
 
@@ -43,9 +40,10 @@ def one_line(text: str) -> str:
 
 
 def _without_middle(text: str) -> str:
-    if len(text) <= MESSAGE_MAX:
+    most = 700  # characters: our messages are shorter, longer ones quote the input
+    if len(text) <= most:
         return text
-    return f"{text[: MESSAGE_MAX // 2]} ... {text[-MESSAGE_MAX // 3 :]}"
+    return f"{text[: most // 2]} ... {text[-most // 3 :]}"
 
 
 def printable(text: str) -> str:
@@ -69,21 +67,18 @@ def without_secrets(text: str) -> str:
     >>> without_secrets("rtsp://me:secret@10.0.0.7/stream?pwd=x")
     'rtsp://10.0.0.7/stream'
     """
-    return URL.sub(_public_part, text)
-
-
-# The scheme has at least two letters (C:/ is a drive) and at most 31, for linear time.
-URL = re.compile(r"([a-z][a-z0-9+.-]{1,30}:/+)(\S*)", re.IGNORECASE)
-PARAMETERS = re.compile(r"[?#;&=]")  # end the path; rtsp://host/user=me&password=x has one too
+    # The scheme has at least two letters (C:/ is a drive) and at most 31, for linear time
+    return re.sub(r"([a-z][a-z0-9+.-]{1,30}:/+)(\S*)", _public_part, text, flags=re.IGNORECASE)
 
 
 def _public_part(url: re.Match[str]) -> str:
     """Cut a URL to scheme, host and path."""
     scheme, rest = url.groups()
     user, _, rest = rest.rpartition("@")
-    if PARAMETERS.search(user):  # the password has a parameter sign, or the "@" is in a query
+    parameters = r"[?#;&=]"  # end the path; rtsp://host/user=me&password=x has one too
+    if re.search(parameters, user):  # the password has a parameter sign, or the "@" is in a query
         return f"{scheme}..."
-    return scheme + PARAMETERS.split(rest)[0]
+    return scheme + re.split(parameters, rest)[0]
 
 
 def visible_name(name: str) -> str:
@@ -92,14 +87,13 @@ def visible_name(name: str) -> str:
     >>> visible_name("a chair").isprintable()
     True
     """
-    return CONTROLS.sub("\ufffd", name)
+    # C0, C1, surrogates, marks of text direction, noncharacters
+    controls = "[\x00-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069\ufffe\uffff]"
+    return re.sub(controls, "\ufffd", name)
 
 
-CONTROLS = re.compile(  # C0, C1, surrogates, marks of text direction, noncharacters
-    "[\x00-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069\ufffe\uffff]"
-)
-
-COCO_CLASSES = (
+# The 80 classes of COCO in the order of their numbers; a name of two words has an underscore here
+COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in (
     "person bicycle car motorcycle airplane bus train truck boat traffic_light fire_hydrant "
     "stop_sign parking_meter bench bird cat dog horse sheep cow elephant bear zebra giraffe "
     "backpack umbrella handbag tie suitcase frisbee skis snowboard sports_ball kite "
@@ -108,8 +102,7 @@ COCO_CLASSES = (
     "chair couch potted_plant bed dining_table toilet tv laptop mouse remote keyboard "
     "cell_phone microwave oven toaster sink refrigerator book clock vase scissors teddy_bear "
     "hair_drier toothbrush"
-)
-COCO_NAMES: tuple[str, ...] = tuple(name.replace("_", " ") for name in COCO_CLASSES.split())
+).split())  # fmt: skip
 
 
 def option(default: Any, text: str, flag: str = "", old_flag: str = "") -> Any:

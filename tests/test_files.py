@@ -154,7 +154,7 @@ def test_json_takes_no_more_than_was_reckoned(tmp_path: Path, item: str) -> None
     """By what Python has allocated; 2 MB of text of the worst kinds."""
     path, text = tmp_path / "a.json", "[" + item * (2_000_000 // len(item)) + "0]"
     path.write_text(text)
-    reckoned = sum(text.count(sign) * each for sign, each in files.JSON_BYTES.items())
+    reckoned = files.json_memory(text)
     tracemalloc.start()
     try:
         data = files.load_json(path)
