@@ -361,7 +361,7 @@ class TrackState:
 
     @property
     def evidence(self) -> Array:
-        """Sum of a track's scores (T,) in detections of score .5, `new_score`'s default; at least 1."""
+        """Sum of a track's scores (T,) over .5, the default of `new_score`; at least 1."""
         return np.asarray(np.maximum(self.votes.sum(1) / 0.5, 1))
 
     @staticmethod
