@@ -70,7 +70,7 @@ from reobj.objects.confidence import LOW_CONFIDENCE
 from reobj.objects.fit import link_and_fit
 from reobj.objects.observations import Views
 from reobj.results.evaluation_3d import align_with_truth, fraction_within_2_sigma, sizes_in_sigma
-from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
+from reobj.results.truth import LabelledBoxes, Role, read_result, read_truth
 from reobj.types import Array, BoolArray, IntArray, box_area, box_iou, rows_by
 
 ROOM = Path(__file__).resolve().parent.parent / "examples" / "room"
@@ -365,21 +365,21 @@ INSIDE = 0.7  # share of a box in that of a hidden object: it is that one's, too
 
 
 def identity_f1(truth: LabelledBoxes, found: LabelledBoxes, min_iou: float) -> float:
-    """Compute IDF1 within classes; boxes on nothing but IGNORED truth are left out."""
+    """Compute IDF1 within classes; boxes on nothing but Role.IGNORED truth are left out."""
     left_out = np.zeros(len(found), bool)
     true_id, found_id = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for t, f in frames_of(truth, found):
         same = truth.name[t][:, None] == found.name[f]  # (G, P)
         hit = same & (box_iou(truth.xyxy[t], found.xyxy[f]) >= min_iou)
         inside = same & (shares_inside(truth.xyxy[t], found.xyxy[f]) >= INSIDE)
-        clear = truth.role[t] == SCORED
+        clear = truth.role[t] == Role.SCORED
         left_out[f] = (hit | inside)[~clear].any(0) & ~hit[clear].any(0)
         g, p = np.nonzero(hit & clear[:, None])
         true_id.append(truth.identity[t[g]])
         found_id.append(found.identity[f[p]])
     common, *_ = common_frames(np.concatenate(true_id), np.concatenate(found_id))
     right = common[linear_sum_assignment(-common)].sum()
-    return float(2 * right / max((truth.role == SCORED).sum() + (~left_out).sum(), 1))
+    return float(2 * right / max((truth.role == Role.SCORED).sum() + (~left_out).sum(), 1))
 
 
 @dataclass(frozen=True)

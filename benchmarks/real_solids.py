@@ -66,7 +66,7 @@ import reobj_track as rt
 from reobj.files import atomic, load_json
 from reobj.results.evaluation_3d import MIN_HALF_AXIS, align_with_truth, read_true_objects
 from reobj.results.overlay import draw_ellipses, draw_tracks
-from reobj.results.truth import SCORED, LabelledBoxes, read_result, read_truth
+from reobj.results.truth import LabelledBoxes, Role, read_result, read_truth
 from reobj.types import Array, Image, IntArray, box_iou, rows_by
 
 SOLVERS = ("sfmo", "psfmo", "lfd", "solids")
@@ -136,7 +136,7 @@ class Recording:
     def boxes(self) -> Boxes:
         """Read the boxes, of the classes of the true objects."""
         if self.detections is None:
-            seen = self.truth[self.truth.role == SCORED]
+            seen = self.truth[self.truth.role == Role.SCORED]
             return Boxes(seen.frame - 1, seen.xyxy, np.ones(len(seen)), seen.name)
         found = rt.read_detections(self.detections, rt.Video(self.video))
         name = np.array(found.class_names, str)[found.class_id]
@@ -208,7 +208,7 @@ def scannet_recording(folder: Path) -> Recording:
     rows = scene.scored
     truth = LabelledBoxes(
         scene.row[rows] + 1, scene.identity[rows], scene.xyxy[rows], scene.name[rows],
-        np.full(len(rows), SCORED),
+        np.full(len(rows), Role.SCORED),
     )  # fmt: skip
     points = instance_points(folder)
     ids = [k for k in np.unique(truth.identity).tolist() if k in points]
@@ -559,7 +559,7 @@ def outlines(solids: quadrics.Ellipsoids, side: Array) -> Iterator[Array]:
 
 def draw_frame(rec: Recording, found: dict[str, Scored], path: Path) -> None:
     """Draw boxes and ellipsoids over the last frame in which most objects are in view, in turn."""
-    frames = rec.truth.frame[rec.truth.role == SCORED] - 1
+    frames = rec.truth.frame[rec.truth.role == Role.SCORED] - 1
     last = int(frames.max()) // 2
     count = np.bincount(frames[frames > last])
     chosen = int(np.flatnonzero(count == count.max())[-1])

@@ -26,7 +26,7 @@ import quadrics
 import reobj_track as rt
 from reobj.cameras import viewing_rays
 from reobj.files import atomic
-from reobj.results.truth import ABSENT, SCORED, read_truth
+from reobj.results.truth import Role, read_truth
 from reobj.sources.masks import NO_RUNS, rle_decode, rle_encode
 from reobj.types import Array, Image, IntArray
 
@@ -173,7 +173,7 @@ def recording_scene(folder: Path, every: int = 1, min_visibility: float = 0.0) -
         raise rt.ReobjError(f"{folder}: expected identities in gt_mot.txt, gt.txt or gt/gt.txt")
     files = image_files(folder)
     truth = read_truth(truth_file, rt.COCO_NAMES, min_visibility)
-    truth = truth[truth.role != ABSENT]
+    truth = truth[truth.role != Role.ABSENT]
     if len(truth) and truth.frame.max() > len(files):
         raise rt.ReobjError(
             f"{truth_file}: frame {truth.frame.max()} of {len(files)} images in {folder}: give the "
@@ -183,7 +183,7 @@ def recording_scene(folder: Path, every: int = 1, min_visibility: float = 0.0) -
     n = len(truth)
     scene = Scene(
         folder.name, files, np.arange(len(files)), truth.frame - 1, truth.xyxy, truth.name,
-        np.full(n, -1), np.where(truth.role == SCORED, truth.identity, 0),
+        np.full(n, -1), np.where(truth.role == Role.SCORED, truth.identity, 0),
         sights(folder, truth.frame - 1, truth.xyxy), [NO_RUNS] * n, (size[0], size[1]),
     )  # fmt: skip
     return scene.sampled(every)

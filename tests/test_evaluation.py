@@ -26,7 +26,7 @@ from reobj.results.evaluation import (
 )
 from reobj.results.evaluation_3d import read_true_objects, score_objects
 from reobj.results.result import VideoInfo
-from reobj.results.truth import ABSENT, IGNORED, SCORED, LabelledBoxes, labelled, read_truth
+from reobj.results.truth import LabelledBoxes, Role, labelled, read_truth
 from reobj.results.workspace import Workspace
 from reobj.types import Embeddings
 
@@ -360,7 +360,7 @@ def test_zero_marked_truth_is_left_out(tmp_path: Path) -> None:
 def test_results_on_ignored_truth_are_dropped() -> None:
     """The better overlap decides whose a box is; one on nothing stays."""
     truth = boxes((0, 1, 0), (0, 2, 4), (0, 3, 90))
-    role = np.array([SCORED, IGNORED, ABSENT])
+    role = np.array([Role.SCORED, Role.IGNORED, Role.ABSENT])
     truth = LabelledBoxes(truth.frame, truth.identity, truth.xyxy, truth.name, role)
     found = boxes((0, 7, 0), (0, 8, 5), (0, 9, 90), (0, 10, 300), (1, 8, 5))
     kept = drop_ignored(truth, found)

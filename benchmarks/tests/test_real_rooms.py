@@ -17,7 +17,7 @@ import quadrics
 import reobj_track as rt
 from reobj.results.evaluation import score_tracks
 from reobj.results.result import VideoInfo
-from reobj.results.truth import IGNORED, SCORED, LabelledBoxes
+from reobj.results.truth import LabelledBoxes, Role
 
 FRAMES = 20
 
@@ -28,7 +28,7 @@ def boxes(*rows: tuple) -> LabelledBoxes:
         np.array(column) for column in zip(*(r[:4] for r in rows), strict=True)
     )
     xyxy = np.stack([left, 0 * left, left + 10, 0 * left + 10], 1).astype(float)
-    role = np.array([r[4] if len(r) > 4 else SCORED for r in rows])
+    role = np.array([r[4] if len(r) > 4 else Role.SCORED for r in rows])
     return LabelledBoxes(frame, identity, xyxy, name.astype(str), role)
 
 
@@ -52,14 +52,14 @@ def test_identity_f1_of_hand_made_boxes() -> None:
 
 def test_boxes_on_hidden_truth_alone_are_left_out() -> None:
     seen = [(f, 1, 0, "chair") for f in range(1, 6)]
-    hidden = [(f, 2, 30, "chair", IGNORED) for f in range(1, 6)]
+    hidden = [(f, 2, 30, "chair", Role.IGNORED) for f in range(1, 6)]
     found = [(f, 1, 0, "chair") for f in range(1, 6)]
     on_hidden = [(f, 2, 31, "chair") for f in range(1, 6)]
     of_other_class = [(f, 3, 31, "cup") for f in range(1, 6)]
     assert rr.identity_f1(boxes(*seen, *hidden), boxes(*found, *on_hidden), 0.3) == 1
     score = rr.identity_f1(boxes(*seen, *hidden), boxes(*found, *of_other_class), 0.3)
     assert score == pytest.approx(2 * 5 / (5 + 10))
-    near = [(f, 2, 2, "chair", IGNORED) for f in range(1, 6)]  # a seen chair is there too
+    near = [(f, 2, 2, "chair", Role.IGNORED) for f in range(1, 6)]  # a seen chair is there too
     assert rr.identity_f1(boxes(*seen, *near), boxes(*found), 0.3) == 1
 
 

@@ -15,7 +15,7 @@ from simulated import CAMERA, CUP, SIZE, chair_solids, walk
 
 import quadrics
 import reobj_track as rt
-from reobj.results.truth import SCORED, LabelledBoxes
+from reobj.results.truth import LabelledBoxes, Role
 
 FRAMES = 16
 CHAIR = rt.COCO_NAMES.index("chair")
@@ -101,7 +101,7 @@ def labelled(*rows: tuple) -> LabelledBoxes:
     """Rows of frame, identity, left and class: boxes of 10 x 10 px."""
     frame, identity, left, name = (np.array(c) for c in zip(*rows, strict=True))
     xyxy = np.stack([left, 0 * left, left + 10, 0 * left + 10], 1).astype(float)
-    return LabelledBoxes(frame, identity, xyxy, name.astype(str), np.full(len(rows), SCORED))
+    return LabelledBoxes(frame, identity, xyxy, name.astype(str), np.full(len(rows), Role.SCORED))
 
 
 @pytest.mark.parametrize(

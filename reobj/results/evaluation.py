@@ -20,9 +20,8 @@ from reobj.files import wrapped
 from reobj.results.evaluation_3d import score_objects
 from reobj.results.result import Result
 from reobj.results.truth import (
-    IGNORED,
-    SCORED,
     LabelledBoxes,
+    Role,
     check_counts,
     read_result,
     read_truth,
@@ -77,9 +76,9 @@ def _best_pairs(score: Array) -> tuple[IntArray, IntArray]:
 def drop_ignored(truth: LabelledBoxes, predicted: LabelledBoxes) -> LabelledBoxes:
     """Drop results matched to an ignored true box, as MOTChallenge does."""
     keep = np.ones(len(predicted), bool)
-    for g, p, iou in _frame_steps(truth, predicted) if (truth.role == IGNORED).any() else ():
+    for g, p, iou in _frame_steps(truth, predicted) if (truth.role == Role.IGNORED).any() else ():
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
-        keep[p[b]] &= truth.role[g[a]] != IGNORED
+        keep[p[b]] &= truth.role[g[a]] != Role.IGNORED
     return predicted[keep]
 
 
@@ -92,7 +91,7 @@ def _numbered(
         identities of truth (G,) and result (P,), the steps with identity numbers instead of rows,
         and the number of boxes of each identity, (G,) and (P,).
     """
-    truth = truth[truth.role == SCORED]
+    truth = truth[truth.role == Role.SCORED]
     gt_ids, gt, gt_size = np.unique(truth.identity, return_inverse=True, return_counts=True)
     ids, pr, pr_size = np.unique(predicted.identity, return_inverse=True, return_counts=True)
     steps = [(gt[g], pr[p], iou) for g, p, iou in _frame_steps(truth, predicted)]
@@ -141,14 +140,14 @@ def matched_rows(truth: LabelledBoxes, predicted: LabelledBoxes) -> tuple[IntArr
     """Match truth and result frame by frame at IoU >= .5, with the largest total IoU.
 
     Returns:
-        rows (M,) of the SCORED true boxes and of the result.
+        rows (M,) of the Role.SCORED true boxes and of the result.
     """
     pairs = [np.empty((2, 0), np.int64)]
     for g, p, iou in _frame_steps(truth, predicted):
         a, b = _best_pairs(np.where(iou >= MATCH_IOU, iou, 0))
         pairs.append(np.stack([g[a], p[b]]))
     rows = np.concatenate(pairs, 1)
-    scored = truth.role[rows[0]] == SCORED
+    scored = truth.role[rows[0]] == Role.SCORED
     return rows[0][scored], rows[1][scored]
 
 
@@ -383,7 +382,7 @@ def evaluate(
         raise ReobjError(
             f"--classes: {', '.join(sorted(unknown))}: neither in the truth nor in the result"
         )
-    names_scored = list(classes) or sorted(set(truth.name[truth.role == SCORED]) - {""})
+    names_scored = list(classes) or sorted(set(truth.name[truth.role == Role.SCORED]) - {""})
     if classes:
         truth, predicted = _of_classes(truth, predicted, classes, named)
         check_counts(truth, Path(gt), f"none is of {', '.join(classes)}")
@@ -406,14 +405,14 @@ def _of_classes(
 ) -> tuple[LabelledBoxes, LabelledBoxes]:
     """Select the boxes of some classes.
 
-    If the result has no classes (not `named`), true boxes of other classes become IGNORED.
+    If the result has no classes (not `named`), true boxes of other classes become Role.IGNORED.
     """
     true_rows, predicted_rows = (
         np.isin(boxes.name, [*classes, ""]) for boxes in (truth, predicted)
     )
     if named:
         return truth[true_rows], predicted[predicted_rows]
-    role = np.where(true_rows | (truth.role != SCORED), truth.role, IGNORED)
+    role = np.where(true_rows | (truth.role != Role.SCORED), truth.role, Role.IGNORED)
     return dataclasses.replace(truth, role=role), predicted
 
 
@@ -443,7 +442,7 @@ def score_appearance(tracked: Result, truth: LabelledBoxes) -> dict[str, float]:
         return {}
     identity = np.arange(len(tracks))
     names = np.array([*tracked.class_names, ""])[tracks.class_id]  # -1: unknown
-    role = np.full(len(tracks), SCORED)
+    role = np.full(len(tracks), Role.SCORED)
     predicted = LabelledBoxes(tracks.frame + 1, identity, tracks.xyxy, names, role)
     fused = np.concatenate([embeddings.foreground, embeddings.background], 1)
     rank = return_ranks(truth, predicted, unit_rows(fused))

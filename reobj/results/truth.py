@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import configparser
 import dataclasses
+import enum
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,10 +26,13 @@ from reobj.sources.cvat import read_cvat
 from reobj.sources.tables import WHOLE_MAX, read_mot_rows
 from reobj.types import CLASS_MAX, Array, BoolArray, IntArray, ReobjError
 
-# Roles of true boxes
-SCORED = 0  # counts
-IGNORED = 1  # does not count; boxes of the result that match it are dropped
-ABSENT = 2  # left out
+
+class Role(enum.IntEnum):
+    """What a true box counts for."""
+
+    SCORED = 0
+    IGNORED = 1  # does not count; boxes of the result that match it are dropped
+    ABSENT = 2  # left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +42,7 @@ class LabelledBoxes:
     Attributes (N rows in any order):
         frame: (N,) from 1, as in MOTChallenge files. identity: (N,). xyxy: (N, 4) native pixels.
         name: (N,) class names; "" matches every class.
-        role: (N,) SCORED, IGNORED or ABSENT; all SCORED in a result.
+        role: (N,) Role.SCORED, Role.IGNORED or Role.ABSENT; all Role.SCORED in a result.
     """
 
     frame: IntArray
@@ -54,7 +58,7 @@ class LabelledBoxes:
         return LabelledBoxes(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
 
 
-def labelled(rows: Array, name: Any = "", role: Any = SCORED) -> LabelledBoxes:
+def labelled(rows: Array, name: Any = "", role: Any = Role.SCORED) -> LabelledBoxes:
     """Convert MOTChallenge rows (N, 6+) to labelled boxes; name, role: for all rows, or (N,)."""
     n = len(rows)
     box = rows[:, 2:6]
@@ -76,7 +80,7 @@ def read_truth(
 
     Args:
         class_names: by the numbers of files that do not name their classes (from 0).
-        min_visibility: rows of lower visibility are IGNORED.
+        min_visibility: rows of lower visibility are Role.IGNORED.
         notes: assumptions about the file are appended. size: (w, h) of the video, (0, 0): unknown.
     Raises:
         ReobjError: the file cannot be read, or an identity has two boxes in a frame.
@@ -90,7 +94,7 @@ def read_truth(
                 f"{path}: boxes of images, without identities; expected CVAT for video"
             )
         names = np.array(recorded.class_names, str)[recorded.class_id]
-        role = np.full(len(names), SCORED)
+        role = np.full(len(names), Role.SCORED)
         truth = LabelledBoxes(recorded.frame + 1, recorded.identity, recorded.xyxy, names, role)
         notes += recorded.messages
     elif path.suffix.lower() == ".json":
@@ -114,7 +118,7 @@ def read_result(out: Path, notes: list[str] | None = None) -> LabelledBoxes:
         result = Result.load(out)
         tracks = result.tracks
         names = np.array([*result.class_names, ""], str)  # the last one is that of class -1
-        role = np.full(len(tracks), SCORED)
+        role = np.full(len(tracks), Role.SCORED)
         ids = tracks.track_id
         frame = tracks.frame + 1
         predicted = LabelledBoxes(frame, ids, tracks.xyxy, names[tracks.class_id], role)
@@ -143,27 +147,29 @@ def _read_mot(
     sequence = _sequence(path)
     _check_length(rows, path, sequence)
     if rows.shape[1] != 9:
-        return labelled(rows, "", np.where(flagged, ABSENT, SCORED))
+        return labelled(rows, "", np.where(flagged, Role.ABSENT, Role.SCORED))
     number = rows[:, 7].clip(-CLASS_MAX, CLASS_MAX).astype(np.int64)
     hidden = rows[:, 8] < min_visibility
     labels = path.with_name("labels.txt")
     stated = path.with_name("gt_mot_format.json")
     if labels.exists():
         notes.append(f"classes are lines of {labels.name}, from 1 (CVAT's MOT 1.1)")
-        role = np.where(flagged, ABSENT, hidden * IGNORED)
+        role = np.where(flagged, Role.ABSENT, hidden * Role.IGNORED)
         return labelled(rows, _by_line(number, labels, path), role)
     if stated.exists():
-        return labelled(rows, _names_of(number, stated, class_names), (flagged | hidden) * IGNORED)
+        return labelled(
+            rows, _names_of(number, stated, class_names), (flagged | hidden) * Role.IGNORED
+        )
     if benchmark := _benchmark(sequence.get("name", ""), path, number, flagged):
         notes.append(f"classes are {benchmark}'s: pedestrians count, boxes on distractors do not")
-        role = np.where(flagged | (number != MOT_PEDESTRIAN), ABSENT, hidden * IGNORED)
-        role[np.isin(number, MOT_DISTRACTORS[benchmark])] = IGNORED
+        role = np.where(flagged | (number != MOT_PEDESTRIAN), Role.ABSENT, hidden * Role.IGNORED)
+        role[np.isin(number, MOT_DISTRACTORS[benchmark])] = Role.IGNORED
         return labelled(rows, "", role)
     if (number < 0).all() or (sequence and (number == MOT_PEDESTRIAN).all()):
         notes.append("the truth has one class without a name: classes do not count")
-        return labelled(rows, "", np.where(flagged, ABSENT, hidden * IGNORED))
+        return labelled(rows, "", np.where(flagged, Role.ABSENT, hidden * Role.IGNORED))
     notes.append("class numbers of the truth are those of the detector (COCO's), from 0")
-    return labelled(rows, _names_of(number, None, class_names), (flagged | hidden) * IGNORED)
+    return labelled(rows, _names_of(number, None, class_names), (flagged | hidden) * Role.IGNORED)
 
 
 def _from_one(rows: Array, path: Path, notes: list[str]) -> Array:
@@ -264,7 +270,7 @@ def _read_kitti(path: Path, notes: list[str]) -> LabelledBoxes:
     if not np.isfinite(table).all():
         raise ReobjError(f"{path}: a number is not finite; expected KITTI's tracking labels")
     dont_care = names == "DontCare"
-    role = np.where(dont_care, IGNORED, SCORED)
+    role = np.where(dont_care, Role.IGNORED, Role.SCORED)
     notes.append("KITTI's labels: frames from 0; boxes on DontCare do not count; KITTI's rules of "
                 "distractors, occlusion and height are not applied")  # fmt: skip
     whole = table[:, :2].astype(np.int64)
@@ -287,7 +293,7 @@ def _read_coco_video(path: Path) -> LabelledBoxes:
         ]  # fmt: skip
         table = np.array(rows, np.float64).reshape(-1, 6)
         names = [name_of[a["category_id"]] for a in data["annotations"]]
-        crowd = [IGNORED if a.get("iscrowd") or a.get("ignore") else SCORED
+        crowd = [Role.IGNORED if a.get("iscrowd") or a.get("ignore") else Role.SCORED
                  for a in data["annotations"]]  # fmt: skip
     except ReobjError:
         raise
@@ -301,7 +307,7 @@ def _read_coco_video(path: Path) -> LabelledBoxes:
 
 def _check_identities(boxes: LabelledBoxes, path: Path) -> None:
     """Refuse boxes without identity, and an identity that has two boxes in a frame."""
-    scored = boxes[boxes.role == SCORED]
+    scored = boxes[boxes.role == Role.SCORED]
     if (scored.identity < 0).any():
         count = (scored.identity < 0).sum()
         total = len(scored)
@@ -326,10 +332,10 @@ def check_counts(truth: LabelledBoxes, path: Path, left_out: str = "") -> None:
     Args:
         left_out: reason why boxes of the file were removed before.
     """
-    if (truth.role == SCORED).any():
+    if (truth.role == Role.SCORED).any():
         return
-    absent = (truth.role == ABSENT).sum()
-    ignored = (truth.role == IGNORED).sum()
+    absent = (truth.role == Role.ABSENT).sum()
+    ignored = (truth.role == Role.IGNORED).sum()
     why = "no boxes in it"
     if len(truth):
         why = (f"of {len(truth)} rows {absent} are marked not to count (column 7 is 0, or another "
@@ -350,7 +356,7 @@ def with_common_names(
     """
     unnamed = {"", "object"}  # names of boxes without a class
     our_names = sorted(set(predicted.name.tolist()) - unnamed)
-    true_names = sorted(set(truth.name[truth.role == SCORED].tolist()) - unnamed)
+    true_names = sorted(set(truth.name[truth.role == Role.SCORED].tolist()) - unnamed)
     ours_of = {_normalised(name): name for name in our_names}
     renamed = {name: ours_of.get(_normalised(name), name) for name in set(truth.name.tolist())}
     names = np.array([renamed[name] for name in truth.name.tolist()], str)
