@@ -52,7 +52,7 @@ def losses(full: list[list[Figures]], reduced: list[list[Figures]]) -> np.ndarra
     """Return the loss of each run (n,) of `reduced` against the same run of `full`."""
     found = []
     for before, after in zip(full, reduced, strict=True):
-        true = max(before[0].get("found") or 0, 1)
+        true = max(before[0].get("true") or before[0].get("found") or 0, 1)
         for a, b in zip(before, after, strict=True):
             false_a, false_b = (
                 sum(f.get(k) or 0 for k in ("doubles", "elsewhere")) for f in (a, b)
