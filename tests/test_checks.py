@@ -1,14 +1,18 @@
-"""The check of supplied poses against tracks: wrong direction, wrong axes, no false alarm."""
+"""Supplied poses against tracks and images: direction, axes, no false alarm, two readings."""
 
 from __future__ import annotations
 
+import statistics
+
 import numpy as np
 import pytest
-from pose_worlds import FOCAL, SIZE, motion, supplied
+from pose_worlds import FOCAL, PINHOLE, SIZE, FakeVideo, motion, supplied
 from scipy.spatial.transform import Rotation
 
+import quadrics
+import reobj_track as rt
 from reobj.cameras import invert_rigid
-from reobj.poses.supplied.interpretation import check_poses
+from reobj.poses.supplied.interpretation import PoseReading, by_images, by_tracks, check_poses
 
 
 def box_tracks(cams, noise_px, seed, objects=12):
@@ -92,3 +96,160 @@ def test_what_fits_within_a_degree_is_beyond_doubt():
     cams = motion("still")
     for seed in range(5):
         assert check_poses(supplied(invert_rigid(cams)), box_tracks(cams, 0, seed)) is None
+
+
+# ---- Which of two readings the boxes or the images say ---------------------------------------
+
+
+def reading(key, poses):
+    return PoseReading(key, f"rule {key}", poses)
+
+
+def at(cams, shift, frames):
+    """The frames have the poses of frames that are `shift` later."""
+    moved = np.full_like(cams, np.nan)
+    for i in frames:
+        if 0 <= i + shift < len(cams):
+            moved[i] = cams[i + shift]
+    return supplied(moved)
+
+
+def object_px(poses, frame, xyxy):
+    """Median distance of the sides inside the image, one by one."""
+    views = PINHOLE.K @ poses.cam_from_world[frame]
+    fit = quadrics.fit_objects(xyxy[:, None], views, SIZE)
+    if fit.status[0] == "rejected":
+        return max(SIZE)
+    fitted = quadrics.solid_boxes(fit.ellipsoids, list(fit.support), views)[:, 0]
+    return statistics.median(
+        abs(side - box[k])
+        for box, sides in zip(xyxy, fitted, strict=True)
+        for k, side in enumerate(sides)
+        if 1 < box[k] < SIZE[k % 2] - 1 and np.isfinite(side)
+    )
+
+
+def sizes_by_boxes(one, other, frame, boxes):
+    """Residuals of two readings, each as often as independent boxes show it."""
+    found = []
+    for xyxy in boxes:
+        seen = [{i for i in frame if p.known[i]} for p in (one, other)]
+        if len(seen[0] & seen[1]) >= 8:
+            seen = [seen[0] & seen[1]] * 2
+        if min(map(len, seen)) >= 8:
+            pair = [object_px(p, sorted(s), xyxy[sorted(s)])
+                    for p, s in zip((one, other), seen, strict=True)]  # fmt: skip
+            found += [pair] * (min(map(len, seen)) // 5)
+    size = np.exp(np.log(np.maximum(found, 1e-3)).mean(0)) if found else np.ones(2)
+    return size, len(found)
+
+
+@pytest.mark.parametrize(
+    ("seen", "noise_px", "known", "chosen"),
+    [
+        (range(60), 2, None, True),
+        (range(20), 2, None, False),
+        (range(4, 60, 7), 0.02, None, True),
+        (range(4, 53, 7), 0.02, None, False),
+        (range(60), 0.02, (range(34), range(26, 60)), False),  # 8 frames have both poses
+        (range(60), 0.02, (range(33), range(26, 60)), True),  # 7: every reading by its own frames
+    ],
+)
+def test_boxes_choose_a_reading_by_the_sides_inside_the_image(seen, noise_px, known, chosen):
+    """Every object in 5 boxes is one trial; boxes that are cut by the image end at its border."""
+    cams = motion("orbit")
+    solids = quadrics.Ellipsoids(
+        np.array([[0.3, 0.2, 0.4], [1.2, 1.5, 0.5]]), np.array([[0.3, 0.2, 0.4], [0.9, 0.9, 0.5]]),
+        np.tile(np.eye(3), (2, 1, 1)),
+    )  # fmt: skip
+    boxes = quadrics.solid_boxes(solids, "ellipsoid", PINHOLE.K @ cams).swapaxes(0, 1)
+    boxes = boxes + noise_px * np.random.default_rng(0).choice([-1, 1], boxes.shape)
+    boxes = boxes.clip(1, np.tile(SIZE, 2) - 1)
+    frame, obj = np.repeat(seen, 2), np.tile([0, 1], len(seen))
+    tracks = rt.Tracks(frame, obj, obj, boxes[obj, frame], np.ones(len(obj)), obj, obj)
+    right, late = (at(cams, *one) for one in zip((0, -2), known or [range(60)] * 2, strict=True))
+    found = by_tracks([reading("right", right), reading("late", late)], tracks)
+    (one, other), trials = sizes_by_boxes(right, late, seen, boxes)
+    assert (trials * np.log(other / one) > np.log(1000)) == chosen
+    text = f"it fits the boxes within {one:.2g} px, by rule late {other:.2g} px"
+    expected = [("right", text)] if chosen else [("right", ""), ("late", "")]
+    assert [(f.key, f.measured) for f in found] == expected
+
+
+def degrees_between(a, b):
+    return np.degrees(np.arccos(np.clip(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12),
+                                        -1, 1)))  # fmt: skip
+
+
+def telling_pairs(one, other):
+    """Pairs of frames whose motion differs most between two readings, spread over the video."""
+    both = np.flatnonzero(one.known & (other or one).known).tolist()
+    scored = []
+    for step in (1, 2, 5, 10):
+        for i, j in zip(both, both[step:], strict=False):
+            motions = []
+            for poses in (one, other or one):
+                first, second = (np.vstack([poses.cam_from_world[k], [0, 0, 0, 1]]) for k in (i, j))
+                motions.append(second @ np.linalg.inv(first))
+            turns = [Rotation.from_matrix(m[:3, :3]) for m in motions]
+            angle = turns[0].magnitude()
+            if other:
+                angle = (turns[0].inv() * turns[1]).magnitude()
+            score = np.degrees(angle)
+            shifts = [m[:3, 3] for m in motions]
+            if other and min(np.linalg.norm(t) for t in shifts) > 0:
+                score += 0.1 * degrees_between(*shifts)
+            if min(np.degrees(turn.magnitude()) for turn in turns) < 30:
+                scored.append((min(score, 8), i, j))
+    chosen = []
+    for score, i, j in sorted(scored, key=lambda s: -s[0]):  # stable
+        places = [abs(both.index(i) - both.index(a)) for a, _ in chosen]
+        if score > 0 and len(chosen) < 20 and all(p >= len(both) / 40 for p in places):
+            chosen.append((i, j))
+    return chosen
+
+
+class Looked(FakeVideo):
+    """A video of blank images that notes which of them are looked at."""
+
+    def __init__(self, count):
+        super().__init__([np.zeros((48, 64, 3), np.uint8)] * count)
+        self.looked = set()
+
+    def __iter__(self):
+        for index in range(self.frame_count):
+            yield LookedFrame(self, index)
+
+
+class LookedFrame:
+    def __init__(self, video, index):
+        self.video, self.index = video, index
+
+    @property
+    def image(self):
+        self.video.looked.add(self.index)
+        return self.video.images[self.index]
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "shift", "known"),
+    [
+        ("walk", 90, 1, range(90)),
+        ("pan", 120, -1, range(0, 120, 2)),
+        ("pan", 60, 3, range(60)),  # turns by more than 30 degrees in 10 frames
+        ("turn", 90, 2, range(5, 90)),  # on the spot: no direction of translation
+        ("orbit", 5, 1, range(5)),
+        ("orbit", 3, 1, range(3)),  # too few
+    ],
+)
+def test_images_are_compared_where_readings_differ_most(kind, count, shift, known):
+    """Not all images are looked at: those of the best pairs, one by one as the text has it."""
+    cams = motion("pan" if kind == "turn" else kind, count)
+    if kind == "turn":
+        cams[:, :, 3] = 0
+    one, other = at(cams, 0, known), at(cams, shift, known)
+    video = Looked(count)
+    given = [reading("a", one), reading("b", other)]
+    assert by_images(given, video) == given
+    pairs = [telling_pairs(*both) for both in ((one, other), (one, None), (other, None))]
+    assert video.looked == {i for some in pairs for pair in some for i in pair}

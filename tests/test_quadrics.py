@@ -20,6 +20,7 @@ import numpy as np
 import own_priors
 import pytest
 import synthetic_quadrics as syn
+from scipy.stats import chi2
 from simulated import chair_solids, walk
 
 import quadrics as q
@@ -1358,3 +1359,8 @@ def test_priors_beyond_numbers_are_refused(tmp_path: Path, key: str) -> None:
     path.write_text(json.dumps({"couch": {"size_m": size | {key: [1e308, -1e308, 1e308]}}}))
     with pytest.raises(q.QuadricsError, match="a category has a missing or invalid field"):
         q.load_priors(path)
+
+
+def test_the_median_of_chi2_is_near() -> None:
+    dof = np.array([1.0, 2, 3, 10, 50, 400])
+    np.testing.assert_allclose(q._median_chi2(dof), chi2.median(dof), rtol=0.04)
