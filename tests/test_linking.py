@@ -243,6 +243,22 @@ def test_what_moves_stays_as_the_tracker_has_it() -> None:
             assert len(np.unique(found.track_id)) == objects
 
 
+def test_what_moves_is_not_taken_for_what_has_its_number() -> None:
+    """Two chairs that move, and later a person that looks like the first: its tracklet has the
+    number of the identity of that chair, and its class is number 0.
+    """
+    table = table_of(walk())
+    table = table[(table.detection_index == 1) | ((table.detection_index == 0) & (
+        (table.frame < 40) | (table.frame >= 80)))]  # fmt: skip
+    piece = np.where(table.detection_index == 1, 1, 2 * (table.frame >= 80))
+    rows = dataclasses.replace(
+        table, track_id=piece + 1, tracklet_id=np.array([4, 2, 1])[piece],
+        class_id=np.array([CHAIR, CHAIR, PERSON])[piece],
+    )  # fmt: skip
+    found, _ = linked(rows, None, views_of(table, table.detection_index, 0.5), moving=("chair",))
+    assert objects_of(found, piece) == [[0], [1], [2]]
+
+
 def test_labels_decide_and_spread_in_their_fragments() -> None:
     """As row by row: rows of fragments that may have a gap, labelled at random.
 

@@ -205,6 +205,7 @@ def as_euroc(folder, cams, sensor=True):
         numbers = [repr(v) for v in BODY_FROM_CAM.ravel().tolist()]
         text_ = SENSOR.format(", ".join(numbers[:7]), ", ".join(numbers[7:]))
         (folder / "cam0" / "sensor.yaml").write_text(text_)
+        (folder / "gt" / "sensor.yaml").write_text("sensor_type: visual-inertial\n")
     head = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], "
     head += "q_RS_z [], " + ", ".join(f"v_RS_R_{a} [m s^-1]" for a in "xyz")
     head += "".join(f", b_{s}_RS_S_{a} []" for s in "wa" for a in "xyz")
@@ -432,6 +433,8 @@ def test_colmap_points_come_along_in_the_order_of_their_numbers(tmp_path, write)
         points = path / "sparse" / "0" / "points3D.txt"
         points.write_text("\n".join(reversed(points.read_text().splitlines())) + "\n")
     poses = read(path)
+    form = "text" if write is as_colmap_text else "binary"
+    assert poses.reading.startswith(f"COLMAP model ({form})")
     np.testing.assert_array_equal(poses.points, np.arange(6).reshape(2, 3))
     np.testing.assert_array_equal(poses.colors, [[9, 8, 7], [255, 0, 1]])
 
@@ -871,3 +874,11 @@ def test_focal_lengths_of_zero_are_refused(tmp_path):
     (path / "sparse/0/cameras.txt").write_text("1 PINHOLE 640 480 0 0 320 240\n")
     with pytest.raises(rt.ReobjError, match="focal length"):
         read(path)
+
+
+def test_rows_of_images_are_no_observations(tmp_path):
+    """Without rows of observations: names of three words, and poses in whole numbers."""
+    path = as_colmap_poses_only(tmp_path, some_cameras())
+    names = ["in a folder/0000.jpg", "0001.jpg", "in a folder/0002.jpg", "0003.jpg"]
+    path.write_text("".join(f"{i} 1 0 0 0 {i} 0 0 1 {name}\n" for i, name in enumerate(names)))
+    assert np.flatnonzero(read(path).known).tolist() == [0, 1, 2, 3]
