@@ -1827,7 +1827,7 @@ def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: boo
         square = (capped * fit.inlier / data.edges.redundancy[fit.obj]).sum((1, 2))
     level = square / dof
     best = level <= _least(level, fit.obj)  # the hypothesis and shape of each object that fits best
-    level /= _median_chi2(dof) / dof
+    level /= _median_chi2_per_dof(dof)
     median = _weighted_median(level[best], np.minimum(dof[best], OBJECT_NOISE_DOF))
     total = dof[best].sum()
     pooled = (NOISE_PRIOR_DOF + median * total) / (NOISE_PRIOR_DOF + total)
@@ -1835,9 +1835,9 @@ def _update_noise(fit: _Fit, value: Array, spec: _Spec, data: _Data, robust: boo
     fit.noise = np.clip(np.sqrt(variance), 0.05, 20.0)
 
 
-def _median_chi2(dof: Array) -> Array:
-    """Return the medians of chi2 distributions. Ref: Wilson and Hilferty 1931."""
-    return np.asarray(dof * (1.0 - 2.0 / (9.0 * dof)) ** 3)
+def _median_chi2_per_dof(dof: Array) -> Array:
+    """Return the medians of chi2 / dof. Ref: Wilson and Hilferty 1931."""
+    return np.asarray((1.0 - 2.0 / (9.0 * dof)) ** 3)
 
 
 def _weighted_median(values: Array, weight: Array) -> float:

@@ -238,8 +238,8 @@ class LookedFrame:
         ("pan", 120, -1, range(0, 120, 2)),
         ("pan", 60, 3, range(60)),  # turns by more than 30 degrees in 10 frames
         ("turn", 90, 2, range(5, 90)),  # on the spot: no direction of translation
-        ("orbit", 5, 1, range(5)),
-        ("orbit", 3, 1, range(3)),  # too few
+        ("walk", 5, 1, range(5)),
+        ("walk", 3, 1, range(3)),  # three pairs of one reading, of both too few
     ],
 )
 def test_images_are_compared_where_readings_differ_most(kind, count, shift, known):

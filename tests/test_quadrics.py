@@ -1363,4 +1363,4 @@ def test_priors_beyond_numbers_are_refused(tmp_path: Path, key: str) -> None:
 
 def test_the_median_of_chi2_is_near() -> None:
     dof = np.array([1.0, 2, 3, 10, 50, 400])
-    np.testing.assert_allclose(q._median_chi2(dof), chi2.median(dof), rtol=0.04)
+    np.testing.assert_allclose(q._median_chi2_per_dof(dof), chi2.median(dof) / dof, rtol=0.04)
