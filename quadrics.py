@@ -1650,8 +1650,7 @@ EDGE_OUTLIER = 5.0  # sigma, residual beyond which an edge is an outlier (occlus
 # sigma^2, largest costs of an edge: -2 log(p / 20 sigma / .4), p the probability of an outlier
 HIDDEN_CAP = 7.4  # p = .2: an edge that may be occluded
 OUTLIER_CAP = 12.0  # p = .02: any other edge
-# Fraction of the objects on the floor whose lower part is occluded in all views; that of `HIDDEN`
-# among the votes for the scale
+# Fraction of the objects on the floor whose lower part is occluded in all views
 OCCLUDED_BELOW = 0.25
 # (9, 9) information that keeps unobservable rotations finite: sigma .9 rad, that of a uniform angle
 # within +-90 deg
@@ -1988,8 +1987,11 @@ SCENE_LOG = 0.5
 # Mixture of votes for the scale: weight, bias (log), sigma (log). The terms are right votes, wrong
 # classes (10 to 38 % of the listed objects in two recordings) and partly occluded objects, of
 # whose size at least half is visible.
-HIDDEN = [(0.25 / 3.0, float(-np.log(seen)), 0.0) for seen in (0.58, 0.75, 0.92)]
-VOTES = ((0.5, 0.0, 0.0), (0.25, 0.0, UNKNOWN_SIZE_LOG), *HIDDEN)
+VOTES = (
+    (0.5, 0.0, 0.0),
+    (0.25, 0.0, UNKNOWN_SIZE_LOG),
+    *((0.25 / 3.0, float(-np.log(seen)), 0.0) for seen in (0.58, 0.75, 0.92)),
+)
 
 
 class Scale(NamedTuple):

@@ -1,4 +1,4 @@
-"""Hidden edges: where something nearer begins, where boxes end above the floor; and the fit."""
+"""Occluded edges of boxes: where a nearer object begins; and the fit with them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from reobj.objects.observations import Views, gather_views
 from reobj.objects.occlusion import occluded_edges, see_through_ratio
 
 LEFT, UPPER, RIGHT, LOWER = range(4)
-ELSEWHERE = np.array([False, False])  # neither stands on the floor
 
 
 def scene(counter: np.ndarray) -> tuple[quadrics.Ellipsoids, Views]:
@@ -38,7 +37,7 @@ def cut_below(views: Views) -> None:
 def test_the_edge_at_a_counter_is_hidden_and_no_other() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
-    found = occluded_edges(views, solids, ELSEWHERE)
+    found = occluded_edges(views, solids)
     expected = np.zeros((5, 2, 4), bool)
     expected[:, 0, LOWER] = True
     np.testing.assert_array_equal(found, expected)
@@ -49,37 +48,22 @@ def test_what_is_farther_away_hides_nothing() -> None:
     solids.center_in_world[1, 1] = 0.4
     views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
     cut_below(views)
-    assert not occluded_edges(views, solids, ELSEWHERE)[:, 0].any()
+    assert not occluded_edges(views, solids)[:, 0].any()
     solids.center_in_world[0, 1] = 1.0
-    assert occluded_edges(views, solids, ELSEWHERE)[:, 0, LOWER].all()
+    assert occluded_edges(views, solids)[:, 0, LOWER].all()
 
 
 def test_what_covers_the_whole_box_hides_no_edge() -> None:
     """The chair is seen although a solid is in the way: that is no wall."""
     solids, views = scene(np.array([1.5, 0.1, 0.9]))
-    assert not occluded_edges(views, solids, ELSEWHERE).any()
+    assert not occluded_edges(views, solids).any()
 
 
 def test_an_unknown_solid_hides_nothing() -> None:
     solids, views = scene(np.array([1.5, 0.1, 0.3]))
     cut_below(views)
     solids.center_in_world[1] = solids.half_axes[1] = np.nan
-    assert not occluded_edges(views, solids, ELSEWHERE).any()
-
-
-def test_a_box_that_ends_above_the_floor_tells_only_where_its_thing_begins() -> None:
-    """Of the two that stand on the floor one is seen whole in the first frame, half in others."""
-    solids, views = scene(np.array([0.2, 0.2, 0.4]))
-    solids.center_in_world[1, :2] = [1.5, 0]
-    views.boxes[:] = quadrics.solid_boxes(solids, "box", views.img_from_world)
-    lower, height = views.boxes[..., 3], np.diff(views.boxes[..., [1, 3]])[..., 0]
-    lower[0] -= 0.05 * height[0]
-    lower[1:] -= 0.3 * height[1:]
-    expected = np.zeros((5, 2, 4), bool)
-    expected[1:, 0] = [True, False, True, True]
-    found = occluded_edges(views, solids, np.array([True, False]))
-    np.testing.assert_array_equal(found, expected)
-    assert not occluded_edges(views, solids, ELSEWHERE).any()
+    assert not occluded_edges(views, solids).any()
 
 
 def test_no_edge_is_hidden_below_the_image() -> None:
@@ -89,7 +73,7 @@ def test_no_edge_is_hidden_below_the_image() -> None:
     whole = quadrics.solid_boxes(solids, "box", views.img_from_world)
     size = (SIZE[0], float(whole[..., 3].min()) - 20.0)
     views = dataclasses.replace(views, boxes=quadrics.clip_boxes(whole, size), image_size=size)
-    assert not occluded_edges(views, solids, ~ELSEWHERE).any()
+    assert not occluded_edges(views, solids).any()
 
 
 @pytest.mark.parametrize("edge", [UPPER, LOWER])
